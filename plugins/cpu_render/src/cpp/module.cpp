@@ -1,0 +1,22 @@
+// The extension module gsstream_cpu_render._native: one bind_* call per kernel family.
+#include <nanobind/nanobind.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include "bindings.hpp"
+#include "isa.hpp"
+
+namespace nb = nanobind;
+
+NB_MODULE(_native, module) {
+  module.doc() = "Native kernels of gsstream-cpu-render.";
+  module.def("active_isa", [] { return std::string(gsstream_cpu::isa_name(gsstream_cpu::active_isa())); },
+             "Name of the selected instruction set (GSSTREAM_ISA, else the strongest supported).");
+  module.def("supported_isas", [] {
+    std::vector<std::string> names;
+    for (gsstream_cpu::Isa isa : gsstream_cpu::supported_isas()) names.emplace_back(gsstream_cpu::isa_name(isa));
+    return names;
+  }, "Names of the instruction sets this build and processor support, weakest first.");
+  module.def("select_isa", &gsstream_cpu::select_isa, nb::arg("name"),
+             "Select an instruction set by name (tests, comparisons). Raises ValueError if unsupported.");
+}

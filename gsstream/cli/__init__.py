@@ -1,0 +1,1 @@
+"""Thin commands; nothing heavy is imported at the top level."""

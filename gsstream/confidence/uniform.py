@@ -1,0 +1,23 @@
+"""Uniform confidence: every Gaussian is equally suspect."""
+
+from __future__ import annotations
+
+from typing import final
+
+import torch
+from pydantic import Field
+
+from gsstream.confidence.base import ConfidenceEstimator
+from gsstream.core.context import FrameContext
+from gsstream.core.part import PartConfig
+
+
+@final
+class Uniform(ConfidenceEstimator):
+    """The same logit for all (ours, the null part; large values give the paper's constant-one ablation)."""
+
+    class Config(PartConfig):
+        logit: float = Field(default=0.0, ge=-50, le=50, description="logit of the confidence, -50 to 50; 0 is p = 0.5")
+
+    def estimate(self, context: FrameContext) -> torch.Tensor:
+        return torch.full((len(context.gaussians),), float(self.config.logit))

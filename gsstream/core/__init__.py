@@ -1,0 +1,1 @@
+"""The nouns: plain records of arrays. No policy, no input or output, no torch at import time."""

@@ -1,0 +1,82 @@
+"""Cameras: a calibrated rig of pinhole cameras that share one image size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsstream.core.errors import ShapeError
+from gsstream.core.shapes import FloatArray, check_finite, check_shape
+
+
+@dataclass(frozen=True, slots=True)
+class Cameras:
+    """C pinhole cameras.
+
+    Arguments:
+        ids: C names, unique.
+        viewmats: [C, 4, 4] float64 world-to-camera, OpenCV axes (x right, y down, z forward), scene units.
+        Ks: [C, 3, 3] float64 intrinsics in pixels, pixel-corner origin (centre of the first pixel is (0.5, 0.5)).
+        width, height: image size in pixels, the same for all cameras.
+    """
+
+    ids: tuple[str, ...]
+    viewmats: FloatArray
+    Ks: FloatArray
+    width: int
+    height: int
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def centers(self) -> FloatArray:
+        """[C, 3] camera centres in the world."""
+        rotation, translation = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3]
+        return -np.einsum("cji,cj->ci", rotation, translation)
+
+    @property
+    def extent(self) -> float:
+        """1.1 times the largest distance of a camera centre to their mean (3DGS convention), scene units."""
+        if len(self) == 0:
+            return 1.0
+        radius = np.linalg.norm(self.centers - self.centers.mean(0), axis=1).max()
+        return float(1.1 * radius) if radius > 0 else 1.0
+
+    def select(self, index: Sequence[int]) -> Cameras:
+        """The sub-rig with these camera indices."""
+        index = list(index)
+        return Cameras(tuple(self.ids[i] for i in index), self.viewmats[index], self.Ks[index], self.width, self.height)
+
+    def scaled(self, width: int, height: int) -> Cameras:
+        """The same rig at another image size; intrinsics scale with it (exact for pixel-corner origins)."""
+        factor = np.diag([width / self.width, height / self.height, 1.0])
+        return Cameras(self.ids, self.viewmats, factor @ self.Ks, width, height)
+
+    def validate(self) -> None:
+        """Raise ShapeError for NaN poses, reflected or scaled rotations, non-invertible intrinsics, repeated names."""
+        c = len(self)
+        check_shape("viewmats", self.viewmats, (c, 4, 4))
+        check_shape("Ks", self.Ks, (c, 3, 3))
+        if len(set(self.ids)) != c:
+            raise ShapeError(f"camera ids must be unique, got {list(self.ids)}")
+        for i, name in enumerate(self.ids):
+            check_finite(f"pose (w2c) of camera {name!r}", self.viewmats[i])
+            check_finite(f"intrinsics (K) of camera {name!r}", self.Ks[i])
+            _check_rotation(name, self.viewmats[i, :3, :3])
+            if self.Ks[i, 0, 0] <= 0 or self.Ks[i, 1, 1] <= 0 or abs(np.linalg.det(self.Ks[i])) < 1e-12:
+                raise ShapeError(
+                    f"intrinsics (K) of camera {name!r} are not invertible: expected positive focal lengths in pixels, "
+                    f"got fx = {self.Ks[i, 0, 0]:g}, fy = {self.Ks[i, 1, 1]:g}; check the calibration file"
+                )
+
+
+def _check_rotation(name: str, rotation: FloatArray) -> None:
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if error > 1e-3 or np.linalg.det(rotation) < 0:
+        raise ShapeError(
+            f"pose (w2c) of camera {name!r}: the 3x3 part is not a rotation (orthogonality error {error:.2g}, "
+            f"determinant {np.linalg.det(rotation):.3g}, expected 1); world-to-camera with OpenCV axes is expected"
+        )

@@ -1,0 +1,112 @@
+"""Delta: what one frame changes, as the integers that are transmitted, and the one function that applies it.
+
+Encoder and player call the same :func:`apply_delta` on numpy arrays, so the state they reach is equal by construction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gsstream.core.errors import ShapeError
+from gsstream.core.gaussians import ATTRIBUTES, Gaussians
+from gsstream.core.shapes import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """What stays fixed between two key packets and both ends know.
+
+    Arguments:
+        node_counts: [M] int32, number of Gaussians of each node; Gaussians are stored node by node.
+        octree_levels: [N] uint8, level of each Gaussian's anchor.
+        cell_sizes: [levels] float32, scene units; position residuals are measured in the cell of their level.
+    """
+
+    node_counts: IntArray
+    octree_levels: IntArray
+    cell_sizes: FloatArray
+
+    @property
+    def units(self) -> FloatArray:
+        """[N] float32 length unit of each Gaussian's position residual."""
+        return np.asarray(self.cell_sizes, np.float32)[self.octree_levels]
+
+    @property
+    def node_of(self) -> IntArray:
+        """[N] int64 node of each Gaussian."""
+        return np.repeat(np.arange(len(self.node_counts), dtype=np.int64), self.node_counts)
+
+
+@dataclass(frozen=True, slots=True)
+class Delta:
+    """One frame's change.
+
+    Arguments:
+        gates: [M] uint8 gate levels; 0 is closed, ``num_levels`` is fully open.
+        num_levels: 1 (binary) to 255.
+        symbols: attribute -> [A, L] int32 residual symbols of the A Gaussians behind open gates, in storage order.
+            An attribute without an entry does not change.
+        steps: attribute -> quantisation step (position: fraction of the anchor's cell).
+        decoders: attribute -> [L, D] float32 linear decoder; an attribute without one uses its symbols directly.
+    """
+
+    gates: IntArray
+    num_levels: int
+    symbols: Mapping[str, IntArray] = field(default_factory=dict)
+    steps: Mapping[str, float] = field(default_factory=dict)
+    decoders: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    @property
+    def is_empty(self) -> bool:
+        return not bool(np.any(self.gates))
+
+
+def active_rows(layout: Layout, gates: IntArray) -> IntArray:
+    """[A] int64 rows of the Gaussians whose node has a non-zero gate, ascending."""
+    return np.flatnonzero(np.repeat(gates != 0, layout.node_counts))
+
+
+def apply_delta(gaussians: Gaussians[FloatArray], layout: Layout, delta: Delta) -> Gaussians[FloatArray]:
+    """Return the next frame's Gaussians: a_t = a_{t-1} + g * (step * symbols) W, in raw parameter space.
+
+    Rows behind closed gates keep their bits. All arithmetic is float32 in a fixed order, so two calls on one machine
+    agree bitwise. Raises ShapeError when the delta does not fit the scene.
+    """
+    index = active_rows(layout, delta.gates)
+    if len(index) == 0:
+        return gaussians
+    gate = np.repeat(delta.gates, layout.node_counts)[index].astype(np.float32) / np.float32(delta.num_levels)
+    changed = dict(gaussians.items())
+    for name in ATTRIBUTES:
+        if name not in delta.symbols:
+            continue
+        base = changed[name]
+        change = decode_residual(delta.symbols[name], delta.steps[name], delta.decoders.get(name))
+        if change.shape != (len(index), int(np.prod(base.shape[1:]))):
+            raise ShapeError(
+                f"delta of {name}: expected {len(index)} rows of {int(np.prod(base.shape[1:]))} values, "
+                f"got {list(change.shape)}; the packet belongs to another scene"
+            )
+        scale = gate * layout.units[index] if name == "means" else gate
+        out = base.copy()
+        out[index] = base[index] + (change * scale[:, None]).reshape(len(index), *base.shape[1:])
+        changed[name] = out
+    return Gaussians(**changed)
+
+
+def decode_residual(symbols: IntArray, step: float, decoder: FloatArray | None) -> FloatArray:
+    """[A, D] float32 ungated residual of [A, L] symbols.
+
+    The product is summed channel by channel with elementwise operations: a BLAS call may order its sums by the number
+    of rows or threads, and then encoder and player would drift apart.
+    """
+    latent = symbols.astype(np.float32) * np.float32(step)
+    if decoder is None:
+        return latent
+    out = latent[:, :1] * decoder[None, 0]
+    for channel in range(1, decoder.shape[0]):
+        out = out + latent[:, channel : channel + 1] * decoder[None, channel]
+    return out

@@ -1,0 +1,90 @@
+"""The exception tree.
+
+::
+
+    GsstreamError
+    ├── InputError (ValueError)        something the user gave is wrong
+    │   ├── ShapeError                 an array has the wrong shape, dtype or a non-finite value
+    │   ├── SourceError                a recording cannot be read or contradicts itself
+    │   ├── RecipeError                a recipe key or value is unknown or out of range
+    │   ├── UnknownName                a method, part or source that nobody registered
+    │   └── OutputError                the place to write to is unusable (holds another run, not writable)
+    ├── PacketError (ValueError)       a stream is damaged; carries the byte offset
+    ├── PluginUnavailable              a part exists but its plugin is quarantined
+    └── ComponentError                 a part failed while running; carries who, where and when
+
+Every message says what was expected, what came, where, and what to do about it.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class GsstreamError(Exception):
+    """Base of every error raised on purpose."""
+
+
+class InputError(GsstreamError, ValueError):
+    """Something the user gave is wrong; the message says how to mend it."""
+
+
+class ShapeError(InputError):
+    """An array has the wrong shape, dtype, or holds a non-finite value."""
+
+
+class SourceError(InputError):
+    """A recording cannot be read or contradicts itself."""
+
+
+class RecipeError(InputError):
+    """A recipe key or value is unknown, misplaced or out of range."""
+
+
+class OutputError(InputError):
+    """The output folder is unusable: not writable, or it holds another run."""
+
+
+class UnknownName(InputError):
+    """A name nobody registered. The message offers the nearest known one."""
+
+    def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
+        self.kind, self.name, self.known = kind, name, tuple(sorted(known))
+        super().__init__(f"no {kind} named {name!r}{suggest(name, self.known)}")
+
+
+class PacketError(GsstreamError, ValueError):
+    """A stream is damaged. ``offset`` is the byte at which reading failed."""
+
+    def __init__(self, message: str, offset: int | None = None) -> None:
+        self.offset = offset
+        super().__init__(message if offset is None else f"{message} (at byte {offset})")
+
+
+class PluginUnavailable(GsstreamError):
+    """A part exists, but the plugin that ships it could not be loaded."""
+
+
+class ComponentError(GsstreamError):
+    """A part failed while running.
+
+    Attributes name the slot (``"gate"``), the part, its distribution, and the frame and iteration at which it failed.
+    """
+
+    def __init__(
+        self, message: str, *, slot: str, part: str, distribution: str, frame: int | None, iteration: int | None = None
+    ) -> None:
+        self.slot, self.part, self.distribution = slot, part, distribution
+        self.frame, self.iteration = frame, iteration
+        where = f"frame {frame}" if iteration is None else f"frame {frame}, iteration {iteration}"
+        super().__init__(f"{slot} {part!r} (from {distribution}) failed at {where}: {message}")
+
+
+def suggest(name: str, known: Iterable[str]) -> str:
+    """Return ``"; did you mean 'x'?"`` for the nearest known name, else the list of known names."""
+    known = sorted(known)
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    if near:
+        return f"; did you mean {near[0]!r}?"
+    return f"; known: {', '.join(known)}" if known else "; none are registered"

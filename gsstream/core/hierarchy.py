@@ -1,0 +1,59 @@
+"""Hierarchy: which node each Gaussian belongs to, and each node's parent."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from gsstream.core.errors import ShapeError
+
+if TYPE_CHECKING:
+    import torch
+
+
+@dataclass(frozen=True, slots=True)
+class Hierarchy:
+    """A forest over N Gaussians.
+
+    Arguments:
+        node_of: [N] int64, node of each Gaussian, in [0, M).
+        parent: [M] int64; a root is its own parent, so no -1 exists and every gather is total.
+        level: [M] int64; 0 at a root, one more than the parent elsewhere.
+    """
+
+    node_of: torch.Tensor
+    parent: torch.Tensor
+    level: torch.Tensor
+
+    @property
+    def num_nodes(self) -> int:
+        return int(self.parent.shape[0])
+
+    @property
+    def num_gaussians(self) -> int:
+        return int(self.node_of.shape[0])
+
+    def rows(self, index: Any) -> Hierarchy:
+        """The same forest seen by a subset of the Gaussians."""
+        return Hierarchy(self.node_of[index], self.parent, self.level)
+
+    def validate(self) -> None:
+        """Raise ShapeError when the forest is not one."""
+        m = self.num_nodes
+        if self.num_gaussians and (int(self.node_of.min()) < 0 or int(self.node_of.max()) >= m):
+            raise ShapeError(f"node_of: expected values in [0, {m}), got up to {int(self.node_of.max())}")
+        if m == 0:
+            return
+        if int(self.parent.min()) < 0 or int(self.parent.max()) >= m:
+            raise ShapeError(f"parent: expected values in [0, {m})")
+        root = self.parent == _arange_like(self.parent)
+        if bool((self.level[root] != 0).any()):
+            raise ShapeError("level: expected 0 at every root (a node that is its own parent)")
+        if bool((self.level[~root] != self.level[self.parent[~root]] + 1).any()):
+            raise ShapeError("level: expected one more than the parent's level at every node that is not a root")
+
+
+def _arange_like(index: torch.Tensor) -> torch.Tensor:
+    import torch
+
+    return torch.arange(index.shape[0], device=index.device, dtype=index.dtype)

@@ -1,0 +1,58 @@
+"""Axis legend and shape checks.
+
+====== =======================================================
+letter meaning
+====== =======================================================
+N      Gaussians
+A      Gaussians that may change in this frame (active rows)
+M      nodes of a hierarchy (gates live on nodes)
+C      cameras
+H, W   image rows, columns (pixels)
+K      spherical-harmonic bases, (degree + 1) ** 2
+L      latent channels of a residual
+====== =======================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from gsstream.core.errors import ShapeError
+
+FloatArray = np.ndarray[Any, np.dtype[np.floating[Any]]]
+IntArray = np.ndarray[Any, np.dtype[np.integer[Any]]]
+
+
+def check_shape(name: str, array: Any, expected: Sequence[int | str]) -> dict[str, int]:
+    """Check ``array.shape`` against ``expected``; letters bind to sizes.
+
+    Returns the bound letters. Raises ShapeError naming the array, what was expected and what came.
+    """
+    shape = tuple(int(n) for n in array.shape)
+    bound: dict[str, int] = {}
+    ok = len(shape) == len(expected)
+    for want, got in zip(expected, shape, strict=False):
+        ok = ok and (bound.setdefault(want, got) == got if isinstance(want, str) else want == got)
+    if not ok:
+        raise ShapeError(f"{name}: expected shape [{', '.join(map(str, expected))}], got {list(shape)}")
+    return bound
+
+
+def check_finite(name: str, array: Any) -> None:
+    """Raise ShapeError naming the first non-finite index of a numpy array or torch tensor."""
+    values = array.detach().cpu().numpy() if hasattr(array, "detach") else np.asarray(array)
+    # A sum is finite only if every term is, and costs one pass without a temporary.
+    with np.errstate(over="ignore", invalid="ignore"):
+        if np.isfinite(values.sum(dtype=np.float64)):
+            return
+    bad = np.argwhere(~np.isfinite(values))
+    if len(bad) == 0:
+        return
+    index = tuple(int(i) for i in bad[0])
+    raise ShapeError(
+        f"{name}: expected finite values, got {values[index]} at index {list(index)} "
+        f"({len(bad)} of {values.size} values are not finite)"
+    )

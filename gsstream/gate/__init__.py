@@ -1,0 +1,1 @@
+"""Which nodes may move this frame."""

@@ -1,0 +1,34 @@
+"""Always open: no sparsity."""
+
+from __future__ import annotations
+
+from typing import final
+
+import torch
+
+from gsstream.core.state import GateState
+from gsstream.gate.base import GateSampler
+
+
+@final
+class AlwaysOpen(GateSampler):
+    """Every gate is 1 and nothing is trained (ours, the null part)."""
+
+    @property
+    def num_levels(self) -> int:
+        return 1
+
+    def init(self, logits: torch.Tensor) -> GateState:
+        return GateState(logits=torch.zeros_like(logits))
+
+    def noise(self, num_nodes: int, generator: torch.Generator) -> torch.Tensor | None:
+        return None
+
+    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
+        return torch.ones_like(state.logits)
+
+    def open_probability(self, state: GateState) -> torch.Tensor:
+        return torch.ones_like(state.logits)
+
+    def bound(self, state: GateState) -> GateState:
+        return state

@@ -1,0 +1,1 @@
+"""The first frame: points, seeds and their schedule."""

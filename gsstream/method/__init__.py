@@ -1,0 +1,1 @@
+"""A whole streaming method, coarsely."""

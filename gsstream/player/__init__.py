@@ -1,0 +1,1 @@
+"""Decode and look. Knows no training and no torch."""

@@ -1,0 +1,1 @@
+"""Finding parts that others wrote."""

@@ -1,0 +1,121 @@
+"""Recipe: a run described as data. Unknown keys are refused; every field says its unit and range.
+
+Defaults here are those of the dense baseline; methods ship their own recipe files (``gsstream methods show NAME``).
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+SCHEMA_VERSION = "1.0"
+
+
+class Section(BaseModel):
+    """Base of every recipe section: frozen, unknown keys refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+
+class ComponentRef(Section):
+    """A part by name, with its parameters (validated against the part's own Config when the run is assembled)."""
+
+    name: str = Field(description="name of a registered part")
+    params: dict[str, Any] = Field(default_factory=dict, description="the part's own settings")
+
+
+class FirstFrame(Section):
+    """Seeding and root optimisation of frame 0."""
+
+    epochs: int = Field(default=250, ge=0, description="passes over the training cameras (paper: 250)")
+    max_iterations: int = Field(default=4000, ge=0, description="upper bound on epochs * cameras (released code: 4000)")
+    sh_degree: int = Field(default=2, ge=0, le=3, description="degree of the spherical harmonics (paper's code: 2)")
+    points: Literal["auto", "recording", "sparse", "sfm"] = Field(
+        default="auto", description="auto: the recording's points, else triangulation; sparse: the recording's thinned set"
+    )
+    max_points: int = Field(default=40_000, ge=1, description="points kept before the structure seeds anchors")
+    fill_points: int = Field(default=20_000, ge=0, description="random seeds topping up uncovered common view volume (ours)")
+    fill_min_views: int = Field(default=3, ge=1, description="a fill seed must be seen by this many training cameras")
+    fill_min_distance: float = Field(
+        default=0.3, ge=0, description="least distance of a fill seed to any camera, fraction of the rig's extent"
+    )
+    opacity: float = Field(default=0.1, gt=0, lt=1, description="initial opacity")
+    lr_means: float = Field(default=1.6e-4, ge=0, description="learning rate of centres, fraction of the rig's extent")
+    lr_means_final: float = Field(default=1.6e-6, ge=0, description="the same at the last iteration (log-linear)")
+    lr_quats: float = Field(default=0.001, ge=0, description="learning rate of raw quaternions")
+    lr_scales: float = Field(default=0.005, ge=0, description="learning rate of log scales")
+    lr_opacities: float = Field(default=0.05, ge=0, description="learning rate of opacity logits")
+    lr_sh0: float = Field(default=0.0025, ge=0, description="learning rate of degree-0 colour")
+    lr_shN: float = Field(default=0.000125, ge=0, description="learning rate of higher colour coefficients")
+    densify_from: int = Field(default=500, ge=0, description="first iteration of densification and pruning")
+    densify_until: float = Field(default=0.6, ge=0, le=1, description="last, as a fraction of all iterations")
+    densify_every: int = Field(default=100, ge=1, description="iterations between two densifications")
+    densify_gradient: float = Field(
+        default=2e-4, gt=0, description="mean screen gradient (half-width units) above which a Gaussian is densified"
+    )
+    max_gaussians: int = Field(default=100_000, ge=1, description="upper bound on the number of Gaussians")
+    prune_opacity: float = Field(default=0.005, ge=0, lt=1, description="Gaussians below this opacity are removed")
+    scale_penalty: float = Field(default=0.0, ge=0, description="weight of the mean scale, in rig extents (ours)")
+    opacity_penalty: float = Field(default=0.0, ge=0, description="weight of the mean opacity (ours)")
+    exposure: bool = Field(
+        default=False, description="fit an affine colour map per training camera while optimising frame 0 (ours)"
+    )
+
+
+class Stream(Section):
+    """Every later frame."""
+
+    epochs: int = Field(default=20, ge=1, description="passes over the training cameras per frame (full 20, fast 10, edge 6)")
+    active_threshold: float = Field(
+        default=0.0, ge=0, le=1, description="rows whose gate opens with at most this probability are left out"
+    )
+    progressive: bool = Field(default=False, description="activate octree levels from floor(H/2) on during a frame (paper)")
+    progressive_omega: float = Field(default=1.5, ge=1, description="growth of the iterations per level, N_{i+1} = omega N_i")
+
+
+class Loss(Section):
+    """Photometric loss (1 - dssim) L1 + dssim (1 - SSIM)."""
+
+    dssim: float = Field(default=0.2, ge=0, le=1, description="weight of 1 - SSIM")
+
+
+class GateTraining(Section):
+    """Optimisation of the gate logits."""
+
+    lr: float = Field(default=0.1, ge=0, description="Adam learning rate of the gate logits (released code: 0.1)")
+    optimiser: Literal["fresh", "persistent"] = Field(
+        default="fresh", description="fresh: Adam moments restart each frame; persistent: they live on (released code)"
+    )
+
+
+class Codec(Section):
+    """How packets are written."""
+
+    key_every: int = Field(default=0, ge=0, description="frames between key packets; 0: only the first")
+    fsync: bool = Field(default=False, description="force every packet to disk before the next frame starts")
+
+
+class Recipe(Section):
+    """Everything that decides the bytes of a run, besides the recording itself."""
+
+    schema_version: Literal["1.0"] = Field(default="1.0", description="version of this schema")
+    method: str = Field(default="dense", description="name of the method this recipe belongs to")
+    seed: int = Field(default=0, ge=0, description="seed of every random stream")
+    structure: ComponentRef = Field(default=ComponentRef(name="flat"), description="how Gaussians are grouped")
+    confidence: ComponentRef = Field(default=ComponentRef(name="uniform"), description="which Gaussians probably changed")
+    propagation: ComponentRef = Field(default=ComponentRef(name="group-max"), description="how belief spreads to nodes")
+    gate: ComponentRef = Field(default=ComponentRef(name="always-open"), description="which nodes may move")
+    regularizer: ComponentRef = Field(default=ComponentRef(name="none"), description="what openness costs")
+    update: ComponentRef = Field(default=ComponentRef(name="additive"), description="how a gated change is applied")
+    renderer: ComponentRef = Field(
+        default=ComponentRef(name="auto"), description="auto: the fastest that works here, else the reference"
+    )
+    first_frame: FirstFrame = Field(default=FirstFrame(), description="frame 0")
+    stream: Stream = Field(default=Stream(), description="later frames")
+    loss: Loss = Field(default=Loss(), description="photometric loss")
+    gate_training: GateTraining = Field(default=GateTraining(), description="optimisation of gates")
+    codec: Codec = Field(default=Codec(), description="packets")
+    scale: float = Field(default=1.0, gt=0, le=1, description="images are downscaled by this factor on reading")
+    frames: int | None = Field(default=None, ge=1, description="number of frames to process; all when absent")
+    background: tuple[float, float, float] = Field(default=(0.0, 0.0, 0.0), description="colour behind everything")

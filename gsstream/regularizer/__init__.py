@@ -1,0 +1,1 @@
+"""What openness and motion cost."""

@@ -1,0 +1,28 @@
+"""Regularizer: named penalty terms on open gates and on residuals."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+
+import torch
+
+from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.part import Part
+
+
+class Regularizer(Part):
+    """Each term is a finite scalar >= 0; the total is their sum; all closed and zero residual costs exactly 0."""
+
+    @abstractmethod
+    def penalty(
+        self, open_probability: torch.Tensor, residual: torch.Tensor, hierarchy: Hierarchy, num_gaussians: int
+    ) -> Mapping[str, torch.Tensor]:
+        """Penalty of the A active rows.
+
+        Arguments:
+            open_probability: [M] probability that each node's gate is not zero.
+            residual: [A, 3] ungated position residual in units of the anchor's cell.
+            hierarchy: the hierarchy seen by the A active rows.
+            num_gaussians: N, the divisor of a mean over the whole scene (closed rows contribute nothing).
+        """

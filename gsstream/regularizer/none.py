@@ -1,0 +1,21 @@
+"""No regulariser: nothing costs anything."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import final
+
+import torch
+
+from gsstream.core.hierarchy import Hierarchy
+from gsstream.regularizer.base import Regularizer
+
+
+@final
+class NoRegularizer(Regularizer):
+    """No terms (ours, the null part)."""
+
+    def penalty(
+        self, open_probability: torch.Tensor, residual: torch.Tensor, hierarchy: Hierarchy, num_gaussians: int
+    ) -> Mapping[str, torch.Tensor]:
+        return {}

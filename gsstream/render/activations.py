@@ -1,0 +1,39 @@
+"""The only place in the engine that knows exp, sigmoid and normalise."""
+
+from __future__ import annotations
+
+import torch
+
+
+def activate_scales(scales: torch.Tensor) -> torch.Tensor:
+    """Log standard deviations -> standard deviations, scene units."""
+    return scales.exp()
+
+
+def activate_opacities(opacities: torch.Tensor) -> torch.Tensor:
+    """Logits -> (0, 1)."""
+    return opacities.sigmoid()
+
+
+def rotation_matrices(quats: torch.Tensor) -> torch.Tensor:
+    """[N, 4] wxyz of any non-zero norm -> [N, 3, 3]. A norm below 1e-10 is treated as 1e-10 (gives a finite matrix)."""
+    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True).clamp_min(1e-10)).unbind(-1)
+    entries = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(entries, -1).reshape(-1, 3, 3)
+
+
+SH0 = 0.28209479177387814
+
+
+def rgb_to_sh0(rgb: torch.Tensor) -> torch.Tensor:
+    """[N, 3] colour in [0, 1] -> [N, 1, 3] degree-0 coefficient."""
+    return ((rgb - 0.5) / SH0)[:, None]
+
+
+def logit(p: float) -> float:
+    """Inverse sigmoid of a probability strictly between 0 and 1."""
+    return float(torch.logit(torch.tensor(p, dtype=torch.float64)))

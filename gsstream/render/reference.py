@@ -1,0 +1,146 @@
+"""The slow renderer that defines the truth: plain torch, any float dtype, readable.
+
+Cost grows with N * H * W; use it for tests, for tiny scenes, and where no compiled renderer is available.
+"""
+
+from __future__ import annotations
+
+from typing import final
+
+import torch
+from pydantic import Field
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.context import ScreenGradient
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.part import PartConfig
+from gsstream.render.activations import SH0, activate_opacities, activate_scales, rotation_matrices
+from gsstream.render.base import Renderer, RenderOutput
+
+NEAR = 0.01
+BLUR = 0.3
+ALPHA_CUT = 1 / 255
+ALPHA_MAX = 0.999
+TRANSMITTANCE_MIN = 1e-4
+
+
+@final
+class ReferenceRenderer(Renderer):
+    """EWA splatting (Zwicker et al. 2001; Kerbl et al. 2023) written for clarity."""
+
+    class Config(PartConfig):
+        rows_per_pass: int = Field(default=32, ge=1, description="image rows composited at once; bounds the memory")
+
+    def render(
+        self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, background: tuple[float, float, float]
+    ) -> RenderOutput:
+        return self._render(gaussians, cameras, view, background, None)
+
+    def screen_gradient(
+        self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, image_gradient: torch.Tensor
+    ) -> ScreenGradient:
+        fixed = gaussians.map(torch.Tensor.detach)
+        probe = torch.zeros(len(fixed), 2, dtype=fixed.means.dtype, requires_grad=True)
+        with torch.enable_grad():
+            output = self._render(fixed, cameras, view, (0.0, 0.0, 0.0), probe)
+            (gradient,) = torch.autograd.grad((output.image * image_gradient).sum(), probe, allow_unused=True)
+        gradient = torch.zeros_like(probe) if gradient is None else gradient
+        return ScreenGradient(gradient.detach(), (gradient != 0).any(1))
+
+    def _render(
+        self,
+        gaussians: Gaussians[torch.Tensor],
+        cameras: Cameras,
+        view: int,
+        background: tuple[float, float, float],
+        probe: torch.Tensor | None,
+    ) -> RenderOutput:
+        dtype = gaussians.means.dtype
+        means2d, conics, colors, depths, opacities = project(gaussians, cameras, view)
+        if probe is not None:
+            means2d = means2d + probe
+        order = torch.argsort(depths.detach(), stable=True)
+        order = order[depths.detach()[order] > NEAR]
+        parts = (means2d[order], conics[order], colors[order], opacities[order])
+        images, alphas = [], []
+        for start in range(0, cameras.height, self.config.rows_per_pass):
+            stop = min(cameras.height, start + self.config.rows_per_pass)
+            image, alpha = composite(*parts, start, stop, cameras.width, torch.tensor(background, dtype=dtype))
+            images.append(image)
+            alphas.append(alpha)
+        return RenderOutput(torch.cat(images), torch.cat(alphas))
+
+
+def project(
+    gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """EWA projection: means2d [N, 2] px, conics [N, 2, 2], colours [N, 3], depths [N], opacities [N]."""
+    dtype = gaussians.means.dtype
+    viewmat = torch.as_tensor(cameras.viewmats[view], dtype=dtype)
+    rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
+    points = gaussians.means @ rotation.T + translation  # [N, 3] camera space
+    # Points at or behind the camera are culled later; a safe depth keeps their (unused) arithmetic finite.
+    depth = points[:, 2]
+    safe = torch.where(depth > NEAR, depth, torch.ones_like(depth))
+    K = torch.as_tensor(cameras.Ks[view], dtype=dtype)
+    fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+    width, height = cameras.width, cameras.height
+    means2d = torch.stack([fx * points[:, 0] / safe + cx, fy * points[:, 1] / safe + cy], -1)
+    # The Jacobian is evaluated at most 1.3 fields of view off axis, where the affine approximation still holds.
+    margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
+    tx = safe * torch.clamp(points[:, 0] / safe, -cx / fx - margin_x, (width - cx) / fx + margin_x)
+    ty = safe * torch.clamp(points[:, 1] / safe, -cy / fy - margin_y, (height - cy) / fy + margin_y)
+    zero = torch.zeros_like(safe)
+    jacobian = torch.stack([fx / safe, zero, -fx * tx / safe**2, zero, fy / safe, -fy * ty / safe**2], -1)
+    axes = rotation_matrices(gaussians.quats) * activate_scales(gaussians.scales)[:, None, :]
+    footprint = jacobian.reshape(-1, 2, 3) @ rotation @ axes  # [N, 2, 3]
+    covariance = footprint @ footprint.transpose(1, 2) + BLUR * torch.eye(2, dtype=dtype)
+    center = -(rotation.T @ translation)
+    colors = evaluate_sh(gaussians.sh0, gaussians.shN, gaussians.means - center)
+    return means2d, torch.linalg.inv(covariance), colors, depth, activate_opacities(gaussians.opacities)
+
+
+def composite(
+    means2d: torch.Tensor, conics: torch.Tensor, colors: torch.Tensor, opacities: torch.Tensor,
+    start: int, stop: int, width: int, background: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+    """Front-to-back compositing of depth-sorted splats over image rows [start, stop): image and alpha."""
+    dtype = means2d.dtype
+    ys, xs = torch.meshgrid(
+        torch.arange(start, stop, dtype=dtype) + 0.5, torch.arange(width, dtype=dtype) + 0.5, indexing="ij"
+    )
+    dx = xs[None] - means2d[:, 0, None, None]  # [N, h, W]
+    dy = ys[None] - means2d[:, 1, None, None]
+    a, b, c = (conics[:, i, j, None, None] for i, j in ((0, 0), (0, 1), (1, 1)))
+    power = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+    alpha = torch.clamp_max(opacities[:, None, None] * torch.exp(-power), ALPHA_MAX)
+    alpha = torch.where(alpha >= ALPHA_CUT, alpha, torch.zeros_like(alpha))
+    ones = torch.ones_like(xs)[None]
+    before = torch.cumprod(torch.cat([ones, 1 - alpha]), 0)[:-1]
+    alpha = torch.where((before > TRANSMITTANCE_MIN).detach(), alpha, torch.zeros_like(alpha))
+    transmittance = torch.cumprod(torch.cat([ones, 1 - alpha]), 0)
+    image = torch.einsum("nhw,nc->hwc", alpha * transmittance[:-1], colors)
+    return image + transmittance[-1][..., None] * background, 1 - transmittance[-1]
+
+
+def evaluate_sh(sh0: torch.Tensor, shN: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+    """Colour max(0, 0.5 + sum of real spherical harmonics) [N, 3] for unnormalised view directions [N, 3]."""
+    x, y, z = (directions / directions.norm(dim=-1, keepdim=True).clamp_min(1e-10)).unbind(-1)
+    basis = [torch.full_like(x, SH0)]
+    bases = shN.shape[1] + 1
+    if bases > 1:
+        basis += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
+    if bases > 4:
+        basis += [
+            1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * z * z - x * x - y * y),
+            -1.0925484305920792 * x * z, 0.5462742152960396 * (x * x - y * y),
+        ]  # fmt: skip
+    if bases > 9:
+        basis += [
+            -0.5900435899266435 * y * (3 * x * x - y * y), 2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (5 * z * z - 1), 0.3731763325901154 * z * (5 * z * z - 3),
+            -0.4570457994644658 * x * (5 * z * z - 1), 1.445305721320277 * z * (x * x - y * y),
+            -0.5900435899266435 * x * (x * x - 3 * y * y),
+        ]  # fmt: skip
+    coefficients = torch.cat([sh0, shN], 1)  # [N, K, 3]
+    return torch.clamp_min((torch.stack(basis, -1)[..., None] * coefficients).sum(1) + 0.5, 0.0)

@@ -1,0 +1,1 @@
+"""How a gated change is applied to the previous Gaussians."""

@@ -1,0 +1,105 @@
+"""UpdateRule: which attributes change, in which latent space, at which quantisation step.
+
+An internal seam, not yet a public component kind. The training forward pass here and ``core.delta.apply_delta`` (the
+transmitted truth, numpy) compute the same map; a test holds them together.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.part import Part
+
+
+@dataclass(frozen=True, slots=True)
+class AttributeCode:
+    """How the residual of one attribute is represented.
+
+    Arguments:
+        step: quantisation step in latent units (position: fraction of the anchor's cell).
+        lr: Adam learning rate of the latents, latent units per iteration.
+        latent: number of latent channels; 0 means identity (one latent per feature, no decoder).
+        decoder_lr: Adam learning rate of the linear decoder.
+        decoder_std: standard deviation of the decoder's initial entries.
+    """
+
+    step: float
+    lr: float
+    latent: int = 0
+    decoder_lr: float = 0.0
+    decoder_std: float = 0.0
+
+
+class UpdateRule(Part):
+    """a_t = a_{t-1} + g * (quantised latents) W, on raw attributes; position residuals in units of the anchor's cell."""
+
+    @abstractmethod
+    def codes(self) -> Mapping[str, AttributeCode]:
+        """Attribute name -> code; an attribute left out never changes."""
+
+    def init_decoders(self, gaussians: Gaussians[torch.Tensor], generator: torch.Generator) -> dict[str, torch.Tensor]:
+        """[L, D] decoder of every attribute that has one, drawn at the key packet."""
+        decoders = {}
+        for name, code in self.codes().items():
+            width = _width(gaussians, name)
+            if code.latent and width:
+                decoders[name] = torch.randn(code.latent, width, generator=generator) * code.decoder_std
+        return decoders
+
+
+def _width(gaussians: Gaussians[torch.Tensor], name: str) -> int:
+    value: torch.Tensor = getattr(gaussians, name)
+    return int(value[0].numel()) if len(value) else int(torch.tensor(value.shape[1:]).prod())
+
+
+def init_latents(rule: UpdateRule, base: Gaussians[torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Zero latents [A, L] for the rows of ``base``; attributes of width 0 (no higher SH) are left out."""
+    return {
+        name: torch.zeros(len(base), code.latent or _width(base, name))
+        for name, code in rule.codes().items()
+        if _width(base, name)
+    }
+
+
+def quantise(latents: torch.Tensor, step: float) -> torch.Tensor:
+    """Round to multiples of ``step`` with a straight-through gradient (ours; the released code rounds only in its size)."""
+    return latents + (torch.round(latents.detach() / step) * step - latents.detach())
+
+
+def apply_residual(
+    rule: UpdateRule,
+    base: Gaussians[torch.Tensor],
+    gates: torch.Tensor,
+    latents: Mapping[str, torch.Tensor],
+    decoders: Mapping[str, torch.Tensor],
+    units: torch.Tensor,
+) -> Gaussians[torch.Tensor]:
+    """Gated, quantised, decoded residual on the A rows of ``base``.
+
+    Arguments:
+        gates: [A] in [0, 1].
+        latents: attribute -> [A, L].
+        decoders: attribute -> [L, D].
+        units: [A] cell of each anchor, scene units.
+    """
+    changed = dict(base.items())
+    codes = rule.codes()
+    for name, latent in latents.items():
+        change = quantise(latent, codes[name].step)
+        if name in decoders:
+            change = change @ decoders[name]
+        scale = gates * units if name == "means" else gates
+        value = changed[name]
+        changed[name] = value + (change * scale[:, None]).reshape(value.shape)
+    return Gaussians(**changed)
+
+
+def symbols(rule: UpdateRule, latents: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """[A, L] int32 symbols that the packet carries."""
+    codes = rule.codes()
+    return {name: torch.round(value.detach() / codes[name].step).to(torch.int32) for name, value in latents.items()}

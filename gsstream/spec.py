@@ -1,0 +1,56 @@
+"""What a plugin declares. Imports no torch: listing plugins stays cheap.
+
+A plugin is a module named by an entry point of the group ``gsstream``::
+
+    # pyproject.toml
+    [project.entry-points.gsstream]
+    mine = "gsstream_mine.plugin"
+
+    # gsstream_mine/plugin.py
+    from gsstream.spec import ComponentSpec, hookimpl
+
+    @hookimpl
+    def gsstream_components():
+        return [ComponentSpec(kind="gate", name="mine", target="gsstream_mine.gate:MyGate", summary="...")]
+"""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import pluggy
+from pydantic import BaseModel, ConfigDict, Field
+
+from gsstream import API_VERSION
+
+ENTRY_POINT_GROUP = "gsstream"
+Kind = Literal[
+    "structure", "confidence", "propagation", "gate", "regularizer", "update", "renderer", "source", "metric", "method"
+]
+KINDS: tuple[str, ...] = get_args(Kind)
+
+hookspec = pluggy.HookspecMarker("gsstream")
+hookimpl = pluggy.HookimplMarker("gsstream")
+
+
+class ComponentSpec(BaseModel):
+    """One part, described without importing it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Kind = Field(description="which slot the part fits")
+    name: str = Field(pattern=r"^[a-z][a-z0-9_-]*$", description="name used in recipes and on the command line")
+    target: str = Field(pattern=r"^[\w.]+:\w+$", description="'module:Class', imported on first use")
+    summary: str = Field(description="one line for listings")
+    api: str = Field(default=API_VERSION, pattern=r"^\d+\.\d+$", description="plugin interface it was written for")
+
+
+class MethodSpec(BaseModel):
+    """A named method: a recipe shipped as data inside a package."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_-]*$", description="name used by --method")
+    recipe: str = Field(pattern=r"^[\w.]+:[\w./-]+$", description="'package:path/inside/it.yaml'")
+    summary: str = Field(description="one line for listings")
+    api: str = Field(default=API_VERSION, pattern=r"^\d+\.\d+$", description="plugin interface it was written for")

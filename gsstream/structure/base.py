@@ -1,0 +1,54 @@
+"""Structure: place anchors, build and maintain a Hierarchy."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import torch
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.frame import PointCloud
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.part import Part
+from gsstream.core.topology import TopologyEdit
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Where Gaussians start.
+
+    Arguments:
+        positions: [N, 3] float32, scene units.
+        colors: [N, 3] float32 in [0, 1].
+        levels: [N] int64 octree level of each anchor, 0 = coarsest.
+        cell_sizes: [levels] float32 side of a cell per level, scene units; position residuals are measured in it.
+        origin: [3] float32 lower corner of the root grid.
+    """
+
+    positions: torch.Tensor
+    colors: torch.Tensor
+    levels: torch.Tensor
+    cell_sizes: torch.Tensor
+    origin: torch.Tensor
+
+
+class Structure(Part):
+    """Groups Gaussians; gates live on the nodes of the hierarchy it builds.
+
+    Invariants (checked by the contract kit): ``node_of`` in [0, M); parents end at a root; the same Gaussians give the
+    same partition whatever their order; no gradient is carried.
+    """
+
+    @abstractmethod
+    def seed(self, points: PointCloud, cameras: Cameras) -> Anchors:
+        """Choose anchors for the first frame from [P] points. Raises InputError when there are no points."""
+
+    @abstractmethod
+    def build(self, gaussians: Gaussians[torch.Tensor], anchors: Anchors) -> Hierarchy:
+        """Group the Gaussians (rows aligned with ``anchors.levels``)."""
+
+    @abstractmethod
+    def update(self, hierarchy: Hierarchy, edit: TopologyEdit, gaussians: Gaussians[torch.Tensor]) -> Hierarchy:
+        """The hierarchy after a topology edit. The identity edit changes nothing."""

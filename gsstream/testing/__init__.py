@@ -1,0 +1,1 @@
+"""What plugin authors test with. Ships with the package."""

@@ -1,0 +1,195 @@
+"""cameras.json, schema "opencv-multiview-1": the rig, its split and where each camera's images lie."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import ShapeError, SourceError
+from gsstream.source.base import Split
+
+SCHEMA = "opencv-multiview-1"
+CALIBRATION_FILE = "cameras.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What cameras.json says. ``patterns`` maps camera id to its image path pattern relative to the folder."""
+
+    name: str
+    fps: float
+    num_frames: int
+    licence: str
+    train: Cameras
+    test: Cameras
+    patterns: dict[str, str]
+
+
+def read_calibration(folder: Path) -> Calibration:
+    """Read and check ``folder/cameras.json``.
+
+    Raises SourceError saying which file, camera or key is wrong, and what was expected.
+    """
+    if not folder.is_dir():
+        raise SourceError(f"{folder}: no such folder; expected a recording with {CALIBRATION_FILE} and its images")
+    path = folder / CALIBRATION_FILE
+    data = _load_json(path)
+    cameras = data.get("cameras")
+    if not isinstance(cameras, list) or not cameras or not all(isinstance(c, dict) for c in cameras):
+        raise SourceError(f"{path}: 'cameras' must be a non-empty list of objects, got {_brief(cameras)}")
+    ids = [_camera_id(path, camera, index) for index, camera in enumerate(cameras)]
+    if len(set(ids)) != len(ids):
+        twice = sorted({i for i in ids if ids.count(i) > 1})
+        raise SourceError(f"{path}: camera ids must be unique, these occur more than once: {', '.join(twice)}")
+    rig = _rig(path, ids, cameras)
+    splits = _splits(path, ids, cameras, data.get("test_cameras"))
+    train = [i for i, split in enumerate(splits) if split == "train"]
+    if not train:
+        raise SourceError(f'{path}: there is no training camera; give at least one camera "split": "train"')
+    return Calibration(
+        name=str(data.get("name", folder.name)),
+        fps=_positive(path, "fps", data.get("fps", 30.0)),
+        num_frames=_count(path, data.get("frames")),
+        licence=str(data.get("licence", "")),
+        train=rig.select(train),
+        test=rig.select([i for i, split in enumerate(splits) if split == "test"]),
+        patterns={i: _pattern(path, i, camera) for i, camera in zip(ids, cameras, strict=True)},
+    )
+
+
+def _load_json(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise SourceError(
+            f"{path}: no such file; a recording folder holds {CALIBRATION_FILE} (schema {SCHEMA!r}) beside its images"
+        ) from error
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise SourceError(f"{path}: not valid JSON: {error}") from error
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error}") from error
+    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
+        got = data.get("schema") if isinstance(data, dict) else type(data).__name__
+        raise SourceError(f'{path}: expected "schema": "{SCHEMA}", got {got!r}; convert the calibration to it')
+    return data
+
+
+def _rig(path: Path, ids: list[str], cameras: list[dict[str, Any]]) -> Cameras:
+    sizes = {i: _size(path, i, camera) for i, camera in zip(ids, cameras, strict=True)}
+    first = sizes[ids[0]]
+    for camera_id, size in sizes.items():
+        if size != first:
+            raise SourceError(
+                f"{path}: all cameras of a rig must share one image size, but {ids[0]!r} is {first[0]} x {first[1]} "
+                f"and {camera_id!r} is {size[0]} x {size[1]}; resample the odd ones (and their K)"
+            )
+    poses = np.stack([_matrix(path, i, c, "w2c", 4) for i, c in zip(ids, cameras, strict=True)])
+    intrinsics = np.stack([_matrix(path, i, c, "K", 3) for i, c in zip(ids, cameras, strict=True)])
+    rig = Cameras(tuple(ids), poses, intrinsics, *first)
+    try:
+        rig.validate()
+    except ShapeError as error:
+        raise SourceError(f"{path}: {error}") from error
+    for i, camera_id in enumerate(ids):
+        if not np.allclose(poses[i, 3], (0, 0, 0, 1)) or not np.allclose(intrinsics[i, 2], (0, 0, 1)):
+            raise SourceError(f"{path}: camera {camera_id!r}: the last row of w2c must be 0 0 0 1 and of K 0 0 1")
+        if abs(intrinsics[i, 0, 1]) > 1e-6 * intrinsics[i, 0, 0] or intrinsics[i, 1, 0] != 0:
+            raise SourceError(
+                f"{path}: camera {camera_id!r}: K has skew {intrinsics[i, 0, 1]:g}; only undistorted pinhole cameras "
+                "without skew are supported, so resample the images"
+            )
+    return rig
+
+
+def _splits(path: Path, ids: list[str], cameras: list[dict[str, Any]], named: Any) -> list[Split]:
+    if named is not None and not isinstance(named, list):
+        raise SourceError(f"{path}: 'test_cameras' must be a list of camera ids, got {_brief(named)}")
+    test = set(named or [])
+    if unknown := sorted(str(t) for t in test - set(ids)):
+        names = ", ".join(map(repr, unknown))
+        raise SourceError(f"{path}: test camera {names} does not exist; cameras: {', '.join(ids)}")
+    splits: list[Split] = []
+    for camera_id, camera in zip(ids, cameras, strict=True):
+        split = camera.get("split", "test" if camera_id in test else "train")
+        if split not in ("train", "test"):
+            raise SourceError(f'{path}: camera {camera_id!r}: split must be "train" or "test", got {split!r}')
+        if named is not None and (split == "test") != (camera_id in test):
+            raise SourceError(
+                f"{path}: camera {camera_id!r} has split {split!r}, which contradicts 'test_cameras' {sorted(test)}"
+            )
+        splits.append(split)
+    return splits
+
+
+def _camera_id(path: Path, camera: dict[str, Any], index: int) -> str:
+    camera_id = camera.get("id")
+    if not isinstance(camera_id, str) or not camera_id:
+        raise SourceError(f"{path}: camera number {index} needs a non-empty text 'id', got {_brief(camera_id)}")
+    return camera_id
+
+
+def _size(path: Path, camera_id: str, camera: dict[str, Any]) -> tuple[int, int]:
+    width, height = camera.get("width"), camera.get("height")
+    if type(width) is not int or type(height) is not int or width < 1 or height < 1:
+        raise SourceError(
+            f"{path}: camera {camera_id!r}: width and height must be positive whole pixels, got {width!r} x {height!r}"
+        )
+    return width, height
+
+
+def _matrix(path: Path, camera_id: str, camera: dict[str, Any], key: str, side: int) -> np.ndarray[Any, Any]:
+    try:
+        matrix = np.asarray(camera.get(key), dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise SourceError(f"{path}: camera {camera_id!r}: {key} is not a matrix of numbers ({error})") from error
+    if matrix.shape != (side, side):
+        raise SourceError(
+            f"{path}: camera {camera_id!r}: {key} must be a {side} x {side} matrix, got shape {list(matrix.shape)}"
+        )
+    return matrix
+
+
+def _pattern(path: Path, camera_id: str, camera: dict[str, Any]) -> str:
+    pattern = camera.get("frames")
+    if not isinstance(pattern, str) or not pattern:
+        raise SourceError(
+            f"{path}: camera {camera_id!r} has no frames; "
+            f'give "frames" as a path pattern such as "{camera_id}/%06d.png"'
+        )
+    try:
+        example = frame_path(pattern, 0)
+    except (TypeError, ValueError) as error:
+        raise SourceError(
+            f"{path}: camera {camera_id!r}: 'frames' {pattern!r} must hold one integer conversion "
+            f"such as %06d ({error})"
+        ) from error
+    if PurePosixPath(example).is_absolute() or ".." in PurePosixPath(example).parts:
+        raise SourceError(f"{path}: camera {camera_id!r}: 'frames' {pattern!r} must stay inside the recording's folder")
+    return pattern
+
+
+def frame_path(pattern: str, index: int) -> str:
+    """The relative path of a frame; a pattern without a conversion names the one image of a static set."""
+    return pattern % index if "%" in pattern else pattern
+
+
+def _count(path: Path, frames: Any) -> int:
+    if type(frames) is not int or frames < 1:
+        raise SourceError(f"{path}: 'frames' must be the number of frames, at least 1, got {_brief(frames)}")
+    return frames
+
+
+def _positive(path: Path, key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < float("inf"):
+        raise SourceError(f"{path}: {key!r} must be a positive number, got {_brief(value)}")
+    return float(value)
+
+
+def _brief(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,107 @@
+"""Decode one photograph and shrink it: exact area averaging in floating point, so no extra rounding to 8 bits."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from gsstream.core.errors import SourceError
+from gsstream.core.shapes import FloatArray
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_RGB_COLOR_TYPE = 2
+_READABLE = "8-bit JPEG or PNG, or 16-bit PNG, without transparency"
+
+
+def read_image(path: Path, size: tuple[int, int], target: tuple[int, int]) -> FloatArray:
+    """Decode an image of ``size`` (width, height) and average it down to ``target`` (width, height).
+
+    Returns [h, w, 3] float32 in [0, 1]; grey images are repeated over the three channels.
+    Raises SourceError naming the file when it is missing, damaged, of another size, or of an unsupported kind.
+    """
+    pixels, full_scale = _decode(path)
+    height, width = pixels.shape[:2]
+    if (width, height) != size:
+        raise SourceError(
+            f"{path}: the image is {width} x {height} pixels, but cameras.json declares {size[0]} x {size[1]}; "
+            "correct the declared size (and K with it) or export the frames again"
+        )
+    return shrink(pixels, target) / np.float32(full_scale)
+
+
+def shrink(pixels: np.ndarray[Any, Any], target: tuple[int, int]) -> FloatArray:
+    """Area-average [H, W, 3] pixels to ``target`` (width, height), at most the present size; float32, same unit."""
+    height, width = pixels.shape[:2]
+    ratio_x, ratio_y = width / target[0], height / target[1]
+    if ratio_x == 1 and ratio_y == 1:
+        return pixels.astype(np.float32)
+    if ratio_x == ratio_y == int(ratio_x):
+        step = int(ratio_x)
+        total = np.zeros((target[1], target[0], 3), np.uint32 if pixels.dtype.kind == "u" else np.float64)
+        for y in range(step):
+            for x in range(step):
+                total += pixels[y::step, x::step]
+        return total.astype(np.float32) / np.float32(step * step)
+    lines = _average(pixels.reshape(height, -1), target[1]).reshape(target[1], width, 3)
+    across = _average(lines.transpose(1, 0, 2).reshape(width, -1), target[0])
+    return np.ascontiguousarray(across.reshape(target[0], target[1], 3).transpose(1, 0, 2), np.float32)
+
+
+def _average(lines: np.ndarray[Any, Any], target: int) -> FloatArray:
+    """Area-average [n, m] along the first axis to [target, m]: differences of the running sum at the new edges."""
+    count = len(lines)
+    total = np.zeros((count + 1, lines.shape[1]))
+    np.cumsum(lines, axis=0, out=total[1:])
+    edges = np.arange(target + 1) * (count / target)
+    below = np.minimum(edges.astype(np.int64), count - 1)
+    at_edges = total[below] + (edges - below)[:, None] * lines[below]
+    return np.diff(at_edges, axis=0) * (target / count)
+
+
+def _decode(path: Path) -> tuple[np.ndarray[Any, Any], float]:
+    """Pixels [H, W, 3] uint8 or uint16 and the value that means 1.0."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(26)
+        if head.startswith(_PNG_SIGNATURE) and len(head) == 26 and head[24] == 16 and head[25] == _RGB_COLOR_TYPE:
+            return _decode_rgb16(path), 65535.0
+        with Image.open(path) as image:
+            image.load()
+            return _to_rgb(path, image)
+    except FileNotFoundError as error:
+        raise SourceError(f"{path}: the image is missing; every declared frame must exist ({_READABLE})") from error
+    # Pillow raises SyntaxError, struct- and zlib-level errors for damaged PNG chunks besides OSError.
+    except (OSError, SyntaxError, EOFError, zlib.error, Image.DecompressionBombError) as error:
+        raise SourceError(
+            f"{path}: the image cannot be decoded ({error}); expected {_READABLE}. "
+            "It is probably truncated or not an image: copy or export it again"
+        ) from error
+
+
+def _decode_rgb16(path: Path) -> np.ndarray[Any, Any]:
+    # Pillow keeps only the high byte of 16-bit colour PNG; kornia's decoder keeps both.
+    from kornia_rs import io
+
+    try:
+        return np.asarray(io.read_image_png_u16(str(path), "rgb"))
+    except Exception as error:  # the decoder raises bare Exception for every damaged file
+        raise OSError(str(error)) from error
+
+
+def _to_rgb(path: Path, image: Image.Image) -> tuple[np.ndarray[Any, Any], float]:
+    transparent = image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
+    if transparent:
+        raise SourceError(
+            f"{path}: the image has a transparency channel (mode {image.mode}); expected {_READABLE}. "
+            "Flatten it over the background you want to train against"
+        )
+    if image.mode.startswith("I;16"):
+        grey = np.asarray(image).astype(np.uint16)
+        return np.repeat(grey[..., None], 3, axis=2), 65535.0
+    if image.mode not in ("RGB", "L", "P", "1"):
+        raise SourceError(f"{path}: unsupported pixel layout {image.mode!r}; expected {_READABLE}")
+    return np.asarray(image.convert("RGB")), 255.0

@@ -35,7 +35,8 @@ class Cameras:
     def centers(self) -> FloatArray:
         """[C, 3] camera centres in the world."""
         rotation, translation = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3]
-        return -np.einsum("cji,cj->ci", rotation, translation)
+        centers: FloatArray = -np.einsum("cji,cj->ci", rotation, translation)
+        return centers
 
     @property
     def extent(self) -> float:

@@ -49,9 +49,9 @@ class OutputError(InputError):
 class UnknownName(InputError):
     """A name nobody registered. The message offers the nearest known one."""
 
-    def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
+    def __init__(self, kind: str, name: str, known: Iterable[str], hint: str = "") -> None:
         self.kind, self.name, self.known = kind, name, tuple(sorted(known))
-        super().__init__(f"no {kind} named {name!r}{suggest(name, self.known)}")
+        super().__init__(f"no {kind} named {name!r}{suggest(name, self.known)}{hint}")
 
 
 class PacketError(GsstreamError, ValueError):

@@ -32,7 +32,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class PointCloud:
-    """P coloured points. ``xyz`` [P, 3] float32 scene units, ``rgb`` [P, 3] float32 in [0, 1]; ``origin`` says whence."""
+    """P coloured points. ``xyz`` [P, 3] float32 scene units, ``rgb`` [P, 3] float32 in [0, 1]; ``origin``: whence."""
 
     xyz: FloatArray
     rgb: FloatArray

@@ -57,7 +57,7 @@ class Part(ABC):
         raise AttributeError(f"{type(self).__name__} is frozen: state is passed in and returned, never kept ({name!r})")
 
     def __eq__(self, other: object) -> bool:
-        return type(self) is type(other) and self.config == other.config  # type: ignore[attr-defined]
+        return type(self) is type(other) and self.config == other.config
 
     def __hash__(self) -> int:
         return hash((type(self), self.config))

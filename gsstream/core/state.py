@@ -25,7 +25,7 @@ def rows(axis: RowAxis | None, **kwargs: Any) -> Any:
 
 
 def edit_state(state: State, edit: TopologyEdit) -> State:
-    """Apply a topology edit to every per-Gaussian field of a state dataclass; moments of fresh rows are not zeroed here."""
+    """Apply a topology edit to every per-Gaussian field of a state; moments of fresh rows are not zeroed here."""
     changes = {
         f.name: getattr(state, f.name)[edit.source]
         for f in dataclasses.fields(state)  # type: ignore[arg-type]

@@ -32,10 +32,10 @@ class FirstFrame(Section):
     max_iterations: int = Field(default=4000, ge=0, description="upper bound on epochs * cameras (released code: 4000)")
     sh_degree: int = Field(default=2, ge=0, le=3, description="degree of the spherical harmonics (paper's code: 2)")
     points: Literal["auto", "recording", "sparse", "sfm"] = Field(
-        default="auto", description="auto: the recording's points, else triangulation; sparse: the recording's thinned set"
+        default="auto", description="auto: the recording's points, else triangulation; sparse: its thinned set"
     )
     max_points: int = Field(default=40_000, ge=1, description="points kept before the structure seeds anchors")
-    fill_points: int = Field(default=20_000, ge=0, description="random seeds topping up uncovered common view volume (ours)")
+    fill_points: int = Field(default=20_000, ge=0, description="random seeds in uncovered common view volume (ours)")
     fill_min_views: int = Field(default=3, ge=1, description="a fill seed must be seen by this many training cameras")
     fill_min_distance: float = Field(
         default=0.3, ge=0, description="least distance of a fill seed to any camera, fraction of the rig's extent"
@@ -66,12 +66,12 @@ class FirstFrame(Section):
 class Stream(Section):
     """Every later frame."""
 
-    epochs: int = Field(default=20, ge=1, description="passes over the training cameras per frame (full 20, fast 10, edge 6)")
+    epochs: int = Field(default=20, ge=1, description="passes over the training cameras per frame (fast: 10, edge: 6)")
     active_threshold: float = Field(
         default=0.0, ge=0, le=1, description="rows whose gate opens with at most this probability are left out"
     )
-    progressive: bool = Field(default=False, description="activate octree levels from floor(H/2) on during a frame (paper)")
-    progressive_omega: float = Field(default=1.5, ge=1, description="growth of the iterations per level, N_{i+1} = omega N_i")
+    progressive: bool = Field(default=False, description="activate octree levels from floor(H/2) on (paper)")
+    progressive_omega: float = Field(default=1.5, ge=1, description="iterations per level: N_{i+1} = omega N_i")
 
 
 class Loss(Section):
@@ -103,7 +103,7 @@ class Recipe(Section):
     method: str = Field(default="dense", description="name of the method this recipe belongs to")
     seed: int = Field(default=0, ge=0, description="seed of every random stream")
     structure: ComponentRef = Field(default=ComponentRef(name="flat"), description="how Gaussians are grouped")
-    confidence: ComponentRef = Field(default=ComponentRef(name="uniform"), description="which Gaussians probably changed")
+    confidence: ComponentRef = Field(default=ComponentRef(name="uniform"), description="which Gaussians changed")
     propagation: ComponentRef = Field(default=ComponentRef(name="group-max"), description="how belief spreads to nodes")
     gate: ComponentRef = Field(default=ComponentRef(name="always-open"), description="which nodes may move")
     regularizer: ComponentRef = Field(default=ComponentRef(name="none"), description="what openness costs")

@@ -1,0 +1,131 @@
+"""Recipe + catalogue -> live parts. Every part's settings are checked here; all problems come in one error."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from gsstream.confidence.base import ConfidenceEstimator
+from gsstream.core.errors import PluginUnavailable, UnknownName
+from gsstream.core.part import Part
+from gsstream.gate.base import GateSampler
+from gsstream.plugins.catalog import Catalog
+from gsstream.propagation.base import Propagation
+from gsstream.recipe.check import join_problems, validate
+from gsstream.recipe.document import KeyPath, Origin
+from gsstream.recipe.load import ResolvedRecipe
+from gsstream.recipe.model import ComponentRef, Recipe
+from gsstream.regularizer.base import Regularizer
+from gsstream.render.base import Renderer
+from gsstream.residual.base import UpdateRule
+from gsstream.structure.base import Structure
+
+SLOTS = ("structure", "confidence", "propagation", "gate", "regularizer", "update", "renderer")
+#: What "auto" tries, fastest first, before it falls back to the reference.
+AUTO_RENDERERS = ("cpu",)
+
+
+class SlowRendererWarning(UserWarning):
+    """The reference renderer is used because no fast one works here."""
+
+
+@dataclass(frozen=True, slots=True)
+class Assembly:
+    """The live parts of a run.
+
+    Arguments:
+        recipe: the recipe with every part's parameters written out and the renderer that was chosen.
+        origins: path -> origin of every value that is not a default (for ``recipe.save.save_resolved``).
+    """
+
+    recipe: Recipe
+    structure: Structure
+    confidence: ConfidenceEstimator
+    propagation: Propagation
+    gate: GateSampler
+    regularizer: Regularizer
+    update: UpdateRule
+    renderer: Renderer
+    origins: Mapping[KeyPath, Origin] = field(default_factory=dict)
+
+    @property
+    def resolved(self) -> ResolvedRecipe:
+        """Recipe and provenance together."""
+        return ResolvedRecipe(self.recipe, self.origins)
+
+
+def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog) -> Assembly:
+    """Import every named part, check its parameters against its own Config, and build it.
+
+    Raises:
+        RecipeError: parameters that a part does not know or refuses, unknown parts; all of them together.
+        PluginUnavailable: a part's plugin is in quarantine or the part is not what it claims to be.
+    """
+    if isinstance(resolved, Recipe):
+        resolved = ResolvedRecipe(resolved, {})
+    problems: list[str] = []
+    parts: dict[str, Any] = {}
+    refs: dict[str, ComponentRef] = {}
+    for slot in SLOTS:
+        ref: ComponentRef = getattr(resolved.recipe, slot)
+        if slot == "renderer" and ref.name == "auto":
+            part = _auto_renderer(ref, resolved, catalog, problems)
+            ref = ComponentRef(name=part[0]) if part else ref
+            built = part[1] if part else None
+        else:
+            built = _build(slot, ref, resolved, catalog, problems)
+        if built is not None:
+            parts[slot] = built
+            refs[slot] = ComponentRef(name=ref.name, params=built.config.model_dump(mode="json"))
+    join_problems(problems)
+    return Assembly(recipe=resolved.recipe.model_copy(update=refs), origins=resolved.origins, **parts)
+
+
+def _build(
+    slot: str, ref: ComponentRef, resolved: ResolvedRecipe, catalog: Catalog, problems: list[str]
+) -> Part | None:
+    try:
+        cls = catalog.resolve(slot, ref.name)
+    except UnknownName as error:
+        problems.append(f"{resolved.near((slot, 'name')).where}: {slot}.name: {error}")
+        return None
+    config = validate(cls.Config, ref.params, resolved.near, (slot, "params"), problems)
+    return None if config is None else _construct(slot, ref.name, cls, config, catalog)
+
+
+def _construct(slot: str, name: str, cls: type[Any], config: Any, catalog: Catalog) -> Part:
+    try:
+        part: Part = cls(config)
+    except Exception as error:  # third-party constructor: reported with its owner's name
+        origin = catalog.entry(slot, name).origin
+        raise PluginUnavailable(f"{slot} {name!r} (from {origin}) could not be built: {error}") from error
+    return part
+
+
+def _auto_renderer(
+    ref: ComponentRef, resolved: ResolvedRecipe, catalog: Catalog, problems: list[str]
+) -> tuple[str, Part] | None:
+    """(name, renderer) of the fastest renderer that works here, else the reference with one warning."""
+    if ref.params:
+        where = resolved.near(("renderer", "params", next(iter(ref.params)))).where
+        problems.append(f"{where}: renderer.params needs a named renderer, but renderer.name is 'auto'")
+        return None
+    reasons = []
+    for name in AUTO_RENDERERS:
+        try:
+            cls = catalog.resolve("renderer", name)
+            return name, _construct("renderer", name, cls, cls.Config(), catalog)
+        except (UnknownName, PluginUnavailable) as error:
+            reasons.append(str(error))
+    warnings.warn(
+        "no fast renderer works here, so the reference renderer is used: about 500 times slower. To mend it, install a "
+        f"C++ compiler and run 'pip install ./plugins/cpu_render'. Reason: {'; '.join(reasons)}",
+        SlowRendererWarning,
+        stacklevel=3,
+    )
+    cls = catalog.resolve("renderer", "reference")
+    return "reference", _construct("renderer", "reference", cls, cls.Config(), catalog)
+
+

@@ -1,0 +1,33 @@
+"""The parts that ship with gsstream, registered through the hooks that every plugin uses."""
+
+from __future__ import annotations
+
+from gsstream.spec import ComponentSpec, Kind, MethodSpec, hookimpl
+
+
+def _part(kind: Kind, name: str, target: str, summary: str) -> ComponentSpec:
+    return ComponentSpec(kind=kind, name=name, target=f"gsstream.{target}", summary=summary)
+
+
+@hookimpl
+def gsstream_components() -> list[ComponentSpec]:
+    return [
+        _part("structure", "flat", "structure.flat:Flat", "each Gaussian is its own node"),
+        _part("confidence", "uniform", "confidence.uniform:Uniform", "everything may have changed"),
+        _part("propagation", "group-max", "propagation.group_max:GroupMax", "a node is as suspect as its worst member"),
+        _part("gate", "always-open", "gate.always_open:AlwaysOpen", "no sparsity: every gate is 1"),
+        _part("regularizer", "none", "regularizer.none:NoRegularizer", "nothing costs anything"),
+        _part("update", "additive", "residual.additive:Additive", "gated change added to raw attributes"),
+        _part("renderer", "reference", "render.reference:ReferenceRenderer", "pure torch, slow, defines the truth"),
+    ]
+
+
+@hookimpl
+def gsstream_methods() -> list[MethodSpec]:
+    return [
+        MethodSpec(
+            name="dense",
+            recipe="gsstream.recipe:methods/dense.yaml",
+            summary="every Gaussian may change in every frame: the baseline",
+        )
+    ]

@@ -1,0 +1,182 @@
+"""Guarded discovery: every entry point in its own ``try``; a failure becomes a record, never a dead program.
+
+pluggy checks and calls the hooks, but does not find plugins for us: its own loader stops at the first that fails.
+
+Environment:
+    GSSTREAM_LOAD_PLUGINS: comma-separated allow-list of entry points or distributions; empty loads none.
+    GSSTREAM_TRACE_PLUGINS: 1 prints every hook call and what it returned to stderr.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import pluggy
+
+from gsstream import API_VERSION, __version__
+from gsstream.core.errors import suggest
+from gsstream.core.versions import version_problem
+from gsstream.plugins import builtin, hookspecs
+from gsstream.spec import ENTRY_POINT_GROUP, ComponentSpec, MethodSpec
+
+Spec = ComponentSpec | MethodSpec
+HOOKS: dict[str, type[Spec]] = {"gsstream_components": ComponentSpec, "gsstream_methods": MethodSpec}
+
+
+class PluginFault(Exception):
+    """Why a plugin is refused; never leaves this package except as the cause of ``PluginUnavailable``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Discovered:
+    """One plugin, healthy or not: exactly one of ``specs`` and ``error`` is given.
+
+    Arguments:
+        name: name of the entry point.
+        distribution, version: the installed distribution that ships it; "?" when its metadata is unreadable.
+        specs: what it declares, in its order.
+        error: why it is in quarantine.
+        declared: what a quarantined plugin did declare before it was refused, if it came that far.
+    """
+
+    name: str
+    distribution: str
+    version: str
+    specs: tuple[Spec, ...] | None
+    error: BaseException | None = None
+    declared: tuple[Spec, ...] = ()
+
+    @property
+    def reason(self) -> str:
+        """First line of the error, with the error's type where the message alone would not say it."""
+        if self.error is None:
+            return ""
+        text = (str(self.error).strip() or "no message").splitlines()[0]
+        return text if isinstance(self.error, PluginFault) else f"{type(self.error).__name__}: {text}"
+
+
+def discover() -> list[Discovered]:
+    """The built-in parts first, then every installed plugin, ordered by distribution and entry point. Never raises."""
+    found = [_inspect("builtin", "gsstream", __version__, lambda: builtin)]
+    allowed = _allow_list()
+    seen: set[str] = set()
+    for dist in _distributions():
+        for name, value in _entry_points(dist):
+            distribution, version = _identity(dist)
+            seen |= {name, distribution}
+            if allowed is not None and not allowed & {name, distribution}:
+                left_out = PluginFault("left out by GSSTREAM_LOAD_PLUGINS")
+                found.append(Discovered(name, distribution, version, None, left_out))
+            elif value is None:
+                broken = PluginFault("entry_points.txt cannot be read: expected lines 'name = module'")
+                found.append(Discovered(name, distribution, version, None, broken))
+            else:
+                found.append(_inspect(name, distribution, version, lambda value=value: importlib.import_module(value)))
+    for name in sorted((allowed or set()) - seen):
+        missing = PluginFault(f"named in GSSTREAM_LOAD_PLUGINS but not installed{suggest(name, seen)}")
+        found.append(Discovered(name, "?", "?", None, missing))
+    return found
+
+
+def _allow_list() -> set[str] | None:
+    text = os.environ.get("GSSTREAM_LOAD_PLUGINS")
+    return None if text is None else {name.strip() for name in text.split(",") if name.strip()}
+
+
+def _distributions() -> list[importlib.metadata.Distribution]:
+    """Distributions that mention our group, first on the path wins, in an order that does not depend on the path."""
+    mine: dict[str, importlib.metadata.Distribution] = {}
+    for dist in importlib.metadata.distributions():
+        text = dist.read_text("entry_points.txt")
+        if text and f"[{ENTRY_POINT_GROUP}]" in text.replace(" ", ""):
+            mine.setdefault(_identity(dist)[0].lower().replace("_", "-"), dist)
+    return [mine[key] for key in sorted(mine)]
+
+
+def _identity(dist: importlib.metadata.Distribution) -> tuple[str, str]:
+    metadata = dist.metadata
+    return metadata["Name"] or "?", metadata["Version"] or "?"
+
+
+def _entry_points(dist: importlib.metadata.Distribution) -> Iterator[tuple[str, str | None]]:
+    """(name, module) of every entry point of our group; (distribution, None) when the file is malformed."""
+    try:
+        points = [(p.name, p.value) for p in dist.entry_points if p.group == ENTRY_POINT_GROUP]
+    except Exception:  # importlib.metadata raises whatever its parser stumbles over; one bad file must not hide others
+        yield _identity(dist)[0], None
+        return
+    yield from sorted(points)
+
+
+def _inspect(name: str, distribution: str, version: str, load: Any) -> Discovered:
+    declared: list[Spec] = []
+    try:
+        module = load()
+        _collect(module, declared)
+    except (Exception, SystemExit) as error:  # containing whatever a plugin raises is the purpose of this function
+        return Discovered(name, distribution, version, None, error, tuple(declared))
+    return Discovered(name, distribution, version, tuple(declared))
+
+
+def _collect(module: ModuleType, declared: list[Spec]) -> None:
+    """Call the hooks of one plugin, append what it declares, raise PluginFault at the first thing refused."""
+    manager = pluggy.PluginManager("gsstream")
+    manager.add_hookspecs(hookspecs)
+    if os.environ.get("GSSTREAM_TRACE_PLUGINS") == "1":
+        _trace(manager, module.__name__)
+    manager.register(module)
+    callers = manager.get_hookcallers(module) or []
+    for hook, model in HOOKS.items():
+        for result in getattr(manager.hook, hook)():
+            _check_result(hook, model, result)
+            declared.extend(result)
+    _check_versions(declared)
+    unknown = sorted(caller.name for caller in callers if not caller.has_spec())
+    if unknown:
+        hint = suggest(unknown[0], HOOKS)
+        raise PluginFault(f"implements the hook {unknown[0]!r}, which this gsstream does not know{hint}")
+    if not callers:
+        raise PluginFault(f"{module.__name__} implements no hook; expected @hookimpl on one of {', '.join(HOOKS)}")
+    _check_unique(declared)
+
+
+def _trace(manager: pluggy.PluginManager, module: str) -> None:
+    def after(outcome: Any, hook: str, _impls: Any, _kwargs: Any) -> None:
+        result = outcome.exception or outcome.get_result()
+        print(f"gsstream: {module}: {hook}() -> {result!r}", file=sys.stderr)
+
+    manager.add_hookcall_monitoring(lambda *_: None, after)
+
+
+def _check_result(hook: str, model: type[Spec], result: object) -> None:
+    if not isinstance(result, list | tuple):
+        raise PluginFault(f"{hook}() returned {type(result).__name__}; expected a list of {model.__name__}")
+    for item in result:
+        if not isinstance(item, model):
+            raise PluginFault(f"{hook}() returned a {type(item).__name__} in its list; expected {model.__name__}")
+
+
+def _check_versions(declared: list[Spec]) -> None:
+    for spec in declared:
+        problem = version_problem("component API", spec.api, API_VERSION)
+        if problem:
+            raise PluginFault(f"{spec.name}: {problem}")
+
+
+def _check_unique(declared: list[Spec]) -> None:
+    keys = [spec_key(spec) for spec in declared]
+    for kind, name in keys:
+        if keys.count((kind, name)) > 1:
+            raise PluginFault(f"declares the {kind} {name!r} twice")
+
+
+def spec_key(spec: Spec) -> tuple[str, str]:
+    """(kind, name); named methods and whole-method components share the kind "method"."""
+    return ("method" if isinstance(spec, MethodSpec) else spec.kind, spec.name)

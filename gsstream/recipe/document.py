@@ -1,0 +1,179 @@
+"""Recipe text -> leaves: every value with its path and the place it was written.
+
+YAML 1.2 through ruamel.yaml: ``1e-3`` is a number, ``on`` is a word, a key given twice is an error.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+
+from gsstream.core.errors import RecipeError
+
+KeyPath = tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Where a value comes from.
+
+    Arguments:
+        label: provenance, as printed beside the value: "default", "method s2gs", "file run.yaml:6", "command line".
+        where: prefix of error messages: "run.yaml:6:5", "--set gate.temperature=0.3".
+    """
+
+    label: str
+    where: str
+
+
+DEFAULT = Origin("default", "default")
+
+
+@dataclass(frozen=True, slots=True)
+class Leaf:
+    """A value that is not a mapping, and where it was written."""
+
+    value: Any
+    origin: Origin
+
+
+class Empty:
+    """Stands for a mapping without entries: it sets nothing, but its key must still be known."""
+
+
+class Section:
+    """Stands for a mapping with entries while a file is being read."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """The leaves of one file or of the command line, in the order they were written.
+
+    Arguments:
+        leaves: path -> leaf.
+        marks: path -> origin of every key, those of sections too, where the place is known.
+        shorthand: whether ``gate.temperature`` may stand for ``gate.params.temperature``.
+    """
+
+    leaves: Mapping[KeyPath, Leaf]
+    marks: Mapping[KeyPath, Origin] = field(default_factory=dict)
+    shorthand: bool = False
+
+    def where(self, path: KeyPath, leaf: Leaf) -> str:
+        """Place of the key at ``path``, one of the keys that lead to ``leaf``."""
+        return self.marks.get(path, leaf.origin).where
+
+
+def read_file(path: Path, label: str | None = None) -> Layer:
+    """A YAML file as a layer.
+
+    Arguments:
+        path: the file.
+        label: provenance of its values; ``file NAME:LINE`` when absent.
+
+    Raises:
+        RecipeError: unreadable, not YAML, a key given twice, an anchor, a value that is no JSON value.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecipeError(f"cannot read the recipe {path}: {error}") from error
+    root = _compose(text, str(path))
+    if root is None:
+        return Layer({})
+    if not isinstance(root, MappingNode):
+        raise RecipeError(f"{_where(root, str(path))}: a recipe maps keys to values; got a single value or a list")
+
+    def origin(node: Node) -> Origin:
+        return Origin(label or f"file {path}:{node.start_mark.line + 1}", _where(node, str(path)))
+
+    marks: dict[KeyPath, Origin] = {}
+    leaves: dict[KeyPath, Leaf] = {}
+    for key, node, value in _walk(root, (), str(path)):
+        marks[key] = origin(node)
+        if not isinstance(value, Section):
+            leaves[key] = Leaf(value, marks[key])
+    return Layer(leaves, marks)
+
+
+def read_override(text: str, option: str = "--set") -> tuple[KeyPath, Leaf]:
+    """One ``a.b=value`` of the command line; the value is read as YAML.
+
+    Raises:
+        RecipeError: no "=", an empty key or value, or a value that is not YAML.
+    """
+    where = f"{option} {text}"
+    key, equals, value = text.partition("=")
+    path = tuple(key.strip().split("."))
+    if not equals or not all(path) or not value.strip():
+        raise RecipeError(f"{where}: expected KEY.PATH=VALUE, e.g. --set stream.epochs=10 (write null for 'absent')")
+    node = _compose(value, where)
+    assert node is not None, "a non-blank text composes to a node or raises"
+    return path, Leaf(_plain(node, where, located=False), Origin("command line", where))
+
+
+def _compose(text: str, name: str) -> Node | None:
+    try:
+        return YAML(typ="safe", pure=True).compose(text)  # type: ignore[no-any-return]
+    except MarkedYAMLError as error:
+        mark = error.problem_mark
+        place = f"{name}:{mark.line + 1}:{mark.column + 1}" if mark else name
+        raise RecipeError(f"{place}: not valid YAML: {error.problem or error.context}") from error
+    except (YAMLError, ValueError) as error:
+        raise RecipeError(f"{name}: not valid YAML: {error}") from error
+
+
+def _where(node: Node, name: str) -> str:
+    return f"{name}:{node.start_mark.line + 1}:{node.start_mark.column + 1}"
+
+
+def _walk(mapping: MappingNode, path: KeyPath, name: str) -> Iterator[tuple[KeyPath, Node, Any]]:
+    """(path, key node, value) of every key below a mapping, a section before what it holds."""
+    seen: dict[str, Node] = {}
+    _refuse_anchor(mapping, _where(mapping, name))
+    for key_node, node in mapping.value:
+        if not isinstance(key_node, ScalarNode) or not str(key_node.tag).endswith(":str"):
+            got = getattr(key_node, "value", "?")
+            raise RecipeError(f"{_where(key_node, name)}: a key must be a word, got {got!r}")
+        key = key_node.value
+        if key in seen:
+            raise RecipeError(
+                f"{_where(key_node, name)}: key {'.'.join((*path, key))!r} is given twice, first in line "
+                f"{seen[key].start_mark.line + 1}"
+            )
+        seen[key] = key_node
+        if isinstance(node, MappingNode) and node.value:
+            yield (*path, key), key_node, Section()
+            yield from _walk(node, (*path, key), name)
+        elif isinstance(node, MappingNode):
+            yield (*path, key), key_node, Empty()
+        else:
+            yield (*path, key), key_node, _plain(node, name)
+
+
+def _plain(node: Node, name: str, *, located: bool = True) -> Any:
+    """A node as a JSON value."""
+    where = _where(node, name) if located else name
+    _refuse_anchor(node, where)
+    if isinstance(node, SequenceNode):
+        return [_plain(item, name, located=located) for item in node.value]
+    if isinstance(node, MappingNode):
+        return {str(key.value): _plain(value, name, located=located) for key, value in node.value}
+    value = YAML(typ="safe", pure=True).constructor.construct_object(node)
+    if value is not None and not isinstance(value, str | bool | int | float):
+        raise RecipeError(f"{where}: {node.value!r} reads as a {type(value).__name__}; quote it if a word is meant")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise RecipeError(f"{where}: expected a finite number, got {node.value}")
+    return value
+
+
+def _refuse_anchor(node: Node, where: str) -> None:
+    if node.anchor:
+        raise RecipeError(f"{where}: anchors and aliases (&{node.anchor}) are not used in recipes; write the value out")

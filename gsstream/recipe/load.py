@@ -1,0 +1,170 @@
+"""Layers -> one recipe: model defaults <- the method's file <- a recipe file <- the command line.
+
+A file may say ``base: NAME`` (a method) or ``base: other.yaml`` (a file beside it) and then only its differences.
+Naming another part in a slot drops the parameters that lower layers gave to the former one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsstream.core.errors import RecipeError
+from gsstream.recipe.check import join_problems, keep_known, validate
+from gsstream.recipe.document import DEFAULT, Empty, KeyPath, Layer, Leaf, Origin, read_file, read_override
+from gsstream.recipe.model import Recipe
+
+#: Finds the YAML file of a named method; raises UnknownName or PluginUnavailable.
+FindMethod = Callable[[str], Path]
+
+
+@dataclass(frozen=True, slots=True)
+class ResolvedRecipe:
+    """A valid recipe and, for every leaf that is not a model default, where its value comes from."""
+
+    recipe: Recipe
+    origins: Mapping[KeyPath, Origin]
+
+    def origin(self, path: KeyPath) -> Origin:
+        """Origin of the leaf at ``path``; of the nearest enclosing key when the leaf itself was not written."""
+        for end in range(len(path), 0, -1):
+            if (found := self.origins.get(path[:end])) is not None:
+                return found
+        return DEFAULT
+
+    def near(self, path: KeyPath) -> Origin:
+        """Where to look for a problem at ``path``: what was written there, below it, or closest around it."""
+        for end in range(len(path), 0, -1):
+            for written, origin in self.origins.items():
+                if written[:end] == path[:end]:
+                    return origin
+        return DEFAULT
+
+
+def resolve_recipe(
+    method: str | None, find_method: FindMethod, file: Path | None = None, overrides: Sequence[tuple[str, str]] = ()
+) -> ResolvedRecipe:
+    """Stack the layers and validate the result; every problem found is reported in one error.
+
+    Arguments:
+        method: name given by --method; None takes the one the file is based on, else "dense".
+        find_method: name -> YAML file (``Catalog.recipe_path``).
+        file: a recipe file with differences.
+        overrides: (option, "a.b=value") of the command line, e.g. ("--set", "gate.temperature=0.3"); later ones win.
+
+    Raises:
+        RecipeError: unknown keys (with the nearest valid name), values out of range, contradictions.
+        UnknownName, PluginUnavailable: from ``find_method``.
+    """
+    chain = _file_chain(file, find_method, ()) if file else []
+    stated = [layer.leaves[("method",)] for layer in chain if ("method",) in layer.leaves]
+    named = stated[-1].value if stated else None
+    if stated and not isinstance(named, str):
+        raise RecipeError(f"{stated[-1].origin.where}: method: expected a name, got {named!r}")
+    if method and named and named != method:
+        raise RecipeError(
+            f"{file} belongs to the method {named!r}, but --method says {method!r}: leave --method out, or change the "
+            "file's 'base' or 'method'"
+        )
+    name = method or named or "dense"
+    if not any(leaf.origin.label.startswith("method ") for leaf in stated):
+        chain = _method_chain(name, find_method, ()) + chain
+    if overrides:
+        leaves: dict[KeyPath, Leaf] = {}
+        for option, text in overrides:
+            path, leaf = read_override(text, option)
+            leaves.pop(path, None)  # a repeated key counts where it was given last
+            leaves[path] = leaf
+        chain = [*chain, Layer(leaves, shorthand=True)]
+    return stack(chain)
+
+
+def load_recipe(path: Path) -> ResolvedRecipe:
+    """Read a complete recipe, such as the one saved beside a result; what it leaves out takes the model's default."""
+    layer = read_file(path)
+    if ("base",) in layer.leaves:
+        raise RecipeError(f"{layer.leaves[('base',)].origin.where}: a complete recipe has no 'base'")
+    return stack([layer])
+
+
+def stack(layers: Sequence[Layer]) -> ResolvedRecipe:
+    """Merge layers, lowest first, check every key and validate the whole.
+
+    Raises:
+        RecipeError: all problems together.
+    """
+    problems: list[str] = []
+    merged: dict[KeyPath, Leaf] = {}
+    for layer in layers:
+        known = keep_known(layer, problems)
+        for path, leaf in known.items():
+            if len(path) == 2 and path[1] == "name" and leaf.value != _part_name(merged, path):
+                for stale in [p for p in merged if p[:2] == (path[0], "params")]:
+                    del merged[stale]
+        for path, leaf in known.items():
+            if not isinstance(leaf.value, Empty):
+                _put(merged, path, leaf)
+    origins = {path: leaf.origin for path, leaf in merged.items()}
+    recipe = validate(Recipe, _nest(merged), ResolvedRecipe(Recipe(), origins).near, (), problems)
+    join_problems(problems)
+    assert recipe is not None, "an invalid recipe leaves at least one problem"
+    return ResolvedRecipe(recipe, origins)
+
+
+def recipe_hash(recipe: Recipe) -> str:
+    """SHA-256 of the recipe's values, provenance left out: equal hashes mean equal runs of the same recording."""
+    canonical = json.dumps(recipe.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+def _method_chain(name: str, find_method: FindMethod, within: tuple[str, ...]) -> list[Layer]:
+    path = find_method(name)
+    chain = _file_chain(path, find_method, within, label=f"method {name}")
+    stamp = Leaf(name, Origin(f"method {name}", str(path)))
+    return [*chain, Layer({("method",): stamp})]
+
+
+def _file_chain(path: Path, find_method: FindMethod, within: tuple[str, ...], label: str | None = None) -> list[Layer]:
+    """The layers of a file: those of its base, then its own."""
+    key = str(path.resolve())
+    if key in within:
+        raise RecipeError(f"{path}: 'base' goes in a circle: {' -> '.join([*within, key])}")
+    layer = read_file(path, label)
+    leaves = dict(layer.leaves)
+    base = leaves.pop(("base",), None)
+    if base is None:
+        return [layer]
+    if not isinstance(base.value, str):
+        raise RecipeError(f"{base.origin.where}: base: expected the name of a method or a file, got {base.value!r}")
+    if re.fullmatch(r"[a-z][a-z0-9_-]*", base.value):
+        below = _method_chain(base.value, find_method, (*within, key))
+    else:
+        below = _file_chain(path.parent / base.value, find_method, (*within, key), label)
+    return [*below, Layer(leaves, layer.marks)]
+
+
+def _put(leaves: dict[KeyPath, Leaf], path: KeyPath, leaf: Leaf) -> None:
+    """Set a leaf; whatever stood above or below that path gives way."""
+    for other in [p for p in leaves if p[: len(path)] == path or path[: len(p)] == p]:
+        del leaves[other]
+    leaves[path] = leaf
+
+
+def _part_name(merged: Mapping[KeyPath, Leaf], path: KeyPath) -> Any:
+    """The part that the layers so far put into the slot ``path[0]``."""
+    return merged[path].value if path in merged else Recipe.model_fields[path[0]].default.name
+
+
+def _nest(leaves: Mapping[KeyPath, Leaf]) -> dict[str, Any]:
+    tree: dict[str, Any] = {}
+    for path, leaf in leaves.items():
+        node = tree
+        for key in path[:-1]:
+            node = node.setdefault(key, {})
+        node[path[-1]] = leaf.value
+    return tree

@@ -1,0 +1,170 @@
+"""View-space gradient difference: what changed between two frames, as the Gaussians feel it."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, final
+
+import torch
+from pydantic import Field, model_validator
+
+from gsstream.api import ConfidenceEstimator, FrameContext, PartConfig, Rng, Traits, check_finite
+from gsstream_s2gs.normalise import minmax, noise_units, ratio, robust
+
+
+@final
+class ViewSpaceGradient(ConfidenceEstimator):
+    """z_i = (|m_i| - median|m|) / (MAD|m| + eps), m the view-space gradient difference (paper, equation for p_i).
+
+    m_i = mean over views of d(E_t - E_{t-1}) / d mu_i, where E compares the render of frame t-1 with either
+    ground truth and mu_i is the projected centre (paper, appendix "Dynamic Confidence Estimator"). Both losses see the
+    same render, so the difference is formed before the one backward pass per view; for the squared loss the render
+    itself cancels and is never needed: the upstream gradient is 2 (gt_{t-1} - gt_t) / (3 H W).
+
+    The result is z itself, not sigmoid(z); MAD is the plain median absolute deviation (no 1.4826, as printed).
+    Medians are taken over Gaussians that some camera sees. Gaussians that no camera sees, and all Gaussians of a frame
+    in which nothing changed (all |m| = 0; the printed formula would give p = 0.5), get ``floor``.
+
+    The absolute epsilon of the paper acts in the units of m: here gradients of a mean over all pixels with respect to
+    positions in half image widths (as in the released code). Then |m| is well below epsilon nearly everywhere, most
+    logits start near 0 and the optimisation decides. ``epsilon_mode: relative`` removes the dependence on units.
+
+    Released code: m is a sum over views of norms, E the mean per-pixel Euclidean distance, p = m / (m + median):
+    ``loss: l2norm``, ``aggregate: sum-of-norms``, ``normalisation: ratio``.
+    """
+
+    class Config(PartConfig):
+        loss: Literal["mse", "l2norm"] = Field(
+            default="mse", description="E; mse: paper; l2norm: mean Euclidean distance of pixel colours (released code)"
+        )
+        distance_epsilon: float = Field(
+            default=1e-12, gt=0, le=1, description="inside the root of l2norm, image units^2; no 0/0 (ours)"
+        )
+        aggregate: Literal["mean-vector", "sum-of-norms", "mean-of-norms"] = Field(
+            default="mean-vector",
+            description="over views; mean-vector: norm of the mean gradient (paper); sum-of-norms: released; "
+            "mean-of-norms: mean norm over the views that see the Gaussian (ours)",
+        )
+        units: Literal["ndc", "pixel"] = Field(
+            default="ndc", description="gradients per half image (pixel gradient * (W/2, H/2), released) or per pixel"
+        )
+        normalisation: Literal["robust", "ratio", "minmax", "noise"] = Field(
+            default="robust",
+            description="robust: paper; ratio: ln(m / median), released; minmax: paper's ablation; "
+            "noise: m in units of what camera noise alone would give, minus noise_threshold (ours)",
+        )
+        epsilon: float = Field(
+            default=2e-4, ge=0, le=1e6, description="added to the MAD (robust); paper: 2e-4, in units of |m|"
+        )
+        epsilon_mode: Literal["absolute", "relative"] = Field(
+            default="absolute", description="absolute: paper; relative: epsilon * (median + MAD) (ours)"
+        )
+        noise_threshold: float = Field(
+            default=3.0, ge=0, le=100, description="(noise) multiple of the noise where z is 0, to 100 (ours)"
+        )
+        noise_minimum: float = Field(
+            default=0.4 / 255, gt=0, le=1,
+            description="(noise) least noise of a camera, image units; 0.4/255 is 8-bit rounding of two frames (ours)",
+        )  # fmt: skip
+        perturbation: float = Field(
+            default=0.0, ge=0, le=100,
+            description="noise added to |m| in standard deviations of |m|, floored at 0 (paper's robustness table)",
+        )  # fmt: skip
+        seed: int = Field(default=0, ge=0, description="seed of perturbation and noise probes")
+        floor: float = Field(
+            default=-math.log(1000.0), ge=-50, le=0, description="logit where nothing changes, -50 to 0 (ours)"
+        )
+        limit: float = Field(default=50.0, gt=0, le=1e4, description="logits are kept in [-limit, limit] (ours)")
+
+        @model_validator(mode="after")
+        def _combinations(self) -> ViewSpaceGradient.Config:
+            if self.normalisation == "noise" and self.loss != "mse":
+                raise ValueError(
+                    f"normalisation noise: expected loss mse (noise passes through it linearly), got {self.loss}; "
+                    "set loss: mse or another normalisation"
+                )
+            if self.normalisation == "noise" and self.perturbation > 0:
+                raise ValueError("normalisation noise: expected perturbation 0, got more; use robust, ratio or minmax")
+            return self
+
+    traits = Traits(needs_renderer=True)
+
+    def estimate(self, context: FrameContext) -> torch.Tensor:
+        """Logits [N] float32 in [-limit, limit]. Raises ShapeError when a gradient is not finite."""
+        config = self.config
+        magnitude, expected, seen = self._magnitudes(context)
+        logits = torch.full_like(magnitude, config.floor)
+        if not bool(seen.any()) or float(magnitude.max()) == 0.0:
+            return logits.float()
+        values = self._perturb(magnitude[seen], context.index)
+        if config.normalisation == "robust":
+            chosen = robust(values, config.epsilon, config.epsilon_mode == "relative", config.limit)
+        elif config.normalisation == "ratio":
+            chosen = ratio(values, config.floor, config.limit)
+        elif config.normalisation == "minmax":
+            chosen = minmax(values, config.limit)
+        else:
+            chosen = noise_units(values, expected[seen], config.noise_threshold, config.floor)
+        logits[seen] = chosen.clamp(-config.limit, config.limit)
+        return logits.float()
+
+    def _magnitudes(self, context: FrameContext) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """|m| [N] float64, the same expected from noise alone (zeros unless asked for), and who is seen [N] bool."""
+        means = context.gaussians.means
+        total = torch.zeros(len(means), 2, dtype=torch.float64, device=means.device)
+        norms, noise = total[:, 0].clone(), total[:, 0].clone()
+        count = torch.zeros(len(means), dtype=torch.int64, device=means.device)
+        views = len(context.cameras)
+        for view in range(views):
+            gradient, visible = self._gradient(context, view, self._upstream(context, view))
+            total += gradient
+            norms += gradient.norm(dim=1)
+            count += visible
+            if self.config.normalisation == "noise":
+                probe = self._gradient(context, view, self._noise_upstream(context, view))[0].norm(dim=1)
+                noise += probe.square() if self.config.aggregate == "mean-vector" else probe
+        if self.config.aggregate == "mean-vector":
+            return total.norm(dim=1) / max(views, 1), noise.sqrt() / max(views, 1), count > 0
+        divisor = count.clamp_min(1) if self.config.aggregate == "mean-of-norms" else 1
+        return norms / divisor, noise / divisor, count > 0
+
+    def _gradient(self, context: FrameContext, view: int, upstream: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """One backward pass: [N, 2] in the chosen units, float64 (float32 squares vanish below 1e-23); [N] bool."""
+        gradient, visible = context.screen_gradient(view, upstream)
+        check_finite(f"screen gradient of view {view} at frame {context.index}", gradient)
+        result = gradient.double() * visible[:, None]
+        if self.config.units == "ndc":
+            result = result * result.new_tensor([context.cameras.width / 2, context.cameras.height / 2])
+        return result, visible
+
+    def _upstream(self, context: FrameContext, view: int) -> torch.Tensor:
+        """[H, W, 3] derivative of E_t - E_{t-1} with respect to the render of frame t-1."""
+        now, before = context.image(view), context.previous_image(view)
+        if self.config.loss == "mse":
+            return 2 * (before - now) / before.numel()
+        render = context.previous_render(view)
+        pixels = before.shape[0] * before.shape[1]
+        return (self._direction(render - now) - self._direction(render - before)) / pixels
+
+    def _direction(self, difference: torch.Tensor) -> torch.Tensor:
+        """Derivative of sqrt(|d|^2 + eps): d over that root; 0 where render and ground truth agree."""
+        epsilon: float = self.config.distance_epsilon
+        return difference / (difference.square().sum(-1, keepdim=True) + epsilon).sqrt()
+
+    def _noise_upstream(self, context: FrameContext, view: int) -> torch.Tensor:
+        """The upstream gradient that the camera's noise alone could have given: one seeded draw."""
+        before = context.previous_image(view)
+        generator = Rng(self.config.seed).stream(f"s2gs/view-gradient/noise/{view}", context.index)
+        draw = torch.randn(before.shape, generator=generator, dtype=before.dtype).to(before.device)
+        sigma: float = max(context.noise_sigma(view), self.config.noise_minimum)
+        return 2 * sigma * draw / before.numel()
+
+    def _perturb(self, values: torch.Tensor, index: int) -> torch.Tensor:
+        """max(|m| + a std(|m|) n, 0), n standard normal (paper, equation for the noisy VGD; on norms, so that the floor
+        at 0 has a meaning)."""
+        strength: float = self.config.perturbation
+        if strength == 0:
+            return values
+        generator = Rng(self.config.seed).stream("s2gs/view-gradient/perturbation", index)
+        draw = torch.randn(len(values), generator=generator, dtype=torch.float64).to(values.device)
+        return (values + strength * values.std(correction=0) * draw).clamp_min(0)

@@ -1,0 +1,148 @@
+#include "adam.hpp"
+
+#include <cmath>
+
+#include "simd.hpp"
+
+namespace gsstream_cpu::GSS_ISA {
+namespace {
+
+struct Factors {
+  Floats beta1, rest1, beta2, rest2, eps, size, root2;  // size = lr / (1 - beta1^t), root2 = 1 / sqrt(1 - beta2^t)
+};
+
+// One vector; `rate` multiplies the step (per-column learning rates), else 1.
+GSS_INLINE void update_lanes(float* param, const float* grad, float* m, float* v, const Factors& f, Floats rate) {
+  const Floats g = load(grad);
+  const Floats first = f.beta1 * load(m) + f.rest1 * g;
+  const Floats second = f.beta2 * load(v) + f.rest2 * (g * g);
+  store(m, first);
+  store(v, second);
+  const Floats bottom = GSS_ISA::sqrt(second) * f.root2 + f.eps;
+  store(param, load(param) - f.size * rate * (first / bottom));
+}
+
+void update_row(float* param, const float* grad, float* m, float* v, std::size_t columns, const Factors& f,
+                const float* rates) {
+  const Floats one = broadcast(1.0f);
+  std::size_t i = 0;
+  for (; i + LANES <= columns; i += LANES)
+    update_lanes(param + i, grad + i, m + i, v + i, f, rates ? load(rates + i) : one);
+  const std::size_t left = columns - i;
+  if (left == 0) return;
+  float p[LANES] = {}, g[LANES] = {}, a[LANES] = {}, b[LANES] = {}, r[LANES] = {};
+  for (std::size_t k = 0; k < left; ++k) {
+    p[k] = param[i + k], g[k] = grad[i + k], a[k] = m[i + k], b[k] = v[i + k];
+    r[k] = rates ? rates[i + k] : 1.0f;
+  }
+  update_lanes(p, g, a, b, f, load(r));
+  for (std::size_t k = 0; k < left; ++k) param[i + k] = p[k], m[i + k] = a[k], v[i + k] = b[k];
+}
+
+bool all_zero(const float* values, std::size_t count) {
+  for (std::size_t i = 0; i < count; ++i)
+    if (values[i] != 0.0f) return false;
+  return true;
+}
+
+// Corrections of step t. Neighbouring rows mostly share their count, so the caller keeps the last result.
+struct Correction {
+  int64_t step = 0;
+  double size = 0.0, root2 = 0.0;
+
+  GSS_INLINE void set(const AdamJob& job, int64_t t) {
+    if (t == step) return;
+    step = t;
+    const double power = static_cast<double>(t);
+    size = 1.0 / (1.0 - std::pow(job.beta1, power));
+    root2 = 1.0 / std::sqrt(1.0 - std::pow(job.beta2, power));
+  }
+};
+
+GSS_INLINE void set_step(Factors& f, const Correction& c, double lr) {
+  f.size = broadcast(static_cast<float>(lr * c.size));
+  f.root2 = broadcast(static_cast<float>(c.root2));
+}
+
+GSS_INLINE std::size_t row_of(const AdamJob& job, std::size_t i) {
+  return job.ids ? static_cast<std::size_t>(job.ids[i]) : i;
+}
+
+GSS_INLINE const float* grad_of(const AdamJob& job, std::size_t i) {
+  return job.grad + (job.compact ? i : row_of(job, i)) * job.columns;
+}
+
+GSS_INLINE bool touched(const AdamJob& job, std::size_t i) {
+  return !(job.mask && !job.mask[row_of(job, i)]) && !(job.skip_zero_rows && all_zero(grad_of(job, i), job.columns));
+}
+
+GSS_INLINE bool alike(const AdamJob& job, std::size_t a, std::size_t b) {
+  return (!job.step || job.step[a] == job.step[b]) && (!job.lr_rows || job.lr_rows[a] == job.lr_rows[b]);
+}
+
+void update(const AdamJob& job, std::size_t begin, std::size_t end) {
+  Factors f;
+  f.beta1 = broadcast(static_cast<float>(job.beta1));
+  f.rest1 = broadcast(static_cast<float>(1.0 - job.beta1));
+  f.beta2 = broadcast(static_cast<float>(job.beta2));
+  f.rest2 = broadcast(static_cast<float>(1.0 - job.beta2));
+  f.eps = broadcast(static_cast<float>(job.eps));
+  Correction correction;
+  const std::size_t d = job.columns;
+  const double common = job.lr_columns ? 1.0 : job.lr;
+  // Every row alike and visited: no need to look at them one by one.
+  if (!job.ids && !job.mask && !job.step && !job.skip_zero_rows && !job.lr_columns && !job.lr_rows) {
+    correction.set(job, job.dense_step);
+    set_step(f, correction, common);
+    const std::size_t at = begin * d;
+    return update_row(job.param + at, job.grad + at, job.exp_avg + at, job.exp_avg_sq + at, (end - begin) * d, f, nullptr);
+  }
+  for (std::size_t i = begin; i < end;) {
+    if (!touched(job, i)) {
+      ++i;
+      continue;
+    }
+    const std::size_t row = row_of(job, i);
+    // Neighbours in memory that share count and rate form one long row, so that narrow rows fill the vectors.
+    std::size_t run = 1;
+    if (!job.lr_columns)
+      while (i + run < end && row_of(job, i + run) == row + run && alike(job, row, row + run) && touched(job, i + run)) ++run;
+    int64_t step = job.dense_step;
+    if (job.step) {
+      step = static_cast<int64_t>(job.step[row]) + 1;
+      for (std::size_t k = 0; k < run; ++k) job.step[row + k] = static_cast<int32_t>(step);
+    }
+    correction.set(job, step);
+    set_step(f, correction, job.lr_rows ? static_cast<double>(job.lr_rows[row]) : common);
+    const std::size_t at = row * d;
+    update_row(job.param + at, grad_of(job, i), job.exp_avg + at, job.exp_avg_sq + at, run * d, f, job.lr_columns);
+    i += run;
+  }
+}
+
+// x - x is 0 for finite x and NaN otherwise.
+std::size_t first_bad(const float* values, std::size_t count) {
+  std::size_t i = 0;
+  constexpr std::size_t block = 16 * LANES;
+  for (; i + block <= count; i += block) {
+    Floats sum = {};
+    for (std::size_t k = 0; k < block; k += LANES) {
+      const Floats x = load(values + i + k);
+      sum += x - x;
+    }
+    constexpr uint32_t every = (1u << LANES) - 1u;
+    if (bits_of(greater_equal(sum, Floats{})) != every) break;
+  }
+  for (; i < count; ++i)
+    if (!(values[i] - values[i] == 0.0f)) return i;
+  return count;
+}
+
+}  // namespace
+
+const AdamKernels& adam_kernels() {
+  static const AdamKernels table{update, first_bad};
+  return table;
+}
+
+}  // namespace gsstream_cpu::GSS_ISA

@@ -1,1 +1,26 @@
-"""What crosses the wire. Imports no torch."""
+"""What crosses the wire: key, delta and empty packets in an append-only file. Imports no torch.
+
+``encode_*`` and ``decode_*`` are pure functions between records and complete packets; :class:`StreamWriter` and
+:class:`StreamReader` put packets into a file and find them again. Normative text: docs/reference/packet-format.md.
+"""
+
+from gsstream.packet.base import FORMAT_VERSION as FORMAT_VERSION
+from gsstream.packet.base import EncodedPacket as EncodedPacket
+from gsstream.packet.base import PacketKind as PacketKind
+from gsstream.packet.delta import decode_delta as decode_delta
+from gsstream.packet.delta import decode_empty as decode_empty
+from gsstream.packet.delta import encode_delta as encode_delta
+from gsstream.packet.delta import encode_empty as encode_empty
+from gsstream.packet.delta import next_decoders as next_decoders
+from gsstream.packet.delta import quantise_decoders as quantise_decoders
+from gsstream.packet.key import KeyState as KeyState
+from gsstream.packet.key import decode_key as decode_key
+from gsstream.packet.key import encode_key as encode_key
+from gsstream.packet.key import quantise_key as quantise_key
+from gsstream.packet.meta import StreamMeta as StreamMeta
+from gsstream.packet.meta import hash_recipe as hash_recipe
+from gsstream.packet.reader import Entry as Entry
+from gsstream.packet.reader import StreamReader as StreamReader
+from gsstream.packet.state import PlayerState as PlayerState
+from gsstream.packet.state import decode_packet as decode_packet
+from gsstream.packet.writer import StreamWriter as StreamWriter

@@ -1,0 +1,97 @@
+"""Playback: Gaussians at any frame of a stream. Numpy only; the decode functions are the encoder's own."""
+
+from __future__ import annotations
+
+import os
+from bisect import bisect_right
+from collections.abc import Iterator
+from typing import Literal
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.delta import Delta
+from gsstream.core.errors import InputError, PacketError
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.shapes import FloatArray
+from gsstream.packet import Entry, PacketKind, PlayerState, StreamMeta, StreamReader, decode_packet
+        try:
+            if not self.reader.frames:
+                raise self.reader.damage or PacketError("the stream holds no complete packet yet", self.reader.end)
+            self._entries = self.reader.frames
+            self._state = self._decode(None, self._entries[0])
+        except PacketError:
+            self.reader.close()
+            raise
+
+    def __enter__(self) -> Playback:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self.reader.close()
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self._entries)
+
+    @property
+    def frames(self) -> range:
+        """Frame indices that can be asked for."""
+        first = self._entries[0].frame
+        return range(first, first + len(self._entries))
+
+    @property
+    def meta(self) -> StreamMeta:
+        """Meta of the key packet last decoded."""
+        return self._state.meta
+
+    def cameras(self, split: Literal["train", "test"] = "test") -> Cameras:
+        """The rig of a split."""
+        return self.meta.test if split == "test" else self.meta.train
+
+    def entry(self, frame: int) -> Entry:
+        """Kind, offset and size of a frame's packet. Raises InputError outside :attr:`frames`, or what damaged it."""
+        if frame not in self.frames:
+            if self.reader.damage is not None and frame > self.frames[-1]:
+                raise self.reader.damage
+            known = f"{self.frames[0]} to {self.frames[-1]}"
+            raise InputError(f"frame {frame} is not in this stream: expected one of {known}")
+        return self._entries[frame - self.frames[0]]
+
+    def state_at(self, frame: int) -> Gaussians[FloatArray]:
+        """The scene of a frame, decoded from the nearest earlier key packet or the frame last asked for."""
+        return self.player_state(frame).gaussians
+
+    def delta_at(self, frame: int) -> Delta | None:
+        """What a frame's packet changed; None for key and empty packets."""
+        return self.player_state(frame).delta
+
+    def player_state(self, frame: int) -> PlayerState:
+        """Scene, layout, decoders and last delta of a frame. Raises PacketError when a packet on the way is damaged."""
+        self.entry(frame)
+        first = self.frames[0]
+        keys = [e.frame for e in self._entries if e.kind == PacketKind.KEY]
+        start = keys[bisect_right(keys, frame) - 1]
+        state: PlayerState | None = None
+        if start <= self._state.frame <= frame:
+            state, start = self._state, self._state.frame + 1
+        for entry in self._entries[start - first : frame - first + 1]:
+            state = self._state = self._decode(state, entry)
+        assert state is not None
+        return state
+
+    def __iter__(self) -> Iterator[tuple[int, Gaussians[FloatArray]]]:
+        """(frame, scene) in order; then the damage that ends the file, if any, is raised."""
+        for frame in self.frames:
+            yield frame, self.state_at(frame)
+        if self.reader.damage is not None:
+            raise self.reader.damage
+
+    def refresh(self) -> None:
+        """See what a writer has added since."""
+        self.reader.refresh()
+        self._entries = self.reader.frames
+
+    def _decode(self, state: PlayerState | None, entry: Entry) -> PlayerState:
+        return decode_packet(state, self.reader.read(entry), offset=entry.offset)

@@ -13,6 +13,14 @@ from gsstream.core.errors import InputError, PacketError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
 from gsstream.packet import Entry, PacketKind, PlayerState, StreamMeta, StreamReader, decode_packet
+
+
+class Playback:
+    """A stream seen as scenes by frame index. Stepping forward decodes one packet; seeking starts at a key packet."""
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        """Open a stream. Raises SourceError when there is none, PacketError when its first packet is not readable."""
+        self.reader = StreamReader(path)
         try:
             if not self.reader.frames:
                 raise self.reader.damage or PacketError("the stream holds no complete packet yet", self.reader.end)

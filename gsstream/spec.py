@@ -25,7 +25,7 @@ from gsstream import API_VERSION
 
 ENTRY_POINT_GROUP = "gsstream"
 Kind = Literal[
-    "structure", "confidence", "propagation", "gate", "regularizer", "update", "renderer", "source", "metric", "method"
+    "structure", "confidence", "propagation", "gate", "regularizer", "update", "renderer", "loss", "source", "metric", "method"
 ]
 KINDS: tuple[str, ...] = get_args(Kind)
 

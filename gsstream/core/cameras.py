@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,8 @@ class Cameras:
         viewmats: [C, 4, 4] float64 world-to-camera, OpenCV axes (x right, y down, z forward), scene units.
         Ks: [C, 3, 3] float64 intrinsics in pixels, pixel-corner origin (centre of the first pixel is (0.5, 0.5)).
         width, height: image size in pixels, the same for all cameras.
+        near: near plane, scene units; nothing closer to a camera is drawn. On a rig that looks inwards it keeps
+            Gaussians of one camera's wall out of the face of its neighbours.
     """
 
     ids: tuple[str, ...]
@@ -27,6 +29,7 @@ class Cameras:
     Ks: FloatArray
     width: int
     height: int
+    near: float = 0.01
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -49,16 +52,19 @@ class Cameras:
     def select(self, index: Sequence[int]) -> Cameras:
         """The sub-rig with these camera indices."""
         index = list(index)
-        return Cameras(tuple(self.ids[i] for i in index), self.viewmats[index], self.Ks[index], self.width, self.height)
+        ids = tuple(self.ids[i] for i in index)
+        return replace(self, ids=ids, viewmats=self.viewmats[index], Ks=self.Ks[index])
 
     def scaled(self, width: int, height: int) -> Cameras:
         """The same rig at another image size; intrinsics scale with it (exact for pixel-corner origins)."""
         factor = np.diag([width / self.width, height / self.height, 1.0])
-        return Cameras(self.ids, self.viewmats, factor @ self.Ks, width, height)
+        return replace(self, Ks=factor @ self.Ks, width=width, height=height)
 
     def validate(self) -> None:
         """Raise ShapeError for NaN poses, reflected or scaled rotations, non-invertible intrinsics, repeated names."""
         c = len(self)
+        if not self.near > 0:
+            raise ShapeError(f"near plane: expected a positive distance in scene units, got {self.near}")
         check_shape("viewmats", self.viewmats, (c, 4, 4))
         check_shape("Ks", self.Ks, (c, 3, 3))
         if len(set(self.ids)) != c:

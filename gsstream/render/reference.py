@@ -17,7 +17,6 @@ from gsstream.core.part import PartConfig
 from gsstream.render.activations import SH0, activate_opacities, activate_scales, rotation_matrices
 from gsstream.render.base import Renderer, RenderOutput
 
-NEAR = 0.01
 BLUR = 0.3
 ALPHA_CUT = 1 / 255
 ALPHA_MAX = 0.999
@@ -44,8 +43,9 @@ class ReferenceRenderer(Renderer):
         with torch.enable_grad():
             output = self._render(fixed, cameras, view, (0.0, 0.0, 0.0), probe)
             (gradient,) = torch.autograd.grad((output.image * image_gradient).sum(), probe, allow_unused=True)
-        gradient = torch.zeros_like(probe) if gradient is None else gradient
-        return ScreenGradient(gradient.detach(), (gradient != 0).any(1))
+        gradient = torch.zeros_like(probe) if gradient is None else gradient.detach()
+        # Visible does not depend on what the gradient happens to be: a still Gaussian in view has gradient 0.
+        return ScreenGradient(gradient, footprint_in_image(fixed, cameras, view) | (gradient != 0).any(1))
 
     def _render(
         self,
@@ -60,7 +60,7 @@ class ReferenceRenderer(Renderer):
         if probe is not None:
             means2d = means2d + probe
         order = torch.argsort(depths.detach(), stable=True)
-        order = order[depths.detach()[order] > NEAR]
+        order = order[depths.detach()[order] > cameras.near]
         parts = (means2d[order], conics[order], colors[order], opacities[order])
         images, alphas = [], []
         for start in range(0, cameras.height, self.config.rows_per_pass):
@@ -81,7 +81,7 @@ def project(
     points = gaussians.means @ rotation.T + translation  # [N, 3] camera space
     # Points at or behind the camera are culled later; a safe depth keeps their (unused) arithmetic finite.
     depth = points[:, 2]
-    safe = torch.where(depth > NEAR, depth, torch.ones_like(depth))
+    safe = torch.where(depth > cameras.near, depth, torch.ones_like(depth))
     K = torch.as_tensor(cameras.Ks[view], dtype=dtype)
     fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
     width, height = cameras.width, cameras.height
@@ -98,6 +98,17 @@ def project(
     center = -(rotation.T @ translation)
     colors = evaluate_sh(gaussians.sh0, gaussians.shN, gaussians.means - center)
     return means2d, torch.linalg.inv(covariance), colors, depth, activate_opacities(gaussians.opacities)
+
+
+def footprint_in_image(gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int) -> torch.Tensor:
+    """[N] bool: in front of the camera, and the box around alpha >= ALPHA_CUT holds or crosses the pixel centres."""
+    means2d, conics, _, depths, opacities = project(gaussians, cameras, view)
+    variances = torch.linalg.inv(conics).diagonal(dim1=1, dim2=2)  # [N, 2] px^2
+    reach = 2 * torch.log(opacities / ALPHA_CUT)
+    half = (reach[:, None].clamp_min(0) * variances).sqrt()
+    far_corner = torch.tensor([cameras.width, cameras.height], dtype=means2d.dtype) - 0.5
+    inside = ((means2d + half >= 0.5) & (means2d - half <= far_corner)).all(1)
+    return inside & (depths > NEAR) & (reach >= 0)
 
 
 def composite(

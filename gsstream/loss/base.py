@@ -1,0 +1,28 @@
+"""Loss: a value and its gradient with respect to the rendered image, without an autograd graph."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any
+
+import torch
+
+from gsstream.core.part import Part
+
+
+class Loss(Part):
+    """A per-image loss. ``prepare`` is called once per target and frame, ``evaluate`` once per iteration."""
+
+    @abstractmethod
+    def prepare(self, target: torch.Tensor) -> Any:
+        """Precompute what depends only on the target [H, W, 3]; opaque to the engine."""
+
+    @abstractmethod
+    def evaluate(
+        self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
+    ) -> tuple[float, torch.Tensor]:
+        """Return the loss of ``image`` [H, W, 3] and its gradient [H, W, 3].
+
+        With a tile mask [ceil(H / 16), ceil(W / 16)] the sum runs over the pixels of active tiles only, divided by the
+        number of all pixels, so that a full mask equals no mask.
+        """

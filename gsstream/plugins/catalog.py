@@ -14,8 +14,8 @@ from gsstream.core.errors import PluginUnavailable, UnknownName
 from gsstream.plugins.discovery import Discovered, PluginFault, discover, spec_key
 from gsstream.spec import ComponentSpec, MethodSpec
 
-#: The abstract base class of each kind, named so that listing parts imports none of them. Kinds that are Protocols
-#: (source, metric, method) have no class to inherit from.
+#: The abstract base class of each kind, named so that listing parts imports none of them. The kinds source, metric and
+#: method are Protocols: there is no class to inherit from. A source's target is called as target(uri, scale).
 CONTRACTS: Mapping[str, str] = {
     "structure": "gsstream.structure.base:Structure",
     "confidence": "gsstream.confidence.base:ConfidenceEstimator",
@@ -77,10 +77,7 @@ class Catalog:
             # A plugin that died at import declared nothing: its entry point's name is all that is known of it.
             declared = {spec_key(spec) for spec in plugin.declared}
             if (kind, name) in declared or (not declared and plugin.name == name):
-                raise PluginUnavailable(
-                    f"{kind} {name!r} is not available: plugin {plugin.name!r} (from {plugin.distribution} "
-                    f"{plugin.version}) is in quarantine: {plugin.reason}"
-                ) from plugin.error
+                raise plugin.unavailable(f"{kind} {name!r}") from plugin.error
         broken = len(self.quarantine)
         hint = f" ({broken} plugin{'s'[: broken > 1]} could not be loaded: see 'gsstream plugins')" if broken else ""
         raise UnknownName(kind, name, self.names(kind), hint)

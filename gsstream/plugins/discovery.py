@@ -21,7 +21,7 @@ from typing import Any
 import pluggy
 
 from gsstream import API_VERSION, __version__
-from gsstream.core.errors import suggest
+from gsstream.core.errors import PluginUnavailable, suggest
 from gsstream.core.versions import version_problem
 from gsstream.plugins import builtin, hookspecs
 from gsstream.spec import ENTRY_POINT_GROUP, ComponentSpec, MethodSpec
@@ -60,6 +60,13 @@ class Discovered:
             return ""
         text = (str(self.error).strip() or "no message").splitlines()[0]
         return text if isinstance(self.error, PluginFault) else f"{type(self.error).__name__}: {text}"
+
+    def unavailable(self, what: str) -> PluginUnavailable:
+        """The error for somebody who asks for ``what``, a part of this quarantined plugin; raise it from ``error``."""
+        return PluginUnavailable(
+            f"{what} is not available: plugin {self.name!r} (from {self.distribution} {self.version}) is in quarantine: "
+            f"{self.reason}"
+        )
 
 
 def discover() -> list[Discovered]:

@@ -1,0 +1,18 @@
+"""Plain tables for listings: aligned columns, no colour, stable for scripts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+
+def table(heading: Sequence[str], rows: Iterable[Sequence[str]], indent: str = "") -> str:
+    """Rows under a heading, every column as wide as its widest cell; the last one is not padded."""
+    lines = [tuple(heading), *(tuple(row) for row in rows)]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(heading))]
+    padded = ([cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines)
+    return "\n".join(indent + "  ".join(cells).rstrip() for cells in padded)
+
+
+def plural(number: int, noun: str) -> str:
+    """"1 part", "2 parts"."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"

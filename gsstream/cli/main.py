@@ -1,0 +1,98 @@
+"""The command table. Nothing heavy is imported here: each command imports what it needs when it runs."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import typer
+from typer.main import get_command
+
+from gsstream import API_VERSION, __version__
+from gsstream.cli import methods, plugins, recipe, run, streams
+from gsstream.core.errors import GsstreamError, InputError
+
+
+@dataclass
+class GlobalOptions:
+    """What the options before the command's name say."""
+
+    debug: bool = False
+
+
+app = typer.Typer(
+    name="gsstream",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _version(show: bool) -> None:
+    if show:
+        typer.echo(f"gsstream {__version__} (component API {API_VERSION})")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    context: typer.Context,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    _version_wanted: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Online free-viewpoint video as a stream of 3D Gaussians, built from swappable parts."""
+    context.obj.debug = debug
+
+
+app.command(name="run")(run.run)
+app.command(name="play")(streams.play)
+app.command(name="evaluate")(streams.evaluate)
+app.command(name="info")(streams.info)
+app.add_typer(methods.app, name="methods")
+app.add_typer(plugins.app, name="plugins")
+app.add_typer(recipe.app, name="recipe")
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run one command and exit: 0 done, 2 something given is wrong, 130 interrupted, 1 everything else."""
+    sys.exit(run_command(sys.argv[1:] if argv is None else argv))
+
+
+def run_command(argv: Sequence[str]) -> int:
+    """Run one command; errors become one clear message on stderr and an exit code."""
+    options = GlobalOptions()
+    with warnings.catch_warnings():
+        warnings.showwarning = _show_warning
+        try:
+            code = get_command(app).main(list(argv), prog_name="gsstream", standalone_mode=False, obj=options)
+        except typer.TyperException as error:
+            error.show()  # type: ignore[attr-defined]  # every error of the parser has it; typer's base class hides it
+            return error.exit_code
+        except (typer.Abort, KeyboardInterrupt):
+            return _interrupted()
+        except GsstreamError as error:
+            if options.debug:
+                traceback.print_exc()
+            else:
+                typer.echo(f"error: {error}", err=True)
+            return 2 if isinstance(error, InputError) else 1
+    if code == 130:
+        return _interrupted()
+    return code if isinstance(code, int) else 0
+
+
+def _interrupted() -> int:
+    typer.echo("interrupted", err=True)
+    return 130
+
+
+def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    typer.echo(f"warning: {message}", err=True)

@@ -1,0 +1,134 @@
+"""``gsstream plugins``: every plugin and part, healthy or quarantined, and what a part can be told."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from gsstream.cli.listing import plural, table
+
+if TYPE_CHECKING:
+    from gsstream.plugins.catalog import Catalog, Entry
+
+app = typer.Typer(help="List plugins and parts, or show one part.", rich_markup_mode=None)
+
+
+@app.callback(invoke_without_command=True)
+def plugins(
+    context: typer.Context,
+    check: Annotated[bool, typer.Option("--check", help="Import every part (slow); report those that fail.")] = False,
+) -> None:
+    """List all plugins, healthy and quarantined, and the parts they ship."""
+    if context.invoked_subcommand is not None:
+        return
+    from gsstream.plugins.catalog import load_catalog
+    from gsstream.spec import KINDS
+
+    catalog = load_catalog()
+    typer.echo(table(("PLUGIN", "FROM", "STATUS"), _plugin_rows(catalog)))
+    order = {kind: place for place, kind in enumerate(KINDS)}
+    parts = sorted(catalog.entries.items(), key=lambda item: (order[item[0][0]], item[0][1]))
+    rows = [(kind, name, entry.distribution, entry.spec.summary) for (kind, name), entry in parts]
+    typer.echo("\n" + table(("KIND", "NAME", "FROM", "SUMMARY"), rows))
+    if check and not _check(catalog):
+        raise typer.Exit(1)
+
+
+def _plugin_rows(catalog: Catalog) -> Iterator[tuple[str, str, str]]:
+    from gsstream.spec import MethodSpec
+
+    for plugin in catalog.plugins:
+        if plugin.specs is None:
+            status = f"quarantined: {plugin.reason}"
+        else:
+            methods = sum(isinstance(spec, MethodSpec) for spec in plugin.specs)
+            status = f"{plural(len(plugin.specs) - methods, 'part')}, {plural(methods, 'method')}"
+        yield plugin.name, f"{plugin.distribution} {plugin.version}", status
+
+
+def _check(catalog: Catalog) -> bool:
+    """Resolve everything; print one line per failure."""
+    from gsstream.core.errors import PluginUnavailable
+    from gsstream.spec import MethodSpec
+
+    failures = []
+    for (kind, name), entry in catalog.entries.items():
+        try:
+            if isinstance(entry.spec, MethodSpec):
+                catalog.recipe_path(name)
+            else:
+                catalog.resolve(kind, name)
+        except PluginUnavailable as error:
+            failures.append(str(error))
+    typer.echo(f"\n{len(catalog.entries) - len(failures)} of {len(catalog.entries)} declarations hold")
+    for failure in failures:
+        typer.echo(f"  failed: {failure}")
+    return not failures
+
+
+@app.command()
+def show(part: Annotated[str, typer.Argument(help="NAME, or KIND/NAME where several parts share a name.")]) -> None:
+    """Show a part's settings with their defaults, ranges and meaning."""
+    from gsstream.core.errors import UnknownName
+    from gsstream.plugins.catalog import load_catalog
+    from gsstream.spec import KINDS
+
+    catalog = load_catalog()
+    kind, slash, name = part.rpartition("/")
+    if slash and kind not in KINDS:
+        raise UnknownName("kind of part", kind, KINDS)
+    found = [key for key in catalog.entries if key[1] == name and kind in ("", key[0])]
+    if not found:
+        for plugin in catalog.quarantine:
+            if name == plugin.name or any(spec.name == name for spec in plugin.declared):
+                raise plugin.unavailable(part) from plugin.error
+        raise UnknownName("part", name, {key[1] for key in catalog.entries if kind in ("", key[0])})
+    for place, key in enumerate(found):
+        typer.echo(("\n" if place else "") + _describe(catalog, *key, catalog.entries[key]))
+
+
+def _describe(catalog: Catalog, kind: str, name: str, entry: Entry) -> str:
+    from gsstream.spec import MethodSpec
+
+    heading = f"{kind} {name} (from {entry.origin}): {entry.spec.summary}"
+    if isinstance(entry.spec, MethodSpec):
+        return f"{heading}\nsee: gsstream methods show {name}"
+    target = catalog.resolve(kind, name)
+    lines = [heading, f"target: {entry.spec.target}, component API {entry.spec.api}"]
+    config = getattr(target, "Config", None)
+    rows = list(_fields(config.model_json_schema(), "")) if config is not None else []
+    if not rows:
+        return "\n".join([*lines, "no settings"])
+    return "\n".join([*lines, "", table(("SETTING", "TYPE", "DEFAULT", "MEANING"), rows)])
+
+
+def _fields(schema: dict[str, Any], prefix: str, root: dict[str, Any] | None = None) -> Iterator[tuple[str, ...]]:
+    """One row per setting of a JSON schema; settings that hold settings are followed."""
+    root = root or schema
+    for name, field in schema.get("properties", {}).items():
+        inner = field
+        if reference := field.get("$ref"):
+            inner = root["$defs"][reference.rpartition("/")[2]]
+        if inner.get("properties"):
+            defaults = field.get("default") or {}
+            for row in _fields(inner, f"{prefix}{name}.", root):
+                key = row[0].removeprefix(f"{prefix}{name}.")
+                yield (row[0], row[1], repr(defaults[key]) if key in defaults else row[2], row[3])
+            continue
+        default = repr(field["default"]) if "default" in field else "required"
+        yield f"{prefix}{name}", _type(inner), default, field.get("description", "")
+
+
+_BOUNDS = (("minimum", ">="), ("exclusiveMinimum", ">"), ("maximum", "<="), ("exclusiveMaximum", "<"))
+
+
+def _type(field: dict[str, Any]) -> str:
+    """"number > 0, <= 1" or "one of a, b"."""
+    if "anyOf" in field:
+        return " or ".join(_type(option) for option in field["anyOf"])
+    if "enum" in field:
+        return "one of " + ", ".join(str(choice) for choice in field["enum"])
+    bounds = ", ".join(f"{sign} {field[key]}" for key, sign in _BOUNDS if key in field)
+    return f"{field.get('type', 'any')} {bounds}".rstrip()

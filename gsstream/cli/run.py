@@ -1,0 +1,54 @@
+"""``gsstream run``: a recording in, a stream and its measurements out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def run(
+    source: Annotated[
+        str, typer.Option("--source", help="Recording: demo, synthetic:KEY=VALUE&..., or a folder with cameras.json.")
+    ],
+    out: Annotated[Path, typer.Option("--out", help="Output folder; must not hold another run.")],
+    method: Annotated[
+        str | None, typer.Option("--method", help="Method (see 'gsstream methods'); by default the recipe file's.")
+    ] = None,
+    recipe: Annotated[
+        Path | None, typer.Option("--recipe", help="YAML file with differences from the method's recipe.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change a value, e.g. gate.temperature=0.3; repeatable."),
+    ] = None,
+    frames: Annotated[int | None, typer.Option("--frames", help="Number of frames; all by default.")] = None,
+    scale: Annotated[float | None, typer.Option("--scale", help="Shrink images by this factor in (0, 1].")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of every random stream.")] = None,
+    renderer: Annotated[str | None, typer.Option("--renderer", help="Renderer: auto, cpu, reference, ...")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the run that --out holds.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run that --out holds.")] = False,
+    no_video: Annotated[bool, typer.Option("--no-video", help="Write no video, only still pictures.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print only warnings and errors.")] = False,
+) -> None:
+    """Encode a recording as a stream of 3D Gaussians.
+
+    The recipe of the run is the method's, changed by --recipe FILE, then by --set and the short options.
+    """
+    from gsstream.engine.output import prepare_output
+    from gsstream.plugins.catalog import load_catalog
+    from gsstream.recipe.load import resolve_recipe
+
+    overrides = [("--set", text) for text in settings or ()]
+    short = {"frames": frames, "scale": scale, "seed": seed, "renderer": renderer}
+    overrides += [(f"--{key}", f"{key}={value}") for key, value in short.items() if value is not None]
+    catalog = load_catalog()
+    resolved = resolve_recipe(method, catalog.recipe_path, recipe, overrides)
+    # The slow imports come last, so that a mistake on the command line is answered at once.
+    from gsstream.engine.assemble import assemble
+    from gsstream.engine.session import run as run_session
+
+    assembly = assemble(resolved, catalog)
+    prepare_output(out, resume=resume, overwrite=overwrite)
+    run_session(assembly, source, out, resume=resume, video=not no_video, quiet=quiet)

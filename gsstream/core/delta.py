@@ -75,6 +75,7 @@ def apply_delta(gaussians: Gaussians[FloatArray], layout: Layout, delta: Delta) 
     Rows behind closed gates keep their bits. All arithmetic is float32 in a fixed order, so two calls on one machine
     agree bitwise. Raises ShapeError when the delta does not fit the scene.
     """
+    _check_fit(layout, delta)
     index = active_rows(layout, delta.gates)
     if len(index) == 0:
         return gaussians
@@ -95,6 +96,27 @@ def apply_delta(gaussians: Gaussians[FloatArray], layout: Layout, delta: Delta) 
         out[index] = base[index] + (change * scale[:, None]).reshape(len(index), *base.shape[1:])
         changed[name] = out
     return Gaussians(**changed)
+
+
+def _check_fit(layout: Layout, delta: Delta) -> None:
+    if delta.gates.shape != layout.node_counts.shape:
+        raise ShapeError(
+            f"gates: expected one for each of {len(layout.node_counts)} nodes, got shape {list(delta.gates.shape)}; "
+            "the packet belongs to another scene"
+        )
+    if delta.gates.size and int(delta.gates.max()) > delta.num_levels:
+        raise ShapeError(f"gates: expected levels 0 to {delta.num_levels}, got {int(delta.gates.max())}")
+    for name, symbols in delta.symbols.items():
+        if name not in ATTRIBUTES:
+            raise ShapeError(f"symbols: expected attributes among {', '.join(ATTRIBUTES)}, got {name!r}")
+        if name not in delta.steps:
+            raise ShapeError(f"steps: expected one for every coded attribute, got none for {name!r}")
+        decoder = delta.decoders.get(name)
+        channels = symbols.shape[1] if decoder is None else decoder.shape[0]
+        if symbols.shape[1] != channels:
+            raise ShapeError(
+                f"decoder of {name}: expected {symbols.shape[1]} rows (one per latent channel), got {channels}"
+            )
 
 
 def decode_residual(symbols: IntArray, step: float, decoder: FloatArray | None) -> FloatArray:

@@ -20,10 +20,21 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 
 class GsstreamError(Exception):
-    """Base of every error raised on purpose."""
+    """Base of every error raised on purpose. Survives pickling with its attributes, so workers can report it."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restore, (type(self), self.args, self.__dict__)
+
+
+def _restore(kind: type[GsstreamError], args: tuple[Any, ...], facts: dict[str, Any]) -> GsstreamError:
+    # Past the constructor: it takes the facts from which the message in ``args`` was once made.
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(facts)
+    return error
 
 
 class InputError(GsstreamError, ValueError):

@@ -40,8 +40,11 @@ class Hierarchy:
     def validate(self) -> None:
         """Raise ShapeError when the forest is not one."""
         m = self.num_nodes
+        if tuple(self.level.shape) != (m,):
+            raise ShapeError(f"level: expected shape [{m}] like parent, got {list(self.level.shape)}")
         if self.num_gaussians and (int(self.node_of.min()) < 0 or int(self.node_of.max()) >= m):
-            raise ShapeError(f"node_of: expected values in [0, {m}), got up to {int(self.node_of.max())}")
+            got = f"{int(self.node_of.min())} to {int(self.node_of.max())}"
+            raise ShapeError(f"node_of: expected values in [0, {m}), got {got}")
         if m == 0:
             return
         if int(self.parent.min()) < 0 or int(self.parent.max()) >= m:

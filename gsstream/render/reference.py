@@ -107,8 +107,8 @@ def footprint_in_image(gaussians: Gaussians[torch.Tensor], cameras: Cameras, vie
     reach = 2 * torch.log(opacities / ALPHA_CUT)
     half = (reach[:, None].clamp_min(0) * variances).sqrt()
     far_corner = torch.tensor([cameras.width, cameras.height], dtype=means2d.dtype) - 0.5
-    inside = ((means2d + half >= 0.5) & (means2d - half <= far_corner)).all(1)
-    return inside & (depths > NEAR) & (reach >= 0)
+    inside: torch.Tensor = ((means2d + half >= 0.5) & (means2d - half <= far_corner)).all(1)
+    return inside & (depths > cameras.near) & (reach >= 0)
 
 
 def composite(

@@ -67,8 +67,12 @@ def init_latents(rule: UpdateRule, base: Gaussians[torch.Tensor]) -> dict[str, t
 
 
 def quantise(latents: torch.Tensor, step: float) -> torch.Tensor:
-    """Round to multiples of ``step`` with a straight-through gradient (ours; the released code rounds only in its size)."""
-    return latents + (torch.round(latents.detach() / step) * step - latents.detach())
+    """Round to multiples of ``step`` with a straight-through gradient (ours; the released code never rounds here).
+
+    The value is exactly symbol * step, as the decoder has it: latents - latents is 0, whereas latents plus the rounding
+    error would be an ulp off.
+    """
+    return torch.round(latents.detach() / step) * step + (latents - latents.detach())
 
 
 def apply_residual(

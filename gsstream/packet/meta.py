@@ -18,7 +18,8 @@ from gsstream.core.errors import PacketError, ShapeError
 CONVENTIONS: Mapping[str, str] = {
     "viewmats": "world-to-camera, OpenCV axes", "Ks": "pixels, pixel-corner origin", "quats": "wxyz",
     "scales": "log", "opacities": "logit", "colour": "0.5 + sum of real spherical harmonics, clamped at 0",
-    "blur": "0.3 px", "alpha": "cut 1/255, clamp 0.999, transmittance above 1e-4", "near": "0.01",
+    "blur": "0.3 px", "alpha": "cut 1/255, clamp 0.999, transmittance above 1e-4",
+    "near": "scene units, per rig",
 }  # fmt: skip
 
 
@@ -102,7 +103,7 @@ def meta_from_json(data: bytes) -> StreamMeta:
 
 def _rig(cameras: Cameras) -> dict[str, Any]:
     return {
-        "ids": list(cameras.ids), "width": cameras.width, "height": cameras.height,
+        "ids": list(cameras.ids), "width": cameras.width, "height": cameras.height, "near": cameras.near,
         "viewmats": np.asarray(cameras.viewmats, np.float64).reshape(-1, 16).tolist(),
         "Ks": np.asarray(cameras.Ks, np.float64).reshape(-1, 9).tolist(),
     }  # fmt: skip
@@ -112,7 +113,7 @@ def _cameras(value: Any) -> Cameras:
     ids = tuple(_text(name) for name in value["ids"])
     viewmats = np.asarray(value["viewmats"], np.float64).reshape(len(ids), 4, 4)
     Ks = np.asarray(value["Ks"], np.float64).reshape(len(ids), 3, 3)
-    cameras = Cameras(ids, viewmats, Ks, int(value["width"]), int(value["height"]))
+    cameras = Cameras(ids, viewmats, Ks, int(value["width"]), int(value["height"]), float(value["near"]))
     if not (0 <= cameras.width <= 1 << 16 and 0 <= cameras.height <= 1 << 16):
         raise ValueError(f"image size {cameras.width} x {cameras.height} is beyond 65536")
     cameras.validate()

@@ -1,1 +1,10 @@
-"""What is measured on decoded frames."""
+"""What is measured on decoded frames. Numpy only."""
+
+from gsstream.metrics.moving import moving_mask as moving_mask
+from gsstream.metrics.moving import psnr_moving as psnr_moving
+from gsstream.metrics.noise import noise_sigma as noise_sigma
+from gsstream.metrics.psnr import psnr as psnr
+from gsstream.metrics.ssim import SSIM_VARIANT as SSIM_VARIANT
+from gsstream.metrics.ssim import ssim as ssim
+from gsstream.metrics.trend import peak_memory_mb as peak_memory_mb
+from gsstream.metrics.trend import slope_per_100 as slope_per_100

@@ -1,0 +1,30 @@
+"""Camera noise, measured between two frames without knowing what moved."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gsstream.core.shapes import FloatArray
+from gsstream.metrics.psnr import check_pair
+
+#: Standard deviation of a normal variable over its median absolute deviation.
+MAD_TO_SIGMA = 1.4826
+
+
+def noise_sigma(first: FloatArray, second: FloatArray) -> float:
+    """Standard deviation of one camera's noise in one image, [0, 1] units.
+
+    MAD of the differences times 1.4826, divided by sqrt 2 (a difference holds the noise of two images). The median is
+    taken out first, so an even change of exposure does not count; fewer than half of the pixels may move.
+
+    Arguments:
+        first, second: [H, W, 3] in [0, 1], two frames of one camera.
+
+    Images of 8 bits give a coarse answer (steps of about 1/255), and 0 where most pixels do not change at all.
+    """
+    check_pair(first, second)
+    difference = np.asarray(second, np.float32) - np.asarray(first, np.float32)
+    spread = np.median(np.abs(difference - np.median(difference)))
+    return float(MAD_TO_SIGMA * spread / math.sqrt(2))

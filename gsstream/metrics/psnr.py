@@ -1,0 +1,39 @@
+"""Peak signal-to-noise ratio of images in [0, 1]."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gsstream.core.errors import ShapeError
+from gsstream.core.shapes import FloatArray
+
+Mask = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+
+
+def psnr(image: FloatArray, target: FloatArray, mask: Mask | None = None) -> float:
+    """-10 log10 of the mean squared error, dB; peak 1. One image, one number: means over images are means of dB.
+
+    Arguments:
+        image, target: [H, W, 3] in [0, 1]. Values outside are not clamped here; what is shown is clamped before.
+        mask: [H, W] bool, the pixels that count; default all.
+
+    Returns inf for equal images, nan for an empty mask. Raises ShapeError when shapes disagree.
+    """
+    check_pair(image, target)
+    error = (np.asarray(image, np.float64) - target) ** 2
+    if mask is not None:
+        if mask.shape != error.shape[:2]:
+            raise ShapeError(f"mask: expected {list(error.shape[:2])}, got {list(mask.shape)}")
+        error = error[mask]
+    if error.size == 0:
+        return math.nan
+    mean = float(error.mean())
+    return math.inf if mean == 0 else -10 * math.log10(mean)
+
+
+def check_pair(image: FloatArray, target: FloatArray) -> None:
+    """Raise ShapeError unless both are [H, W, 3] of one size."""
+    if image.shape != target.shape or image.ndim != 3 or image.shape[2] != 3:
+        raise ShapeError(f"expected two [H, W, 3] images of one size, got {list(image.shape)} and {list(target.shape)}")

@@ -1,0 +1,97 @@
+"""Camera paths computed from a calibrated rig: a turn around what it looks at, a spiral around its middle."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import ShapeError
+from gsstream.core.shapes import FloatArray
+
+PATHS = ("orbit", "spiral")
+
+
+def camera_path(kind: str, rig: Cameras, number: int) -> Cameras:
+    """``number`` cameras along the path ``kind`` (one of PATHS), with the intrinsics of the rig's first camera."""
+    if kind not in PATHS:
+        raise ShapeError(f"no camera path {kind!r}; known: {', '.join(PATHS)}")
+    if len(rig) == 0 or number < 1:
+        raise ShapeError(f"a path needs a rig and at least one frame, got {len(rig)} cameras and {number} frames")
+    return orbit(rig, number) if kind == "orbit" else spiral(rig, number)
+
+
+def focus_point(rig: Cameras) -> FloatArray:
+    """[3] point nearest to all optical axes in the least-squares sense.
+
+    Parallel axes (or a single camera) leave the distance open; then it is the rig's extent in front of its middle.
+    """
+    axes, centers = rig.viewmats[:, 2, :3], rig.centers
+    across = np.eye(3)[None] - axes[:, :, None] * axes[:, None, :]
+    matrix = across.sum(0)
+    if np.linalg.cond(matrix) > 1e6:
+        return np.asarray(centers.mean(0) + rig.extent * axes.mean(0))
+    return np.asarray(np.linalg.solve(matrix, np.einsum("cij,cj->i", across, centers)))
+
+
+def orbit(rig: Cameras, number: int) -> Cameras:
+    """One full turn around the focus point at the rig's mean distance and height, starting at its first camera."""
+    focus, up = focus_point(rig), _up(rig)
+    offsets = rig.centers - focus
+    height = float((offsets @ up).mean())
+    radius = float(np.linalg.norm(offsets - np.outer(offsets @ up, up), axis=1).mean())
+    start = offsets[0] - (offsets[0] @ up) * up
+    if np.linalg.norm(start) < 1e-9:
+        start = np.cross(up, [1.0, 0, 0]) if abs(up[0]) < 0.9 else np.cross(up, [0, 1.0, 0])
+    first = start / np.linalg.norm(start)
+    second = np.cross(up, first)
+    angle = np.arange(number) * (2 * np.pi / number)
+    ring = radius * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
+    return _look_at(rig, focus + height * up + ring, focus, up)
+
+
+def spiral(rig: Cameras, number: int, turns: float = 2.0) -> Cameras:
+    """A spiral around the rig's mean position, half as wide as the rig itself, always looking at the focus point."""
+    focus, up, centers = focus_point(rig), _up(rig), rig.centers
+    middle = centers.mean(0)
+    forward = focus - middle
+    if np.linalg.norm(forward) < 1e-3 * rig.extent:
+        # A ring of cameras around the scene: its middle is the scene itself, so start from one camera.
+        middle = centers[0]
+        forward = focus - middle
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    right = right / np.linalg.norm(right)
+    above = np.cross(right, forward)
+    spread = np.abs(np.stack([(centers - middle) @ right, (centers - middle) @ above]))
+    reach = np.minimum(0.5 * np.percentile(spread, 80, axis=1), 0.25 * np.linalg.norm(focus - middle))
+    reach = np.maximum(reach, 0.02 * np.linalg.norm(focus - middle))
+    along = np.arange(number) / number
+    angle = 2 * np.pi * turns * along
+    size = np.sin(np.pi * along)  # opens and closes, so that the path loops
+    moves = np.outer(size * np.cos(angle) * reach[0], right) + np.outer(size * np.sin(angle) * reach[1], above)
+    return _look_at(rig, middle + moves, focus, up)
+
+
+def _up(rig: Cameras) -> FloatArray:
+    """Unit mean of the cameras' up directions (minus their y axes)."""
+    up = -rig.viewmats[:, 1, :3].mean(0)
+    norm = np.linalg.norm(up)
+    # Cameras rolled against each other may cancel; the first one then decides.
+    return np.asarray(up / norm if norm > 1e-3 else -rig.viewmats[0, 1, :3])
+
+
+def _look_at(rig: Cameras, centers: FloatArray, target: FloatArray, up: FloatArray) -> Cameras:
+    forward = target - centers
+    forward = forward / np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, up)
+    norm = np.linalg.norm(right, axis=1, keepdims=True)
+    # Straight along "up" there is no horizon; the first camera's x axis stands in.
+    right = np.where(norm > 1e-6, right / np.maximum(norm, 1e-6), rig.viewmats[0, 0, :3])
+    down = np.cross(forward, right)
+    down = down / np.linalg.norm(down, axis=1, keepdims=True)
+    rotation = np.stack([np.cross(down, forward), down, forward], 1)
+    viewmats = np.tile(np.eye(4), (len(centers), 1, 1))
+    viewmats[:, :3, :3] = rotation
+    viewmats[:, :3, 3] = -np.einsum("cij,cj->ci", rotation, centers)
+    ids = tuple(f"path-{i:04d}" for i in range(len(centers)))
+    return Cameras(ids, viewmats, np.tile(rig.Ks[0], (len(centers), 1, 1)), rig.width, rig.height)

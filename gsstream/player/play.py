@@ -1,0 +1,141 @@
+"""Play a stream into pictures: a folder of PNGs, an animated WebP or GIF, or an MP4 (extra ``video``)."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import InputError, OutputError
+from gsstream.core.shapes import FloatArray
+from gsstream.player.paths import PATHS, camera_path
+from gsstream.player.playback import Playback
+from gsstream.player.render import PlayerRenderer, render, to_bytes
+
+_ANIMATED = (".webp", ".gif")
+Bytes = np.ndarray[Any, np.dtype[np.uint8]]
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """What was written: ``path`` (a file, or a folder of PNGs) with ``frames`` pictures."""
+
+    path: Path
+    frames: int
+
+
+def play(
+    stream: str | os.PathLike[str], out: str | os.PathLike[str], *, camera: str | None = None,
+    frames: Sequence[int] | None = None, fps: float | None = None, renderer: PlayerRenderer | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Played:  # fmt: skip
+    """Render a stream from one camera.
+
+    Arguments:
+        out: ``.mp4`` needs PyAV, and becomes a folder of PNGs (with a warning) where it is missing; ``.webp`` and
+            ``.gif`` are animated pictures; anything else is a folder.
+        camera: id of a train or test camera, "orbit" or "spiral"; default: the first test, else the first train camera.
+        frames: frame indices in the order to be shown; default: all.
+        fps: pictures per second; default: that of the recording.
+        progress: called with (done, total) after every picture.
+
+    Raises InputError for an unknown camera or frame, PacketError for a damaged stream, OutputError when ``out`` cannot
+    be written.
+    """
+    with Playback(stream) as playback:
+        chosen = list(playback.frames if frames is None else frames)
+        if not chosen:
+            raise InputError("no frames to play: expected at least one frame index")
+        cameras = choose_cameras(playback, camera, len(chosen))
+        for frame in chosen:
+            playback.entry(frame)
+        images = _images(playback, chosen, cameras, renderer, progress)
+        rate = playback.meta.fps if fps is None else fps
+        try:
+            return _write(Path(out), images, chosen, rate)
+        except OSError as error:
+            raise OutputError(f"cannot write {out}: {error.strerror or error}") from error
+
+
+def choose_cameras(playback: Playback, camera: str | None, number: int) -> Cameras:
+    """One camera for all pictures (by id), or ``number`` cameras along a path."""
+    meta = playback.meta
+    if camera in PATHS:
+        return camera_path(camera, meta.train if len(meta.train) else meta.test, number)
+    return meta.camera((*meta.test.ids, *meta.train.ids)[0] if camera is None else camera)
+
+
+def _images(
+    playback: Playback, frames: Sequence[int], cameras: Cameras, renderer: PlayerRenderer | None,
+    progress: Callable[[int, int], None] | None,
+) -> Iterator[Bytes]:  # fmt: skip
+    background = playback.meta.background
+    last: tuple[object, int, FloatArray] | None = None
+    for i, frame in enumerate(frames):
+        scene, view = playback.state_at(frame), min(i, len(cameras) - 1)
+        # An empty packet keeps the very same scene object: nothing has to be rendered again.
+        if last is None or last[0] is not scene or last[1] != view:
+            last = (scene, view, render(scene, cameras, view, background, renderer))
+        yield to_bytes(last[2])
+        if progress is not None:
+            progress(i + 1, len(frames))
+
+
+def _write(out: Path, images: Iterator[Bytes], frames: Sequence[int], fps: float) -> Played:
+    suffix = out.suffix.lower()
+    if suffix == ".mp4":
+        if importlib.util.find_spec("av") is not None:
+            return _write_video(out, images, fps)
+        warnings.warn(
+            f"writing MP4 needs PyAV (pip install 'gsstream[video]'); PNGs go to {out.with_suffix('')} instead",
+            stacklevel=3,
+        )
+        out = out.with_suffix("")
+    if suffix in _ANIMATED:
+        return _write_animation(out, images, fps)
+    out.mkdir(parents=True, exist_ok=True)
+    count = 0
+    for frame, image in zip(frames, images, strict=True):
+        Image.fromarray(image).save(out / f"{frame:06d}.png", compress_level=3)
+        count += 1
+    return Played(out, count)
+
+
+def _write_animation(out: Path, images: Iterator[Bytes], fps: float) -> Played:
+    pictures = [Image.fromarray(image) for image in images]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    options: dict[str, Any] = {"quality": 85} if out.suffix.lower() == ".webp" else {}
+    pictures[0].save(
+        out, save_all=True, append_images=pictures[1:], duration=max(1, round(1000 / fps)), loop=0, **options
+    )
+    return Played(out, len(pictures))
+
+
+def _write_video(out: Path, images: Iterator[Bytes], fps: float) -> Played:
+    import av
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    count = 0
+    with av.open(str(out), "w") as container:
+        stream: Any = None
+        for image in images:
+            # 4:2:0 needs even sides: the last row or column is repeated once where they are odd.
+            image = np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)), mode="edge")
+            if stream is None:
+                stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
+                stream.height, stream.width = image.shape[:2]
+                stream.pix_fmt, stream.options = "yuv420p", {"crf": "16", "preset": "medium"}
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+            count += 1
+        if stream is not None:
+            container.mux(stream.encode())
+    return Played(out, count)

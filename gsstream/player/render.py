@@ -1,0 +1,73 @@
+"""The player's renderer: a compiled one that a plugin offers, else plain numpy with one warning.
+
+A plugin offers one by an entry point of the group ``gsstream.player``::
+
+    [project.entry-points."gsstream.player"]
+    mine = "gsstream_mine.rasterizer:render_numpy"
+
+a function of the signature of :func:`gsstream.player.software.render_numpy`, whose module needs no torch.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.metadata
+import warnings
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.shapes import FloatArray, check_finite, check_shape
+from gsstream.player.software import render_numpy
+
+ENTRY_POINT_GROUP = "gsstream.player"
+
+
+class PlayerRenderer(NamedTuple):
+    """A renderer and who ships it."""
+
+    name: str
+    render_numpy: Callable[..., FloatArray]
+
+
+class SlowRendererWarning(UserWarning):
+    """No compiled renderer is installed; the player renders with numpy."""
+
+
+@functools.cache
+def find_renderer() -> PlayerRenderer:
+    """The first compiled renderer that loads, in the order of names; else numpy. Warns once when it is numpy."""
+    problems = []
+    for point in sorted(importlib.metadata.entry_points(group=ENTRY_POINT_GROUP), key=lambda p: p.name):
+        try:
+            return PlayerRenderer(point.name, point.load())
+        except Exception as error:  # third-party code: whatever it raises is reported, and the player still plays
+            problems.append(f"{point.name} ({point.value}) failed: {type(error).__name__}: {error}")
+    why = "; ".join(problems) or "install gsstream-cpu-render for a fast one"
+    warnings.warn(f"rendering with plain numpy, which is slow: {why}", SlowRendererWarning, stacklevel=2)
+    return PlayerRenderer("numpy", render_numpy)
+
+
+def render(
+    gaussians: Gaussians[FloatArray], cameras: Cameras, view: int = 0,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0), renderer: PlayerRenderer | None = None,
+) -> FloatArray:  # fmt: skip
+    """Render one camera of a rig: [H, W, 3] float32, not clamped above 1.
+
+    Raises ShapeError when the renderer returns another shape or a value that is not finite.
+    """
+    chosen = find_renderer() if renderer is None else renderer
+    size = (cameras.width, cameras.height)
+    pose = (cameras.viewmats[view], cameras.Ks[view])
+    image = chosen.render_numpy(*(a for _, a in gaussians.items()), *pose, *size, background)
+    check_shape(f"image of renderer {chosen.name!r}", image, (cameras.height, cameras.width, 3))
+    check_finite(f"image of renderer {chosen.name!r}", image)
+    return np.asarray(image, np.float32)
+
+
+def to_bytes(image: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+    """[..., 3] colour in [0, 1] -> 8 bits, rounded; values outside are shown as the nearest displayable colour."""
+    return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)

@@ -1,0 +1,139 @@
+"""A slow forward rasteriser in plain numpy, tile by tile: the player's renderer where no compiled one is installed.
+
+Same conventions as gsstream/render (which needs torch): pixel-corner origin, 0.3 px blur, alpha cut 1/255, alpha clamp
+0.999, a Gaussian counts while the transmittance before it exceeds 1e-4, near plane 0.01. A test holds the two together.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsstream.core.shapes import FloatArray, IntArray
+
+NEAR, BLUR, ALPHA_CUT, ALPHA_MAX, TRANSMITTANCE_MIN = 0.01, 0.3, 1 / 255, 0.999, 1e-4
+TILE = 16
+_SH1 = 0.4886025119029199
+_SH2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+_SH3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+
+
+def render_numpy(
+    means: FloatArray, quats: FloatArray, scales: FloatArray, opacities: FloatArray, sh0: FloatArray, shN: FloatArray,
+    viewmat: FloatArray, K: FloatArray, width: int, height: int, background: tuple[float, float, float],
+) -> FloatArray:  # fmt: skip
+    """Render raw Gaussians (shapes as in core.gaussians) for one camera: [height, width, 3] float32.
+
+    ``viewmat`` [4, 4] world-to-camera, ``K`` [3, 3] pixels, ``background`` in [0, 1].
+    """
+    viewmat, K = np.asarray(viewmat, np.float64), np.asarray(K, np.float64)
+    center = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    points = means.astype(np.float64) @ viewmat[:3, :3].T + viewmat[:3, 3]
+    front = np.flatnonzero(points[:, 2] > NEAR)
+    front = front[np.argsort(points[front, 2], kind="stable")]
+    means2d, covariance = _project(points[front], quats[front], scales[front], viewmat, K, width, height)
+    with np.errstate(over="ignore"):
+        opacity = 1 / (1 + np.exp(-opacities[front].astype(np.float64)))
+    colors = _colors(sh0[front], shN[front], means[front].astype(np.float64) - center)
+    image = np.empty((height, width, 3), np.float32)
+    image[:] = background
+    splats = np.column_stack([means2d, _conics(covariance), opacity, colors])
+    rows, tiles = _tile_lists(means2d, covariance, opacity, width, height)
+    columns = -(-width // TILE)
+    starts = np.flatnonzero(np.diff(tiles, prepend=-1))
+    for start, stop in zip(starts, np.append(starts[1:], len(tiles)), strict=True):
+        y, x = divmod(int(tiles[start]), columns)
+        window = (slice(y * TILE, min((y + 1) * TILE, height)), slice(x * TILE, min((x + 1) * TILE, width)))
+        image[window] = _composite(splats[rows[start:stop]], window, background)
+    return image
+
+
+def _project(
+    points: FloatArray, quats: FloatArray, scales: FloatArray, viewmat: FloatArray, K: FloatArray, width: int,
+    height: int,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Means2d [N, 2] px and blurred covariances [N, 3] (xx, xy, yy) px^2 (EWA splatting, Zwicker et al. 2001)."""
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    x, y, depth = points.T
+    means2d = np.stack([fx * x / depth + cx, fy * y / depth + cy], -1)
+    margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
+    tx = np.clip(x / depth, -cx / fx - margin_x, (width - cx) / fx + margin_x)
+    ty = np.clip(y / depth, -cy / fy - margin_y, (height - cy) / fy + margin_y)
+    zero = np.zeros_like(depth)
+    jacobian = np.stack([fx / depth, zero, -fx * tx / depth, zero, fy / depth, -fy * ty / depth], -1).reshape(-1, 2, 3)
+    axes = _rotations(quats.astype(np.float64)) * np.exp(scales.astype(np.float64))[:, None, :]
+    footprint = jacobian @ (viewmat[:3, :3] @ axes)
+    full = footprint @ footprint.transpose(0, 2, 1)
+    return means2d, np.stack([full[:, 0, 0] + BLUR, full[:, 0, 1], full[:, 1, 1] + BLUR], -1)
+
+
+def _rotations(quats: FloatArray) -> FloatArray:
+    w, x, y, z = (quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-10)).T
+    entries = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return np.asarray(np.stack(entries, -1).reshape(-1, 3, 3))
+
+
+def _conics(covariance: FloatArray) -> FloatArray:
+    a, b, c = covariance.T
+    return np.asarray(np.stack([c, -b, a], -1) / (a * c - b * b)[:, None])
+
+
+def _colors(sh0: FloatArray, shN: FloatArray, directions: FloatArray) -> FloatArray:
+    """[N, 3] view-dependent colour, clamped at 0."""
+    x, y, z = (directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-10)).T
+    basis = [np.full_like(x, 0.28209479177387814)]
+    if shN.shape[1] > 0:
+        basis += [-_SH1 * y, _SH1 * z, -_SH1 * x]
+    if shN.shape[1] > 3:
+        a, b, c = _SH2
+        basis += [a * x * y, -a * y * z, b * (2 * z * z - x * x - y * y), -a * x * z, c * (x * x - y * y)]
+    if shN.shape[1] > 8:
+        a, b, c, d, e = _SH3
+        basis += [
+            -a * y * (3 * x * x - y * y), b * x * y * z, -c * y * (5 * z * z - 1), d * z * (5 * z * z - 3),
+            -c * x * (5 * z * z - 1), e * z * (x * x - y * y), -a * x * (x * x - 3 * y * y),
+        ]  # fmt: skip
+    coefficients = np.concatenate([sh0, shN], 1).astype(np.float64)
+    return np.asarray(np.maximum(np.einsum("kn,nkc->nc", np.stack(basis), coefficients) + 0.5, 0.0))
+
+
+def _tile_lists(
+    means2d: FloatArray, covariance: FloatArray, opacity: FloatArray, width: int, height: int
+) -> tuple[IntArray, IntArray]:
+    """(splat, tile) pairs, tile by tile, splats in depth order. A splat reaches as far as its alpha exceeds the cut."""
+    reach2 = 2 * np.log(np.maximum(opacity / ALPHA_CUT, 1.0))
+    # The tiny margin keeps pixels whose alpha equals the cut up to rounding.
+    half = np.sqrt(reach2[:, None] * covariance[:, [0, 2]]) + 1e-6
+    limit = np.array([-(-width // TILE), -(-height // TILE)])
+    with np.errstate(invalid="ignore"):
+        low = np.clip(np.floor((means2d - half) / TILE), 0, limit).astype(np.int64)
+        high = np.clip(np.floor((means2d + half) / TILE) + 1, 0, limit).astype(np.int64)
+    span = np.where((opacity >= ALPHA_CUT)[:, None], np.maximum(high - low, 0), 0)
+    number = span[:, 0] * span[:, 1]
+    rows = np.repeat(np.arange(len(number)), number)
+    inside = np.arange(len(rows)) - np.repeat(np.cumsum(number) - number, number)
+    tile = (low[rows, 1] + inside // np.maximum(span[rows, 0], 1)) * limit[0]
+    tile += low[rows, 0] + inside % np.maximum(span[rows, 0], 1)
+    order = np.argsort(tile, kind="stable")
+    return rows[order], tile[order]
+
+
+def _composite(splats: FloatArray, window: tuple[slice, slice], background: tuple[float, float, float]) -> FloatArray:
+    ys, xs = (np.arange(s.start, s.stop) + 0.5 for s in window)
+    shape = (len(ys), len(xs))
+    dx = np.tile(xs, shape[0])[None] - splats[:, 0:1]
+    dy = np.repeat(ys, shape[1])[None] - splats[:, 1:2]
+    a, b, c, opacity = splats[:, 2:3], splats[:, 3:4], splats[:, 4:5], splats[:, 5:6]
+    alpha = np.minimum(opacity * np.exp(-(0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy)), ALPHA_MAX)
+    alpha[alpha < ALPHA_CUT] = 0
+    # Transmittance only falls, so "stop after it drops below the minimum" equals masking what comes later.
+    before = np.cumprod(np.concatenate([np.ones((1, alpha.shape[1])), 1 - alpha]), 0)
+    stopped = before[:-1] <= TRANSMITTANCE_MIN
+    alpha[stopped] = 0
+    first_stop = np.where(stopped.any(0), stopped.argmax(0), len(splats))
+    left = before[first_stop, np.arange(alpha.shape[1])]
+    color = np.einsum("np,nc->pc", alpha * before[:-1], splats[:, 6:9]) + left[:, None] * np.asarray(background)
+    return np.asarray(color.reshape(*shape, 3), np.float32)

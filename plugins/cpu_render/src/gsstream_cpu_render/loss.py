@@ -1,0 +1,141 @@
+"""Photometric loss with its gradient: (1 - w) mean |I - G| + w (1 - mean SSIM).
+
+SSIM is Wang et al. 2004, eq. 13, with the settings of 3D Gaussian splatting: 11x11 Gaussian window of sigma 1.5, zero
+padding, C1 = 0.01^2, C2 = 0.03^2, per channel. Images are [H, W, 3] float32, normally in [0, 1].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsstream_cpu_render import _native
+from gsstream_cpu_render.checks import Float32, first_non_finite, native_array, refuse, refuse_value
+
+TILE = 16
+"""Side of a tile, pixels."""
+
+
+@dataclass(frozen=True)
+class PhotometricTarget:
+    """A target image with its window statistics, computed once and used in every iteration of a frame.
+
+    ``image`` [H, W, 3] float32 (a private copy), ``mean`` and ``variance`` [H, W, 3]: blurred image and windowed
+    variance. Raises ShapeError for a wrong shape or dtype and for a value that is not finite.
+    """
+
+    image: Float32
+    mean: Float32 = field(init=False, repr=False)
+    variance: Float32 = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        image = _image("target", self.image).copy()
+        mean, variance = np.empty_like(image), np.empty_like(image)
+        _native.photometric_target(image, mean, variance)
+        # A window mean is not finite if any value in the window is not, so one sum over the statistics tells.
+        with np.errstate(invalid="ignore", over="ignore"):
+            suspicious = not np.isfinite(variance.sum(dtype=np.float64))
+        if suspicious:
+            refuse(first_non_finite("target", image) or "target: expected values in [0, 1], got some that overflow")
+        for name, array in (("image", image), ("mean", mean), ("variance", variance)):
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+
+@dataclass(frozen=True)
+class PhotometricLoss:
+    """Loss and gradient of one image.
+
+    ``value`` = (1 - w) ``l1`` + w ``dssim``; ``l1`` and ``dssim`` are sums over active pixels and channels of |I - G|
+    and 1 - SSIM, divided by 3 H W. ``gradient`` [H, W, 3] is d value / d image, or None if it was not asked for.
+    """
+
+    value: float
+    l1: float
+    dssim: float
+    gradient: Float32 | None
+
+
+def tile_shape(height: int, width: int) -> tuple[int, int]:
+    """Tile rows and columns of an image; partial tiles at the right and bottom count."""
+    return -(-height // TILE), -(-width // TILE)
+
+
+def photometric_loss(
+    image: Any,
+    target: Any,
+    *,
+    dssim_weight: float = 0.2,
+    tile_mask: Any | None = None,
+    gradient: bool = True,
+    halo_gradient: bool = False,
+    out: Float32 | None = None,
+) -> PhotometricLoss:
+    """Evaluate the loss over all pixels, or over the pixels of active tiles.
+
+    Args:
+        image: [H, W, 3] float32. With a mask, pixels up to 5 beyond active tiles are read too (SSIM windows), so the
+            inactive part must hold the rest of the picture, for instance the cached render of the previous frame.
+        target: [H, W, 3] float32, or a PhotometricTarget, which saves blurring it again.
+        dssim_weight: w in [0, 1].
+        tile_mask: [ceil(H/16), ceil(W/16)] bool or uint8; None means all tiles. The sums are divided by 3 H W as in
+            the dense loss, so that losses of disjoint masks add up to it.
+        gradient: compute the gradient.
+        halo_gradient: also write the gradient at pixels of inactive tiles that are seen by windows of active ones.
+            Without it the gradient of inactive tiles is left as it is in ``out`` (zero without ``out``).
+        out: [H, W, 3] float32 to write the gradient into, if given.
+
+    Raises:
+        ShapeError: wrong shape, dtype, memory layout, or a value that is not finite.
+        InputError: dssim_weight outside [0, 1].
+    """
+    if not 0.0 <= dssim_weight <= 1.0:
+        refuse_value(f"dssim_weight: expected a number in [0, 1], got {dssim_weight!r}")
+    image = _image("image", image)
+    known = target if isinstance(target, PhotometricTarget) else None
+    goal = native_array("target", target if known is None else known.image, np.float32, image.shape)
+    height, width, _ = image.shape
+    active = _mask(tile_mask, height, width)
+    wanted = _dilated(active) if halo_gradient else active
+    if not gradient:
+        result = None
+    elif out is None:
+        result = np.zeros_like(image)
+    else:
+        result = native_array("out", out, np.float32, image.shape, writable=True)
+    scale = 1.0 / image.size
+    statistics = (None, None) if known is None else (known.mean, known.variance)
+    l1, dssim = _native.photometric_evaluate(
+        image, goal, *statistics, active, wanted, result, (1.0 - dssim_weight) * scale, -dssim_weight * scale
+    )
+    if not np.isfinite(l1 + dssim):
+        refuse(first_non_finite("image", image) or first_non_finite("target", goal)
+               or "image: expected values in [0, 1], got some so large that the loss overflows")  # fmt: skip
+    l1, dssim = l1 * scale, dssim * scale
+    return PhotometricLoss((1.0 - dssim_weight) * l1 + dssim_weight * dssim, l1, dssim, result)
+
+
+def _image(name: str, value: Any) -> Float32:
+    array = native_array(name, value, np.float32, ("H", "W", 3))
+    if array.size == 0:
+        refuse(f"{name}: expected at least one pixel, got shape {list(array.shape)}")
+    return array
+
+
+def _mask(mask: Any | None, height: int, width: int) -> NDArray[np.uint8]:
+    shape = tile_shape(height, width)
+    if mask is None:
+        return np.ones(shape, dtype=np.uint8)
+    boolean = str(getattr(mask, "dtype", "")) in ("bool", "torch.bool")
+    array = native_array("tile_mask", mask, np.bool_ if boolean else np.uint8, shape)
+    return array.view(np.uint8)
+
+
+def _dilated(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    rows, columns = mask.shape
+    padded = np.pad(mask, 1)
+    shifts = [padded[y : y + rows, x : x + columns] for y in range(3) for x in range(3)]
+    return np.ascontiguousarray(np.maximum.reduce(shifts))

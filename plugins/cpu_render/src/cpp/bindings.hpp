@@ -15,4 +15,9 @@ using ByteArray = nanobind::ndarray<const uint8_t, nanobind::c_contig, nanobind:
 using IndexArray = nanobind::ndarray<const uint32_t, nanobind::c_contig, nanobind::device::cpu>;
 using IndexOutArray = nanobind::ndarray<uint32_t, nanobind::c_contig, nanobind::device::cpu>;
 
+void bind_rasterizer(nanobind::module_& module);
+void bind_photometric(nanobind::module_& module);
+void bind_adam(nanobind::module_& module);
+void bind_threads(nanobind::module_& module);
+
 }  // namespace gsstream_cpu

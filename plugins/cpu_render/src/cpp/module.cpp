@@ -19,4 +19,8 @@ NB_MODULE(_native, module) {
   }, "Names of the instruction sets this build and processor support, weakest first.");
   module.def("select_isa", &gsstream_cpu::select_isa, nb::arg("name"),
              "Select an instruction set by name (tests, comparisons). Raises ValueError if unsupported.");
+  gsstream_cpu::bind_rasterizer(module);
+  gsstream_cpu::bind_photometric(module);
+  gsstream_cpu::bind_adam(module);
+  gsstream_cpu::bind_threads(module);
 }

@@ -50,7 +50,6 @@ GSS_INLINE Floats select_or_zero(Mask m, Floats a) { return (Floats)_mm512_maskz
 GSS_INLINE Floats min(Floats a, Floats b) { return (Floats)_mm512_min_ps((__m512)a, (__m512)b); }
 GSS_INLINE Floats max(Floats a, Floats b) { return (Floats)_mm512_max_ps((__m512)a, (__m512)b); }
 GSS_INLINE Floats sqrt(Floats a) { return (Floats)_mm512_sqrt_ps((__m512)a); }
-GSS_INLINE Floats reciprocal_guess(Floats a) { return (Floats)_mm512_rcp14_ps((__m512)a); }
 #else
 typedef Ints Mask;
 GSS_INLINE Mask greater_equal(Floats a, Floats b) { return a >= b; }
@@ -66,14 +65,12 @@ GSS_INLINE uint32_t bits_of(Mask m) { return static_cast<uint32_t>(_mm256_movema
 GSS_INLINE Floats min(Floats a, Floats b) { return (Floats)_mm256_min_ps((__m256)a, (__m256)b); }
 GSS_INLINE Floats max(Floats a, Floats b) { return (Floats)_mm256_max_ps((__m256)a, (__m256)b); }
 GSS_INLINE Floats sqrt(Floats a) { return (Floats)_mm256_sqrt_ps((__m256)a); }
-GSS_INLINE Floats reciprocal_guess(Floats a) { return (Floats)_mm256_rcp_ps((__m256)a); }
 #elif defined(__x86_64__)
 GSS_INLINE bool any(Mask m) { return _mm_movemask_ps((__m128)m) != 0; }
 GSS_INLINE uint32_t bits_of(Mask m) { return static_cast<uint32_t>(_mm_movemask_ps((__m128)m)); }
 GSS_INLINE Floats min(Floats a, Floats b) { return (Floats)_mm_min_ps((__m128)a, (__m128)b); }
 GSS_INLINE Floats max(Floats a, Floats b) { return (Floats)_mm_max_ps((__m128)a, (__m128)b); }
 GSS_INLINE Floats sqrt(Floats a) { return (Floats)_mm_sqrt_ps((__m128)a); }
-GSS_INLINE Floats reciprocal_guess(Floats a) { return (Floats)_mm_rcp_ps((__m128)a); }
 #else
 GSS_INLINE bool any(Mask m) { return vmaxvq_u32((uint32x4_t)m) != 0; }
 GSS_INLINE uint32_t bits_of(Mask m) {
@@ -83,20 +80,21 @@ GSS_INLINE uint32_t bits_of(Mask m) {
 GSS_INLINE Floats min(Floats a, Floats b) { return select(a < b, a, b); }
 GSS_INLINE Floats max(Floats a, Floats b) { return select(a > b, a, b); }
 GSS_INLINE Floats sqrt(Floats a) { return (Floats)vsqrtq_f32((float32x4_t)a); }
-GSS_INLINE Floats reciprocal_guess(Floats a) {
-  const float32x4_t guess = vrecpeq_f32((float32x4_t)a);  // 8 bits only: one Newton step more than x86
-  return (Floats)vmulq_f32(guess, vrecpsq_f32((float32x4_t)a, guess));
-}
 #endif
 #endif
 
 // x limited to [low, high]; a NaN becomes `low`.
 GSS_INLINE Floats clamp(Floats x, Floats low, Floats high) { return min(max(x, low), high); }
 
-// 1/x for finite x of ordinary size, to about 2 ulp (guess and one Newton step).
+// 1/x for finite x of ordinary size, to about 2 ulp; exact for x = 1 (AVX-512's guess is exact for powers of two, the
+// older guesses are not, and their divisions are cheaper).
 GSS_INLINE Floats reciprocal(Floats x) {
-  const Floats guess = reciprocal_guess(x);
+#if defined(__AVX512F__)
+  const Floats guess = (Floats)_mm512_rcp14_ps((__m512)x);
   return guess * (2.0f - x * guess);
+#else
+  return 1.0f / x;
+#endif
 }
 
 // 2^x for |x| < 126: degree-5 minimax polynomial on [-1/2, 1/2], relative error about 2e-7.

@@ -1,0 +1,290 @@
+#include "rasterizer.hpp"
+
+#include <algorithm>
+#include <cstring>
+#include <new>
+#include <stdexcept>
+#include <string>
+
+#include "parallel.hpp"
+
+namespace gsstream_cpu {
+namespace {
+
+constexpr std::size_t TILE_GRAIN = 2;
+constexpr std::size_t BACKWARD_GRAIN = 512;  // visible Gaussians; a multiple of every vector width
+constexpr std::size_t CLEAR_GRAIN = 16384;   // rows
+
+std::size_t chunk_count(std::size_t rows) { return (rows + PROJECT_CHUNK - 1) / PROJECT_CHUNK; }
+
+}  // namespace
+
+PairList::~PairList() { std::free(data); }
+
+void PairList::reserve_more(std::size_t extra) {
+  if (size + extra <= capacity) return;
+  const std::size_t wanted = std::max(size + extra, capacity + capacity / 2 + 256);
+  void* grown = std::realloc(data, wanted * sizeof(Pair));
+  if (!grown) throw std::bad_alloc();
+  data = static_cast<Pair*>(grown);
+  capacity = wanted;
+}
+
+// Blocks of the cells of the caller's mask (16x16) that lie in one raster tile (32x16), inside the image.
+static uint32_t wanted_blocks(int tile_x, int tile_y, int width, int height, const uint8_t* mask) {
+  const int mask_columns = (width + MASK_TILE - 1) / MASK_TILE;
+  uint32_t blocks = 0;
+  for (int b = 0; b < BLOCKS; b++) {
+    const int x = tile_x * TILE_WIDTH + b % BLOCKS_X * BLOCK_SIDE, y = tile_y * TILE_HEIGHT + b / BLOCKS_X * BLOCK_SIDE;
+    if (x >= width || y >= height) continue;
+    if (!mask || mask[y / MASK_TILE * mask_columns + x / MASK_TILE]) blocks |= 1u << b;
+  }
+  return blocks;
+}
+
+void TileSelection::build(int width, int height, const uint8_t* mask) {
+  tiles_x = (width + TILE_WIDTH - 1) / TILE_WIDTH;
+  tiles_y = (height + TILE_HEIGHT - 1) / TILE_HEIGHT;
+  blocks.assign(static_cast<std::size_t>(tiles_x) * tiles_y, 0);
+  sum.assign(static_cast<std::size_t>(tiles_x + 1) * (tiles_y + 1), 0);
+  active.clear();
+  for (int y = 0; y < tiles_y; y++)
+    for (int x = 0; x < tiles_x; x++) {
+      const std::size_t tile = static_cast<std::size_t>(y) * tiles_x + x;
+      blocks[tile] = wanted_blocks(x, y, width, height, mask);
+      if (blocks[tile]) active.push_back(static_cast<uint32_t>(tile));
+      int32_t* cell = &sum[static_cast<std::size_t>(y + 1) * (tiles_x + 1) + x + 1];
+      cell[0] = cell[-1] + cell[-(tiles_x + 1)] - cell[-(tiles_x + 2)] + (blocks[tile] != 0);
+    }
+}
+
+bool TileSelection::contains(const TileSelection& other) const {
+  for (std::size_t tile = 0; tile < blocks.size(); tile++)
+    if (other.blocks[tile] & ~blocks[tile]) return false;
+  return true;
+}
+
+class Rasterizer::Claim {
+ public:
+  explicit Claim(std::atomic<bool>& busy) : busy_(busy) {
+    if (busy_.exchange(true))
+      throw std::runtime_error("this Rasterizer is already running in another thread; expected one Rasterizer per camera "
+                               "and thread. Create a second one.");
+  }
+  ~Claim() { busy_.store(false); }
+  Claim(const Claim&) = delete;
+  Claim& operator=(const Claim&) = delete;
+
+ private:
+  std::atomic<bool>& busy_;
+};
+
+Rasterizer::Rasterizer()
+    : project_kernels_(project_kernels()), project_backward_kernels_(project_backward_kernels()), composite_kernels_(composite_kernels()) {}
+Rasterizer::~Rasterizer() = default;
+
+// Stage 1. Results are in visible_ (memory order) and records.
+uint32_t Rasterizer::project(const Scene& scene, const TileSelection& selection, Record* records) {
+  const std::size_t chunks = chunk_count(scene.count);
+  if (chunks > chunk_capacity_) {
+    chunks_ = std::make_unique<ProjectChunk[]>(chunks);
+    chunk_capacity_ = chunks;
+  }
+  ProjectJob job{scene.arrays, scene.count, camera_, selection.tiles_x, selection.tiles_y, selection.blocks.data(), selection.sum.data(), records, chunks_.get()};
+  parallel_for(chunks, 1, [&](std::size_t begin, std::size_t end) { project_kernels_.forward[scene.sh_degree](job, begin, end); });
+  uint32_t faults = 0;
+  for (std::size_t c = 0; c < chunks; c++) faults |= chunks_[c].faults;
+  if (!faults) join_chunks(chunks);
+  return faults;
+}
+
+void Rasterizer::join_chunks(std::size_t chunks) {
+  std::vector<std::size_t> first_visible(chunks + 1, 0), first_pair(chunks + 1, 0);
+  for (std::size_t c = 0; c < chunks; c++) {
+    first_visible[c + 1] = first_visible[c] + chunks_[c].visible;
+    first_pair[c + 1] = first_pair[c] + chunks_[c].pairs.size;
+  }
+  visible_.count = first_visible[chunks];
+  visible_.pair_count = first_pair[chunks];
+  if (visible_.pair_count >= FROZEN)
+    throw std::length_error("expected fewer than 2^32-1 (Gaussian, tile) pairs, got " + std::to_string(visible_.pair_count) +
+                            ". Are the scales in log units of the scene? Render fewer or smaller Gaussians.");
+  visible_.rows.require(visible_.count);
+  visible_.pair_offset.require(visible_.count + 1);
+  visible_.by_depth.require(visible_.count);
+  visible_.pairs.require(visible_.pair_count);
+  visible_.pair_offset[visible_.count] = static_cast<uint32_t>(visible_.pair_count);
+  parallel_for(chunks, 4, [&](std::size_t begin, std::size_t end) {
+    for (std::size_t c = begin; c < end; c++) {
+      const ProjectChunk& chunk = chunks_[c];
+      if (chunk.pairs.size) std::memcpy(&visible_.pairs[first_pair[c]], chunk.pairs.data, chunk.pairs.size * sizeof(Pair));
+      uint32_t pair = static_cast<uint32_t>(first_pair[c]);
+      for (uint32_t i = 0; i < chunk.visible; i++) {
+        const uint32_t slot = static_cast<uint32_t>(first_visible[c]) + i;
+        visible_.rows[slot] = chunk.row[i];
+        visible_.by_depth[slot] = {chunk.depth_bits[i], slot};
+        visible_.pair_offset[slot] = pair;
+        pair += chunk.pair_count[i];
+      }
+    }
+  });
+}
+
+// Stage 3.
+void Rasterizer::composite(const TileLists& lists, const TileSelection& selection, const Target& target) {
+  const std::size_t pixels = selection.active.size() * BLOCKS * BLOCK_PIXELS;
+  job_ = {};
+  job_.records = records_.data();
+  job_.lists = lists.view();
+  job_.tiles = selection.active.data();
+  job_.tile_blocks = selection.blocks.data();
+  job_.tiles_x = selection.tiles_x;
+  job_.width = camera_.width;
+  job_.height = camera_.height;
+  std::copy_n(target.background, 3, job_.background);
+  job_.image = target.image;
+  job_.transmittance = target.transmittance;
+  job_.contributed = contributed_.require(lists.size);
+  job_.pixel_transmittance = pixel_transmittance_.require(pixels);
+  job_.pixel_last = pixel_last_.require(pixels);
+  parallel_for(selection.active.size(), TILE_GRAIN, [&](std::size_t begin, std::size_t end) { composite_kernels_.forward(job_, begin, end); });
+  lists_ = &lists;
+}
+
+uint32_t Rasterizer::forward(const Scene& scene, const Camera& camera, const uint8_t* mask, const Target& target) {
+  const Claim claim(busy_);
+  mode_ = Mode::none;
+  cached_ = frozen_ = false;
+  passes_++;
+  camera_ = camera;
+  selection_.build(camera.width, camera.height, mask);
+  const uint32_t faults = project(scene, selection_, records_.require(scene.count));
+  if (faults) return faults;
+  sort_by_depth(visible_.by_depth, sort_scratch_, visible_.count);
+  build_tile_lists(visible_, selection_.blocks.size(), 0, cached_lists_);
+  composite(cached_lists_, selection_, target);
+  scene_ = scene;
+  scene_count_ = scene.count;
+  cached_selection_ = selection_;
+  cached_ = true;
+  mode_ = Mode::full;
+  return 0;
+}
+
+void Rasterizer::freeze(const uint8_t* mask, const uint32_t* active, std::size_t count) {
+  const Claim claim(busy_);
+  if (!cached_) throw std::invalid_argument("freeze: expected a forward pass of the whole scene before, got none. Call forward first.");
+  for (std::size_t i = 0; i < count; i++)
+    if (active[i] >= scene_count_ || (i > 0 && active[i] <= active[i - 1]))
+      throw std::invalid_argument("freeze: active_ids must be strictly ascending rows below " + std::to_string(scene_count_) + ", got " +
+                                  std::to_string(active[i]) + " at index " + std::to_string(i) + ". Sort them and drop duplicates.");
+  TileSelection wanted;
+  wanted.build(camera_.width, camera_.height, mask);
+  if (!cached_selection_.contains(wanted))
+    throw std::invalid_argument("freeze: tile_mask has tiles that the cached forward pass did not cover. Run forward with a mask that covers them.");
+  mode_ = Mode::none;
+  selection_ = std::move(wanted);
+  is_active_.resize(scene_count_, 0);
+  for (uint32_t row : active_rows_)
+    if (row < is_active_.size()) is_active_[row] = 0;
+  active_rows_.assign(active, active + count);
+  for (uint32_t row : active_rows_) is_active_[row] = 1;
+  records_.require_keeping(scene_count_ + count, scene_count_);
+  filter_tile_lists(cached_lists_, selection_.blocks.data(), is_active_, frozen_lists_);
+  frozen_ = true;
+}
+
+// Projects the active rows and leaves the lists of the whole scene over `selection` in merged_lists_.
+uint32_t Rasterizer::list_active(const Scene& rows, const TileSelection& selection) {
+  if (!frozen_) throw std::invalid_argument("expected freeze(tile_mask, active_ids) before an active pass, got none since the last forward or commit.");
+  const uint32_t base = static_cast<uint32_t>(scene_count_);
+  const uint32_t faults = project(rows, selection, records_.data() + base);
+  if (faults) return faults;
+  sort_by_depth(visible_.by_depth, sort_scratch_, visible_.count);
+  build_tile_lists(visible_, selection.blocks.size(), base, active_lists_);
+  merge_tile_lists(frozen_lists_, active_lists_, records_.data(), base, active_rows_, merged_lists_);
+  return 0;
+}
+
+uint32_t Rasterizer::forward_active(const Scene& rows, const Target& target) {
+  const Claim claim(busy_);
+  mode_ = Mode::none;
+  passes_++;
+  const uint32_t faults = list_active(rows, selection_);
+  if (faults) return faults;
+  composite(merged_lists_, selection_, target);
+  scene_ = rows;
+  mode_ = Mode::active;
+  return 0;
+}
+
+void Rasterizer::forward_cached(const uint8_t* mask, const Target& target) {
+  const Claim claim(busy_);
+  if (!cached_) throw std::invalid_argument("forward_cached: expected a forward pass of the whole scene before, got none. Call forward first.");
+  TileSelection wanted;
+  wanted.build(camera_.width, camera_.height, mask);
+  if (!cached_selection_.contains(wanted))
+    throw std::invalid_argument("forward_cached: tile_mask has tiles that the cached forward pass did not cover.");
+  mode_ = Mode::none;
+  passes_++;
+  composite(cached_lists_, wanted, target);
+}
+
+uint32_t Rasterizer::commit(const Scene& rows) {
+  const Claim claim(busy_);
+  mode_ = Mode::none;
+  if (frozen_) filter_tile_lists(cached_lists_, cached_selection_.blocks.data(), is_active_, frozen_lists_);
+  const uint32_t faults = list_active(rows, cached_selection_);
+  frozen_ = false;
+  if (faults) return faults;
+  const uint32_t base = static_cast<uint32_t>(scene_count_);
+  for (std::size_t e = 0; e < merged_lists_.size; e++) {
+    uint32_t& record = merged_lists_.entries[e].record;
+    if (record >= base) record = active_rows_[record - base];
+  }
+  for (std::size_t slot = 0; slot < active_rows_.size(); slot++) records_[active_rows_[slot]] = records_[base + slot];
+  cached_lists_.swap(merged_lists_);
+  return 0;
+}
+
+void Rasterizer::clear_gradients(const GradientArrays& out) const {
+  const std::size_t rest = 3 * static_cast<std::size_t>((scene_.sh_degree + 1) * (scene_.sh_degree + 1) - 1);
+  const std::pair<float*, std::size_t> arrays[] = {{out.means, 3},     {out.quats, 4}, {out.scales, 3},   {out.opacities, 1},
+                                                   {out.means2d, 2}, {out.sh0, 3},   {out.shN, rest}};
+  parallel_for(scene_.count, CLEAR_GRAIN, [&](std::size_t begin, std::size_t end) {
+    for (const auto& [data, width] : arrays)
+      if (width) std::memset(data + begin * width, 0, (end - begin) * width * sizeof(float));
+  });
+}
+
+// Stages 4 and 5.
+void Rasterizer::differentiate(Mode mode, const float* image_gradient, const float* alpha_gradient, const GradientArrays& out, bool compact) {
+  if (mode_ != mode)
+    throw std::invalid_argument(mode == Mode::full ? "backward: expected a forward pass before, got none (or another pass since)."
+                                                   : "backward_active: expected a forward_active pass before, got none (or another pass since).");
+  const CompositeBackwardJob raster{job_, image_gradient, alpha_gradient, moments_.require(visible_.pair_count * MOMENT_STRIDE)};
+  parallel_for(selection_.active.size(), TILE_GRAIN, [&](std::size_t begin, std::size_t end) { composite_kernels_.backward(raster, begin, end); });
+  if (!compact) clear_gradients(out);
+  const ProjectBackwardJob job{scene_.arrays, camera_, visible_.count, visible_.rows.data(), visible_.pair_offset.data(), moments_.data(), out, compact};
+  parallel_for(visible_.count, BACKWARD_GRAIN, [&](std::size_t begin, std::size_t end) { project_backward_kernels_.backward[scene_.sh_degree](job, begin, end); });
+}
+
+void Rasterizer::backward(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out, bool compact) {
+  const Claim claim(busy_);
+  differentiate(Mode::full, image_gradient, alpha_gradient, out, compact);
+}
+
+void Rasterizer::backward_active(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out) {
+  const Claim claim(busy_);
+  differentiate(Mode::active, image_gradient, alpha_gradient, out, false);
+}
+
+std::size_t Rasterizer::memory_bytes() const {
+  std::size_t bytes = visible_.bytes() + sort_scratch_.bytes() + contributed_.bytes() + pixel_transmittance_.bytes() + moments_.bytes() +
+                      pixel_last_.bytes() + records_.bytes() + active_rows_.capacity() * sizeof(uint32_t) + is_active_.capacity();
+  for (const TileLists* lists : {&cached_lists_, &frozen_lists_, &active_lists_, &merged_lists_}) bytes += lists->bytes();
+  for (std::size_t c = 0; c < chunk_capacity_; c++) bytes += sizeof(ProjectChunk) + chunks_[c].pairs.capacity * sizeof(Pair);
+  return bytes;
+}
+
+}  // namespace gsstream_cpu

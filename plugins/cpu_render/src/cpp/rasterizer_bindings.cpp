@@ -1,0 +1,237 @@
+#include <nanobind/stl/optional.h>
+
+#include <algorithm>
+#include <initializer_list>
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "bindings.hpp"
+#include "rasterizer.hpp"
+
+namespace nb = nanobind;
+
+namespace gsstream_cpu {
+namespace {
+
+// The Python side checks with messages for people; these checks keep memory safe whatever comes.
+void require(bool good, const char* what) {
+  if (!good) throw std::invalid_argument(std::string("Rasterizer: ") + what);
+}
+
+template <class Array>
+void require_shape(const Array& array, std::initializer_list<std::size_t> shape, const char* name) {
+  bool good = array.ndim() == shape.size();
+  std::size_t axis = 0;
+  for (std::size_t side : shape) good = good && array.shape(axis++) == side;
+  require(good, (std::string(name) + " has the wrong shape").c_str());
+}
+
+// Keeps the arrays of a forward pass alive until the backward that reads them again.
+struct SceneArrays {
+  std::vector<ConstFloatArray> held;
+  Scene scene;
+
+  SceneArrays() = default;
+  SceneArrays(ConstFloatArray means, ConstFloatArray quats, ConstFloatArray scales, ConstFloatArray opacities, ConstFloatArray sh0, ConstFloatArray shN)
+      : held{means, quats, scales, opacities, sh0, shN} {
+    require(means.ndim() == 2 && shN.ndim() == 3, "means must be [N,3] and shN [N,K-1,3]");
+    const std::size_t n = means.shape(0), rest = shN.shape(1);
+    require(n < FROZEN / 2, "too many Gaussians");
+    require(rest == 0 || rest == 3 || rest == 8 || rest == 15, "shN must have 0, 3, 8 or 15 coefficients");
+    require_shape(means, {n, 3}, "means");
+    require_shape(quats, {n, 4}, "quats");
+    require_shape(scales, {n, 3}, "scales");
+    require_shape(opacities, {n}, "opacities");
+    require_shape(sh0, {n, 1, 3}, "sh0");
+    require_shape(shN, {n, rest, 3}, "shN");
+    scene.arrays = {means.data(), quats.data(), scales.data(), opacities.data(), sh0.data(), shN.data()};
+    scene.count = n;
+    scene.sh_degree = rest == 0 ? 0 : rest == 3 ? 1 : rest == 8 ? 2 : 3;
+  }
+};
+
+Camera make_camera(const ConstFloatArray& viewmat, const ConstFloatArray& intrinsics, int width, int height) {
+  require_shape(viewmat, {4, 4}, "viewmat");
+  require_shape(intrinsics, {3, 3}, "K");
+  require(width >= 1 && height >= 1 && width <= 65536 && height <= 65536, "image sides must be 1 to 65536");
+  Camera c{};
+  const float *v = viewmat.data(), *k = intrinsics.data();
+  for (int i = 0; i < 3; i++) {
+    for (int j = 0; j < 3; j++) c.rotation[3 * i + j] = v[4 * i + j];
+    c.translation[i] = v[4 * i + 3];
+  }
+  for (int j = 0; j < 3; j++)
+    c.position[j] = -(c.rotation[j] * c.translation[0] + c.rotation[3 + j] * c.translation[1] + c.rotation[6 + j] * c.translation[2]);
+  c.fx = k[0];
+  c.fy = k[4];
+  c.cx = k[2];
+  c.cy = k[5];
+  require(c.fx > 0 && c.fy > 0, "K must have positive focal lengths");
+  const float margin_x = 0.15f * static_cast<float>(width) / c.fx, margin_y = 0.15f * static_cast<float>(height) / c.fy;
+  c.x_low = -c.cx / c.fx - margin_x;
+  c.x_high = (static_cast<float>(width) - c.cx) / c.fx + margin_x;
+  c.y_low = -c.cy / c.fy - margin_y;
+  c.y_high = (static_cast<float>(height) - c.cy) / c.fy + margin_y;
+  c.width = width;
+  c.height = height;
+  return c;
+}
+
+const uint8_t* mask_data(const std::optional<ByteArray>& mask, int width, int height) {
+  if (!mask) return nullptr;
+  const auto cells = [](int pixels) { return static_cast<std::size_t>((pixels + MASK_TILE - 1) / MASK_TILE); };
+  require_shape(*mask, {cells(height), cells(width)}, "tile_mask");
+  return mask->data();
+}
+
+Target make_target(const ConstFloatArray& background, const FloatArray& image, const FloatArray& transmittance, int width, int height) {
+  const std::size_t w = static_cast<std::size_t>(width), h = static_cast<std::size_t>(height);
+  require_shape(background, {3}, "background");
+  require_shape(image, {h, w, 3}, "image");
+  require_shape(transmittance, {h, w}, "transmittance");
+  const float* b = background.data();
+  return {{b[0], b[1], b[2]}, image.data(), transmittance.data()};
+}
+
+class PyRasterizer {
+ public:
+  uint32_t forward(ConstFloatArray means, ConstFloatArray quats, ConstFloatArray scales, ConstFloatArray opacities, ConstFloatArray sh0,
+                   ConstFloatArray shN, ConstFloatArray viewmat, ConstFloatArray K, int width, int height, ConstFloatArray background,
+                   std::optional<ByteArray> tile_mask, FloatArray image, FloatArray transmittance) {
+    SceneArrays scene(means, quats, scales, opacities, sh0, shN);
+    const Camera camera = make_camera(viewmat, K, width, height);
+    const uint8_t* mask = mask_data(tile_mask, width, height);
+    const Target target = make_target(background, image, transmittance, width, height);
+    return keep(std::move(scene), [&](const Scene& s) { return rasterizer_.forward(s, camera, mask, target); });
+  }
+
+  uint32_t forward_active(ConstFloatArray means, ConstFloatArray quats, ConstFloatArray scales, ConstFloatArray opacities, ConstFloatArray sh0,
+                          ConstFloatArray shN, ConstFloatArray background, FloatArray image, FloatArray transmittance) {
+    SceneArrays rows = active_rows(means, quats, scales, opacities, sh0, shN);
+    const Target target = make_target(background, image, transmittance, rasterizer_.width(), rasterizer_.height());
+    return keep(std::move(rows), [&](const Scene& s) { return rasterizer_.forward_active(s, target); });
+  }
+
+  uint32_t commit(ConstFloatArray means, ConstFloatArray quats, ConstFloatArray scales, ConstFloatArray opacities, ConstFloatArray sh0,
+                  ConstFloatArray shN) {
+    return keep(active_rows(means, quats, scales, opacities, sh0, shN), [&](const Scene& s) { return rasterizer_.commit(s); });
+  }
+
+  void forward_cached(ConstFloatArray background, std::optional<ByteArray> tile_mask, FloatArray image, FloatArray transmittance) {
+    const uint8_t* mask = mask_data(tile_mask, rasterizer_.width(), rasterizer_.height());
+    const Target target = make_target(background, image, transmittance, rasterizer_.width(), rasterizer_.height());
+    const nb::gil_scoped_release release;
+    rasterizer_.forward_cached(mask, target);
+  }
+
+  void backward(ConstFloatArray v_image, std::optional<ConstFloatArray> v_alpha, FloatArray v_means, FloatArray v_quats, FloatArray v_scales,
+                FloatArray v_opacities, FloatArray v_sh0, FloatArray v_shN, FloatArray v_means2d, bool compact) {
+    const std::size_t rows = compact ? rasterizer_.visible().count : current_.scene.count;
+    const GradientArrays out = gradients(rows, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN, v_means2d);
+    const float* alpha = upstream(v_image, v_alpha);
+    const nb::gil_scoped_release release;
+    rasterizer_.backward(v_image.data(), alpha, out, compact);
+  }
+
+  void backward_active(ConstFloatArray v_image, std::optional<ConstFloatArray> v_alpha, FloatArray v_means, FloatArray v_quats, FloatArray v_scales,
+                       FloatArray v_opacities, FloatArray v_sh0, FloatArray v_shN, FloatArray v_means2d) {
+    const GradientArrays out = gradients(rasterizer_.active_count(), v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN, v_means2d);
+    const float* alpha = upstream(v_image, v_alpha);
+    const nb::gil_scoped_release release;
+    rasterizer_.backward_active(v_image.data(), alpha, out);
+  }
+
+  void freeze(std::optional<ByteArray> tile_mask, IndexArray active_ids) {
+    require(active_ids.ndim() == 1, "active_ids must be [A]");
+    const uint8_t* mask = mask_data(tile_mask, rasterizer_.width(), rasterizer_.height());
+    const nb::gil_scoped_release release;
+    rasterizer_.freeze(mask, active_ids.data(), active_ids.shape(0));
+  }
+
+  void visible_rows(IndexOutArray out) const {
+    require_shape(out, {rasterizer_.visible().count}, "out");
+    std::copy_n(rasterizer_.visible().rows.data(), rasterizer_.visible().count, out.data());
+  }
+
+  const Rasterizer& rasterizer() const { return rasterizer_; }
+
+ private:
+  template <class Pass>
+  uint32_t keep(SceneArrays&& arrays, Pass&& pass) {
+    uint32_t faults = 0;
+    {
+      const nb::gil_scoped_release release;
+      faults = pass(arrays.scene);
+    }
+    current_ = std::move(arrays);
+    return faults;
+  }
+
+  SceneArrays active_rows(ConstFloatArray means, ConstFloatArray quats, ConstFloatArray scales, ConstFloatArray opacities, ConstFloatArray sh0,
+                          ConstFloatArray shN) const {
+    SceneArrays rows(means, quats, scales, opacities, sh0, shN);
+    require(rows.scene.count == rasterizer_.active_count(), "expected one row per active id");
+    return rows;
+  }
+
+  GradientArrays gradients(std::size_t n, const FloatArray& means, const FloatArray& quats, const FloatArray& scales, const FloatArray& opacities,
+                           const FloatArray& sh0, const FloatArray& shN, const FloatArray& means2d) const {
+    const std::size_t degree = static_cast<std::size_t>(current_.scene.sh_degree), bases = (degree + 1) * (degree + 1);
+    require_shape(means, {n, 3}, "v_means");
+    require_shape(quats, {n, 4}, "v_quats");
+    require_shape(scales, {n, 3}, "v_scales");
+    require_shape(opacities, {n}, "v_opacities");
+    require_shape(sh0, {n, 1, 3}, "v_sh0");
+    require_shape(shN, {n, bases - 1, 3}, "v_shN");
+    require_shape(means2d, {n, 2}, "v_means2d");
+    return {means.data(), quats.data(), scales.data(), opacities.data(), sh0.data(), shN.data(), means2d.data()};
+  }
+
+  const float* upstream(const ConstFloatArray& v_image, const std::optional<ConstFloatArray>& v_alpha) const {
+    const std::size_t w = static_cast<std::size_t>(rasterizer_.width()), h = static_cast<std::size_t>(rasterizer_.height());
+    require_shape(v_image, {h, w, 3}, "v_image");
+    if (v_alpha) require_shape(*v_alpha, {h, w}, "v_alpha");
+    return v_alpha ? v_alpha->data() : nullptr;
+  }
+
+  Rasterizer rasterizer_;
+  SceneArrays current_;
+};
+
+}  // namespace
+
+// Named arguments, none of which may be converted (see bindings.hpp).
+static auto strict(const char* name) { return nb::arg(name).noconvert(); }
+
+#define GSS_SCENE strict("means"), strict("quats"), strict("scales"), strict("opacities"), strict("sh0"), strict("shN")
+#define GSS_TARGET strict("image"), strict("transmittance")
+#define GSS_GRADIENTS \
+  strict("v_means"), strict("v_quats"), strict("v_scales"), strict("v_opacities"), strict("v_sh0"), strict("v_shN"), strict("v_means2d")
+
+void bind_rasterizer(nb::module_& module) {
+  module.attr("FAULT_NOT_FINITE") = static_cast<uint32_t>(FAULT_NOT_FINITE);
+  module.attr("FAULT_QUATERNION") = static_cast<uint32_t>(FAULT_QUATERNION);
+  nb::class_<PyRasterizer>(module, "Rasterizer", "Rasteriser of one camera; see gsstream_cpu_render.rasterizer for the checked interface.")
+      .def(nb::init<>())
+      .def("forward", &PyRasterizer::forward, GSS_SCENE, strict("viewmat"), strict("K"), nb::arg("width"), nb::arg("height"), strict("background"),
+           strict("tile_mask").none(), GSS_TARGET, "Returns FAULT_* bits; 0 means rendered.")
+      .def("backward", &PyRasterizer::backward, strict("v_image"), strict("v_alpha").none(), GSS_GRADIENTS, nb::arg("compact"))
+      .def("freeze", &PyRasterizer::freeze, strict("tile_mask").none(), strict("active_ids"))
+      .def("forward_active", &PyRasterizer::forward_active, GSS_SCENE, strict("background"), GSS_TARGET)
+      .def("backward_active", &PyRasterizer::backward_active, strict("v_image"), strict("v_alpha").none(), GSS_GRADIENTS)
+      .def("commit", &PyRasterizer::commit, GSS_SCENE)
+      .def("forward_cached", &PyRasterizer::forward_cached, strict("background"), strict("tile_mask").none(), GSS_TARGET)
+      .def("visible_rows", &PyRasterizer::visible_rows, strict("out"))
+      .def_prop_ro("visible_count", [](const PyRasterizer& r) { return r.rasterizer().visible().count; })
+      .def_prop_ro("active_count", [](const PyRasterizer& r) { return r.rasterizer().active_count(); })
+      .def_prop_ro("scene_count", [](const PyRasterizer& r) { return r.rasterizer().scene_count(); })
+      .def_prop_ro("pair_count", [](const PyRasterizer& r) { return r.rasterizer().pair_count(); })
+      .def_prop_ro("entry_count", [](const PyRasterizer& r) { return r.rasterizer().entry_count(); })
+      .def_prop_ro("passes", [](const PyRasterizer& r) { return r.rasterizer().passes(); })
+      .def("memory_bytes", [](const PyRasterizer& r) { return r.rasterizer().memory_bytes(); });
+}
+
+}  // namespace gsstream_cpu

@@ -1,0 +1,119 @@
+#include "tile_lists.hpp"
+
+#include <algorithm>
+#include <utility>
+
+#include "parallel.hpp"
+
+namespace gsstream_cpu {
+namespace {
+
+constexpr std::size_t PARALLEL_FROM = 8192;  // visible Gaussians per additional thread
+constexpr std::size_t TILE_GRAIN = 8;
+constexpr std::size_t PREFETCH = 16;
+
+struct Slice {
+  std::size_t begin, end;
+};
+
+// Calls visit(pair, visible slot, pair index) for the pairs of a slice of the depth order.
+template <class Visit>
+void for_pairs(const VisibleSet& visible, Slice slice, Visit&& visit) {
+  for (std::size_t i = slice.begin; i < slice.end; i++) {
+    const uint32_t slot = visible.by_depth[i].slot;
+    if (i + PREFETCH < slice.end) __builtin_prefetch(&visible.pair_offset[visible.by_depth[i + PREFETCH].slot]);
+    for (uint32_t p = visible.pair_offset[slot]; p < visible.pair_offset[slot + 1]; p++) visit(visible.pairs[p], slot, p);
+  }
+}
+
+}  // namespace
+
+void TileLists::resize(std::size_t tile_count, std::size_t entry_count) {
+  tiles = tile_count;
+  size = entry_count;
+  offset.require(tile_count + 1);
+  entries.require(entry_count);
+  blocks.require(entry_count);
+}
+
+void TileLists::swap(TileLists& other) {
+  std::swap(tiles, other.tiles);
+  std::swap(size, other.size);
+  offset.swap(other.offset);
+  entries.swap(other.entries);
+  blocks.swap(other.blocks);
+}
+
+// A stable counting scatter by tile in depth order: every list comes out depth-sorted, without sorting per tile. Each
+// part counts its slice; the running sums then give every part its own places, so the result is the same for any
+// number of parts.
+void build_tile_lists(const VisibleSet& visible, std::size_t tiles, uint32_t record_base, TileLists& out) {
+  out.resize(tiles, visible.pair_count);
+  const std::size_t threads = static_cast<std::size_t>(num_threads());
+  const std::size_t parts = std::clamp<std::size_t>(visible.count / PARALLEL_FROM, 1, threads);
+  const auto slice = [&](std::size_t p) { return Slice{visible.count * p / parts, visible.count * (p + 1) / parts}; };
+  std::vector<uint32_t> next(parts * tiles, 0);
+  parallel_for(parts, 1, [&](std::size_t begin, std::size_t end) {
+    for (std::size_t p = begin; p < end; p++)
+      for_pairs(visible, slice(p), [counts = &next[p * tiles]](Pair pair, uint32_t, uint32_t) { counts[pair.tile]++; });
+  });
+  uint32_t total = 0;
+  for (std::size_t tile = 0; tile < tiles; tile++) {
+    out.offset[tile] = total;
+    for (std::size_t p = 0; p < parts; p++) total += std::exchange(next[p * tiles + tile], total);
+  }
+  out.offset[tiles] = total;
+  parallel_for(parts, 1, [&](std::size_t begin, std::size_t end) {
+    for (std::size_t p = begin; p < end; p++)
+      for_pairs(visible, slice(p), [&, places = &next[p * tiles]](Pair pair, uint32_t slot, uint32_t index) {
+        const uint32_t place = places[pair.tile]++;
+        out.entries[place] = {record_base + visible.rows[slot], index};
+        out.blocks[place] = pair.blocks;
+      });
+  });
+}
+
+void filter_tile_lists(const TileLists& from, const uint32_t* tile_blocks, const std::vector<uint8_t>& is_active, TileLists& out) {
+  std::size_t most = 0;
+  for (std::size_t tile = 0; tile < from.tiles; tile++)
+    if (tile_blocks[tile]) most += from.offset[tile + 1] - from.offset[tile];
+  out.resize(from.tiles, most);
+  uint32_t next = 0;
+  for (std::size_t tile = 0; tile < from.tiles; tile++) {
+    out.offset[tile] = next;
+    if (!tile_blocks[tile]) continue;
+    for (uint32_t e = from.offset[tile]; e < from.offset[tile + 1]; e++) {
+      const uint32_t blocks = from.blocks[e] & tile_blocks[tile];
+      if (!blocks || is_active[from.entries[e].record]) continue;
+      out.entries[next] = {from.entries[e].record, FROZEN};
+      out.blocks[next++] = blocks;
+    }
+  }
+  out.offset[from.tiles] = next;
+  out.size = next;
+}
+
+void merge_tile_lists(const TileLists& frozen, const TileLists& active, const Record* records, uint32_t record_base,
+                      const std::vector<uint32_t>& active_rows, TileLists& out) {
+  out.resize(frozen.tiles, frozen.size + active.size);
+  for (std::size_t tile = 0; tile <= frozen.tiles; tile++) out.offset[tile] = frozen.offset[tile] + active.offset[tile];
+  const auto active_first = [&](const TileEntry& a, const TileEntry& f) {
+    const float near = records[a.record].depth, far = records[f.record].depth;
+    return near != far ? near < far : active_rows[a.record - record_base] < f.record;
+  };
+  parallel_for(frozen.tiles, TILE_GRAIN, [&](std::size_t begin, std::size_t end) {
+    for (std::size_t tile = begin; tile < end; tile++) {
+      uint32_t a = active.offset[tile], f = frozen.offset[tile], place = out.offset[tile];
+      const uint32_t a_end = active.offset[tile + 1], f_end = frozen.offset[tile + 1];
+      while (a < a_end || f < f_end) {
+        const bool take_active = f == f_end || (a < a_end && active_first(active.entries[a], frozen.entries[f]));
+        const TileLists& source = take_active ? active : frozen;
+        const uint32_t from = take_active ? a++ : f++;
+        out.entries[place] = source.entries[from];
+        out.blocks[place++] = source.blocks[from];
+      }
+    }
+  });
+}
+
+}  // namespace gsstream_cpu

@@ -35,6 +35,7 @@ from gsstream.core.state import GateState as GateState
 from gsstream.core.state import rows as rows
 from gsstream.core.topology import TopologyEdit as TopologyEdit
 from gsstream.gate.base import GateSampler as GateSampler
+from gsstream.loss.base import Loss as Loss
 from gsstream.propagation.base import Propagation as Propagation
 from gsstream.regularizer.base import Regularizer as Regularizer
 from gsstream.render.base import Renderer as Renderer

@@ -11,6 +11,7 @@ from gsstream.confidence.base import ConfidenceEstimator
 from gsstream.core.errors import PluginUnavailable, UnknownName
 from gsstream.core.part import Part
 from gsstream.gate.base import GateSampler
+from gsstream.loss.base import Loss
 from gsstream.plugins.catalog import Catalog
 from gsstream.propagation.base import Propagation
 from gsstream.recipe.check import join_problems, validate
@@ -25,6 +26,7 @@ from gsstream.structure.base import Structure
 SLOTS = ("structure", "confidence", "propagation", "gate", "regularizer", "update", "renderer")
 #: What "auto" tries, fastest first, before it falls back to the reference.
 AUTO_RENDERERS = ("cpu",)
+AUTO_LOSSES = ("cpu", "reference")
 
 
 class SlowRendererWarning(UserWarning):
@@ -48,6 +50,7 @@ class Assembly:
     regularizer: Regularizer
     update: UpdateRule
     renderer: Renderer
+    loss: Loss
     origins: Mapping[KeyPath, Origin] = field(default_factory=dict)
 
     @property
@@ -79,7 +82,9 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog) -> Assembly:
         if built is not None:
             parts[slot] = built
             refs[slot] = ComponentRef(name=ref.name, params=built.config.model_dump(mode="json"))
+    loss = _loss(resolved, catalog, problems)
     join_problems(problems)
+    parts["loss"] = loss
     return Assembly(recipe=resolved.recipe.model_copy(update=refs), origins=resolved.origins, **parts)
 
 
@@ -102,6 +107,19 @@ def _construct(slot: str, name: str, cls: type[Any], config: Any, catalog: Catal
         origin = catalog.entry(slot, name).origin
         raise PluginUnavailable(f"{slot} {name!r} (from {origin}) could not be built: {error}") from error
     return part
+
+
+def _loss(resolved: ResolvedRecipe, catalog: Catalog, problems: list[str]) -> Part | None:
+    """The loss implementation the recipe names, or the fastest that works here (they agree to 1e-6)."""
+    wanted = resolved.recipe.loss.backend
+    for name in AUTO_LOSSES if wanted == "auto" else (wanted,):
+        try:
+            cls = catalog.resolve("loss", name)
+            return _construct("loss", name, cls, cls.Config(), catalog)
+        except (UnknownName, PluginUnavailable) as error:
+            if wanted != "auto":
+                problems.append(f"{resolved.near(('loss', 'backend')).where}: loss.backend: {error}")
+    return None
 
 
 def _auto_renderer(

@@ -19,6 +19,7 @@ def gsstream_components() -> list[ComponentSpec]:
         _part("regularizer", "none", "regularizer.none:NoRegularizer", "nothing costs anything"),
         _part("update", "additive", "residual.additive:Additive", "gated change added to raw attributes"),
         _part("renderer", "reference", "render.reference:ReferenceRenderer", "pure torch, slow, defines the truth"),
+        _part("loss", "reference", "loss.photometric:ReferenceLoss", "L1 + D-SSIM in torch, slow, defines the truth"),
         _part("source", "demo", "source.open:open_source", "the small recording that ships with gsstream"),
         _part("source", "synthetic", "source.open:open_source", "an analytic moving scene: synthetic:KEY=VALUE&..."),
         _part("source", "folder", "source.open:open_source", "a folder of images per camera with cameras.json"),

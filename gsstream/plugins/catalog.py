@@ -24,6 +24,7 @@ CONTRACTS: Mapping[str, str] = {
     "regularizer": "gsstream.regularizer.base:Regularizer",
     "update": "gsstream.residual.base:UpdateRule",
     "renderer": "gsstream.render.base:Renderer",
+    "loss": "gsstream.loss.base:Loss",
 }
 
 

@@ -56,6 +56,7 @@ class FirstFrame(Section):
     )
     max_gaussians: int = Field(default=100_000, ge=1, description="upper bound on the number of Gaussians")
     prune_opacity: float = Field(default=0.005, ge=0, lt=1, description="Gaussians below this opacity are removed")
+    max_scale: float = Field(default=0.3, gt=0, description="Gaussians wider than this fraction of the rig's extent go")
     scale_penalty: float = Field(default=0.0, ge=0, description="weight of the mean scale, in rig extents (ours)")
     opacity_penalty: float = Field(default=0.0, ge=0, description="weight of the mean opacity (ours)")
     exposure: bool = Field(
@@ -78,6 +79,9 @@ class Loss(Section):
     """Photometric loss (1 - dssim) L1 + dssim (1 - SSIM)."""
 
     dssim: float = Field(default=0.2, ge=0, le=1, description="weight of 1 - SSIM")
+    backend: str = Field(
+        default="auto", description="implementation; auto: the fastest that works here (all give the same value)"
+    )
 
 
 class GateTraining(Section):
@@ -118,4 +122,7 @@ class Recipe(Section):
     codec: Codec = Field(default=Codec(), description="packets")
     scale: float = Field(default=1.0, gt=0, le=1, description="images are downscaled by this factor on reading")
     frames: int | None = Field(default=None, ge=1, description="number of frames to process; all when absent")
+    near: float = Field(
+        default=0.01, gt=0, lt=1, description="near plane, fraction of the rig's extent; nothing closer to a camera is drawn"
+    )
     background: tuple[float, float, float] = Field(default=(0.0, 0.0, 0.0), description="colour behind everything")

@@ -9,6 +9,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame, PointCloud
 
 Split = Literal["train", "test"]
+PointKind = Literal["recording", "sparse"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +43,11 @@ class FrameSource(Protocol):
     def frame(self, index: int, split: Split = "train") -> Frame:
         """Read one instant. Raises SourceError naming the file when an image is missing or unreadable."""
 
-    def points(self) -> PointCloud | None:
-        """Points of frame 0 that ship with the recording (never derived from test cameras), or None."""
+    def points(self, kind: PointKind = "recording") -> PointCloud | None:
+        """Points of frame 0 that ship with the recording (never derived from test cameras), or None.
+
+        ``kind``: "recording", or "sparse" for a thinned, noisier stand-in where one ships.
+        """
 
     def close(self) -> None:
         """Release files and threads."""

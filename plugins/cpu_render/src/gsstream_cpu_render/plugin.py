@@ -7,12 +7,18 @@ from gsstream.spec import ComponentSpec, hookimpl
 
 @hookimpl
 def gsstream_components() -> list[ComponentSpec]:
-    """The renderer `cpu`."""
+    """The renderer `cpu` and the loss `cpu`."""
     return [
         ComponentSpec(
             kind="renderer",
             name="cpu",
             target="gsstream_cpu_render.renderer:CpuRenderer",
             summary="fast CPU rasteriser (C++20, SIMD), with tile masks and cached frozen Gaussians",
-        )
+        ),
+        ComponentSpec(
+            kind="loss",
+            name="cpu",
+            target="gsstream_cpu_render.loss_part:CpuLoss",
+            summary="native L1 + D-SSIM with its gradient, on tile masks",
+        ),
     ]

@@ -1,0 +1,118 @@
+"""Frame 0: points -> anchors -> optimised Gaussians -> key packet -> the state every later frame starts from."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsstream.core.delta import Layout
+from gsstream.core.frame import Frame, PointCloud
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.rng import Rng
+from gsstream.core.shapes import FloatArray
+from gsstream.engine.assemble import Assembly
+from gsstream.engine.exposure import Exposure
+from gsstream.engine.guard import guarded
+from gsstream.engine.root import Progress, initial_gaussians, optimise_root, sort_by_node
+from gsstream.engine.stream_state import Step, StreamState
+from gsstream.packet import EncodedPacket, KeyState, StreamMeta, decode_packet, encode_key, quantise_key
+from gsstream.structure.base import Anchors
+
+
+def begin(
+    parts: Assembly, points: PointCloud, frame: Frame, meta: StreamMeta, rng: Rng, progress: Progress
+) -> Step:
+    """Reconstruct frame 0 and write it as a key packet.
+
+    Arguments:
+        points: seeds (never derived from test cameras).
+        frame: training images of frame 0.
+        meta: what the key packet says about the run; the exposure fit is added to it.
+    """
+    clock = [time.perf_counter()]
+    with guarded("structure", parts.structure, frame.index):
+        anchors = parts.structure.seed(points, frame.cameras)
+    clock.append(time.perf_counter())
+    start = initial_gaussians(anchors, parts.recipe.first_frame)
+    root = optimise_root(start, anchors.levels, frame, parts.recipe, parts.renderer, parts.loss, rng, progress)
+    clock.append(time.perf_counter())
+    # Positions are float32 in the packet too, so the hierarchy of the decoded scene is the one built here.
+    decoded = quantise_key(root.gaussians.map(lambda t: t.numpy())).map(torch.from_numpy)
+    hierarchy, levels, decoded = arrange(parts, decoded, root.levels, anchors)
+    layout = make_layout(hierarchy, levels, anchors)
+    state, packet = key_state(parts, decoded, layout, hierarchy, frame, meta, root.exposure, rng)
+    clock.append(time.perf_counter())
+    metrics: dict[str, Any] = {
+        "bytes": dict(packet.sizes),
+        "num_gaussians": len(decoded),
+        "active_gaussians": len(decoded),
+        "num_gates": len(layout.node_counts),
+        "active_gates": 0,
+        "iterations": root.iterations,
+        "seconds": dict(zip(("seed", "optimise", "code"), np.diff(clock).tolist(), strict=True)),
+    }
+    return Step(state, packet, "key", metrics)
+
+
+def arrange(
+    parts: Assembly, gaussians: Gaussians[torch.Tensor], levels: torch.Tensor, anchors: Anchors
+) -> tuple[Hierarchy, torch.Tensor, Gaussians[torch.Tensor]]:
+    """Group the Gaussians and store them node by node: (hierarchy, levels, Gaussians), all in the new order."""
+    with guarded("structure", parts.structure, 0):
+        hierarchy = parts.structure.build(gaussians, anchors)
+        hierarchy.validate()
+    edit = sort_by_node(hierarchy.node_of)
+    return hierarchy.rows(edit.source), levels[edit.source], gaussians.rows(edit.source)
+
+
+def make_layout(hierarchy: Hierarchy, levels: torch.Tensor, anchors: Anchors) -> Layout:
+    """What both ends know until the next key packet; ``hierarchy.node_of`` must be sorted."""
+    counts = torch.bincount(hierarchy.node_of, minlength=hierarchy.num_nodes)
+    return Layout(
+        node_counts=counts.numpy().astype(np.int32),
+        octree_levels=levels.numpy().astype(np.uint8),
+        cell_sizes=anchors.cell_sizes.numpy().astype(np.float32),
+    )
+
+
+def key_state(
+    parts: Assembly,
+    gaussians: Gaussians[torch.Tensor],
+    layout: Layout,
+    hierarchy: Hierarchy,
+    frame: Frame,
+    meta: StreamMeta,
+    exposure: Exposure | None,
+    rng: Rng,
+) -> tuple[StreamState, EncodedPacket]:
+    """Encode a key packet and continue from its decoded bytes."""
+    extra: Mapping[str, Any] = {**meta.extra, **exposure_to_meta(exposure)}
+    arrays: Gaussians[FloatArray] = gaussians.map(lambda t: np.ascontiguousarray(t.numpy()))
+    packet = encode_key(KeyState(arrays, layout, replace(meta, extra=extra)), frame=frame.index)
+    player = decode_packet(None, packet.data)
+    decoders = parts.update.init_decoders(gaussians, rng.stream("decoders", frame.index))
+    state = StreamState(
+        player=player, hierarchy=hierarchy, previous=frame, decoders=decoders, exposure=exposure_from_meta(player.meta)
+    )
+    return state, packet
+
+
+def exposure_to_meta(exposure: Exposure | None) -> dict[str, Any]:
+    """The colour maps of the training cameras as plain values: what a camera recorded can be shown from the stream."""
+    if exposure is None:
+        return {}
+    return {"exposure": {"matrix": exposure.matrix.tolist(), "offset": exposure.offset.tolist()}}
+
+
+def exposure_from_meta(meta: StreamMeta) -> Exposure | None:
+    """Inverse of :func:`exposure_to_meta`; encoder and resumed encoder both continue from the packet's values."""
+    stored = meta.extra.get("exposure")
+    if stored is None:
+        return None
+    return Exposure(torch.tensor(stored["matrix"]), torch.tensor(stored["offset"]))

@@ -1,0 +1,63 @@
+"""The frame context that confidence estimators see."""
+
+from __future__ import annotations
+
+import torch
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.context import ScreenGradient
+from gsstream.core.frame import Frame
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.hierarchy import Hierarchy
+from gsstream.engine.stream_state import StreamState
+from gsstream.metrics.noise import noise_sigma
+from gsstream.render.base import Renderer
+
+
+class StepContext:
+    """Read-only view of one frame step (implements ``gsstream.core.context.FrameContext``).
+
+    Images are as recorded; gradients are pulled through the camera's colour map, so that estimators need not know it.
+    """
+
+    def __init__(
+        self, state: StreamState, frame: Frame, renderer: Renderer, background: tuple[float, float, float]
+    ) -> None:
+        self._state, self._frame, self._renderer, self._background = state, frame, renderer, background
+        self._gaussians = state.gaussians
+
+    @property
+    def index(self) -> int:
+        return self._frame.index
+
+    @property
+    def gaussians(self) -> Gaussians[torch.Tensor]:
+        return self._gaussians
+
+    @property
+    def hierarchy(self) -> Hierarchy:
+        return self._state.hierarchy
+
+    @property
+    def cameras(self) -> Cameras:
+        return self._frame.cameras
+
+    def image(self, view: int) -> torch.Tensor:
+        return torch.from_numpy(self._frame.images[view])
+
+    def previous_image(self, view: int) -> torch.Tensor:
+        return torch.from_numpy(self._state.previous.images[view])
+
+    def previous_render(self, view: int) -> torch.Tensor:
+        with torch.no_grad():
+            image = self._renderer.render(self._gaussians, self.cameras, view, self._background).image
+        return self._state.exposure.apply(view, image) if self._state.exposure else image
+
+    def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
+        upstream = image_gradient.float()
+        if self._state.exposure:
+            upstream = self._state.exposure.pull(view, upstream)
+        return self._renderer.screen_gradient(self._gaussians, self.cameras, view, upstream.contiguous())
+
+    def noise_sigma(self, view: int) -> float:
+        return noise_sigma(self._state.previous.images[view], self._frame.images[view])

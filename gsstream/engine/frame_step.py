@@ -1,0 +1,120 @@
+"""One frame, top to bottom: (StreamState, Frame) -> Step.
+
+context -> estimate -> propagate -> init gates -> optimise -> harden -> encode -> decode own packet -> next state
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from gsstream.core.delta import Delta
+from gsstream.core.frame import Frame
+from gsstream.core.rng import Rng
+from gsstream.core.shapes import IntArray
+from gsstream.core.state import GateState
+from gsstream.engine.assemble import Assembly
+from gsstream.engine.context import StepContext
+from gsstream.engine.guard import guarded
+from gsstream.engine.optimise import Problem, Solution, optimise
+from gsstream.engine.stream_state import Step, StreamState
+from gsstream.packet import EncodedPacket, decode_packet, encode_delta, encode_empty, quantise_decoders
+from gsstream.residual.base import symbols as residual_symbols
+
+
+def frame_step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> Step:
+    """Advance the stream by one frame. Pure: a failure leaves ``state`` as it was."""
+    clock = [time.perf_counter()]
+    context = StepContext(state, frame, parts.renderer, parts.recipe.background)
+    with guarded("confidence", parts.confidence, frame.index):
+        logits = parts.confidence.estimate(context)
+    with guarded("propagation", parts.propagation, frame.index):
+        node_logits = parts.propagation.propagate(logits, state.hierarchy)
+    with guarded("gate", parts.gate, frame.index):
+        gate = parts.gate.init(node_logits)
+    clock.append(time.perf_counter())
+
+    active = active_set(parts, state, gate)
+    problem = Problem(state, frame, active, state.gaussians.rows(active), gate)
+    with guarded("method", parts.gate, frame.index):
+        solution = optimise(parts, problem, rng.stream("frame", frame.index))
+    clock.append(time.perf_counter())
+
+    delta = harden(parts, problem, solution)
+    packet = encode(delta, state, frame.index)
+    player = decode_packet(state.player, packet.data)
+    clock.append(time.perf_counter())
+    decoders = {**state.decoders, **{name: torch.from_numpy(value) for name, value in player.decoders.items()}}
+    after = replace(state, player=player, previous=frame, decoders=decoders, gate_moments=solution.gate_moments)
+    metrics = step_metrics(parts, delta, after, packet, solution, active)
+    metrics["seconds"] = dict(zip(("confidence", "optimise", "code"), np.diff(clock).tolist(), strict=True))
+    return Step(after, packet, "empty" if delta.is_empty else "delta", metrics)
+
+
+def active_set(parts: Assembly, state: StreamState, gate: GateState) -> torch.Tensor:
+    """[A] rows whose gate may open: open probability above the recipe's threshold."""
+    probability = parts.gate.open_probability(gate)
+    may_open = probability > parts.recipe.stream.active_threshold
+    return may_open[state.hierarchy.node_of].nonzero()[:, 0]
+
+
+def harden(parts: Assembly, problem: Problem, solution: Solution) -> Delta:
+    """The transmitted integers: deterministic gates and the symbols of the rows behind them.
+
+    A gate behind which every symbol is zero is closed: it would cost bits and change nothing (ours).
+    """
+    layout = problem.state.player.layout
+    gates = torch.round(parts.gate.sample(solution.gate, None) * parts.gate.num_levels).numpy().astype(np.uint8)
+    active = problem.active.numpy()
+    integers = {name: value.numpy() for name, value in residual_symbols(parts.update, solution.latents).items()}
+    moving = np.zeros(len(active), bool)
+    for value in integers.values():
+        moving |= value.any(1)
+    touched = np.zeros(len(gates), bool)
+    touched[layout.node_of[active[moving]]] = True
+    gates = np.where(touched, gates, 0).astype(np.uint8)
+    sent = np.flatnonzero(np.repeat(gates != 0, layout.node_counts))
+    table = {name: _rows_of(value, active, sent) for name, value in integers.items()}
+    table = {name: value for name, value in table.items() if value.any()}
+    decoders = {name: value.numpy() for name, value in solution.decoders.items() if name in table}
+    codes = parts.update.codes()
+    steps = {name: codes[name].step for name in table}
+    return Delta(gates, parts.gate.num_levels, table, steps, quantise_decoders(decoders))
+
+
+def _rows_of(values: IntArray, active: IntArray, wanted: IntArray) -> IntArray:
+    """Rows ``wanted`` of a table whose rows belong to ``active``; rows that took no part are zero."""
+    out = np.zeros((len(wanted), values.shape[1]), np.int32)
+    place = np.searchsorted(active, wanted)
+    known = (place < len(active)) & (active[np.minimum(place, max(0, len(active) - 1))] == wanted)
+    out[known] = values[place[known]]
+    return out
+
+
+def encode(delta: Delta, state: StreamState, index: int) -> EncodedPacket:
+    """The packet of a delta; an empty one when nothing changed."""
+    if delta.is_empty:
+        return encode_empty(frame=index)
+    return encode_delta(delta, state.player.layout, state.player.decoders, frame=index)
+
+
+def step_metrics(
+    parts: Assembly, delta: Delta, after: StreamState, packet: EncodedPacket, solution: Solution, active: torch.Tensor
+) -> dict[str, object]:
+    """Numbers of one frame step that need no rendering."""
+    counts = after.player.layout.node_counts
+    sizes: Mapping[str, int] = packet.sizes
+    return {
+        "bytes": dict(sizes),
+        "active_gaussians": int(counts[delta.gates != 0].sum()),
+        "num_gaussians": int(counts.sum()),
+        "active_gates": int((delta.gates != 0).sum()),
+        "num_gates": len(delta.gates),
+        "candidate_gaussians": len(active),
+        "loss": solution.loss,
+        "iterations": solution.iterations,
+    }

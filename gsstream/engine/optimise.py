@@ -1,0 +1,154 @@
+"""Optimise one frame's gates and residuals. Only rows whose gate may open take part."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+
+from gsstream.core.frame import Frame
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.state import GateState
+from gsstream.engine.assemble import Assembly
+from gsstream.engine.exposure import Exposure
+from gsstream.engine.parameters import AdamTable
+from gsstream.engine.stream_state import StreamState
+from gsstream.residual.base import apply_residual, init_latents
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What one frame's optimisation is given.
+
+    Arguments:
+        active: [A] int64 rows that may change, ascending.
+        base: those rows of the decoded previous scene.
+        gate: initial gate state [M].
+    """
+
+    state: StreamState
+    frame: Frame
+    active: torch.Tensor
+    base: Gaussians[torch.Tensor]
+    gate: GateState
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Latents [A, L] per attribute, decoders, final gate logits, gate moments, and the mean loss of the last epoch."""
+
+    latents: Mapping[str, torch.Tensor]
+    decoders: Mapping[str, torch.Tensor]
+    gate: GateState
+    gate_moments: Mapping[str, torch.Tensor]
+    loss: float
+    iterations: int
+
+
+def optimise(parts: Assembly, problem: Problem, generator: torch.Generator) -> Solution:
+    """Minimise photometric loss + penalty over epochs x views, one view per iteration."""
+    recipe = parts.recipe
+    views = len(problem.frame.cameras)
+    iterations = recipe.stream.epochs * views
+    run = _FrameRun(parts, problem, generator)
+    order: list[int] = []
+    recent: list[float] = []
+    for iteration in range(iterations):
+        order = order or torch.randperm(views, generator=generator).tolist()
+        recent.append(run.step(order.pop(), iteration / iterations))
+    loss = sum(recent[-views:]) / max(1, len(recent[-views:]))
+    return run.solution(loss, iterations)
+
+
+class _FrameRun:
+    """The moving state of one frame's optimisation; lives only inside :func:`optimise`."""
+
+    def __init__(self, parts: Assembly, problem: Problem, generator: torch.Generator) -> None:
+        self.parts, self.problem, self.generator = parts, problem, generator
+        state, layout = problem.state, problem.state.player.layout
+        self.hierarchy = state.hierarchy.rows(problem.active)
+        active = problem.active.numpy()
+        self.units = torch.from_numpy(layout.units[active])
+        self.levels = torch.from_numpy(layout.octree_levels[active].astype("int64"))
+        self.schedule = level_schedule(parts, len(layout.cell_sizes))
+        codes = parts.update.codes()
+        latents = init_latents(parts.update, problem.base)
+        self.latents = AdamTable(latents, {name: codes[name].lr for name in latents})
+        decoders = {name: state.decoders[name] for name in latents if name in state.decoders}
+        self.decoders = AdamTable(decoders, {name: codes[name].decoder_lr for name in decoders})
+        self.gate = AdamTable({"logits": problem.gate.logits}, {"logits": parts.recipe.gate_training.lr})
+        self.gate.load_moments("logits", state.gate_moments)
+        # One gate per Gaussian and nothing to learn: sampling it anew every iteration would be wasted work.
+        self.session = parts.renderer.open(
+            state.gaussians, problem.active, problem.frame.cameras, parts.recipe.background
+        )
+        self.targets = [parts.loss.prepare(torch.from_numpy(image)) for image in problem.frame.images]
+        self.exposure: Exposure | None = state.exposure
+
+    def step(self, view: int, fraction: float) -> float:
+        """One iteration on one view; returns the photometric loss."""
+        parts = self.parts
+        gate = GateState(self.gate["logits"])
+        gates = parts.gate.sample(gate, parts.gate.noise(self.hierarchy.num_nodes, self.generator))
+        rows = self._rows(gates, fraction)
+        output = self.session.render(view, rows)
+        raw = output.image.detach()
+        seen = self.exposure.apply(view, raw) if self.exposure else raw
+        value, gradient = parts.loss.evaluate(seen, self.targets[view], parts.recipe.loss.dssim)
+        upstream = self.exposure.pull(view, gradient) if self.exposure else gradient
+        penalties = list(self._penalty(gate).values())
+        roots = [output.image, *(p for p in penalties if p.requires_grad)]
+        torch.autograd.backward(roots, [upstream, *[None] * (len(roots) - 1)])
+        for table in (self.latents, self.decoders, self.gate):
+            table.step()
+        bounded = parts.gate.bound(GateState(self.gate["logits"].detach())).logits
+        self.gate["logits"].data.copy_(bounded)
+        return value
+
+    def _rows(self, gates: torch.Tensor, fraction: float) -> Gaussians[torch.Tensor]:
+        per_row = gates[self.hierarchy.node_of]
+        if self.schedule:
+            per_row = per_row * (self.levels <= current_level(self.schedule, fraction))
+        return apply_residual(
+            self.parts.update, self.problem.base, per_row, self.latents.leaves, self.decoders.leaves, self.units
+        )
+
+    def _penalty(self, gate: GateState) -> Mapping[str, torch.Tensor]:
+        residual = self.latents.leaves.get("means")
+        if residual is None:
+            residual = torch.zeros(len(self.problem.base), 3)
+        probability = self.parts.gate.open_probability(gate)
+        total = self.problem.state.hierarchy.num_gaussians
+        return self.parts.regularizer.penalty(probability, residual, self.hierarchy, total)
+
+    def solution(self, loss: float, iterations: int) -> Solution:
+        moments = self.gate.moments("logits") if self.parts.recipe.gate_training.optimiser == "persistent" else {}
+        return Solution(
+            latents={name: leaf.detach() for name, leaf in self.latents.leaves.items()},
+            decoders={name: leaf.detach() for name, leaf in self.decoders.leaves.items()},
+            gate=GateState(self.gate["logits"].detach()),
+            gate_moments=moments,
+            loss=loss,
+            iterations=iterations,
+        )
+
+
+def level_schedule(parts: Assembly, num_levels: int) -> tuple[tuple[float, int], ...]:
+    """Progressive training (paper, supplement): (fraction of the frame until which, finest active level).
+
+    Starts at level floor(H / 2); each finer level's stage is omega times longer, N_{i+1} = omega N_i. Empty when the
+    recipe does not ask for it or there is nothing to hold back. The paper leaves omega and the treatment of inactive
+    levels open: here they keep their previous attributes (ours).
+    """
+    first = num_levels // 2
+    if not parts.recipe.stream.progressive or num_levels - first < 2:
+        return ()
+    weights = [parts.recipe.stream.progressive_omega**i for i in range(num_levels - first)]
+    ends = [sum(weights[: i + 1]) / sum(weights) for i in range(len(weights))]
+    return tuple((end, first + i) for i, end in enumerate(ends))
+
+
+def current_level(schedule: tuple[tuple[float, int], ...], fraction: float) -> int:
+    """Finest active level at this fraction [0, 1) of the frame's iterations."""
+    return next((level for end, level in schedule if fraction < end), schedule[-1][1])

@@ -1,0 +1,73 @@
+"""Seeds of the first frame: the recording's points, else triangulation; topped up where no seed covers the view volume."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsstream.core.errors import InputError
+from gsstream.core.frame import Frame, PointCloud
+from gsstream.core.rng import Rng
+from gsstream.init.seeding import fill_volume, thin_points
+from gsstream.recipe.model import FirstFrame
+from gsstream.source.base import FrameSource
+
+#: Fewer points than this cannot carry a scene: "auto" then asks triangulation for more.
+SPARSE = 500
+
+
+def gather_points(source: FrameSource, frame: Frame, settings: FirstFrame, rng: Rng) -> PointCloud:
+    """Points to seed from. Test cameras take no part.
+
+    Raises InputError when the recipe asks for a kind of points that the recording does not have, or nothing is left.
+    """
+    cloud = thin_points(_base_points(source, frame, settings), settings.max_points)
+    if settings.fill_points == 0:
+        if len(cloud) == 0:
+            raise InputError("no points to start from: the recording ships none; set first_frame.fill_points above 0")
+        return cloud
+    fill = fill_volume(
+        cloud,
+        frame.images,
+        frame.cameras,
+        settings.fill_points,
+        min_views=settings.fill_min_views,
+        min_distance=settings.fill_min_distance * frame.cameras.extent,
+        rng=rng.numpy("fill", frame.index),
+    )
+    return join(cloud, fill)
+
+
+def join(first: PointCloud, second: PointCloud) -> PointCloud:
+    """Both clouds, in order."""
+    return PointCloud(
+        np.concatenate([first.xyz, second.xyz]).astype(np.float32),
+        np.concatenate([first.rgb, second.rgb]).astype(np.float32),
+        f"{first.origin} + {second.origin}",
+    )
+
+
+def _base_points(source: FrameSource, frame: Frame, settings: FirstFrame) -> PointCloud:
+    empty = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), "none")
+    if settings.points == "sfm":
+        return _triangulate(frame)
+    shipped = source.points("sparse" if settings.points == "sparse" else "recording")
+    if shipped is not None:
+        return shipped
+    if settings.points != "auto":
+        raise InputError(
+            f"first_frame.points = {settings.points!r}, but the recording {source.info.name!r} ships no points; "
+            "use 'auto' or 'sfm'"
+        )
+    try:
+        return _triangulate(frame)
+    except InputError:
+        # Without the optional triangulation the common view volume is still seeded.
+        if settings.fill_points == 0:
+            raise
+        return empty
+
+
+def _triangulate(frame: Frame) -> PointCloud:
+    from gsstream.init.sfm import triangulate
+
+    return triangulate(frame.images, frame.cameras)

@@ -1,0 +1,52 @@
+"""What the encoder carries from frame to frame. Everything a player cannot know is here; the rest is the player's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import torch
+
+from gsstream.core.frame import Frame
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.state import rows
+from gsstream.engine.exposure import Exposure
+from gsstream.packet import EncodedPacket, PlayerState
+
+
+@dataclass(frozen=True)
+class StreamState:
+    """Encoder state after a frame.
+
+    Arguments:
+        player: exactly what every player has after the last packet (decoded from its bytes).
+        hierarchy: groups of the layout in ``player``.
+        previous: training images of the last frame.
+        decoders: linear decoders to continue from; equal to the player's once they were sent.
+        exposure: colour maps of the training cameras, or None.
+        gate_moments: Adam moments of the gate logits when the recipe carries them over (released code), else empty.
+    """
+
+    player: PlayerState
+    hierarchy: Hierarchy = rows("gaussian")
+    previous: Frame = rows(None)
+    decoders: Mapping[str, torch.Tensor] = rows(None, default_factory=dict)
+    exposure: Exposure | None = rows(None, default=None)
+    gate_moments: Mapping[str, torch.Tensor] = rows("node", default_factory=dict)
+
+    @property
+    def gaussians(self) -> Gaussians[torch.Tensor]:
+        """The decoded scene as torch tensors that share the player's memory."""
+        return self.player.gaussians.map(torch.from_numpy)
+
+
+@dataclass(frozen=True)
+class Step:
+    """Outcome of one frame step: (state, frame) -> Step. Nothing is mutated, so a failed frame costs nothing."""
+
+    state: StreamState
+    packet: EncodedPacket
+    status: Literal["key", "delta", "empty"]
+    metrics: Mapping[str, Any] = field(default_factory=dict)

@@ -1,0 +1,26 @@
+"""The photometric loss as a gsstream part."""
+
+from __future__ import annotations
+
+from typing import Any, final
+
+import torch
+from gsstream.api import Loss
+
+from gsstream_cpu_render.loss import PhotometricTarget, photometric_loss
+
+
+@final
+class CpuLoss(Loss):
+    """Native (1 - w) L1 + w (1 - SSIM), 3DGS variant; equal to the reference to 1e-6, at a fraction of its time."""
+
+    def prepare(self, target: torch.Tensor) -> Any:
+        return PhotometricTarget(target.detach().numpy())
+
+    def evaluate(
+        self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
+    ) -> tuple[float, torch.Tensor]:
+        mask = None if tile_mask is None else tile_mask.numpy()
+        result = photometric_loss(image.detach().contiguous().numpy(), prepared, dssim_weight=dssim, tile_mask=mask)
+        assert result.gradient is not None
+        return result.value, torch.from_numpy(result.gradient)

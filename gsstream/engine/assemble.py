@@ -40,6 +40,7 @@ class Assembly:
     Arguments:
         recipe: the recipe with every part's parameters written out and the renderer that was chosen.
         origins: path -> origin of every value that is not a default (for ``recipe.save.save_resolved``).
+        distributions: installed distributions that the parts come from.
     """
 
     recipe: Recipe
@@ -52,6 +53,7 @@ class Assembly:
     renderer: Renderer
     loss: Loss
     origins: Mapping[KeyPath, Origin] = field(default_factory=dict)
+    distributions: tuple[str, ...] = ()
 
     @property
     def resolved(self) -> ResolvedRecipe:
@@ -85,7 +87,9 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog) -> Assembly:
     loss = _loss(resolved, catalog, problems)
     join_problems(problems)
     parts["loss"] = loss
-    return Assembly(recipe=resolved.recipe.model_copy(update=refs), origins=resolved.origins, **parts)
+    owners = sorted({catalog.entry(slot, ref.name).distribution for slot, ref in refs.items()})
+    recipe = resolved.recipe.model_copy(update=refs)
+    return Assembly(recipe=recipe, origins=resolved.origins, distributions=tuple(owners), **parts)
 
 
 def _build(

@@ -46,7 +46,7 @@ def begin(
     decoded = quantise_key(root.gaussians.map(lambda t: t.numpy())).map(torch.from_numpy)
     hierarchy, levels, decoded = arrange(parts, decoded, root.levels, anchors)
     layout = make_layout(hierarchy, levels, anchors)
-    state, packet = key_state(parts, decoded, layout, hierarchy, frame, meta, root.exposure, rng)
+    state, packet = key_state(parts, decoded, layout, hierarchy, frame, meta, root.exposure, anchors.origin, rng)
     clock.append(time.perf_counter())
     metrics: dict[str, Any] = {
         "bytes": dict(packet.sizes),
@@ -89,10 +89,11 @@ def key_state(
     frame: Frame,
     meta: StreamMeta,
     exposure: Exposure | None,
+    origin: torch.Tensor,
     rng: Rng,
 ) -> tuple[StreamState, EncodedPacket]:
     """Encode a key packet and continue from its decoded bytes."""
-    extra: Mapping[str, Any] = {**meta.extra, **exposure_to_meta(exposure)}
+    extra: Mapping[str, Any] = {**meta.extra, **exposure_to_meta(exposure), "origin": origin.tolist()}
     arrays: Gaussians[FloatArray] = gaussians.map(lambda t: np.ascontiguousarray(t.numpy()))
     packet = encode_key(KeyState(arrays, layout, replace(meta, extra=extra)), frame=frame.index)
     player = decode_packet(None, packet.data)

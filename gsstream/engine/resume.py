@@ -1,0 +1,97 @@
+"""Continue a stream exactly: everything the encoder needs follows from the stream, the source and the recipe."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gsstream.core.errors import OutputError, PacketError
+from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.rng import Rng
+from gsstream.engine.assemble import Assembly
+from gsstream.engine.begin import exposure_from_meta
+from gsstream.engine.stream_state import StreamState
+from gsstream.packet import PacketKind, PlayerState, StreamReader, decode_packet
+from gsstream.source.base import FrameSource
+from gsstream.structure.base import Anchors
+
+
+def resume_state(
+    parts: Assembly, path: Path, source: FrameSource, rng: Rng, near: float
+) -> StreamState | None:
+    """Encoder state after the last complete packet of a stream; None when not even frame 0 is complete.
+
+    Raises OutputError when the recipe is not the one the stream was written with, or carries state that a stream does
+    not hold (gate moments across frames).
+    """
+    if parts.recipe.gate_training.optimiser == "persistent":
+        raise OutputError(
+            "gate_training.optimiser = 'persistent' carries Adam moments that no stream holds: such a run cannot be "
+            "resumed; start it again with --overwrite"
+        )
+    with StreamReader(path) as reader:
+        if not reader.frames or reader.frames[0].kind != PacketKind.KEY:
+            return None
+        state = _replay(parts, reader, rng)
+    _check_recipe(parts, state.player)
+    frame = source.frame(state.player.frame, "train")
+    return replace(state, previous=replace(frame, cameras=replace(frame.cameras, near=near)))
+
+
+def _replay(parts: Assembly, reader: StreamReader, rng: Rng) -> StreamState:
+    """Decode all packets; rebuild what the key packet implies at every key packet."""
+    player: PlayerState | None = None
+    state: StreamState | None = None
+    for entry in reader.frames:
+        try:
+            player = decode_packet(player, reader.read(entry), offset=entry.offset)
+        except PacketError:
+            break
+        state = key_state_from_player(parts, player, rng) if entry.kind == PacketKind.KEY else state
+        assert state is not None
+        decoders = {**state.decoders, **{name: torch.from_numpy(value) for name, value in player.decoders.items()}}
+        state = replace(state, player=player, decoders=decoders)
+    if state is None:
+        raise PacketError("the first key packet of the stream is damaged", 0)
+    return state
+
+
+def key_state_from_player(parts: Assembly, player: PlayerState, rng: Rng) -> StreamState:
+    """The encoder state right after a key packet, from the decoded packet alone (``previous`` is not set)."""
+    gaussians = player.gaussians.map(torch.from_numpy)
+    decoders = parts.update.init_decoders(gaussians, rng.stream("decoders", player.frame))
+    return StreamState(
+        player=player,
+        hierarchy=rebuild_hierarchy(parts, player),
+        previous=None,  # type: ignore[arg-type]
+        decoders=decoders,
+        exposure=exposure_from_meta(player.meta),
+    )
+
+
+def rebuild_hierarchy(parts: Assembly, player: PlayerState) -> Hierarchy:
+    """The hierarchy the encoder built: the structure sees the same bits, so it gives the same forest."""
+    gaussians = player.gaussians.map(torch.from_numpy)
+    levels = torch.from_numpy(player.layout.octree_levels.astype(np.int64))
+    anchors = Anchors(
+        positions=gaussians.means,
+        colors=torch.zeros_like(gaussians.means),
+        levels=levels,
+        cell_sizes=torch.from_numpy(np.asarray(player.layout.cell_sizes)),
+        origin=torch.tensor(player.meta.extra["origin"], dtype=torch.float32),
+    )
+    return parts.structure.build(gaussians, anchors)
+
+
+def _check_recipe(parts: Assembly, player: PlayerState) -> None:
+    old, new = dict(player.meta.recipe), parts.recipe.model_dump(mode="json")
+    # The number of frames may grow: it decides where a run ends, not what its packets hold.
+    changed = sorted(key for key in new if key != "frames" and old.get(key) != new[key])
+    if changed:
+        raise OutputError(
+            f"the stream was written with another recipe: {', '.join(changed)} differ; resume with the same recipe "
+            "(recipe.yaml beside the stream) or start again with --overwrite"
+        )

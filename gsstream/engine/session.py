@@ -1,0 +1,213 @@
+"""A run: source -> method -> packets on disk, with metrics. Ends cleanly after the current frame on Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import OutputError
+from gsstream.core.frame import Frame
+from gsstream.core.rng import Rng
+from gsstream.engine.assemble import Assembly
+from gsstream.engine.begin import begin
+from gsstream.engine.frame_step import frame_step
+from gsstream.engine.measure import HeldOut
+from gsstream.engine.points import gather_points
+from gsstream.engine.progress import RunProgress
+from gsstream.engine.resume import resume_state
+from gsstream.engine.stream_state import Step, StreamState
+from gsstream.metrics import peak_memory_mb
+from gsstream.packet import StreamMeta, StreamWriter
+from gsstream.recipe.save import save_resolved
+from gsstream.source.base import FrameSource, SourceInfo
+from gsstream.source.open import open_source
+from gsstream.source.prefetch import Prefetcher
+
+STREAM, METRICS, RECIPE = "stream.gss", "metrics.jsonl", "recipe.yaml"
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """Where a run ended: folder, frames written in total, and whether Ctrl-C ended it early."""
+
+    out: Path
+    frames: int
+    interrupted: bool
+
+
+def run(
+    parts: Assembly,
+    source_uri: str,
+    out: Path,
+    *,
+    resume: bool = False,
+    quiet: bool = False,
+    measure: bool = True,
+    video: bool = True,
+) -> RunResult:
+    """Encode a recording into ``out`` (stream.gss, metrics.jsonl, recipe.yaml, pictures).
+
+    Arguments:
+        source_uri: what ``--source`` takes.
+        out: a prepared output folder.
+        resume: continue the run that ``out`` holds; the recipe must be the same.
+        measure: render and compare the test cameras of every frame.
+        video: also write an MP4 of a test camera.
+    """
+    source = open_source(source_uri, parts.recipe.scale)
+    try:
+        result = _Run(parts, source, out, quiet, measure).encode(resume)
+    finally:
+        source.close()
+    from gsstream.trade.gallery import write_gallery
+
+    write_gallery(out, source_uri, video=video, quiet=quiet)
+    return result
+
+
+class _Run:
+    """The moving parts of one run; lives only inside :func:`run`."""
+
+    def __init__(self, parts: Assembly, source: FrameSource, out: Path, quiet: bool, measure: bool) -> None:
+        self.parts, self.source, self.out = parts, source, out
+        self.rng = Rng(parts.recipe.seed)
+        self.near = parts.recipe.near * source.info.train.extent
+        self.total = _num_frames(source.info, parts.recipe.frames)
+        self.held_out = HeldOut(parts.renderer, parts.recipe.background) if measure else None
+        self.progress = RunProgress(self.total, quiet)
+
+    def encode(self, resume: bool) -> RunResult:
+        state = self._resume() if resume else None
+        done = 0 if state is None else state.player.frame + 1
+        if state is None:
+            save_resolved(self.out / RECIPE, self.parts.resolved)
+        last = None if state is None else state.player.frame
+        writer = StreamWriter.open(
+            self.out / STREAM, resume=state is not None, last_frame=last, fsync=self.parts.recipe.codec.fsync
+        )
+        indices = range(done, self.total)
+        with writer, self.progress, _stop_on_interrupt() as stop, Prefetcher(self.source, indices) as frames:
+            for train, test, waited in _timed(frames):
+                state = self._advance(writer, state, self._with_near(train), self._with_near(test), waited)
+                done = train.index + 1
+                if stop.is_set():
+                    break
+        return RunResult(self.out, done, stop.is_set())
+
+    def _advance(
+        self, writer: StreamWriter, state: StreamState | None, train: Frame, test: Frame, waited: float
+    ) -> StreamState:
+        train.validate()
+        started = time.perf_counter()
+        step = self._first(train) if state is None else frame_step(self.parts, state, train, self.rng)
+        writer.append(step.packet)
+        total = time.perf_counter() - started
+        metrics = self._metrics(step, train.index, test, total, waited)
+        with (self.out / METRICS).open("a", encoding="utf-8") as log:
+            log.write(json.dumps(metrics) + "\n")
+        self.progress.frame(metrics)
+        return step.state
+
+    def _first(self, frame: Frame) -> Step:
+        points = gather_points(self.source, frame, self.parts.recipe.first_frame, self.rng)
+        return begin(self.parts, points, frame, self._meta(frame.cameras), self.rng, self.progress.root)
+
+    def _metrics(self, step: Step, index: int, test: Frame, total: float, waited: float) -> dict[str, Any]:
+        metrics: dict[str, Any] = {"frame": index, "status": step.status, **step.metrics}
+        known = sum(metrics["seconds"].values())
+        metrics["seconds"] = {**metrics["seconds"], "other": max(0.0, total - known)}
+        metrics["wait_seconds"] = waited
+        if self.held_out and len(test.cameras):
+            metrics |= self.held_out.measure(step.state, test)
+        metrics["peak_memory_mb"] = peak_memory_mb()
+        return metrics
+
+    def _meta(self, train: Cameras) -> StreamMeta:
+        info, recipe = self.source.info, self.parts.recipe
+        distributions = {"gsstream", *self.parts.distributions}
+        return StreamMeta(
+            method=recipe.method,
+            source=info.name,
+            recipe=recipe.model_dump(mode="json"),
+            train=train,
+            test=replace(info.test, near=self.near),
+            fps=info.fps,
+            background=recipe.background,
+            plugins={name: version(name) for name in sorted(distributions)},
+            extra={"source_uri": info.uri, "licence": info.licence},
+        )
+
+    def _with_near(self, frame: Frame) -> Frame:
+        return replace(frame, cameras=replace(frame.cameras, near=self.near))
+
+    def _resume(self) -> StreamState | None:
+        state = resume_state(self.parts, self.out / STREAM, self.source, self.rng, self.near)
+        if state is None:
+            return None
+        _trim_metrics(self.out / METRICS, state.player.frame)
+        if self.held_out and len(self.source.info.test):
+            second = self.source.frame(1, "test") if state.player.frame >= 1 else None
+            self.held_out.remember(self.source.frame(0, "test"), second)
+        return state
+
+
+def _num_frames(info: SourceInfo, wanted: int | None) -> int:
+    have = info.num_frames
+    if have is None:
+        raise OutputError(f"the recording {info.name!r} does not say how many frames it has; give --frames")
+    return have if wanted is None else min(have, wanted)
+
+
+def _timed(frames: Prefetcher) -> Iterator[tuple[Frame, Frame, float]]:
+    """(train, test, seconds waited for decoding) of every frame."""
+    while True:
+        started = time.perf_counter()
+        try:
+            train, test = next(frames)
+        except StopIteration:
+            return
+        yield train, test, time.perf_counter() - started
+
+
+@contextmanager
+def _stop_on_interrupt() -> Iterator[threading.Event]:
+    """First Ctrl-C: finish the frame in flight. Second: stop at once (the stream stays valid up to the last packet)."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+
+    def handler(*_: object) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    previous = signal.signal(signal.SIGINT, handler)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def _trim_metrics(path: Path, last: int) -> None:
+    """Drop lines of frames that the stream does not hold (a kill can fall between packet and line)."""
+    if not path.exists():
+        return
+    kept: list[str] = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            entry: Mapping[str, Any] = json.loads(line)
+        except json.JSONDecodeError:
+            continue
+        if int(entry["frame"]) <= last:
+            kept.append(line)
+    path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")

@@ -23,7 +23,7 @@ def moving_mask(image: FloatArray, first: FloatArray, sigma: float) -> Mask:
     """
     check_pair(image, first)
     threshold = max(4 * math.sqrt(2) * sigma, FLOOR)
-    moved = (np.abs(np.asarray(image, np.float64) - first) > threshold).any(-1)
+    moved: Mask = np.any(np.abs(np.asarray(image, np.float64) - first) > threshold, axis=-1)
     return dilate(moved, DILATION)
 
 

@@ -32,12 +32,15 @@ def _blur(image: FloatArray) -> FloatArray:
     for axis in (0, 1):
         padding = [(0, 0)] * 3
         padding[axis] = (_RADIUS, _RADIUS)
-        wide = np.moveaxis(np.pad(image, padding), axis, 0)
-        size = image.shape[axis]
-        out = taps[0] * wide[_RADIUS : _RADIUS + size]
+        wide, size = np.pad(image, padding), image.shape[axis]
+        out = taps[0] * image
         for i in range(1, _RADIUS + 1):
-            pair = wide[_RADIUS - i : _RADIUS - i + size] + wide[_RADIUS + i : _RADIUS + i + size]
+            pair = _window(wide, axis, _RADIUS - i, size) + _window(wide, axis, _RADIUS + i, size)
             pair *= taps[i]
             out += pair
-        image = np.moveaxis(out, 0, axis)
+        image = out
     return image
+
+
+def _window(image: FloatArray, axis: int, start: int, size: int) -> FloatArray:
+    return image[start : start + size] if axis == 0 else image[:, start : start + size]

@@ -1,0 +1,151 @@
+"""Quality of decoded frames: what the player shows, against the recording, and against showing frame 0 for ever."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import InputError
+from gsstream.core.shapes import FloatArray
+from gsstream.metrics import SSIM_VARIANT, moving_mask, noise_sigma, psnr, slope_per_100, ssim
+from gsstream.player.playback import Playback
+from gsstream.player.render import PlayerRenderer, find_renderer, render
+from gsstream.source.base import FrameSource
+from gsstream.trade.records import mean
+from gsstream.trade.summary import format_table
+
+
+@dataclass(frozen=True, slots=True)
+class ViewQuality:
+    """One test camera at one frame; dB and SSIM; nan where nothing moves, inf for equal images."""
+
+    frame: int
+    camera: str
+    psnr: float
+    ssim: float
+    psnr_moving: float
+    moving_share: float
+    hold_psnr: float
+    hold_ssim: float
+    hold_psnr_moving: float
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """All views of all frames.
+
+    Arguments:
+        views: in the order of frames, then cameras.
+        sigmas: camera -> noise of one image, [0, 1] units.
+        renderer: name of the player's renderer.
+    """
+
+    views: tuple[ViewQuality, ...]
+    sigmas: Mapping[str, float]
+    renderer: str
+
+    def series(self, name: str) -> dict[int, float]:
+        """Frame -> mean over cameras of a quantity of :class:`ViewQuality` (views where it is not finite left out)."""
+        frames = sorted({view.frame for view in self.views})
+        return {t: mean(getattr(v, name) for v in self.views if v.frame == t) for t in frames}
+
+    def to_json(self) -> str:
+        """Everything as JSON; nan and inf become null."""
+        views = [{k: _plain(v) for k, v in asdict(view).items()} for view in self.views]
+        data = {"ssim_variant": SSIM_VARIANT, "renderer": self.renderer, "sigmas": dict(self.sigmas), "views": views}
+        return json.dumps(data, indent=1, allow_nan=False)
+
+    def table(self) -> str:
+        """Markdown: decoded and held, frame 0, mean of later frames, slope, SSIM, moving pixels."""
+        rows = [["", "PSNR 0", "PSNR", "dB/100", "SSIM", "moving"]]
+        for label, prefix in (("decoded", ""), ("frame 0 held", "hold_")):
+            whole = self.series(prefix + "psnr")
+            (first, psnr_first), later = next(iter(whole.items())), dict(list(whole.items())[1:])
+            known = {t: v for t, v in later.items() if math.isfinite(v)}
+            slope = slope_per_100(list(known), list(known.values()))
+            rest = [mean(v for t, v in self.series(prefix + n).items() if t != first) for n in ("ssim", "psnr_moving")]
+            numbers = [psnr_first, mean(known.values()), slope, *rest]
+            forms = [".2f", ".2f", "+.2f", ".4f", ".2f"]
+            cells = zip(numbers, forms, strict=True)
+            rows.append([label, *(format(v, form) if math.isfinite(v) else "-" for v, form in cells)])
+        notes = f"{SSIM_VARIANT}; renderer {self.renderer}; means over cameras, then over frames 1..T-1"
+        return f"{format_table(rows)}\n\n{notes}"
+
+
+def evaluate(
+    stream: str | os.PathLike[str], source: FrameSource, *, frames: Sequence[int] | None = None,
+    split: Literal["train", "test"] = "test", renderer: PlayerRenderer | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Evaluation:  # fmt: skip
+    """Render a stream's packets with the player and compare every test view with the recording.
+
+    Colours are clamped to [0, 1] first, as a screen would (3DGS convention). Noise is measured between the first two
+    evaluated frames; "moving" is relative to the first evaluated frame, which is also the one held.
+
+    Arguments:
+        frames: frame indices; default all of the stream.
+        progress: called with (done, total) after every frame.
+
+    Raises InputError when the recording's cameras are not those of the stream, PacketError for a damaged stream.
+    """
+    renderer = find_renderer() if renderer is None else renderer
+    with Playback(stream) as playback:
+        rig = playback.cameras(split)
+        chosen = sorted(set(playback.frames if frames is None else frames))
+        if not chosen or len(rig) == 0:
+            raise InputError(f"nothing to evaluate: {len(chosen)} frames, {len(rig)} {split} cameras")
+        order = _match(rig, source.info.test if split == "test" else source.info.train, split)
+        truth_first = _truth(source, chosen[0], split, order)
+        truth_next = _truth(source, chosen[1], split, order) if len(chosen) > 1 else truth_first
+        sigmas = [noise_sigma(a, b) for a, b in zip(truth_first, truth_next, strict=True)]
+        held = _rendered(playback, chosen[0], rig, renderer)
+        scene, images, views = playback.state_at(chosen[0]), held, []
+        for done, frame in enumerate(chosen, 1):
+            if playback.state_at(frame) is not scene:
+                scene, images = playback.state_at(frame), _rendered(playback, frame, rig, renderer)
+            truth = _truth(source, frame, split, order)
+            for i, name in enumerate(rig.ids):
+                mask = moving_mask(truth[i], truth_first[i], sigmas[i])
+                views.append(_compare(frame, name, images[i], held[i], truth[i], mask))
+            if progress is not None:
+                progress(done, len(chosen))
+    return Evaluation(tuple(views), dict(zip(rig.ids, sigmas, strict=True)), renderer.name)
+
+
+def _compare(frame: int, name: str, image: FloatArray, held: FloatArray, truth: FloatArray, mask: Any) -> ViewQuality:
+    return ViewQuality(
+        frame, name, psnr(image, truth), ssim(image, truth), psnr(image, truth, mask), float(mask.mean()),
+        psnr(held, truth), ssim(held, truth), psnr(held, truth, mask),
+    )  # fmt: skip
+
+
+def _rendered(playback: Playback, frame: int, rig: Cameras, renderer: PlayerRenderer) -> list[FloatArray]:
+    scene, background = playback.state_at(frame), playback.meta.background
+    return [np.clip(render(scene, rig, view, background, renderer), 0, 1) for view in range(len(rig))]
+
+
+def _truth(source: FrameSource, frame: int, split: Literal["train", "test"], order: Sequence[int]) -> FloatArray:
+    return source.frame(frame, split).images[list(order)]
+
+
+def _match(rig: Cameras, recorded: Cameras, split: str) -> list[int]:
+    """Index in the recording of every camera of the stream."""
+    missing = [name for name in rig.ids if name not in recorded.ids]
+    if missing or (rig.width, rig.height) != (recorded.width, recorded.height):
+        raise InputError(
+            f"the recording does not fit the stream: expected {split} cameras {list(rig.ids)} at {rig.width} x "
+            f"{rig.height}, got {list(recorded.ids)} at {recorded.width} x {recorded.height}; "
+            "open the recording at the scale of the run"
+        )
+    return [recorded.ids.index(name) for name in rig.ids]
+
+
+def _plain(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value

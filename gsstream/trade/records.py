@@ -1,0 +1,97 @@
+"""What a run wrote down: ``metrics.jsonl``, one JSON object per frame."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gsstream.core.errors import InputError
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRecord:
+    """One frame of a run. Quantities that were not measured are empty or nan.
+
+    Arguments:
+        frame: frame index.
+        psnr, ssim, psnr_moving: test camera -> value (dB, 1, dB); cameras where nothing moves are left out.
+        bytes: packet section -> bytes, headers included.
+        seconds: phase -> wall seconds.
+        active_gaussians, num_gaussians, active_gates, num_gates: counts.
+        peak_memory_mb: peak resident memory so far, MB.
+    """
+
+    frame: int
+    psnr: Mapping[str, float] = field(default_factory=dict)
+    ssim: Mapping[str, float] = field(default_factory=dict)
+    psnr_moving: Mapping[str, float] = field(default_factory=dict)
+    bytes: Mapping[str, int] = field(default_factory=dict)
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    active_gaussians: int = 0
+    num_gaussians: int = 0
+    active_gates: int = 0
+    num_gates: int = 0
+    peak_memory_mb: float = math.nan
+
+    @property
+    def is_key(self) -> bool:
+        """Only key packets carry a layout."""
+        return "layout" in self.bytes
+
+    @property
+    def total_bytes(self) -> int:
+        return sum(self.bytes.values())
+
+
+def mean(values: Iterable[float]) -> float:
+    """Mean of the finite values; nan when there are none."""
+    kept = [v for v in values if math.isfinite(v)]
+    return sum(kept) / len(kept) if kept else math.nan
+
+
+def read_records(path: str | os.PathLike[str]) -> list[FrameRecord]:
+    """Read ``metrics.jsonl`` (or the folder that holds it), in the order of frames; the last entry of a frame counts.
+
+    Unknown entries are passed over, so that a newer writer can be summarised. Raises InputError naming file and line.
+    """
+    path = Path(path)
+    path = path / "metrics.jsonl" if path.is_dir() else path
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}; expected the metrics.jsonl of a run") from error
+    found: dict[int, FrameRecord] = {}
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        try:
+            record = _record(json.loads(line))
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            if number == len(lines):
+                break  # a run that is being written, or was killed, ends in half a line
+            raise InputError(f"{path}:{number}: not a frame record: {error!r}") from error
+        found[record.frame] = record
+    if not found:
+        raise InputError(f"{path} holds no frame record")
+    return [found[frame] for frame in sorted(found)]
+
+
+def _record(data: dict[str, Any]) -> FrameRecord:
+    memory = data.get("peak_memory_mb")
+    return FrameRecord(
+        frame=int(data["frame"]),
+        psnr=_numbers(data.get("psnr")), ssim=_numbers(data.get("ssim")), psnr_moving=_numbers(data.get("psnr_moving")),
+        bytes={name: int(v) for name, v in _numbers(data.get("bytes")).items()}, seconds=_numbers(data.get("seconds")),
+        active_gaussians=int(data.get("active_gaussians") or 0), num_gaussians=int(data.get("num_gaussians") or 0),
+        active_gates=int(data.get("active_gates") or 0), num_gates=int(data.get("num_gates") or 0),
+        peak_memory_mb=math.nan if memory is None else float(memory),
+    )  # fmt: skip
+
+
+def _numbers(table: Mapping[str, Any] | None) -> dict[str, float]:
+    return {str(name): float(value) for name, value in (table or {}).items() if value is not None}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from gsstream.core.cameras import Cameras
@@ -73,11 +75,20 @@ def spiral(rig: Cameras, number: int, turns: float = 2.0) -> Cameras:
 
 
 def _up(rig: Cameras) -> FloatArray:
-    """Unit mean of the cameras' up directions (minus their y axes)."""
-    up = -rig.viewmats[:, 1, :3].mean(0)
-    norm = np.linalg.norm(up)
-    # Cameras rolled against each other may cancel; the first one then decides.
-    return np.asarray(up / norm if norm > 1e-3 else -rig.viewmats[0, 1, :3])
+    """Unit up direction: across the cameras' x axes, which are level unless a camera is rolled.
+
+    The mean of the cameras' own up directions would lean towards the side from which a half-circle rig looks down; it
+    only gives the sign, and the direction where all x axes are parallel.
+    """
+    mean = -rig.viewmats[:, 1, :3].mean(0)
+    if np.linalg.norm(mean) < 1e-3:
+        # Cameras rolled against each other cancel; the first one then decides.
+        mean = -rig.viewmats[0, 1, :3]
+    axes = rig.viewmats[:, 0, :3]
+    values, vectors = np.linalg.eigh(axes.T @ axes / len(rig))
+    up = vectors[:, 0] * np.sign(vectors[:, 0] @ mean)
+    level = values[0] < 0.05 * values[1] and values[1] > 1e-3 and up @ mean > 0.5 * np.linalg.norm(mean)
+    return np.asarray(up if level else mean / np.linalg.norm(mean))
 
 
 def _look_at(rig: Cameras, centers: FloatArray, target: FloatArray, up: FloatArray) -> Cameras:
@@ -94,4 +105,4 @@ def _look_at(rig: Cameras, centers: FloatArray, target: FloatArray, up: FloatArr
     viewmats[:, :3, :3] = rotation
     viewmats[:, :3, 3] = -np.einsum("cij,cj->ci", rotation, centers)
     ids = tuple(f"path-{i:04d}" for i in range(len(centers)))
-    return Cameras(ids, viewmats, np.tile(rig.Ks[0], (len(centers), 1, 1)), rig.width, rig.height)
+    return replace(rig, ids=ids, viewmats=viewmats, Ks=np.tile(rig.Ks[0], (len(centers), 1, 1)))

@@ -1,16 +1,18 @@
 """A slow forward rasteriser in plain numpy, tile by tile: the player's renderer where no compiled one is installed.
 
 Same conventions as gsstream/render (which needs torch): pixel-corner origin, 0.3 px blur, alpha cut 1/255, alpha clamp
-0.999, a Gaussian counts while the transmittance before it exceeds 1e-4, near plane 0.01. A test holds the two together.
+0.999, a Gaussian counts while the transmittance before it exceeds 1e-4, nothing at or before the near plane. A test holds the two together.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from gsstream.core.shapes import FloatArray, IntArray
 
-NEAR, BLUR, ALPHA_CUT, ALPHA_MAX, TRANSMITTANCE_MIN = 0.01, 0.3, 1 / 255, 0.999, 1e-4
+BLUR, ALPHA_CUT, ALPHA_MAX, TRANSMITTANCE_MIN = 0.3, 1 / 255, 0.999, 1e-4
 TILE = 16
 _SH1 = 0.4886025119029199
 _SH2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
@@ -18,17 +20,24 @@ _SH3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.37317633259
 
 
 def render_numpy(
-    means: FloatArray, quats: FloatArray, scales: FloatArray, opacities: FloatArray, sh0: FloatArray, shN: FloatArray,
-    viewmat: FloatArray, K: FloatArray, width: int, height: int, background: tuple[float, float, float],
+    splats: Sequence[FloatArray], viewmat: FloatArray, K: FloatArray, width: int, height: int,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0), *, near: float = 0.01,
 ) -> FloatArray:  # fmt: skip
-    """Render raw Gaussians (shapes as in core.gaussians) for one camera: [height, width, 3] float32.
+    """Render one camera: [height, width, 3] float32.
 
-    ``viewmat`` [4, 4] world-to-camera, ``K`` [3, 3] pixels, ``background`` in [0, 1].
+    Arguments:
+        splats: the six raw arrays of N Gaussians in the order of core.gaussians.ATTRIBUTES.
+        viewmat: [4, 4] world-to-camera.
+        K: [3, 3] pixels.
+        width, height: pixels.
+        background: colour behind everything, [0, 1].
+        near: near plane, scene units.
     """
+    means, quats, scales, opacities, sh0, shN = splats
     viewmat, K = np.asarray(viewmat, np.float64), np.asarray(K, np.float64)
     center = -viewmat[:3, :3].T @ viewmat[:3, 3]
     points = means.astype(np.float64) @ viewmat[:3, :3].T + viewmat[:3, 3]
-    front = np.flatnonzero(points[:, 2] > NEAR)
+    front = np.flatnonzero(points[:, 2] > near)
     front = front[np.argsort(points[front, 2], kind="stable")]
     means2d, covariance = _project(points[front], quats[front], scales[front], viewmat, K, width, height)
     with np.errstate(over="ignore"):
@@ -36,14 +45,14 @@ def render_numpy(
     colors = _colors(sh0[front], shN[front], means[front].astype(np.float64) - center)
     image = np.empty((height, width, 3), np.float32)
     image[:] = background
-    splats = np.column_stack([means2d, _conics(covariance), opacity, colors])
+    table = np.column_stack([means2d, _conics(covariance), opacity, colors])
     rows, tiles = _tile_lists(means2d, covariance, opacity, width, height)
     columns = -(-width // TILE)
     starts = np.flatnonzero(np.diff(tiles, prepend=-1))
     for start, stop in zip(starts, np.append(starts[1:], len(tiles)), strict=True):
         y, x = divmod(int(tiles[start]), columns)
         window = (slice(y * TILE, min((y + 1) * TILE, height)), slice(x * TILE, min((x + 1) * TILE, width)))
-        image[window] = _composite(splats[rows[start:stop]], window, background)
+        image[window] = _composite(table[rows[start:stop]], window, background)
     return image
 
 

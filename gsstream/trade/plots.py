@@ -64,7 +64,7 @@ def plot_runs(runs: Mapping[str, Sequence[FrameRecord]], out: str | os.PathLike[
             axis.plot(x, y, color=colors[name], linewidth=1.3, label=name, **style)
         axis.set_title(label, loc="left", fontsize=9)
         if zero:
-            axis.set_ylim(bottom=0)
+            axis.set_ylim(0, 1.1 * max(max(y) for _, y in lines.values()) or 1)
         _restrain(axis)
     axes[-1].set_xlabel("frame", fontsize=9)
     if len(runs) > 1:

@@ -1,15 +1,15 @@
 """A slow forward rasteriser in plain numpy, tile by tile: the player's renderer where no compiled one is installed.
 
 Same conventions as gsstream/render (which needs torch): pixel-corner origin, 0.3 px blur, alpha cut 1/255, alpha clamp
-0.999, a Gaussian counts while the transmittance before it exceeds 1e-4, nothing at or before the near plane. A test holds the two together.
+0.999, a Gaussian counts while the transmittance before it exceeds 1e-4, nothing at or before the near plane. A test
+holds the two together.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
+from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray, IntArray
 
 BLUR, ALPHA_CUT, ALPHA_MAX, TRANSMITTANCE_MIN = 0.3, 1 / 255, 0.999, 1e-4
@@ -20,20 +20,19 @@ _SH3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.37317633259
 
 
 def render_numpy(
-    splats: Sequence[FloatArray], viewmat: FloatArray, K: FloatArray, width: int, height: int,
+    gaussians: Gaussians[FloatArray], viewmat: FloatArray, K: FloatArray, width: int, height: int,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0), *, near: float = 0.01,
 ) -> FloatArray:  # fmt: skip
     """Render one camera: [height, width, 3] float32.
 
     Arguments:
-        splats: the six raw arrays of N Gaussians in the order of core.gaussians.ATTRIBUTES.
         viewmat: [4, 4] world-to-camera.
         K: [3, 3] pixels.
         width, height: pixels.
         background: colour behind everything, [0, 1].
         near: near plane, scene units.
     """
-    means, quats, scales, opacities, sh0, shN = splats
+    means, quats, scales, opacities, sh0, shN = (array for _, array in gaussians.items())
     viewmat, K = np.asarray(viewmat, np.float64), np.asarray(K, np.float64)
     center = -viewmat[:3, :3].T @ viewmat[:3, 3]
     points = means.astype(np.float64) @ viewmat[:3, :3].T + viewmat[:3, 3]

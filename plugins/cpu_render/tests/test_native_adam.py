@@ -44,7 +44,7 @@ class Rows:
             self.param[row] -= rate * first / (np.sqrt(second) + 1e-15)
 
 
-def fresh(param: Table) -> dict[str, Table]:
+def fresh(param: Table) -> dict[str, Any]:
     zeros = np.zeros_like(param)
     return {"param": param.copy(), "exp_avg": zeros, "exp_avg_sq": zeros.copy(), "step": np.zeros(len(param), np.int32)}
 

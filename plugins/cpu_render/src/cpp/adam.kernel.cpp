@@ -1,6 +1,7 @@
 #include "adam.hpp"
 
 #include <cmath>
+#include <initializer_list>
 
 #include "simd.hpp"
 
@@ -11,32 +12,53 @@ struct Factors {
   Floats beta1, rest1, beta2, rest2, eps, size, root2;  // size = lr / (1 - beta1^t), root2 = 1 / sqrt(1 - beta2^t)
 };
 
-// One vector; `rate` multiplies the step (per-column learning rates), else 1.
-GSS_INLINE void update_lanes(float* param, const float* grad, float* m, float* v, const Factors& f, Floats rate) {
-  const Floats g = load(grad);
-  const Floats first = f.beta1 * load(m) + f.rest1 * g;
-  const Floats second = f.beta2 * load(v) + f.rest2 * (g * g);
-  store(m, first);
-  store(v, second);
-  const Floats bottom = GSS_ISA::sqrt(second) * f.root2 + f.eps;
-  store(param, load(param) - f.size * rate * (first / bottom));
+// `size` is the step already multiplied by the learning rate of each lane.
+GSS_INLINE void update_lanes(Floats& param, Floats grad, Floats& m, Floats& v, const Factors& f, Floats size) {
+  m = f.beta1 * m + f.rest1 * grad;
+  v = f.beta2 * v + f.rest2 * (grad * grad);
+  const Floats bottom = GSS_ISA::sqrt(v) * f.root2 + f.eps;
+  param -= size * (m / bottom);
+}
+
+// The first `count` < LANES floats; other lanes are 0 and are not touched in memory.
+GSS_INLINE Floats load_part(const float* p, std::size_t count) {
+#if defined(__AVX512F__)
+  return (Floats)_mm512_maskz_loadu_ps(static_cast<__mmask16>((1u << count) - 1u), p);
+#else
+  float part[LANES] = {};
+  for (std::size_t i = 0; i < count; ++i) part[i] = p[i];
+  return load(part);
+#endif
+}
+
+GSS_INLINE void store_part(float* p, Floats v, std::size_t count) {
+#if defined(__AVX512F__)
+  _mm512_mask_storeu_ps(p, static_cast<__mmask16>((1u << count) - 1u), (__m512)v);
+#else
+  float part[LANES];
+  store(part, v);
+  for (std::size_t i = 0; i < count; ++i) p[i] = part[i];
+#endif
 }
 
 void update_row(float* param, const float* grad, float* m, float* v, std::size_t columns, const Factors& f,
                 const float* rates) {
-  const Floats one = broadcast(1.0f);
   std::size_t i = 0;
-  for (; i + LANES <= columns; i += LANES)
-    update_lanes(param + i, grad + i, m + i, v + i, f, rates ? load(rates + i) : one);
+  for (; i + LANES <= columns; i += LANES) {
+    Floats p = load(param + i), first = load(m + i), second = load(v + i);
+    update_lanes(p, load(grad + i), first, second, f, rates ? f.size * load(rates + i) : f.size);
+    store(param + i, p);
+    store(m + i, first);
+    store(v + i, second);
+  }
   const std::size_t left = columns - i;
   if (left == 0) return;
-  float p[LANES] = {}, g[LANES] = {}, a[LANES] = {}, b[LANES] = {}, r[LANES] = {};
-  for (std::size_t k = 0; k < left; ++k) {
-    p[k] = param[i + k], g[k] = grad[i + k], a[k] = m[i + k], b[k] = v[i + k];
-    r[k] = rates ? rates[i + k] : 1.0f;
-  }
-  update_lanes(p, g, a, b, f, load(r));
-  for (std::size_t k = 0; k < left; ++k) param[i + k] = p[k], m[i + k] = a[k], v[i + k] = b[k];
+  Floats p = load_part(param + i, left), first = load_part(m + i, left), second = load_part(v + i, left);
+  // Idle lanes would divide 0 by 0 without eps; the result is thrown away.
+  update_lanes(p, load_part(grad + i, left), first, second, f, rates ? f.size * load_part(rates + i, left) : f.size);
+  store_part(param + i, p, left);
+  store_part(m + i, first, left);
+  store_part(v + i, second, left);
 }
 
 bool all_zero(const float* values, std::size_t count) {
@@ -76,6 +98,17 @@ GSS_INLINE bool touched(const AdamJob& job, std::size_t i) {
   return !(job.mask && !job.mask[row_of(job, i)]) && !(job.skip_zero_rows && all_zero(grad_of(job, i), job.columns));
 }
 
+// Rows far apart in memory are asked for a few rows ahead: their latency, not the arithmetic, is the cost.
+GSS_INLINE void fetch_ahead(const AdamJob& job, std::size_t i, std::size_t end) {
+  constexpr std::size_t ahead = 12;
+  if (!job.ids || i + ahead >= end) return;
+  const std::size_t at = row_of(job, i + ahead) * job.columns, last = at + job.columns - 1;
+  for (const float* array : {job.param, job.exp_avg, job.exp_avg_sq}) {
+    __builtin_prefetch(array + at, 1);
+    __builtin_prefetch(array + last, 1);
+  }
+}
+
 GSS_INLINE bool alike(const AdamJob& job, std::size_t a, std::size_t b) {
   return (!job.step || job.step[a] == job.step[b]) && (!job.lr_rows || job.lr_rows[a] == job.lr_rows[b]);
 }
@@ -98,6 +131,7 @@ void update(const AdamJob& job, std::size_t begin, std::size_t end) {
     return update_row(job.param + at, job.grad + at, job.exp_avg + at, job.exp_avg_sq + at, (end - begin) * d, f, nullptr);
   }
   for (std::size_t i = begin; i < end;) {
+    fetch_ahead(job, i, end);
     if (!touched(job, i)) {
       ++i;
       continue;

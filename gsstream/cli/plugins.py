@@ -42,6 +42,8 @@ def _plugin_rows(catalog: Catalog) -> Iterator[tuple[str, str, str]]:
     for plugin in catalog.plugins:
         if plugin.specs is None:
             status = f"quarantined: {plugin.reason}"
+        elif plugin.left_out:
+            status = "left out by GSSTREAM_LOAD_PLUGINS"
         else:
             methods = sum(isinstance(spec, MethodSpec) for spec in plugin.specs)
             status = f"{plural(len(plugin.specs) - methods, 'part')}, {plural(methods, 'method')}"

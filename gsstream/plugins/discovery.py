@@ -9,11 +9,10 @@ Environment:
 
 from __future__ import annotations
 
-import importlib
 import importlib.metadata
 import os
 import sys
-from collections.abc import Iterator
+import textwrap
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -36,7 +35,7 @@ class PluginFault(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Discovered:
-    """One plugin, healthy or not: exactly one of ``specs`` and ``error`` is given.
+    """One plugin: healthy, left out, or in quarantine; exactly one of ``specs`` and ``error`` is given.
 
     Arguments:
         name: name of the entry point.
@@ -44,6 +43,7 @@ class Discovered:
         specs: what it declares, in its order.
         error: why it is in quarantine.
         declared: what a quarantined plugin did declare before it was refused, if it came that far.
+        left_out: not loaded, because GSSTREAM_LOAD_PLUGINS does not name it; ``specs`` is empty.
     """
 
     name: str
@@ -52,20 +52,21 @@ class Discovered:
     specs: tuple[Spec, ...] | None
     error: BaseException | None = None
     declared: tuple[Spec, ...] = ()
+    left_out: bool = False
 
     @property
     def reason(self) -> str:
-        """First line of the error, with the error's type where the message alone would not say it."""
+        """The error in one line, with its type where the message alone would not say it."""
         if self.error is None:
             return ""
-        text = (str(self.error).strip() or "no message").splitlines()[0]
+        text = textwrap.shorten(str(self.error) or "no message", 300, placeholder=" ...")
         return text if isinstance(self.error, PluginFault) else f"{type(self.error).__name__}: {text}"
 
     def unavailable(self, what: str) -> PluginUnavailable:
         """The error for somebody who asks for ``what``, a part of this quarantined plugin; raise it from ``error``."""
         return PluginUnavailable(
-            f"{what} is not available: plugin {self.name!r} (from {self.distribution} {self.version}) is in quarantine: "
-            f"{self.reason}"
+            f"{what} is not available: plugin {self.name!r} (from {self.distribution} {self.version}) is in "
+            f"quarantine: {self.reason}"
         )
 
 
@@ -74,18 +75,12 @@ def discover() -> list[Discovered]:
     found = [_inspect("builtin", "gsstream", __version__, lambda: builtin)]
     allowed = _allow_list()
     seen: set[str] = set()
-    for dist in _distributions():
-        for name, value in _entry_points(dist):
-            distribution, version = _identity(dist)
-            seen |= {name, distribution}
-            if allowed is not None and not allowed & {name, distribution}:
-                left_out = PluginFault("left out by GSSTREAM_LOAD_PLUGINS")
-                found.append(Discovered(name, distribution, version, None, left_out))
-            elif value is None:
-                broken = PluginFault("entry_points.txt cannot be read: expected lines 'name = module'")
-                found.append(Discovered(name, distribution, version, None, broken))
-            else:
-                found.append(_inspect(name, distribution, version, lambda value=value: importlib.import_module(value)))
+    for point, distribution, version in _entry_points():
+        seen |= {point.name, distribution}
+        if allowed is not None and not allowed & {point.name, distribution}:
+            found.append(Discovered(point.name, distribution, version, (), left_out=True))
+        else:
+            found.append(_inspect(point.name, distribution, version, point.load))
     for name in sorted((allowed or set()) - seen):
         missing = PluginFault(f"named in GSSTREAM_LOAD_PLUGINS but not installed{suggest(name, seen)}")
         found.append(Discovered(name, "?", "?", None, missing))
@@ -97,29 +92,14 @@ def _allow_list() -> set[str] | None:
     return None if text is None else {name.strip() for name in text.split(",") if name.strip()}
 
 
-def _distributions() -> list[importlib.metadata.Distribution]:
-    """Distributions that mention our group, first on the path wins, in an order that does not depend on the path."""
-    mine: dict[str, importlib.metadata.Distribution] = {}
-    for dist in importlib.metadata.distributions():
-        text = dist.read_text("entry_points.txt")
-        if text and f"[{ENTRY_POINT_GROUP}]" in text.replace(" ", ""):
-            mine.setdefault(_identity(dist)[0].lower().replace("_", "-"), dist)
-    return [mine[key] for key in sorted(mine)]
-
-
-def _identity(dist: importlib.metadata.Distribution) -> tuple[str, str]:
-    metadata = dist.metadata
-    return metadata["Name"] or "?", metadata["Version"] or "?"
-
-
-def _entry_points(dist: importlib.metadata.Distribution) -> Iterator[tuple[str, str | None]]:
-    """(name, module) of every entry point of our group; (distribution, None) when the file is malformed."""
-    try:
-        points = [(p.name, p.value) for p in dist.entry_points if p.group == ENTRY_POINT_GROUP]
-    except Exception:  # importlib.metadata raises whatever its parser stumbles over; one bad file must not hide others
-        yield _identity(dist)[0], None
-        return
-    yield from sorted(points)
+def _entry_points() -> list[tuple[importlib.metadata.EntryPoint, str, str]]:
+    """(entry point, distribution, version) of our group, in an order that does not depend on the path."""
+    found = []
+    for point in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP):
+        assert point.dist is not None, "entry points that were discovered know their distribution"
+        metadata = point.dist.metadata
+        found.append((point, metadata["Name"] or "?", metadata["Version"] or "?"))
+    return sorted(found, key=lambda item: (item[1], item[0].name))
 
 
 def _inspect(name: str, distribution: str, version: str, load: Any) -> Discovered:

@@ -128,6 +128,8 @@ def _compose(text: str, name: str) -> Node | None:
         raise RecipeError(f"{place}: not valid YAML: {error.problem or error.context}") from error
     except (YAMLError, ValueError) as error:
         raise RecipeError(f"{name}: not valid YAML: {error}") from error
+    except RecursionError as error:
+        raise RecipeError(f"{name}: not valid YAML: nested too deeply") from error
 
 
 def _where(node: Node, name: str) -> str:

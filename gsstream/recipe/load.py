@@ -68,8 +68,8 @@ def resolve_recipe(
         raise RecipeError(f"{stated[-1].origin.where}: method: expected a name, got {named!r}")
     if method and named and named != method:
         raise RecipeError(
-            f"{file} belongs to the method {named!r}, but --method says {method!r}: leave --method out, or change the "
-            "file's 'base' or 'method'"
+            f"{stated[-1].origin.where}: {file} belongs to the method {named!r}, but --method says {method!r}: leave "
+            "--method out, or change the file's 'base' or 'method'"
         )
     name = method or named or "dense"
     if not any(leaf.origin.label.startswith("method ") for leaf in stated):
@@ -109,6 +109,8 @@ def stack(layers: Sequence[Layer]) -> ResolvedRecipe:
         for path, leaf in known.items():
             if not isinstance(leaf.value, Empty):
                 _put(merged, path, leaf)
+            elif "params" in path[:-1] and not any(p[: len(path)] == path for p in merged):
+                _put(merged, path, Leaf({}, leaf.origin))  # a part's setting may be a mapping without entries
     origins = {path: leaf.origin for path, leaf in merged.items()}
     recipe = validate(Recipe, _nest(merged), ResolvedRecipe(Recipe(), origins).near, (), problems)
     join_problems(problems)
@@ -132,8 +134,6 @@ def _method_chain(name: str, find_method: FindMethod, within: tuple[str, ...]) -
 def _file_chain(path: Path, find_method: FindMethod, within: tuple[str, ...], label: str | None = None) -> list[Layer]:
     """The layers of a file: those of its base, then its own."""
     key = str(path.resolve())
-    if key in within:
-        raise RecipeError(f"{path}: 'base' goes in a circle: {' -> '.join([*within, key])}")
     layer = read_file(path, label)
     leaves = dict(layer.leaves)
     base = leaves.pop(("base",), None)
@@ -141,10 +141,17 @@ def _file_chain(path: Path, find_method: FindMethod, within: tuple[str, ...], la
         return [layer]
     if not isinstance(base.value, str):
         raise RecipeError(f"{base.origin.where}: base: expected the name of a method or a file, got {base.value!r}")
-    if re.fullmatch(r"[a-z][a-z0-9_-]*", base.value):
-        below = _method_chain(base.value, find_method, (*within, key))
+    method = re.fullmatch(r"[a-z][a-z0-9_-]*", base.value) is not None
+    target = find_method(base.value) if method else path.parent / base.value
+    if not target.is_file():
+        raise RecipeError(f"{base.origin.where}: base: there is no file {target}")
+    circle = (*within, key, str(target.resolve()))
+    if circle[-1] in circle[:-1]:
+        raise RecipeError(f"{base.origin.where}: base: goes in a circle: {' -> '.join(circle)}")
+    if method:
+        below = _method_chain(base.value, find_method, circle[:-1])
     else:
-        below = _file_chain(path.parent / base.value, find_method, (*within, key), label)
+        below = _file_chain(target, find_method, circle[:-1], label)
     return [*below, Layer(leaves, layer.marks)]
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.scalarstring import DoubleQuotedScalarString
 
 from gsstream.recipe.document import KeyPath
 from gsstream.recipe.load import ResolvedRecipe, recipe_hash
@@ -16,13 +17,11 @@ from gsstream.recipe.load import ResolvedRecipe, recipe_hash
 
 def to_yaml(resolved: ResolvedRecipe) -> str:
     """YAML text that ``load_recipe`` reads back to an equal recipe."""
-    yaml = YAML()
-    yaml.width = 10_000
-    yaml.representer.add_representer(type(None), lambda r, _: r.represent_scalar("tag:yaml.org,2002:null", "null"))
-    stream = io.StringIO()
-    yaml.dump(_annotate(resolved.recipe.model_dump(mode="json"), (), resolved), stream)
+    values = resolved.recipe.model_dump(mode="json")
+    widths = [len(line) for line in _dump(_tree(values, (), None, 0)).split("\n")]
+    column = 2 + max((width for width in widths if width < 60), default=0)
     heading = f"# Resolved recipe {recipe_hash(resolved.recipe)}\n# Beside every value: where it comes from.\n"
-    return heading + _align(stream.getvalue())
+    return heading + _dump(_tree(values, (), resolved, column))
 
 
 def save_resolved(path: Path, resolved: ResolvedRecipe) -> None:
@@ -30,42 +29,40 @@ def save_resolved(path: Path, resolved: ResolvedRecipe) -> None:
     path.write_text(to_yaml(resolved), encoding="utf-8")
 
 
-def leaves_of(tree: Mapping[str, Any], path: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:
-    """(path, value) of everything that is not a mapping, in order."""
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            yield from leaves_of(value, (*path, key))
-        else:
-            yield (*path, key), value
+def _dump(tree: CommentedMap) -> str:
+    yaml = YAML()
+    yaml.width = 1_000_000  # a value stays on the line of its comment
+    yaml.representer.add_representer(type(None), lambda r, _: r.represent_scalar("tag:yaml.org,2002:null", "null"))
+    stream = io.StringIO()
+    yaml.dump(tree, stream)
+    return stream.getvalue()
 
 
-def _annotate(tree: Mapping[str, Any], path: KeyPath, resolved: ResolvedRecipe) -> CommentedMap:
+def _tree(values: Mapping[str, Any], path: KeyPath, resolved: ResolvedRecipe | None, column: int) -> CommentedMap:
+    """The values as ruamel's round-trip mapping, each leaf with its provenance as a comment at ``column``."""
     out = CommentedMap()
-    for key, value in tree.items():
-        here = (*path, key)
+    for name, value in values.items():
+        here, key = (*path, name), _inline(name)
         if isinstance(value, Mapping) and value:
-            out[key] = _annotate(value, here, resolved)
+            out[key] = _tree(value, here, resolved, column)
             continue
-        out[key] = _flow(value)
-        out.yaml_add_eol_comment(resolved.origin(here).label.replace("\n", " "), key, column=0)
+        out[key] = _inline(value)
+        if resolved is not None:
+            label = " ".join(resolved.origin(here).label.split())
+            out.yaml_add_eol_comment(label, key, column=column)
     return out
 
 
-def _flow(value: Any) -> Any:
-    """Lists and empty mappings on one line, so that a comment can stand behind them."""
+def _inline(value: Any) -> Any:
+    """A value on one line, so that a comment can stand behind it."""
     out: Any
+    if isinstance(value, str) and not value.isprintable():
+        return DoubleQuotedScalarString(value)
     if isinstance(value, list):
-        out = CommentedSeq([_flow(item) for item in value])
+        out = CommentedSeq([_inline(item) for item in value])
     elif isinstance(value, Mapping):
-        out = CommentedMap({key: _flow(item) for key, item in value.items()})
+        out = CommentedMap({_inline(key): _inline(item) for key, item in value.items()})
     else:
         return value
     out.fa.set_flow_style()
     return out
-
-
-def _align(text: str) -> str:
-    """Put the provenance comments in one column."""
-    lines = [line.rpartition(" # ") for line in text.splitlines()]
-    width = max((len(head.rstrip()) for head, mark, _ in lines if mark and len(head.rstrip()) < 60), default=0)
-    return "\n".join(f"{head.rstrip():<{width}}  # {tail}" if mark else tail for head, mark, tail in lines) + "\n"

@@ -1,0 +1,163 @@
+"""The command line as its user meets it: listings, messages, exit codes, the frozen list of options."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+
+from gsstream.cli.main import app, run_command
+
+CHEAP = [
+    ["--help"],
+    ["--version"],
+    ["methods"],
+    ["methods", "show", "dense"],
+    ["plugins"],
+    ["run", "--help"],
+    ["play", "--help"],
+    ["evaluate", "--help"],
+    ["info", "--help"],
+    ["recipe", "show", "dense"],
+]
+
+OPTIONS = {
+    "gsstream": ["--debug", "--version"],
+    "gsstream run": [
+        "--source", "--out", "--method", "--recipe", "--set", "--frames", "--scale", "--seed", "--renderer", "--resume",
+        "--overwrite", "--no-video", "--quiet",
+    ],
+    "gsstream play": ["STREAM", "--out", "--camera", "--frames"],
+    "gsstream evaluate": ["STREAM", "--source"],
+    "gsstream info": ["STREAM"],
+    "gsstream methods": [],
+    "gsstream methods show": ["NAME"],
+    "gsstream plugins": ["--check"],
+    "gsstream plugins show": ["PART"],
+    "gsstream recipe": [],
+    "gsstream recipe show": ["METHOD", "--recipe", "--set", "--full"],
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _no_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GSSTREAM_LOAD_PLUGINS", "")
+
+
+def options_of(command, path: str) -> dict[str, list[str]]:
+    shown = [p for p in command.params if p.name != "help"]
+    own = {path: [p.opts[0] if p.param_type_name == "option" else p.name.upper() for p in shown]}
+    for name, child in getattr(command, "commands", {}).items():
+        own |= options_of(child, f"{path} {name}")
+    return own
+
+
+def test_options_are_frozen() -> None:
+    """A new option is a promise: add it here and to docs/reference/cli.md on purpose, or make it a recipe key."""
+    found = options_of(get_command(app), "gsstream")
+    assert {path: sorted(names) for path, names in found.items()} == {p: sorted(names) for p, names in OPTIONS.items()}
+
+
+def test_every_option_says_what_it_does() -> None:
+    def walk(command):
+        yield from ((command.name, param) for param in command.params)
+        for child in getattr(command, "commands", {}).values():
+            assert child.help, f"{child.name} has no help"
+            yield from walk(child)
+
+    for command, param in walk(get_command(app)):
+        assert getattr(param, "help", None), f"{command} {param.name} has no help"
+
+
+@pytest.mark.parametrize("args", CHEAP, ids=" ".join)
+def test_cheap_commands_import_no_torch(args: list[str]) -> None:
+    code = (
+        "import sys\nfrom gsstream.cli.main import run_command\ncode = run_command(sys.argv[1:])\n"
+        "heavy = sorted({'torch', 'kornia', 'matplotlib', 'constriction', 'pycolmap', 'av'} & set(sys.modules))\n"
+        "print(code, heavy, file=sys.stderr)\n"
+    )
+    result = subprocess.run([sys.executable, "-c", code, *args], capture_output=True, text=True, timeout=60, check=False)
+    assert result.stderr == "0 []\n"
+    assert result.stdout
+
+
+def run(capsys: pytest.CaptureFixture[str], *args: str) -> tuple[int, str, str]:
+    code = run_command(args)
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["run", "--source", "demo", "--out", "OUT", "--method", "dens"], "no method named 'dens'; did you mean 'dense'?"),
+        (["run", "--source", "demo", "--out", "OUT", "--set", "lss.dssim=1"], "--set lss.dssim=1: unknown key 'lss'; "
+         "did you mean 'loss'?"),
+        (["run", "--source", "demo", "--out", "OUT", "--frames", "0"], "--frames frames=0: frames: input should be greater "
+         "than or equal to 1, got 0"),
+        (["run", "--source", "demo", "--out", "OUT", "--recipe", "absent.yaml"], "cannot read the recipe absent.yaml: "),
+        (["info", "absent.gss"], "no stream at absent.gss: expected a .gss file or the output folder of a run"),
+        (["play", "absent.gss", "--out", "x", "--frames", "5:2"], "--frames 5:2: expected A:B with A < B, e.g. 0:30"),
+        (["plugins", "show", "additiv"], "no part named 'additiv'; did you mean 'additive'?"),
+        (["plugins", "show", "gatte/additive"], "no kind of part named 'gatte'; did you mean 'gate'?"),
+        (["methods", "show", "s2g"], "no method named 's2g'; known: dense"),
+    ],
+)  # fmt: skip
+def test_mistakes_end_with_one_line_and_code_2(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, args: list[str], message: str
+) -> None:
+    code, out, err = run(capsys, *[str(tmp_path / "out") if arg == "OUT" else arg for arg in args])
+    assert (code, out) == (2, "")
+    assert err.startswith(f"error: {message}")
+    assert err.count("\n") == 1
+    assert not (tmp_path / "out").exists(), "a refused command leaves nothing behind"
+
+
+def test_debug_shows_the_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = run(capsys, "--debug", "methods", "show", "nobody")
+    assert code == 2
+    assert "Traceback (most recent call last)" in err
+    assert "UnknownName: no method named 'nobody'" in err
+
+
+@pytest.mark.parametrize("args", [["frob"], ["run", "--sorce", "demo"], ["run"], ["play"]])
+def test_usage_errors_have_code_2(capsys: pytest.CaptureFixture[str], args: list[str]) -> None:
+    code, _, err = run(capsys, *args)
+    assert code == 2
+    assert "Error: " in err
+
+
+def test_interrupts_have_code_130(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gsstream.plugins.catalog.discover", interrupt)
+    assert run(capsys, "methods") == (130, "", "interrupted\n")
+
+
+def test_show_lists_every_setting_with_its_default(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, "plugins", "show", "flat")
+    assert code == 0
+    assert "structure flat (from gsstream 0.1.0): each Gaussian is its own node" in out
+    (row,) = [line for line in out.splitlines() if line.startswith("resolution ")]
+    assert "integer >= 1, <= 65536" in row
+    assert " 1024 " in row
+    nested = run(capsys, "plugins", "show", "update/additive")[1]
+    assert [line.split()[0] for line in nested.splitlines()[4:6]] == ["means.step", "means.lr"]
+
+
+def test_methods_show_names_parts_and_their_origin(capsys: pytest.CaptureFixture[str]) -> None:
+    out = run(capsys, "methods", "show", "dense")[1]
+    (row,) = [line for line in out.splitlines() if line.startswith("gate ")]
+    assert row.split()[:4] == ["gate", "always-open", "gsstream", "0.1.0"]
+
+
+def test_recipe_show_checks_parts_when_asked(capsys: pytest.CaptureFixture[str]) -> None:
+    typo = ["recipe", "show", "dense", "--set", "renderer=reference", "--set", "structure.resoluton=2"]
+    assert run(capsys, *typo)[0] == 0
+    code, _, err = run(capsys, *typo, "--full")
+    assert code == 2
+    assert err.endswith("unknown key 'structure.params.resoluton'; did you mean 'resolution'?\n")

@@ -1,0 +1,5 @@
+"""Calls sys.exit where a library should raise."""
+
+import sys
+
+sys.exit("no licence found")

@@ -1,0 +1,8 @@
+"""Misspells the hook."""
+
+from gsstream.spec import hookimpl
+
+
+@hookimpl
+def gsstream_component():
+    return []

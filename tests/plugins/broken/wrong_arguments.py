@@ -1,0 +1,8 @@
+"""Asks for an argument that the hook does not have."""
+
+from gsstream.spec import hookimpl
+
+
+@hookimpl
+def gsstream_components(registry):  # noqa: ARG001
+    return []

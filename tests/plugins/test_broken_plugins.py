@@ -1,0 +1,140 @@
+"""A broken plugin never costs more than itself: it is listed with its reason, everything else works."""
+
+from __future__ import annotations
+
+import pytest
+
+REASONS = {
+    "raises_at_import": "ModuleNotFoundError: No module named 'a_package_nobody_has'",
+    "exits_at_import": "SystemExit: no licence found",
+    "other_major": "from-the-future: built for component API 2.0, this gsstream speaks 1.0: upgrade gsstream",
+    "newer_minor": "newer-gate: built for component API 1.3, this gsstream speaks 1.0: upgrade gsstream",
+    "duplicate_name": "declares the gate 'always-open', which gsstream 0.1.0 already provides; rename it",
+    "unknown_hook": "implements the hook 'gsstream_component', which this gsstream does not know; did you mean "
+    "'gsstream_components'?",
+    "wrong_arguments": "PluginValidationError: Plugin 'gsstream_wrong_arguments_plugin' for hook 'gsstream_components' "
+    "hookimpl definition: gsstream_components(registry) Argument(s) {'registry'} are declared in the hookimpl but ",
+    "wrong_return": "gsstream_components() returned a str in its list; expected ComponentSpec",
+    "bad_spec": "ValidationError: 1 validation error for ComponentSpec kind Input should be 'structure', 'confidence',",
+    "no_hook": "gsstream_no_hook_plugin implements no hook; expected @hookimpl on one of gsstream_components, ",
+}
+
+
+@pytest.mark.parametrize("fault", REASONS)
+def test_listed_with_its_reason_while_the_rest_works(lab, fault: str) -> None:
+    lab.install(fault)
+    listing = lab.cli("plugins")
+    assert listing.returncode == 0, listing.stderr
+    (line,) = [line for line in listing.stdout.splitlines() if line.startswith(f"{fault} ")]
+    assert f"gsstream-{fault.replace('_', '-')} 0.3" in line
+    assert f"quarantined: {REASONS[fault]}" in line
+    assert "always-open" in listing.stdout
+    methods = lab.cli("methods")
+    assert methods.returncode == 0
+    assert methods.stdout.splitlines()[1].startswith("dense")
+    assert REASONS[fault] in methods.stderr
+
+
+def test_all_faults_at_once(lab) -> None:
+    for fault in REASONS:
+        lab.install(fault)
+    listing = lab.cli("plugins")
+    assert listing.returncode == 0, listing.stderr
+    assert listing.stdout.count("quarantined: ") == len(REASONS)
+    assert lab.cli("recipe", "show", "dense").returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("fault", "asked", "cause"),
+    [
+        ("raises_at_import", "raises_at_import", "ModuleNotFoundError"),
+        ("newer_minor", "newer-gate", "PluginFault"),
+        ("duplicate_name", "free-name", "PluginFault"),
+    ],
+)
+def test_asking_for_a_quarantined_part_raises_from_the_original_error(lab, fault: str, asked: str, cause: str) -> None:
+    lab.install(fault)
+    code = (
+        "import sys\n"
+        "from gsstream.plugins.catalog import load_catalog\n"
+        "from gsstream.core.errors import PluginUnavailable\n"
+        "try: load_catalog().resolve('gate', sys.argv[1])\n"
+        "except PluginUnavailable as error: print(type(error.__cause__).__name__, error)\n"
+    )
+    result = lab.python(code, asked)
+    assert result.stdout.startswith(f"{cause} gate {asked!r} is not available: plugin {fault!r} (from gsstream-")
+    assert REASONS[fault] in result.stdout
+    shown = lab.cli("plugins", "show", asked)
+    assert shown.returncode == 1
+    assert REASONS[fault] in shown.stderr
+
+
+def test_lying_declarations_are_found_when_used(lab) -> None:
+    lab.install("lying_spec")
+    assert lab.cli("plugins").returncode == 0
+    check = lab.cli("plugins", "--check")
+    assert check.returncode == 1
+    for name, reason in {
+        "gate 'no-module'": "ModuleNotFoundError: No module named 'a_module_nobody_has'",
+        "gate 'no-class'": "its target 'gsstream.gate.always_open:Gate' does not exist: gsstream.gate.always_open",
+        "gate 'wrong-kind'": "its target 'gsstream.structure.flat:Flat' is not a GateSampler: declared as 'gate'",
+        "gate 'not-a-class'": "its target 'gsstream.gate.base:__doc__' is not a GateSampler: declared as 'gate'",
+        "gate 'unfinished'": "leaves these methods of GateSampler unwritten: ",
+        "method 'no-recipe'": "its recipe 'gsstream.recipe:methods/absent.yaml' does not exist",
+    }.items():
+        (line,) = [line for line in check.stdout.splitlines() if line.startswith(f"  failed: {name} ")]
+        assert "(from gsstream-lying-spec 0.3)" in line
+        assert reason in line
+
+
+def test_an_entry_point_to_nowhere(lab) -> None:
+    lab.install("unknown_hook", entry_points="[gsstream]\nunknown_hook = gsstream_absent_module\n")
+    lab.add("healthy", HEALTHY)
+    listing = lab.cli("plugins").stdout
+    assert "quarantined: ModuleNotFoundError: No module named 'gsstream_absent_module'" in listing
+    assert "1 part, 0 methods" in listing
+
+
+HEALTHY = """
+from gsstream.spec import ComponentSpec, hookimpl
+
+@hookimpl
+def gsstream_components():
+    return [ComponentSpec(kind="gate", name="mine", target="gsstream.gate.always_open:AlwaysOpen", summary="mine")]
+"""
+
+
+def test_the_second_owner_of_a_name_is_refused_whatever_the_order_on_the_path(lab) -> None:
+    lab.add("zeta", HEALTHY)
+    lab.add("alpha", HEALTHY)
+    listing = lab.cli("plugins").stdout
+    assert "quarantined: declares the gate 'mine', which gsstream-alpha 0.3 already provides; rename it" in listing
+    assert listing.count("quarantined") == 1
+
+
+def test_allow_list(lab) -> None:
+    lab.add("healthy", HEALTHY)
+    lab.install("raises_at_import")
+    only = lab.cli("plugins", load="healthy,helthy").stdout
+    assert "1 part, 0 methods" in only
+    assert "raises-at-import 0.3  left out by GSSTREAM_LOAD_PLUGINS\n" in only
+    assert "quarantined: named in GSSTREAM_LOAD_PLUGINS but not installed; did you mean 'healthy'?" in only
+    nothing = lab.cli("plugins", load="").stdout
+    assert "mine" not in nothing
+    assert "a_package_nobody_has" not in nothing
+
+
+def test_trace_prints_every_hook_call(lab) -> None:
+    lab.add("healthy", HEALTHY)
+    traced = lab.cli("methods", GSSTREAM_TRACE_PLUGINS="1").stderr
+    assert "gsstream: gsstream_healthy_plugin: gsstream_components() -> [[ComponentSpec(" in traced
+    assert "trace" not in lab.cli("methods").stderr
+
+
+def test_unknown_names_mention_quarantine(lab) -> None:
+    lab.install("raises_at_import")
+    result = lab.cli("methods", "show", "s2gz")
+    assert result.returncode == 2
+    assert result.stderr == (
+        "error: no method named 's2gz'; known: dense (1 plugin could not be loaded: see 'gsstream plugins')\n"
+    )

@@ -1,0 +1,98 @@
+"""Recipe + catalogue -> live parts."""
+
+from __future__ import annotations
+
+import warnings
+
+import pytest
+
+from gsstream.core.errors import PluginUnavailable, RecipeError
+from gsstream.engine.assemble import SLOTS, Assembly, SlowRendererWarning, assemble
+from gsstream.plugins.catalog import Catalog, load_catalog
+from gsstream.plugins.discovery import Discovered
+from gsstream.recipe.load import ResolvedRecipe, resolve_recipe
+from gsstream.recipe.model import ComponentRef, Recipe
+from gsstream.spec import ComponentSpec
+
+
+@pytest.fixture
+def builtin(monkeypatch: pytest.MonkeyPatch) -> Catalog:
+    monkeypatch.setenv("GSSTREAM_LOAD_PLUGINS", "")
+    return load_catalog()
+
+
+def resolve(catalog: Catalog, *sets: str) -> ResolvedRecipe:
+    overrides = [("--set", item) for item in ("renderer=reference", *sets)]
+    return resolve_recipe("dense", catalog.recipe_path, None, overrides)
+
+
+def test_the_null_parts_assemble(builtin: Catalog) -> None:
+    assembly = assemble(resolve(builtin, "structure.resolution=64"), builtin)
+    assert isinstance(assembly, Assembly)
+    for slot in SLOTS:
+        part = getattr(assembly, slot)
+        assert type(part) is builtin.resolve(slot, getattr(assembly.recipe, slot).name)
+        assert getattr(assembly.recipe, slot).params == part.config.model_dump(mode="json")
+    assert assembly.structure.config.resolution == 64
+    assert assembly.resolved.origin(("structure", "params", "resolution")).label == "command line"
+
+
+def test_an_assembled_recipe_assembles_to_the_same(builtin: Catalog) -> None:
+    once = assemble(resolve(builtin, "update.means.step=0.5"), builtin)
+    twice = assemble(once.recipe, builtin)
+    assert twice.recipe == once.recipe
+    assert all(getattr(twice, slot) == getattr(once, slot) for slot in SLOTS)
+    assert once.recipe.update.params["means"] == {"step": 0.5, "lr": 0.1}, "a section may be given in part"
+
+
+def test_all_problems_come_in_one_error(builtin: Catalog) -> None:
+    sets = ["gate=always-opne", "structure.resoluton=3", "update.means.stp=1", "update.quats.step=-1", "update.sh0.lr=x"]
+    with pytest.raises(RecipeError) as caught:
+        assemble(resolve(builtin, *sets), builtin)
+    assert str(caught.value).splitlines() == [
+        "5 problems in the recipe:",
+        "  --set structure.resoluton=3: unknown key 'structure.params.resoluton'; did you mean 'resolution'?",
+        "  --set gate=always-opne: gate.name: no gate named 'always-opne'; did you mean 'always-open'?",
+        "  --set update.means.stp=1: unknown key 'update.params.means.stp'; did you mean 'step'?",
+        "  --set update.quats.step=-1: update.params.quats.step: input should be greater than 0, got -1",
+        "  --set update.sh0.lr=x: update.params.sh0.lr: input should be a valid number, got 'x'",
+    ]
+
+
+def test_auto_falls_back_to_the_reference_with_one_warning(builtin: Catalog) -> None:
+    with pytest.warns(SlowRendererWarning) as caught:
+        assembly = assemble(Recipe(), builtin)
+    assert len(caught) == 1
+    message = str(caught[0].message)
+    for part in ("500 times slower", "C++ compiler", "pip install ./plugins/cpu_render", "no renderer named 'cpu'"):
+        assert part in message
+    assert assembly.recipe.renderer.name == "reference"
+
+
+def renderer_plugin(target: str) -> Catalog:
+    spec = ComponentSpec(kind="renderer", name="cpu", target=target, summary="stands in for the native one")
+    plugins = [plugin for plugin in load_catalog().plugins if plugin.name == "builtin"]
+    return load_catalog([*plugins, Discovered("cpu_render", "gsstream-cpu-render", "1", (spec,))])
+
+
+def test_auto_takes_the_cpu_renderer_when_it_works() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assembly = assemble(Recipe(), renderer_plugin("gsstream.render.reference:ReferenceRenderer"))
+    assert assembly.recipe.renderer.name == "cpu"
+
+
+def test_a_native_module_that_cannot_be_imported() -> None:
+    catalog = renderer_plugin("a_native_module_nobody_built:Renderer")
+    with pytest.warns(SlowRendererWarning, match="No module named 'a_native_module_nobody_built'"):
+        assert assemble(Recipe(), catalog).recipe.renderer.name == "reference"
+    with pytest.raises(PluginUnavailable, match=r"renderer 'cpu' \(from gsstream-cpu-render 1\) cannot be used"):
+        assemble(Recipe(renderer=ComponentRef(name="cpu")), catalog)
+
+
+def test_auto_takes_no_settings(builtin: Catalog) -> None:
+    with pytest.raises(RecipeError) as caught:
+        assemble(resolve(builtin, "renderer=auto", "renderer.threads=2"), builtin)
+    assert str(caught.value) == (
+        "--set renderer.threads=2: renderer.params needs a named renderer, but renderer.name is 'auto'"
+    )

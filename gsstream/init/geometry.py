@@ -1,0 +1,98 @@
+"""Where a rig looks, which of its cameras match well, and which of them see a point. Training cameras only."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.shapes import FloatArray, IntArray
+
+BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
+
+
+def visible_views(points: FloatArray, cameras: Cameras) -> BoolArray:
+    """Which cameras have a point inside their image and in front of them; occlusion is not considered.
+
+    Arguments:
+        points: [P, 3] scene units.
+
+    Returns [P, C] bool.
+    """
+    visible = np.zeros((len(points), len(cameras)), bool)
+    for index in range(len(cameras)):
+        uv, depth = project(points, cameras, index)
+        visible[:, index] = inside(uv, depth, cameras)
+    return visible
+
+
+def project(points: FloatArray, cameras: Cameras, index: int) -> tuple[FloatArray, FloatArray]:
+    """Pixel positions [P, 2] (pixel-corner origin) and depths [P] in one camera; positions are 0 where depth <= 0."""
+    view, intrinsics = cameras.viewmats[index], cameras.Ks[index]
+    local = points @ view[:3, :3].T + view[:3, 3]
+    depth = local[:, 2]
+    front = depth > 0
+    homogeneous = local @ intrinsics.T
+    uv = np.zeros((len(points), 2), homogeneous.dtype)
+    np.divide(homogeneous[:, :2], depth[:, None], out=uv, where=front[:, None])
+    return uv, depth
+
+
+def inside(uv: FloatArray, depth: FloatArray, cameras: Cameras) -> BoolArray:
+    """[P] bool: in front of the camera and within its image."""
+    seen: BoolArray = (depth > 0) & (uv >= 0).all(1) & (uv[:, 0] < cameras.width) & (uv[:, 1] < cameras.height)
+    return seen
+
+
+def unproject(uv: FloatArray, depth: FloatArray, cameras: Cameras, index: int) -> FloatArray:
+    """World points [P, 3] at pixel positions [P, 2] and planar depths [P] of one camera."""
+    homogeneous = np.concatenate([uv, np.ones((len(uv), 1), uv.dtype)], axis=1)
+    local = (homogeneous @ np.linalg.inv(cameras.Ks[index]).T) * depth[:, None]
+    view = cameras.viewmats[index]
+    world: FloatArray = (local - view[:3, 3]) @ view[:3, :3]
+    return world
+
+
+def pixel_centres(width: int, height: int) -> FloatArray:
+    """[height * width, 2] centres of all pixels, row by row."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def focus_point(cameras: Cameras) -> FloatArray:
+    """The point nearest to all optical axes (least squares), drawn weakly to the cameras for parallel axes; [3]."""
+    axes, centers = cameras.viewmats[:, 2, :3], cameras.centers
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    weak = 1e-4 * len(cameras)
+    right = np.einsum("cij,cj->i", across, centers) + weak * centers.mean(0)
+    focus: FloatArray = np.linalg.solve(across.sum(0) + weak * np.eye(3), right)
+    return focus
+
+
+def depth_range(cameras: Cameras, near: float = 0.3, far: float = 4.0) -> FloatArray:
+    """[C, 2] nearest and farthest planar depth worth searching, scene units (ours).
+
+    Arguments:
+        near, far: multiples of each camera's distance to the rig's focus. The far end is at least 1.3 times the
+            distance to the farthest other camera, so that an inside-out dome reaches its opposite wall.
+    """
+    centers = cameras.centers
+    gaps = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+    distance = np.linalg.norm(centers - focus_point(cameras), axis=1)
+    # Parallel axes put the focus at the cameras themselves; the rig's own size is the next best ruler.
+    distance = np.maximum(distance, max(float(gaps.max()), 1e-6) * 0.25)
+    return np.stack([near * distance, np.maximum(far * distance, 1.3 * gaps.max(1))], axis=1)
+
+
+def neighbour_views(cameras: Cameras, count: int, least_angle: float = 5.0) -> IntArray:
+    """[C, min(count, C - 1)] best partners of each camera for matching: nearest in direction seen from the focus.
+
+    Angles under ``least_angle`` degrees give poor depth and are put back in the order.
+    """
+    outward = cameras.centers - focus_point(cameras)
+    outward = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12)
+    angle = np.degrees(np.arccos(np.clip(outward @ outward.T, -1, 1)))
+    rank = np.where(angle < least_angle, least_angle + 4 * (least_angle - angle), angle)
+    np.fill_diagonal(rank, np.inf)
+    return np.argsort(rank, axis=1, kind="stable")[:, : min(count, len(cameras) - 1)]

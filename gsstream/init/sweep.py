@@ -1,0 +1,162 @@
+"""Plane-sweep stereo for every training view: where along each pixel's ray do the neighbours agree?
+
+Ours, from standard pieces: fronto-parallel plane sweep (Collins, CVPR 1996), window NCC, which no camera gain or offset
+disturbs, mean of the two best neighbours against occlusion, and semi-global aggregation (Hirschmueller, PAMI 2008).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.shapes import FloatArray, check_shape
+from gsstream.init.aggregate import aggregate, best_plane
+from gsstream.init.geometry import depth_range, neighbour_views, pixel_centres
+
+_GREY = np.array([0.299, 0.587, 0.114], np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class SweepSettings:
+    """Settings of the sweep; the defaults were chosen on two recordings (docs: first frame).
+
+    Arguments:
+        planes: depth hypotheses per view, uniform in inverse depth.
+        neighbours: partners of each view.
+        windows: half widths in pixels of the square NCC windows, averaged; a wide one carries weak texture.
+        noise: image noise in [0, 1] below which texture does not count.
+        unseen: cost of a hypothesis outside a neighbour's image; an uncorrelated match costs 0.5.
+        step_penalty, jump_penalty: aggregation costs of a change by one plane and by more.
+        workers: threads, each on a view of its own.
+    """
+
+    planes: int = 128
+    neighbours: int = 6
+    windows: Sequence[int] = (2, 6)
+    noise: float = 2.0 / 255.0
+    unseen: float = 0.6
+    step_penalty: float = 0.03
+    jump_penalty: float = 1.0
+    workers: int = 2
+
+
+def sweep_depths(images: FloatArray, cameras: Cameras, settings: SweepSettings) -> FloatArray:
+    """Planar depth of every pixel of every view, right or wrong: nothing is rejected here.
+
+    Arguments:
+        images: [C, H, W, 3] float32 in [0, 1] of C >= 2 cameras.
+
+    Returns [C, H, W] float32, scene units. Deterministic for any number of workers.
+    """
+    check_shape("images", images, (len(cameras), cameras.height, cameras.width, 3))
+    grey = torch.from_numpy(np.ascontiguousarray(images @ _GREY))
+    partners = neighbour_views(cameras, settings.neighbours)
+    near_far = depth_range(cameras)
+    inverse = np.linspace(1 / near_far[:, 1], 1 / near_far[:, 0], settings.planes, axis=1).astype(np.float32)
+
+    def one(view: int) -> FloatArray:
+        cost = _matching_cost(grey, cameras, view, partners[view].tolist(), inverse[view], settings)
+        total = aggregate(cost, grey[view].numpy(), settings.step_penalty, settings.jump_penalty)
+        plane = best_plane(total)
+        return 1 / (inverse[view, 0] + plane * (inverse[view, 1] - inverse[view, 0]))
+
+    # Many small tensors: a second thread inside an operation costs more than it brings, one per view does not.
+    threads = torch.get_num_threads()
+    try:
+        with ThreadPoolExecutor(settings.workers, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            depths: FloatArray = np.stack(list(pool.map(one, range(len(cameras)))))
+            return depths
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _matching_cost(
+    grey: torch.Tensor, cameras: Cameras, view: int, partners: list[int], inverse: FloatArray, settings: SweepSettings
+) -> FloatArray:
+    """[D, H, W] mean of the two best neighbours' (1 - NCC) / 2, in [0, 1]."""
+    height, width = grey.shape[1:]
+    reference = grey[view][None, None]
+    statistics = [_mean_and_variance(reference, half) for half in settings.windows]
+    maps = [_plane_map(cameras, view, partner) for partner in partners]
+    cost = np.empty((len(inverse), height, width), np.float32)
+    chunk = 4  # planes at a time: the temporaries stay in the cache
+    for start in range(0, len(inverse), chunk):
+        planes = torch.from_numpy(inverse[start : start + chunk])
+        best = torch.full((len(planes), height, width), settings.unseen)
+        second = best.clone()
+        for partner, (rotation, translation) in zip(partners, maps, strict=True):
+            grid, unseen = _grid(rotation, translation, planes, height, width)
+            warped = F.grid_sample(
+                grey[partner][None, None], grid, mode="bilinear", padding_mode="border", align_corners=False
+            ).reshape(len(planes), 1, height, width)
+            match = _ncc_cost(warped, reference, statistics, settings)
+            match.masked_fill_(unseen, settings.unseen)
+            second = torch.minimum(second, torch.maximum(best, match))
+            best = torch.minimum(best, match)
+        cost[start : start + chunk] = (0.5 * (best + second)).numpy()
+    return cost
+
+
+def _plane_map(cameras: Cameras, view: int, partner: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """A pixel at inverse depth q lands in the partner at (A + q b), homogeneous, image = [-1, 1]; A [3, HW], b [3]."""
+    relative = cameras.viewmats[partner] @ np.linalg.inv(cameras.viewmats[view])
+    to_unit = np.array([[2 / cameras.width, 0, -1], [0, 2 / cameras.height, -1], [0, 0, 1.0]])
+    camera = to_unit @ cameras.Ks[partner]
+    uv = pixel_centres(cameras.width, cameras.height)
+    rays = np.linalg.inv(cameras.Ks[view]) @ np.concatenate([uv, np.ones((len(uv), 1))], axis=1).T
+    rotation = (camera @ relative[:3, :3] @ rays).astype(np.float32)
+    return torch.from_numpy(rotation), torch.from_numpy((camera @ relative[:3, 3]).astype(np.float32))
+
+
+def _grid(
+    rotation: torch.Tensor, translation: torch.Tensor, planes: torch.Tensor, height: int, width: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Sampling grid [1, D H, W, 2] and the mask [D, H, W] of samples outside the partner's image."""
+    position = rotation[None] + translation[None, :, None] * planes[:, None, None]
+    depth = position[:, 2]
+    xy = position[:, :2] / depth.clamp_min(1e-3)[:, None]
+    unseen = (depth <= 1e-3) | (xy.abs().amax(1) > 1)
+    grid = xy.permute(0, 2, 1).reshape(1, len(planes) * height, width, 2)
+    return grid, unseen.reshape(len(planes), height, width)
+
+
+def _ncc_cost(
+    warped: torch.Tensor,
+    reference: torch.Tensor,
+    statistics: list[tuple[torch.Tensor, torch.Tensor]],
+    settings: SweepSettings,
+) -> torch.Tensor:
+    floor = settings.noise**2
+    square, product = warped * warped, warped * reference
+    cost = torch.zeros_like(warped)
+    for half, (mean, variance) in zip(settings.windows, statistics, strict=True):
+        warped_mean = _box(warped, half)
+        warped_variance = (_box(square, half) - warped_mean * warped_mean).clamp_min(0)
+        covariance = _box(product, half) - warped_mean * mean
+        cost += 0.5 * (1 - covariance * torch.rsqrt((variance + floor) * (warped_variance + floor)))
+    return cost[:, 0] / len(settings.windows)
+
+
+def _mean_and_variance(image: torch.Tensor, half: int) -> tuple[torch.Tensor, torch.Tensor]:
+    mean = _box(image, half)
+    return mean, (_box(image * image, half) - mean * mean).clamp_min(0)
+
+
+def _box(image: torch.Tensor, half: int) -> torch.Tensor:
+    """Mean over a square of 2 half + 1 pixels; borders are replicated. [N, 1, H, W]."""
+    height, width = image.shape[-2:]
+    side = 2 * half + 1
+    padded = F.pad(image, (half, half, half, half), mode="replicate")
+    rows = padded[..., :width].clone()
+    for k in range(1, side):
+        rows += padded[..., k : k + width]
+    total = rows[..., :height, :].clone()
+    for k in range(1, side):
+        total += rows[..., k : k + height, :]
+    return total / (side * side)

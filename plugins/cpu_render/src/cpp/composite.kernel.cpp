@@ -111,8 +111,11 @@ GSS_INLINE void blend_tile(const CompositeJob& job, ForwardTile& tile, uint32_t 
   uint32_t alive = job.tile_blocks[index], k = 0;
   for (; k < count && alive; k++) {
     if (k + PREFETCH < count) __builtin_prefetch(&job.records[entries[k + PREFETCH].record]);
+    const uint32_t wanted = blocks[k] & alive;
+    contributed[k] = 0;
+    if (!wanted) continue;
     const Kernel kernel(job.records[entries[k].record], x, y);
-    contributed[k] = blend_entry(tile, kernel, blocks[k] & alive, static_cast<int32_t>(k) + 1, alive);
+    contributed[k] = blend_entry(tile, kernel, wanted, static_cast<int32_t>(k) + 1, alive);
   }
   for (; k < count; k++) contributed[k] = 0;
 }
@@ -156,11 +159,13 @@ struct BackwardTile {
   alignas(64) int32_t last[BLOCKS][BLOCK_PIXELS];
 };
 
-GSS_INLINE void start_backward_tile(const CompositeBackwardJob& job, BackwardTile& tile, std::size_t slot, uint32_t index, int tile_x, int tile_y) {
+// False if the upstream gradient is zero all over the tile (NaN is not zero).
+GSS_INLINE bool start_backward_tile(const CompositeBackwardJob& job, BackwardTile& tile, std::size_t slot, uint32_t index, int tile_x, int tile_y) {
   const CompositeJob& fwd = job.forward;
   const float* background = fwd.background;
   const float* kept_transmittance = fwd.pixel_transmittance + slot * BLOCKS * BLOCK_PIXELS;
   const int32_t* kept_last = fwd.pixel_last + slot * BLOCKS * BLOCK_PIXELS;
+  Ints magnitude{};
   for (uint32_t blocks = fwd.tile_blocks[index]; blocks; blocks &= blocks - 1) {
     const int b = __builtin_ctz(blocks);
     const BlockPlace place = place_of(b, tile_x, tile_y, fwd.width, fwd.height);
@@ -168,13 +173,15 @@ GSS_INLINE void start_backward_tile(const CompositeBackwardJob& job, BackwardTil
     read_rgb(place, job.image_gradient, tile.red[b], tile.green[b], tile.blue[b]);
     if (job.alpha_gradient) read_scalar(place, job.alpha_gradient, alpha_gradient);
     for (int q = 0; q < BLOCK_PIXELS; q += LANES) {
-      const Floats t = load(kept_transmittance + b * BLOCK_PIXELS + q);
+      const Floats t = load(kept_transmittance + b * BLOCK_PIXELS + q), from_alpha = load(alpha_gradient + q);
+      magnitude |= (Ints)load(tile.red[b] + q) | (Ints)load(tile.green[b] + q) | (Ints)load(tile.blue[b] + q) | (Ints)from_alpha;
       const Floats seen = background[0] * load(tile.red[b] + q) + background[1] * load(tile.green[b] + q) + background[2] * load(tile.blue[b] + q);
       store(tile.transmittance[b] + q, t);
-      store(tile.behind[b] + q, t * (seen - load(alpha_gradient + q)));  // alpha = 1 - transmittance
+      store(tile.behind[b] + q, t * (seen - from_alpha));  // alpha = 1 - transmittance
       store(tile.last[b] + q, load(kept_last + b * BLOCK_PIXELS + q));
     }
   }
+  return any(greater_equal(magnitude & INT32_MAX, broadcast(1)));
 }
 
 // Undoes one entry in LANES pixels of one block: transmittance and light behind become those before the entry.
@@ -233,30 +240,44 @@ GSS_INLINE void roll_back_entry(BackwardTile& tile, const Kernel& k, uint32_t bl
   }
 }
 
-void backward(const CompositeBackwardJob& job, std::size_t first_tile, std::size_t end_tile) {
-  const CompositeJob& fwd = job.forward;
-  BackwardTile tile;
-  for (std::size_t slot = first_tile; slot < end_tile; slot++) {
-    const uint32_t index = fwd.tiles[slot];
-    const int x = static_cast<int>(index) % fwd.tiles_x * TILE_WIDTH, y = static_cast<int>(index) / fwd.tiles_x * TILE_HEIGHT;
-    const uint32_t first = fwd.lists.offset[index];
-    const TileEntry* entries = fwd.lists.entries + first;
-    start_backward_tile(job, tile, slot, index, x, y);
-    for (int32_t k = static_cast<int32_t>(fwd.lists.offset[index + 1] - first) - 1; k >= 0; k--) {
-      if (k >= PREFETCH) __builtin_prefetch(&fwd.records[entries[k - PREFETCH].record]);
-      const uint32_t blocks = fwd.contributed[first + k], pair = entries[k].pair;
-      float* moments = job.moments + static_cast<std::size_t>(pair) * MOMENT_STRIDE;
-      if (!blocks) {
-        if (pair != FROZEN) std::memset(moments, 0, MOMENT_STRIDE * sizeof(float));
-        continue;
-      }
-      const Kernel kernel(fwd.records[entries[k].record], static_cast<float>(x), static_cast<float>(y));
-      if (pair == FROZEN)
-        roll_back_entry(tile, kernel, blocks, k + 1);
-      else
-        differentiate_entry(tile, kernel, blocks, k + 1, moments);
-    }
+// Entries in front of the first one that wants a gradient need no visit. Returns the index of that entry (or the
+// number of entries) and clears the moments of the pairs before it.
+GSS_INLINE uint32_t first_wanted(const CompositeBackwardJob& job, uint32_t first, uint32_t count, bool tile_matters) {
+  for (uint32_t k = 0; k < count; k++) {
+    const uint32_t pair = job.forward.lists.entries[first + k].pair;
+    if (pair == FROZEN) continue;
+    if (tile_matters && job.forward.contributed[first + k]) return k;
+    std::memset(job.moments + static_cast<std::size_t>(pair) * MOMENT_STRIDE, 0, MOMENT_STRIDE * sizeof(float));
   }
+  return count;
+}
+
+GSS_INLINE void differentiate_tile(const CompositeBackwardJob& job, BackwardTile& tile, std::size_t slot) {
+  const CompositeJob& fwd = job.forward;
+  const uint32_t index = fwd.tiles[slot], first = fwd.lists.offset[index], count = fwd.lists.offset[index + 1] - first;
+  const int x = static_cast<int>(index) % fwd.tiles_x * TILE_WIDTH, y = static_cast<int>(index) / fwd.tiles_x * TILE_HEIGHT;
+  const TileEntry* entries = fwd.lists.entries + first;
+  const bool matters = start_backward_tile(job, tile, slot, index, x, y);
+  const int32_t front = static_cast<int32_t>(first_wanted(job, first, count, matters));
+  for (int32_t k = static_cast<int32_t>(count) - 1; k >= front; k--) {
+    if (k >= PREFETCH) __builtin_prefetch(&fwd.records[entries[k - PREFETCH].record]);
+    const uint32_t blocks = fwd.contributed[first + k], pair = entries[k].pair;
+    float* moments = job.moments + static_cast<std::size_t>(pair) * MOMENT_STRIDE;
+    if (!blocks) {
+      if (pair != FROZEN) std::memset(moments, 0, MOMENT_STRIDE * sizeof(float));
+      continue;
+    }
+    const Kernel kernel(fwd.records[entries[k].record], static_cast<float>(x), static_cast<float>(y));
+    if (pair == FROZEN)
+      roll_back_entry(tile, kernel, blocks, k + 1);
+    else
+      differentiate_entry(tile, kernel, blocks, k + 1, moments);
+  }
+}
+
+void backward(const CompositeBackwardJob& job, std::size_t first_tile, std::size_t end_tile) {
+  BackwardTile tile;
+  for (std::size_t slot = first_tile; slot < end_tile; slot++) differentiate_tile(job, tile, slot);
 }
 
 }  // namespace

@@ -9,6 +9,8 @@
 namespace nb = nanobind;
 
 NB_MODULE(_native, module) {
+  // Rasterisers in module globals outlive the interpreter's last look; nanobind would report them as leaks.
+  nb::set_leak_warnings(false);
   module.doc() = "Native kernels of gsstream-cpu-render.";
   module.def("active_isa", [] { return std::string(gsstream_cpu::isa_name(gsstream_cpu::active_isa())); },
              "Name of the selected instruction set (GSSTREAM_ISA, else the strongest supported).");

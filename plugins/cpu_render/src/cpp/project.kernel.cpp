@@ -64,7 +64,7 @@ GSS_INLINE uint32_t footprints(const ProjectJob& job, const Splats& s, Footprint
   store(f.tile_x1, tile_index(x + extent_x, 1.0f / TILE_WIDTH, last_x));
   store(f.tile_y0, tile_index(y - extent_y, 1.0f / TILE_HEIGHT, last_y));
   store(f.tile_y1, tile_index(y + extent_y, 1.0f / TILE_HEIGHT, last_y));
-  Mask seen = both(greater(s.view[2], broadcast(NEAR_PLANE)), greater(log2_opacity, broadcast(LOG2_ALPHA_CUT)));
+  Mask seen = both(greater(s.view[2], broadcast(camera.near)), greater(log2_opacity, broadcast(LOG2_ALPHA_CUT)));
   seen = both(seen, both(greater(x + extent_x, Floats{}), greater(y + extent_y, Floats{})));
   seen = both(seen, greater(broadcast(static_cast<float>(camera.width)), x - extent_x));
   seen = both(seen, greater(broadcast(static_cast<float>(camera.height)), y - extent_y));

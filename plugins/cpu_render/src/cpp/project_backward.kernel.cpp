@@ -159,6 +159,8 @@ void project_backward(const ProjectBackwardJob& job, std::size_t begin, std::siz
     SplatGradients<K> out;
     ChainGradients chain;
     through_exponent(s, moments, out, chain);
+    scatter_rows<2>(out.mean2d, out_rows, valid, job.out.means2d);
+    if (!job.out.means) continue;
     through_covariance(s, out, chain);
     through_camera(job.camera, s, out, chain);
     through_quaternion(s, chain, out);
@@ -167,7 +169,6 @@ void project_backward(const ProjectBackwardJob& job, std::size_t begin, std::siz
     scatter_rows<4>(out.quat, out_rows, valid, job.out.quats);
     scatter_rows<3>(out.scale, out_rows, valid, job.out.scales);
     scatter_rows<1>(&out.opacity, out_rows, valid, job.out.opacities);
-    scatter_rows<2>(out.mean2d, out_rows, valid, job.out.means2d);
     scatter_rows<3>(out.sh, out_rows, valid, job.out.sh0);
     if constexpr (K > 1) scatter_rows<3 * (K - 1)>(out.sh + 3, out_rows, valid, job.out.shN);
   }

@@ -14,7 +14,6 @@ constexpr int BLOCKS = BLOCKS_X * BLOCKS_Y;
 constexpr int MASK_TILE = 16;
 static_assert(BLOCKS == 32, "a set of blocks is one uint32_t");
 
-constexpr float NEAR_PLANE = 0.01f;
 constexpr float BLUR = 0.3f;                   // pixels^2 added to the 2-D covariance (3DGS)
 constexpr float ALPHA_MAX = 0.999f;
 constexpr float TRANSMITTANCE_MIN = 1e-4f;     // a Gaussian counts iff the transmittance before it is above this
@@ -27,6 +26,7 @@ struct Camera {
   float rotation[9], translation[3];  // world to camera, OpenCV axes
   float position[3];                  // camera centre in the world
   float fx, fy, cx, cy;               // pixels, origin at the image corner
+  float near;                         // scene units; Gaussians with depth <= near are not drawn
   float x_low, x_high, y_low, y_high; // limits of x/z and y/z inside the Jacobian (1.3 times the field of view)
   int width, height;
 };
@@ -130,7 +130,7 @@ struct ProjectBackwardJob {
   const uint32_t* rows;         // [visible] row of each visible Gaussian
   const uint32_t* pair_offset;  // [visible+1]
   const float* moments;
-  GradientArrays out;
+  GradientArrays out;           // means null: only means2d is wanted
   bool compact;                 // write row i of the output for visible Gaussian i, instead of row rows[i]
 };
 

@@ -58,6 +58,18 @@ void TileSelection::build(int width, int height, const uint8_t* mask) {
     }
 }
 
+void TileSelection::restrict(const TileSelection& within, const std::vector<uint32_t>& wanted) {
+  tiles_x = within.tiles_x;
+  tiles_y = within.tiles_y;
+  sum.clear();
+  active.clear();
+  blocks.assign(within.blocks.size(), 0);
+  for (uint32_t tile : within.active) {
+    blocks[tile] = within.blocks[tile] & wanted[tile];
+    if (blocks[tile]) active.push_back(tile);
+  }
+}
+
 bool TileSelection::contains(const TileSelection& other) const {
   for (std::size_t tile = 0; tile < blocks.size(); tile++)
     if (other.blocks[tile] & ~blocks[tile]) return false;
@@ -80,7 +92,7 @@ class Rasterizer::Claim {
 };
 
 Rasterizer::Rasterizer()
-    : project_kernels_(project_kernels()), project_backward_kernels_(project_backward_kernels()), composite_kernels_(composite_kernels()) {}
+    : isa_(active_isa()), project_kernels_(project_kernels()), project_backward_kernels_(project_backward_kernels()), composite_kernels_(composite_kernels()) {}
 Rasterizer::~Rasterizer() = default;
 
 // Stage 1. Results are in visible_ (memory order) and records.
@@ -148,6 +160,7 @@ void Rasterizer::composite(const TileLists& lists, const TileSelection& selectio
   job_.pixel_transmittance = pixel_transmittance_.require(pixels);
   job_.pixel_last = pixel_last_.require(pixels);
   parallel_for(selection.active.size(), TILE_GRAIN, [&](std::size_t begin, std::size_t end) { composite_kernels_.forward(job_, begin, end); });
+  job_tiles_ = selection.active.size();
   lists_ = &lists;
 }
 
@@ -190,11 +203,11 @@ void Rasterizer::freeze(const uint8_t* mask, const uint32_t* active, std::size_t
   active_rows_.assign(active, active + count);
   for (uint32_t row : active_rows_) is_active_[row] = 1;
   records_.require_keeping(scene_count_ + count, scene_count_);
-  filter_tile_lists(cached_lists_, selection_.blocks.data(), is_active_, frozen_lists_);
+  filter_tile_lists(cached_lists_, selection_.blocks, is_active_, frozen_lists_, dropped_blocks_);
   frozen_ = true;
 }
 
-// Projects the active rows and leaves the lists of the whole scene over `selection` in merged_lists_.
+// Projects the active rows and leaves their lists over `selection` in active_lists_.
 uint32_t Rasterizer::list_active(const Scene& rows, const TileSelection& selection) {
   if (!frozen_) throw std::invalid_argument("expected freeze(tile_mask, active_ids) before an active pass, got none since the last forward or commit.");
   const uint32_t base = static_cast<uint32_t>(scene_count_);
@@ -202,17 +215,23 @@ uint32_t Rasterizer::list_active(const Scene& rows, const TileSelection& selecti
   if (faults) return faults;
   sort_by_depth(visible_.by_depth, sort_scratch_, visible_.count);
   build_tile_lists(visible_, selection.blocks.size(), base, active_lists_);
-  merge_tile_lists(frozen_lists_, active_lists_, records_.data(), base, active_rows_, merged_lists_);
   return 0;
 }
 
-uint32_t Rasterizer::forward_active(const Scene& rows, const Target& target) {
+uint32_t Rasterizer::forward_active(const Scene& rows, const Target& target, bool touched_only) {
   const Claim claim(busy_);
   mode_ = Mode::none;
   passes_++;
   const uint32_t faults = list_active(rows, selection_);
   if (faults) return faults;
-  composite(merged_lists_, selection_, target);
+  if (touched_only) {
+    std::vector<uint32_t> touched = dropped_blocks_;
+    add_touched_blocks(active_lists_, touched);
+    touched_.restrict(selection_, touched);
+  }
+  const TileSelection& wanted = touched_only ? touched_ : selection_;
+  merge_tile_lists(frozen_lists_, active_lists_, wanted.blocks, records_.data(), static_cast<uint32_t>(scene_count_), active_rows_, merged_lists_);
+  composite(merged_lists_, wanted, target);
   scene_ = rows;
   mode_ = Mode::active;
   return 0;
@@ -233,11 +252,12 @@ void Rasterizer::forward_cached(const uint8_t* mask, const Target& target) {
 uint32_t Rasterizer::commit(const Scene& rows) {
   const Claim claim(busy_);
   mode_ = Mode::none;
-  if (frozen_) filter_tile_lists(cached_lists_, cached_selection_.blocks.data(), is_active_, frozen_lists_);
+  if (frozen_) filter_tile_lists(cached_lists_, cached_selection_.blocks, is_active_, frozen_lists_, dropped_blocks_);
   const uint32_t faults = list_active(rows, cached_selection_);
   frozen_ = false;
   if (faults) return faults;
   const uint32_t base = static_cast<uint32_t>(scene_count_);
+  merge_tile_lists(frozen_lists_, active_lists_, cached_selection_.blocks, records_.data(), base, active_rows_, merged_lists_);
   for (std::size_t e = 0; e < merged_lists_.size; e++) {
     uint32_t& record = merged_lists_.entries[e].record;
     if (record >= base) record = active_rows_[record - base];
@@ -253,7 +273,7 @@ void Rasterizer::clear_gradients(const GradientArrays& out) const {
                                                    {out.means2d, 2}, {out.sh0, 3},   {out.shN, rest}};
   parallel_for(scene_.count, CLEAR_GRAIN, [&](std::size_t begin, std::size_t end) {
     for (const auto& [data, width] : arrays)
-      if (width) std::memset(data + begin * width, 0, (end - begin) * width * sizeof(float));
+      if (data && width) std::memset(data + begin * width, 0, (end - begin) * width * sizeof(float));
   });
 }
 
@@ -263,7 +283,7 @@ void Rasterizer::differentiate(Mode mode, const float* image_gradient, const flo
     throw std::invalid_argument(mode == Mode::full ? "backward: expected a forward pass before, got none (or another pass since)."
                                                    : "backward_active: expected a forward_active pass before, got none (or another pass since).");
   const CompositeBackwardJob raster{job_, image_gradient, alpha_gradient, moments_.require(visible_.pair_count * MOMENT_STRIDE)};
-  parallel_for(selection_.active.size(), TILE_GRAIN, [&](std::size_t begin, std::size_t end) { composite_kernels_.backward(raster, begin, end); });
+  parallel_for(job_tiles_, TILE_GRAIN, [&](std::size_t begin, std::size_t end) { composite_kernels_.backward(raster, begin, end); });
   if (!compact) clear_gradients(out);
   const ProjectBackwardJob job{scene_.arrays, camera_, visible_.count, visible_.rows.data(), visible_.pair_offset.data(), moments_.data(), out, compact};
   parallel_for(visible_.count, BACKWARD_GRAIN, [&](std::size_t begin, std::size_t end) { project_backward_kernels_.backward[scene_.sh_degree](job, begin, end); });

@@ -26,6 +26,8 @@ struct TileSelection {
   std::vector<uint32_t> blocks;  // [tiles]; never blocks outside the image
   std::vector<uint32_t> active;  // tiles with any
   std::vector<int32_t> sum;      // summed-area table of (blocks != 0)
+  // `blocks` of each tile of `within`, limited to `wanted` [tiles]. Leaves `sum` empty.
+  void restrict(const TileSelection& within, const std::vector<uint32_t>& wanted);
   // mask: [ceil(height/16), ceil(width/16)], or null for everything.
   void build(int width, int height, const uint8_t* mask);
   bool contains(const TileSelection& other) const;
@@ -50,11 +52,15 @@ class Rasterizer {
   // Forward passes return Fault bits; if any is set nothing was rendered and the cache is as before (active) or empty.
   // The arrays of `scene` are read again by the matching backward.
   uint32_t forward(const Scene& scene, const Camera& camera, const uint8_t* mask, const Target& target);
-  uint32_t forward_active(const Scene& rows, const Target& target);
+  // With `touched_only`, only blocks that the active rows touch now or touched in the cache are rendered: all others
+  // would come out as they are in the cache.
+  uint32_t forward_active(const Scene& rows, const Target& target, bool touched_only);
   // Renders from the cache alone (no projection, no gradients).
   void forward_cached(const uint8_t* mask, const Target& target);
 
-  // Outputs have one row per Gaussian (zero where unseen), or with `compact` one per visible_rows().
+  // Ends the life of the arrays given to the last forward; no backward may follow.
+  void forget() { mode_ = Mode::none; }
+  // out.means null: only out.means2d is written. Outputs have one row per Gaussian (zero where unseen), or with `compact` one per visible_rows().
   void backward(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out, bool compact);
   // Outputs have one row per active row.
   void backward_active(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out);
@@ -71,6 +77,7 @@ class Rasterizer {
   std::size_t active_count() const { return active_rows_.size(); }
   int width() const { return camera_.width; }
   int height() const { return camera_.height; }
+  Isa isa() const { return isa_; }
   uint64_t passes() const { return passes_; }
   std::size_t memory_bytes() const;
 
@@ -85,6 +92,7 @@ class Rasterizer {
   void differentiate(Mode mode, const float* image_gradient, const float* alpha_gradient, const GradientArrays& out, bool compact);
   void clear_gradients(const GradientArrays& out) const;
 
+  const Isa isa_;  // one object uses one set for life: moments are laid out per set
   const ProjectKernels& project_kernels_;
   const ProjectBackwardKernels& project_backward_kernels_;
   const CompositeKernels& composite_kernels_;
@@ -95,7 +103,10 @@ class Rasterizer {
   Camera camera_{};
   Scene scene_;  // of the last forward
   CompositeJob job_{};
+  std::size_t job_tiles_ = 0;
   TileSelection selection_;
+  TileSelection touched_;  // of the last active pass with touched_only
+  std::vector<uint32_t> dropped_blocks_;
 
   std::unique_ptr<ProjectChunk[]> chunks_;
   std::size_t chunk_capacity_ = 0;

@@ -1,4 +1,5 @@
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
 
 #include <algorithm>
 #include <initializer_list>
@@ -53,7 +54,7 @@ struct SceneArrays {
   }
 };
 
-Camera make_camera(const ConstFloatArray& viewmat, const ConstFloatArray& intrinsics, int width, int height) {
+Camera make_camera(const ConstFloatArray& viewmat, const ConstFloatArray& intrinsics, int width, int height, float near) {
   require_shape(viewmat, {4, 4}, "viewmat");
   require_shape(intrinsics, {3, 3}, "K");
   require(width >= 1 && height >= 1 && width <= 65536 && height <= 65536, "image sides must be 1 to 65536");
@@ -69,6 +70,8 @@ Camera make_camera(const ConstFloatArray& viewmat, const ConstFloatArray& intrin
   c.fy = k[4];
   c.cx = k[2];
   c.cy = k[5];
+  c.near = near;
+  require(near > 0, "near must be positive");
   require(c.fx > 0 && c.fy > 0, "K must have positive focal lengths");
   const float margin_x = 0.15f * static_cast<float>(width) / c.fx, margin_y = 0.15f * static_cast<float>(height) / c.fy;
   c.x_low = -c.cx / c.fx - margin_x;
@@ -99,20 +102,20 @@ Target make_target(const ConstFloatArray& background, const FloatArray& image, c
 class PyRasterizer {
  public:
   uint32_t forward(ConstFloatArray means, ConstFloatArray quats, ConstFloatArray scales, ConstFloatArray opacities, ConstFloatArray sh0,
-                   ConstFloatArray shN, ConstFloatArray viewmat, ConstFloatArray K, int width, int height, ConstFloatArray background,
+                   ConstFloatArray shN, ConstFloatArray viewmat, ConstFloatArray K, int width, int height, float near, ConstFloatArray background,
                    std::optional<ByteArray> tile_mask, FloatArray image, FloatArray transmittance) {
     SceneArrays scene(means, quats, scales, opacities, sh0, shN);
-    const Camera camera = make_camera(viewmat, K, width, height);
+    const Camera camera = make_camera(viewmat, K, width, height, near);
     const uint8_t* mask = mask_data(tile_mask, width, height);
     const Target target = make_target(background, image, transmittance, width, height);
     return keep(std::move(scene), [&](const Scene& s) { return rasterizer_.forward(s, camera, mask, target); });
   }
 
   uint32_t forward_active(ConstFloatArray means, ConstFloatArray quats, ConstFloatArray scales, ConstFloatArray opacities, ConstFloatArray sh0,
-                          ConstFloatArray shN, ConstFloatArray background, FloatArray image, FloatArray transmittance) {
+                          ConstFloatArray shN, ConstFloatArray background, FloatArray image, FloatArray transmittance, bool touched_only) {
     SceneArrays rows = active_rows(means, quats, scales, opacities, sh0, shN);
     const Target target = make_target(background, image, transmittance, rasterizer_.width(), rasterizer_.height());
-    return keep(std::move(rows), [&](const Scene& s) { return rasterizer_.forward_active(s, target); });
+    return keep(std::move(rows), [&](const Scene& s) { return rasterizer_.forward_active(s, target, touched_only); });
   }
 
   uint32_t commit(ConstFloatArray means, ConstFloatArray quats, ConstFloatArray scales, ConstFloatArray opacities, ConstFloatArray sh0,
@@ -134,6 +137,20 @@ class PyRasterizer {
     const float* alpha = upstream(v_image, v_alpha);
     const nb::gil_scoped_release release;
     rasterizer_.backward(v_image.data(), alpha, out, compact);
+  }
+
+  void backward_screen(ConstFloatArray v_image, FloatArray v_means2d) {
+    require_shape(v_means2d, {current_.scene.count, 2}, "v_means2d");
+    upstream(v_image, std::nullopt);
+    GradientArrays out{};
+    out.means2d = v_means2d.data();
+    const nb::gil_scoped_release release;
+    rasterizer_.backward(v_image.data(), nullptr, out, false);
+  }
+
+  void forget() {
+    rasterizer_.forget();
+    current_ = {};
   }
 
   void backward_active(ConstFloatArray v_image, std::optional<ConstFloatArray> v_alpha, FloatArray v_means, FloatArray v_quats, FloatArray v_scales,
@@ -216,11 +233,13 @@ void bind_rasterizer(nb::module_& module) {
   module.attr("FAULT_QUATERNION") = static_cast<uint32_t>(FAULT_QUATERNION);
   nb::class_<PyRasterizer>(module, "Rasterizer", "Rasteriser of one camera; see gsstream_cpu_render.rasterizer for the checked interface.")
       .def(nb::init<>())
-      .def("forward", &PyRasterizer::forward, GSS_SCENE, strict("viewmat"), strict("K"), nb::arg("width"), nb::arg("height"), strict("background"),
+      .def("forward", &PyRasterizer::forward, GSS_SCENE, strict("viewmat"), strict("K"), nb::arg("width"), nb::arg("height"), nb::arg("near"), strict("background"),
            strict("tile_mask").none(), GSS_TARGET, "Returns FAULT_* bits; 0 means rendered.")
       .def("backward", &PyRasterizer::backward, strict("v_image"), strict("v_alpha").none(), GSS_GRADIENTS, nb::arg("compact"))
+      .def("backward_screen", &PyRasterizer::backward_screen, strict("v_image"), strict("v_means2d"), "Gradient of the 2-D means only.")
+      .def("forget", &PyRasterizer::forget, "Drop the arrays kept for backward.")
       .def("freeze", &PyRasterizer::freeze, strict("tile_mask").none(), strict("active_ids"))
-      .def("forward_active", &PyRasterizer::forward_active, GSS_SCENE, strict("background"), GSS_TARGET)
+      .def("forward_active", &PyRasterizer::forward_active, GSS_SCENE, strict("background"), GSS_TARGET, nb::arg("touched_only"))
       .def("backward_active", &PyRasterizer::backward_active, strict("v_image"), strict("v_alpha").none(), GSS_GRADIENTS)
       .def("commit", &PyRasterizer::commit, GSS_SCENE)
       .def("forward_cached", &PyRasterizer::forward_cached, strict("background"), strict("tile_mask").none(), GSS_TARGET)
@@ -230,6 +249,7 @@ void bind_rasterizer(nb::module_& module) {
       .def_prop_ro("scene_count", [](const PyRasterizer& r) { return r.rasterizer().scene_count(); })
       .def_prop_ro("pair_count", [](const PyRasterizer& r) { return r.rasterizer().pair_count(); })
       .def_prop_ro("entry_count", [](const PyRasterizer& r) { return r.rasterizer().entry_count(); })
+      .def_prop_ro("isa", [](const PyRasterizer& r) { return std::string(isa_name(r.rasterizer().isa())); })
       .def_prop_ro("passes", [](const PyRasterizer& r) { return r.rasterizer().passes(); })
       .def("memory_bytes", [](const PyRasterizer& r) { return r.rasterizer().memory_bytes(); });
 }

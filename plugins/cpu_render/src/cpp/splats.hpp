@@ -52,7 +52,7 @@ GSS_INLINE void to_view_space(const Camera& camera, Splats& s) {
   for (int i = 0; i < 3; i++)
     s.view[i] = r[3 * i] * s.mean[0] + r[3 * i + 1] * s.mean[1] + r[3 * i + 2] * s.mean[2] + camera.translation[i];
   // Gaussians nearer than the near plane are dropped later; keep their numbers finite until then.
-  s.inverse_z = 1.0f / max(s.view[2], broadcast(NEAR_PLANE));
+  s.inverse_z = 1.0f / max(s.view[2], broadcast(camera.near));
   const Floats x = s.view[0] * s.inverse_z, y = s.view[1] * s.inverse_z;
   const Floats x_low = broadcast(camera.x_low), x_high = broadcast(camera.x_high);
   const Floats y_low = broadcast(camera.y_low), y_high = broadcast(camera.y_high);

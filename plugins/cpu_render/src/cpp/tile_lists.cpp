@@ -73,36 +73,53 @@ void build_tile_lists(const VisibleSet& visible, std::size_t tiles, uint32_t rec
   });
 }
 
-void filter_tile_lists(const TileLists& from, const uint32_t* tile_blocks, const std::vector<uint8_t>& is_active, TileLists& out) {
+void filter_tile_lists(const TileLists& from, const std::vector<uint32_t>& tile_blocks, const std::vector<uint8_t>& is_active, TileLists& out,
+                       std::vector<uint32_t>& dropped) {
   std::size_t most = 0;
   for (std::size_t tile = 0; tile < from.tiles; tile++)
     if (tile_blocks[tile]) most += from.offset[tile + 1] - from.offset[tile];
   out.resize(from.tiles, most);
+  dropped.assign(from.tiles, 0);
   uint32_t next = 0;
   for (std::size_t tile = 0; tile < from.tiles; tile++) {
     out.offset[tile] = next;
     if (!tile_blocks[tile]) continue;
     for (uint32_t e = from.offset[tile]; e < from.offset[tile + 1]; e++) {
       const uint32_t blocks = from.blocks[e] & tile_blocks[tile];
-      if (!blocks || is_active[from.entries[e].record]) continue;
-      out.entries[next] = {from.entries[e].record, FROZEN};
-      out.blocks[next++] = blocks;
+      if (is_active[from.entries[e].record]) {
+        dropped[tile] |= blocks;
+      } else if (blocks) {
+        out.entries[next] = {from.entries[e].record, FROZEN};
+        out.blocks[next++] = blocks;
+      }
     }
   }
   out.offset[from.tiles] = next;
   out.size = next;
 }
 
-void merge_tile_lists(const TileLists& frozen, const TileLists& active, const Record* records, uint32_t record_base,
-                      const std::vector<uint32_t>& active_rows, TileLists& out) {
+void add_touched_blocks(const TileLists& lists, std::vector<uint32_t>& touched) {
+  for (std::size_t tile = 0; tile < lists.tiles; tile++)
+    for (uint32_t e = lists.offset[tile]; e < lists.offset[tile + 1]; e++) touched[tile] |= lists.blocks[e];
+}
+
+void merge_tile_lists(const TileLists& frozen, const TileLists& active, const std::vector<uint32_t>& tile_blocks, const Record* records,
+                      uint32_t record_base, const std::vector<uint32_t>& active_rows, TileLists& out) {
   out.resize(frozen.tiles, frozen.size + active.size);
-  for (std::size_t tile = 0; tile <= frozen.tiles; tile++) out.offset[tile] = frozen.offset[tile] + active.offset[tile];
+  uint32_t total = 0;
+  for (std::size_t tile = 0; tile < frozen.tiles; tile++) {
+    out.offset[tile] = total;
+    if (tile_blocks[tile]) total += frozen.offset[tile + 1] - frozen.offset[tile] + active.offset[tile + 1] - active.offset[tile];
+  }
+  out.offset[frozen.tiles] = total;
+  out.size = total;
   const auto active_first = [&](const TileEntry& a, const TileEntry& f) {
     const float near = records[a.record].depth, far = records[f.record].depth;
     return near != far ? near < far : active_rows[a.record - record_base] < f.record;
   };
   parallel_for(frozen.tiles, TILE_GRAIN, [&](std::size_t begin, std::size_t end) {
     for (std::size_t tile = begin; tile < end; tile++) {
+      if (!tile_blocks[tile]) continue;
       uint32_t a = active.offset[tile], f = frozen.offset[tile], place = out.offset[tile];
       const uint32_t a_end = active.offset[tile + 1], f_end = frozen.offset[tile + 1];
       while (a < a_end || f < f_end) {

@@ -1,1 +1,1 @@
-"""Fast differentiable Gaussian-splatting rasteriser for CPUs, a renderer plugin of gsstream. Importing it imports no torch."""
+"""Fast differentiable Gaussian splatting on CPUs, a renderer plugin of gsstream. Importing it imports no torch."""

@@ -1,12 +1,14 @@
 """The fast rasteriser on numpy arrays: for the torch-free player and as the floor under CpuRenderer.
 
-Semantics (those of gsstream's reference renderer): near plane 0.01, 0.3 px^2 blur, alpha cut at 1/255 and clamped at
+Semantics (those of gsstream's reference renderer): near plane, 0.3 px^2 blur, alpha cut at 1/255 and clamped at
 0.999, a Gaussian counts while the transmittance before it exceeds 1e-4, Jacobian limited to 1.3 fields of view, colour
 max(0, 0.5 + harmonics). Results are bit-identical for any number of threads. Source: ours, after EWA splatting
 (Zwicker et al. 2001) and 3D Gaussian Splatting (Kerbl et al. 2023); derivation of the tile test in the C++ files.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,32 +24,25 @@ from gsstream_cpu_render.arrays import (
     require_mask,
     require_splats,
 )
-from gsstream_cpu_render.checks import Float32
-
-Background = tuple[float, float, float]
+from gsstream_cpu_render.checks import Float32, refuse, refuse_value
+from gsstream_cpu_render.view import NEAR, Background, checked_view
 
 
 def render_numpy(
-    splats: SplatArrays,
-    viewmat: ArrayLike,
-    K: ArrayLike,
-    width: int,
-    height: int,
-    background: Background = (0.0, 0.0, 0.0),
-) -> Float32:
-    """Render one image [H, W, 3].
+    means: Float32, quats: Float32, scales: Float32, opacities: Float32, sh0: Float32, shN: Float32,
+    viewmat: ArrayLike, K: ArrayLike, width: int, height: int,
+    background: Background = (0.0, 0.0, 0.0), near: float = NEAR,
+) -> Float32:  # fmt: skip
+    """Render raw Gaussians (shapes: SplatArrays; any float dtype or layout) for one camera: [height, width, 3].
 
-    Arguments:
-        splats: raw parameters of N Gaussians (N may be 0).
-        viewmat: [4, 4] world to camera, OpenCV axes.
-        K: [3, 3] intrinsics in pixels, origin at the image corner.
-        width, height: pixels, 1 to 65536.
-        background: linear RGB.
+    Arguments as NumpyRasterizer. A rasteriser kept for many frames saves the allocation of its scratch memory.
 
     Raises:
-        ValueError: wrong dtype, shape or layout, values that are not finite, a singular quaternion.
+        InputError: wrong shapes, values that are not finite, a quaternion without direction.
     """
-    return NumpyRasterizer(viewmat, K, width, height, background).forward(splats)[0]
+    parts = (means, quats, scales, opacities, sh0, shN)
+    splats = SplatArrays(*(np.ascontiguousarray(part, np.float32) for part in parts))
+    return NumpyRasterizer(viewmat, K, width, height, background, near).forward(splats)[0]
 
 
 class NumpyRasterizer:
@@ -60,27 +55,27 @@ class NumpyRasterizer:
         K: [3, 3] intrinsics in pixels without skew, origin at the image corner.
         width, height: pixels, 1 to 65536.
         background: linear RGB.
+        near: near plane, scene units; Gaussians at this depth or closer are not drawn.
+        native: the object that another NumpyRasterizer gave by `release`, for its memory.
 
     Raises:
-        ValueError: camera matrices of wrong shape, not finite, with skew or without a positive focal length.
+        InputError: camera matrices of wrong shape, not finite, with skew or without a positive focal length.
     """
 
     def __init__(
-        self, viewmat: ArrayLike, K: ArrayLike, width: int, height: int, background: Background = (0.0, 0.0, 0.0)
+        self,
+        viewmat: ArrayLike,
+        K: ArrayLike,
+        width: int,
+        height: int,
+        background: Background = (0.0, 0.0, 0.0),
+        near: float = NEAR,
+        *,
+        native: Any = None,
     ) -> None:
-        self._viewmat = _camera_matrix("viewmat", viewmat, 4)
-        self._K = _camera_matrix("K", K, 3)
-        if not (self._K[0, 0] > 0 and self._K[1, 1] > 0):
-            raise ValueError(f"K: expected positive focal lengths, got fx = {self._K[0, 0]}, fy = {self._K[1, 1]}")
-        if self._K[0, 1] != 0:
-            raise ValueError(f"K: expected no skew (K[0, 1] = 0), got {self._K[0, 1]}. Undistort the images first")
-        if not (1 <= width <= 65536 and 1 <= height <= 65536):
-            raise ValueError(f"image size: expected 1 to 65536 pixels a side, got {width} x {height}")
-        self.width, self.height = int(width), int(height)
-        self._background = np.asarray(background, np.float32)
-        if self._background.shape != (3,) or not np.isfinite(self._background).all():
-            raise ValueError(f"background: expected three finite numbers, got {background!r}")
-        self._native = _native.Rasterizer()
+        self._view = checked_view(viewmat, K, width, height, background, near)
+        self.width, self.height = self._view.width, self._view.height
+        self._native = _native.Rasterizer() if native is None else native
         self._coefficients = 1
         self._scene_rows = 0
 
@@ -103,14 +98,12 @@ class NumpyRasterizer:
             transmittance: [H, W] output; a new one (ones) if None.
 
         Raises:
-            ValueError: wrong dtype, shape or layout, values that are not finite, a singular quaternion.
+            InputError: wrong dtype, shape or layout, values that are not finite, a singular quaternion.
         """
         splats = require_splats(splats)
         mask = require_mask(tile_mask, self.width, self.height)
         target = self._target(image, transmittance)
-        faults = self._native.forward(
-            *splats, self._viewmat, self._K, self.width, self.height, self._background, mask, *target
-        )
+        faults = self._call("forward", *splats, *self._view, mask, *target)
         raise_on_faults(faults, splats)
         self._coefficients, self._scene_rows = splats.shN.shape[1] + 1, len(splats.means)
         return target
@@ -131,12 +124,22 @@ class NumpyRasterizer:
             out: arrays to write, e.g. memory of the caller's; new ones if None.
 
         Raises:
-            ValueError: wrong dtype, shape or layout, or no matching forward.
+            InputError: wrong dtype, shape or layout, or no matching forward.
         """
         rows = self._native.visible_count if compact else self._scene_rows
         gradients = self._gradients(rows, out)
-        self._native.backward(*self._upstream(v_image, v_alpha), *gradients, compact)
+        self._call("backward", *self._upstream(v_image, v_alpha), *gradients, compact)
         return gradients
+
+    def backward_screen(self, v_image: Float32) -> Float32:
+        """Gradient of sum(v_image * image) with respect to the 2-D means of all Gaussians: [N, 2], pixels.
+
+        Raises:
+            InputError: wrong dtype, shape or layout, or no matching forward.
+        """
+        v_means2d = np.empty((self._scene_rows, 2), np.float32)
+        self._call("backward_screen", self._upstream(v_image, None)[0], v_means2d)
+        return v_means2d
 
     def visible_rows(self) -> NDArray[np.uint32]:
         """Ascending rows that touch a wanted tile in the last pass (after an active pass: indices into active_ids)."""
@@ -154,28 +157,35 @@ class NumpyRasterizer:
             active_ids: [A] uint32, strictly ascending.
 
         Raises:
-            ValueError: no full forward yet, ids out of range or unsorted, tiles that are not cached.
+            InputError: no full forward yet, ids out of range or unsorted, tiles that are not cached.
         """
         if not isinstance(active_ids, np.ndarray) or active_ids.dtype != np.uint32 or active_ids.ndim != 1:
             got = f"{getattr(active_ids, 'dtype', type(active_ids).__name__)} {list(np.shape(active_ids))}"
-            raise ValueError(f"active_ids: expected uint32 [A], got {got}. Convert with ids.astype(np.uint32)")
-        self._native.freeze(require_mask(tile_mask, self.width, self.height), np.ascontiguousarray(active_ids))
+            refuse(f"active_ids: expected uint32 [A], got {got}; convert with ids.astype(np.uint32)")
+        self._call("freeze", require_mask(tile_mask, self.width, self.height), np.ascontiguousarray(active_ids))
 
     def forward_active(
-        self, rows: SplatArrays, *, image: Float32 | None = None, transmittance: Float32 | None = None
+        self,
+        rows: SplatArrays,
+        *,
+        image: Float32 | None = None,
+        transmittance: Float32 | None = None,
+        touched_only: bool = False,
     ) -> tuple[Float32, Float32]:
         """Render the frozen tiles with new values of the active rows: bit-identical to `forward` of the whole scene.
 
         Arguments:
             rows: raw parameters of the A active Gaussians, in the order of active_ids.
             image, transmittance: outputs as in `forward`; other tiles are left untouched.
+            touched_only: render only the 4 x 4 blocks that active rows touch now or touched when cached. All other
+                pixels are as in the cache: put a copy of the cached image into `image`.
 
         Raises:
-            ValueError: wrong dtype, shape or layout, values that are not finite, no `freeze` since the last forward.
+            InputError: wrong dtype, shape or layout, values that are not finite, no `freeze` since the last forward.
         """
         rows = require_splats(rows, self._native.active_count)
         target = self._target(image, transmittance)
-        raise_on_faults(self._native.forward_active(*rows, self._background, *target), rows)
+        raise_on_faults(self._call("forward_active", *rows, self._view.background, *target, touched_only), rows)
         self._coefficients = rows.shN.shape[1] + 1
         return target
 
@@ -185,20 +195,20 @@ class NumpyRasterizer:
         """Gradients with respect to the active rows: bit-identical to these rows of `backward`.
 
         Raises:
-            ValueError: wrong dtype, shape or layout, or no matching forward_active.
+            InputError: wrong dtype, shape or layout, or no matching forward_active.
         """
         gradients = self._gradients(self._native.active_count, out)
-        self._native.backward_active(*self._upstream(v_image, v_alpha), *gradients)
+        self._call("backward_active", *self._upstream(v_image, v_alpha), *gradients)
         return gradients
 
     def commit(self, rows: SplatArrays) -> None:
         """Put final values of the active rows into the cache, as if `forward` had seen them. Ends the freeze.
 
         Raises:
-            ValueError: as forward_active.
+            InputError: as forward_active.
         """
         rows = require_splats(rows, self._native.active_count)
-        raise_on_faults(self._native.commit(*rows), rows)
+        raise_on_faults(self._call("commit", *rows), rows)
 
     def forward_cached(
         self,
@@ -210,11 +220,21 @@ class NumpyRasterizer:
         """Render the cached scene without projecting anything.
 
         Raises:
-            ValueError: no full forward yet, or tiles that are not cached.
+            InputError: no full forward yet, or tiles that are not cached.
         """
         target = self._target(image, transmittance)
-        self._native.forward_cached(self._background, require_mask(tile_mask, self.width, self.height), *target)
+        self._call("forward_cached", self._view.background, require_mask(tile_mask, self.width, self.height), *target)
         return target
+
+    def forget(self) -> None:
+        """Let go of the arrays kept for backward (the cache stays). No backward may follow."""
+        self._native.forget()
+
+    def release(self) -> Any:
+        """Give away the native object with its memory. This object is of no use afterwards."""
+        native, self._native = self._native, None
+        native.forget()
+        return native
 
     # ---- facts
 
@@ -237,11 +257,17 @@ class NumpyRasterizer:
 
     # ---- checks
 
+    def _call(self, name: str, *arguments: object) -> int:
+        try:
+            return getattr(self._native, name)(*arguments) or 0
+        except ValueError as error:
+            refuse_value(str(error))
+
     def _target(self, image: Float32 | None, transmittance: Float32 | None) -> tuple[Float32, Float32]:
         h, w = self.height, self.width
         if image is None:
             image = np.empty((h, w, 3), np.float32)
-            image[:] = self._background
+            image[:] = self._view.background
         if transmittance is None:
             transmittance = np.ones((h, w), np.float32)
         return (
@@ -261,12 +287,3 @@ class NumpyRasterizer:
         for name, value, shape in zip(out._fields, out, gradient_shapes(rows, self._coefficients), strict=True):
             require_float32(f"out.{name}", value, shape, writable=True)
         return out
-
-
-def _camera_matrix(name: str, value: ArrayLike, side: int) -> Float32:
-    matrix = np.ascontiguousarray(value, np.float32)
-    if matrix.shape != (side, side):
-        raise ValueError(f"{name}: expected shape [{side}, {side}], got {list(matrix.shape)}")
-    if not np.isfinite(matrix).all():
-        raise ValueError(f"{name}: expected finite values, got {matrix.tolist()}")
-    return matrix

@@ -1,0 +1,77 @@
+"""Idle rasterisers, kept for their scratch memory: allocating it anew costs as much as a small render."""
+
+from __future__ import annotations
+
+import threading
+from abc import ABC, abstractmethod
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsstream_cpu_render import _native
+from gsstream_cpu_render.arrays import SplatArrays
+from gsstream_cpu_render.checks import Float32
+from gsstream_cpu_render.rasterizer import NumpyRasterizer
+from gsstream_cpu_render.view import Background
+
+MOST_IDLE = 32
+
+_lock = threading.Lock()
+_idle: list[Any] = []
+
+
+class Rig(Protocol):
+    """What is needed of gsstream's Cameras."""
+
+    @property
+    def viewmats(self) -> NDArray[np.floating[Any]]: ...
+    @property
+    def Ks(self) -> NDArray[np.floating[Any]]: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+    @property
+    def near(self) -> float: ...
+
+
+class Passes(ABC):
+    """A forward and the backward that belongs to it."""
+
+    @abstractmethod
+    def forward(self, splats: SplatArrays) -> tuple[Float32, Float32]:
+        """Image [H, W, 3] and transmittance [H, W], both owned by the caller."""
+
+    @abstractmethod
+    def backward(self, splats: SplatArrays, v_image: Float32, v_alpha: Float32 | None) -> tuple[Float32, ...]:
+        """Gradients in the order of SplatGradients. ``splats`` are those of the forward."""
+
+
+class Lease:
+    """A rasteriser for one owner; its memory returns to the pool when the last reference to the lease goes."""
+
+    def __init__(self, rasterizer: NumpyRasterizer) -> None:
+        self.rasterizer = rasterizer
+
+    def __del__(self) -> None:
+        native = self.rasterizer.release()
+        with _lock:
+            if len(_idle) < MOST_IDLE and native.isa == _native.active_isa():
+                _idle.append(native)
+
+
+def lease(cameras: Rig, view: int, background: Background) -> Lease:
+    """A rasteriser for camera ``view`` of a rig."""
+    with _lock:
+        native = _idle.pop() if _idle else None
+    pose = (cameras.viewmats[view], cameras.Ks[view])
+    return Lease(NumpyRasterizer(*pose, cameras.width, cameras.height, background, cameras.near, native=native))
+
+
+def release_idle_memory() -> int:
+    """Free the scratch memory of idle rasterisers; returns the bytes freed."""
+    with _lock:
+        freed = sum(int(native.memory_bytes()) for native in _idle)
+        _idle.clear()
+    return freed

@@ -29,14 +29,15 @@ def methods(context: typer.Context) -> None:
 @app.command()
 def show(name: Annotated[str, typer.Argument(help="Name of a method.")]) -> None:
     """Show a method's parts and the values it sets."""
-    from gsstream.plugins.catalog import CONTRACTS, load_catalog
+    from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
+    from gsstream.recipe.model import ComponentRef
 
     catalog = load_catalog()
     entry = catalog.entry("method", name)
     resolved = resolve_recipe(name, catalog.recipe_path)
     typer.echo(f"{name} (from {entry.origin}): {entry.spec.summary}\nrecipe: {catalog.recipe_path(name)}\n")
-    refs = [(slot, getattr(resolved.recipe, slot).name) for slot in CONTRACTS]
+    refs = [(slot, value.name) for slot, value in resolved.recipe if isinstance(value, ComponentRef)]
     rows = []
     for slot, part in refs:
         found = catalog.entries.get((slot, part))

@@ -3,46 +3,83 @@
 from __future__ import annotations
 
 import re
+import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from gsstream.cli.listing import plural, table
+
+if TYPE_CHECKING:
+    from gsstream.player.playback import Playback
 
 Stream = Annotated[Path, typer.Argument(help="A stream (.gss), or the output folder of a run.")]
 
 
 def play(
     stream: Stream,
-    out: Annotated[Path, typer.Option("--out", help="Folder for pictures, or a video file (.mp4).")],
-    camera: Annotated[str, typer.Option("--camera", help="Camera id, or train, test, all.")] = "test",
+    out: Annotated[Path, typer.Option("--out", help="Folder for pictures, or a file: .mp4, .webp or .gif.")],
+    camera: Annotated[
+        str | None,
+        typer.Option("--camera", help="Camera id, orbit, spiral, or train, test, all; default: the first test camera."),
+    ] = None,
     frames: Annotated[
         str | None, typer.Option("--frames", metavar="A:B", help="Frames A to B - 1; either may be left out.")
     ] = None,
 ) -> None:
-    """Decode a stream and render it from its cameras."""
+    """Decode a stream and render it, without torch or the recording."""
     first, last = _frame_range(frames)
-    from gsstream.player import play as play_stream
+    file = stream_file(stream)
+    from gsstream.player.play import play as play_stream
+    from gsstream.player.playback import Playback
 
-    play_stream(stream_file(stream), out, camera=camera, first=first, last=last)
+    with Playback(file) as playback:
+        cameras = _cameras(playback, camera)
+        chosen = _frames(playback, first, last)
+    for name in cameras:
+        target = out if len(cameras) == 1 else _one_of_many(out, name or "")
+        played = play_stream(file, target, camera=name, frames=chosen, progress=_progress(name or "camera"))
+        typer.echo(f"{played.path}: {plural(played.frames, 'picture')}")
 
 
 def evaluate(
     stream: Stream,
     source: Annotated[
-        str | None, typer.Option("--source", help="Recording to compare with; by default the one it was made from.")
+        str | None, typer.Option("--source", help="Recording to compare with; default: the one it was made from.")
     ] = None,
 ) -> None:
-    """Measure a stream: render the decoded frames and compare them with the recording's test cameras."""
-    from gsstream.engine.evaluate import evaluate as evaluate_stream
+    """Render the decoded frames and compare them with the recording's test cameras."""
+    file = stream_file(stream)
+    from gsstream.core.errors import InputError
+    from gsstream.engine.recording import open_recording
+    from gsstream.player.playback import Playback
+    from gsstream.plugins.catalog import load_catalog
+    from gsstream.trade.evaluate import evaluate as evaluate_stream
 
-    evaluate_stream(stream_file(stream), source)
+    with Playback(file) as playback:
+        meta = playback.meta
+    uri = source or meta.extra.get("source_uri")
+    if not uri:
+        raise InputError(f"{file} does not say which recording it was made from; name it with --source")
+    recording = open_recording(str(uri), float(meta.recipe.get("scale", 1.0)), load_catalog())
+    try:
+        evaluation = evaluate_stream(file, recording, progress=_progress("frame"))
+    finally:
+        recording.close()
+    typer.echo(evaluation.table())
 
 
 def info(stream: Stream) -> None:
     """Say what a stream holds: method, cameras, packets and their sizes."""
-    from gsstream.player import describe
+    file = stream_file(stream)
+    from gsstream.player.playback import Playback
 
-    typer.echo(describe(stream_file(stream)))
+    with Playback(file) as playback:
+        typer.echo(f"{file}: {_describe(playback)}")
+        if playback.reader.damage is not None:
+            raise playback.reader.damage
 
 
 def stream_file(path: Path) -> Path:
@@ -58,10 +95,70 @@ def stream_file(path: Path) -> Path:
     return file
 
 
-def _frame_range(text: str | None) -> tuple[int, int | None]:
+def _describe(playback: Playback) -> str:
+    meta, reader = playback.meta, playback.reader
+    frames = playback.frames
+    size = f"{meta.train.width} x {meta.train.height} pixels"
+    rows = [
+        ("method", f"{meta.method} (recipe {meta.recipe_hash})"),
+        ("recording", f"{meta.source} ({meta.extra.get('source_uri', 'unknown')})"),
+        ("cameras", f"{len(meta.train)} train, {len(meta.test)} test, {size}, {meta.fps:g} frames/s"),
+        ("Gaussians", f"{len(playback.state_at(frames[0]))} in frame {frames[0]}"),
+        ("written by", ", ".join(f"{name} {version}" for name, version in sorted(meta.plugins.items()))),
+    ]
+    if reader.unfinished is not None:
+        rows.append(("unfinished", f"{reader.unfinished.size} bytes from byte {reader.unfinished.offset}"))
+    lines = [plural(len(frames), "frame"), *(f"  {key:<11}{value}" for key, value in rows), ""]
+    sizes: dict[str, list[int]] = {}
+    for entry in reader.frames:
+        sizes.setdefault(entry.kind.name.lower(), []).append(entry.size)
+    packets = [(kind, str(len(n)), f"{sum(n)}", f"{sum(n) / len(n):.0f}", f"{max(n)}") for kind, n in sizes.items()]
+    return "\n".join(lines) + table(("PACKETS", "NUMBER", "BYTES", "MEAN", "LARGEST"), packets, indent="  ")
+
+
+def _one_of_many(out: Path, camera: str) -> Path:
+    """Several cameras make one file or folder each, named after the camera."""
+    return out.with_name(f"{out.stem}-{camera}{out.suffix}") if out.suffix else out / camera
+
+
+def _cameras(playback: Playback, wanted: str | None) -> list[str | None]:
+    """Ids meant by --camera; None is the player's own choice."""
     from gsstream.core.errors import InputError
 
-    match = re.fullmatch(r"(\d*):(\d*)", "0:" if text is None else text)
-    if match is None or (match[2] and int(match[2]) <= int(match[1] or 0)):
+    train, test = list(playback.meta.train.ids), list(playback.meta.test.ids)
+    groups: dict[str | None, list[str]] = {"train": train, "test": test, "all": train + test}
+    found = groups.get(wanted)
+    if found is None:
+        return [wanted]
+    if not found:
+        raise InputError(f"--camera {wanted}: this stream has no {wanted} cameras")
+    return list(found)
+
+
+def _frames(playback: Playback, first: int | None, last: int | None) -> list[int]:
+    start = playback.frames[0] if first is None else first
+    stop = playback.frames[-1] + 1 if last is None else last
+    for edge in (start, stop - 1):
+        playback.entry(edge)  # says which frames there are when this one is not
+    return list(range(start, stop))
+
+
+def _frame_range(text: str | None) -> tuple[int | None, int | None]:
+    from gsstream.core.errors import InputError
+
+    match = re.fullmatch(r"(\d*):(\d*)", ":" if text is None else text)
+    first, last = (int(number) if number else None for number in match.groups()) if match else (0, 0)
+    if last is not None and last <= (first or 0):
         raise InputError(f"--frames {text}: expected A:B with A < B, e.g. 0:30, or A: for all frames from A on")
-    return int(match[1] or 0), int(match[2]) if match[2] else None
+    return first, last
+
+
+def _progress(what: str) -> Callable[[int, int], None] | None:
+    """A counter that overwrites itself on a terminal; silent elsewhere."""
+    if not sys.stderr.isatty():
+        return None
+
+    def show(done: int, total: int) -> None:
+        typer.echo(f"\r{what} {done}/{total}", nl=done == total, err=True)
+
+    return show

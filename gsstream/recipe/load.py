@@ -119,9 +119,12 @@ def stack(layers: Sequence[Layer]) -> ResolvedRecipe:
 
 
 def recipe_hash(recipe: Recipe) -> str:
-    """SHA-256 of the recipe's values, provenance left out: equal hashes mean equal runs of the same recording."""
+    """First 16 hex digits of the SHA-256 of the recipe's values, provenance left out.
+
+    Equal hashes mean equal runs of the same recording. ``StreamMeta.recipe_hash`` is the same number.
+    """
     canonical = json.dumps(recipe.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(canonical.encode()).hexdigest()
+    return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
 
 def _method_chain(name: str, find_method: FindMethod, within: tuple[str, ...]) -> list[Layer]:

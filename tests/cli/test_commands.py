@@ -24,6 +24,8 @@ CHEAP = [
     ["recipe", "show", "dense"],
 ]
 
+RUN = ["run", "--source", "demo", "--out", "OUT"]
+
 OPTIONS = {
     "gsstream": ["--debug", "--version"],
     "gsstream run": [
@@ -79,7 +81,8 @@ def test_cheap_commands_import_no_torch(args: list[str]) -> None:
         "heavy = sorted({'torch', 'kornia', 'matplotlib', 'constriction', 'pycolmap', 'av'} & set(sys.modules))\n"
         "print(code, heavy, file=sys.stderr)\n"
     )
-    result = subprocess.run([sys.executable, "-c", code, *args], capture_output=True, text=True, timeout=60, check=False)
+    command = [sys.executable, "-c", code, *args]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert result.stderr == "0 []\n"
     assert result.stdout
 
@@ -93,19 +96,17 @@ def run(capsys: pytest.CaptureFixture[str], *args: str) -> tuple[int, str, str]:
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["run", "--source", "demo", "--out", "OUT", "--method", "dens"], "no method named 'dens'; did you mean 'dense'?"),
-        (["run", "--source", "demo", "--out", "OUT", "--set", "lss.dssim=1"], "--set lss.dssim=1: unknown key 'lss'; "
-         "did you mean 'loss'?"),
-        (["run", "--source", "demo", "--out", "OUT", "--frames", "0"], "--frames frames=0: frames: input should be greater "
-         "than or equal to 1, got 0"),
-        (["run", "--source", "demo", "--out", "OUT", "--recipe", "absent.yaml"], "cannot read the recipe absent.yaml: "),
+        ([*RUN, "--method", "dens"], "no method named 'dens'; did you mean 'dense'?"),
+        ([*RUN, "--set", "lss.dssim=1"], "--set lss.dssim=1: unknown key 'lss'; did you mean 'loss'?"),
+        ([*RUN, "--frames", "0"], "--frames frames=0: frames: input should be greater than or equal to 1, got 0"),
+        ([*RUN, "--recipe", "absent.yaml"], "cannot read the recipe absent.yaml: "),
         (["info", "absent.gss"], "no stream at absent.gss: expected a .gss file or the output folder of a run"),
         (["play", "absent.gss", "--out", "x", "--frames", "5:2"], "--frames 5:2: expected A:B with A < B, e.g. 0:30"),
         (["plugins", "show", "additiv"], "no part named 'additiv'; did you mean 'additive'?"),
         (["plugins", "show", "gatte/additive"], "no kind of part named 'gatte'; did you mean 'gate'?"),
         (["methods", "show", "s2g"], "no method named 's2g'; known: dense"),
     ],
-)  # fmt: skip
+)
 def test_mistakes_end_with_one_line_and_code_2(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, args: list[str], message: str
 ) -> None:

@@ -46,7 +46,8 @@ def test_an_assembled_recipe_assembles_to_the_same(builtin: Catalog) -> None:
 
 
 def test_all_problems_come_in_one_error(builtin: Catalog) -> None:
-    sets = ["gate=always-opne", "structure.resoluton=3", "update.means.stp=1", "update.quats.step=-1", "update.sh0.lr=x"]
+    sets = ["gate=always-opne", "structure.resoluton=3"]
+    sets += ["update.means.stp=1", "update.quats.step=-1", "update.sh0.lr=x"]
     with pytest.raises(RecipeError) as caught:
         assemble(resolve(builtin, *sets), builtin)
     assert str(caught.value).splitlines() == [

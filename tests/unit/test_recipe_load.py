@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsstream.core.errors import RecipeError, UnknownName
+from gsstream.packet.meta import hash_recipe
 from gsstream.recipe.load import ResolvedRecipe, load_recipe, recipe_hash, resolve_recipe
 from gsstream.recipe.model import Recipe
 from gsstream.recipe.save import save_resolved, to_yaml
@@ -182,6 +183,11 @@ def test_hash_ignores_provenance_and_sees_every_value(lab) -> None:
     assert base == recipe_hash(lab.resolve("soft", None, "seed=5").recipe)
     for change in ("seed=6", "gate.levels=11", "background=[0,0,0.5]", "codec.fsync=true", "loss.dssim=0.1000001"):
         assert recipe_hash(lab.resolve("soft", "seed: 5\n", change).recipe) != base
+
+
+def test_the_hash_is_the_one_in_the_stream(lab) -> None:
+    recipe = lab.resolve("soft").recipe
+    assert recipe_hash(recipe) == hash_recipe(recipe.model_dump(mode="json"))
 
 
 json_values = st.recursive(

@@ -59,7 +59,8 @@ def _average(lines: np.ndarray[Any, Any], target: int) -> FloatArray:
     edges = np.arange(target + 1) * (count / target)
     below = np.minimum(edges.astype(np.int64), count - 1)
     at_edges = total[below] + (edges - below)[:, None] * lines[below]
-    return np.diff(at_edges, axis=0) * (target / count)
+    means: FloatArray = np.diff(at_edges, axis=0) * (target / count)
+    return means
 
 
 def _decode(path: Path) -> tuple[np.ndarray[Any, Any], float]:

@@ -40,11 +40,11 @@ class HierarchicalMax(Propagation):
 
 
 def roots(parent: torch.Tensor) -> torch.Tensor:
-    """[M] root of each node, by pointer jumping: ceil(log2(depth)) gathers instead of one per level."""
+    """[M] root of each node, by pointer jumping: log2(M) gathers instead of one per level. Raises for a cycle."""
     root = parent
-    for _ in range(max(1, len(parent).bit_length())):
-        further = root[root]
-        if torch.equal(further, root):
-            return root
-        root = further
+    for _ in range(len(parent).bit_length()):
+        root = root[root]
+    # Checked at the end: a circle whose length is a power of two looks settled on the way.
+    if torch.equal(parent[root], root):
+        return root
     raise ShapeError(f"parent: expected every node to end at a root, got a cycle among {len(parent)} nodes")

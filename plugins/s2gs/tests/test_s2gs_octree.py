@@ -1,0 +1,369 @@
+"""The streaming octree: keys, seeding, weeding, partitions, edits, degenerate clouds."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from gsstream_s2gs import morton
+from gsstream_s2gs.octree import StreamingOctree
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from s2gs_scene import gaussians, rig
+
+from gsstream.api import (
+    Anchors,
+    Cameras,
+    Gaussians,
+    Hierarchy,
+    InputError,
+    PointCloud,
+    ShapeError,
+    TopologyEdit,
+)
+
+
+def octree(**settings_: object) -> StreamingOctree:
+    return StreamingOctree(StreamingOctree.Config(**({"root_exponent": 3, "max_levels": 6} | settings_)))
+
+
+def cloud(n: int = 300, seed: int = 0, scale: float = 1.0, offset: float = 0.0) -> PointCloud:
+    g = np.random.default_rng(seed)
+    xyz = (g.normal(size=(n, 3)) * 0.5 * scale + offset).astype(np.float32)
+    return PointCloud(xyz, g.random((n, 3)).astype(np.float32), "test")
+
+
+def placed(means: torch.Tensor) -> Gaussians[torch.Tensor]:
+    n = len(means)
+    return dataclasses.replace(gaussians(max(n, 1)).rows(slice(0, n)), means=means)
+
+
+def grid(origin: float = 0.0, cell: float = 1.0, levels: int = 3) -> Anchors:
+    sizes = torch.tensor([cell / 2**level for level in range(levels)])
+    none = torch.zeros(0, 3)
+    return Anchors(none, none, torch.zeros(0, dtype=torch.int64), sizes, torch.full((3,), origin))
+
+
+def partition(hierarchy: Hierarchy) -> set[frozenset[int]]:
+    groups: dict[int, set[int]] = {}
+    for row, node in enumerate(hierarchy.node_of.tolist()):
+        groups.setdefault(node, set()).add(row)
+    return {frozenset(g) for g in groups.values()}
+
+
+class TestMorton:
+    @given(st.lists(st.tuples(*[st.integers(0, 2**21 - 1)] * 3), min_size=1, max_size=30))
+    @settings(max_examples=100, deadline=None)
+    def test_round_trip_and_parents(self, cells: list[tuple[int, int, int]]) -> None:
+        c = torch.tensor(cells)
+        keys = morton.encode(c)
+        assert bool((keys >= 0).all())
+        assert torch.equal(morton.decode(keys), c)
+        for up in (1, 5, 21):
+            assert torch.equal(morton.decode(keys >> 3 * up), c >> up)
+
+    def test_against_bit_by_bit(self) -> None:
+        g = np.random.default_rng(0)
+        for x, y, z in g.integers(0, 2**21, (50, 3)).tolist():
+            slow = sum(((v >> b) & 1) << (3 * b + axis) for b in range(21) for axis, v in enumerate((x, y, z)))
+            assert int(morton.encode(torch.tensor([[x, y, z]]))[0]) == slow
+
+
+class TestSeed:
+    def test_anchors_are_the_centres_of_occupied_cells(self) -> None:
+        points = cloud()
+        anchors = octree().seed(points, rig())
+        xyz = torch.from_numpy(points.xyz).double()
+        for level, size in enumerate(anchors.cell_sizes.double().tolist()):
+            at = anchors.levels == level
+            cells = (anchors.positions[at].double() - anchors.origin.double()) / size
+            torch.testing.assert_close(cells.frac(), torch.full_like(cells, 0.5), atol=1e-3, rtol=0)
+            mine = {tuple(c) for c in cells.floor().long().tolist()}
+            occupied = {tuple(c) for c in ((xyz - anchors.origin) / size).floor().long().tolist()}
+            assert len(mine) == int(at.sum())
+            assert mine <= occupied
+            assert level > 0 or mine == occupied
+
+    def test_corner_option(self) -> None:
+        centers, corners = octree().seed(cloud(), rig()), octree(anchor="corner").seed(cloud(), rig())
+        level0 = int((centers.levels == 0).sum())
+        half = (centers.positions[:level0] - corners.positions[:level0]) / centers.cell_sizes[0]
+        torch.testing.assert_close(half, torch.full_like(half, 0.5), atol=1e-4, rtol=0)
+
+    def test_colours(self) -> None:
+        xyz = np.array([[0, 0, 0], [0.01, 0, 0], [1, 1, 1]], np.float32)
+        rgb = np.array([[0.2, 0.8, 0], [0.4, 0.4, 0], [1, 0, 0.5]], np.float32)
+        points = PointCloud(xyz, rgb, "test")
+        mean, most = (octree(color=how, max_levels=1).seed(points, rig()).colors for how in ("mean", "max"))
+        np.testing.assert_allclose(mean.numpy(), [[0.3, 0.6, 0], [1, 0, 0.5]], rtol=1e-6)
+        np.testing.assert_allclose(most.numpy(), [[0.4, 0.8, 0], [1, 0, 0.5]], rtol=1e-6)
+
+    @pytest.mark.parametrize("log_base", [1.2, 1.5, 2.0, 3.0])
+    def test_number_of_levels(self, log_base: float) -> None:
+        points, cameras = cloud(), rig()
+        distances = np.linalg.norm(points.xyz[None] - cameras.centers[:, None], axis=2)
+        pool = np.quantile(distances, [0.001, 0.999], axis=1).ravel()
+        ratio = np.quantile(pool, 0.999) / np.quantile(pool, 0.001)
+        wanted = round(math.log(ratio, log_base)) + 1
+        found = octree(log_base=log_base, max_levels=19).seed(points, cameras)
+        assert len(found.cell_sizes) == min(wanted, 19)
+        np.testing.assert_allclose(found.cell_sizes[1:] / found.cell_sizes[:-1], 0.5)
+        assert len(octree(log_base=log_base, max_levels=2).seed(points, cameras).cell_sizes) <= 2
+
+    def test_smaller_base_keeps_more_anchors(self) -> None:
+        counts = [len(octree(log_base=b, root_exponent=5).seed(cloud(), rig()).positions) for b in (1.2, 1.5, 2.0, 3.0)]
+        assert counts == sorted(counts, reverse=True)
+        assert counts[0] > counts[-1]
+
+    @pytest.mark.parametrize("rounding", ["floor", "round"])
+    @pytest.mark.parametrize("threshold", [0.0, 0.5, 0.9])
+    def test_weeding_against_a_plain_loop(self, rounding: str, threshold: float) -> None:
+        points, cameras = cloud(), rig(5)
+        part = octree(level_rounding=rounding, visible_threshold=threshold, log_base=1.3)
+        kept = part.seed(points, cameras)
+        everything = octree(level_rounding=rounding, visible_threshold=0.0, log_base=1.3)
+        levels = len(kept.cell_sizes)
+        distances = np.linalg.norm(points.xyz[None].astype(float) - cameras.centers[:, None], axis=2)
+        far = np.quantile(np.quantile(distances, [0.001, 0.999], axis=1).ravel(), 0.999)
+        expected = 0
+        size = kept.cell_sizes.double().numpy()
+        for level in range(levels):
+            cells = np.unique(np.floor((points.xyz - kept.origin.double().numpy()) / size[level]), axis=0)
+            for center in kept.origin.double().numpy() + (cells + 0.5) * size[level]:
+                asked = np.log(far / np.linalg.norm(center - cameras.centers, axis=1)) / math.log(1.3)
+                asked = np.clip(np.floor(asked) if rounding == "floor" else np.round(asked), 0, levels - 1)
+                expected += level == 0 or (level <= asked).mean() > threshold
+        assert len(kept.positions) == expected
+        assert len(everything.seed(points, cameras).positions) >= expected
+
+    def test_level_zero_survives_every_threshold(self) -> None:
+        strict, loose = (octree(visible_threshold=t).seed(cloud(), rig()) for t in (0.99, 0.0))
+        assert int((strict.levels == 0).sum()) == int((loose.levels == 0).sum()) > 0
+
+    def test_order_of_points_and_cameras_does_not_matter(self) -> None:
+        points, cameras = cloud(), rig()
+        order = np.random.default_rng(1).permutation(len(points))
+        a = octree().seed(points, cameras)
+        b = octree().seed(PointCloud(points.xyz[order], points.rgb[order], "x"), cameras.select([1, 2, 0]))
+        assert torch.equal(a.positions, b.positions)
+        assert torch.equal(a.levels, b.levels)
+        torch.testing.assert_close(a.colors, b.colors)
+
+    def test_all_points_on_one_side_of_the_origin_are_inside(self) -> None:
+        """Multiplying coordinates by 1.1, as released, moves the lower bound above the points here."""
+        for offset in (40.0, -40.0):
+            points = cloud(offset=offset)
+            anchors = octree().seed(points, rig())
+            side = float(anchors.cell_sizes[0]) * 8
+            inside = (points.xyz >= anchors.origin.numpy()) & (points.xyz <= anchors.origin.numpy() + side)
+            assert inside.all()
+
+    @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1.0, 1e3, 1e6])
+    @pytest.mark.parametrize("padding", [0.0, 0.05])
+    def test_extents(self, scale: float, padding: float) -> None:
+        cameras = rig()
+        viewmats = cameras.viewmats.copy()
+        viewmats[:, :3, 3] *= scale
+        anchors = octree(padding=padding).seed(cloud(scale=scale), dataclasses.replace(cameras, viewmats=viewmats))
+        plain = octree(padding=padding).seed(cloud(), cameras)
+        assert torch.isfinite(anchors.positions).all()
+        assert len(anchors.positions) == pytest.approx(len(plain.positions), rel=0.02)
+        torch.testing.assert_close(anchors.cell_sizes / scale, plain.cell_sizes, rtol=1e-4, atol=0)
+
+    @pytest.mark.parametrize(
+        "xyz",
+        [
+            np.zeros((1, 3)),
+            np.ones((50, 3)) * 7,
+            np.outer(np.linspace(-1, 1, 50), [1, 0, 0]),
+            np.outer(np.linspace(-1, 1, 50), [1, 1, 0]) + np.array([0, 0, 3]),
+            np.full((10, 3), 1e6) + np.arange(10)[:, None],
+            np.r_[np.zeros((9, 3)), np.full((1, 3), 1e6)],
+        ],
+        ids=["one", "coincident", "line", "plane diagonal", "far", "outlier"],
+    )
+    def test_degenerate_clouds(self, xyz: np.ndarray) -> None:
+        points = PointCloud(xyz.astype(np.float32), np.full(xyz.shape, 0.5, np.float32), "test")
+        part = octree()
+        anchors = part.seed(points, rig())
+        assert torch.isfinite(anchors.positions).all()
+        assert bool((anchors.cell_sizes > 0).all())
+        assert 1 <= len(anchors.positions) <= len(points) * len(anchors.cell_sizes)
+        hierarchy = part.build(placed(anchors.positions), anchors)
+        hierarchy.validate()
+        assert hierarchy.num_nodes <= len(anchors.positions)
+
+    def test_a_point_at_a_camera(self) -> None:
+        """Distance 0 asks for infinitely many levels; the cap answers, nothing is infinite or undefined."""
+        cameras = rig(1)
+        points = PointCloud(
+            np.r_[cameras.centers, np.zeros((5, 3))].astype(np.float32), np.ones((6, 3), np.float32), "t"
+        )
+        at_camera = dataclasses.replace(cameras, viewmats=cameras.viewmats.copy())
+        anchors = octree(distance_quantile=1.0, anchor="corner").seed(points, at_camera)
+        assert len(anchors.cell_sizes) <= 6
+        assert torch.isfinite(anchors.positions).all()
+        here = PointCloud(cameras.centers.astype(np.float32), np.ones((1, 3), np.float32), "t")
+        assert len(octree(distance_quantile=1.0).seed(here, cameras).positions) >= 1
+
+    @pytest.mark.parametrize("bad", [math.nan, math.inf])
+    @pytest.mark.parametrize("field", ["xyz", "rgb"])
+    def test_not_finite_is_refused_by_name(self, field: str, bad: float) -> None:
+        points = cloud(5)
+        getattr(points, field)[3, 1] = bad
+        with pytest.raises(ShapeError, match=rf"points.{field}: .* index \[3, 1\]"):
+            octree().seed(points, rig())
+
+    def test_nothing_to_start_from(self) -> None:
+        with pytest.raises(InputError, match="no points"):
+            octree().seed(cloud(0), rig())
+        with pytest.raises(InputError, match="no training cameras"):
+            octree().seed(cloud(), Cameras((), np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), 4, 4))
+
+    def test_keys_that_would_overflow_are_refused(self) -> None:
+        StreamingOctree.Config(root_exponent=12, max_levels=10)
+        with pytest.raises(ValidationError, match=r"expected at most 22 .* got 13 \+ 10; lower either"):
+            StreamingOctree.Config(root_exponent=13, max_levels=10)
+
+    def test_the_finest_grid_that_fits(self) -> None:
+        anchors = octree(root_exponent=12, max_levels=10, log_base=1.05).seed(cloud(2000), rig())
+        assert len(anchors.cell_sizes) == 10
+        hierarchy = octree(root_exponent=12, max_levels=10).build(placed(anchors.positions), anchors)
+        hierarchy.validate()
+
+
+class TestBuild:
+    def test_default_nodes_are_the_root_cells(self) -> None:
+        part = octree()
+        anchors = part.seed(cloud(), rig())
+        hierarchy = part.build(placed(anchors.positions), anchors)
+        hierarchy.validate()
+        roots = int((anchors.levels == 0).sum())
+        assert hierarchy.num_nodes == roots
+        assert torch.equal(hierarchy.parent, torch.arange(roots))
+        assert not hierarchy.level.any()
+        # every level-0 anchor owns a node, in the order in which they are stored
+        assert torch.equal(hierarchy.node_of[anchors.levels == 0], torch.arange(roots))
+
+    @given(
+        st.lists(st.tuples(*[st.floats(-50, 50, width=32)] * 3), min_size=1, max_size=25),
+        st.integers(0, 3),
+        st.randoms(use_true_random=False),
+    )
+    @settings(max_examples=80, deadline=None)
+    def test_partition(self, means: list[tuple[float, float, float]], depth: int, random: object) -> None:
+        x, part = torch.tensor(means, dtype=torch.float32), octree(gate_level=depth)
+        hierarchy = part.build(placed(x), grid(cell=2.0))
+        hierarchy.validate()
+        assert hierarchy.node_of.dtype == hierarchy.parent.dtype == torch.int64
+        used = set(hierarchy.node_of.tolist()) | set(hierarchy.parent.tolist())
+        assert used == set(range(hierarchy.num_nodes))
+        assert bool((hierarchy.level[hierarchy.node_of] == depth).all())
+        cells = (x.double() / (2.0 / 2**depth)).floor()
+        same_cell = (cells[:, None] == cells[None]).all(2)
+        assert torch.equal(same_cell, hierarchy.node_of[:, None] == hierarchy.node_of[None])
+        up = hierarchy.node_of
+        for _ in range(depth):
+            up = hierarchy.parent[up]
+        roots = (x.double() / 2.0).floor()
+        assert torch.equal((roots[:, None] == roots[None]).all(2), up[:, None] == up[None])
+
+    def test_order_of_rows_does_not_matter(self) -> None:
+        x = torch.randn(200, 3, generator=torch.Generator().manual_seed(0)) * 3
+        order = torch.randperm(200, generator=torch.Generator().manual_seed(1))
+        for depth in (0, 2):
+            part = octree(gate_level=depth)
+            a, b = part.build(placed(x), grid()), part.build(placed(x[order]), grid())
+            assert torch.equal(a.node_of[order], b.node_of)
+            assert torch.equal(a.parent, b.parent)
+
+    def test_translation_by_whole_cells_changes_nothing(self) -> None:
+        x = torch.randint(-400, 400, (100, 3), generator=torch.Generator().manual_seed(0)) / 128.0
+        part = octree(gate_level=1)
+        a, b = part.build(placed(x), grid()), part.build(placed(x + 16.0), grid())
+        assert partition(a) == partition(b)
+
+    def test_nodes_are_numbered_along_a_morton_curve(self) -> None:
+        x = torch.tensor([[3.5, 3.5, 3.5], [0.5, 0.5, 0.5], [1.5, 0.5, 0.5], [0.5, 0.5, 1.5], [2.5, 0.5, 0.5]])
+        assert octree().build(placed(x), grid()).node_of.tolist() == [4, 0, 1, 2, 3]
+
+    def test_storing_node_by_node_is_spatially_coherent(self) -> None:
+        x = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0)) * 16
+        node_of = octree().build(placed(x), grid()).node_of
+        stored = x[torch.argsort(node_of, stable=True)]
+        assert float(stored.diff(dim=0).norm(dim=1).mean()) < 0.25 * float(x.diff(dim=0).norm(dim=1).mean())
+
+    def test_wanderers_keep_their_own_regions(self) -> None:
+        x = torch.tensor([[0.5, 0.5, 0.5], [-5000.5, 0.5, 0.5], [9000.5, 0.5, 0.5], [1e30, 0, 0], [3e38, 0, 0]])
+        hierarchy = octree().build(placed(x), grid())
+        assert partition(hierarchy) == {frozenset({0}), frozenset({1}), frozenset({2}), frozenset({3, 4})}
+
+    def test_not_finite_is_refused(self) -> None:
+        x = torch.zeros(4, 3)
+        x[2, 0] = math.nan
+        with pytest.raises(ShapeError, match=r"means: .* index \[2, 0\]"):
+            octree().build(placed(x), grid())
+
+    @pytest.mark.parametrize("depth", [0, 2])
+    def test_an_empty_scene(self, depth: int) -> None:
+        hierarchy = octree(gate_level=depth).build(placed(torch.zeros(0, 3)), grid())
+        hierarchy.validate()
+        assert hierarchy.num_nodes == hierarchy.num_gaussians == 0
+
+    def test_no_gradient(self) -> None:
+        hierarchy = octree().build(placed(torch.zeros(4, 3, requires_grad=True)), grid())
+        assert not hierarchy.node_of.requires_grad
+
+    def test_one_gate_each(self) -> None:
+        x = torch.rand(50, 3, generator=torch.Generator().manual_seed(0)) * 4
+        alone, cells = octree(grouping="gaussian").build(placed(x), grid()), octree().build(placed(x), grid())
+        alone.validate()
+        assert sorted(alone.node_of.tolist()) == list(range(50))
+        by_cell = cells.node_of[torch.argsort(alone.node_of)]
+        assert torch.equal(by_cell, by_cell.sort().values)  # the same spatial order as the cells
+
+
+class TestUpdate:
+    @pytest.mark.parametrize("settings_", [{}, {"gate_level": 2}, {"grouping": "gaussian"}], ids=str)
+    def test_identity_changes_nothing(self, settings_: dict[str, object]) -> None:
+        x = torch.randn(40, 3, generator=torch.Generator().manual_seed(0)) * 2
+        part = octree(**settings_)
+        before = part.build(placed(x), grid())
+        after = part.update(before, TopologyEdit.permute(torch.arange(40)), placed(x))
+        for name in ("node_of", "parent", "level"):
+            assert torch.equal(getattr(after, name), getattr(before, name))
+
+    @given(st.lists(st.integers(0, 19), min_size=1, max_size=40), st.integers(0, 2))
+    @settings(max_examples=60, deadline=None)
+    def test_copies_share_their_sources_node(self, source: list[int], depth: int) -> None:
+        x = torch.randn(20, 3, generator=torch.Generator().manual_seed(0)) * 2
+        part, rows = octree(gate_level=depth), torch.tensor(source)
+        before = part.build(placed(x), grid())
+        after = part.update(before, TopologyEdit.permute(rows), placed(x[rows]))
+        after.validate()
+        old = before.node_of[rows]
+        assert torch.equal(old[:, None] == old[None], after.node_of[:, None] == after.node_of[None])
+        assert set(after.node_of.tolist()) | set(after.parent.tolist()) == set(range(after.num_nodes))
+        # unmoved rows: the update is what building anew would give
+        again = part.build(placed(x[rows]), grid())
+        assert torch.equal(after.node_of, again.node_of)
+        assert torch.equal(after.parent, again.parent)
+
+    def test_moved_gaussians_keep_their_region(self) -> None:
+        """The hierarchy is fixed once established: motion does not change who shares a gate."""
+        x = torch.tensor([[0.5, 0.5, 0.5], [0.6, 0.5, 0.5]])
+        part = octree()
+        before = part.build(placed(x), grid())
+        after = part.update(before, TopologyEdit.permute(torch.arange(2)), placed(x + torch.tensor([[9.0], [0.0]])))
+        assert torch.equal(after.node_of, before.node_of)
+
+    def test_one_gate_each_stays_so(self) -> None:
+        x = torch.randn(10, 3)
+        part = octree(grouping="gaussian")
+        edit = TopologyEdit.permute(torch.tensor([3, 3, 1, 9, 9, 9]))
+        after = part.update(part.build(placed(x), grid()), edit, placed(x))
+        assert sorted(after.node_of.tolist()) == list(range(6))

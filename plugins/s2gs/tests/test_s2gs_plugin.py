@@ -1,0 +1,205 @@
+"""What the plugin declares, its recipes, what all parts have in common, and the latent update rule."""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import inspect
+import math
+import pickle
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib.metadata import entry_points
+from importlib.resources import files
+from typing import get_args, get_origin
+
+import pytest
+import torch
+from gsstream_s2gs import plugin
+from gsstream_s2gs.latent import LatentCode, LatentResidual
+from pydantic import BaseModel, ValidationError
+from ruamel.yaml import YAML
+from s2gs_scene import gaussians
+
+from gsstream.api import ConfidenceEstimator, GateSampler, Part, Propagation, Regularizer, Structure, UpdateRule
+from gsstream.recipe.model import Recipe
+from gsstream.residual.base import apply_residual, init_latents
+
+KINDS = {
+    "structure": Structure, "confidence": ConfidenceEstimator, "propagation": Propagation,
+    "gate": GateSampler, "regularizer": Regularizer, "update": UpdateRule,
+}  # fmt: skip
+
+
+def part_class(spec: object) -> type[Part]:
+    module, name = spec.target.split(":")  # type: ignore[attr-defined]
+    return getattr(importlib.import_module(module), name)  # type: ignore[no-any-return]
+
+
+def models(config: type[BaseModel]) -> Iterator[type[BaseModel]]:
+    yield config
+    for field in config.model_fields.values():
+        for kind in (field.annotation, *get_args(field.annotation)):
+            if get_origin(kind) is None and inspect.isclass(kind) and issubclass(kind, BaseModel):
+                yield from models(kind)
+
+
+@pytest.mark.parametrize("spec", plugin.COMPONENTS, ids=lambda s: s.name)
+class TestEveryPart:
+    def test_fits_its_slot(self, spec: object) -> None:
+        kind = part_class(spec)
+        assert issubclass(kind, KINDS[spec.kind])  # type: ignore[attr-defined]
+        assert getattr(kind, "__final__", False)
+        assert not inspect.isabstract(kind)
+        assert "paper" in (inspect.getdoc(kind) or "")
+
+    def test_copies_are_equal_and_frozen(self, spec: object) -> None:
+        part = part_class(spec)()
+        assert copy.deepcopy(part) == part == pickle.loads(pickle.dumps(part))
+        with pytest.raises(AttributeError, match="is frozen"):
+            part.config = None
+        assert repr(part.config) in repr(part)
+
+    def test_config(self, spec: object) -> None:
+        config = part_class(spec).Config
+        assert config.model_validate_json(config().model_dump_json()) == config()
+        assert config.model_validate(config().model_dump()) == config()
+        config.model_json_schema()
+        with pytest.raises(ValidationError, match="no_such_key"):
+            config(no_such_key=1)
+        for model in models(config):
+            assert all(field.description for field in model.model_fields.values()), model
+            with pytest.raises(ValidationError):
+                setattr(config(), next(iter(config.model_fields)), 0)
+
+
+def test_the_entry_point_leads_here() -> None:
+    (found,) = (e for e in entry_points(group="gsstream") if e.name == "s2gs")
+    assert found.load() is plugin
+    assert [s.kind for s in plugin.gsstream_components()] == list(KINDS)
+    assert [s.name for s in plugin.gsstream_methods()] == ["s2gs", "s2gs-fast", "s2gs-edge"]
+
+
+def test_declaring_imports_no_torch() -> None:
+    code = "import sys, gsstream_s2gs.plugin as p; p.gsstream_components(); sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+class TestRecipes:
+    def read(self, name: str) -> dict:
+        (spec,) = (m for m in plugin.METHODS if m.name == name)
+        package, path = spec.recipe.split(":")
+        return YAML(typ="safe").load(files(package).joinpath(path).read_text("utf-8"))
+
+    def resolved(self, name: str) -> Recipe:
+        """Differences over their base, key by key."""
+
+        def merge(below: dict, above: dict) -> dict:
+            both = dict(below)
+            for key, value in above.items():
+                both[key] = merge(both[key], value) if isinstance(both.get(key), dict) else value
+            return both
+
+        data = self.read(name)
+        base = data.pop("base", None)
+        return Recipe.model_validate(merge(self.read(base), data) if base else data)
+
+    @pytest.mark.parametrize(("name", "epochs"), [("s2gs", 20), ("s2gs-fast", 10), ("s2gs-edge", 6)])
+    def test_budgets_of_the_paper(self, name: str, epochs: int) -> None:
+        recipe = self.resolved(name)
+        assert recipe.method == name
+        assert recipe.stream.epochs == epochs
+        assert recipe.first_frame.epochs == 250
+
+    @pytest.mark.parametrize("name", ["s2gs", "s2gs-fast", "s2gs-edge"])
+    def test_every_slot_is_one_of_our_parts_with_valid_settings(self, name: str) -> None:
+        recipe = self.resolved(name)
+        specs = {(s.kind, s.name): s for s in plugin.COMPONENTS}
+        for kind in KINDS:
+            reference = getattr(recipe, kind)
+            part_class(specs[kind, reference.name]).Config.model_validate(reference.params)
+
+
+class TestLatent:
+    def test_sizes_are_the_released_ones(self) -> None:
+        scene = gaussians(7)
+        latents = init_latents(LatentResidual(), scene)
+        assert {n: v.shape[1] for n, v in latents.items()} == {
+            "means": 3, "quats": 6, "scales": 8, "opacities": 1, "sh0": 4
+        }  # fmt: skip
+        decoders = LatentResidual().init_decoders(scene, torch.Generator().manual_seed(0))
+        assert {n: tuple(v.shape) for n, v in decoders.items()} == {
+            "quats": (6, 4), "scales": (8, 3), "opacities": (1, 1), "sh0": (4, 3)
+        }  # fmt: skip
+
+    def test_one_number_may_be_changed(self) -> None:
+        changed = LatentResidual.Config.model_validate({"sh0": {"lr": 0.05}, "means": {"step": 0.1}})
+        assert changed.sh0 == LatentCode(latent=4, lr=0.05, decoder_std=0.02, decoder_lr=1e-3)
+        assert changed.means.step == 0.1
+        assert changed.means.lr == LatentResidual.Config().means.lr
+        assert changed.quats == LatentResidual.Config().quats
+        with pytest.raises(ValidationError, match=r"sh0\.rate"):
+            LatentResidual.Config.model_validate({"sh0": {"rate": 0.05}})
+        with pytest.raises(ValidationError, match="sh1"):
+            LatentResidual.Config.model_validate({"sh1": {"lr": 0.05}})
+        with pytest.raises(ValidationError, match="quats"):
+            LatentResidual.Config.model_validate({"quats": 3})
+
+    def test_rate_zero_freezes(self) -> None:
+        frozen = LatentResidual(LatentResidual.Config.model_validate({"sh0": {"lr": 0.0}, "means": {"lr": 0.0}}))
+        assert set(frozen.codes()) == {"quats", "scales", "opacities", "shN"}
+
+    def test_a_closed_gate_keeps_its_bits_and_there_is_no_bias(self) -> None:
+        scene, rule = gaussians(9), LatentResidual()
+        generator = torch.Generator().manual_seed(0)
+        decoders = rule.init_decoders(scene, generator)
+        latents = {n: 5 * torch.randn(v.shape, generator=generator) for n, v in init_latents(rule, scene).items()}
+        gates = torch.tensor([0.0] * 5 + [1.0] * 4)
+        after = apply_residual(rule, scene, gates, latents, decoders, torch.ones(9))
+        silent = {n: torch.zeros_like(v) for n, v in latents.items()}
+        same = apply_residual(rule, scene, torch.ones(9), silent, decoders, torch.ones(9))
+        for name, value in scene.items():
+            assert torch.equal(getattr(after, name)[:5], value[:5])
+            assert torch.equal(getattr(same, name), value)
+            if name in latents:
+                assert not torch.equal(getattr(after, name)[5:], value[5:])
+
+    @pytest.mark.parametrize(
+        ("name", "least", "most"),
+        [
+            # change of a visible quantity by one symbol: 8-bit grey levels, degrees, relative size, opacity at 0.5
+            ("sh0", 0.2, 10.0), ("quats", 0.1, 5.0), ("scales", 0.002, 0.1), ("opacities", 0.0, 0.1),
+        ],
+    )  # fmt: skip
+    def test_one_symbol_is_a_small_visible_change(self, name: str, least: float, most: float) -> None:
+        scene, rule = gaussians(3), LatentResidual()
+        seen = []
+        for seed in range(20):
+            decoder = rule.init_decoders(scene, torch.Generator().manual_seed(seed))[name]
+            norm = float(decoder.norm(dim=1).mean())
+            unit = {"sh0": 255 * 0.2821 / math.sqrt(3), "quats": math.degrees(2), "scales": 1.0, "opacities": 0.25}
+            seen.append(norm * unit[name])
+        mean = sum(seen) / len(seen)
+        assert least < mean < most
+
+    @pytest.mark.parametrize("views", [11, 17])
+    def test_latents_speak_within_the_first_passes_and_stay_silent_on_noise(self, views: int) -> None:
+        """A steady pull moves a symbol within two passes; noise does not within six (the shortest budget)."""
+        for name, code in LatentResidual().codes().items():
+            if name in ("means", "shN"):
+                continue
+            latent = torch.zeros(400, requires_grad=True)
+            adam = torch.optim.Adam([latent], lr=code.lr, eps=1e-15)
+            for _ in range(2 * views):
+                latent.grad = torch.ones_like(latent)
+                adam.step()
+            assert bool((latent.detach().abs() > 0.5).all()), name
+            generator = torch.Generator().manual_seed(0)
+            latent = torch.zeros(400, requires_grad=True)
+            adam = torch.optim.Adam([latent], lr=code.lr, eps=1e-15)
+            for _ in range(6 * views):
+                latent.grad = torch.randn(400, generator=generator)
+                adam.step()
+            if code.lr <= 0.025:
+                assert float((latent.detach().abs() > 0.5).float().mean()) < 0.1, name

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from gsstream.engine.session import RunResult
 
 
 def run(
@@ -27,6 +30,10 @@ def run(
     scale: Annotated[float | None, typer.Option("--scale", help="Shrink images by this factor in (0, 1].")] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of every random stream.")] = None,
     renderer: Annotated[str | None, typer.Option("--renderer", help="Renderer: auto, cpu, reference, ...")] = None,
+    first_frame: Annotated[
+        Path | None,
+        typer.Option("--first-frame", help="Take frame 0 over from this stream instead of reconstructing it."),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run that --out holds.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run that --out holds.")] = False,
     no_video: Annotated[bool, typer.Option("--no-video", help="Write no video, only still pictures.")] = False,
@@ -51,4 +58,24 @@ def run(
 
     assembly = assemble(resolved, catalog)
     prepare_output(out, resume=resume, overwrite=overwrite)
-    run_session(assembly, source, out, resume=resume, video=not no_video, quiet=quiet)
+    result = run_session(assembly, source, out, resume=resume, quiet=quiet, first_frame=first_frame)
+    _pictures(result, source, assembly.recipe.scale, video=not no_video, quiet=quiet)
+
+
+def _pictures(result: RunResult, uri: str, scale: float, *, video: bool, quiet: bool) -> None:
+    """Contact sheet, plots, summary and video of what was written, and where to find them."""
+    from gsstream.source.open import open_source
+    from gsstream.trade.gallery import SUMMARY, write_gallery
+
+    if result.frames == 0:
+        return
+    source = open_source(uri, scale)
+    try:
+        written = write_gallery(result.out, source, video=video)
+    finally:
+        source.close()
+    if not quiet:
+        typer.echo((result.out / SUMMARY).read_text(encoding="utf-8").rstrip())
+        typer.echo("\n".join(f"wrote {path}" for path in (result.out / "stream.gss", *written)))
+        if result.interrupted:
+            typer.echo(f"stopped after frame {result.frames - 1}; continue with --resume")

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from gsstream.core.delta import Layout
+from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
@@ -21,7 +22,7 @@ from gsstream.engine.exposure import Exposure
 from gsstream.engine.guard import guarded
 from gsstream.engine.root import Progress, initial_gaussians, optimise_root, sort_by_node
 from gsstream.engine.stream_state import Step, StreamState
-from gsstream.packet import EncodedPacket, KeyState, StreamMeta, decode_packet, encode_key, quantise_key
+from gsstream.packet import EncodedPacket, KeyState, PlayerState, StreamMeta, decode_packet, encode_key, quantise_key
 from gsstream.structure.base import Anchors
 
 
@@ -58,6 +59,47 @@ def begin(
         "seconds": dict(zip(("seed", "optimise", "code"), np.diff(clock).tolist(), strict=True)),
     }
     return Step(state, packet, "key", metrics)
+
+
+def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
+    """Start from the decoded frame 0 of another stream, grouped by this method: methods compare on the same scene.
+
+    Raises InputError when the recipe asks for another degree of spherical harmonics than the stream has.
+    """
+    started = time.perf_counter()
+    if first.gaussians.sh_degree != parts.recipe.first_frame.sh_degree:
+        raise InputError(
+            f"the first frame has spherical harmonics of degree {first.gaussians.sh_degree}, the recipe asks for "
+            f"{parts.recipe.first_frame.sh_degree}; set first_frame.sh_degree={first.gaussians.sh_degree}"
+        )
+    gaussians = first.gaussians.map(torch.from_numpy)
+    anchors = decoded_anchors(first)
+    hierarchy, levels, gaussians = arrange(parts, gaussians, anchors.levels, anchors)
+    layout = make_layout(hierarchy, levels, anchors)
+    exposure = exposure_from_meta(first.meta)
+    state, packet = key_state(parts, gaussians, layout, hierarchy, frame, meta, exposure, anchors.origin, rng)
+    metrics = {
+        "bytes": dict(packet.sizes),
+        "num_gaussians": len(gaussians),
+        "active_gaussians": len(gaussians),
+        "num_gates": len(layout.node_counts),
+        "active_gates": 0,
+        "iterations": 0,
+        "seconds": {"code": time.perf_counter() - started},
+    }
+    return Step(state, packet, "key", metrics)
+
+
+def decoded_anchors(player: PlayerState) -> Anchors:
+    """What a structure needs to group a decoded scene again."""
+    gaussians = player.gaussians.map(torch.from_numpy)
+    return Anchors(
+        positions=gaussians.means,
+        colors=torch.zeros_like(gaussians.means),
+        levels=torch.from_numpy(player.layout.octree_levels.astype(np.int64)),
+        cell_sizes=torch.from_numpy(np.asarray(player.layout.cell_sizes)),
+        origin=torch.tensor(player.meta.extra["origin"], dtype=torch.float32),
+    )
 
 
 def arrange(

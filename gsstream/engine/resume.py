@@ -5,18 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from gsstream.core.errors import OutputError, PacketError
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.engine.assemble import Assembly
-from gsstream.engine.begin import exposure_from_meta
+from gsstream.engine.begin import decoded_anchors, exposure_from_meta
 from gsstream.engine.stream_state import StreamState
 from gsstream.packet import PacketKind, PlayerState, StreamReader, decode_packet
 from gsstream.source.base import FrameSource
-from gsstream.structure.base import Anchors
 
 
 def resume_state(
@@ -74,16 +72,7 @@ def key_state_from_player(parts: Assembly, player: PlayerState, rng: Rng) -> Str
 
 def rebuild_hierarchy(parts: Assembly, player: PlayerState) -> Hierarchy:
     """The hierarchy the encoder built: the structure sees the same bits, so it gives the same forest."""
-    gaussians = player.gaussians.map(torch.from_numpy)
-    levels = torch.from_numpy(player.layout.octree_levels.astype(np.int64))
-    anchors = Anchors(
-        positions=gaussians.means,
-        colors=torch.zeros_like(gaussians.means),
-        levels=levels,
-        cell_sizes=torch.from_numpy(np.asarray(player.layout.cell_sizes)),
-        origin=torch.tensor(player.meta.extra["origin"], dtype=torch.float32),
-    )
-    return parts.structure.build(gaussians, anchors)
+    return parts.structure.build(player.gaussians.map(torch.from_numpy), decoded_anchors(player))
 
 
 def _check_recipe(parts: Assembly, player: PlayerState) -> None:

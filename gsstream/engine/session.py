@@ -18,7 +18,7 @@ from gsstream.core.errors import OutputError
 from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
 from gsstream.engine.assemble import Assembly
-from gsstream.engine.begin import begin
+from gsstream.engine.begin import begin, begin_from
 from gsstream.engine.frame_step import frame_step
 from gsstream.engine.measure import HeldOut
 from gsstream.engine.points import gather_points
@@ -26,7 +26,7 @@ from gsstream.engine.progress import RunProgress
 from gsstream.engine.resume import resume_state
 from gsstream.engine.stream_state import Step, StreamState
 from gsstream.metrics import peak_memory_mb
-from gsstream.packet import StreamMeta, StreamWriter
+from gsstream.packet import StreamMeta, StreamReader, StreamWriter, decode_packet
 from gsstream.recipe.save import save_resolved
 from gsstream.source.base import FrameSource, SourceInfo
 from gsstream.source.open import open_source
@@ -52,33 +52,32 @@ def run(
     resume: bool = False,
     quiet: bool = False,
     measure: bool = True,
-    video: bool = True,
+    first_frame: Path | None = None,
 ) -> RunResult:
-    """Encode a recording into ``out`` (stream.gss, metrics.jsonl, recipe.yaml, pictures).
+    """Encode a recording into ``out`` (stream.gss, metrics.jsonl, recipe.yaml).
 
     Arguments:
         source_uri: what ``--source`` takes.
         out: a prepared output folder.
         resume: continue the run that ``out`` holds; the recipe must be the same.
         measure: render and compare the test cameras of every frame.
-        video: also write an MP4 of a test camera.
+        first_frame: another stream whose frame 0 is taken over instead of being reconstructed again.
     """
     source = open_source(source_uri, parts.recipe.scale)
     try:
-        result = _Run(parts, source, out, quiet, measure).encode(resume)
+        return _Run(parts, source, out, quiet, measure, first_frame).encode(resume)
     finally:
         source.close()
-    from gsstream.trade.gallery import write_gallery
-
-    write_gallery(out, source_uri, video=video, quiet=quiet)
-    return result
 
 
 class _Run:
     """The moving parts of one run; lives only inside :func:`run`."""
 
-    def __init__(self, parts: Assembly, source: FrameSource, out: Path, quiet: bool, measure: bool) -> None:
-        self.parts, self.source, self.out = parts, source, out
+    def __init__(
+        self, parts: Assembly, source: FrameSource, out: Path, quiet: bool, measure: bool,
+        first_frame: Path | None,
+    ) -> None:  # fmt: skip
+        self.parts, self.source, self.out, self.first_frame = parts, source, out, first_frame
         self.rng = Rng(parts.recipe.seed)
         self.near = parts.recipe.near * source.info.train.extent
         self.total = _num_frames(source.info, parts.recipe.frames)
@@ -118,6 +117,10 @@ class _Run:
         return step.state
 
     def _first(self, frame: Frame) -> Step:
+        if self.first_frame is not None:
+            with StreamReader(self.first_frame) as reader:
+                player = decode_packet(None, reader.read(reader.frames[0]))
+            return begin_from(self.parts, player, frame, self._meta(frame.cameras), self.rng)
         points = gather_points(self.source, frame, self.parts.recipe.first_frame, self.rng)
         return begin(self.parts, points, frame, self._meta(frame.cameras), self.rng, self.progress.root)
 

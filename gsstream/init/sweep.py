@@ -64,7 +64,8 @@ def sweep_depths(images: FloatArray, cameras: Cameras, settings: SweepSettings) 
         cost = _matching_cost(grey, cameras, view, partners[view].tolist(), inverse[view], settings)
         total = aggregate(cost, grey[view].numpy(), settings.step_penalty, settings.jump_penalty)
         plane = best_plane(total)
-        return 1 / (inverse[view, 0] + plane * (inverse[view, 1] - inverse[view, 0]))
+        depth: FloatArray = 1 / (inverse[view, 0] + plane * (inverse[view, 1] - inverse[view, 0]))
+        return depth
 
     # Many small tensors: a second thread inside an operation costs more than it brings, one per view does not.
     threads = torch.get_num_threads()

@@ -6,8 +6,9 @@ import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 from gsstream.core.errors import PacketError, SourceError
 from gsstream.packet.base import FILE_HEADER, PACKET_HEADER, PacketKind, check_file_header, parse_header, parse_packet
@@ -47,7 +48,8 @@ class StreamReader:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         try:
-            self._file: BinaryIO = self.path.open("rb")
+            # Unbuffered: a writer that resumes rewrites the index, and a buffer would go on showing the old bytes.
+            self._file: FileIO = self.path.open("rb", buffering=0)
         except OSError as error:
             raise SourceError(f"cannot open the stream {self.path}: {error.strerror}; expected a .gss file") from error
         self.entries: list[Entry] = []

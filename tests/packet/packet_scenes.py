@@ -1,0 +1,102 @@
+"""Small scenes, deltas and streams for the packet tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.delta import Delta, Layout, active_rows
+from gsstream.core.gaussians import Gaussians
+from gsstream.packet import (
+    EncodedPacket,
+    KeyState,
+    PlayerState,
+    StreamMeta,
+    StreamWriter,
+    decode_packet,
+    encode_delta,
+    encode_empty,
+    encode_key,
+    quantise_decoders,
+)
+
+
+def make_scene(rng: np.random.Generator, number: int, sh_rest: int = 3) -> Gaussians:
+    return Gaussians(
+        means=rng.normal(size=(number, 3)).astype(np.float32),
+        quats=rng.normal(size=(number, 4)).astype(np.float32),
+        scales=(rng.normal(size=(number, 3)) - 3).astype(np.float32),
+        opacities=(3 * rng.normal(size=number)).astype(np.float32),
+        sh0=rng.normal(size=(number, 1, 3)).astype(np.float32),
+        shN=(0.1 * rng.normal(size=(number, sh_rest, 3))).astype(np.float32),
+    )
+
+
+def make_layout(rng: np.random.Generator, number: int, nodes: int) -> Layout:
+    counts = np.bincount(rng.integers(0, nodes, number), minlength=nodes).astype(np.int32)
+    return Layout(counts, rng.integers(0, 3, number).astype(np.uint8), np.float32([1.0, 0.3, 0.1]))
+
+
+def make_meta() -> StreamMeta:
+    viewmats = np.tile(np.eye(4), (3, 1, 1))
+    viewmats[:, 2, 3] = [2.0, 1 / 3, np.pi]
+    K = np.array([[50.0, 0, 16], [0, 51.0, 12], [0, 0, 1]])
+    rig = Cameras(("left", "right", "held-out"), viewmats, np.tile(K, (3, 1, 1)), 32, 24, 0.02)
+    recipe = {"method": "dense", "gate": {"temperature": 0.3}, "frames": None}
+    train, test = rig.select([0, 1]), rig.select([2])
+    return StreamMeta("dense", "unit test", recipe, train, test, 30.0, (0.1, 0.2, 0.3), {"p": "1"})
+
+
+def make_key(rng: np.random.Generator, number: int = 40, nodes: int = 12, sh_rest: int = 3) -> KeyState:
+    return KeyState(make_scene(rng, number, sh_rest), make_layout(rng, number, nodes), make_meta())
+
+
+def make_delta(
+    rng: np.random.Generator, layout: Layout, share: float = 0.4, levels: int = 4, latent: bool = True
+) -> Delta:
+    nodes = len(layout.node_counts)
+    gates = (rng.random(nodes) < share) * rng.integers(1, levels + 1, nodes)
+    rows = len(active_rows(layout, gates))
+    widths = {"means": 3, "quats": 4, "opacities": 1, "sh0": 2 if latent else 3}
+    symbols = {n: np.rint(2 * rng.laplace(size=(rows, w))).astype(np.int32) for n, w in widths.items()}
+    decoders = quantise_decoders({"sh0": rng.normal(size=(2, 3))}) if latent else {}
+    return Delta(gates.astype(np.uint8), levels, symbols, dict.fromkeys(widths, 0.01), decoders)
+
+
+def make_packets(seed: int = 0, frames: int = 7, key_at: int = 4, **sizes: int) -> list[EncodedPacket]:
+    """Key, deltas with a decoder that changes once, an empty packet at frame 2, a second key."""
+    rng = np.random.default_rng(seed)
+    state: PlayerState | None = None
+    packets = []
+    for frame in range(frames):
+        if frame in (0, key_at):
+            packet = encode_key(make_key(rng, **sizes), frame=frame)
+        elif frame == 2:
+            packet = encode_empty(frame=frame)
+        else:
+            packet = encode_delta(make_delta(rng, state.layout), state.layout, state.decoders, frame=frame)
+        packets.append(packet)
+        state = decode_packet(state, packet.data)
+    return packets
+
+
+def decode_all(packets: list[EncodedPacket]) -> list[PlayerState]:
+    states: list[PlayerState] = []
+    for packet in packets:
+        states.append(decode_packet(states[-1] if states else None, packet.data))
+    return states
+
+
+def write_stream(path: Path, packets: list[EncodedPacket], index: bool = True) -> bytes:
+    writer = StreamWriter.open(path)
+    for packet in packets:
+        writer.append(packet)
+    writer.close(index=index)
+    return path.read_bytes()
+
+
+def same_bits(first: Gaussians, second: Gaussians) -> bool:
+    pairs = zip(first.items(), second.items(), strict=True)
+    return all(a.shape == b.shape and a.dtype == b.dtype and a.tobytes() == b.tobytes() for (_, a), (_, b) in pairs)

@@ -1,0 +1,147 @@
+"""Bit fields, symbol tables and gates: what goes in comes out, and it costs what theory says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from gsstream.core.errors import PacketError, ShapeError
+from gsstream.packet.bits import BitReader, BitWriter, pack_blobs, unpack_blobs
+from gsstream.packet.bulk import decompress, pack_array, unpack_array
+from gsstream.packet.gates import decode_gates, encode_gates
+from gsstream.packet.symbols import decode_symbols, encode_symbols
+
+INT32 = st.integers(-(2**31), 2**31 - 1)
+
+
+def entropy_bytes(column: np.ndarray) -> float:
+    """Order-0 entropy, bytes."""
+    _, counts = np.unique(column, return_counts=True)
+    return float(-(counts * np.log2(counts / counts.sum())).sum() / 8)
+
+
+@given(st.lists(st.tuples(st.sampled_from("bgs"), st.integers(0, 2**33)), max_size=60))
+def test_bit_fields_round_trip(fields):
+    writer = BitWriter()
+    for kind, value in fields:
+        {"b": lambda v: writer.bits(v & 0xFF, 8), "g": writer.gamma, "s": lambda v: writer.signed(-v)}[kind](value)
+    reader = BitReader(writer.to_bytes())
+    for kind, value in fields:
+        read = {"b": lambda: reader.bits(8), "g": reader.gamma, "s": reader.signed}[kind]()
+        assert read == {"b": value & 0xFF, "g": value, "s": -value}[kind]
+    reader.finish()
+
+
+def test_bit_reader_refuses_overruns_and_leftovers():
+    with pytest.raises(PacketError):
+        BitReader(b"\x00").bits(9)
+    with pytest.raises(PacketError):
+        BitReader(b"\x00" * 100).gamma()
+    with pytest.raises(PacketError):
+        BitReader(b"\x80\x00").finish()
+    with pytest.raises(PacketError):
+        BitReader(b"\x01").finish()
+
+
+@given(st.lists(st.binary(max_size=300), min_size=1, max_size=5))
+def test_blobs_round_trip(blobs):
+    assert unpack_blobs(pack_blobs(blobs), len(blobs)) == blobs
+
+
+@settings(max_examples=150)
+@given(
+    hnp.arrays(
+        np.int32, st.tuples(st.integers(0, 60), st.integers(0, 5)),
+        elements=st.one_of(st.integers(-3, 3), st.integers(-500, 500), INT32),
+    )
+)  # fmt: skip
+def test_symbols_round_trip(table):
+    data = encode_symbols(table)
+    decoded = decode_symbols(data, *table.shape)
+    assert decoded.dtype == np.int32
+    assert np.array_equal(decoded, table)
+
+
+def test_symbols_at_the_ends_of_int32():
+    table = np.array([[-(2**31), 2**31 - 1], [2**31 - 1, -(2**31)], [0, 0]], np.int32)
+    assert np.array_equal(decode_symbols(encode_symbols(table), 3, 2), table)
+
+
+@pytest.mark.parametrize("scale", [0.3, 1.0, 4.0, 30.0])
+def test_large_tables_cost_their_entropy(scale):
+    rng = np.random.default_rng(3)
+    table = np.rint(rng.laplace(size=(40_000, 3)) * scale * [1, 2, 4]).astype(np.int32)
+    size, bound = len(encode_symbols(table)), sum(entropy_bytes(column) for column in table.T)
+    header = sum(len(np.unique(column)) for column in table.T)  # about a byte per bin at most
+    assert bound - 8 <= size <= 1.005 * bound + header + 60
+
+
+def test_one_model_is_shared_when_that_is_smaller():
+    rng = np.random.default_rng(4)
+    table = np.rint(rng.laplace(size=(30, 24)) * 3).astype(np.int32)
+    alone = sum(len(encode_symbols(table[:, [i]])) for i in range(24))
+    assert len(encode_symbols(table)) < 0.6 * alone
+
+
+def test_a_lone_outlier_does_not_pay_for_the_gap():
+    table = np.rint(np.random.default_rng(5).laplace(size=(500, 1))).astype(np.int32)
+    plain = len(encode_symbols(table))
+    table[17] = 1_000_000
+    assert len(encode_symbols(table)) <= plain + 12
+
+
+def test_constant_channels_cost_no_payload():
+    assert len(encode_symbols(np.full((100_000, 9), -7, np.int32))) <= 4
+
+
+@settings(max_examples=150)
+@given(st.integers(1, 255), st.data())
+def test_gates_round_trip(levels, data):
+    gates = data.draw(hnp.arrays(np.uint8, st.integers(0, 200), elements=st.one_of(st.just(0), st.integers(0, levels))))
+    decoded, decoded_levels = decode_gates(encode_gates(gates, levels), len(gates))
+    assert decoded_levels == levels
+    assert np.array_equal(decoded, gates)
+
+
+@pytest.mark.parametrize(("share", "bound"), [(0.0, 8), (0.001, 200), (1.0, 8)])
+def test_sparse_gates_cost_follows_change(share, bound):
+    gates = (np.random.default_rng(6).random(100_000) < share).astype(np.uint8)
+    assert len(encode_gates(gates, 1)) <= bound
+
+
+@pytest.mark.parametrize("share", [0.01, 0.1, 0.5])
+def test_random_gates_cost_their_entropy(share):
+    gates = (np.random.default_rng(7).random(50_000) < share).astype(np.uint8)
+    assert len(encode_gates(gates, 1)) <= 1.04 * entropy_bytes(gates) + 60
+
+
+def test_clustered_gates_cost_less_than_their_entropy():
+    gates = np.repeat((np.random.default_rng(8).random(500) < 0.2).astype(np.uint8), 100)
+    assert len(encode_gates(gates, 1)) < 0.05 * entropy_bytes(gates)
+
+
+@pytest.mark.parametrize(("gates", "levels"), [([3], 2), ([1], 0), ([1], 256), ([[1]], 1)])
+def test_impossible_gates_are_refused(gates, levels):
+    with pytest.raises(ShapeError):
+        encode_gates(np.array(gates), levels)
+
+
+@given(hnp.arrays(np.float32, st.integers(0, 50), elements=st.floats(width=32, allow_nan=False)))
+def test_bulk_round_trip(array):
+    assert unpack_array(pack_array(array, "<f4"), "<f4", len(array)).tobytes() == array.tobytes()
+
+
+def test_bulk_refuses_sizes_before_allocating():
+    bomb = pack_array(np.zeros(10_000_000, np.uint8), "u1")
+    assert len(bomb) < 1000
+    with pytest.raises(PacketError, match="announces"):
+        decompress(bomb, 1000)
+    with pytest.raises(PacketError, match="announces"):
+        unpack_array(bomb, "u1", 10)
+    with pytest.raises(PacketError):
+        decompress(bomb[:-3], 20_000_000)
+    with pytest.raises(PacketError):
+        decompress(bomb + b"x", 20_000_000)

@@ -1,0 +1,328 @@
+"""Damaged and malicious streams: a correct prefix or a PacketError with its byte, never a crash or large allocation."""
+
+from __future__ import annotations
+
+import struct
+import tracemalloc
+import zlib
+
+import numpy as np
+import pytest
+from packet_scenes import decode_all, make_delta, make_key, make_packets, same_bits, write_stream
+
+from gsstream.core.errors import PacketError
+from gsstream.packet import (
+    PacketKind,
+    StreamReader,
+    decode_delta,
+    decode_key,
+    decode_packet,
+    encode_delta,
+    encode_empty,
+    encode_key,
+)
+from gsstream.packet.base import MAX_BODY, MAX_GAUSSIANS, build_packet, file_header, parse_packet
+from gsstream.packet.bits import BitWriter, pack_blobs
+from gsstream.packet.bulk import compress, pack_array
+from gsstream.player.playback import Playback
+
+LIMIT = 32 << 20
+
+
+@pytest.fixture(scope="module")
+def small():
+    packets = make_packets(frames=5, key_at=3, number=8, nodes=4, sh_rest=0)
+    return packets, decode_all(packets)
+
+
+@pytest.fixture
+def bounded_memory():
+    tracemalloc.start()
+    yield
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < LIMIT
+
+
+def play_prefix(path, states):
+    """Play until the end or an error; every frame seen must be right. Returns (frames seen, error or None)."""
+    seen, error = 0, None
+    try:
+        with Playback(path) as playback:
+            for frame, scene in playback:
+                assert frame == seen
+                assert same_bits(scene, states[frame].gaussians)
+                seen += 1
+    except PacketError as caught:
+        error = caught
+    assert error is None or 0 <= error.offset <= path.stat().st_size
+    return seen, error
+
+
+def test_truncation_at_every_byte_keeps_every_complete_packet(tmp_path, small):
+    packets, states = small
+    data = write_stream(tmp_path / "whole.gss", packets)
+    ends = np.cumsum([16] + [len(p.data) for p in packets])[1:]
+    path = tmp_path / "cut.gss"
+    for cut in range(len(data)):
+        path.write_bytes(data[:cut])
+        complete = int((ends <= cut).sum())
+        if cut >= 16:
+            with StreamReader(path) as reader:
+                assert len(reader.frames) == complete
+                assert reader.damage is None
+                assert (reader.unfinished is None) == (cut in {16, *ends.tolist(), len(data)})
+        if cut % 17 == 0 or cut in ends:
+            seen, error = play_prefix(path, states)
+            assert seen == complete
+            assert (error is None) == (complete > 0)
+
+
+def test_every_flipped_bit_is_noticed_at_or_before_its_packet(tmp_path, small):
+    packets, states = small
+    data = write_stream(tmp_path / "whole.gss", packets, index=False)
+    ends = np.cumsum([16] + [len(p.data) for p in packets])[1:]
+    rng, path = np.random.default_rng(0), tmp_path / "flipped.gss"
+    for at in range(len(data)):
+        hurt = bytearray(data)
+        hurt[at] ^= 1 << int(rng.integers(8))
+        path.write_bytes(hurt)
+        sound = int((ends <= at).sum())
+        if at >= 16:
+            with StreamReader(path) as reader:
+                with pytest.raises(PacketError) as caught:
+                    reader.check()
+                assert caught.value.offset == (ends[sound - 1] if sound else 16)
+        if at % 17 == 0:
+            seen, error = play_prefix(path, states)
+            assert error is not None
+            assert seen == sound
+
+
+def test_flips_in_the_index_are_found_by_check(tmp_path, small):
+    packets, _ = small
+    data = write_stream(tmp_path / "whole.gss", packets)
+    start = len(write_stream(tmp_path / "bare.gss", packets, index=False))
+    for at in range(start, len(data)):
+        hurt = bytearray(data)
+        hurt[at] ^= 0x10
+        (tmp_path / "x.gss").write_bytes(hurt)
+        with StreamReader(tmp_path / "x.gss") as reader:
+            assert len(reader.frames) == 5
+            with pytest.raises(PacketError):
+                reader.check()
+
+
+def test_random_bytes_are_no_stream(tmp_path):
+    rng, path = np.random.default_rng(1), tmp_path / "random.gss"
+    for size in [0, 1, 15, 16, 17, 64, 1000] * 10:
+        path.write_bytes(rng.bytes(size))
+        with pytest.raises(PacketError) as caught:
+            Playback(path)
+        assert caught.value.offset is not None
+        path.write_bytes(file_header() + rng.bytes(size))
+        with pytest.raises(PacketError):
+            Playback(path)
+
+
+def resealed(packet, mutate):
+    """The packet with mutated section payloads and correct checksums: only the decoders can notice."""
+    header, sections = parse_packet(packet.data)
+    return build_packet(header.kind, header.frame, [(name, mutate(name, s.data)) for name, s in sections.items()]).data
+
+
+def _mutate(rng, data):
+    out = bytearray(data)
+    for _ in range(int(rng.integers(1, 4))):
+        action, at = int(rng.integers(4)), int(rng.integers(len(out) + 1))
+        if action == 0 and at < len(out):
+            out[at] ^= 1 << int(rng.integers(8))
+        elif action == 1:
+            del out[at : at + int(rng.integers(1, 9))]
+        elif action == 2:
+            out[at:at] = rng.bytes(int(rng.integers(1, 9)))
+        else:
+            out[at : at + 4] = struct.pack("<I", int(rng.choice([0, 1, 0x7FFFFFFF, 0xFFFFFFFF, 0x80000000])))
+    return bytes(out)
+
+
+@pytest.mark.usefixtures("bounded_memory")
+@pytest.mark.parametrize("kind", ["key", "delta"])
+def test_resealed_mutations_allocate_little(small, kind):
+    check_mutations(small, kind, turns=200, seed=10)
+
+
+@pytest.mark.parametrize("kind", ["key", "delta"])
+def test_resealed_mutations_are_refused_or_give_a_sound_state(small, kind):
+    check_mutations(small, kind, turns=2000, seed=2)
+
+
+def check_mutations(small, kind, turns, seed):
+    packets, states = small
+    packet, before = (packets[0], None) if kind == "key" else (packets[1], states[0])
+    rng, offsets = np.random.default_rng(seed), []
+    names = list(parse_packet(packet.data)[1])
+    for turn in range(turns):
+        target = names[turn % len(names)]
+        data = resealed(packet, lambda name, old, t=target: _mutate(rng, old) if name == t else old)
+        try:
+            state = decode_packet(before, data, offset=1000)
+        except PacketError as error:
+            offsets.append(error.offset)
+        else:
+            state.gaussians.validate()
+            assert len(state.gaussians) == int(state.layout.node_counts.sum())
+    assert len(offsets) > 0.6 * turns
+    assert all(1000 <= offset <= 1000 + 2 * len(packet.data) for offset in offsets)
+
+
+def _replace(packet, name, data):
+    return resealed(packet, lambda n, old: data if n == name else old)
+
+
+@pytest.mark.usefixtures("bounded_memory")
+def test_lying_counts_are_refused_before_allocation():
+    key = encode_key(make_key(np.random.default_rng(3), 10, 4))
+    many = 0xFFFFFFFF
+    liars = {
+        "Gaussians": struct.pack("<IIB", many, 4, 3),
+        "nodes": struct.pack("<IIB", 10, many, 3),
+        "levels": struct.pack("<IIB", 10, 4, 255),
+        "cells": struct.pack("<IIB", 10, 4, 3) + b"\0" * 5,
+        "just beyond": struct.pack("<IIB", MAX_GAUSSIANS + 1, 4, 3),
+    }
+    for what, layout in liars.items():
+        with pytest.raises(PacketError):
+            decode_key(_replace(key, "layout", layout + b"\0" * 20))
+        assert what
+
+
+@pytest.mark.usefixtures("bounded_memory")
+def test_bombs_are_refused_before_inflation():
+    key = encode_key(make_key(np.random.default_rng(4), 10, 4))
+    bomb = compress(b"\0" * (20 << 20))  # 20 MB of zeros in a few hundred bytes
+    tracemalloc.reset_peak()
+    start = tracemalloc.get_traced_memory()[0]
+    for name in ("meta", "means"):
+        with pytest.raises(PacketError, match="announces"):
+            decode_key(_replace(key, name, bomb))
+    assert tracemalloc.get_traced_memory()[1] - start < 1 << 20
+
+
+@pytest.mark.usefixtures("bounded_memory")
+def test_histograms_beyond_the_limit_are_refused():
+    rng = np.random.default_rng(5)
+    state = make_key(rng, 10, 4)
+    packet = encode_delta(make_delta(rng, state.layout, 1.0, 1, latent=False), state.layout, {}, frame=1)
+    prefix = parse_packet(packet.data)[1]["means"].data[:6]
+    for low, bins in ((0, 1 << 30), (2**31 - 2, 100), (-(2**32), 2)):
+        head = BitWriter()
+        head.bits(1, 1)
+        head.signed(low)
+        head.gamma(bins - 1)
+        head.bits(0, 1)
+        body = pack_blobs([head.to_bytes(), b""])
+        with pytest.raises(PacketError, match="histogram"):
+            decode_delta(_replace(packet, "means", prefix + body), state.layout, {})
+
+
+@pytest.mark.parametrize(
+    ("mode", "channels", "step"),
+    [(2, 3, 0.1), (1, 3, 0.1), (0, 0, 0.1), (0, 255, 0.1), (0, 3, 0.0), (0, 3, np.nan), (0, 3, np.inf), (0, 3, -1.0)],
+)
+def test_impossible_attribute_headers_are_refused(mode, channels, step):
+    rng = np.random.default_rng(6)
+    state = make_key(rng, 10, 4)
+    packet = encode_delta(make_delta(rng, state.layout, 1.0, 1, latent=False), state.layout, {}, frame=1)
+    old = parse_packet(packet.data)[1]["means"].data
+    with pytest.raises(PacketError):
+        decode_delta(_replace(packet, "means", struct.pack("<BBf", mode, channels, step) + old[6:]), state.layout, {})
+
+
+def test_huge_residuals_cannot_overflow_the_scene():
+    rng = np.random.default_rng(7)
+    state = make_key(rng, 10, 4)
+    delta = make_delta(rng, state.layout, 1.0, 1, latent=True)
+    delta.symbols["sh0"][:] = 2**31 - 1
+    packet = encode_delta(delta, state.layout, {}, frame=1)
+    old = parse_packet(packet.data)[1]
+    large = {
+        "decoders": old["decoders"].data[:3] + np.full(6, 60_000, "<f2").tobytes(),
+        "sh0": struct.pack("<BBf", 1, 2, 9e5) + old["sh0"].data[6:],
+    }
+    huge = resealed(packet, lambda name, data: large.get(name, data))
+    with pytest.raises(PacketError, match="cannot be"):
+        decode_delta(huge, state.layout, {})
+
+
+def _header(kind, sections, frame, body, data=b""):
+    checksum = zlib.crc32(data, zlib.crc32(struct.pack("<BBII", kind, sections, frame, body)))
+    check = zlib.crc32(struct.pack("<BBIII", kind, sections, frame, body, checksum)) & 0xFFFF
+    return struct.pack("<BBHIII", kind, sections, check, frame, body, checksum) + data
+
+
+@pytest.mark.parametrize(
+    "packet",
+    [
+        _header(9, 0, 1, 0), _header(2, 255, 1, 4000), _header(2, 0, 1, MAX_BODY + 1), _header(2, 3, 1, 2, b"ab"),
+        _header(2, 1, 1, 5, struct.pack("<BI", 99, 0)), _header(2, 1, 1, 5, struct.pack("<BI", 3, 0xFFFFFFFF)),
+        _header(2, 2, 1, 10, struct.pack("<BIBI", 3, 0, 3, 0)), _header(2, 1, 1, 6, struct.pack("<BI", 3, 0) + b"x"),
+        _header(3, 1, 1, 5, struct.pack("<BI", 3, 0)), _header(3, 0, 5, 0), _header(2, 0, 1, 0),
+    ],
+)  # fmt: skip
+def test_impossible_headers_stop_the_walk_at_their_byte(tmp_path, small, packet):
+    packets, states = small
+    path = tmp_path / "s.gss"
+    start = len(write_stream(path, packets[:1], index=False))
+    with path.open("ab") as file:
+        file.write(packet)
+    seen, error = play_prefix(path, states)
+    assert seen == 1
+    assert start <= error.offset <= start + len(packet)
+
+
+def test_a_length_beyond_the_file_is_an_unfinished_packet(tmp_path, small):
+    packets, _ = small
+    path = tmp_path / "s.gss"
+    start = len(write_stream(path, packets[:1], index=False))
+    with path.open("ab") as file:
+        file.write(_header(2, 1, 1, MAX_BODY))
+    with StreamReader(path) as reader:
+        assert reader.damage is None
+        assert (reader.unfinished.offset, reader.unfinished.size) == (start, 16)
+
+
+def test_a_stream_must_begin_with_a_key_packet(tmp_path):
+    path = tmp_path / "s.gss"
+    path.write_bytes(file_header() + encode_empty(frame=0).data)
+    with pytest.raises(PacketError, match="key packet first") as caught:
+        Playback(path)
+    assert caught.value.offset == 16
+
+
+def test_damage_behind_the_frame_asked_for_does_not_matter(tmp_path, small):
+    packets, states = small
+    data = bytearray(write_stream(tmp_path / "s.gss", packets))
+    with StreamReader(tmp_path / "s.gss") as reader:
+        hurt = reader.entries[2]
+    data[hurt.offset + 8] ^= 1
+    (tmp_path / "s.gss").write_bytes(data)
+    with Playback(tmp_path / "s.gss") as playback:
+        assert same_bits(playback.state_at(1), states[1].gaussians)
+        with pytest.raises(PacketError) as caught:
+            playback.state_at(2)
+        assert caught.value.offset == hurt.offset
+
+
+@pytest.mark.parametrize("meta", [b"", b"[]", b"{}", b"[" * 100_000, b'{"version": NaN}', b"\xff\xfe", b"1" * 5000])
+def test_meta_that_is_not_meta_is_refused(meta):
+    key = encode_key(make_key(np.random.default_rng(8), 10, 4))
+    with pytest.raises(PacketError):
+        decode_key(_replace(key, "meta", compress(meta)))
+
+
+def test_values_that_are_not_finite_are_refused():
+    key = encode_key(make_key(np.random.default_rng(9), 10, 4))
+    with pytest.raises(PacketError, match="finite"):
+        decode_key(_replace(key, "means", pack_array(np.full(30, np.nan, np.float32), "<f4")))
+    assert PacketKind(key.data[0]) == PacketKind.KEY

@@ -1,0 +1,210 @@
+"""Key, delta and empty packets: round trips, the quantisation grid, and what an encoder refuses."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from packet_scenes import decode_all, make_delta, make_key, make_layout, make_meta, make_packets, make_scene, same_bits
+
+from gsstream.core.delta import Delta, Layout, apply_delta
+from gsstream.core.errors import PacketError, ShapeError
+from gsstream.packet import (
+    KeyState,
+    PacketKind,
+    decode_delta,
+    decode_key,
+    decode_packet,
+    encode_delta,
+    encode_empty,
+    encode_key,
+    quantise_decoders,
+    quantise_key,
+)
+from gsstream.packet.base import SECTION_NAMES, parse_packet
+from gsstream.packet.key import KEY_BITS
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+@settings(max_examples=40, deadline=None)
+@given(SEEDS, st.integers(0, 60), st.sampled_from([0, 3, 8, 15]))
+def test_key_round_trip_is_bitwise(seed, number, sh_rest):
+    state = make_key(np.random.default_rng(seed), number, sh_rest=sh_rest)
+    packet = encode_key(state, frame=5)
+    decoded = decode_key(packet.data)
+    assert same_bits(decoded.gaussians, quantise_key(state.gaussians))
+    assert same_bits(quantise_key(decoded.gaussians), decoded.gaussians)
+    assert encode_key(decoded, frame=5).data == packet.data
+    for field in dataclasses.fields(Layout):
+        assert np.array_equal(getattr(decoded.layout, field.name), getattr(state.layout, field.name))
+    assert (packet.kind, packet.frame) == (PacketKind.KEY, 5)
+
+
+@settings(max_examples=40, deadline=None)
+@given(SEEDS, st.floats(1e-6, 1e6))
+def test_quantising_twice_is_quantising_once_whatever_the_quaternion_norm(seed, norm):
+    scene = make_scene(np.random.default_rng(seed), 20)
+    unit = scene.quats / np.linalg.norm(scene.quats, axis=1, keepdims=True)
+    once = quantise_key(dataclasses.replace(scene, quats=(unit * norm).astype(np.float32)))
+    assert same_bits(quantise_key(once), once)
+    cosine = np.abs((once.quats * unit).sum(1)) / np.linalg.norm(once.quats, axis=1)
+    assert cosine.min() > 1 - 2e-6
+
+
+def test_quantisation_error_is_half_a_step():
+    scene = make_scene(np.random.default_rng(1), 500, 8)
+    unit = scene.quats / np.linalg.norm(scene.quats, axis=1, keepdims=True)
+    scene = dataclasses.replace(scene, quats=unit.astype(np.float32))
+    decoded = quantise_key(scene)
+    assert np.array_equal(decoded.means, scene.means)
+    for name, bits in KEY_BITS.items():
+        error = np.abs(getattr(decoded, name) - getattr(scene, name)).max()
+        assert 0 < error <= 0.5 * 2.0**-bits
+
+
+def test_meta_round_trip_keeps_every_bit():
+    meta = make_meta()
+    state = dataclasses.replace(make_key(np.random.default_rng(2)), meta=meta)
+    decoded = decode_key(encode_key(state).data).meta
+    for split in ("train", "test"):
+        a, b = getattr(meta, split), getattr(decoded, split)
+        assert (a.ids, a.width, a.height, a.near) == (b.ids, b.width, b.height, b.near)
+        assert a.viewmats.tobytes() == b.viewmats.tobytes()
+        assert a.Ks.tobytes() == b.Ks.tobytes()
+    assert dataclasses.replace(decoded, train=meta.train, test=meta.test) == meta
+    assert decoded.recipe_hash == meta.recipe_hash
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("means", np.nan, "finite"), ("scales", np.inf, "finite"), ("quats", 0.0, "norm zero"),
+        ("opacities", 1e9, "diverged"), ("sh0", 1e8, "diverged"),
+    ],
+)  # fmt: skip
+def test_key_refuses_bad_values(field, value, message):
+    state = make_key(np.random.default_rng(3))
+    array = getattr(state.gaussians, field).copy()
+    array[7] = value
+    with pytest.raises(ShapeError, match=message):
+        encode_key(dataclasses.replace(state, gaussians=dataclasses.replace(state.gaussians, **{field: array})))
+
+
+def test_key_refuses_a_layout_of_another_scene():
+    rng = np.random.default_rng(4)
+    with pytest.raises(ShapeError, match="layout"):
+        encode_key(KeyState(make_scene(rng, 40), make_layout(rng, 41, 5), make_meta()))
+
+
+@settings(max_examples=60, deadline=None)
+@given(SEEDS, st.integers(0, 50), st.integers(1, 20), st.floats(0, 1), st.integers(1, 255), st.booleans())
+def test_delta_round_trip(seed, number, nodes, share, levels, latent):
+    rng = np.random.default_rng(seed)
+    state = make_key(rng, number, nodes)
+    delta = make_delta(rng, state.layout, share, levels, latent)
+    packet = encode_delta(delta, state.layout, {}, frame=1)
+    decoded = decode_delta(packet.data, state.layout, {})
+    assert np.array_equal(decoded.gates, delta.gates)
+    assert decoded.num_levels == levels
+    assert set(decoded.symbols) == set(delta.symbols)
+    for name in delta.symbols:
+        assert np.array_equal(decoded.symbols[name], delta.symbols[name])
+        assert np.float32(decoded.steps[name]) == np.float32(delta.steps[name])
+    for name in delta.decoders:
+        assert decoded.decoders[name].tobytes() == delta.decoders[name].tobytes()
+    scene = quantise_key(state.gaussians)
+    assert same_bits(apply_delta(scene, state.layout, decoded), apply_delta(scene, state.layout, delta))
+
+
+def test_sizes_account_for_every_byte():
+    for packet in make_packets():
+        _, sections = parse_packet(packet.data)
+        assert sum(packet.sizes.values()) == len(packet.data)
+        assert {n: len(s.data) for n, s in sections.items()} == {n: v for n, v in packet.sizes.items() if n != "header"}
+        assert packet.sizes["header"] == 16 + 5 * len(sections)
+        assert set(packet.sizes) <= {*SECTION_NAMES.values(), "header"}
+
+
+def test_an_empty_packet_is_16_bytes_and_changes_nothing():
+    states = decode_all(make_packets())
+    assert len(encode_empty(frame=2).data) == 16
+    assert states[2].gaussians is states[1].gaussians
+
+
+def test_decoders_are_sent_only_when_they_change():
+    rng = np.random.default_rng(5)
+    state = make_key(rng)
+    delta = make_delta(rng, state.layout)
+    first = encode_delta(delta, state.layout, {}, frame=1)
+    again = encode_delta(delta, state.layout, delta.decoders, frame=2)
+    assert "decoders" in first.sizes
+    assert "decoders" not in again.sizes
+    decoded = decode_delta(again.data, state.layout, delta.decoders)
+    assert decoded.decoders["sh0"].tobytes() == delta.decoders["sh0"].tobytes()
+    with pytest.raises(PacketError, match="never sent"):
+        decode_delta(again.data, state.layout, {})
+
+
+def test_a_key_packet_forgets_the_decoders():
+    packets = make_packets(frames=6, key_at=4)
+    assert decode_all(packets)[4].decoders == {}
+    assert "decoders" in packets[5].sizes
+
+
+def test_decoder_rounding_is_idempotent_and_refuses_overflow():
+    once = quantise_decoders({"sh0": np.random.default_rng(6).normal(size=(2, 3)) * 100})
+    assert quantise_decoders(once)["sh0"].tobytes() == once["sh0"].tobytes()
+    with pytest.raises(ShapeError, match="diverged"):
+        quantise_decoders({"sh0": np.full((1, 3), 1e6)})
+
+
+def _broken_deltas():
+    rng = np.random.default_rng(7)
+    state = make_key(rng)
+    delta = make_delta(rng, state.layout)
+    rows = delta.symbols["means"].shape[0]
+    change = dataclasses.replace
+    yield state.layout, change(delta, gates=delta.gates[:-1]), "gates"
+    yield state.layout, change(delta, gates=np.full_like(delta.gates, 9)), "symbols|gates"
+    short = {**delta.symbols, "means": delta.symbols["means"][:-1]}
+    yield state.layout, change(delta, symbols=short), "symbols of means"
+    yield state.layout, change(delta, symbols={**delta.symbols, "means": np.zeros((rows, 2), np.int32)}), "channels"
+    yield state.layout, change(delta, symbols={**delta.symbols, "means": np.zeros((rows, 3), np.int64)}), "int32"
+    yield state.layout, change(delta, steps={}), "step"
+    yield state.layout, change(delta, steps={**delta.steps, "means": 0.0}), "step of means"
+    yield state.layout, change(delta, steps={**delta.steps, "means": float("nan")}), "step of means"
+    yield state.layout, change(delta, decoders={"sh0": np.full((2, 3), 1 / 3, np.float32)}), "quantise_decoders"
+    yield state.layout, change(delta, decoders={"scales": np.zeros((3, 3), np.float32)}), "decoders"
+    yield state.layout, change(delta, symbols={**delta.symbols, "colour": delta.symbols["means"]}), "colour"
+
+
+@pytest.mark.parametrize("case", range(11))
+def test_encoder_refuses_deltas_that_do_not_fit(case):
+    layout, delta, message = list(_broken_deltas())[case]
+    with pytest.raises(ShapeError, match=message):
+        encode_delta(delta, layout, {}, frame=1)
+
+
+def test_a_delta_needs_the_frame_before_it():
+    packets = make_packets()
+    state = decode_all(packets)[0]
+    with pytest.raises(PacketError, match="frame before"):
+        decode_packet(None, packets[1].data, offset=77)
+    with pytest.raises(PacketError, match="frame before"):
+        decode_packet(state, packets[3].data)
+
+
+def test_a_delta_of_another_scene_is_refused():
+    rng = np.random.default_rng(8)
+    first, second = make_key(rng, 40, 12, 3), make_key(rng, 40, 12, 8)
+    rows = int(first.layout.node_counts.sum())
+    delta = Delta(np.ones(12, np.uint8), 1, {"shN": np.ones((rows, 9), np.int32)}, {"shN": 0.1})
+    packet = encode_delta(delta, first.layout, {}, frame=1)
+    state = decode_packet(None, encode_key(second).data)
+    with pytest.raises(PacketError) as caught:
+        decode_packet(state, packet.data, offset=123)
+    assert caught.value.offset == 123

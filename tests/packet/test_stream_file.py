@@ -1,0 +1,232 @@
+"""Stream files: what is written is what is read, however the writer ended."""
+
+from __future__ import annotations
+
+import os
+import signal
+import struct
+import subprocess
+import sys
+
+import pytest
+from packet_scenes import decode_all, make_packets, same_bits, write_stream
+
+from gsstream.core.errors import InputError, OutputError, PacketError, SourceError
+from gsstream.packet import PacketKind, StreamReader, StreamWriter, encode_empty
+from gsstream.packet.base import FILE_HEADER, file_header
+from gsstream.packet.reader import key_offsets, parse_index
+from gsstream.player.playback import Playback
+
+
+def test_reported_bytes_are_the_bytes_on_disk(tmp_path):
+    packets = make_packets()
+    path = tmp_path / "s.gss"
+    writer = StreamWriter.open(path)
+    expected = FILE_HEADER.size
+    for packet in packets:
+        expected += writer.append(packet)
+        assert path.stat().st_size == expected  # flushed before append returns
+    writer.close(index=False)
+    assert path.stat().st_size == FILE_HEADER.size + sum(sum(p.sizes.values()) for p in packets)
+
+
+def test_playback_equals_the_encoder_in_any_order(tmp_path):
+    packets = make_packets()
+    write_stream(tmp_path / "s.gss", packets)
+    states = decode_all(packets)
+    with Playback(tmp_path / "s.gss") as playback:
+        assert list(playback.frames) == list(range(7))
+        for frame in (6, 0, 3, 3, 1, 5, 2, 4, 6, 0):
+            assert same_bits(playback.state_at(frame), states[frame].gaussians)
+        assert [frame for frame, _ in playback] == list(range(7))
+        with pytest.raises(InputError, match="frame 7"):
+            playback.state_at(7)
+
+
+def test_stepping_forward_decodes_each_packet_once(tmp_path, monkeypatch):
+    write_stream(tmp_path / "s.gss", make_packets())
+    with Playback(tmp_path / "s.gss") as playback:
+        read = []
+        real = playback.reader.read
+        monkeypatch.setattr(playback.reader, "read", lambda entry: (read.append(entry.frame), real(entry))[1])
+        for frame in range(7):
+            playback.state_at(frame)
+        assert read == list(range(1, 7))
+
+
+def test_late_join_from_the_second_key_packet(tmp_path):
+    packets = make_packets(key_at=4)
+    data = write_stream(tmp_path / "s.gss", packets, index=False)
+    with StreamReader(tmp_path / "s.gss") as reader:
+        offset = next(e.offset for e in reader.entries if e.kind == PacketKind.KEY and e.frame == 4)
+    (tmp_path / "late.gss").write_bytes(file_header() + data[offset:])
+    states = decode_all(packets)
+    with Playback(tmp_path / "late.gss") as playback:
+        assert list(playback.frames) == [4, 5, 6]
+        for frame in playback.frames:
+            assert same_bits(playback.state_at(frame), states[frame].gaussians)
+
+
+def test_index_is_found_from_the_end_and_names_the_keys(tmp_path):
+    data = write_stream(tmp_path / "s.gss", make_packets())
+    offset, magic = struct.unpack("<Q4s", data[-12:])
+    assert magic == b"GSSX"
+    with StreamReader(tmp_path / "s.gss") as reader:
+        assert parse_index(data[offset:], offset) == key_offsets(reader.entries) != []
+        reader.check()
+
+
+def test_an_index_that_lies_is_found_out(tmp_path):
+    packets = make_packets()
+    write_stream(tmp_path / "a.gss", packets, index=False)
+    other = write_stream(tmp_path / "b.gss", make_packets(seed=5), index=True)
+    index = StreamReader(tmp_path / "b.gss").entries[-1]
+    with (tmp_path / "a.gss").open("ab") as file:
+        file.write(other[index.offset :])
+    with StreamReader(tmp_path / "a.gss") as reader, pytest.raises(PacketError, match="index"):
+        reader.check()
+
+
+@pytest.mark.parametrize("index", [True, False])
+def test_resume_gives_the_file_of_an_uninterrupted_run(tmp_path, index):
+    packets = make_packets()
+    whole = write_stream(tmp_path / "whole.gss", packets)
+    path = tmp_path / "s.gss"
+    write_stream(path, packets[:3], index=index)
+    with StreamWriter.open(path, resume=True) as writer:
+        assert writer.next_frame == 3
+        for packet in packets[3:]:
+            writer.append(packet)
+    assert path.read_bytes() == whole
+
+
+def test_resume_after_death_at_every_byte_of_a_packet(tmp_path):
+    packets = make_packets()
+    whole = write_stream(tmp_path / "whole.gss", packets)
+    with StreamReader(tmp_path / "whole.gss") as reader:
+        third = reader.entries[3]
+    path = tmp_path / "s.gss"
+    for cut in range(third.offset, third.offset + third.size):
+        path.write_bytes(whole[:cut])
+        with StreamWriter.open(path, resume=True) as writer:
+            assert writer.next_frame == 3
+            for packet in packets[3:]:
+                writer.append(packet)
+        assert path.read_bytes() == whole
+
+
+KILLED = """
+import os, signal, sys
+from packet_scenes import make_packets
+from gsstream.packet import StreamWriter
+packets = make_packets()
+writer = StreamWriter.open(sys.argv[1], fsync=True)
+for packet in packets[:3]:
+    writer.append(packet)
+os.write(writer._file.fileno(), packets[3].data[:-9])
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_resume_after_a_killed_writer(tmp_path):
+    packets, path = make_packets(), tmp_path / "s.gss"
+    here = os.path.dirname(__file__)
+    done = subprocess.run([sys.executable, "-c", KILLED, str(path)], cwd=here, check=False)
+    assert done.returncode == -signal.SIGKILL
+    with StreamReader(path) as reader:
+        assert reader.unfinished is not None
+        assert reader.unfinished.size == len(packets[3].data) - 9
+        assert reader.damage is None
+    with StreamWriter.open(path, resume=True) as writer:
+        for packet in packets[3:]:
+            writer.append(packet)
+    assert path.read_bytes() == write_stream(tmp_path / "whole.gss", packets)
+
+
+def test_resume_cuts_a_torn_last_packet_and_unwritten_space(tmp_path):
+    packets = make_packets()
+    data = write_stream(tmp_path / "s.gss", packets[:4], index=False)
+    for torn in (data[:-200] + b"\0" * 200, data + b"\0" * 4096):
+        path = tmp_path / "torn.gss"
+        path.write_bytes(torn)
+        with StreamWriter.open(path, resume=True) as writer:
+            for packet in packets[writer.next_frame :]:
+                writer.append(packet)
+        assert path.read_bytes() == write_stream(tmp_path / "again.gss", packets)
+        (tmp_path / "again.gss").unlink()
+
+
+def test_resume_never_cuts_good_packets_behind_damage(tmp_path):
+    packets, path = make_packets(), tmp_path / "s.gss"
+    data = bytearray(write_stream(path, packets))
+    with StreamReader(path) as reader:
+        second = reader.entries[1]
+    for at in (second.offset + 9, second.offset + 60):  # its length; its body
+        hurt = bytes(data[:at]) + bytes([data[at] ^ 1]) + bytes(data[at + 1 :])
+        path.write_bytes(hurt)
+        with pytest.raises(PacketError) as caught:
+            StreamWriter.open(path, resume=True)
+        assert caught.value.offset == second.offset
+        assert path.read_bytes() == hurt
+
+
+def test_resume_to_an_older_checkpoint(tmp_path):
+    packets, path = make_packets(), tmp_path / "s.gss"
+    whole = write_stream(path, packets)
+    with StreamWriter.open(path, resume=True, last_frame=1) as writer:
+        assert writer.next_frame == 2
+        for packet in packets[2:]:
+            writer.append(packet)
+    assert path.read_bytes() == whole
+    with pytest.raises(OutputError, match="frame 12"):
+        StreamWriter.open(path, resume=True, last_frame=12)
+    assert path.read_bytes() == whole
+
+
+def test_writer_refuses_what_is_out_of_turn(tmp_path):
+    packets, path = make_packets(), tmp_path / "s.gss"
+    with StreamWriter.open(path) as writer:
+        with pytest.raises(PacketError, match="key"):
+            writer.append(packets[1])
+        writer.append(packets[0])
+        with pytest.raises(PacketError, match="consecutive"):
+            writer.append(packets[2])
+        with pytest.raises(PacketError, match="consecutive"):
+            writer.append(encode_empty(frame=0))
+    with pytest.raises(OutputError, match="exists"):
+        StreamWriter.open(path)
+
+
+def test_an_exception_leaves_a_valid_stream_without_index(tmp_path):
+    packets, path = make_packets(), tmp_path / "s.gss"
+    writer = StreamWriter.open(path)
+    writer.append(packets[0])
+    writer.__exit__(KeyboardInterrupt, KeyboardInterrupt(), None)
+    assert path.stat().st_size == FILE_HEADER.size + len(packets[0].data)
+    with Playback(path) as playback:
+        assert len(playback) == 1
+
+
+def test_a_growing_stream_can_be_followed(tmp_path):
+    packets, path = make_packets(), tmp_path / "s.gss"
+    writer = StreamWriter.open(path)
+    writer.append(packets[0])
+    with Playback(path) as playback:
+        for number, packet in enumerate(packets[1:], 2):
+            writer.append(packet)
+            playback.refresh()
+            assert len(playback) == number
+        writer.close()
+        playback.refresh()
+        assert same_bits(playback.state_at(6), decode_all(packets)[6].gaussians)
+        StreamWriter.open(path, resume=True).append(encode_empty(frame=7))
+        playback.refresh()
+        assert playback.frames[-1] == 7
+
+
+def test_missing_and_empty_files_are_named(tmp_path):
+    with pytest.raises(SourceError, match=r"nothing\.gss"):
+        Playback(tmp_path / "nothing.gss")
+    (tmp_path / "header.gss").write_bytes(file_header())
+    with pytest.raises(PacketError, match="no complete packet"):
+        Playback(tmp_path / "header.gss")

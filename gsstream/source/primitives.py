@@ -12,6 +12,10 @@ from gsstream.core.shapes import FloatArray
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 _FAR = np.float32(1e9)
 _EPSILON = np.float32(1e-4)
+_rng = np.random.default_rng(7)  # a private generator: fixed wave directions [3, 16], wave numbers from 0.4 to 5
+_WAVES = _rng.normal(size=(3, 16))
+_WAVES = (_WAVES / np.linalg.norm(_WAVES, axis=0) * np.geomspace(0.4, 5.0, 16)).astype(np.float32)
+_SHIFTS = _rng.uniform(0.5, 5.0, 16).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,12 +28,9 @@ class Surface:
     phase: float = 0.0
 
     def shade(self, local: FloatArray) -> FloatArray:
-        """Albedo [P, 3] at local positions [P, 3]: soft checks with a slower wave across them."""
-        scaled = local * np.float32(self.frequency) + np.float32(self.phase)
-        wave = np.sin(scaled)
-        checks = np.tanh(4 * wave[:, 0] * wave[:, 1] + 4 * wave[:, 1] * wave[:, 2] + 4 * wave[:, 2] * wave[:, 0])
-        slow = np.sin(0.37 * scaled[:, 0] + 0.23 * scaled[:, 1] - 0.31 * scaled[:, 2])
-        tone = 1 + np.float32(self.contrast) * (0.7 * checks + 0.3 * slow)
+        """Albedo [P, 3] at local positions [P, 3]: blots from waves in many directions, so that no patch repeats."""
+        waves = np.sin(local @ (_WAVES * np.float32(self.frequency)) + _SHIFTS * np.float32(self.phase))
+        tone = 1 + np.float32(self.contrast) * np.tanh(0.7 * waves.sum(1, dtype=np.float32))
         albedo: FloatArray = np.asarray(self.color, np.float32) * tone[:, None].astype(np.float32)
         return albedo
 

@@ -25,8 +25,9 @@ from gsstream import API_VERSION
 
 ENTRY_POINT_GROUP = "gsstream"
 Kind = Literal[
-    "structure", "confidence", "propagation", "gate", "regularizer", "update", "renderer", "loss", "source", "metric", "method"
-]
+    "structure", "confidence", "propagation", "gate", "regularizer", "update", "renderer", "loss", "source", "metric",
+    "method",
+]  # fmt: skip
 KINDS: tuple[str, ...] = get_args(Kind)
 
 hookspec = pluggy.HookspecMarker("gsstream")

@@ -10,6 +10,8 @@ import typer
 from gsstream.cli.listing import plural, table
 
 if TYPE_CHECKING:
+    from pydantic import BaseModel
+
     from gsstream.plugins.catalog import Catalog, Entry
 
 app = typer.Typer(help="List plugins and parts, or show one part.", rich_markup_mode=None)
@@ -100,10 +102,15 @@ def _describe(catalog: Catalog, kind: str, name: str, entry: Entry) -> str:
     target = catalog.resolve(kind, name)
     lines = [heading, f"target: {entry.spec.target}, component API {entry.spec.api}"]
     config = getattr(target, "Config", None)
-    rows = list(_fields(config.model_json_schema(), "")) if config is not None else []
+    rows = list(setting_rows(config)) if config is not None else []
     if not rows:
         return "\n".join([*lines, "no settings"])
     return "\n".join([*lines, "", table(("SETTING", "TYPE", "DEFAULT", "MEANING"), rows)])
+
+
+def setting_rows(config: type[BaseModel]) -> Iterator[tuple[str, ...]]:
+    """(key, type with bounds, default, meaning) of every setting, those of nested sections under dotted keys."""
+    yield from _fields(config.model_json_schema(), "")
 
 
 def _fields(schema: dict[str, Any], prefix: str, root: dict[str, Any] | None = None) -> Iterator[tuple[str, ...]]:
@@ -128,6 +135,8 @@ _BOUNDS = (("minimum", ">="), ("exclusiveMinimum", ">"), ("maximum", "<="), ("ex
 
 def _type(field: dict[str, Any]) -> str:
     """"number > 0, <= 1" or "one of a, b"."""
+    if "const" in field:
+        return repr(field["const"])
     if "anyOf" in field:
         return " or ".join(_type(option) for option in field["anyOf"])
     if "enum" in field:

@@ -106,7 +106,8 @@ class ScatterSession(RenderSession):
         tile_mask: torch.Tensor | None = None,
     ) -> RenderOutput:
         if probe is not None:
-            raise NotImplementedError(f"{type(self._renderer).__name__} offers no gradient of the 2-D means in a session")
+            name = type(self._renderer).__name__
+            raise NotImplementedError(f"{name} offers no gradient of the 2-D means in a session")
         whole = rows
         if self._active is not None:
             base = dict(self._gaussians.items())

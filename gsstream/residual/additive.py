@@ -14,7 +14,7 @@ from gsstream.residual.base import AttributeCode, UpdateRule
 class DirectCode(PartConfig):
     """Step and learning rate of one attribute."""
 
-    step: float = Field(gt=0, description="quantisation step, raw attribute units (means: fraction of the anchor's cell)")
+    step: float = Field(gt=0, description="quantisation step, raw units (means: fraction of the anchor's cell)")
     lr: float = Field(ge=0, description="Adam learning rate, same units per iteration; 0 freezes the attribute")
 
 

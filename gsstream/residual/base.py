@@ -36,7 +36,7 @@ class AttributeCode:
 
 
 class UpdateRule(Part):
-    """a_t = a_{t-1} + g * (quantised latents) W, on raw attributes; position residuals in units of the anchor's cell."""
+    """a_t = a_{t-1} + g * (quantised latents) W, on raw attributes; position residuals in units of the cell."""
 
     @abstractmethod
     def codes(self) -> Mapping[str, AttributeCode]:

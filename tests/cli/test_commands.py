@@ -30,6 +30,7 @@ OPTIONS = {
     "gsstream": ["--debug", "--version"],
     "gsstream run": [
         "--source", "--out", "--method", "--recipe", "--set", "--frames", "--scale", "--seed", "--renderer", "--resume",
+        "--first-frame",
         "--overwrite", "--no-video", "--quiet",
     ],
     "gsstream play": ["STREAM", "--out", "--camera", "--frames"],

@@ -4,5 +4,5 @@ from gsstream.spec import hookimpl
 
 
 @hookimpl
-def gsstream_components(registry):  # noqa: ARG001
+def gsstream_components(registry):
     return []

@@ -1,0 +1,62 @@
+# Two commands, nothing to prepare: 'make demo' and 'make test'. Both set up .venv first (Python >= 3.11, a C++ compiler).
+#   make demo            encode the recording that ships with gsstream; says where the pictures are
+#   make test            lint, types, import rules and all tests
+#   make PYTHON=python3.12 test    choose the interpreter .venv is made with
+#   make clean           remove .venv and what was built
+
+PYTHON ?= python3
+CXX ?= c++
+VENV := .venv
+BIN := $(VENV)/bin
+DEMO_METHOD ?= s2gs-fast
+DEMO_OUT ?= runs/demo
+
+# The stamps carry a checksum of what they were made from, so a change of contents, not of dates, sets up again.
+LISTS := requirements.txt $(wildcard pyproject.toml plugins/*/pyproject.toml)
+NATIVE := $(wildcard plugins/cpu_render/CMakeLists.txt plugins/cpu_render/pyproject.toml plugins/cpu_render/src/cpp/*)
+checksum = $(firstword $(shell cat $(1) | cksum))
+INSTALLED := $(VENV)/.installed-$(call checksum,$(LISTS))
+BUILT := $(VENV)/.built-$(call checksum,$(NATIVE))
+
+.PHONY: demo test setup clean
+.DEFAULT_GOAL := demo
+
+demo: setup
+	$(BIN)/gsstream run --method $(DEMO_METHOD) --source demo --out $(DEMO_OUT) --overwrite
+	@echo "The stream, its measurements and the pictures are in $(abspath $(DEMO_OUT)):"
+	@ls -1 $(DEMO_OUT)
+
+# Every check runs even when an earlier one failed; pytest comes last, so that its summary is the last thing printed.
+test: setup
+	@status=0; \
+	for check in "ruff check ." "mypy" "lint-imports"; do \
+	  echo "== $$check"; $(BIN)/$$check || { echo "== FAILED: $$check"; status=1; }; \
+	done; \
+	echo "== pytest"; $(BIN)/python -m pytest || status=1; \
+	exit $$status
+
+setup: $(BUILT)
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+	  echo "gsstream needs Python 3.11 or newer; '$(PYTHON)' is: $$($(PYTHON) --version 2>&1)."; \
+	  echo "Name another one: make PYTHON=python3.12"; exit 1; }
+	@$(PYTHON) -m venv $(VENV) || { \
+	  echo "Could not make a virtual environment (on Debian and Ubuntu: apt install python3-venv)."; rm -rf $(VENV); exit 1; }
+
+$(INSTALLED): $(BIN)/python
+	@echo 'int main() { return []<class T>(T x) { return x; }(0); }' | $(CXX) -std=c++20 -x c++ -fsyntax-only - 2>/dev/null || { \
+	  echo "gsstream builds its renderer with a C++20 compiler; '$(CXX)' is missing or too old."; \
+	  echo "Install one (on Debian and Ubuntu: apt install g++) or name another: make CXX=clang++"; exit 1; }
+	@rm -f $(VENV)/.installed-* $(VENV)/.built-*
+	CXX=$(CXX) $(BIN)/python -m pip install --disable-pip-version-check -r requirements.txt
+	@touch $(INSTALLED) $(BUILT)
+
+# Only the native sources changed: build the renderer again and leave everything else alone.
+$(BUILT): $(INSTALLED)
+	@test -e $(BUILT) || { rm -f $(VENV)/.built-*; \
+	  CXX=$(CXX) $(BIN)/python -m pip install --disable-pip-version-check --no-deps -e plugins/cpu_render; }
+	@touch $(BUILT)
+
+clean:
+	rm -rf $(VENV) plugins/cpu_render/build

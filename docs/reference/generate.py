@@ -1,0 +1,78 @@
+"""Writes api.md, cli.md and recipe.md from the code, so that they cannot drift: ``python docs/reference/generate.py``.
+
+``tests/test_architecture.py`` fails while a page on disk differs from what this module makes.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).parent
+NOTE = "<!-- Made by docs/reference/generate.py from the code. Do not edit. -->\n"
+
+
+def exported() -> dict[str, Any]:
+    """Every public name of gsstream.api, modules left out."""
+    import gsstream.api
+
+    names = {name: value for name, value in vars(gsstream.api).items() if not name.startswith("_")}
+    return {name: names[name] for name in sorted(names, key=str.lower) if not inspect.ismodule(names[name])}
+
+
+def api() -> str:
+    """One line per exported name, with its signature."""
+    lines = [NOTE, "# gsstream.api", "", "Everything a plugin or a script may import.", ""]
+    lines += ["| name | what it is | defined in |", "|---|---|---|"]
+    for name, value in exported().items():
+        described = inspect.isclass(value) or inspect.isroutine(value)
+        text = (inspect.getdoc(value) or "").splitlines()[0] if described else f"constant, `{value!r}`"
+        module = getattr(value, "__module__", "gsstream") if described else "-"
+        lines.append(f"| `{name}` | {text.replace('|', chr(92) + '|')} | `{module}` |")
+    return "\n".join(lines) + "\n"
+
+
+def cli() -> str:
+    """Every command with its arguments and options."""
+    from typer.main import get_command
+
+    from gsstream.cli.main import app
+
+    lines = [NOTE, "# Command line", ""]
+    lines += ["Exit codes: 0 done; 2 something given is wrong; 130 interrupted; 1 other.", ""]
+    for path, command in _commands(get_command(app), "gsstream"):
+        lines += [f"## {path}", "", (command.help or "").strip(), ""]
+        shown = [param for param in command.params if param.name != "help"]
+        if shown:
+            lines += ["| argument or option | meaning |", "|---|---|"]
+            for param in shown:
+                name = ", ".join(param.opts) if param.param_type_name == "option" else param.name.upper()
+                lines.append(f"| `{name}` | {getattr(param, 'help', '')} |")
+            lines.append("")
+    return "\n".join(lines)
+
+
+def _commands(command: Any, path: str) -> Iterator[tuple[str, Any]]:
+    yield path, command
+    for name, child in getattr(command, "commands", {}).items():
+        yield from _commands(child, f"{path} {name}")
+
+
+def recipe() -> str:
+    """Every key of a recipe with type, default and meaning."""
+    from gsstream.cli.plugins import setting_rows
+    from gsstream.recipe.model import Recipe
+
+    lines = [NOTE, "# Recipe keys", "", "A part's own settings (`SLOT.params`): `gsstream plugins show PART`.", ""]
+    lines += ["| key | type | default | meaning |", "|---|---|---|---|"]
+    lines += [f"| `{key}` | {kind} | `{default}` | {text} |" for key, kind, default, text in setting_rows(Recipe)]
+    return "\n".join(lines) + "\n"
+
+
+PAGES = {"api.md": api, "cli.md": cli, "recipe.md": recipe}
+
+if __name__ == "__main__":
+    for page, make in PAGES.items():
+        (HERE / page).write_text(make(), encoding="utf-8")

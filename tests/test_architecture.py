@@ -1,0 +1,159 @@
+"""The walls of the house: who imports whom, what stays cheap, how long a file may be, what must be documented."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import inspect
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from pydantic import BaseModel
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = [ROOT / "gsstream", *sorted((ROOT / "plugins").glob("*/src"))]
+LIBRARY = sorted(path for folder in FOLDERS for path in folder.rglob("*.py"))
+MAX_FILE, MAX_FUNCTION = 300, 60
+
+#: What must import without torch: listing parts stays cheap, and the player runs where there is no torch.
+TORCH_FREE = tuple(f"gsstream.{room}" for room in ("spec", "plugins", "recipe", "player", "packet", "core"))
+
+
+def test_import_contracts() -> None:
+    command = [sys.executable, "-c", "from importlinter.cli import lint_imports_command as main; main()", "--no-cache"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "5 kept, 0 broken" in result.stdout
+
+
+def modules_below(names: tuple[str, ...]) -> list[str]:
+    found = ["gsstream"]
+    for name in names:
+        base = ROOT.joinpath(*name.split("."))
+        paths = base.rglob("*.py") if base.is_dir() else [base.with_suffix(".py")]
+        for path in sorted(paths):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            found.append(".".join(parts[:-1] if parts[-1] == "__init__" else parts))
+    return found
+
+
+def test_these_rooms_import_no_torch() -> None:
+    names = modules_below(TORCH_FREE)
+    code = (
+        "import importlib, sys\n"
+        "for name in sys.argv[1:]:\n"
+        "    importlib.import_module(name)\n"
+        "    if 'torch' in sys.modules: sys.exit(f'{name} imports torch')\n"
+    )
+    command = [sys.executable, "-c", code, *names]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert len(names) > 30
+
+
+def violations(check: Callable[[ast.Module], Iterator[tuple[int, str]]]) -> list[str]:
+    """"file:line: what" of every fault a check finds in the library."""
+    found = []
+    for path in LIBRARY:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        found += [f"{path.relative_to(ROOT)}:{line}: {what}" for line, what in check(tree)]
+    return found
+
+
+def test_files_are_short() -> None:
+    assert len(LIBRARY) > 100, "the sources were not found"
+    lengths = {str(path.relative_to(ROOT)): len(path.read_text(encoding="utf-8").splitlines()) for path in LIBRARY}
+    assert not {name: length for name, length in lengths.items() if length > MAX_FILE}
+
+
+def test_functions_are_short() -> None:
+    def check(tree: ast.Module) -> Iterator[tuple[int, str]]:
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                length = (node.end_lineno or node.lineno) - node.lineno + 1
+                if length > MAX_FUNCTION:
+                    yield node.lineno, f"{node.name} has {length} lines"
+
+    assert violations(check) == []
+
+
+def test_no_silent_repair() -> None:
+    def check(tree: ast.Module) -> Iterator[tuple[int, str]]:
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ExceptHandler) and node.type is None:
+                yield node.lineno, "a bare except hides everything"
+            if isinstance(node, ast.Attribute) and node.attr == "nan_to_num":
+                yield node.lineno, "nan_to_num hides the cause"
+
+    assert violations(check) == []
+
+
+def test_public_names_have_docstrings() -> None:
+    def check(tree: ast.Module) -> Iterator[tuple[int, str]]:
+        if tree.body and not ast.get_docstring(tree):
+            yield 1, "the module says nothing about itself"
+        for node in tree.body:
+            named = isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith(("_", "gsstream_"))
+            if named and not ast.get_docstring(node):
+                yield node.lineno, f"{node.name} has no docstring"
+
+    assert violations(check) == []
+
+
+def generator():
+    spec = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "reference" / "generate.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("page", ["api.md", "cli.md", "recipe.md"])
+def test_reference_pages_say_what_the_code_says(page: str) -> None:
+    written = (ROOT / "docs" / "reference" / page).read_text(encoding="utf-8")
+    assert written == generator().PAGES[page](), "run: python docs/reference/generate.py"
+
+
+def test_every_exported_name_has_its_own_docstring() -> None:
+    for name, value in generator().exported().items():
+        if inspect.isclass(value) or inspect.isroutine(value):
+            assert vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__, f"gsstream.api.{name} has no docstring"
+
+
+def settings(model: type[BaseModel], name: str):
+    for key, field in model.model_fields.items():
+        yield f"{name}.{key}", field
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from settings(field.annotation, f"{name}.{key}")
+
+
+def test_every_setting_is_described(monkeypatch: pytest.MonkeyPatch) -> None:
+    from gsstream.plugins.catalog import CONTRACTS, load_catalog
+    from gsstream.recipe.model import Recipe
+
+    monkeypatch.setenv("GSSTREAM_LOAD_PLUGINS", "")
+    catalog = load_catalog()
+    models = {"recipe": Recipe}
+    models |= {f"{k}/{n}": catalog.resolve(k, n).Config for k, n in catalog.entries if k in CONTRACTS}
+    for name, model in models.items():
+        assert model.model_config.get("extra") == "forbid", f"{name} accepts unknown keys"
+        assert model.model_config.get("frozen"), f"{name} can be changed after it was checked"
+        for key, field in settings(model, name):
+            assert field.description, f"{key} has no description"
+
+
+def test_the_requirements_cover_every_distribution_of_this_repository() -> None:
+    lines = (ROOT / "requirements.txt").read_text().splitlines()
+    for project in [ROOT, *(path.parent for path in sorted((ROOT / "plugins").glob("*/pyproject.toml")))]:
+        folder = project.relative_to(ROOT).as_posix()
+        assert f"-e {folder}" in lines
+    documented = (ROOT / "docs" / "dependencies.md").read_text()
+    for line in lines:
+        if line and not line.startswith(("#", "-e")):
+            name, equals, _ = line.partition("==")
+            assert equals, f"{line} is not pinned"
+            assert f"`{name}`" in documented, f"docs/dependencies.md does not say why {name}"

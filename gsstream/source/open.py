@@ -33,6 +33,7 @@ def open_source(uri: str, scale: float = 1.0) -> FrameSource:
 
         return SyntheticSource.from_query(rest, scale=scale, uri=uri)
     folder = Path(uri)
-    if folder.exists():
+    # An empty text is the current folder to Path, and never what was meant.
+    if uri and folder.exists():
         return MultiviewSource(folder, scale=scale, uri=uri)
     raise SourceError(f"source {uri!r}: no such folder and no known scheme; expected {_KNOWN}")

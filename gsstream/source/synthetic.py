@@ -20,7 +20,7 @@ from gsstream.source.toyroom import LIGHT, arc_cameras, moving_shapes, object_ce
 
 _AMBIENT = np.float32(0.45)
 _POINT_STRIDE = 3
-_SPARSE_POINTS = 1500
+_SPARSE_SHARE = 5
 
 
 class SyntheticOptions(BaseModel):
@@ -106,7 +106,7 @@ class SyntheticSource:
     def points(self, kind: PointKind = "recording") -> PointCloud:
         """Points on the surfaces seen by the training cameras at frame 0.
 
-        "recording": every third pixel, 2 mm noise per axis; "sparse": 1500 of them with 5 mm (1 scene unit = 1 m).
+        "recording": every third pixel, 2 mm noise per axis; "sparse": a random fifth of them with 5 mm (1 unit = 1 m).
         """
         frame, depth = self.frame(0), self.depth(0)
         rows = slice(_POINT_STRIDE // 2, None, _POINT_STRIDE)
@@ -118,7 +118,7 @@ class SyntheticSource:
         xyz, rgb = np.concatenate(clouds), frame.images[:, rows, rows].reshape(-1, 3)
         rng = Rng(self._options.seed).numpy("synthetic points")
         if kind == "sparse":
-            chosen = np.sort(rng.permutation(len(xyz))[:_SPARSE_POINTS])
+            chosen = np.sort(rng.permutation(len(xyz))[: len(xyz) // _SPARSE_SHARE])
             xyz, rgb = xyz[chosen], rgb[chosen]
         xyz = xyz + rng.normal(0, 0.002 if kind == "recording" else 0.005, xyz.shape)
         return PointCloud(xyz.astype(np.float32), rgb.astype(np.float32), f"synthetic surfaces ({kind})")

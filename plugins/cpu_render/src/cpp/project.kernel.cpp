@@ -131,12 +131,12 @@ GSS_INLINE void color_group(const ProjectJob& job, const uint32_t* rows, uint32_
   view_direction(job.camera, s);
   evaluate_color<K>(job.gaussians, rows, s, sh, color);
   alignas(64) float channels[3][LANES];
-  Floats nonfinite = Floats{};
+  Ints largest{};
   for (int c = 0; c < 3; c++) {
-    nonfinite += color[c] * 0.0f;
+    largest = largest_magnitude(largest, color[c]);
     store(channels[c], max(color[c], Floats{}));
   }
-  if (visible & ~bits_of(greater_equal(nonfinite, Floats{}))) chunk.faults |= FAULT_NOT_FINITE;
+  if (visible & ~bits_of(is_finite(largest))) chunk.faults |= FAULT_NOT_FINITE;
   for (; visible; visible &= visible - 1) {
     const int lane = __builtin_ctz(visible);
     for (int c = 0; c < 3; c++) job.records[rows[lane]].color[c] = channels[c][lane];
@@ -145,7 +145,7 @@ GSS_INLINE void color_group(const ProjectJob& job, const uint32_t* rows, uint32_
 
 GSS_INLINE uint32_t faults_of(const Splats& s, uint32_t lanes) {
   uint32_t faults = 0;
-  if (lanes & ~bits_of(greater_equal(s.nonfinite, Floats{}))) faults |= FAULT_NOT_FINITE;
+  if (lanes & ~bits_of(is_finite(s.largest))) faults |= FAULT_NOT_FINITE;
   const Mask usable = both(greater(s.quat_norm2, broadcast(QUAT_NORM2_MIN)), greater(broadcast(QUAT_NORM2_MAX), s.quat_norm2));
   if (lanes & ~bits_of(usable)) faults |= FAULT_QUATERNION;
   return faults;

@@ -208,6 +208,7 @@ class PyRasterizer {
   }
 
   const float* upstream(const ConstFloatArray& v_image, const std::optional<ConstFloatArray>& v_alpha) const {
+    if (rasterizer_.width() == 0) throw std::invalid_argument("backward: expected a forward pass before, got none.");
     const std::size_t w = static_cast<std::size_t>(rasterizer_.width()), h = static_cast<std::size_t>(rasterizer_.height());
     require_shape(v_image, {h, w, 3}, "v_image");
     if (v_alpha) require_shape(*v_alpha, {h, w}, "v_alpha");

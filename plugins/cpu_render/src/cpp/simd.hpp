@@ -83,6 +83,14 @@ GSS_INLINE Floats sqrt(Floats a) { return (Floats)vsqrtq_f32((float32x4_t)a); }
 #endif
 #endif
 
+// Running largest |x| as an integer, in which NaN and infinity are the largest. (A sum of x * 0 would do, but GCC folds
+// it to 0 for vectors as soon as signed zeros are off.)
+GSS_INLINE Ints largest_magnitude(Ints so_far, Floats x) {
+  const Ints magnitude = (Ints)x & INT32_MAX;
+  return select(greater_equal(magnitude, so_far), magnitude, so_far);
+}
+GSS_INLINE Mask is_finite(Ints magnitude) { return greater_equal(broadcast(0x7f7fffff), magnitude); }
+
 // x limited to [low, high]; a NaN becomes `low`.
 GSS_INLINE Floats clamp(Floats x, Floats low, Floats high) { return min(max(x, low), high); }
 

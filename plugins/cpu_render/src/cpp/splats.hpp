@@ -11,7 +11,7 @@ namespace gsstream_cpu::GSS_ISA {
 struct Splats {
   Floats mean[3], quat[4], scale[3], opacity;  // activated: unit quaternion, linear scale, opacity in (0,1)
   Floats quat_inverse_norm, quat_norm2;
-  Floats nonfinite;                            // 0, or NaN where an input was NaN or infinite
+  Ints largest;                                // largest_magnitude of the raw geometry
   Floats view[3], inverse_z, x_slope, y_slope; // camera space; slopes x/z, y/z limited as above
   Mask x_free, y_free;                         // where the slope was not limited
   Floats rotation[9];
@@ -36,9 +36,9 @@ GSS_INLINE void load_and_activate(const GaussianArrays& in, const uint32_t* rows
   gather_rows<4>(in.quats, rows, s.quat);
   gather_rows<3>(in.scales, rows, s.scale);
   gather_rows<1>(in.opacities, rows, &s.opacity);
-  s.nonfinite = s.opacity * 0.0f;
-  for (int i = 0; i < 3; i++) s.nonfinite += s.mean[i] * 0.0f + s.scale[i] * 0.0f;
-  for (int i = 0; i < 4; i++) s.nonfinite += s.quat[i] * 0.0f;
+  s.largest = largest_magnitude(Ints{}, s.opacity);
+  for (int i = 0; i < 3; i++) s.largest = largest_magnitude(largest_magnitude(s.largest, s.mean[i]), s.scale[i]);
+  for (const Floats& q : s.quat) s.largest = largest_magnitude(s.largest, q);
   s.opacity = 1.0f / (1.0f + exp2(clamp(-LOG2_E * s.opacity, broadcast(-60.f), broadcast(60.f))));
   for (Floats& scale : s.scale)
     scale = exp2(clamp(scale * LOG2_E, broadcast(-LOG2_SCALE_LIMIT), broadcast(LOG2_SCALE_LIMIT)));

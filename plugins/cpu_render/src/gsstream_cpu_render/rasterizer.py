@@ -229,6 +229,7 @@ class NumpyRasterizer:
     def forget(self) -> None:
         """Let go of the arrays kept for backward (the cache stays). No backward may follow."""
         self._native.forget()
+        self._coefficients, self._scene_rows = 1, 0
 
     def release(self) -> Any:
         """Give away the native object with its memory. This object is of no use afterwards."""

@@ -1,0 +1,171 @@
+"""The incremental mode has the same bits as the full path, whatever changes, in whatever order."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cpu_scenes import HEIGHT, WIDTH, equal_bits, random_splats, rasterizer, rows_of, upstream, with_rows
+from gsstream_cpu_render import _native
+from gsstream_cpu_render.arrays import SplatArrays
+from test_cpu_raster_properties import masked_pixels, random_mask
+
+from gsstream.api import InputError
+
+
+def some_ids(n: int, count: int, seed: int) -> np.ndarray:
+    return np.sort(np.random.default_rng(seed).permutation(n)[:count]).astype(np.uint32)
+
+
+def moved(rows: SplatArrays, seed: int, amount: float = 0.2) -> SplatArrays:
+    rng = np.random.default_rng(seed)
+    return SplatArrays(*((a + amount * rng.normal(size=a.shape)).astype(np.float32) for a in rows))
+
+
+@pytest.mark.parametrize("isa", _native.supported_isas())
+@pytest.mark.parametrize(("count", "seed"), [(0, 0), (1, 1), (30, 2), (200, 3)])
+@pytest.mark.parametrize("masked", [False, True])
+def test_active_pass_has_the_bits_of_the_full_path(isa: str, count: int, seed: int, masked: bool) -> None:
+    before = _native.active_isa()
+    _native.select_isa(isa)
+    try:
+        splats, ids = random_splats(200, seed, 9, opaque=seed % 2 == 0), some_ids(200, count, seed)
+        mask = random_mask(seed) if masked else None
+        subject, full = rasterizer(), rasterizer()
+        subject.forward(splats)
+        subject.freeze(mask, ids)
+        for step in range(3):
+            rows = moved(rows_of(splats, ids), 10 * seed + step)
+            image, transmittance = subject.forward_active(rows)
+            gradients = subject.backward_active(*upstream(step))
+            want = full.forward(with_rows(splats, ids, rows), tile_mask=mask)
+            assert equal_bits((image, transmittance), want)
+            assert equal_bits(gradients, rows_of_gradients(full.backward(*upstream(step)), ids))
+    finally:
+        _native.select_isa(before)
+
+
+def rows_of_gradients(gradients: tuple[np.ndarray, ...], ids: np.ndarray) -> tuple[np.ndarray, ...]:
+    return tuple(g[ids] for g in gradients)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_touched_only_changes_exactly_the_pixels_that_change(seed: int) -> None:
+    splats, ids = random_splats(200, seed, 4), some_ids(200, 6, seed)
+    splats.scales[:] -= 1.0
+    subject = rasterizer()
+    cached, cached_transmittance = subject.forward(splats)
+    subject.freeze(None, ids)
+    rows = moved(rows_of(splats, ids), seed, 0.5)
+    image, transmittance = np.full_like(cached, np.nan), np.full_like(cached_transmittance, np.nan)
+    subject.forward_active(rows, image=image, transmittance=transmittance, touched_only=True)
+    gradients = subject.backward_active(*upstream(seed))
+    full = rasterizer()
+    want, want_transmittance = full.forward(with_rows(splats, ids, rows))
+    untouched = np.isnan(transmittance)
+    assert untouched.any()
+    assert np.array_equal(want, np.where(untouched[..., None], cached, image))
+    assert np.array_equal(want_transmittance, np.where(untouched, cached_transmittance, transmittance))
+    assert equal_bits(gradients, rows_of_gradients(full.backward(*upstream(seed)), ids))
+
+
+def test_depth_ties_between_active_and_frozen_keep_memory_order() -> None:
+    splats = random_splats(120, 5, 1)
+    splats.means[:] = splats.means[0]
+    ids = some_ids(120, 40, 5)
+    subject = rasterizer()
+    subject.forward(splats)
+    subject.freeze(None, ids)
+    assert equal_bits(subject.forward_active(rows_of(splats, ids)), rasterizer().forward(splats))
+
+
+def test_commit_equals_a_full_forward_and_can_be_repeated() -> None:
+    splats = random_splats(200, 6, 4)
+    subject = rasterizer()
+    subject.forward(splats)
+    for frame in range(4):
+        ids, mask = some_ids(200, 25, frame), random_mask(frame)
+        subject.freeze(mask, ids)
+        rows = moved(rows_of(splats, ids), frame)
+        subject.forward_active(rows)
+        subject.commit(rows)
+        splats = with_rows(splats, ids, rows)
+        assert equal_bits(subject.forward_cached(), rasterizer().forward(splats))
+    subject.freeze(None, some_ids(200, 25, 99))
+    ids = some_ids(200, 25, 99)
+    subject.forward_active(rows_of(splats, ids))
+    full = rasterizer()
+    full.forward(splats)
+    assert equal_bits(subject.backward_active(*upstream(0)), rows_of_gradients(full.backward(*upstream(0)), ids))
+
+
+def test_forward_cached_renders_only_wanted_tiles() -> None:
+    subject = rasterizer()
+    want, _ = subject.forward(random_splats(100, 7, 1))
+    mask = random_mask(7)
+    image = np.full((HEIGHT, WIDTH, 3), 7.0, np.float32)
+    subject.forward_cached(tile_mask=mask, image=image)
+    pixels = masked_pixels(mask)
+    assert np.array_equal(image[pixels], want[pixels])
+    assert (image[~pixels] == 7.0).all()
+
+
+def test_freezing_again_unmarks_the_former_active_rows() -> None:
+    splats = random_splats(150, 8, 1)
+    first, second = some_ids(150, 40, 1), some_ids(150, 40, 2)
+    subject = rasterizer()
+    subject.forward(splats)
+    subject.freeze(None, first)
+    subject.forward_active(moved(rows_of(splats, first), 0))
+    subject.freeze(None, second)
+    assert equal_bits(subject.forward_active(rows_of(splats, second)), rasterizer().forward(splats))
+
+
+def test_a_refused_active_pass_leaves_the_cache_usable() -> None:
+    splats, ids = random_splats(100, 9, 1), some_ids(100, 10, 9)
+    subject = rasterizer()
+    want = subject.forward(splats)
+    subject.freeze(None, ids)
+    bad = rows_of(splats, ids)
+    bad.means[3, 1] = np.nan
+    with pytest.raises(InputError, match=r"means: expected finite values, got nan at index \[3, 1\]"):
+        subject.forward_active(bad)
+    assert equal_bits(subject.forward_active(rows_of(splats, ids)), want)
+
+
+def test_order_of_calls_is_checked() -> None:
+    splats, ids = random_splats(20, 0, 1), some_ids(20, 5, 0)
+    subject = rasterizer()
+    with pytest.raises(InputError, match="freeze: expected a forward pass of the whole scene"):
+        subject.freeze(None, ids)
+    subject.forward(splats, tile_mask=np.array([[1, 0, 0, 0]] * 3, bool))
+    with pytest.raises(InputError, match="tile_mask has tiles that the cached forward pass did not cover"):
+        subject.freeze(None, ids)
+    subject.forward(splats)
+    with pytest.raises(InputError, match="expected a forward_active pass before"):
+        subject.backward_active(*upstream(0))
+    subject.freeze(None, ids)
+    with pytest.raises(InputError, match="expected a forward pass before"):
+        subject.backward(*upstream(0))
+    with pytest.raises(InputError, match="expected shape"):
+        subject.forward_active(splats)
+    subject.commit(rows_of(splats, ids))
+    with pytest.raises(InputError, match="expected freeze"):
+        subject.forward_active(rows_of(splats, ids))
+
+
+@pytest.mark.parametrize(
+    ("ids", "message"),
+    [
+        (np.array([3, 3], np.uint32), "strictly ascending"),
+        (np.array([4, 3], np.uint32), "got 3 at index 1"),
+        (np.array([0, 20], np.uint32), "rows below 20, got 20"),
+        (np.array([1, 2]), "expected uint32"),
+        ([1, 2], "expected uint32"),
+        (np.array([[1]], np.uint32), "expected uint32"),
+    ],
+)
+def test_bad_active_ids(ids: np.ndarray, message: str) -> None:
+    subject = rasterizer()
+    subject.forward(random_splats(20, 0, 1))
+    with pytest.raises(InputError, match=message):
+        subject.freeze(None, ids)

@@ -1,0 +1,219 @@
+"""Bad input is refused with a message that says what, where and what to do; nothing is rendered."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+from cpu_scenes import HEIGHT, WIDTH, camera, random_splats, rasterizer, upstream
+from gsstream_cpu_render import _native
+from gsstream_cpu_render.arrays import SplatArrays, new_gradients
+from gsstream_cpu_render.rasterizer import NumpyRasterizer
+
+from gsstream.api import InputError, ShapeError
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh0", "shN"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("row", [0, 37])
+def test_values_that_are_not_finite_are_named(name: str, value: float, row: int) -> None:
+    splats = random_splats(40, 0, 4)
+    splats.means[row] = 0.0  # in view, so that its harmonics are read
+    splats.opacities[row] = 0.0
+    getattr(splats, name).reshape(40, -1)[row, -1] = value
+    image = np.full((HEIGHT, WIDTH, 3), 7.0, np.float32)
+    with pytest.raises(InputError, match=rf"{name}: expected finite values, got {value} at index \[{row}"):
+        rasterizer().forward(splats, image=image)
+    assert (image == 7.0).all()
+
+
+@pytest.mark.parametrize("norm", [0.0, 1e-12, 1e12])
+def test_quaternions_without_direction(norm: float) -> None:
+    splats = random_splats(20, 0, 1)
+    splats.quats[13] *= norm / np.linalg.norm(splats.quats[13])
+    with pytest.raises(InputError, match=r"quats: expected norms between 1e-10 and 1e10, got .* at row 13"):
+        rasterizer().forward(splats)
+
+
+def test_overflow_of_finite_values() -> None:
+    splats = random_splats(20, 0, 9)
+    splats.means[5], splats.opacities[5] = 0.0, 0.0  # on the axis, where these three harmonics add up to more than 1
+    splats.sh0[5] = 3.3e38
+    splats.shN[5, [1, 5]] = 3.3e38
+    with pytest.raises(InputError, match="overflowed float32"):
+        rasterizer().forward(splats)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("means", lambda a: a.astype(np.float64), "means: expected dtype float32, got float64"),
+        ("means", lambda a: a[:, :2].copy(), r"means: expected shape \[N, 3\], got \[20, 2\]"),
+        ("quats", lambda a: a[:19], r"quats: expected shape \[20, 4\], got \[19, 4\]"),
+        ("scales", lambda a: np.asfortranarray(a), "scales: expected a contiguous array"),
+        ("opacities", lambda a: a[:, None], r"opacities: expected shape \[20\], got \[20, 1\]"),
+        ("sh0", lambda a: a[:, 0], r"sh0: expected shape \[20, 1, 3\]"),
+        ("shN", lambda a: a[:, :2].copy(), r"shN: expected K-1 coefficients with K in \(1, 4, 9, 16\), got K = 3"),
+        ("shN", lambda a: a.tolist(), "shN: expected a numpy array"),
+    ],
+)
+def test_arrays_of_wrong_form(name: str, change: object, message: str) -> None:
+    splats = random_splats(20, 0, 4)
+    with pytest.raises(ShapeError, match=message):
+        rasterizer().forward(splats._replace(**{name: change(getattr(splats, name))}))  # type: ignore[operator]
+
+
+def test_outputs_are_never_silently_copied() -> None:
+    splats, (v_image, v_alpha) = random_splats(20, 0, 4), upstream(0)
+    subject = rasterizer()
+    with pytest.raises(ShapeError, match="image: expected dtype float32, got float64"):
+        subject.forward(splats, image=np.zeros((HEIGHT, WIDTH, 3)))
+    frozen = np.zeros((HEIGHT, WIDTH), np.float32)
+    frozen.flags.writeable = False
+    with pytest.raises(ShapeError, match="transmittance: expected a writable array"):
+        subject.forward(splats, transmittance=frozen)
+    subject.forward(splats)
+    out = new_gradients(20, 4)
+    with pytest.raises(ShapeError, match=r"out.quats: expected a contiguous array"):
+        subject.backward(v_image, out=out._replace(quats=np.zeros((20, 8), np.float32)[:, ::2]))
+    with pytest.raises(ShapeError, match=r"v_image: expected shape"):
+        subject.backward(v_image[1:])
+    with pytest.raises(ShapeError, match=r"v_alpha: expected dtype float32"):
+        subject.backward(v_image, v_alpha.astype(np.float16))
+
+
+@pytest.mark.parametrize(
+    ("mask", "message"),
+    [
+        (np.ones((3, 4), np.float32), "tile_mask: expected a bool or uint8 array"),
+        (np.ones((4, 3), bool), r"tile_mask: expected shape \[3, 4\]"),
+        (np.ones(12, bool), r"tile_mask: expected shape \[3, 4\]"),
+    ],
+)
+def test_bad_tile_masks(mask: np.ndarray, message: str) -> None:
+    with pytest.raises(ShapeError, match=message):
+        rasterizer().forward(random_splats(5, 0, 1), tile_mask=mask)
+
+
+def test_a_strided_mask_means_what_it_says() -> None:
+    splats = random_splats(50, 0, 1)
+    wide = np.zeros((3, 8), bool)
+    wide[1, 2] = True
+    a, b = (np.zeros((HEIGHT, WIDTH, 3), np.float32) for _ in range(2))
+    rasterizer().forward(splats, tile_mask=wide[:, ::2], image=a)
+    rasterizer().forward(splats, tile_mask=wide[:, ::2].copy(), image=b)
+    assert np.array_equal(a, b)
+    assert (a[16:32, 16:32] != 0).any()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"viewmat": np.eye(3)}, r"viewmat: expected shape \[4, 4\], got \[3, 3\]"),
+        ({"viewmat": np.full((4, 4), np.nan)}, "viewmat: expected finite values"),
+        ({"K": np.diag([0.0, 50, 1])}, "K: expected positive focal lengths in pixels, got fx = 0"),
+        ({"K": np.array([[50.0, 1, 5], [0, 50, 5], [0, 0, 1]])}, "K: expected no skew"),
+        ({"width": 0}, "image size: expected 1 to 65536"),
+        ({"height": 70000}, "image size: expected 1 to 65536"),
+        ({"near": 0.0}, "near: expected a positive distance"),
+        ({"background": (0.0, np.nan, 0.0)}, "background: expected three finite numbers"),
+        ({"background": (0.0, 0.0)}, "background: expected three finite numbers"),
+    ],
+)
+def test_bad_cameras(change: dict[str, object], message: str) -> None:
+    viewmat, K = camera()
+    good = {"viewmat": viewmat, "K": K, "width": 20, "height": 10, "background": (0, 0, 0), "near": 0.01}
+    with pytest.raises(InputError, match=message):
+        NumpyRasterizer(**{**good, **change})  # type: ignore[arg-type]
+
+
+def test_backward_needs_a_forward() -> None:
+    with pytest.raises(InputError, match="backward: expected a forward pass before"):
+        rasterizer().backward(upstream(0)[0])
+    subject = rasterizer()
+    subject.forward(random_splats(5, 0, 1))
+    subject.forget()
+    with pytest.raises(InputError, match="backward: expected a forward pass before"):
+        subject.backward(upstream(0)[0])
+
+
+def test_two_threads_on_one_object_are_refused() -> None:
+    width, height = 640, 480
+    splats = random_splats(20_000, 0, 1)
+    subject = rasterizer(width, height, 500.0)
+    messages: list[str] = []
+
+    def work() -> None:
+        for _ in range(30):
+            try:
+                subject.forward(splats)
+            except RuntimeError as error:
+                messages.append(str(error))
+
+    workers = [threading.Thread(target=work) for _ in range(3)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert messages
+    assert all("one Rasterizer per camera and thread" in message for message in messages)
+
+
+def test_two_objects_in_two_threads_do_not_disturb_each_other() -> None:
+    splats = [random_splats(3000, seed, 4) for seed in range(3)]
+    want = [rasterizer(160, 120, 150.0).forward(s)[0] for s in splats]
+    wrong: list[int] = []
+
+    def work(which: int) -> None:
+        subject = rasterizer(160, 120, 150.0)
+        same = [np.array_equal(subject.forward(splats[which])[0], want[which]) for _ in range(5)]
+        if not all(same):
+            wrong.append(which)
+
+    workers = [threading.Thread(target=work, args=(i,)) for i in range(3)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert wrong == []
+
+
+def test_instruction_set_is_chosen_by_the_environment() -> None:
+    code = "from gsstream_cpu_render import _native; print(_native.active_isa())"
+    weakest = _native.supported_isas()[0]
+    run = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "GSSTREAM_ISA": weakest},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert run.stdout.strip() == weakest
+    run = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "GSSTREAM_ISA": "mmx"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "ValueError: GSSTREAM_ISA: expected one of {" in run.stderr
+    assert "got 'mmx'" in run.stderr
+
+
+def test_numpy_interface_imports_no_torch() -> None:
+    code = (
+        "import sys, numpy as np; from gsstream_cpu_render.rasterizer import render_numpy;"
+        "z = np.zeros; image = render_numpy(z((1, 3)), z((1, 4)) + 1, z((1, 3)), z(1), z((1, 1, 3)), z((1, 0, 3)),"
+        "np.eye(4), np.eye(3), 8, 8); assert image.shape == (8, 8, 3); sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_splat_arrays_have_gsstreams_names_in_gsstreams_order() -> None:
+    from gsstream.api import ATTRIBUTES
+
+    assert SplatArrays._fields == tuple(ATTRIBUTES)

@@ -48,7 +48,8 @@ def render_numpy(
     rows, tiles = _tile_lists(means2d, covariance, opacity, width, height)
     columns = -(-width // TILE)
     starts = np.flatnonzero(np.diff(tiles, prepend=-1))
-    for start, stop in zip(starts, np.append(starts[1:], len(tiles)), strict=True):
+    # With no pair at all `starts` is empty and the background stays.
+    for start, stop in zip(starts, [*starts[1:], len(tiles)], strict=False):
         y, x = divmod(int(tiles[start]), columns)
         window = (slice(y * TILE, min((y + 1) * TILE, height)), slice(x * TILE, min((x + 1) * TILE, width)))
         image[window] = _composite(table[rows[start:stop]], window, background)

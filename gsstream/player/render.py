@@ -46,7 +46,7 @@ def find_renderer() -> PlayerRenderer:
         try:
             function = point.load()
             # Found out here, where there still is another renderer, and not at the first picture.
-            inspect.signature(function).bind(None, None, None, 1, 1, (0.0, 0.0, 0.0), near=0.01)
+            inspect.signature(function).bind(*[None] * 8, 1, 1, (0.0, 0.0, 0.0), near=0.01)
             return PlayerRenderer(point.name, function)
         except Exception as error:  # third-party code: whatever it raises is reported, and the player still plays
             problems.append(f"{point.name} ({point.value}) failed: {type(error).__name__}: {error}")
@@ -66,7 +66,7 @@ def render(
     chosen = find_renderer() if renderer is None else renderer
     size = (cameras.width, cameras.height)
     pose = (cameras.viewmats[view], cameras.Ks[view])
-    image = chosen.render_numpy(gaussians, *pose, *size, background, near=cameras.near)
+    image = chosen.render_numpy(*(array for _, array in gaussians.items()), *pose, *size, background, near=cameras.near)
     check_shape(f"image of renderer {chosen.name!r}", image, (cameras.height, cameras.width, 3))
     check_finite(f"image of renderer {chosen.name!r}", image)
     return np.asarray(image, np.float32)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray, IntArray
 
 BLUR, ALPHA_CUT, ALPHA_MAX, TRANSMITTANCE_MIN = 0.3, 1 / 255, 0.999, 1e-4
@@ -20,19 +19,20 @@ _SH3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.37317633259
 
 
 def render_numpy(
-    gaussians: Gaussians[FloatArray], viewmat: FloatArray, K: FloatArray, width: int, height: int,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0), *, near: float = 0.01,
+    means: FloatArray, quats: FloatArray, scales: FloatArray, opacities: FloatArray, sh0: FloatArray, shN: FloatArray,
+    viewmat: FloatArray, K: FloatArray, width: int, height: int,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0), near: float = 0.01,
 ) -> FloatArray:  # fmt: skip
-    """Render one camera: [height, width, 3] float32.
+    """Render raw Gaussians for one camera: [height, width, 3] float32.
 
     Arguments:
+        means, quats, scales, opacities, sh0, shN: shapes as in core.gaussians.
         viewmat: [4, 4] world-to-camera.
         K: [3, 3] pixels.
         width, height: pixels.
         background: colour behind everything, [0, 1].
         near: near plane, scene units.
     """
-    means, quats, scales, opacities, sh0, shN = (array for _, array in gaussians.items())
     viewmat, K = np.asarray(viewmat, np.float64), np.asarray(K, np.float64)
     center = -viewmat[:3, :3].T @ viewmat[:3, 3]
     points = means.astype(np.float64) @ viewmat[:3, :3].T + viewmat[:3, 3]

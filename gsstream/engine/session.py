@@ -13,6 +13,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import OutputError
 from gsstream.core.frame import Frame
@@ -65,7 +67,8 @@ def run(
     """
     source = open_source(source_uri, parts.recipe.scale)
     try:
-        return _Run(parts, source, out, quiet, measure, first_frame).encode(resume)
+        with _one_torch_thread():
+            return _Run(parts, source, out, quiet, measure, first_frame).encode(resume)
     finally:
         source.close()
 
@@ -161,6 +164,19 @@ class _Run:
             second = self.source.frame(1, "test") if state.player.frame >= 1 else None
             self.held_out.remember(self.source.frame(0, "test"), second)
         return state
+
+
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Torch's share of a frame is elementwise work on few rows: more threads cost more than they give, and spin against
+    the native kernels' own pool. One thread also keeps its sums, and so the bytes, independent of the machine's cores.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _num_frames(info: SourceInfo, wanted: int | None) -> int:

@@ -16,7 +16,7 @@ from gsstream.core.shapes import FloatArray, check_finite, check_shape
 from gsstream.init.fusion import agreement, color_gains, interpolate_depths, world_points
 from gsstream.init.geometry import BoolArray, depth_range, inside, project, unproject, visible_views
 from gsstream.init.sweep import SweepSettings, sweep_depths
-from gsstream.init.thinning import thin_points
+from gsstream.init.thinning import cell_means, detail_cells, thin_points
 
 __all__ = ["PhotoSeeds", "fill_volume", "photo_consistent_seeds", "thin_points", "visible_views"]
 
@@ -75,8 +75,10 @@ def photo_consistent_seeds(
     gains = color_gains(images, depths, sure, cameras)
     depths = interpolate_depths(depths, sure)
     verdict = agreement(depths, cameras, tolerance)
-    accepted = verdict.accepted(least_support, dominance) & sure
-    accepted |= verdict.accepted(least_support, 2 * dominance) & ~sure
+    # A bridged pixel has no match of its own to vouch for it, so it needs twice the majority.
+    accepted = np.where(
+        sure, verdict.accepted(least_support, dominance), verdict.accepted(least_support, 2 * dominance)
+    )
     confidence = verdict.support / np.maximum(verdict.support + verdict.violation, 1)
     xyz = np.concatenate([world_points(depths, cameras, i)[accepted[i].reshape(-1)] for i in range(len(cameras))])
     common = np.clip(images / gains[:, None, None, :], 0, 1)
@@ -86,8 +88,6 @@ def photo_consistent_seeds(
 
 
 def _thin_with_score(cloud: PointCloud, score: FloatArray, count: int) -> tuple[PointCloud, FloatArray]:
-    from gsstream.init.thinning import cell_means, detail_cells
-
     cells = detail_cells(cloud, count)
     xyz, rgb, mean_score = cell_means(cells, cloud.xyz, cloud.rgb, score[:, None])
     return PointCloud(xyz, rgb, cloud.origin), mean_score[:, 0]

@@ -24,10 +24,10 @@ _GREY = np.array([0.299, 0.587, 0.114], np.float32)
 
 @dataclass(frozen=True, slots=True)
 class SweepSettings:
-    """Settings of the sweep; the defaults were chosen on two recordings (docs: first frame).
+    """Settings of the sweep; the defaults were chosen by held-out colour error and true depth on two recordings.
 
     Arguments:
-        planes: depth hypotheses per view, uniform in inverse depth.
+        planes: depth hypotheses per view, uniform in the root of inverse depth.
         neighbours: partners of each view.
         windows: half widths in pixels of the square NCC windows, averaged; a wide one carries weak texture.
         noise: image noise in [0, 1] below which texture does not count.
@@ -58,14 +58,16 @@ def sweep_depths(images: FloatArray, cameras: Cameras, settings: SweepSettings) 
     grey = torch.from_numpy(np.ascontiguousarray(images @ _GREY))
     partners = neighbour_views(cameras, settings.neighbours)
     near_far = depth_range(cameras)
-    inverse = np.linspace(1 / near_far[:, 1], 1 / near_far[:, 0], settings.planes, axis=1).astype(np.float32)
+    # Steps uniform in the root of inverse depth: finer for far walls than uniform parallax, coarser right at the lens.
+    root = np.linspace(near_far[:, 1] ** -0.5, near_far[:, 0] ** -0.5, settings.planes, axis=1)
+    inverse = (root**2).astype(np.float32)
 
     def one(view: int) -> FloatArray:
         cost = _matching_cost(grey, cameras, view, partners[view].tolist(), inverse[view], settings)
         total = aggregate(cost, grey[view].numpy(), settings.step_penalty, settings.jump_penalty)
         plane = best_plane(total)
-        depth: FloatArray = 1 / (inverse[view, 0] + plane * (inverse[view, 1] - inverse[view, 0]))
-        return depth
+        depth: FloatArray = (root[view, 0] + plane * (root[view, 1] - root[view, 0])) ** -2.0
+        return depth.astype(np.float32)
 
     # Many small tensors: a second thread inside an operation costs more than it brings, one per view does not.
     threads = torch.get_num_threads()

@@ -88,12 +88,12 @@ def test_dense_seeds_lie_on_the_true_surfaces(scene: SyntheticSource) -> None:
     # At 96 pixels two percent of the depth is half a pixel of parallax: the median is far better than that.
     assert np.median(error) < 0.012
     assert (error < 0.05).mean() > 0.88
-    # The seeds explain most of what every camera sees.
+    # The seeds explain most of what every camera sees; the ends of the arc see walls that nobody else sees.
     for view in range(len(cameras)):
         uv, depth = project(seeds.points.xyz.astype(np.float64), cameras, view)
         inside = (depth > 0) & (uv >= 0).all(1) & (uv < (96, 72)).all(1)
         column, row = (uv[inside] // 6).astype(int).T
-        assert len(set(zip(column, row, strict=True))) > 0.8 * 16 * 12
+        assert len(set(zip(column, row, strict=True))) > (0.85 if 2 <= view <= 7 else 0.7) * 16 * 12
     np.testing.assert_allclose(seeds.gains, 1, atol=0.03)
 
 

@@ -5,7 +5,10 @@
 #   make clean           remove .venv and what was built
 
 PYTHON ?= python3
-CXX ?= c++
+# make itself presets CXX to g++, which a machine with clang alone does not have.
+ifeq ($(origin CXX),default)
+CXX := c++
+endif
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO_METHOD ?= s2gs-fast

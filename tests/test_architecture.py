@@ -121,7 +121,8 @@ def test_reference_pages_say_what_the_code_says(page: str) -> None:
 def test_every_exported_name_has_its_own_docstring() -> None:
     for name, value in generator().exported().items():
         if inspect.isclass(value) or inspect.isroutine(value):
-            assert vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__, f"gsstream.api.{name} has no docstring"
+            own = vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
+            assert own, f"gsstream.api.{name} has no docstring"
 
 
 def settings(model: type[BaseModel], name: str):

@@ -8,6 +8,8 @@ from gsstream.core.errors import OutputError
 
 #: Files that say "a run lives here", and that a run may replace.
 RUN_FILES = ("stream.gss", "metrics.jsonl", "recipe.yaml")
+#: What is made from a finished run; a new run would make it anew or leave a stale one behind.
+MADE_FILES = ("contact_sheet.png", "frames.png", "summary.txt", "video.mp4")
 
 
 def prepare_output(out: Path, *, resume: bool = False, overwrite: bool = False) -> bool:
@@ -15,7 +17,8 @@ def prepare_output(out: Path, *, resume: bool = False, overwrite: bool = False) 
 
     Arguments:
         resume: continue the run that ``out`` holds.
-        overwrite: delete the ``RUN_FILES`` of the run that ``out`` holds; anything else stays.
+        overwrite: delete the ``RUN_FILES`` and ``MADE_FILES`` of the run that ``out`` holds; anything else stays, and
+            where there is no run, everything does.
 
     Returns:
         Whether there is a run to continue.
@@ -38,8 +41,8 @@ def prepare_output(out: Path, *, resume: bool = False, overwrite: bool = False) 
         raise OutputError(f"nothing to resume: {out} holds no stream.gss; leave --resume out to start a run there")
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for name in present if overwrite else ():
-            (out / name).unlink()
+        for name in (*RUN_FILES, *MADE_FILES) if overwrite and present else ():
+            (out / name).unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"the output folder {out} cannot be used: {error}") from error
     return bool(present) and resume

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from gsstream.core.errors import OutputError
-from gsstream.engine.output import RUN_FILES, prepare_output
+from gsstream.engine.output import MADE_FILES, RUN_FILES, prepare_output
+from gsstream.trade import gallery
 
 
 def test_a_new_folder_is_created(tmp_path: Path) -> None:
@@ -17,10 +18,11 @@ def test_a_new_folder_is_created(tmp_path: Path) -> None:
 
 
 def test_a_folder_with_foreign_files_is_fine(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("mine")
+    for name in ("notes.txt", "video.mp4"):
+        (tmp_path / name).write_text("mine")
     assert prepare_output(tmp_path) is False
     assert prepare_output(tmp_path, overwrite=True) is False
-    assert (tmp_path / "notes.txt").read_text() == "mine"
+    assert {path.read_text() for path in tmp_path.iterdir()} == {"mine"}, "without a run nothing is known to be ours"
 
 
 @pytest.mark.parametrize("name", RUN_FILES)
@@ -35,10 +37,14 @@ def test_any_trace_of_a_run_is_respected(tmp_path: Path, name: str) -> None:
 
 
 def test_overwrite_deletes_the_files_of_a_run_and_nothing_else(tmp_path: Path) -> None:
-    for name in (*RUN_FILES, "notes.txt", "stream.gss.old"):
+    for name in (*RUN_FILES, *MADE_FILES, "notes.txt", "stream.gss.old"):
         (tmp_path / name).write_text(name)
     assert prepare_output(tmp_path, overwrite=True) is False
     assert sorted(path.name for path in tmp_path.iterdir()) == ["notes.txt", "stream.gss.old"]
+
+
+def test_made_files_are_the_ones_the_gallery_writes() -> None:
+    assert set(MADE_FILES) == {gallery.SHEET, gallery.PLOTS, gallery.SUMMARY, gallery.VIDEO}
 
 
 def test_resume(tmp_path: Path) -> None:

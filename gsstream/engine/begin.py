@@ -73,7 +73,7 @@ def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMe
             f"{parts.recipe.first_frame.sh_degree}; set first_frame.sh_degree={first.gaussians.sh_degree}"
         )
     gaussians = first.gaussians.map(torch.from_numpy)
-    anchors = decoded_anchors(first)
+    anchors = own_anchors(parts, first, frame)
     hierarchy, levels, gaussians = arrange(parts, gaussians, anchors.levels, anchors)
     layout = make_layout(hierarchy, levels, anchors)
     exposure = exposure_from_meta(first.meta)
@@ -88,6 +88,17 @@ def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMe
         "seconds": {"code": time.perf_counter() - started},
     }
     return Step(state, packet, "key", metrics)
+
+
+def own_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
+    """The grid this method's structure would lay over the scene; each Gaussian gets the level of the nearest cell size."""
+    theirs = decoded_anchors(first)
+    cloud = PointCloud(first.gaussians.means, np.full_like(first.gaussians.means, 0.5), "frame 0 of another stream")
+    with guarded("structure", parts.structure, frame.index):
+        grid = parts.structure.seed(cloud, frame.cameras)
+    sizes = theirs.cell_sizes[theirs.levels]
+    levels = (sizes.log()[:, None] - grid.cell_sizes.log()[None]).abs().argmin(1)
+    return replace(theirs, levels=levels, cell_sizes=grid.cell_sizes, origin=grid.origin)
 
 
 def decoded_anchors(player: PlayerState) -> Anchors:

@@ -4,6 +4,7 @@
 // function: backward has to find exactly the contributors that forward counted.
 #include "moments.hpp"
 #include "pixel_blocks.hpp"
+#include "pixel_exponent.hpp"
 #include "raster_kernels.hpp"
 #include "simd.hpp"
 
@@ -13,41 +14,11 @@ namespace {
 constexpr int PARTS = BLOCK_PIXELS / LANES;  // vectors per block
 constexpr int PREFETCH = 8;                  // entries ahead
 
-struct PixelCentres {
-  alignas(64) float x[BLOCKS][BLOCK_PIXELS], y[BLOCKS][BLOCK_PIXELS];
-  constexpr PixelCentres() : x(), y() {
-    for (int b = 0; b < BLOCKS; b++)
-      for (int i = 0; i < BLOCK_PIXELS; i++) {
-        x[b][i] = static_cast<float>(b % BLOCKS_X * BLOCK_SIDE + i % BLOCK_SIDE) + 0.5f;
-        y[b][i] = static_cast<float>(b / BLOCKS_X * BLOCK_SIDE + i / BLOCK_SIDE) + 0.5f;
-      }
-  }
-};
-constexpr PixelCentres CENTRES;
-
-// A record broadcast to all lanes, with the centre relative to the tile.
-struct Kernel {
-  Floats x, y, a, b, c, log2_opacity, red, green, blue;
-  GSS_INLINE Kernel(const Record& r, float tile_x, float tile_y)
-      : x(broadcast(tile_x - r.x)), y(broadcast(tile_y - r.y)), a(broadcast(r.a)), b(broadcast(r.b)), c(broadcast(r.c)),
-        log2_opacity(broadcast(r.log2_opacity)), red(broadcast(r.color[0])), green(broadcast(r.color[1])), blue(broadcast(r.color[2])) {}
-};
-
-struct Exponent {
-  Floats dx, dy, log2_alpha;
-};
-GSS_INLINE Exponent exponent_at(const Kernel& k, int block, int lane) {
-  Exponent e;
-  e.dx = load(CENTRES.x[block] + lane) + k.x;
-  e.dy = load(CENTRES.y[block] + lane) + k.y;
-  e.log2_alpha = e.dx * (k.a * e.dx + k.b * e.dy) + (k.c * e.dy * e.dy + k.log2_opacity);
-  return e;
-}
-
 // ---- forward
 
 struct ForwardTile {
-  alignas(64) float transmittance[BLOCKS][BLOCK_PIXELS], red[BLOCKS][BLOCK_PIXELS], green[BLOCKS][BLOCK_PIXELS], blue[BLOCKS][BLOCK_PIXELS];
+  alignas(64) float transmittance[BLOCKS][BLOCK_PIXELS], red[BLOCKS][BLOCK_PIXELS], green[BLOCKS][BLOCK_PIXELS],
+      blue[BLOCKS][BLOCK_PIXELS];
   alignas(64) int32_t last[BLOCKS][BLOCK_PIXELS];
   Mask live[BLOCKS][PARTS];  // pixels that still take light
 };
@@ -77,7 +48,8 @@ GSS_INLINE bool retire_pixels(ForwardTile& tile, int b, int part, Mask dead, Mas
 }
 
 // Blends one entry into the given blocks. Returns the blocks it added light to; removes finished blocks from `alive`.
-GSS_INLINE uint32_t blend_entry(ForwardTile& tile, const Kernel& k, uint32_t blocks, int32_t next_entry, uint32_t& alive) {
+GSS_INLINE uint32_t blend_entry(ForwardTile& tile, const Kernel& k, uint32_t blocks, int32_t next_entry,
+                                uint32_t& alive) {
   uint32_t contributed = 0;
   for (; blocks; blocks &= blocks - 1) {
     const int b = __builtin_ctz(blocks);
@@ -97,7 +69,8 @@ GSS_INLINE uint32_t blend_entry(ForwardTile& tile, const Kernel& k, uint32_t blo
       store(tile.blue[b] + q, load(tile.blue[b] + q) + weight * k.blue);
       const Mask dead = both(greater_equal(broadcast(TRANSMITTANCE_MIN), after), live);
       if (__builtin_expect(any(dead), 0))
-        if (retire_pixels(tile, b, part, dead, both(live, greater(after, broadcast(TRANSMITTANCE_MIN))), next_entry)) alive &= ~(1u << b);
+        if (retire_pixels(tile, b, part, dead, both(live, greater(after, broadcast(TRANSMITTANCE_MIN))), next_entry))
+          alive &= ~(1u << b);
     }
   }
   return contributed;
@@ -120,7 +93,8 @@ GSS_INLINE void blend_tile(const CompositeJob& job, ForwardTile& tile, uint32_t 
   for (; k < count; k++) contributed[k] = 0;
 }
 
-GSS_INLINE void finish_tile(const CompositeJob& job, ForwardTile& tile, std::size_t slot, uint32_t index, int tile_x, int tile_y) {
+GSS_INLINE void finish_tile(const CompositeJob& job, ForwardTile& tile, std::size_t slot, uint32_t index, int tile_x,
+                            int tile_y) {
   float* kept_transmittance = job.pixel_transmittance + slot * BLOCKS * BLOCK_PIXELS;
   int32_t* kept_last = job.pixel_last + slot * BLOCKS * BLOCK_PIXELS;
   for (uint32_t blocks = job.tile_blocks[index]; blocks; blocks &= blocks - 1) {
@@ -143,7 +117,8 @@ void forward(const CompositeJob& job, std::size_t first_tile, std::size_t end_ti
   ForwardTile tile;
   for (std::size_t slot = first_tile; slot < end_tile; slot++) {
     const uint32_t index = job.tiles[slot];
-    const int x = static_cast<int>(index) % job.tiles_x * TILE_WIDTH, y = static_cast<int>(index) / job.tiles_x * TILE_HEIGHT;
+    const int x = static_cast<int>(index) % job.tiles_x * TILE_WIDTH,
+              y = static_cast<int>(index) / job.tiles_x * TILE_HEIGHT;
     start_tile(tile, job.tile_blocks[index]);
     blend_tile(job, tile, index, static_cast<float>(x), static_cast<float>(y));
     finish_tile(job, tile, slot, index, x, y);
@@ -160,7 +135,8 @@ struct BackwardTile {
 };
 
 // False if the upstream gradient is zero all over the tile (NaN is not zero).
-GSS_INLINE bool start_backward_tile(const CompositeBackwardJob& job, BackwardTile& tile, std::size_t slot, uint32_t index, int tile_x, int tile_y) {
+GSS_INLINE bool start_backward_tile(const CompositeBackwardJob& job, BackwardTile& tile, std::size_t slot,
+                                    uint32_t index, int tile_x, int tile_y) {
   const CompositeJob& fwd = job.forward;
   const float* background = fwd.background;
   const float* kept_transmittance = fwd.pixel_transmittance + slot * BLOCKS * BLOCK_PIXELS;
@@ -174,8 +150,10 @@ GSS_INLINE bool start_backward_tile(const CompositeBackwardJob& job, BackwardTil
     if (job.alpha_gradient) read_scalar(place, job.alpha_gradient, alpha_gradient);
     for (int q = 0; q < BLOCK_PIXELS; q += LANES) {
       const Floats t = load(kept_transmittance + b * BLOCK_PIXELS + q), from_alpha = load(alpha_gradient + q);
-      magnitude |= (Ints)load(tile.red[b] + q) | (Ints)load(tile.green[b] + q) | (Ints)load(tile.blue[b] + q) | (Ints)from_alpha;
-      const Floats seen = background[0] * load(tile.red[b] + q) + background[1] * load(tile.green[b] + q) + background[2] * load(tile.blue[b] + q);
+      magnitude |=
+          (Ints)load(tile.red[b] + q) | (Ints)load(tile.green[b] + q) | (Ints)load(tile.blue[b] + q) | (Ints)from_alpha;
+      const Floats seen = background[0] * load(tile.red[b] + q) + background[1] * load(tile.green[b] + q) +
+                          background[2] * load(tile.blue[b] + q);
       store(tile.transmittance[b] + q, t);
       store(tile.behind[b] + q, t * (seen - from_alpha));  // alpha = 1 - transmittance
       store(tile.last[b] + q, load(kept_last + b * BLOCK_PIXELS + q));
@@ -192,13 +170,15 @@ struct Undone {
 };
 GSS_INLINE bool undo_entry(BackwardTile& tile, const Kernel& k, int b, int q, int32_t next_entry, Undone& u) {
   u.at = exponent_at(k, b, q);
-  const Mask counted = both(greater_equal(u.at.log2_alpha, broadcast(LOG2_ALPHA_CUT)), greater_equal(load(tile.last[b] + q), broadcast(next_entry)));
+  const Mask counted = both(greater_equal(u.at.log2_alpha, broadcast(LOG2_ALPHA_CUT)),
+                            greater_equal(load(tile.last[b] + q), broadcast(next_entry)));
   if (PARTS > 1 && !any(counted)) return false;  // a block of one vector is known to contribute
   u.raw_alpha = exp2(u.at.log2_alpha);
   u.alpha = select_or_zero(counted, min(u.raw_alpha, broadcast(ALPHA_MAX)));
   const Floats restore = reciprocal(1.0f - u.alpha);
   const Floats before = load(tile.transmittance[b] + q) * restore, behind = load(tile.behind[b] + q);
-  const Floats shine = k.red * load(tile.red[b] + q) + k.green * load(tile.green[b] + q) + k.blue * load(tile.blue[b] + q);
+  const Floats shine =
+      k.red * load(tile.red[b] + q) + k.green * load(tile.green[b] + q) + k.blue * load(tile.blue[b] + q);
   u.weight = u.alpha * before;
   u.alpha_gradient = before * shine - behind * restore;
   store(tile.transmittance[b] + q, before);
@@ -206,7 +186,8 @@ GSS_INLINE bool undo_entry(BackwardTile& tile, const Kernel& k, int b, int q, in
   return true;
 }
 
-GSS_INLINE void differentiate_entry(BackwardTile& tile, const Kernel& k, uint32_t blocks, int32_t next_entry, float* out) {
+GSS_INLINE void differentiate_entry(BackwardTile& tile, const Kernel& k, uint32_t blocks, int32_t next_entry,
+                                    float* out) {
   Floats m[MOMENTS] = {};
   for (; blocks; blocks &= blocks - 1) {
     const int b = __builtin_ctz(blocks);
@@ -255,7 +236,8 @@ GSS_INLINE uint32_t first_wanted(const CompositeBackwardJob& job, uint32_t first
 GSS_INLINE void differentiate_tile(const CompositeBackwardJob& job, BackwardTile& tile, std::size_t slot) {
   const CompositeJob& fwd = job.forward;
   const uint32_t index = fwd.tiles[slot], first = fwd.lists.offset[index], count = fwd.lists.offset[index + 1] - first;
-  const int x = static_cast<int>(index) % fwd.tiles_x * TILE_WIDTH, y = static_cast<int>(index) / fwd.tiles_x * TILE_HEIGHT;
+  const int x = static_cast<int>(index) % fwd.tiles_x * TILE_WIDTH,
+            y = static_cast<int>(index) / fwd.tiles_x * TILE_HEIGHT;
   const TileEntry* entries = fwd.lists.entries + first;
   const bool matters = start_backward_tile(job, tile, slot, index, x, y);
   const int32_t front = static_cast<int32_t>(first_wanted(job, first, count, matters));

@@ -17,7 +17,8 @@ constexpr uint32_t DIGITS = 1u << DIGIT_BITS;
 using Histogram = std::array<uint32_t, DIGITS>;
 
 // One counting pass over `parts` contiguous pieces. The order of the result does not depend on the number of pieces.
-void radix_pass(const DepthItem* from, DepthItem* to, std::size_t count, uint32_t lowest, int shift, std::vector<Histogram>& histograms) {
+void radix_pass(const DepthItem* from, DepthItem* to, std::size_t count, uint32_t lowest, int shift,
+                std::vector<Histogram>& histograms) {
   const std::size_t parts = histograms.size();
   const auto digit = [=](const DepthItem& item) { return ((item.depth_bits - lowest) >> shift) & (DIGITS - 1); };
   parallel_for(parts, 1, [&](std::size_t begin, std::size_t end) {
@@ -31,7 +32,8 @@ void radix_pass(const DepthItem* from, DepthItem* to, std::size_t count, uint32_
     for (Histogram& h : histograms) next += std::exchange(h[d], next);
   parallel_for(parts, 1, [&](std::size_t begin, std::size_t end) {
     for (std::size_t p = begin; p < end; p++)
-      for (std::size_t i = count * p / parts; i < count * (p + 1) / parts; i++) to[histograms[p][digit(from[i])]++] = from[i];
+      for (std::size_t i = count * p / parts; i < count * (p + 1) / parts; i++)
+        to[histograms[p][digit(from[i])]++] = from[i];
   });
 }
 
@@ -44,8 +46,9 @@ void sort_by_depth(Buffer<DepthItem>& items, Buffer<DepthItem>& scratch, std::si
     });
     return;
   }
-  const auto [nearest, farthest] = std::minmax_element(
-      items.data(), items.data() + count, [](const DepthItem& a, const DepthItem& b) { return a.depth_bits < b.depth_bits; });
+  const auto [nearest, farthest] =
+      std::minmax_element(items.data(), items.data() + count,
+                          [](const DepthItem& a, const DepthItem& b) { return a.depth_bits < b.depth_bits; });
   const uint32_t lowest = nearest->depth_bits, range = farthest->depth_bits - lowest;
   scratch.require(count);
   const std::size_t threads = static_cast<std::size_t>(num_threads());

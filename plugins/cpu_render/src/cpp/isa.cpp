@@ -29,10 +29,14 @@ Isa isa_from_name(const std::string& name, const char* origin) {
 
 const char* isa_name(Isa isa) {
   switch (isa) {
-    case Isa::baseline: return "baseline";
-    case Isa::avx2: return "avx2";
-    case Isa::avx512: return "avx512";
-    case Isa::neon: return "neon";
+    case Isa::baseline:
+      return "baseline";
+    case Isa::avx2:
+      return "avx2";
+    case Isa::avx512:
+      return "avx512";
+    case Isa::neon:
+      return "neon";
   }
   return "?";
 }
@@ -50,7 +54,8 @@ std::vector<Isa> supported_isas() {
 #else
   found.push_back(Isa::neon);
 #endif
-  if (found.empty()) throw std::runtime_error("gsstream-cpu-render needs at least SSE4.2 (x86-64-v2) on this processor.");
+  if (found.empty())
+    throw std::runtime_error("gsstream-cpu-render needs at least SSE4.2 (x86-64-v2) on this processor.");
   return found;
 }
 

@@ -1,5 +1,6 @@
 // Instruction-set dispatch. The vector width is fixed at compile time, so every *.kernel.cpp is compiled once per
-// set, inside namespace gsstream_cpu::GSS_ISA, and the strongest set that this processor supports is chosen at run time.
+// set, inside namespace gsstream_cpu::GSS_ISA, and the strongest set that this processor supports is chosen at run
+// time.
 //
 // How a kernel family plugs in (say `adam`):
 //   adam.hpp         struct AdamKernels { void (*step)(const AdamJob&, std::size_t begin, std::size_t end); };
@@ -29,19 +30,30 @@ void select_isa(const std::string& name);
 }  // namespace gsstream_cpu
 
 #if defined(__x86_64__)
-#define GSS_KERNEL_TABLE(Table, getter)                  \
-  namespace baseline { const Table& getter(); }          \
-  namespace avx2 { const Table& getter(); }              \
-  namespace avx512 { const Table& getter(); }            \
-  inline const Table& getter() {                         \
-    switch (::gsstream_cpu::active_isa()) {                       \
-      case ::gsstream_cpu::Isa::avx512: return avx512::getter();  \
-      case ::gsstream_cpu::Isa::avx2: return avx2::getter();      \
-      default: return baseline::getter();                \
-    }                                                    \
+#define GSS_KERNEL_TABLE(Table, getter)     \
+  namespace baseline {                      \
+  const Table& getter();                    \
+  }                                         \
+  namespace avx2 {                          \
+  const Table& getter();                    \
+  }                                         \
+  namespace avx512 {                        \
+  const Table& getter();                    \
+  }                                         \
+  inline const Table& getter() {            \
+    switch (::gsstream_cpu::active_isa()) { \
+      case ::gsstream_cpu::Isa::avx512:     \
+        return avx512::getter();            \
+      case ::gsstream_cpu::Isa::avx2:       \
+        return avx2::getter();              \
+      default:                              \
+        return baseline::getter();          \
+    }                                       \
   }
 #else
-#define GSS_KERNEL_TABLE(Table, getter)    \
-  namespace neon { const Table& getter(); } \
+#define GSS_KERNEL_TABLE(Table, getter) \
+  namespace neon {                      \
+  const Table& getter();                \
+  }                                     \
   inline const Table& getter() { return neon::getter(); }
 #endif

@@ -13,10 +13,12 @@ GSS_INLINE constexpr int moment_slot(int k) { return 4 * (k & 3) + (k >> 2); }
 // Value k lands in moment_slot(k).
 GSS_INLINE void store_moments(const Floats* v, float* out) {
   const auto fold_halves = [](Floats a, Floats b) {  // 128-bit quarters: [a0+a2, a1+a3, b0+b2, b1+b3]
-    return (Floats)_mm512_shuffle_f32x4((__m512)a, (__m512)b, 0x44) + (Floats)_mm512_shuffle_f32x4((__m512)a, (__m512)b, 0xEE);
+    return (Floats)_mm512_shuffle_f32x4((__m512)a, (__m512)b, 0x44) +
+           (Floats)_mm512_shuffle_f32x4((__m512)a, (__m512)b, 0xEE);
   };
   const auto fold_quarters = [](Floats a, Floats b) {  // one quarter left per input vector
-    return (Floats)_mm512_shuffle_f32x4((__m512)a, (__m512)b, 0x88) + (Floats)_mm512_shuffle_f32x4((__m512)a, (__m512)b, 0xDD);
+    return (Floats)_mm512_shuffle_f32x4((__m512)a, (__m512)b, 0x88) +
+           (Floats)_mm512_shuffle_f32x4((__m512)a, (__m512)b, 0xDD);
   };
   const auto fold_pairs = [](Floats a, Floats b) {
     return (Floats)_mm512_unpacklo_ps((__m512)a, (__m512)b) + (Floats)_mm512_unpackhi_ps((__m512)a, (__m512)b);

@@ -17,19 +17,26 @@ struct BlockPlace {
 GSS_INLINE BlockPlace place_of(int block, int tile_x, int tile_y, int width, int height) {
   const int x = tile_x + block % BLOCKS_X * BLOCK_SIDE, y = tile_y + block / BLOCKS_X * BLOCK_SIDE;
   const int right = width - x, below = height - y;
-  return {static_cast<std::size_t>(y) * static_cast<std::size_t>(width) + static_cast<std::size_t>(x), static_cast<std::size_t>(width),
-          right < BLOCK_SIDE ? right : BLOCK_SIDE, below < BLOCK_SIDE ? below : BLOCK_SIDE};
+  return {static_cast<std::size_t>(y) * static_cast<std::size_t>(width) + static_cast<std::size_t>(x),
+          static_cast<std::size_t>(width), right < BLOCK_SIDE ? right : BLOCK_SIDE,
+          below < BLOCK_SIDE ? below : BLOCK_SIDE};
 }
 
-GSS_INLINE Quad load_quad(const float* p) { Quad r; std::memcpy(&r, p, sizeof r); return r; }
+GSS_INLINE Quad load_quad(const float* p) {
+  Quad r;
+  std::memcpy(&r, p, sizeof r);
+  return r;
+}
 GSS_INLINE void store_quad(float* p, Quad v) { std::memcpy(p, &v, sizeof v); }
 
-GSS_INLINE void write_rgb(const BlockPlace& place, const float* red, const float* green, const float* blue, float* image) {
+GSS_INLINE void write_rgb(const BlockPlace& place, const float* red, const float* green, const float* blue,
+                          float* image) {
   for (int row = 0; row < place.rows; row++) {
     float* out = image + 3 * (place.first + row * place.stride);
     if (place.columns == BLOCK_SIDE) {
       const Quad r = load_quad(red + 4 * row), g = load_quad(green + 4 * row), b = load_quad(blue + 4 * row);
-      const Quad rg = __builtin_shufflevector(r, g, 0, 4, 1, 5), gb = __builtin_shufflevector(g, b, 1, 5, 2, 6), br = __builtin_shufflevector(b, r, 2, 7, 3, 3);
+      const Quad rg = __builtin_shufflevector(r, g, 0, 4, 1, 5), gb = __builtin_shufflevector(g, b, 1, 5, 2, 6),
+                 br = __builtin_shufflevector(b, r, 2, 7, 3, 3);
       store_quad(out, __builtin_shufflevector(rg, __builtin_shufflevector(b, r, 0, 5, 0, 0), 0, 1, 4, 5));
       store_quad(out + 4, __builtin_shufflevector(gb, r, 0, 1, 6, 2));
       store_quad(out + 8, __builtin_shufflevector(br, __builtin_shufflevector(g, b, 3, 7, 3, 3), 0, 1, 4, 5));

@@ -73,7 +73,8 @@ GSS_INLINE uint32_t footprints(const ProjectJob& job, const Splats& s, Footprint
 
 GSS_INLINE bool touches_active_tile(const ProjectJob& job, const Footprints& f, int lane) {
   const int stride = job.tiles_x + 1;
-  const int32_t *top = job.active_sum + f.tile_y0[lane] * stride, *bottom = job.active_sum + (f.tile_y1[lane] + 1) * stride;
+  const int32_t *top = job.active_sum + f.tile_y0[lane] * stride,
+                *bottom = job.active_sum + (f.tile_y1[lane] + 1) * stride;
   const int left = f.tile_x0[lane], right = f.tile_x1[lane] + 1;
   return bottom[right] - bottom[left] - top[right] + top[left] > 0;
 }
@@ -91,8 +92,8 @@ GSS_INLINE uint32_t emit_pairs(const ProjectJob& job, const Footprints& f, int l
       const uint32_t tile = static_cast<uint32_t>(ty * job.tiles_x + tx);
       const uint32_t wanted = job.tile_blocks[tile];
       if (!wanted) continue;
-      const uint32_t blocks =
-          wanted & touched_blocks(r, static_cast<float>(tx * TILE_WIDTH), static_cast<float>(ty * TILE_HEIGHT), x_of_y, y_of_x);
+      const uint32_t blocks = wanted & touched_blocks(r, static_cast<float>(tx * TILE_WIDTH),
+                                                      static_cast<float>(ty * TILE_HEIGHT), x_of_y, y_of_x);
       if (blocks) *next++ = {tile, blocks};
     }
   pairs.size += static_cast<std::size_t>(next - first);
@@ -100,7 +101,8 @@ GSS_INLINE uint32_t emit_pairs(const ProjectJob& job, const Footprints& f, int l
 }
 
 // Writes the records of the candidate lanes that touch a wanted block; returns those lanes.
-GSS_INLINE uint32_t emit_group(const ProjectJob& job, const Footprints& f, const uint32_t* rows, uint32_t candidates, ProjectChunk& chunk) {
+GSS_INLINE uint32_t emit_group(const ProjectJob& job, const Footprints& f, const uint32_t* rows, uint32_t candidates,
+                               ProjectChunk& chunk) {
   uint32_t visible = 0;
   for (; candidates; candidates &= candidates - 1) {
     const int lane = __builtin_ctz(candidates);
@@ -125,7 +127,8 @@ GSS_INLINE uint32_t emit_group(const ProjectJob& job, const Footprints& f, const
 }
 
 template <int K>
-GSS_INLINE void color_group(const ProjectJob& job, const uint32_t* rows, uint32_t visible, Splats& s, ProjectChunk& chunk) {
+GSS_INLINE void color_group(const ProjectJob& job, const uint32_t* rows, uint32_t visible, Splats& s,
+                            ProjectChunk& chunk) {
   Harmonics<K> sh;
   Floats color[3];
   view_direction(job.camera, s);
@@ -146,7 +149,8 @@ GSS_INLINE void color_group(const ProjectJob& job, const uint32_t* rows, uint32_
 GSS_INLINE uint32_t faults_of(const Splats& s, uint32_t lanes) {
   uint32_t faults = 0;
   if (lanes & ~bits_of(is_finite(s.largest))) faults |= FAULT_NOT_FINITE;
-  const Mask usable = both(greater(s.quat_norm2, broadcast(QUAT_NORM2_MIN)), greater(broadcast(QUAT_NORM2_MAX), s.quat_norm2));
+  const Mask usable =
+      both(greater(s.quat_norm2, broadcast(QUAT_NORM2_MIN)), greater(broadcast(QUAT_NORM2_MAX), s.quat_norm2));
   if (lanes & ~bits_of(usable)) faults |= FAULT_QUATERNION;
   return faults;
 }

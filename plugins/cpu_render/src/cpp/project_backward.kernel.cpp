@@ -1,4 +1,5 @@
-// Stage 5: from per-pair moments to gradients of the raw parameters. Visible Gaussians only; the projection is recomputed.
+// Stage 5: from per-pair moments to gradients of the raw parameters. Visible Gaussians only; the projection is
+// recomputed.
 #include "moments.hpp"
 #include "raster_kernels.hpp"
 #include "splats.hpp"
@@ -39,7 +40,8 @@ GSS_INLINE void gather_moments(const ProjectBackwardJob& job, std::size_t first,
 
 // log(alpha) = log(opacity) - 1/2 d^T Q d with d = pixel - mean2d and Q the inverse covariance.
 template <int K>
-GSS_INLINE void through_exponent(const Splats& s, const Floats* moments, SplatGradients<K>& out, ChainGradients& chain) {
+GSS_INLINE void through_exponent(const Splats& s, const Floats* moments, SplatGradients<K>& out,
+                                 ChainGradients& chain) {
   const Floats g = moments[0], gx = moments[1], gy = moments[2], gxx = moments[3], gxy = moments[4], gyy = moments[5];
   const Floats qa = s.yy * s.inverse_det, qb = -s.xy * s.inverse_det, qc = s.xx * s.inverse_det;
   out.opacity = g * (1.0f - s.opacity);  // d log(sigmoid)/d logit
@@ -93,8 +95,10 @@ GSS_INLINE void through_camera(const Camera& camera, const Splats& s, SplatGradi
   chain.view[1] = to_y + select_or_zero(s.y_free, slope_y);
   chain.view[2] = -(to_x * s.view[0] + to_y * s.view[1]) * iz - (fx_z * jxx + fy_z * jyy) * iz;
   // A free slope depends on z once more than a limited one.
-  chain.view[2] -= select(s.x_free, 2 * s.x_slope, s.x_slope) * slope_x + select(s.y_free, 2 * s.y_slope, s.y_slope) * slope_y;
-  for (int j = 0; j < 3; j++) out.mean[j] = cam[j] * chain.view[0] + cam[3 + j] * chain.view[1] + cam[6 + j] * chain.view[2];
+  chain.view[2] -=
+      select(s.x_free, 2 * s.x_slope, s.x_slope) * slope_x + select(s.y_free, 2 * s.y_slope, s.y_slope) * slope_y;
+  for (int j = 0; j < 3; j++)
+    out.mean[j] = cam[j] * chain.view[0] + cam[3 + j] * chain.view[1] + cam[6 + j] * chain.view[2];
 }
 
 // Rotation matrix -> unit quaternion -> raw quaternion (projection on the tangent, divided by the norm).
@@ -112,7 +116,8 @@ GSS_INLINE void through_quaternion(const Splats& s, const ChainGradients& chain,
 }
 
 template <int K>
-GSS_INLINE void through_color(const ProjectBackwardJob& job, const uint32_t* rows, const Floats* moments, Splats& s, SplatGradients<K>& out) {
+GSS_INLINE void through_color(const ProjectBackwardJob& job, const uint32_t* rows, const Floats* moments, Splats& s,
+                              SplatGradients<K>& out) {
   Harmonics<K> sh;
   Floats color[3], gradient[3];
   view_direction(job.camera, s);
@@ -177,7 +182,8 @@ void project_backward(const ProjectBackwardJob& job, std::size_t begin, std::siz
 }  // namespace
 
 const ProjectBackwardKernels& project_backward_kernels() {
-  static const ProjectBackwardKernels table{{project_backward<1>, project_backward<4>, project_backward<9>, project_backward<16>}};
+  static const ProjectBackwardKernels table{
+      {project_backward<1>, project_backward<4>, project_backward<9>, project_backward<16>}};
   return table;
 }
 

@@ -14,24 +14,25 @@ constexpr int BLOCKS = BLOCKS_X * BLOCKS_Y;
 constexpr int MASK_TILE = 16;
 static_assert(BLOCKS == 32, "a set of blocks is one uint32_t");
 
-constexpr float BLUR = 0.3f;                   // pixels^2 added to the 2-D covariance (3DGS)
+constexpr float BLUR = 0.3f;  // pixels^2 added to the 2-D covariance (3DGS)
 constexpr float ALPHA_MAX = 0.999f;
-constexpr float TRANSMITTANCE_MIN = 1e-4f;     // a Gaussian counts iff the transmittance before it is above this
-constexpr float LOG2_ALPHA_CUT = -7.99435344f; // log2(1/255)
+constexpr float TRANSMITTANCE_MIN = 1e-4f;      // a Gaussian counts iff the transmittance before it is above this
+constexpr float LOG2_ALPHA_CUT = -7.99435344f;  // log2(1/255)
 constexpr float LOG2_E = 1.44269504f, LN_2 = 0.69314718f;
-constexpr float LOG2_SCALE_LIMIT = 30.0f;      // scales are kept within 2^-30..2^30 so that covariances stay finite
+constexpr float LOG2_SCALE_LIMIT = 30.0f;  // scales are kept within 2^-30..2^30 so that covariances stay finite
 constexpr float QUAT_NORM2_MIN = 1e-20f, QUAT_NORM2_MAX = 1e20f;
 
 struct Camera {
-  float rotation[9], translation[3];  // world to camera, OpenCV axes
-  float position[3];                  // camera centre in the world
-  float fx, fy, cx, cy;               // pixels, origin at the image corner
-  float near;                         // scene units; Gaussians with depth <= near are not drawn
-  float x_low, x_high, y_low, y_high; // limits of x/z and y/z inside the Jacobian (1.3 times the field of view)
+  float rotation[9], translation[3];   // world to camera, OpenCV axes
+  float position[3];                   // camera centre in the world
+  float fx, fy, cx, cy;                // pixels, origin at the image corner
+  float near;                          // scene units; Gaussians with depth <= near are not drawn
+  float x_low, x_high, y_low, y_high;  // limits of x/z and y/z inside the Jacobian (1.3 times the field of view)
   int width, height;
 };
 
-// Raw parameters, row-major: means [N,3], quats [N,4] wxyz, log scales [N,3], logit opacities [N], sh0 [N,3], shN [N,3(K-1)].
+// Raw parameters, row-major: means [N,3], quats [N,4] wxyz, log scales [N,3], logit opacities [N], sh0 [N,3], shN
+// [N,3(K-1)].
 struct GaussianArrays {
   const float *means, *quats, *scales, *opacities, *sh0, *shN;
 };
@@ -107,10 +108,10 @@ struct CompositeJob {
   const uint32_t* tile_blocks;  // [tiles of the image]
   int tiles_x, width, height;
   float background[3];
-  float *image, *transmittance; // caller's [H,W,3] and [H,W]; only active blocks are written
-  uint32_t* contributed;        // per entry: the blocks where it added light; backward visits only these
-  float* pixel_transmittance;   // per active tile, block order: final transmittance
-  int32_t* pixel_last;          // per active tile, block order: entries from this index on were not counted
+  float *image, *transmittance;  // caller's [H,W,3] and [H,W]; only active blocks are written
+  uint32_t* contributed;         // per entry: the blocks where it added light; backward visits only these
+  float* pixel_transmittance;    // per active tile, block order: final transmittance
+  int32_t* pixel_last;           // per active tile, block order: entries from this index on were not counted
 };
 
 struct CompositeBackwardJob {
@@ -130,8 +131,8 @@ struct ProjectBackwardJob {
   const uint32_t* rows;         // [visible] row of each visible Gaussian
   const uint32_t* pair_offset;  // [visible+1]
   const float* moments;
-  GradientArrays out;           // means null: only means2d is wanted
-  bool compact;                 // write row i of the output for visible Gaussian i, instead of row rows[i]
+  GradientArrays out;  // means null: only means2d is wanted
+  bool compact;        // write row i of the output for visible Gaussian i, instead of row rows[i]
 };
 
 }  // namespace gsstream_cpu

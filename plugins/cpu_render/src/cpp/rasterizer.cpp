@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cstring>
-#include <new>
 #include <stdexcept>
 #include <string>
 
@@ -19,69 +18,13 @@ std::size_t chunk_count(std::size_t rows) { return (rows + PROJECT_CHUNK - 1) / 
 
 }  // namespace
 
-PairList::~PairList() { std::free(data); }
-
-void PairList::reserve_more(std::size_t extra) {
-  if (size + extra <= capacity) return;
-  const std::size_t wanted = std::max(size + extra, capacity + capacity / 2 + 256);
-  void* grown = std::realloc(data, wanted * sizeof(Pair));
-  if (!grown) throw std::bad_alloc();
-  data = static_cast<Pair*>(grown);
-  capacity = wanted;
-}
-
-// Blocks of the cells of the caller's mask (16x16) that lie in one raster tile (32x16), inside the image.
-static uint32_t wanted_blocks(int tile_x, int tile_y, int width, int height, const uint8_t* mask) {
-  const int mask_columns = (width + MASK_TILE - 1) / MASK_TILE;
-  uint32_t blocks = 0;
-  for (int b = 0; b < BLOCKS; b++) {
-    const int x = tile_x * TILE_WIDTH + b % BLOCKS_X * BLOCK_SIDE, y = tile_y * TILE_HEIGHT + b / BLOCKS_X * BLOCK_SIDE;
-    if (x >= width || y >= height) continue;
-    if (!mask || mask[y / MASK_TILE * mask_columns + x / MASK_TILE]) blocks |= 1u << b;
-  }
-  return blocks;
-}
-
-void TileSelection::build(int width, int height, const uint8_t* mask) {
-  tiles_x = (width + TILE_WIDTH - 1) / TILE_WIDTH;
-  tiles_y = (height + TILE_HEIGHT - 1) / TILE_HEIGHT;
-  blocks.assign(static_cast<std::size_t>(tiles_x) * tiles_y, 0);
-  sum.assign(static_cast<std::size_t>(tiles_x + 1) * (tiles_y + 1), 0);
-  active.clear();
-  for (int y = 0; y < tiles_y; y++)
-    for (int x = 0; x < tiles_x; x++) {
-      const std::size_t tile = static_cast<std::size_t>(y) * tiles_x + x;
-      blocks[tile] = wanted_blocks(x, y, width, height, mask);
-      if (blocks[tile]) active.push_back(static_cast<uint32_t>(tile));
-      int32_t* cell = &sum[static_cast<std::size_t>(y + 1) * (tiles_x + 1) + x + 1];
-      cell[0] = cell[-1] + cell[-(tiles_x + 1)] - cell[-(tiles_x + 2)] + (blocks[tile] != 0);
-    }
-}
-
-void TileSelection::restrict(const TileSelection& within, const std::vector<uint32_t>& wanted) {
-  tiles_x = within.tiles_x;
-  tiles_y = within.tiles_y;
-  sum.clear();
-  active.clear();
-  blocks.assign(within.blocks.size(), 0);
-  for (uint32_t tile : within.active) {
-    blocks[tile] = within.blocks[tile] & wanted[tile];
-    if (blocks[tile]) active.push_back(tile);
-  }
-}
-
-bool TileSelection::contains(const TileSelection& other) const {
-  for (std::size_t tile = 0; tile < blocks.size(); tile++)
-    if (other.blocks[tile] & ~blocks[tile]) return false;
-  return true;
-}
-
 class Rasterizer::Claim {
  public:
   explicit Claim(std::atomic<bool>& busy) : busy_(busy) {
     if (busy_.exchange(true))
-      throw std::runtime_error("this Rasterizer is already running in another thread; expected one Rasterizer per camera "
-                               "and thread. Create a second one.");
+      throw std::runtime_error(
+          "this Rasterizer is already running in another thread; expected one Rasterizer per camera "
+          "and thread. Create a second one.");
   }
   ~Claim() { busy_.store(false); }
   Claim(const Claim&) = delete;
@@ -92,7 +35,10 @@ class Rasterizer::Claim {
 };
 
 Rasterizer::Rasterizer()
-    : isa_(active_isa()), project_kernels_(project_kernels()), project_backward_kernels_(project_backward_kernels()), composite_kernels_(composite_kernels()) {}
+    : isa_(active_isa()),
+      project_kernels_(project_kernels()),
+      project_backward_kernels_(project_backward_kernels()),
+      composite_kernels_(composite_kernels()) {}
 Rasterizer::~Rasterizer() = default;
 
 // Stage 1. Results are in visible_ (memory order) and records.
@@ -102,8 +48,11 @@ uint32_t Rasterizer::project(const Scene& scene, const TileSelection& selection,
     chunks_ = std::make_unique<ProjectChunk[]>(chunks);
     chunk_capacity_ = chunks;
   }
-  ProjectJob job{scene.arrays, scene.count, camera_, selection.tiles_x, selection.tiles_y, selection.blocks.data(), selection.sum.data(), records, chunks_.get()};
-  parallel_for(chunks, 1, [&](std::size_t begin, std::size_t end) { project_kernels_.forward[scene.sh_degree](job, begin, end); });
+  ProjectJob job{scene.arrays,         scene.count,       camera_,
+                 selection.tiles_x,    selection.tiles_y, selection.blocks.data(),
+                 selection.sum.data(), records,           chunks_.get()};
+  parallel_for(chunks, 1,
+               [&](std::size_t begin, std::size_t end) { project_kernels_.forward[scene.sh_degree](job, begin, end); });
   uint32_t faults = 0;
   for (std::size_t c = 0; c < chunks; c++) faults |= chunks_[c].faults;
   if (!faults) join_chunks(chunks);
@@ -119,7 +68,8 @@ void Rasterizer::join_chunks(std::size_t chunks) {
   visible_.count = first_visible[chunks];
   visible_.pair_count = first_pair[chunks];
   if (visible_.pair_count >= FROZEN)
-    throw std::length_error("expected fewer than 2^32-1 (Gaussian, tile) pairs, got " + std::to_string(visible_.pair_count) +
+    throw std::length_error("expected fewer than 2^32-1 (Gaussian, tile) pairs, got " +
+                            std::to_string(visible_.pair_count) +
                             ". Are the scales in log units of the scene? Render fewer or smaller Gaussians.");
   visible_.rows.require(visible_.count);
   visible_.pair_offset.require(visible_.count + 1);
@@ -129,7 +79,8 @@ void Rasterizer::join_chunks(std::size_t chunks) {
   parallel_for(chunks, 4, [&](std::size_t begin, std::size_t end) {
     for (std::size_t c = begin; c < end; c++) {
       const ProjectChunk& chunk = chunks_[c];
-      if (chunk.pairs.size) std::memcpy(&visible_.pairs[first_pair[c]], chunk.pairs.data, chunk.pairs.size * sizeof(Pair));
+      if (chunk.pairs.size)
+        std::memcpy(&visible_.pairs[first_pair[c]], chunk.pairs.data, chunk.pairs.size * sizeof(Pair));
       uint32_t pair = static_cast<uint32_t>(first_pair[c]);
       for (uint32_t i = 0; i < chunk.visible; i++) {
         const uint32_t slot = static_cast<uint32_t>(first_visible[c]) + i;
@@ -159,7 +110,8 @@ void Rasterizer::composite(const TileLists& lists, const TileSelection& selectio
   job_.contributed = contributed_.require(lists.size);
   job_.pixel_transmittance = pixel_transmittance_.require(pixels);
   job_.pixel_last = pixel_last_.require(pixels);
-  parallel_for(selection.active.size(), TILE_GRAIN, [&](std::size_t begin, std::size_t end) { composite_kernels_.forward(job_, begin, end); });
+  parallel_for(selection.active.size(), TILE_GRAIN,
+               [&](std::size_t begin, std::size_t end) { composite_kernels_.forward(job_, begin, end); });
   job_tiles_ = selection.active.size();
   lists_ = &lists;
 }
@@ -186,15 +138,20 @@ uint32_t Rasterizer::forward(const Scene& scene, const Camera& camera, const uin
 
 void Rasterizer::freeze(const uint8_t* mask, const uint32_t* active, std::size_t count) {
   const Claim claim(busy_);
-  if (!cached_) throw std::invalid_argument("freeze: expected a forward pass of the whole scene before, got none. Call forward first.");
+  if (!cached_)
+    throw std::invalid_argument(
+        "freeze: expected a forward pass of the whole scene before, got none. Call forward first.");
   for (std::size_t i = 0; i < count; i++)
     if (active[i] >= scene_count_ || (i > 0 && active[i] <= active[i - 1]))
-      throw std::invalid_argument("freeze: active_ids must be strictly ascending rows below " + std::to_string(scene_count_) + ", got " +
-                                  std::to_string(active[i]) + " at index " + std::to_string(i) + ". Sort them and drop duplicates.");
+      throw std::invalid_argument("freeze: active_ids must be strictly ascending rows below " +
+                                  std::to_string(scene_count_) + ", got " + std::to_string(active[i]) + " at index " +
+                                  std::to_string(i) + ". Sort them and drop duplicates.");
   TileSelection wanted;
   wanted.build(camera_.width, camera_.height, mask);
   if (!cached_selection_.contains(wanted))
-    throw std::invalid_argument("freeze: tile_mask has tiles that the cached forward pass did not cover. Run forward with a mask that covers them.");
+    throw std::invalid_argument(
+        "freeze: tile_mask has tiles that the cached forward pass did not cover. Run forward with a mask that covers "
+        "them.");
   mode_ = Mode::none;
   selection_ = std::move(wanted);
   is_active_.resize(scene_count_, 0);
@@ -209,7 +166,9 @@ void Rasterizer::freeze(const uint8_t* mask, const uint32_t* active, std::size_t
 
 // Projects the active rows and leaves their lists over `selection` in active_lists_.
 uint32_t Rasterizer::list_active(const Scene& rows, const TileSelection& selection) {
-  if (!frozen_) throw std::invalid_argument("expected freeze(tile_mask, active_ids) before an active pass, got none since the last forward or commit.");
+  if (!frozen_)
+    throw std::invalid_argument(
+        "expected freeze(tile_mask, active_ids) before an active pass, got none since the last forward or commit.");
   const uint32_t base = static_cast<uint32_t>(scene_count_);
   const uint32_t faults = project(rows, selection, records_.data() + base);
   if (faults) return faults;
@@ -230,7 +189,8 @@ uint32_t Rasterizer::forward_active(const Scene& rows, const Target& target, boo
     touched_.restrict(selection_, touched);
   }
   const TileSelection& wanted = touched_only ? touched_ : selection_;
-  merge_tile_lists(frozen_lists_, active_lists_, wanted.blocks, records_.data(), static_cast<uint32_t>(scene_count_), active_rows_, merged_lists_);
+  merge_tile_lists(frozen_lists_, active_lists_, wanted.blocks, records_.data(), static_cast<uint32_t>(scene_count_),
+                   active_rows_, merged_lists_);
   composite(merged_lists_, wanted, target);
   scene_ = rows;
   mode_ = Mode::active;
@@ -239,7 +199,9 @@ uint32_t Rasterizer::forward_active(const Scene& rows, const Target& target, boo
 
 void Rasterizer::forward_cached(const uint8_t* mask, const Target& target) {
   const Claim claim(busy_);
-  if (!cached_) throw std::invalid_argument("forward_cached: expected a forward pass of the whole scene before, got none. Call forward first.");
+  if (!cached_)
+    throw std::invalid_argument(
+        "forward_cached: expected a forward pass of the whole scene before, got none. Call forward first.");
   TileSelection wanted;
   wanted.build(camera_.width, camera_.height, mask);
   if (!cached_selection_.contains(wanted))
@@ -257,7 +219,8 @@ uint32_t Rasterizer::commit(const Scene& rows) {
   frozen_ = false;
   if (faults) return faults;
   const uint32_t base = static_cast<uint32_t>(scene_count_);
-  merge_tile_lists(frozen_lists_, active_lists_, cached_selection_.blocks, records_.data(), base, active_rows_, merged_lists_);
+  merge_tile_lists(frozen_lists_, active_lists_, cached_selection_.blocks, records_.data(), base, active_rows_,
+                   merged_lists_);
   for (std::size_t e = 0; e < merged_lists_.size; e++) {
     uint32_t& record = merged_lists_.entries[e].record;
     if (record >= base) record = active_rows_[record - base];
@@ -269,8 +232,9 @@ uint32_t Rasterizer::commit(const Scene& rows) {
 
 void Rasterizer::clear_gradients(const GradientArrays& out) const {
   const std::size_t rest = 3 * static_cast<std::size_t>((scene_.sh_degree + 1) * (scene_.sh_degree + 1) - 1);
-  const std::pair<float*, std::size_t> arrays[] = {{out.means, 3},     {out.quats, 4}, {out.scales, 3},   {out.opacities, 1},
-                                                   {out.means2d, 2}, {out.sh0, 3},   {out.shN, rest}};
+  const std::pair<float*, std::size_t> arrays[] = {{out.means, 3},     {out.quats, 4},   {out.scales, 3},
+                                                   {out.opacities, 1}, {out.means2d, 2}, {out.sh0, 3},
+                                                   {out.shN, rest}};
   parallel_for(scene_.count, CLEAR_GRAIN, [&](std::size_t begin, std::size_t end) {
     for (const auto& [data, width] : arrays)
       if (data && width) std::memset(data + begin * width, 0, (end - begin) * width * sizeof(float));
@@ -278,18 +242,28 @@ void Rasterizer::clear_gradients(const GradientArrays& out) const {
 }
 
 // Stages 4 and 5.
-void Rasterizer::differentiate(Mode mode, const float* image_gradient, const float* alpha_gradient, const GradientArrays& out, bool compact) {
+void Rasterizer::differentiate(Mode mode, const float* image_gradient, const float* alpha_gradient,
+                               const GradientArrays& out, bool compact) {
   if (mode_ != mode)
-    throw std::invalid_argument(mode == Mode::full ? "backward: expected a forward pass before, got none (or another pass since)."
-                                                   : "backward_active: expected a forward_active pass before, got none (or another pass since).");
-  const CompositeBackwardJob raster{job_, image_gradient, alpha_gradient, moments_.require(visible_.pair_count * MOMENT_STRIDE)};
-  parallel_for(job_tiles_, TILE_GRAIN, [&](std::size_t begin, std::size_t end) { composite_kernels_.backward(raster, begin, end); });
+    throw std::invalid_argument(
+        mode == Mode::full
+            ? "backward: expected a forward pass before, got none (or another pass since)."
+            : "backward_active: expected a forward_active pass before, got none (or another pass since).");
+  const CompositeBackwardJob raster{job_, image_gradient, alpha_gradient,
+                                    moments_.require(visible_.pair_count * MOMENT_STRIDE)};
+  parallel_for(job_tiles_, TILE_GRAIN,
+               [&](std::size_t begin, std::size_t end) { composite_kernels_.backward(raster, begin, end); });
   if (!compact) clear_gradients(out);
-  const ProjectBackwardJob job{scene_.arrays, camera_, visible_.count, visible_.rows.data(), visible_.pair_offset.data(), moments_.data(), out, compact};
-  parallel_for(visible_.count, BACKWARD_GRAIN, [&](std::size_t begin, std::size_t end) { project_backward_kernels_.backward[scene_.sh_degree](job, begin, end); });
+  const ProjectBackwardJob job{
+      scene_.arrays,   camera_, visible_.count, visible_.rows.data(), visible_.pair_offset.data(),
+      moments_.data(), out,     compact};
+  parallel_for(visible_.count, BACKWARD_GRAIN, [&](std::size_t begin, std::size_t end) {
+    project_backward_kernels_.backward[scene_.sh_degree](job, begin, end);
+  });
 }
 
-void Rasterizer::backward(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out, bool compact) {
+void Rasterizer::backward(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out,
+                          bool compact) {
   const Claim claim(busy_);
   differentiate(Mode::full, image_gradient, alpha_gradient, out, compact);
 }
@@ -300,10 +274,13 @@ void Rasterizer::backward_active(const float* image_gradient, const float* alpha
 }
 
 std::size_t Rasterizer::memory_bytes() const {
-  std::size_t bytes = visible_.bytes() + sort_scratch_.bytes() + contributed_.bytes() + pixel_transmittance_.bytes() + moments_.bytes() +
-                      pixel_last_.bytes() + records_.bytes() + active_rows_.capacity() * sizeof(uint32_t) + is_active_.capacity();
-  for (const TileLists* lists : {&cached_lists_, &frozen_lists_, &active_lists_, &merged_lists_}) bytes += lists->bytes();
-  for (std::size_t c = 0; c < chunk_capacity_; c++) bytes += sizeof(ProjectChunk) + chunks_[c].pairs.capacity * sizeof(Pair);
+  std::size_t bytes = visible_.bytes() + sort_scratch_.bytes() + contributed_.bytes() + pixel_transmittance_.bytes() +
+                      moments_.bytes() + pixel_last_.bytes() + records_.bytes() +
+                      active_rows_.capacity() * sizeof(uint32_t) + is_active_.capacity();
+  for (const TileLists* lists : {&cached_lists_, &frozen_lists_, &active_lists_, &merged_lists_})
+    bytes += lists->bytes();
+  for (std::size_t c = 0; c < chunk_capacity_; c++)
+    bytes += sizeof(ProjectChunk) + chunks_[c].pairs.capacity * sizeof(Pair);
   return bytes;
 }
 

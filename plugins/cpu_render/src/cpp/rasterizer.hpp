@@ -1,7 +1,8 @@
 // The rasteriser of one camera: runs the stages, owns their scratch and, in the incremental mode, the cached scene.
 //
 //   full path         forward -> backward
-//   incremental mode  forward (fills the cache) -> freeze -> { forward_active -> backward_active }* -> commit -> freeze ...
+//   incremental mode  forward (fills the cache) -> freeze -> { forward_active -> backward_active }* -> commit -> freeze
+//   ...
 //
 // The incremental mode gives the same bits as the full path over the same tiles, without any cost that grows with the
 // number of frozen Gaussians. Results do not depend on the number of threads. Not re-entrant: concurrent use of one
@@ -17,21 +18,9 @@
 #include "raster_kernels.hpp"
 #include "raster_types.hpp"
 #include "tile_lists.hpp"
+#include "tile_selection.hpp"
 
 namespace gsstream_cpu {
-
-// Which blocks of which raster tiles are wanted.
-struct TileSelection {
-  int tiles_x = 0, tiles_y = 0;
-  std::vector<uint32_t> blocks;  // [tiles]; never blocks outside the image
-  std::vector<uint32_t> active;  // tiles with any
-  std::vector<int32_t> sum;      // summed-area table of (blocks != 0)
-  // `blocks` of each tile of `within`, limited to `wanted` [tiles]. Leaves `sum` empty.
-  void restrict(const TileSelection& within, const std::vector<uint32_t>& wanted);
-  // mask: [ceil(height/16), ceil(width/16)], or null for everything.
-  void build(int width, int height, const uint8_t* mask);
-  bool contains(const TileSelection& other) const;
-};
 
 struct Scene {
   GaussianArrays arrays{};
@@ -60,7 +49,8 @@ class Rasterizer {
 
   // Ends the life of the arrays given to the last forward; no backward may follow.
   void forget() { mode_ = Mode::none; }
-  // out.means null: only out.means2d is written. Outputs have one row per Gaussian (zero where unseen), or with `compact` one per visible_rows().
+  // out.means null: only out.means2d is written. Outputs have one row per Gaussian (zero where unseen), or with
+  // `compact` one per visible_rows().
   void backward(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out, bool compact);
   // Outputs have one row per active row.
   void backward_active(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out);
@@ -89,7 +79,8 @@ class Rasterizer {
   void join_chunks(std::size_t chunks);
   uint32_t list_active(const Scene& rows, const TileSelection& selection);
   void composite(const TileLists& lists, const TileSelection& selection, const Target& target);
-  void differentiate(Mode mode, const float* image_gradient, const float* alpha_gradient, const GradientArrays& out, bool compact);
+  void differentiate(Mode mode, const float* image_gradient, const float* alpha_gradient, const GradientArrays& out,
+                     bool compact);
   void clear_gradients(const GradientArrays& out) const;
 
   const Isa isa_;  // one object uses one set for life: moments are laid out per set

@@ -36,7 +36,8 @@ struct SceneArrays {
   Scene scene;
 
   SceneArrays() = default;
-  SceneArrays(ConstFloatArray means, ConstFloatArray quats, ConstFloatArray scales, ConstFloatArray opacities, ConstFloatArray sh0, ConstFloatArray shN)
+  SceneArrays(ConstFloatArray means, ConstFloatArray quats, ConstFloatArray scales, ConstFloatArray opacities,
+              ConstFloatArray sh0, ConstFloatArray shN)
       : held{means, quats, scales, opacities, sh0, shN} {
     require(means.ndim() == 2 && shN.ndim() == 3, "means must be [N,3] and shN [N,K-1,3]");
     const std::size_t n = means.shape(0), rest = shN.shape(1);
@@ -54,7 +55,8 @@ struct SceneArrays {
   }
 };
 
-Camera make_camera(const ConstFloatArray& viewmat, const ConstFloatArray& intrinsics, int width, int height, float near) {
+Camera make_camera(const ConstFloatArray& viewmat, const ConstFloatArray& intrinsics, int width, int height,
+                   float near) {
   require_shape(viewmat, {4, 4}, "viewmat");
   require_shape(intrinsics, {3, 3}, "K");
   require(width >= 1 && height >= 1 && width <= 65536 && height <= 65536, "image sides must be 1 to 65536");
@@ -65,7 +67,8 @@ Camera make_camera(const ConstFloatArray& viewmat, const ConstFloatArray& intrin
     c.translation[i] = v[4 * i + 3];
   }
   for (int j = 0; j < 3; j++)
-    c.position[j] = -(c.rotation[j] * c.translation[0] + c.rotation[3 + j] * c.translation[1] + c.rotation[6 + j] * c.translation[2]);
+    c.position[j] = -(c.rotation[j] * c.translation[0] + c.rotation[3 + j] * c.translation[1] +
+                      c.rotation[6 + j] * c.translation[2]);
   c.fx = k[0];
   c.fy = k[4];
   c.cx = k[2];
@@ -90,7 +93,8 @@ const uint8_t* mask_data(const std::optional<ByteArray>& mask, int width, int he
   return mask->data();
 }
 
-Target make_target(const ConstFloatArray& background, const FloatArray& image, const FloatArray& transmittance, int width, int height) {
+Target make_target(const ConstFloatArray& background, const FloatArray& image, const FloatArray& transmittance,
+                   int width, int height) {
   const std::size_t w = static_cast<std::size_t>(width), h = static_cast<std::size_t>(height);
   require_shape(background, {3}, "background");
   require_shape(image, {h, w, 3}, "image");
@@ -101,9 +105,10 @@ Target make_target(const ConstFloatArray& background, const FloatArray& image, c
 
 class PyRasterizer {
  public:
-  uint32_t forward(ConstFloatArray means, ConstFloatArray quats, ConstFloatArray scales, ConstFloatArray opacities, ConstFloatArray sh0,
-                   ConstFloatArray shN, ConstFloatArray viewmat, ConstFloatArray K, int width, int height, float near, ConstFloatArray background,
-                   std::optional<ByteArray> tile_mask, FloatArray image, FloatArray transmittance) {
+  uint32_t forward(ConstFloatArray means, ConstFloatArray quats, ConstFloatArray scales, ConstFloatArray opacities,
+                   ConstFloatArray sh0, ConstFloatArray shN, ConstFloatArray viewmat, ConstFloatArray K, int width,
+                   int height, float near, ConstFloatArray background, std::optional<ByteArray> tile_mask,
+                   FloatArray image, FloatArray transmittance) {
     SceneArrays scene(means, quats, scales, opacities, sh0, shN);
     const Camera camera = make_camera(viewmat, K, width, height, near);
     const uint8_t* mask = mask_data(tile_mask, width, height);
@@ -111,27 +116,31 @@ class PyRasterizer {
     return keep(std::move(scene), [&](const Scene& s) { return rasterizer_.forward(s, camera, mask, target); });
   }
 
-  uint32_t forward_active(ConstFloatArray means, ConstFloatArray quats, ConstFloatArray scales, ConstFloatArray opacities, ConstFloatArray sh0,
-                          ConstFloatArray shN, ConstFloatArray background, FloatArray image, FloatArray transmittance, bool touched_only) {
+  uint32_t forward_active(ConstFloatArray means, ConstFloatArray quats, ConstFloatArray scales,
+                          ConstFloatArray opacities, ConstFloatArray sh0, ConstFloatArray shN,
+                          ConstFloatArray background, FloatArray image, FloatArray transmittance, bool touched_only) {
     SceneArrays rows = active_rows(means, quats, scales, opacities, sh0, shN);
     const Target target = make_target(background, image, transmittance, rasterizer_.width(), rasterizer_.height());
     return keep(std::move(rows), [&](const Scene& s) { return rasterizer_.forward_active(s, target, touched_only); });
   }
 
-  uint32_t commit(ConstFloatArray means, ConstFloatArray quats, ConstFloatArray scales, ConstFloatArray opacities, ConstFloatArray sh0,
-                  ConstFloatArray shN) {
-    return keep(active_rows(means, quats, scales, opacities, sh0, shN), [&](const Scene& s) { return rasterizer_.commit(s); });
+  uint32_t commit(ConstFloatArray means, ConstFloatArray quats, ConstFloatArray scales, ConstFloatArray opacities,
+                  ConstFloatArray sh0, ConstFloatArray shN) {
+    return keep(active_rows(means, quats, scales, opacities, sh0, shN),
+                [&](const Scene& s) { return rasterizer_.commit(s); });
   }
 
-  void forward_cached(ConstFloatArray background, std::optional<ByteArray> tile_mask, FloatArray image, FloatArray transmittance) {
+  void forward_cached(ConstFloatArray background, std::optional<ByteArray> tile_mask, FloatArray image,
+                      FloatArray transmittance) {
     const uint8_t* mask = mask_data(tile_mask, rasterizer_.width(), rasterizer_.height());
     const Target target = make_target(background, image, transmittance, rasterizer_.width(), rasterizer_.height());
     const nb::gil_scoped_release release;
     rasterizer_.forward_cached(mask, target);
   }
 
-  void backward(ConstFloatArray v_image, std::optional<ConstFloatArray> v_alpha, FloatArray v_means, FloatArray v_quats, FloatArray v_scales,
-                FloatArray v_opacities, FloatArray v_sh0, FloatArray v_shN, FloatArray v_means2d, bool compact) {
+  void backward(ConstFloatArray v_image, std::optional<ConstFloatArray> v_alpha, FloatArray v_means, FloatArray v_quats,
+                FloatArray v_scales, FloatArray v_opacities, FloatArray v_sh0, FloatArray v_shN, FloatArray v_means2d,
+                bool compact) {
     const std::size_t rows = compact ? rasterizer_.visible().count : current_.scene.count;
     const GradientArrays out = gradients(rows, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN, v_means2d);
     const float* alpha = upstream(v_image, v_alpha);
@@ -153,9 +162,11 @@ class PyRasterizer {
     current_ = {};
   }
 
-  void backward_active(ConstFloatArray v_image, std::optional<ConstFloatArray> v_alpha, FloatArray v_means, FloatArray v_quats, FloatArray v_scales,
-                       FloatArray v_opacities, FloatArray v_sh0, FloatArray v_shN, FloatArray v_means2d) {
-    const GradientArrays out = gradients(rasterizer_.active_count(), v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN, v_means2d);
+  void backward_active(ConstFloatArray v_image, std::optional<ConstFloatArray> v_alpha, FloatArray v_means,
+                       FloatArray v_quats, FloatArray v_scales, FloatArray v_opacities, FloatArray v_sh0,
+                       FloatArray v_shN, FloatArray v_means2d) {
+    const GradientArrays out =
+        gradients(rasterizer_.active_count(), v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN, v_means2d);
     const float* alpha = upstream(v_image, v_alpha);
     const nb::gil_scoped_release release;
     rasterizer_.backward_active(v_image.data(), alpha, out);
@@ -187,15 +198,16 @@ class PyRasterizer {
     return faults;
   }
 
-  SceneArrays active_rows(ConstFloatArray means, ConstFloatArray quats, ConstFloatArray scales, ConstFloatArray opacities, ConstFloatArray sh0,
-                          ConstFloatArray shN) const {
+  SceneArrays active_rows(ConstFloatArray means, ConstFloatArray quats, ConstFloatArray scales,
+                          ConstFloatArray opacities, ConstFloatArray sh0, ConstFloatArray shN) const {
     SceneArrays rows(means, quats, scales, opacities, sh0, shN);
     require(rows.scene.count == rasterizer_.active_count(), "expected one row per active id");
     return rows;
   }
 
-  GradientArrays gradients(std::size_t n, const FloatArray& means, const FloatArray& quats, const FloatArray& scales, const FloatArray& opacities,
-                           const FloatArray& sh0, const FloatArray& shN, const FloatArray& means2d) const {
+  GradientArrays gradients(std::size_t n, const FloatArray& means, const FloatArray& quats, const FloatArray& scales,
+                           const FloatArray& opacities, const FloatArray& sh0, const FloatArray& shN,
+                           const FloatArray& means2d) const {
     const std::size_t degree = static_cast<std::size_t>(current_.scene.sh_degree), bases = (degree + 1) * (degree + 1);
     require_shape(means, {n, 3}, "v_means");
     require_shape(quats, {n, 4}, "v_quats");
@@ -209,7 +221,8 @@ class PyRasterizer {
 
   const float* upstream(const ConstFloatArray& v_image, const std::optional<ConstFloatArray>& v_alpha) const {
     if (rasterizer_.width() == 0) throw std::invalid_argument("backward: expected a forward pass before, got none.");
-    const std::size_t w = static_cast<std::size_t>(rasterizer_.width()), h = static_cast<std::size_t>(rasterizer_.height());
+    const std::size_t w = static_cast<std::size_t>(rasterizer_.width()),
+                      h = static_cast<std::size_t>(rasterizer_.height());
     require_shape(v_image, {h, w, 3}, "v_image");
     if (v_alpha) require_shape(*v_alpha, {h, w}, "v_alpha");
     return v_alpha ? v_alpha->data() : nullptr;
@@ -226,24 +239,32 @@ static auto strict(const char* name) { return nb::arg(name).noconvert(); }
 
 #define GSS_SCENE strict("means"), strict("quats"), strict("scales"), strict("opacities"), strict("sh0"), strict("shN")
 #define GSS_TARGET strict("image"), strict("transmittance")
-#define GSS_GRADIENTS \
-  strict("v_means"), strict("v_quats"), strict("v_scales"), strict("v_opacities"), strict("v_sh0"), strict("v_shN"), strict("v_means2d")
+#define GSS_GRADIENTS                                                                                                \
+  strict("v_means"), strict("v_quats"), strict("v_scales"), strict("v_opacities"), strict("v_sh0"), strict("v_shN"), \
+      strict("v_means2d")
 
 void bind_rasterizer(nb::module_& module) {
   module.attr("FAULT_NOT_FINITE") = static_cast<uint32_t>(FAULT_NOT_FINITE);
   module.attr("FAULT_QUATERNION") = static_cast<uint32_t>(FAULT_QUATERNION);
-  nb::class_<PyRasterizer>(module, "Rasterizer", "Rasteriser of one camera; see gsstream_cpu_render.rasterizer for the checked interface.")
+  nb::class_<PyRasterizer>(module, "Rasterizer",
+                           "Rasteriser of one camera; see gsstream_cpu_render.rasterizer for the checked interface.")
       .def(nb::init<>())
-      .def("forward", &PyRasterizer::forward, GSS_SCENE, strict("viewmat"), strict("K"), nb::arg("width"), nb::arg("height"), nb::arg("near"), strict("background"),
-           strict("tile_mask").none(), GSS_TARGET, "Returns FAULT_* bits; 0 means rendered.")
-      .def("backward", &PyRasterizer::backward, strict("v_image"), strict("v_alpha").none(), GSS_GRADIENTS, nb::arg("compact"))
-      .def("backward_screen", &PyRasterizer::backward_screen, strict("v_image"), strict("v_means2d"), "Gradient of the 2-D means only.")
+      .def("forward", &PyRasterizer::forward, GSS_SCENE, strict("viewmat"), strict("K"), nb::arg("width"),
+           nb::arg("height"), nb::arg("near"), strict("background"), strict("tile_mask").none(), GSS_TARGET,
+           "Returns FAULT_* bits; 0 means rendered.")
+      .def("backward", &PyRasterizer::backward, strict("v_image"), strict("v_alpha").none(), GSS_GRADIENTS,
+           nb::arg("compact"))
+      .def("backward_screen", &PyRasterizer::backward_screen, strict("v_image"), strict("v_means2d"),
+           "Gradient of the 2-D means only.")
       .def("forget", &PyRasterizer::forget, "Drop the arrays kept for backward.")
       .def("freeze", &PyRasterizer::freeze, strict("tile_mask").none(), strict("active_ids"))
-      .def("forward_active", &PyRasterizer::forward_active, GSS_SCENE, strict("background"), GSS_TARGET, nb::arg("touched_only"))
-      .def("backward_active", &PyRasterizer::backward_active, strict("v_image"), strict("v_alpha").none(), GSS_GRADIENTS)
+      .def("forward_active", &PyRasterizer::forward_active, GSS_SCENE, strict("background"), GSS_TARGET,
+           nb::arg("touched_only"))
+      .def("backward_active", &PyRasterizer::backward_active, strict("v_image"), strict("v_alpha").none(),
+           GSS_GRADIENTS)
       .def("commit", &PyRasterizer::commit, GSS_SCENE)
-      .def("forward_cached", &PyRasterizer::forward_cached, strict("background"), strict("tile_mask").none(), GSS_TARGET)
+      .def("forward_cached", &PyRasterizer::forward_cached, strict("background"), strict("tile_mask").none(),
+           GSS_TARGET)
       .def("visible_rows", &PyRasterizer::visible_rows, strict("out"))
       .def_prop_ro("visible_count", [](const PyRasterizer& r) { return r.rasterizer().visible().count; })
       .def_prop_ro("active_count", [](const PyRasterizer& r) { return r.rasterizer().active_count(); })

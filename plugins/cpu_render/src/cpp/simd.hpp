@@ -30,8 +30,16 @@ typedef int32_t Ints __attribute__((vector_size(4 * LANES)));
 
 GSS_INLINE Floats broadcast(float x) { return x - Floats{}; }
 GSS_INLINE Ints broadcast(int32_t x) { return x - Ints{}; }
-GSS_INLINE Floats load(const float* p) { Floats r; std::memcpy(&r, p, sizeof r); return r; }
-GSS_INLINE Ints load(const int32_t* p) { Ints r; std::memcpy(&r, p, sizeof r); return r; }
+GSS_INLINE Floats load(const float* p) {
+  Floats r;
+  std::memcpy(&r, p, sizeof r);
+  return r;
+}
+GSS_INLINE Ints load(const int32_t* p) {
+  Ints r;
+  std::memcpy(&r, p, sizeof r);
+  return r;
+}
 GSS_INLINE void store(float* p, Floats v) { std::memcpy(p, &v, sizeof v); }
 GSS_INLINE void store(int32_t* p, Ints v) { std::memcpy(p, &v, sizeof v); }
 

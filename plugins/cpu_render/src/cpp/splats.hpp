@@ -11,13 +11,13 @@ namespace gsstream_cpu::GSS_ISA {
 struct Splats {
   Floats mean[3], quat[4], scale[3], opacity;  // activated: unit quaternion, linear scale, opacity in (0,1)
   Floats quat_inverse_norm, quat_norm2;
-  Ints largest;                                // largest_magnitude of the raw geometry
-  Floats view[3], inverse_z, x_slope, y_slope; // camera space; slopes x/z, y/z limited as above
-  Mask x_free, y_free;                         // where the slope was not limited
+  Ints largest;                                 // largest_magnitude of the raw geometry
+  Floats view[3], inverse_z, x_slope, y_slope;  // camera space; slopes x/z, y/z limited as above
+  Mask x_free, y_free;                          // where the slope was not limited
   Floats rotation[9];
-  Floats axes[6];                              // 2x3: Jacobian * camera rotation * rotation (without scale)
-  Floats xx, xy, yy, inverse_det;              // 2-D covariance with blur
-  Floats direction[3], inverse_distance;       // from the camera centre
+  Floats axes[6];                         // 2x3: Jacobian * camera rotation * rotation (without scale)
+  Floats xx, xy, yy, inverse_det;         // 2-D covariance with blur
+  Floats direction[3], inverse_distance;  // from the camera centre
 };
 
 // Transposes rows of `width` floats: out[c] lane l = source[rows[l]*width + c].
@@ -107,7 +107,8 @@ GSS_INLINE void covariance_2d(const Camera& camera, Splats& s) {
 }
 
 GSS_INLINE void view_direction(const Camera& camera, Splats& s) {
-  const Floats x = s.mean[0] - camera.position[0], y = s.mean[1] - camera.position[1], z = s.mean[2] - camera.position[2];
+  const Floats x = s.mean[0] - camera.position[0], y = s.mean[1] - camera.position[1],
+               z = s.mean[2] - camera.position[2];
   s.inverse_distance = 1.0f / sqrt(max(x * x + y * y + z * z, broadcast(1e-20f)));
   s.direction[0] = x * s.inverse_distance;
   s.direction[1] = y * s.inverse_distance;
@@ -121,7 +122,8 @@ struct Harmonics {
 
 // Colours before the cut at zero.
 template <int K>
-GSS_INLINE void evaluate_color(const GaussianArrays& in, const uint32_t* rows, const Splats& s, Harmonics<K>& sh, Floats* color) {
+GSS_INLINE void evaluate_color(const GaussianArrays& in, const uint32_t* rows, const Splats& s, Harmonics<K>& sh,
+                               Floats* color) {
   gather_rows<3>(in.sh0, rows, sh.coefficients);
   if constexpr (K > 1) gather_rows<3 * (K - 1)>(in.shN, rows, sh.coefficients + 3);
   sh_basis<K>(s.direction, sh.basis);

@@ -22,7 +22,8 @@ void for_pairs(const VisibleSet& visible, Slice slice, Visit&& visit) {
   for (std::size_t i = slice.begin; i < slice.end; i++) {
     const uint32_t slot = visible.by_depth[i].slot;
     if (i + PREFETCH < slice.end) __builtin_prefetch(&visible.pair_offset[visible.by_depth[i + PREFETCH].slot]);
-    for (uint32_t p = visible.pair_offset[slot]; p < visible.pair_offset[slot + 1]; p++) visit(visible.pairs[p], slot, p);
+    for (uint32_t p = visible.pair_offset[slot]; p < visible.pair_offset[slot + 1]; p++)
+      visit(visible.pairs[p], slot, p);
   }
 }
 
@@ -73,8 +74,8 @@ void build_tile_lists(const VisibleSet& visible, std::size_t tiles, uint32_t rec
   });
 }
 
-void filter_tile_lists(const TileLists& from, const std::vector<uint32_t>& tile_blocks, const std::vector<uint8_t>& is_active, TileLists& out,
-                       std::vector<uint32_t>& dropped) {
+void filter_tile_lists(const TileLists& from, const std::vector<uint32_t>& tile_blocks,
+                       const std::vector<uint8_t>& is_active, TileLists& out, std::vector<uint32_t>& dropped) {
   std::size_t most = 0;
   for (std::size_t tile = 0; tile < from.tiles; tile++)
     if (tile_blocks[tile]) most += from.offset[tile + 1] - from.offset[tile];
@@ -103,13 +104,15 @@ void add_touched_blocks(const TileLists& lists, std::vector<uint32_t>& touched) 
     for (uint32_t e = lists.offset[tile]; e < lists.offset[tile + 1]; e++) touched[tile] |= lists.blocks[e];
 }
 
-void merge_tile_lists(const TileLists& frozen, const TileLists& active, const std::vector<uint32_t>& tile_blocks, const Record* records,
-                      uint32_t record_base, const std::vector<uint32_t>& active_rows, TileLists& out) {
+void merge_tile_lists(const TileLists& frozen, const TileLists& active, const std::vector<uint32_t>& tile_blocks,
+                      const Record* records, uint32_t record_base, const std::vector<uint32_t>& active_rows,
+                      TileLists& out) {
   out.resize(frozen.tiles, frozen.size + active.size);
   uint32_t total = 0;
   for (std::size_t tile = 0; tile < frozen.tiles; tile++) {
     out.offset[tile] = total;
-    if (tile_blocks[tile]) total += frozen.offset[tile + 1] - frozen.offset[tile] + active.offset[tile + 1] - active.offset[tile];
+    if (tile_blocks[tile])
+      total += frozen.offset[tile + 1] - frozen.offset[tile] + active.offset[tile + 1] - active.offset[tile];
   }
   out.offset[frozen.tiles] = total;
   out.size = total;

@@ -34,17 +34,18 @@ struct TileLists {
 // Distributes the pairs of a depth-sorted visible set. record = record_base + row.
 void build_tile_lists(const VisibleSet& visible, std::size_t tiles, uint32_t record_base, TileLists& out);
 
-// Entries of `from` in wanted tiles whose Gaussian is not marked in is_active, all FROZEN. `dropped` [tiles] becomes the
-// union of the blocks of those that are.
-void filter_tile_lists(const TileLists& from, const std::vector<uint32_t>& tile_blocks, const std::vector<uint8_t>& is_active, TileLists& out,
-                       std::vector<uint32_t>& dropped);
+// Entries of `from` in wanted tiles whose Gaussian is not marked in is_active, all FROZEN. `dropped` [tiles] becomes
+// the union of the blocks of those that are.
+void filter_tile_lists(const TileLists& from, const std::vector<uint32_t>& tile_blocks,
+                       const std::vector<uint8_t>& is_active, TileLists& out, std::vector<uint32_t>& dropped);
 
 // Adds the blocks of the entries of every tile to `touched` [tiles].
 void add_touched_blocks(const TileLists& lists, std::vector<uint32_t>& touched);
 
 // Merges two depth-sorted families of lists by (depth, row), in wanted tiles. Entries of `frozen` refer to
 // record = row; those of `active` to record = record_base + index into active_rows.
-void merge_tile_lists(const TileLists& frozen, const TileLists& active, const std::vector<uint32_t>& tile_blocks, const Record* records,
-                      uint32_t record_base, const std::vector<uint32_t>& active_rows, TileLists& out);
+void merge_tile_lists(const TileLists& frozen, const TileLists& active, const std::vector<uint32_t>& tile_blocks,
+                      const Record* records, uint32_t record_base, const std::vector<uint32_t>& active_rows,
+                      TileLists& out);
 
 }  // namespace gsstream_cpu

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.rng import Rng
-from gsstream.init.seeding import fill_volume, thin_points
+from gsstream.init.seeding import fill_volume, photo_consistent_seeds, thin_points
 from gsstream.recipe.model import FirstFrame
 from gsstream.source.base import FrameSource
 
 #: Fewer points than this cannot carry a scene: "auto" then asks triangulation for more.
 SPARSE = 500
+SWEEP_WIDTH = 160
 
 
 def gather_points(source: FrameSource, frame: Frame, settings: FirstFrame, rng: Rng) -> PointCloud:
@@ -50,6 +53,8 @@ def _base_points(source: FrameSource, frame: Frame, settings: FirstFrame) -> Poi
     empty = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), "none")
     if settings.points == "sfm":
         return _triangulate(frame)
+    if settings.points == "sweep":
+        return _sweep(frame, settings)
     shipped = source.points("sparse" if settings.points == "sparse" else "recording")
     if shipped is not None:
         return shipped
@@ -68,6 +73,19 @@ def _base_points(source: FrameSource, frame: Frame, settings: FirstFrame) -> Poi
 
 
 def _triangulate(frame: Frame) -> PointCloud:
-    from gsstream.init.sfm import triangulate
+    from gsstream.init.sfm import triangulate_points
 
-    return triangulate(frame.images, frame.cameras)
+    return triangulate_points(frame.images, frame.cameras)
+
+
+def _sweep(frame: Frame, settings: FirstFrame) -> PointCloud:
+    """Points that several training views agree on, found at most SWEEP_WIDTH pixels wide (time grows with pixels)."""
+    images, cameras = frame.images, frame.cameras
+    factor = -(-cameras.width // SWEEP_WIDTH)
+    if factor > 1:
+        height, width = cameras.height // factor, cameras.width // factor
+        cut = images[:, : height * factor, : width * factor]
+        images = cut.reshape(len(cameras), height, factor, width, factor, 3).mean((2, 4), dtype=np.float32)
+        # The crop keeps the image corner, so only the size changes before the scale does.
+        cameras = replace(cameras, width=width * factor, height=height * factor).scaled(width, height)
+    return photo_consistent_seeds(images, cameras, settings.max_points).points

@@ -31,8 +31,10 @@ class FirstFrame(Section):
     epochs: int = Field(default=250, ge=0, description="passes over the training cameras (paper: 250)")
     max_iterations: int = Field(default=4000, ge=0, description="upper bound on epochs * cameras (released code: 4000)")
     sh_degree: int = Field(default=2, ge=0, le=3, description="degree of the spherical harmonics (paper's code: 2)")
-    points: Literal["auto", "recording", "sparse", "sfm"] = Field(
-        default="auto", description="auto: the recording's points, else triangulation; sparse: its thinned set"
+    points: Literal["auto", "recording", "sparse", "sfm", "sweep"] = Field(
+        default="auto",
+        description="auto: the recording's points, else triangulation; sparse: the recording's thinned set; "
+        "sfm: triangulation; sweep: points that several views agree on (plane sweep, ours)",
     )
     max_points: int = Field(default=40_000, ge=1, description="points kept before the structure seeds anchors")
     fill_points: int = Field(default=20_000, ge=0, description="random seeds in uncovered common view volume (ours)")

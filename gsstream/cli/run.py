@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +10,7 @@ import typer
 
 if TYPE_CHECKING:
     from gsstream.engine.session import RunResult
+    from gsstream.source.base import FrameSource
 
 
 def run(
@@ -41,7 +43,8 @@ def run(
 ) -> None:
     """Encode a recording as a stream of 3D Gaussians.
 
-    The recipe of the run is the method's, changed by --recipe FILE, then by --set and the short options.
+    The recipe of the run is the method's, changed by --recipe FILE, then by --set and the short options. Ctrl-C ends
+    after the current frame with a valid stream (exit code 130); --resume continues it to the same bytes.
     """
     from gsstream.engine.output import prepare_output
     from gsstream.plugins.catalog import load_catalog
@@ -54,26 +57,37 @@ def run(
     resolved = resolve_recipe(method, catalog.recipe_path, recipe, overrides)
     # The slow imports come last, so that a mistake on the command line is answered at once.
     from gsstream.engine.assemble import assemble
+    from gsstream.engine.recording import open_recording
     from gsstream.engine.session import run as run_session
 
     assembly = assemble(resolved, catalog)
-    prepare_output(out, resume=resume, overwrite=overwrite)
-    result = run_session(assembly, source, out, resume=resume, quiet=quiet, first_frame=first_frame)
-    _pictures(result, source, assembly.recipe.scale, video=not no_video, quiet=quiet)
+    # Opened before the folder is touched: --overwrite must not delete a run for the sake of a recording that is faulty.
+    recording = open_recording(source, assembly.recipe.scale, catalog)
+    try:
+        prepare_output(out, resume=resume, overwrite=overwrite)
+        result = run_session(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first_frame)
+        slow = assembly.recipe.renderer.name == "reference"
+        _pictures(result, recording, video=not no_video, quiet=quiet, warned=slow)
+    finally:
+        recording.close()
+    if result.interrupted:
+        raise typer.Exit(130)
 
 
-def _pictures(result: RunResult, uri: str, scale: float, *, video: bool, quiet: bool) -> None:
-    """Contact sheet, plots, summary and video of what was written, and where to find them."""
-    from gsstream.source.open import open_source
+def _pictures(result: RunResult, recording: FrameSource, *, video: bool, quiet: bool, warned: bool) -> None:
+    """Contact sheet, plots, summary and video of what was written, and where to find them.
+
+    ``warned``: the run has said already that nothing fast renders here; the player need not say it again.
+    """
+    from gsstream.player.render import SlowRendererWarning
     from gsstream.trade.gallery import SUMMARY, write_gallery
 
     if result.frames == 0:
         return
-    source = open_source(uri, scale)
-    try:
-        written = write_gallery(result.out, source, video=video)
-    finally:
-        source.close()
+    with warnings.catch_warnings():
+        if warned:
+            warnings.simplefilter("ignore", SlowRendererWarning)
+        written = write_gallery(result.out, recording, video=video)
     if not quiet:
         typer.echo((result.out / SUMMARY).read_text(encoding="utf-8").rstrip())
         typer.echo("\n".join(f"wrote {path}" for path in (result.out / "stream.gss", *written)))

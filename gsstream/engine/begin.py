@@ -91,7 +91,7 @@ def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMe
 
 
 def own_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
-    """The grid this method's structure would lay over the scene; each Gaussian gets the level of the nearest cell size."""
+    """The grid this method's structure would lay; each Gaussian gets the level of the nearest cell size."""
     theirs = decoded_anchors(first)
     cloud = PointCloud(first.gaussians.means, np.full_like(first.gaussians.means, 0.5), "frame 0 of another stream")
     with guarded("structure", parts.structure, frame.index):

@@ -50,7 +50,7 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> S
     clock.append(time.perf_counter())
     decoders = {**state.decoders, **{name: torch.from_numpy(value) for name, value in player.decoders.items()}}
     after = replace(state, player=player, previous=frame, decoders=decoders, gate_moments=solution.gate_moments)
-    metrics = step_metrics(parts, delta, after, packet, solution, active)
+    metrics = step_metrics(delta, after, packet, solution, active)
     metrics["seconds"] = dict(zip(("confidence", "optimise", "code"), np.diff(clock).tolist(), strict=True))
     return Step(after, packet, "empty" if delta.is_empty else "delta", metrics)
 
@@ -103,7 +103,7 @@ def encode(delta: Delta, state: StreamState, index: int) -> EncodedPacket:
 
 
 def step_metrics(
-    parts: Assembly, delta: Delta, after: StreamState, packet: EncodedPacket, solution: Solution, active: torch.Tensor
+    delta: Delta, after: StreamState, packet: EncodedPacket, solution: Solution, active: torch.Tensor
 ) -> dict[str, object]:
     """Numbers of one frame step that need no rendering."""
     counts = after.player.layout.node_counts

@@ -21,5 +21,9 @@ def guarded(slot: str, part: Part, frame: int | None) -> Iterator[None]:
         module = type(part).__module__.partition(".")[0]
         distribution = packages_distributions().get(module, [module])[0]
         raise ComponentError(
-            f"{type(error).__name__}: {error}", slot=slot, part=type(part).__name__, distribution=distribution, frame=frame
+            f"{type(error).__name__}: {error}",
+            slot=slot,
+            part=type(part).__name__,
+            distribution=distribution,
+            frame=frame,
         ) from error

@@ -53,7 +53,7 @@ class HeldOut:
         """[H, W, 3] decoded image in [0, 1]."""
         with torch.no_grad():
             output = self._renderer.render(state.gaussians, frame.cameras, view, self._background)
-        return np.clip(output.image.numpy(), 0, 1)
+        return np.asarray(np.clip(output.image.numpy(), 0, 1))
 
     def _moving(self, image: FloatArray, truth: FloatArray, view: int) -> float | None:
         if self._first is None or not self._sigma:

@@ -97,14 +97,23 @@ class _FrameRun:
         seen = self.exposure.apply(view, raw) if self.exposure else raw
         value, gradient = parts.loss.evaluate(seen, self.targets[view], parts.recipe.loss.dssim)
         upstream = self.exposure.pull(view, gradient) if self.exposure else gradient
-        penalties = list(self._penalty(gate).values())
+        learning = fraction >= parts.recipe.gate_training.warmup
+        penalties = list(self._penalty(gate).values()) if learning else []
         roots = [output.image, *(p for p in penalties if p.requires_grad)]
         torch.autograd.backward(roots, [upstream, *[None] * (len(roots) - 1)])
-        for table in (self.latents, self.decoders, self.gate):
+        for table in (self.latents, self.decoders):
             table.step()
-        bounded = parts.gate.bound(GateState(self.gate["logits"].detach())).logits
-        self.gate["logits"].data.copy_(bounded)
+        self._step_gates(learning)
         return value
+
+    def _step_gates(self, learning: bool) -> None:
+        """Move the logits and keep them in their bounds; before the warm-up ends, drop what they felt."""
+        if not learning:
+            self.gate["logits"].grad = None
+            return
+        self.gate.step()
+        bounded = self.parts.gate.bound(GateState(self.gate["logits"].detach())).logits
+        self.gate["logits"].data.copy_(bounded)
 
     def _rows(self, gates: torch.Tensor, fraction: float) -> Gaussians[torch.Tensor]:
         per_row = gates[self.hierarchy.node_of]

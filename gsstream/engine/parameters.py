@@ -38,7 +38,9 @@ class AdamTable:
 
     def moments(self, name: str) -> dict[str, torch.Tensor]:
         """Adam state of one leaf; empty before the first step."""
-        return {} if self._adam is None else {k: v.clone() for k, v in self._adam.state.get(self.leaves[name], {}).items()}
+        if self._adam is None:
+            return {}
+        return {key: value.clone() for key, value in self._adam.state.get(self.leaves[name], {}).items()}
 
     def load_moments(self, name: str, moments: Mapping[str, torch.Tensor]) -> None:
         """Continue from moments saved by :meth:`moments`; an empty mapping starts fresh."""

@@ -63,7 +63,8 @@ class RunProgress:
     def say(self, line: str) -> None:
         """One plain line, unless quiet."""
         if not self._quiet:
-            (self._bar.console if self._bar else self._console).print(line, highlight=False, markup=False, soft_wrap=True)
+            console = self._bar.console if self._bar else self._console
+            console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def frame_line(metrics: Mapping[str, Any], total: int) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from gsstream.core.errors import OutputError, PacketError
@@ -13,8 +14,9 @@ from gsstream.core.rng import Rng
 from gsstream.engine.assemble import Assembly
 from gsstream.engine.begin import decoded_anchors, exposure_from_meta
 from gsstream.engine.stream_state import StreamState
-from gsstream.packet import PacketKind, PlayerState, StreamReader, decode_packet
-from gsstream.source.base import FrameSource
+from gsstream.packet import PacketKind, PlayerState, StreamMeta, StreamReader, decode_packet
+from gsstream.packet.base import FILE_HEADER
+from gsstream.source.base import FrameSource, SourceInfo
 
 
 def resume_state(
@@ -22,9 +24,11 @@ def resume_state(
 ) -> StreamState | None:
     """Encoder state after the last complete packet of a stream; None when not even frame 0 is complete.
 
-    Raises OutputError when the recipe is not the one the stream was written with, or carries state that a stream does
-    not hold (gate moments across frames).
+    Raises OutputError when the recipe or the recording is not the one the stream was written with, or when the recipe
+    carries state that a stream does not hold (gate moments across frames).
     """
+    if path.stat().st_size < FILE_HEADER.size:
+        return None
     if parts.recipe.gate_training.optimiser == "persistent":
         raise OutputError(
             "gate_training.optimiser = 'persistent' carries Adam moments that no stream holds: such a run cannot be "
@@ -33,8 +37,11 @@ def resume_state(
     with StreamReader(path) as reader:
         if not reader.frames or reader.frames[0].kind != PacketKind.KEY:
             return None
+        # Before the replay: other parts would fail over a stream that is not theirs, and say something else.
+        meta = decode_packet(None, reader.read(reader.frames[0])).meta
+        _check_recipe(parts, meta)
+        _check_recording(source.info, meta)
         state = _replay(parts, reader, rng)
-    _check_recipe(parts, state.player)
     frame = source.frame(state.player.frame, "train")
     return replace(state, previous=replace(frame, cameras=replace(frame.cameras, near=near)))
 
@@ -75,8 +82,8 @@ def rebuild_hierarchy(parts: Assembly, player: PlayerState) -> Hierarchy:
     return parts.structure.build(player.gaussians.map(torch.from_numpy), decoded_anchors(player))
 
 
-def _check_recipe(parts: Assembly, player: PlayerState) -> None:
-    old, new = dict(player.meta.recipe), parts.recipe.model_dump(mode="json")
+def _check_recipe(parts: Assembly, meta: StreamMeta) -> None:
+    old, new = dict(meta.recipe), parts.recipe.model_dump(mode="json")
     # The number of frames may grow: it decides where a run ends, not what its packets hold.
     changed = sorted(key for key in new if key != "frames" and old.get(key) != new[key])
     if changed:
@@ -84,3 +91,13 @@ def _check_recipe(parts: Assembly, player: PlayerState) -> None:
             f"the stream was written with another recipe: {', '.join(changed)} differ; resume with the same recipe "
             "(recipe.yaml beside the stream) or start again with --overwrite"
         )
+
+
+def _check_recording(info: SourceInfo, meta: StreamMeta) -> None:
+    for split, new, old in (("training", info.train, meta.train), ("test", info.test, meta.test)):
+        same = new.ids == old.ids and (new.width, new.height) == (old.width, old.height)
+        if not same or not np.allclose(new.viewmats, old.viewmats, atol=1e-6) or not np.allclose(new.Ks, old.Ks):
+            raise OutputError(
+                f"the stream was made from the recording {meta.source!r} ({meta.extra.get('source_uri', 'unknown')}), "
+                f"whose {split} cameras are not those of {info.name!r} ({info.uri}); resume with the same --source"
+            )

@@ -64,7 +64,8 @@ def neighbour_distance(positions: torch.Tensor, block: int = 2048) -> torch.Tens
     k = min(4, count)
     if k < 2:
         return torch.full((count,), 0.01)
-    parts = [torch.cdist(rows, positions).topk(k, largest=False).values[:, 1:] for rows in positions.split(block)]
+    blocks = torch.split(positions, block)
+    parts = [torch.cdist(rows, positions).topk(k, largest=False).values[:, 1:] for rows in blocks]
     return torch.cat(parts).square().mean(1).sqrt()
 
 
@@ -148,7 +149,7 @@ class _RootRun:
         seen = self.exposure.exposure.apply(view, raw) if self.exposure else raw
         value, gradient = self.loss.evaluate(seen, self.targets[view], weight)
         upstream = self.exposure.exposure.pull(view, gradient) if self.exposure else gradient
-        image.backward(upstream)
+        torch.autograd.backward(image, upstream)
         self._penalise()
         if self.exposure:
             self.exposure = self.exposure.step(view, raw, gradient, lr=0.005, pull=1e-3)

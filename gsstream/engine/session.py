@@ -6,7 +6,7 @@ import json
 import signal
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.errors import OutputError
+from gsstream.core.errors import SourceError
 from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
 from gsstream.engine.assemble import Assembly
@@ -31,7 +31,6 @@ from gsstream.metrics import peak_memory_mb
 from gsstream.packet import StreamMeta, StreamReader, StreamWriter, decode_packet
 from gsstream.recipe.save import save_resolved
 from gsstream.source.base import FrameSource, SourceInfo
-from gsstream.source.open import open_source
 from gsstream.source.prefetch import Prefetcher
 
 STREAM, METRICS, RECIPE = "stream.gss", "metrics.jsonl", "recipe.yaml"
@@ -48,7 +47,7 @@ class RunResult:
 
 def run(
     parts: Assembly,
-    source_uri: str,
+    source: FrameSource,
     out: Path,
     *,
     resume: bool = False,
@@ -59,18 +58,14 @@ def run(
     """Encode a recording into ``out`` (stream.gss, metrics.jsonl, recipe.yaml).
 
     Arguments:
-        source_uri: what ``--source`` takes.
+        source: an open recording (``engine.recording.open_recording``) at the recipe's scale; the caller closes it.
         out: a prepared output folder.
         resume: continue the run that ``out`` holds; the recipe must be the same.
         measure: render and compare the test cameras of every frame.
         first_frame: another stream whose frame 0 is taken over instead of being reconstructed again.
     """
-    source = open_source(source_uri, parts.recipe.scale)
-    try:
-        with _one_torch_thread():
-            return _Run(parts, source, out, quiet, measure, first_frame).encode(resume)
-    finally:
-        source.close()
+    with _one_torch_thread():
+        return _Run(parts, source, out, quiet, measure, first_frame).encode(resume)
 
 
 class _Run:
@@ -93,17 +88,19 @@ class _Run:
         if state is None:
             save_resolved(self.out / RECIPE, self.parts.resolved)
         last = None if state is None else state.player.frame
+        # Also when resuming finds no complete frame 0: what a kill left of it is cut off and frame 0 starts again.
         writer = StreamWriter.open(
-            self.out / STREAM, resume=state is not None, last_frame=last, fsync=self.parts.recipe.codec.fsync
+            self.out / STREAM, resume=resume, last_frame=last, fsync=self.parts.recipe.codec.fsync
         )
         indices = range(done, self.total)
-        with writer, self.progress, _stop_on_interrupt() as stop, Prefetcher(self.source, indices) as frames:
+        interrupt = _stop_on_interrupt(self.progress.say)
+        with writer, self.progress, interrupt as stop, Prefetcher(self.source, indices) as frames:
             for train, test, waited in _timed(frames):
                 state = self._advance(writer, state, self._with_near(train), self._with_near(test), waited)
                 done = train.index + 1
                 if stop.is_set():
                     break
-        return RunResult(self.out, done, stop.is_set())
+        return RunResult(self.out, done, stop.is_set() and done < self.total)
 
     def _advance(
         self, writer: StreamWriter, state: StreamState | None, train: Frame, test: Frame, waited: float
@@ -157,9 +154,9 @@ class _Run:
 
     def _resume(self) -> StreamState | None:
         state = resume_state(self.parts, self.out / STREAM, self.source, self.rng, self.near)
+        _trim_metrics(self.out / METRICS, -1 if state is None else state.player.frame)
         if state is None:
             return None
-        _trim_metrics(self.out / METRICS, state.player.frame)
         if self.held_out and len(self.source.info.test):
             second = self.source.frame(1, "test") if state.player.frame >= 1 else None
             self.held_out.remember(self.source.frame(0, "test"), second)
@@ -181,9 +178,9 @@ def _one_torch_thread() -> Iterator[None]:
 
 def _num_frames(info: SourceInfo, wanted: int | None) -> int:
     have = info.num_frames
-    if have is None:
-        raise OutputError(f"the recording {info.name!r} does not say how many frames it has; give --frames")
-    return have if wanted is None else min(have, wanted)
+    if have is None and wanted is None:
+        raise SourceError(f"the recording {info.name!r} does not say how many frames it has; give --frames")
+    return min(number for number in (have, wanted) if number is not None)
 
 
 def _timed(frames: Prefetcher) -> Iterator[tuple[Frame, Frame, float]]:
@@ -198,7 +195,7 @@ def _timed(frames: Prefetcher) -> Iterator[tuple[Frame, Frame, float]]:
 
 
 @contextmanager
-def _stop_on_interrupt() -> Iterator[threading.Event]:
+def _stop_on_interrupt(say: Callable[[str], None]) -> Iterator[threading.Event]:
     """First Ctrl-C: finish the frame in flight. Second: stop at once (the stream stays valid up to the last packet)."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -209,6 +206,7 @@ def _stop_on_interrupt() -> Iterator[threading.Event]:
         if stop.is_set():
             raise KeyboardInterrupt
         stop.set()
+        say("stopping after this frame; interrupt again to stop at once")
 
     previous = signal.signal(signal.SIGINT, handler)
     try:

@@ -90,6 +90,11 @@ class GateTraining(Section):
     """Optimisation of the gate logits."""
 
     lr: float = Field(default=0.1, ge=0, description="Adam learning rate of the gate logits (released code: 0.1)")
+    warmup: float = Field(
+        default=0.0, ge=0, lt=1,
+        description="share of a frame's iterations before gates start to learn: a gate without a residual behind it "
+        "feels only the penalty and would close before any camera had its say (ours; paper and released code: 0)",
+    )  # fmt: skip
     optimiser: Literal["fresh", "persistent"] = Field(
         default="fresh", description="fresh: Adam moments restart each frame; persistent: they live on (released code)"
     )
@@ -125,6 +130,6 @@ class Recipe(Section):
     scale: float = Field(default=1.0, gt=0, le=1, description="images are downscaled by this factor on reading")
     frames: int | None = Field(default=None, ge=1, description="number of frames to process; all when absent")
     near: float = Field(
-        default=0.01, gt=0, lt=1, description="near plane, fraction of the rig's extent; nothing closer to a camera is drawn"
+        default=0.01, gt=0, lt=1, description="near plane, fraction of the rig's extent; nothing closer is drawn"
     )
     background: tuple[float, float, float] = Field(default=(0.0, 0.0, 0.0), description="colour behind everything")

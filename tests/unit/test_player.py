@@ -93,6 +93,19 @@ def test_near_plane_equals_the_reference(near):
     assert np.abs(render(scene, rig, 0, renderer=NUMPY) - expected).max() < 1e-6
 
 
+def test_nothing_between_the_near_plane_and_the_camera_is_drawn():
+    """One opaque ball one unit in front of the camera: drawn with the near plane before it, gone with it behind."""
+    rig = look_at(ARC)
+    middle = np.float32(ARC[0]) * (1 - 1 / np.linalg.norm(ARC[0])).astype(np.float32)
+    ball = dataclasses.replace(
+        make_scene(6, 1), means=middle[None], scales=np.full((1, 3), -2, np.float32), opacities=np.float32([9])
+    )
+    drawn, gone = (render(ball, dataclasses.replace(rig, near=near), 0, renderer=NUMPY) for near in (0.99, 1.01))
+    assert drawn.max() > 0.1
+    assert gone.max() == 0
+    assert render(ball, dataclasses.replace(rig, near=1.01), 0).max() == 0, "the renderer that is installed"
+
+
 def test_an_empty_or_invisible_scene_shows_the_background():
     rig = look_at(ARC)
     scene = make_scene(4)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any, final
 
 import torch
-from gsstream.api import Loss
 
+from gsstream.api import Loss
 from gsstream_cpu_render.loss import PhotometricTarget, photometric_loss
 
 

@@ -1,0 +1,1 @@
+"""The renderer part `gsplat`: CUDA rasterisation through the gsplat library."""

@@ -23,6 +23,9 @@ SECTION_HEADER = struct.Struct("<BI")
 
 #: Limits a reader enforces before it allocates. A stream beyond them is refused, not truncated.
 MAX_GAUSSIANS = 4_000_000
+#: A key packet of B bytes announces at most FREE_GAUSSIANS + MAX_GAUSSIANS_PER_BYTE * B Gaussians and nodes.
+FREE_GAUSSIANS = 1 << 16
+MAX_GAUSSIANS_PER_BYTE = 64
 MAX_BODY = 1 << 30
 MAX_SECTIONS = 16
 MAX_META = 16 << 20

@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as hnp
 
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.packet.bits import BitReader, BitWriter, pack_blobs, unpack_blobs
-from gsstream.packet.bulk import decompress, pack_array, unpack_array
+from gsstream.packet.bulk import compress, decompress
 from gsstream.packet.gates import decode_gates, encode_gates
 from gsstream.packet.symbols import decode_symbols, encode_symbols
 
@@ -129,18 +129,16 @@ def test_impossible_gates_are_refused(gates, levels):
         encode_gates(np.array(gates), levels)
 
 
-@given(hnp.arrays(np.float32, st.integers(0, 50), elements=st.floats(width=32, allow_nan=False)))
-def test_bulk_round_trip(array):
-    assert unpack_array(pack_array(array, "<f4"), "<f4", len(array)).tobytes() == array.tobytes()
+@given(st.binary(max_size=400))
+def test_bulk_round_trip(data):
+    assert decompress(compress(data), 400) == data
 
 
 def test_bulk_refuses_sizes_before_allocating():
-    bomb = pack_array(np.zeros(10_000_000, np.uint8), "u1")
+    bomb = compress(bytes(10_000_000))
     assert len(bomb) < 1000
     with pytest.raises(PacketError, match="announces"):
         decompress(bomb, 1000)
-    with pytest.raises(PacketError, match="announces"):
-        unpack_array(bomb, "u1", 10)
     with pytest.raises(PacketError):
         decompress(bomb[:-3], 20_000_000)
     with pytest.raises(PacketError):

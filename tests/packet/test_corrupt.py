@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 import tracemalloc
 import zlib
@@ -10,9 +11,9 @@ import numpy as np
 import pytest
 from packet_scenes import decode_all, make_delta, make_key, make_packets, same_bits, write_stream
 
-from gsstream.core.errors import PacketError
+from gsstream.core.delta import Layout
+from gsstream.core.errors import PacketError, ShapeError
 from gsstream.packet import (
-    PacketKind,
     StreamReader,
     decode_delta,
     decode_key,
@@ -23,7 +24,9 @@ from gsstream.packet import (
 )
 from gsstream.packet.base import MAX_BODY, MAX_GAUSSIANS, build_packet, file_header, parse_packet
 from gsstream.packet.bits import BitWriter, pack_blobs
-from gsstream.packet.bulk import compress, pack_array
+from gsstream.packet.bulk import compress
+from gsstream.packet.key import most_gaussians
+from gsstream.packet.symbols import encode_symbols
 from gsstream.player.playback import Playback
 
 LIMIT = 32 << 20
@@ -190,6 +193,7 @@ def test_lying_counts_are_refused_before_allocation():
         "levels": struct.pack("<IIB", 10, 4, 255),
         "cells": struct.pack("<IIB", 10, 4, 3) + b"\0" * 5,
         "just beyond": struct.pack("<IIB", MAX_GAUSSIANS + 1, 4, 3),
+        "more than the bytes can mean": struct.pack("<IIB", most_gaussians(len(key.data) + 20) + 1, 4, 3),
     }
     for what, layout in liars.items():
         with pytest.raises(PacketError):
@@ -203,9 +207,8 @@ def test_bombs_are_refused_before_inflation():
     bomb = compress(b"\0" * (20 << 20))  # 20 MB of zeros in a few hundred bytes
     tracemalloc.reset_peak()
     start = tracemalloc.get_traced_memory()[0]
-    for name in ("meta", "means"):
-        with pytest.raises(PacketError, match="announces"):
-            decode_key(_replace(key, name, bomb))
+    with pytest.raises(PacketError, match="announces"):
+        decode_key(_replace(key, "meta", bomb))
     assert tracemalloc.get_traced_memory()[1] - start < 1 << 20
 
 
@@ -321,8 +324,32 @@ def test_meta_that_is_not_meta_is_refused(meta):
         decode_key(_replace(key, "meta", compress(meta)))
 
 
-def test_values_that_are_not_finite_are_refused():
-    key = encode_key(make_key(np.random.default_rng(9), 10, 4))
-    with pytest.raises(PacketError, match="finite"):
-        decode_key(_replace(key, "means", pack_array(np.full(30, np.nan, np.float32), "<f4")))
-    assert PacketKind(key.data[0]) == PacketKind.KEY
+def test_more_equal_gaussians_than_readers_accept_are_not_written():
+    number = 400_000
+    state = make_key(np.random.default_rng(9), 1, 1)
+    rows = np.zeros(number, np.int64)
+    layout = Layout(np.int32([number]), np.zeros(number, np.uint8), state.layout.cell_sizes)
+    with pytest.raises(ShapeError, match="Gaussians that differ"):
+        encode_key(dataclasses.replace(state, gaussians=state.gaussians.rows(rows), layout=layout))
+
+
+@pytest.mark.parametrize(
+    ("grid", "message"),
+    [
+        ((-10, 2, 20), "cannot be"), ((5, 2, 4), "cannot be"), ((100, 2, 101), "cannot be"),
+        ((-9, 2, -3), "bytes of positions"),
+    ],
+)  # fmt: skip
+def test_impossible_position_grids_are_refused(grid, message):
+    key = encode_key(make_key(np.random.default_rng(10), 10, 4))
+    old = parse_packet(key.data)[1]["means"].data
+    with pytest.raises(PacketError, match=message):
+        decode_key(_replace(key, "means", struct.pack("<bbb", *grid) + old[3:]))
+
+
+def test_impossible_quaternions_are_refused():
+    key = encode_key(make_key(np.random.default_rng(11), 3, 2))
+    for row in ([4, 0, 0, 0, 0], [0, 0, 0, 0, -128], [0, 120, 100, 90, -60], [0, 1 << 21, 0, 0, 0]):
+        table = np.array([[0, 0, 0, 0, 0], row, [0, 0, 0, 0, 0]], np.int32)
+        with pytest.raises(PacketError, match="quats"):
+            decode_key(_replace(key, "quats", struct.pack("<bB", 7, 4) + encode_symbols(table)))

@@ -34,7 +34,9 @@ def write_gallery(out: Path, source: FrameSource, *, video: bool = True) -> list
     records = read_records(out / METRICS)
     chosen = sorted({int(i) for i in np.linspace(frames[0], frames[-1], min(COLUMNS, len(frames)))})
     written = [sheet_of_stream(out / STREAM, source, chosen, out / SHEET)]
-    written.append(plot_runs({method: records}, out / PLOTS, title=f"{method} on {source.info.name}"))
+    # Frame 0 alone, and no test camera to measure it: there is no curve to draw.
+    if len(records) > 1 or records[0].psnr:
+        written.append(plot_runs({method: records}, out / PLOTS, title=f"{method} on {source.info.name}"))
     (out / SUMMARY).write_text(summary_table({method: summarise(records)}) + "\n", encoding="utf-8")
     written.append(out / SUMMARY)
     if video and len(frames) > 1 and importlib.util.find_spec("av") is not None:

@@ -1,0 +1,96 @@
+"""Whole runs, tiny: through the command line in this process, or in a process of its own that can be killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from gsstream.cli.main import run_command
+from gsstream.engine.stream_state import StreamState
+from gsstream.source.open import DEMO_FOLDER
+
+#: Six frames of an analytic scene, three training cameras, one test camera.
+WORLD = "synthetic:frames=6&views=3&width=64&height=48&supersample=1"
+TINY = {
+    "first_frame.max_iterations": 30, "first_frame.fill_points": 200, "first_frame.max_points": 800,
+    "stream.epochs": 3,
+}  # fmt: skip
+
+
+def arguments(out: Path, *more: str, source: str = WORLD, method: str = "dense", **settings: Any) -> list[str]:
+    """A ``gsstream run`` command line; settings are recipe keys with ``__`` for the dot."""
+    values = {**TINY, **{key.replace("__", "."): value for key, value in settings.items()}}
+    sets = [item for key, value in values.items() for item in ("--set", f"{key}={value}")]
+    return ["run", "--source", source, "--method", method, "--out", str(out), "--quiet", "--no-video", *sets, *more]
+
+
+def encode(out: Path, *more: str, **options: Any) -> bytes:
+    """Run here, to the end; the bytes of the stream."""
+    assert run_command(arguments(out, *more, **options)) == 0
+    return (out / "stream.gss").read_bytes()
+
+
+def start(*command: str, **environment: str) -> subprocess.Popen[str]:
+    """``gsstream ...`` in a process of its own."""
+    code = "from gsstream.cli.main import main; main()"
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *command], env={**os.environ, **environment}, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+
+
+def finish(*command: str, **environment: str) -> tuple[int, str, str]:
+    """(exit code, stdout, stderr) of ``gsstream ...`` in a process of its own."""
+    with start(*command, **environment) as process:
+        out, err = process.communicate(timeout=120)
+    return process.returncode, out, err
+
+
+def demo_copy(
+    folder: Path, *, train: int = 3, frames: int = 3, edit: Callable[[dict[str, Any]], None] = lambda _: None
+) -> Path:
+    """Some training cameras, the test camera and the first frames of the demo recording, as a folder to spoil."""
+    shutil.copytree(DEMO_FOLDER, folder)
+    data = json.loads((folder / "cameras.json").read_text())
+    kept = [c for c in data["cameras"] if c["split"] == "train"][:train]
+    data["cameras"] = kept + [c for c in data["cameras"] if c["split"] == "test"]
+    data["frames"] = frames
+    edit(data)
+    (folder / "cameras.json").write_text(json.dumps(data))
+    return folder
+
+
+def without_test_cameras(data: dict[str, Any]) -> None:
+    """An edit of cameras.json."""
+    data["cameras"] = [c for c in data["cameras"] if c["split"] == "train"]
+    data["test_cameras"] = []
+
+
+class Witness:
+    """Remembers the encoder's state after every frame of runs in this process; changes nothing."""
+
+    def __init__(self, monkeypatch: Any) -> None:
+        from gsstream.engine import session
+
+        self.states: list[StreamState] = []
+        for name in ("begin", "begin_from", "frame_step"):
+            monkeypatch.setattr(session, name, self._watched(getattr(session, name)))
+
+    def _watched(self, step: Callable[..., Any]) -> Callable[..., Any]:
+        def watched(*args: Any, **kwargs: Any) -> Any:
+            outcome = step(*args, **kwargs)
+            self.states.append(outcome.state)
+            return outcome
+
+        return watched
+
+
+def metrics(out: Path) -> list[dict[str, Any]]:
+    """The lines of metrics.jsonl."""
+    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]

@@ -1,0 +1,199 @@
+"""player(packets) == encoder state, bit for bit; and what is rendered on both sides is the same picture."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from flow_runs import WORLD, Witness, demo_copy, encode, metrics, without_test_cameras
+
+from gsstream.cli.main import run_command
+from gsstream.core.delta import Layout, apply_delta
+from gsstream.core.gaussians import ATTRIBUTES
+from gsstream.engine import frame_step as step_module
+from gsstream.packet import PacketKind
+from gsstream.player.playback import Playback
+from gsstream.player.render import PlayerRenderer, find_renderer, render
+from gsstream.player.software import render_numpy
+from gsstream.render.reference import ReferenceRenderer
+from gsstream.residual.base import apply_residual
+
+METHODS = ["dense", "s2gs-edge"]
+
+
+def same_bits(ours, theirs) -> None:
+    for (name, a), (_, b) in zip(ours.items(), theirs.items(), strict=True):
+        assert a.dtype == b.dtype == np.float32, name
+        assert a.shape == b.shape, name
+        assert a.tobytes() == b.tobytes(), name
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_player_has_the_encoders_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str) -> None:
+    witness = Witness(monkeypatch)
+    encode(tmp_path, method=method)
+    assert len(witness.states) == 6
+    with Playback(tmp_path / "stream.gss") as playback:
+        assert list(playback.frames) == list(range(6))
+        changed = 0
+        for frame, state in enumerate(witness.states):
+            theirs = playback.player_state(frame)
+            same_bits(state.player.gaussians, theirs.gaussians)
+            same_bits(state.gaussians.map(torch.Tensor.numpy), theirs.gaussians)
+            np.testing.assert_array_equal(state.hierarchy.node_of.numpy(), theirs.layout.node_of)
+            assert set(state.player.decoders) == set(theirs.decoders)
+            for name, decoder in theirs.decoders.items():
+                assert state.decoders[name].numpy().tobytes() == decoder.tobytes(), name
+            if frame:
+                before = witness.states[frame - 1].player.gaussians.means
+                changed += theirs.gaussians.means.tobytes() != before.tobytes()
+        assert changed >= 3, "a stream in which nothing changes proves nothing"
+        # Out of order: what is shown of a frame does not depend on what was shown before.
+        for frame in (4, 1, 5, 0):
+            same_bits(witness.states[frame].player.gaussians, playback.state_at(frame))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_both_sides_show_the_same_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str) -> None:
+    """The player's renderers on decoded packets equal the reference on the encoder's state, at the same near plane."""
+    witness = Witness(monkeypatch)
+    encode(tmp_path, "--frames", "4", method=method)
+    state = witness.states[-1]
+    with Playback(tmp_path / "stream.gss") as playback:
+        cameras, scene = playback.cameras("test"), playback.state_at(3)
+        assert cameras.near == state.previous.cameras.near != 0.01, "the packet carries the rig's near plane"
+        fast = find_renderer()
+        assert fast.name == "cpu"
+        for renderer in (fast, PlayerRenderer("numpy", render_numpy)):
+            shown = render(scene, cameras, 0, playback.meta.background, renderer)
+            exact = ReferenceRenderer().render(state.gaussians, cameras, 0, playback.meta.background).image
+            assert np.abs(shown - exact.numpy()).max() < 2e-5, renderer.name
+        again = render(state.player.gaussians, cameras, 0, playback.meta.background, fast)
+        assert again.tobytes() == render(scene, cameras, 0, playback.meta.background, fast).tobytes()
+
+
+def test_training_and_transmission_apply_the_same_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """torch's forward on the hardened solution equals the decoded packet up to rounding: what was trained is sent."""
+    seen = []
+
+    def harden(parts, problem, solution):
+        delta = original(parts, problem, solution)
+        layout: Layout = problem.state.player.layout
+        gates = torch.from_numpy(delta.gates.astype(np.float32) / delta.num_levels)[problem.state.hierarchy.node_of]
+        units = torch.from_numpy(layout.units[problem.active.numpy()])
+        rows = apply_residual(
+            parts.update, problem.base, gates[problem.active], solution.latents, solution.decoders, units
+        )
+        seen.append((problem, delta, rows))
+        return delta
+
+    original = step_module.harden
+    monkeypatch.setattr(step_module, "harden", harden)
+    encode(tmp_path, "--frames", "4", method="s2gs-edge")
+    assert len(seen) == 3
+    for problem, delta, rows in seen:
+        sent = apply_delta(problem.state.player.gaussians, problem.state.player.layout, delta)
+        active = problem.active.numpy()
+        assert delta.gates.any()
+        for name in ATTRIBUTES:
+            trained, decoded = getattr(rows, name).numpy(), getattr(sent, name)[active]
+            # Decoders travel as half floats: the only difference between the two, beside the order of sums.
+            step = np.abs(decoded - getattr(problem.base, name).numpy()).max(initial=0)
+            np.testing.assert_allclose(trained, decoded, atol=2e-3 * step + 1e-6, rtol=0, err_msg=name)
+
+
+def test_a_static_scene_costs_almost_nothing(tmp_path: Path) -> None:
+    """Without noise every frame after the first is the same image: nothing to explain, nothing to send."""
+    encode(tmp_path, source=f"{WORLD}&static=1", method="s2gs-edge")
+    with Playback(tmp_path / "stream.gss") as playback:
+        entries = [playback.entry(frame) for frame in playback.frames]
+    assert [entry.kind for entry in entries[1:]] == [PacketKind.EMPTY] * 5
+    assert all(entry.size <= 32 for entry in entries[1:])
+    assert all(line["active_gaussians"] == 0 for line in metrics(tmp_path)[1:])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_one_camera_one_frame_no_colour_bands_no_test_camera(tmp_path: Path, method: str) -> None:
+    folder = demo_copy(tmp_path / "r", train=1, frames=1, edit=without_test_cameras)
+    out = tmp_path / "o"
+    encode(out, source=str(folder), method=method, scale=0.4, first_frame__sh_degree=0)
+    (line,) = metrics(out)
+    assert line["status"] == "key"
+    assert "psnr" not in line
+    with Playback(out / "stream.gss") as playback:
+        scene = playback.state_at(0)
+        assert scene.shN.shape == (len(scene), 0, 3)
+        assert len(playback.cameras("test")) == 0
+        assert render(scene, playback.cameras("train"), 0).max() > 0.1
+    assert (out / "contact_sheet.png").exists()
+
+
+def test_one_camera_several_frames(tmp_path: Path) -> None:
+    folder = demo_copy(tmp_path / "r", train=1, frames=3, edit=without_test_cameras)
+    encode(tmp_path / "o", source=str(folder), method="s2gs-edge", scale=0.4, first_frame__sh_degree=0)
+    assert [line["frame"] for line in metrics(tmp_path / "o")] == [0, 1, 2]
+
+
+def test_decoding_and_rendering_need_no_torch(tmp_path: Path) -> None:
+    encode(tmp_path, "--frames", "2", method="s2gs-edge")
+    code = (
+        "import sys\n"
+        "sys.modules['torch'] = None\n"  # importing it anywhere fails
+        "from gsstream.cli.main import run_command\n"
+        "code = run_command(['play', sys.argv[1], '--out', sys.argv[2]])\n"
+        "loaded = [name in sys.modules for name in ('gsstream_cpu_render.rasterizer', 'gsstream.engine')]\n"
+        "print(code, *loaded, file=sys.stderr)"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path), str(tmp_path / "pictures")]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert result.stderr == "0 True False\n"
+    assert sorted(p.name for p in (tmp_path / "pictures").iterdir()) == ["000000.png", "000001.png"]
+
+
+def test_training_never_sees_test_cameras(tmp_path: Path) -> None:
+    """Other test images: the same stream, other measurements."""
+    honest, spoiled = demo_copy(tmp_path / "a"), demo_copy(tmp_path / "b")
+    for path in (spoiled / "cam03").iterdir():
+        path.write_bytes((spoiled / "cam08" / path.name).read_bytes())
+    streams = []
+    for folder in (honest, spoiled):
+        out = tmp_path / f"out-{folder.name}"
+        # The stream names its source; both runs go by the same path, so that nothing else differs.
+        link = tmp_path / "recording"
+        link.unlink(missing_ok=True)
+        link.symlink_to(folder)
+        streams.append(encode(out, source=str(link), method="s2gs-edge", scale=0.4))
+    assert streams[0] == streams[1]
+    first, second = (metrics(tmp_path / f"out-{name}")[1]["psnr"]["cam03"] for name in "ab")
+    assert first != second
+
+
+def test_the_run_folder_is_complete(tmp_path: Path) -> None:
+    out = tmp_path / "o"
+    encode(out, "--frames", "3", method="s2gs-edge")
+    assert {path.name for path in out.iterdir()} == {
+        "stream.gss", "metrics.jsonl", "recipe.yaml", "contact_sheet.png", "frames.png", "summary.txt"
+    }  # fmt: skip
+    size = (out / "stream.gss").stat().st_size
+    with Playback(out / "stream.gss") as playback:
+        packets = sum(playback.entry(frame).size for frame in playback.frames)
+        overhead = size - packets
+    lines = metrics(out)
+    assert sum(sum(line["bytes"].values()) for line in lines) == packets, "reported bytes are bytes on disk"
+    assert 0 < overhead < 100
+    for line in lines:
+        assert set(line["psnr"]) == set(line["ssim"])
+        assert all(value >= 0 for value in line["seconds"].values())
+        assert line["num_gaussians"] > 0
+        assert line["peak_memory_mb"] > 0
+
+
+def test_a_run_repeats_from_its_saved_recipe(tmp_path: Path) -> None:
+    first = encode(tmp_path / "a", "--frames", "2", method="s2gs-edge")
+    again = ["run", "--source", WORLD, "--recipe", str(tmp_path / "a" / "recipe.yaml"), "--out", str(tmp_path / "b")]
+    assert run_command([*again, "--quiet", "--no-video"]) == 0
+    assert (tmp_path / "b" / "stream.gss").read_bytes() == first

@@ -1,0 +1,192 @@
+"""The same run gives the same bytes: again, with other threads, in two halves, after a kill."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from flow_runs import WORLD, arguments, encode, finish, metrics, start
+
+from gsstream.cli.main import run_command
+from gsstream.engine import session
+from gsstream.packet import StreamReader
+
+METHODS = ["dense", "s2gs-edge"]
+
+
+@pytest.fixture(scope="module", params=METHODS)
+def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, bytes]:
+    """(method, stream) of an undisturbed run of six frames."""
+    return request.param, encode(tmp_path_factory.mktemp("whole"), method=request.param)
+
+
+def resume(out: Path, method: str) -> bytes:
+    return encode(out, "--resume", method=method)
+
+
+def test_same_seed_same_bytes(tmp_path: Path, whole: tuple[str, bytes]) -> None:
+    assert encode(tmp_path / "again", method=whole[0]) == whole[1]
+    assert encode(tmp_path / "other", "--seed", "1", method=whole[0]) != whole[1]
+
+
+def test_threads_change_no_byte(tmp_path: Path, whole: tuple[str, bytes]) -> None:
+    method, once = whole
+    for threads in ("1", "3"):
+        out = tmp_path / threads
+        # The number is read when the native pool starts, so this needs processes of its own.
+        assert finish(*arguments(out, method=method), GSSTREAM_THREADS=threads)[0] == 0
+        assert (out / "stream.gss").read_bytes() == once
+
+
+def test_two_halves_equal_the_whole(
+    tmp_path: Path, whole: tuple[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames 0 to 2 here, broken off in frame 3; the rest in a process of its own."""
+    method, once = whole
+
+    def impatient(parts, state, frame, rng):
+        if frame.index == 3:
+            raise KeyboardInterrupt
+        return step(parts, state, frame, rng)
+
+    step = session.frame_step
+    monkeypatch.setattr(session, "frame_step", impatient)
+    assert run_command(arguments(tmp_path / "o", method=method)) == 130
+    first = metrics(tmp_path / "o")
+    code, _, err = finish(*arguments(tmp_path / "o", "--resume", method=method))
+    assert (code, err) == (0, "")
+    assert (tmp_path / "o" / "stream.gss").read_bytes() == once
+    monkeypatch.undo()
+    encode(tmp_path / "u", method=method)
+    lines, undisturbed = metrics(tmp_path / "o"), metrics(tmp_path / "u")
+    assert [line["frame"] for line in lines] == list(range(6))
+    assert lines[:3] == first
+    for ours, theirs in zip(lines, undisturbed, strict=True):
+        for quantity in ("psnr", "ssim", "psnr_moving", "bytes", "active_gates"):
+            assert ours.get(quantity) == theirs.get(quantity), quantity
+
+
+def test_killed_at_any_moment_it_resumes_to_the_same_bytes(tmp_path: Path, whole: tuple[str, bytes]) -> None:
+    method, once = whole
+    out = tmp_path / "o"
+    process = start(*arguments(out, method=method))
+    wait_for((out / "stream.gss").exists, process)
+    # From inside frame 0 to the last pictures. Not seeded on purpose: over time every moment is tried.
+    delay = random.uniform(0, 2)
+    time.sleep(delay)
+    process.kill()
+    process.communicate()
+    code, _, err = finish(*arguments(out, "--resume", method=method))
+    assert (code, err) == (0, "")
+    assert (out / "stream.gss").read_bytes() == once, f"killed after {delay} s"
+    assert [line["frame"] for line in metrics(out)] == list(range(6))
+
+
+def wait_for(condition, process) -> None:
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("kept", ["nothing", "half a header", "header", "half a key packet", "half a delta packet"])
+def test_a_torn_tail_resumes(tmp_path: Path, whole: tuple[str, bytes], kept: str) -> None:
+    method, once = whole
+    out = tmp_path / "o"
+    out.mkdir()
+    stream = out / "stream.gss"
+    stream.write_bytes(once)
+    with StreamReader(stream) as reader:
+        third = reader.frames[3]
+    sizes = {
+        "nothing": 0, "half a header": 9, "header": 16, "half a key packet": 500,
+        "half a delta packet": third.offset + third.size // 2,
+    }  # fmt: skip
+    stream.write_bytes(once[: sizes[kept]])
+    (out / "metrics.jsonl").write_text("".join(json.dumps({"frame": n}) + "\n" for n in range(5)) + '{"fra')
+    assert resume(out, method) == once
+    assert [line["frame"] for line in metrics(out)] == list(range(6))
+
+
+def test_a_finished_run_resumes_to_itself(tmp_path: Path, whole: tuple[str, bytes]) -> None:
+    method, once = whole
+    encode(tmp_path / "o", method=method)
+    assert resume(tmp_path / "o", method) == once
+
+
+def test_frame_0_of_another_stream_resumes_too(tmp_path: Path) -> None:
+    """The method that takes a frame over groups it by its own structure; resuming must find the same groups."""
+    encode(tmp_path / "dense", "--frames", "1")
+    take = ("--first-frame", str(tmp_path / "dense" / "stream.gss"))
+    once = encode(tmp_path / "a", *take, method="s2gs-edge")
+    encode(tmp_path / "b", *take, method="s2gs-edge")
+    stream = tmp_path / "b" / "stream.gss"
+    with StreamReader(stream) as reader:
+        entry = reader.frames[3]
+    with stream.open("r+b") as file:
+        file.truncate(entry.offset + 5)
+    assert encode(tmp_path / "b", "--resume", *take, method="s2gs-edge") == once
+
+
+def refused(capsys: pytest.CaptureFixture[str], stream: Path, command: list[str]) -> str:
+    """stderr of a command that must fail by code 2 and leave the stream alone."""
+    before = stream.read_bytes()
+    assert run_command(command) == 2
+    assert stream.read_bytes() == before
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1, err
+    return err
+
+
+def test_another_recipe_or_recording_is_not_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    encode(tmp_path, "--frames", "2")
+    stream = tmp_path / "stream.gss"
+    err = refused(capsys, stream, arguments(tmp_path, "--resume", "--seed", "3", stream__epochs=4))
+    assert "written with another recipe: seed, stream differ" in err
+    assert "--overwrite" in err
+    err = refused(capsys, stream, arguments(tmp_path, "--resume", method="s2gs-edge"))
+    assert "written with another recipe: confidence" in err
+    err = refused(capsys, stream, arguments(tmp_path, "--resume", source="demo"))
+    assert "made from the recording 'synthetic'" in err
+    assert "resume with the same --source" in err
+
+
+def test_damage_in_the_middle_is_not_cut_away(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    encode(tmp_path)
+    stream = tmp_path / "stream.gss"
+    with StreamReader(stream) as reader:
+        entry = reader.frames[2]
+    data = bytearray(stream.read_bytes())
+    data[entry.offset + 40] ^= 1
+    stream.write_bytes(data)
+    assert run_command(arguments(tmp_path, "--resume")) == 1
+    err = capsys.readouterr().err
+    assert re.search(r"packet of frame 2 is damaged: its checksum does not match \(at byte \d+\)", err)
+    assert stream.read_bytes() == data
+
+
+@pytest.mark.parametrize("moment", ["frame 0", "later"])
+def test_interrupt_ends_after_the_current_frame(tmp_path: Path, moment: str) -> None:
+    """Ctrl-C: code 130, a stream that plays, and --resume goes on to the bytes of an undisturbed run."""
+    source, out = WORLD.replace("frames=6", "frames=40"), tmp_path / "o"
+    options = {"source": source, "stream__epochs": 10}
+    process = start(*arguments(out, **options))
+    wait_for((out / ("stream.gss" if moment == "frame 0" else "metrics.jsonl")).exists, process)
+    os.kill(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 130, err
+    assert err == "interrupted\n"
+    with StreamReader(out / "stream.gss") as reader:
+        reader.check()
+        done = len(reader.frames)
+        assert reader.unfinished is None
+    assert 1 <= done < 40
+    assert [line["frame"] for line in metrics(out)] == list(range(done))
+    assert (out / "contact_sheet.png").exists()

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.metadata import packages_distributions
+from importlib.metadata import entry_points, packages_distributions
 
 from gsstream.core.errors import ComponentError, GsstreamError
 from gsstream.core.part import Part
+from gsstream.spec import ENTRY_POINT_GROUP
 
 
 @contextmanager
@@ -18,12 +19,18 @@ def guarded(slot: str, part: Part, frame: int | None) -> Iterator[None]:
     except GsstreamError:
         raise
     except Exception as error:
-        module = type(part).__module__.partition(".")[0]
-        distribution = packages_distributions().get(module, [module])[0]
         raise ComponentError(
             f"{type(error).__name__}: {error}",
             slot=slot,
             part=type(part).__name__,
-            distribution=distribution,
+            distribution=_distribution(type(part).__module__.partition(".")[0]),
             frame=frame,
         ) from error
+
+
+def _distribution(package: str) -> str:
+    """Who ships a top-level package. Entry points first: of an editable install the list of files says nothing."""
+    for point in entry_points(group=ENTRY_POINT_GROUP):
+        if point.dist is not None and point.module.partition(".")[0] == package:
+            return point.dist.name
+    return packages_distributions().get(package, [package])[0]

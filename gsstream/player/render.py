@@ -50,8 +50,13 @@ def find_renderer() -> PlayerRenderer:
             return PlayerRenderer(point.name, function)
         except Exception as error:  # third-party code: whatever it raises is reported, and the player still plays
             problems.append(f"{point.name} ({point.value}) failed: {type(error).__name__}: {error}")
-    why = "; ".join(problems) or "install gsstream-cpu-render for a fast one"
-    warnings.warn(f"rendering with plain numpy, which is slow: {why}", SlowRendererWarning, stacklevel=2)
+    why = f". Reason: {'; '.join(problems)}" if problems else ""
+    warnings.warn(
+        "no compiled renderer works here, so pictures are drawn with plain numpy: about 100 times slower. To mend it, "
+        f"install a C++ compiler and gsstream-cpu-render{why}",
+        SlowRendererWarning,
+        stacklevel=2,
+    )
     return PlayerRenderer("numpy", render_numpy)
 
 

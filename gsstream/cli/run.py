@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from gsstream.cli.streams import stream_file
+
 if TYPE_CHECKING:
     from gsstream.engine.session import RunResult
     from gsstream.source.base import FrameSource
@@ -34,7 +36,7 @@ def run(
     renderer: Annotated[str | None, typer.Option("--renderer", help="Renderer: auto, cpu, reference, ...")] = None,
     first_frame: Annotated[
         Path | None,
-        typer.Option("--first-frame", help="Take frame 0 over from this stream instead of reconstructing it."),
+        typer.Option("--first-frame", help="Take frame 0 over from this stream, do not reconstruct it."),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run that --out holds.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run that --out holds.")] = False,
@@ -57,15 +59,16 @@ def run(
     resolved = resolve_recipe(method, catalog.recipe_path, recipe, overrides)
     # The slow imports come last, so that a mistake on the command line is answered at once.
     from gsstream.engine.assemble import assemble
-    from gsstream.engine.recording import open_recording
+    from gsstream.engine.recording import open_recording, read_first_frame
     from gsstream.engine.session import run as run_session
 
     assembly = assemble(resolved, catalog)
-    # Opened before the folder is touched: --overwrite must not delete a run for the sake of a recording that is faulty.
+    # Read before the folder is touched: --overwrite must not delete a run for the sake of a faulty recording.
+    first = None if first_frame is None else read_first_frame(stream_file(first_frame))
     recording = open_recording(source, assembly.recipe.scale, catalog)
     try:
         prepare_output(out, resume=resume, overwrite=overwrite)
-        result = run_session(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first_frame)
+        result = run_session(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first)
         slow = assembly.recipe.renderer.name == "reference"
         _pictures(result, recording, video=not no_video, quiet=quiet, warned=slow)
     finally:

@@ -1,8 +1,11 @@
-"""Opening a recording by its URI, those of plugins included."""
+"""What a run starts from: a recording by its URI, those of plugins included, and frame 0 of another stream."""
 
 from __future__ import annotations
 
-from gsstream.core.errors import GsstreamError, PluginUnavailable
+from pathlib import Path
+
+from gsstream.core.errors import GsstreamError, PacketError, PluginUnavailable
+from gsstream.packet import PlayerState, StreamReader, decode_packet
 from gsstream.plugins.catalog import Catalog
 from gsstream.source.base import FrameSource
 from gsstream.source.open import open_source
@@ -31,3 +34,15 @@ def open_recording(uri: str, scale: float, catalog: Catalog) -> FrameSource:
     except Exception as error:  # third-party code: reported with its owner's name
         raise PluginUnavailable(f"source {scheme!r} (from {entry.origin}) could not open {uri!r}: {error}") from error
     return source
+
+
+def read_first_frame(path: Path) -> PlayerState:
+    """The decoded first frame of a stream.
+
+    Raises SourceError when there is no such file, PacketError when its first packet is missing or damaged.
+    """
+    with StreamReader(path) as reader:
+        if not reader.frames:
+            raise reader.damage or PacketError(f"{path} holds no complete packet yet", reader.end)
+        entry = reader.frames[0]
+        return decode_packet(None, reader.read(entry), offset=entry.offset)

@@ -28,7 +28,7 @@ from gsstream.engine.progress import RunProgress
 from gsstream.engine.resume import resume_state
 from gsstream.engine.stream_state import Step, StreamState
 from gsstream.metrics import peak_memory_mb
-from gsstream.packet import StreamMeta, StreamReader, StreamWriter, decode_packet
+from gsstream.packet import PlayerState, StreamMeta, StreamWriter
 from gsstream.recipe.save import save_resolved
 from gsstream.source.base import FrameSource, SourceInfo
 from gsstream.source.prefetch import Prefetcher
@@ -53,7 +53,7 @@ def run(
     resume: bool = False,
     quiet: bool = False,
     measure: bool = True,
-    first_frame: Path | None = None,
+    first_frame: PlayerState | None = None,
 ) -> RunResult:
     """Encode a recording into ``out`` (stream.gss, metrics.jsonl, recipe.yaml).
 
@@ -62,7 +62,8 @@ def run(
         out: a prepared output folder.
         resume: continue the run that ``out`` holds; the recipe must be the same.
         measure: render and compare the test cameras of every frame.
-        first_frame: another stream whose frame 0 is taken over instead of being reconstructed again.
+        first_frame: frame 0 of another stream (``engine.recording.read_first_frame``), taken over instead of being
+            reconstructed again.
     """
     with _one_torch_thread():
         return _Run(parts, source, out, quiet, measure, first_frame).encode(resume)
@@ -73,7 +74,7 @@ class _Run:
 
     def __init__(
         self, parts: Assembly, source: FrameSource, out: Path, quiet: bool, measure: bool,
-        first_frame: Path | None,
+        first_frame: PlayerState | None,
     ) -> None:  # fmt: skip
         self.parts, self.source, self.out, self.first_frame = parts, source, out, first_frame
         self.rng = Rng(parts.recipe.seed)
@@ -118,9 +119,7 @@ class _Run:
 
     def _first(self, frame: Frame) -> Step:
         if self.first_frame is not None:
-            with StreamReader(self.first_frame) as reader:
-                player = decode_packet(None, reader.read(reader.frames[0]))
-            return begin_from(self.parts, player, frame, self._meta(frame.cameras), self.rng)
+            return begin_from(self.parts, self.first_frame, frame, self._meta(frame.cameras), self.rng)
         points = gather_points(self.source, frame, self.parts.recipe.first_frame, self.rng)
         return begin(self.parts, points, frame, self._meta(frame.cameras), self.rng, self.progress.root)
 

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from gsstream.confidence.base import ConfidenceEstimator
 from gsstream.core.context import FrameContext
-from gsstream.core.part import PartConfig
+from gsstream.core.part import PartConfig, Traits
 
 
 @final
@@ -18,6 +18,9 @@ class Uniform(ConfidenceEstimator):
 
     class Config(PartConfig):
         logit: float = Field(default=0.0, ge=-50, le=50, description="logit of the confidence, -50 to 50; 0 is p = 0.5")
+
+    def claims(self) -> Traits:
+        return Traits(floor=self.config.logit)
 
     def estimate(self, context: FrameContext) -> torch.Tensor:
         return torch.full((len(context.gaussians),), float(self.config.logit))

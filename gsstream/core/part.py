@@ -27,6 +27,14 @@ class Traits:
         stable: (structure) an identity edit changes nothing and co-members stay together.
         needs_renderer: (confidence) asks the context for screen gradients.
         reduction: (regularizer) "mean" or "sum" over Gaussians.
+        weights: (regularizer) settings that its terms are proportional to.
+        floor: (confidence) largest logit of a Gaussian that nobody sees, or of a scene that stands still.
+        finds_motion: (confidence) ranks what moved above what did not.
+        monotone_in_change: (confidence) a stronger change never makes what changed less suspect.
+        normalised: (propagation) keeps the scale: constants stay constant, the flat structure changes nothing.
+        parent_bound: (propagation) no node is less suspect than its children.
+        local: (structure) the members of a node lie within one root cell of each other, along every axis.
+        temperature: (gate) has a setting ``temperature``; gates harden as it falls.
     """
 
     stochastic: bool = False
@@ -36,6 +44,14 @@ class Traits:
     stable: bool = False
     needs_renderer: bool = False
     reduction: str = "mean"
+    weights: tuple[str, ...] = ()
+    floor: float = 0.0
+    finds_motion: bool = False
+    monotone_in_change: bool = False
+    normalised: bool = False
+    parent_bound: bool = False
+    local: bool = False
+    temperature: bool = False
 
 
 class Part(ABC):
@@ -52,6 +68,10 @@ class Part(ABC):
 
     def __init__(self, config: PartConfig | None = None) -> None:
         object.__setattr__(self, "config", self.Config() if config is None else config)
+
+    def claims(self) -> Traits:
+        """The traits of this part as it is configured; override where a setting changes a claim."""
+        return self.traits
 
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(f"{type(self).__name__} is frozen: state is passed in and returned, never kept ({name!r})")

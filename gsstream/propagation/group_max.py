@@ -9,6 +9,7 @@ from pydantic import Field
 
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.part import PartConfig, Traits
+from gsstream.core.shapes import check_finite
 from gsstream.propagation.base import Propagation
 
 
@@ -19,8 +20,9 @@ class GroupMax(Propagation):
     class Config(PartConfig):
         empty: float = Field(default=-50.0, description="logit of a node without members")
 
-    traits = Traits(conservative=True, idempotent=True, differentiable=True)
+    traits = Traits(conservative=True, idempotent=True, differentiable=True, normalised=True)
 
     def propagate(self, logits: torch.Tensor, hierarchy: Hierarchy) -> torch.Tensor:
+        check_finite("logits", logits)
         start = logits.new_full((hierarchy.num_nodes,), self.config.empty)
         return start.scatter_reduce(0, hierarchy.node_of, logits, reduce="amax", include_self=False)

@@ -27,7 +27,7 @@ class Flat(Structure):
             description="position residuals are measured in (scene diameter / resolution); 1 to 65536",
         )  # fmt: skip
 
-    traits = Traits(stable=True, idempotent=True)
+    traits = Traits(stable=True, idempotent=True, local=True)
 
     def seed(self, points: PointCloud, cameras: Cameras) -> Anchors:
         if len(points) == 0:

@@ -1,1 +1,10 @@
-"""What plugin authors test with. Ships with the package."""
+"""The contract kit for parts: ``parametrize_with_checks`` in a test suite, ``run_checks`` in code.
+
+``gsstream check NAME`` says the same to a person.
+"""
+
+from gsstream.testing.cases import World as World
+from gsstream.testing.cases import world as world
+from gsstream.testing.kit import CheckResult as CheckResult
+from gsstream.testing.kit import parametrize_with_checks as parametrize_with_checks
+from gsstream.testing.kit import run_checks as run_checks

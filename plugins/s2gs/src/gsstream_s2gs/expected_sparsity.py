@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Literal, final
 
 import torch
@@ -39,7 +40,10 @@ class ExpectedSparsity(Regularizer):
             description="squared-norm: ||delta o||^2 (paper); half-mean: half the mean over the axes (released code)",
         )
 
-    traits = Traits(differentiable=True, reduction="mean")
+    traits = Traits(differentiable=True, reduction="mean", weights=("lambda1", "lambda2"))
+
+    def claims(self) -> Traits:
+        return replace(self.traits, reduction=self.config.reduction)
 
     def penalty(
         self, open_probability: torch.Tensor, residual: torch.Tensor, hierarchy: Hierarchy, num_gaussians: int

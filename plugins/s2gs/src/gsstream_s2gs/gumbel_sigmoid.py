@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Literal, final
 
 import torch
@@ -50,7 +51,10 @@ class GumbelSigmoid(GateSampler):
             default=False, description="block the gradient where the rounded gate is 0 or 1, as the released clamp does"
         )
 
-    traits = Traits(stochastic=True, differentiable=True)
+    traits = Traits(stochastic=True, differentiable=True, temperature=True)
+
+    def claims(self) -> Traits:
+        return replace(self.traits, stochastic=self.config.noise != "none")
 
     @property
     def num_levels(self) -> int:

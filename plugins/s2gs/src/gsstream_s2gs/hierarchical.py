@@ -27,7 +27,7 @@ class HierarchicalMax(Propagation):
             default=-50.0, ge=-1e4, le=1e4, description="logit of a tree without Gaussians, -1e4 to 1e4 (ours)"
         )
 
-    traits = Traits(conservative=True, idempotent=True, differentiable=True)
+    traits = Traits(conservative=True, idempotent=True, differentiable=True, normalised=True, parent_bound=True)
 
     def propagate(self, logits: torch.Tensor, hierarchy: Hierarchy) -> torch.Tensor:
         """[N] logits -> [M] logits. Raises ShapeError for a wrong length, a value that is not finite, or a cycle."""

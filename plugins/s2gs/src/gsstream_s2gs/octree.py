@@ -95,7 +95,7 @@ class StreamingOctree(Structure):
                 )
             return self
 
-    traits = Traits(stable=True, idempotent=True)
+    traits = Traits(stable=True, idempotent=True, local=True)
 
     def seed(self, points: PointCloud, cameras: Cameras) -> Anchors:
         """Anchors of [P] points seen by the training cameras, sorted by level, then along a Morton curve.

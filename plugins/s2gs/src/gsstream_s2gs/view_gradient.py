@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Literal, final
 
 import torch
@@ -87,7 +88,12 @@ class ViewSpaceGradient(ConfidenceEstimator):
                 raise ValueError("normalisation noise: expected perturbation 0, got more; use robust, ratio or minmax")
             return self
 
-    traits = Traits(needs_renderer=True)
+    traits = Traits(needs_renderer=True, finds_motion=True, monotone_in_change=True)
+
+    def claims(self) -> Traits:
+        # Normalised by its own statistics, a change may look weaker as all others grow: the default is checked to rise.
+        rises = self.config.normalisation == "robust"
+        return replace(self.traits, floor=self.config.floor, monotone_in_change=rises)
 
     def estimate(self, context: FrameContext) -> torch.Tensor:
         """Logits [N] float32 in [-limit, limit]. Raises ShapeError when a gradient is not finite."""

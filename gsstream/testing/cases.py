@@ -1,0 +1,253 @@
+"""Tiny seeded worlds, made on the CPU: what the checks are made on."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.context import ScreenGradient
+from gsstream.core.frame import PointCloud
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.hierarchy import Hierarchy
+from gsstream.render.reference import ReferenceRenderer
+from gsstream.structure.base import Anchors
+
+RENDERER = ReferenceRenderer()
+BLACK = (0.0, 0.0, 0.0)
+SIZE = 20
+Scene = Gaussians[torch.Tensor]
+_GRADIENTS: dict[bytes, ScreenGradient] = {}
+
+
+@dataclass(frozen=True)
+class World:
+    """One case; also the frame context that confidence estimators are given.
+
+    Arguments:
+        before, now: images of the two frames, one [H, W, 3] per camera.
+        moved: [N] bool, the truth about what moved.
+        logits: [N] some confidence.
+        residual: [N, 3] some position residual, cells.
+        hierarchy: three trees of two levels; flat when there are fewer than twelve Gaussians.
+        points, anchors: what a structure is given.
+    """
+
+    name: str
+    gaussians: Scene
+    cameras: Cameras
+    before: tuple[torch.Tensor, ...]
+    now: tuple[torch.Tensor, ...]
+    moved: torch.Tensor
+    logits: torch.Tensor
+    residual: torch.Tensor
+    hierarchy: Hierarchy
+    points: PointCloud
+    anchors: Anchors
+    index: int = 1
+
+    def image(self, view: int) -> torch.Tensor:
+        return self.now[view]
+
+    def previous_image(self, view: int) -> torch.Tensor:
+        return self.before[view]
+
+    def previous_render(self, view: int) -> torch.Tensor:
+        with torch.no_grad():
+            return RENDERER.render(self.gaussians.map(torch.Tensor.detach), self.cameras, view, BLACK).image
+
+    def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
+        upstream = image_gradient.float()
+        rig = self.cameras.select([view])
+        key = b"".join(fingerprint((self.gaussians.map(torch.Tensor.detach), rig, upstream)))
+        if key not in _GRADIENTS:
+            # Many checks ask for the same gradient of the same world; the renderer is a pure function.
+            _GRADIENTS[key] = RENDERER.screen_gradient(self.gaussians, rig, 0, upstream)
+        return _copy(_GRADIENTS[key])  # type: ignore[no-any-return]
+
+    def noise_sigma(self, view: int) -> float:
+        return 0.002
+
+    def blended(self, share: float) -> World:
+        """The same world with only a share of the change between the frames."""
+        pairs = zip(self.before, self.now, strict=True)
+        return replace(self, now=tuple(b + share * (n - b) for b, n in pairs))
+
+    def views(self, order: list[int]) -> World:
+        """The same world with the cameras in another order, or fewer of them."""
+        before, now = (tuple(images[i] for i in order) for images in (self.before, self.now))
+        return replace(self, cameras=self.cameras.select(order), before=before, now=now)
+
+    def permuted(self, order: torch.Tensor) -> World:
+        """The same world with the Gaussians in another order."""
+        return replace(
+            self, gaussians=self.gaussians.rows(order), moved=self.moved[order], logits=self.logits[order],
+            residual=self.residual[order], hierarchy=self.hierarchy.rows(order),
+            anchors=replace(
+                self.anchors, positions=self.anchors.positions[order], colors=self.anchors.colors[order],
+                levels=self.anchors.levels[order],
+            ),
+        )  # fmt: skip
+
+    def double(self) -> World:
+        """Logits and residuals in double precision."""
+        return replace(self, logits=self.logits.double(), residual=self.residual.double())
+
+
+def rig(views: int = 3) -> Cameras:
+    """Cameras on an arc of radius 3 around the origin, looking inwards."""
+    viewmats = []
+    for angle in np.linspace(-0.4, 0.4, views):
+        c, s = np.cos(angle), np.sin(angle)
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+        viewmat[2, 3] = 3.0
+        viewmats.append(viewmat)
+    K = np.array([[25.0, 0, SIZE / 2], [0, 25.0, SIZE / 2], [0, 0, 1]])
+    ids = tuple(f"cam{i}" for i in range(views))
+    return Cameras(ids, np.array(viewmats).reshape(-1, 4, 4), np.tile(K, (views, 1, 1)), SIZE, SIZE)
+
+
+def scene(means: torch.Tensor, seed: int = 0, scales: torch.Tensor | None = None) -> Scene:
+    """Small, fairly opaque blobs of random colours at ``means`` [N, 3]."""
+    n = len(means)
+    g = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        means=means,
+        quats=torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+        scales=torch.full((n, 3), -2.5) if scales is None else scales,
+        opacities=torch.full((n,), 0.5),
+        sh0=torch.randn(n, 1, 3, generator=g),
+        shN=torch.zeros(n, 0, 3),
+    )
+
+
+def flat(n: int) -> Hierarchy:
+    """One root node per Gaussian."""
+    index = torch.arange(n)
+    return Hierarchy(index, index, torch.zeros_like(index))
+
+
+def forest(n: int) -> Hierarchy:
+    """Three trees: nodes 0 to 2 are roots, nodes 3 to 14 their children (four each); flat below twelve Gaussians."""
+    if n < 12:
+        return flat(n)
+    parent = torch.cat([torch.arange(3), torch.arange(12) % 3])
+    return Hierarchy(torch.arange(n) * 7 % 12 + 3, parent, torch.tensor([0] * 3 + [1] * 12))
+
+
+def trees(hierarchy: Hierarchy) -> torch.Tensor:
+    """[M] root of each node, by following parents."""
+    root = hierarchy.parent
+    for _ in range(hierarchy.num_nodes):
+        root = hierarchy.parent[root]
+    return root
+
+
+def make(name: str, before: Scene, cameras: Cameras, *, shift: float = 0.0) -> World:
+    """A world whose Gaussians with x > 0.3 and in view move by ``shift`` between the frames."""
+    n = len(before)
+    moved = (before.means[:, 0] > 0.3) & (before.means[:, 1].abs() < 5) & (shift != 0)
+    means = before.means.clone()
+    means[moved, 1] += shift
+    g = torch.Generator().manual_seed(n + 1)
+    xyz, rgb = before.means.numpy().copy(), torch.rand(n, 3, generator=g)
+    levels = torch.arange(n) % 2
+    sizes = torch.tensor([0.5, 0.25]) * max(1.0, float(before.means.abs().max()) if n else 1.0)
+    origin = before.means.amin(0) - 0.1 if n else torch.zeros(3)
+    return World(
+        name, before, cameras, _images(before, cameras), _images(replace(before, means=means), cameras), moved,
+        3 * torch.randn(n, generator=g), torch.randn(n, 3, generator=g), forest(n),
+        PointCloud(xyz, rgb.numpy(), name), Anchors(before.means.clone(), rgb, levels, sizes, origin),
+    )  # fmt: skip
+
+
+def _images(gaussians: Scene, cameras: Cameras) -> tuple[torch.Tensor, ...]:
+    with torch.no_grad():
+        return tuple(RENDERER.render(gaussians, cameras, view, BLACK).image for view in range(len(cameras)))
+
+
+def _cloud(n: int = 200, seed: int = 0) -> torch.Tensor:
+    return torch.randn(n, 3, generator=torch.Generator().manual_seed(seed)) * 0.35
+
+
+def _unseen() -> torch.Tensor:
+    means = _cloud(60)
+    means[::2, 1] += 30.0
+    return means
+
+
+def _thin() -> Scene:
+    means = _cloud(40)
+    means[:, 2] = 0.0
+    return scene(means, scales=torch.tensor([-2.5, -2.5, -12.0]).repeat(40, 1))
+
+
+def _moving(name: str, views: int = 3) -> World:
+    return make(name, scene(_cloud()), rig(views), shift=0.08)
+
+
+def _huge(name: str) -> World:
+    world = make(name, scene(_cloud(24)), rig())
+    return replace(world, logits=1e4 * torch.sign(world.logits))
+
+
+WORLDS: dict[str, Callable[[], World]] = {
+    "empty": lambda: make("empty", scene(torch.zeros(0, 3)), rig()),
+    "one": lambda: make("one", scene(torch.tensor([[0.1, 0.0, 0.0]])), rig()),
+    "two identical": lambda: make("two identical", scene(torch.full((2, 3), 0.1)), rig()),
+    "line": lambda: make("line", scene(torch.linspace(-0.6, 0.6, 20)[:, None] * torch.ones(3)), rig(), shift=0.05),
+    "cloud": lambda: _moving("cloud"),
+    "far": lambda: make("far", scene(_cloud(30) + 1e6), rig()),
+    "thin": lambda: make("thin", _thin(), rig(), shift=0.05),
+    "static": lambda: make("static", scene(_cloud()), rig()),
+    "moving": lambda: _moving("moving"),
+    "unseen": lambda: make("unseen", scene(_unseen()), rig(), shift=0.08),
+    "one camera": lambda: _moving("one camera", 1),
+    "huge logits": lambda: _huge("huge logits"),
+}
+
+
+@functools.cache
+def _made(name: str) -> World:
+    return WORLDS[name]()
+
+
+def world(name: str) -> World:
+    """A fresh copy of a named world, so that a part that spoils its inputs spoils nobody else's."""
+    fresh: World = _copy(_made(name))
+    return fresh
+
+
+def _copy(value: Any) -> Any:
+    if isinstance(value, torch.Tensor):
+        return value.clone()
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if isinstance(value, ScreenGradient):
+        return ScreenGradient(*map(_copy, value))
+    if isinstance(value, tuple):
+        return tuple(_copy(item) for item in value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        changes = {f.name: _copy(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return replace(value, **changes)
+    return value
+
+
+def fingerprint(value: Any) -> list[bytes]:
+    """The bits of every array inside a value, in a fixed order."""
+    if isinstance(value, torch.Tensor):
+        return [value.detach().numpy().tobytes(), str((value.dtype, tuple(value.shape), value.requires_grad)).encode()]
+    if isinstance(value, np.ndarray):
+        return [value.tobytes()]
+    if isinstance(value, tuple):
+        return [bits for item in value for bits in fingerprint(item)]
+    if dataclasses.is_dataclass(value):
+        return [bits for f in dataclasses.fields(value) for bits in fingerprint(getattr(value, f.name))]
+    return []

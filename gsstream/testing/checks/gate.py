@@ -1,0 +1,176 @@
+"""What a gate sampler promises."""
+
+from __future__ import annotations
+
+import io
+from itertools import pairwise
+
+import torch
+
+from gsstream.core.state import GateState, edit_state
+from gsstream.core.topology import TopologyEdit
+from gsstream.gate.base import GateSampler
+from gsstream.testing.cases import world
+from gsstream.testing.compare import ROUNDING, all_equal, at_most, equal, finite
+from gsstream.testing.drive import draw
+from gsstream.testing.registry import check
+
+DRAWS = 4096
+PROBABILITIES = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)
+
+
+def _spread() -> torch.Tensor:
+    """[241] logits from -6 to 6."""
+    return torch.linspace(-6, 6, 241)
+
+
+def _samples(part: GateSampler, state: GateState) -> list[tuple[str, torch.Tensor]]:
+    noise = draw(part, len(state.logits))
+    drawn = [] if noise is None else [("with noise", part.sample(state, noise))]
+    return [("without noise", part.sample(state, None)), *drawn]
+
+
+@check("gate")
+def check_gate_range_and_levels(part: GateSampler) -> None:
+    """Every value is exactly k / num_levels with 0 <= k <= num_levels, as the decoder computes it."""
+    levels = part.num_levels
+    assert 1 <= levels <= 255, f"num_levels: expected 1 to 255, got {levels}"
+    for how, gates in _samples(part, part.init(_spread())):
+        k = torch.round(gates * levels)
+        at_most(f"{how}: levels", k, float(levels), 0.0, "a gate is at most fully open")
+        at_most(f"{how}: negated levels", -k, 0.0, 0.0, "a gate is at least closed")
+        equal(f"{how}: k / num_levels", gates.detach(), k / torch.tensor(float(levels)))
+
+
+@check("gate")
+def check_gate_init_calibrated(part: GateSampler) -> None:
+    """A fresh gate opens at least as probably as the confidence says; a stochastic binary one, exactly so."""
+    p = torch.linspace(0.01, 0.99, 99)
+    state = part.init(torch.logit(p))
+    opened = part.open_probability(state)
+    at_most("confidence against open probability", p, opened, 1e-4, ROUNDING)
+    if part.num_levels == 1 and part.claims().stochastic:
+        equal("open probability of a binary gate", opened, p, 1e-4, ROUNDING)
+
+
+@check("gate", trait="stochastic")
+def check_gate_calibration(part: GateSampler) -> None:
+    """Over 4096 draws the share of open gates is the open probability, within 4 standard deviations."""
+    for p in PROBABILITIES:
+        state = part.init(torch.logit(torch.tensor(p)).expand(DRAWS).clone())
+        expected = float(part.open_probability(state)[0])
+        got = float((part.sample(state, draw(part, DRAWS)) > 0).float().mean())
+        sigma = max(expected * (1 - expected), 1 / DRAWS) ** 0.5 / DRAWS**0.5
+        assert abs(got - expected) <= 4 * sigma, (
+            f"confidence {p}: expected a share of {expected:.4f} open gates, got {got:.4f}; "
+            f"tolerance {4 * sigma:.4f} is 4 sigma of {DRAWS} draws"
+        )
+
+
+@check("gate", trait="stochastic")
+def check_gate_really_stochastic(part: GateSampler) -> None:
+    """With noise, gates vary from draw to draw."""
+    state = part.init(torch.zeros(256))
+    first, second = (part.sample(state, draw(part, 256, seed)) for seed in (1, 2))
+    differ = int((first != second).sum())
+    assert differ > 0, "gates of confidence 0.5 are the same in two draws of 256: the noise has no effect"
+
+
+@check("gate", trait="stochastic")
+def check_gate_noise_is_data(part: GateSampler) -> None:
+    """Sampling is a function of (state, noise); permuted noise permutes the gates; 65536 draws are finite."""
+    state = part.init(_spread())
+    noise = draw(part, len(state.logits))
+    assert noise is not None, "claims to be stochastic, but noise is None"
+    order = torch.randperm(len(noise), generator=torch.Generator().manual_seed(9))
+    gates = part.sample(state, noise)
+    equal("the same noise again", part.sample(state, noise), gates)
+    equal("permuted rows and noise", part.sample(GateState(state.logits[order]), noise[order]), gates[order])
+    many = draw(part, 65536)
+    assert many is not None
+    finite("65536 draws", many)
+
+
+@check("gate")
+def check_gate_monotone(part: GateSampler) -> None:
+    """A larger logit lowers neither the gate (same noise) nor the open probability."""
+    low, high = part.init(_spread()), part.init(_spread() + 0.5)
+    at_most("open probability", part.open_probability(low), part.open_probability(high), 1e-6, ROUNDING)
+    for (how, less), (_, more) in zip(_samples(part, low), _samples(part, high), strict=True):
+        at_most(f"gates {how}", less, more.detach(), 1e-6, ROUNDING)
+
+
+@check("gate", trait="differentiable")
+def check_gate_gradient_flow(part: GateSampler) -> None:
+    """The gradient is finite, never negative, and alive for nine in ten logits within +-1, hard gates included."""
+    logits = torch.linspace(-1, 1, 101, requires_grad=True)
+    for how, gates in _samples(part, GateState(logits)):
+        assert gates.requires_grad, f"gates {how} carry no gradient"
+        (gradient,) = torch.autograd.grad(gates.sum(), logits)
+        finite(f"gradient {how}", gradient)
+        at_most(f"negated gradient {how}", -gradient, 0.0, 0.0, "a gate never closes as its logit rises")
+        if how == "without noise":
+            alive = float((gradient > 0).float().mean())
+            assert alive >= 0.9, f"gradient {how}: alive for {alive:.2f} of all |logits| <= 1; expected 0.9"
+
+
+@check("gate")
+def check_gate_extremes(part: GateSampler) -> None:
+    """Logits of +-1e4 give gates in [0, 1], finite probabilities and finite gradients."""
+    for state in (part.init(torch.tensor([-1e4, 1e4])), GateState(torch.tensor([-1e4, 1e4]))):
+        logits = state.logits.detach().clone().requires_grad_(True)
+        gates = part.sample(GateState(logits), None)
+        probability = part.open_probability(GateState(logits))
+        finite("open probability at +-1e4", probability)
+        assert float(gates[1].detach()) == 1.0, f"logit 1e4: expected a gate of exactly 1.0, got {gates[1].item()!r}"
+        total = (gates + probability).sum()
+        if total.requires_grad:
+            (gradient,) = torch.autograd.grad(total, logits)
+            finite("gradient at +-1e4", gradient)
+
+
+@check("gate", trait="temperature")
+def check_gate_temperature_limit(part: GateSampler) -> None:
+    """As the temperature falls (1, 0.3, 0.1), gates do not move away from 0 and 1."""
+    distances = []
+    for temperature in (1.0, 0.3, 0.1):
+        colder = type(part)(part.config.model_copy(update={"temperature": temperature}))
+        gates = colder.sample(colder.init(_spread()), None)
+        distances.append(float(torch.minimum(gates, 1 - gates).mean()))
+    fine = all(b <= a + 1e-6 for a, b in pairwise(distances))
+    assert fine, f"mean distance to 0 or 1 at temperatures 1, 0.3, 0.1: {distances}; expected no rise (1e-6: float32)"
+
+
+@check("gate")
+def check_gate_deterministic_is_final(part: GateSampler) -> None:
+    """The transmitted gate, sample(state, None), does not depend on gradients being recorded."""
+    logits = part.init(_spread()).logits.detach()
+    with torch.no_grad():
+        quiet = part.sample(GateState(logits), None)
+    recorded = part.sample(GateState(logits.clone().requires_grad_(True)), None).detach()
+    equal("gates with gradients recorded", recorded, quiet)
+
+
+@check("gate")
+def check_gate_bound(part: GateSampler) -> None:
+    """Bounds are a projection: bounding twice is bounding once, and a fresh state is within them."""
+    fresh = part.init(_spread() * 10)
+    equal("bound(init(z))", part.bound(fresh).logits, fresh.logits)
+    once = part.bound(GateState(_spread() * 10))
+    equal("bound(bound(s))", part.bound(once).logits, once.logits)
+    at_most("order of bounded logits", once.logits[:-1], once.logits[1:], 0.0, "bounds keep the order")
+
+
+@check("gate")
+def check_gate_state_resume(part: GateSampler) -> None:
+    """A state saved and loaded gives the same bits, and its rows follow an edit."""
+    state = part.init(world("cloud").logits)
+    buffer = io.BytesIO()
+    torch.save(state.logits, buffer)
+    buffer.seek(0)
+    loaded = type(state)(logits=torch.load(buffer, weights_only=True))
+    all_equal("loaded state", dict(_samples(part, loaded)), dict(_samples(part, state)))
+    edited = edit_state(state, TopologyEdit.keep(torch.zeros(len(state.logits), dtype=torch.bool)))
+    assert len(edited.logits) == len(state.logits), "gates live on nodes: an edit of Gaussians must not change them"
+    got = tuple(state.logits.shape)
+    assert got == (len(world("cloud").logits),), f"logits: expected one per node, got shape {list(got)}"

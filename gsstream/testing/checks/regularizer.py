@@ -1,0 +1,148 @@
+"""What a regularizer promises."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.shapes import check_shape
+from gsstream.regularizer.base import Regularizer
+from gsstream.testing.cases import World, forest, world
+from gsstream.testing.compare import ROUNDING, at_most, equal, finite
+from gsstream.testing.registry import Skip, check
+
+
+def _terms(
+    part: Regularizer, case: World, opened: torch.Tensor | None = None, residual: torch.Tensor | None = None
+) -> Mapping[str, torch.Tensor]:
+    opened = _opened(case) if opened is None else opened
+    residual = case.residual if residual is None else residual
+    return part.penalty(opened, residual, case.hierarchy, len(case.logits))
+
+
+def _opened(case: World) -> torch.Tensor:
+    """[M] open probabilities between 0.1 and 0.9."""
+    return torch.linspace(0.1, 0.9, case.hierarchy.num_nodes).to(case.residual.dtype)
+
+
+def _total(terms: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    values = [value.double() for value in terms.values()]
+    return torch.stack(values).sum() if values else torch.zeros((), dtype=torch.float64)
+
+
+@check("regularizer")
+def check_regularizer_scalar(part: Regularizer) -> None:
+    """Each term is a finite scalar >= 0 in the input's dtype."""
+    for case in (world("cloud"), world("cloud").double()):
+        for name, value in _terms(part, case).items():
+            check_shape(f"term {name!r}", value, ())
+            finite(f"term {name!r}", value)
+            at_most(f"negated term {name!r}", -value, 0.0, 0.0, "penalties are not rewards")
+
+
+@check("regularizer")
+def check_regularizer_terms(part: Regularizer) -> None:
+    """The names of the terms do not depend on the input, so that logs line up."""
+    names = {name: list(_terms(part, world(name))) for name in ("one", "two identical", "cloud")}
+    assert len({tuple(found) for found in names.values()}) == 1, f"terms differ from input to input: {names}"
+
+
+@check("regularizer")
+def check_regularizer_zero_at_rest(part: Regularizer) -> None:
+    """All closed and no residual costs exactly 0."""
+    case = world("cloud")
+    rest = _total(_terms(part, case, torch.zeros(case.hierarchy.num_nodes), torch.zeros_like(case.residual)))
+    equal("penalty at rest", rest, torch.zeros_like(rest))
+
+
+@check("regularizer")
+def check_regularizer_monotone(part: Regularizer) -> None:
+    """Raising an open probability or enlarging a residual does not lower the total."""
+    case = world("cloud")
+    before = _total(_terms(part, case))
+    for node in range(0, case.hierarchy.num_nodes, 4):
+        opened = _opened(case)
+        opened[node] += 0.05
+        at_most(f"total before node {node} opens", before, float(_total(_terms(part, case, opened))), 1e-6, ROUNDING)
+    for row in range(0, len(case.residual), 40):
+        residual = case.residual.clone()
+        residual[row] *= 1.5
+        after = float(_total(_terms(part, case, None, residual)))
+        at_most(f"total before residual {row} grows", before, after, 1e-6, ROUNDING)
+
+
+@check("regularizer")
+def check_regularizer_linear_in_weight(part: Regularizer) -> None:
+    """Doubling the weights (Traits.weights) doubles the total; zero weights give exactly 0 and no gradient."""
+    weights = part.claims().weights
+    if not weights:
+        raise Skip("claims no weights (Traits.weights)")
+    case = world("cloud")
+
+    def scaled(factor: float) -> Regularizer:
+        values: dict[str, Any] = {name: factor * getattr(part.config, name) for name in weights}
+        return type(part)(part.config.model_copy(update=values))
+
+    once, twice = _total(_terms(part, case)), _total(_terms(scaled(2.0), case))
+    equal("twice the weights", twice, 2 * once, 1e-5, ROUNDING)
+    opened, residual = _opened(case).requires_grad_(True), case.residual.clone().requires_grad_(True)
+    nothing = _total(_terms(scaled(0.0), case, opened, residual))
+    equal("zero weights", nothing.detach(), torch.zeros_like(nothing))
+    if nothing.requires_grad:
+        for gradient in torch.autograd.grad(nothing, [opened, residual], allow_unused=True, materialize_grads=True):
+            equal("gradient at zero weights", gradient, torch.zeros_like(gradient))
+
+
+@check("regularizer")
+def check_regularizer_gradient(part: Regularizer) -> None:
+    """Agrees with finite differences in double precision; finite where nothing moves and all is closed."""
+    case = world("two identical").double()
+    inputs = (torch.tensor([0.3, 0.7], dtype=torch.float64, requires_grad=True), case.residual.requires_grad_(True))
+    if not _total(part.penalty(*inputs, case.hierarchy, 2)).requires_grad:
+        return  # it costs nothing, whatever the input
+    torch.autograd.gradcheck(lambda p, r: _total(part.penalty(p, r, case.hierarchy, 2)), inputs, eps=1e-6, atol=1e-6)
+    rest = (torch.zeros_like(inputs[0]).requires_grad_(True), torch.zeros_like(inputs[1]).requires_grad_(True))
+    total = _total(part.penalty(*rest, case.hierarchy, 2))
+    for name, gradient in zip(("gates", "residual"), torch.autograd.grad(total, rest, allow_unused=True), strict=True):
+        if gradient is not None:
+            finite(f"gradient at rest with respect to the {name}", gradient)
+
+
+@check("regularizer")
+def check_regularizer_reduction(part: Regularizer) -> None:
+    """A scene beside its own copy costs the same (Traits.reduction "mean") or twice as much ("sum")."""
+    case = world("cloud")
+    once, m = _total(_terms(part, case)), case.hierarchy.num_nodes
+    half = forest(len(case.logits))
+    both = Hierarchy(*(torch.cat([a, a + step]) for a, step in ((half.node_of, m), (half.parent, m), (half.level, 0))))
+    terms = part.penalty(_opened(case).repeat(2), case.residual.repeat(2, 1), both, 2 * len(case.logits))
+    factor = {"mean": 1.0, "sum": 2.0}[part.claims().reduction]
+    equal(f"reduction {part.claims().reduction!r}", _total(terms), factor * once, 1e-5, ROUNDING)
+
+
+@check("regularizer")
+def check_regularizer_closed_rows(part: Regularizer) -> None:
+    """Rows that are left out because their gates are closed cost what they cost when they were kept: nothing."""
+    case = world("cloud")
+    opened = _opened(case)
+    closed = torch.arange(case.hierarchy.num_nodes) % 2 == 0
+    opened[closed] = 0.0
+    kept = ~closed[case.hierarchy.node_of]
+    whole = _total(_terms(part, case, opened))
+    active = part.penalty(opened, case.residual[kept], case.hierarchy.rows(kept), len(case.logits))
+    equal("active rows alone", _total(active), whole, 1e-5, ROUNDING)
+
+
+@check("regularizer")
+def check_regularizer_empty(part: Regularizer) -> None:
+    """No active rows cost exactly 0."""
+    case = world("empty")
+    total = _total(_terms(part, case))
+    equal("no Gaussians", total, torch.zeros_like(total))
+    scene = world("cloud")
+    none_active = part.penalty(_opened(scene), scene.residual[:0], scene.hierarchy.rows(slice(0, 0)), len(scene.logits))
+    total = _total(none_active)
+    equal("no active rows", total, torch.zeros_like(total))

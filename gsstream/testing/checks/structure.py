@@ -1,0 +1,199 @@
+"""What a structure promises."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from gsstream.core.errors import InputError
+from gsstream.core.frame import PointCloud
+from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.topology import TopologyEdit
+from gsstream.structure.base import Structure
+from gsstream.testing.cases import World, world
+from gsstream.testing.compare import finite
+from gsstream.testing.registry import check
+
+WORLDS = ("one", "two identical", "line", "cloud", "far", "thin", "unseen")
+
+
+def canonical(labels: torch.Tensor) -> list[int]:
+    """Labels renamed in the order of their first occurrence."""
+    names: dict[int, int] = {}
+    return [names.setdefault(int(label), len(names)) for label in labels]
+
+
+def _built(part: Structure, case: World) -> Hierarchy:
+    return part.build(case.gaussians, case.anchors)
+
+
+@check("structure")
+def check_structure_partition(part: Structure) -> None:
+    """node_of is int64 in [0, M); every node has a member or a child."""
+    for name in WORLDS:
+        case = world(name)
+        forest = _built(part, case)
+        n, m = len(case.gaussians), forest.num_nodes
+        dtype = forest.node_of.dtype
+        assert dtype == torch.int64, f"world {name!r}: node_of: expected int64, got {dtype}"
+        assert tuple(forest.node_of.shape) == (n,), f"world {name!r}: node_of: expected shape [{n}]"
+        low, high = int(forest.node_of.min()), int(forest.node_of.max())
+        assert low >= 0 and high < m, f"world {name!r}: node_of: expected [0, {m}), got {low} to {high}"
+        used = torch.zeros(m, dtype=torch.bool)
+        used[forest.node_of] = True
+        used[forest.parent[forest.parent != torch.arange(m)]] = True
+        barren = (~used).nonzero()[:, 0]
+        assert len(barren) == 0, f"world {name!r}: nodes without member or child: {barren[:5].tolist()} of {m}"
+
+
+@check("structure")
+def check_structure_forest(part: Structure) -> None:
+    """A root is its own parent; following parents ends at a root within max(level) steps."""
+    for name in WORLDS:
+        forest = _built(part, world(name))
+        m = forest.num_nodes
+        forest_parent = forest.parent
+        low, high = int(forest_parent.min()), int(forest_parent.max())
+        assert low >= 0 and high < m, f"world {name!r}: parent: expected [0, {m}), got {low} to {high}"
+        at = torch.arange(m)
+        for _ in range(int(forest.level.max())):
+            at = forest_parent[at]
+        lost = (forest_parent[at] != at).nonzero()[:, 0]
+        steps = int(forest.level.max())
+        assert len(lost) == 0, f"world {name!r}: node {lost[:1].tolist()} reaches no root within {steps} steps"
+        root = forest_parent == torch.arange(m)
+        want = torch.where(root, torch.zeros_like(forest.level), forest.level[forest_parent] + 1)
+        wrong = (forest.level != want).nonzero()[:, 0]
+        assert len(wrong) == 0, (
+            f"world {name!r}: level of node {int(wrong[0])}: expected {int(want[wrong[0]])}, "
+            f"got {int(forest.level[wrong[0]])}"
+        )
+
+
+@check("structure")
+def check_structure_label_free(part: Structure) -> None:
+    """Permuting the Gaussians gives the same groups, whatever the nodes are called."""
+    case = world("cloud")
+    order = torch.randperm(len(case.gaussians), generator=torch.Generator().manual_seed(5))
+    first = canonical(_built(part, case).node_of[order])
+    second = canonical(_built(part, case.permuted(order)).node_of)
+    apart = [i for i, (a, b) in enumerate(zip(first, second, strict=True)) if a != b]
+    assert not apart, f"permuted Gaussians are grouped differently: {len(apart)} of {len(first)}, first row {apart[0]}"
+
+
+@check("structure", trait="local")
+def check_structure_locality(part: Structure) -> None:
+    """Two members of one node are within one root cell of each other along every axis."""
+    for name in ("line", "cloud", "unseen"):
+        case = world(name)
+        forest, cell = _built(part, case), float(case.anchors.cell_sizes[0])
+        for node in range(forest.num_nodes):
+            members = case.gaussians.means[forest.node_of == node]
+            if len(members) == 0:
+                continue
+            span = float((members.amax(0) - members.amin(0)).max())
+            assert span <= cell * (1 + 1e-5), (
+                f"world {name!r}: members of node {node} are {span:.6g} apart; expected at most one root cell, "
+                f"{cell:.6g} (1e-5 of it for float32 cell borders)"
+            )
+
+
+@check("structure", trait="stable")
+def check_structure_stable_update(part: Structure) -> None:
+    """The identity edit changes nothing; co-members stay together after a removal; a copy joins its source."""
+    case = world("cloud")
+    forest, n = _built(part, case), len(case.gaussians)
+    same = part.update(forest, TopologyEdit.keep(torch.ones(n, dtype=torch.bool)), case.gaussians)
+    for field in ("node_of", "parent", "level"):
+        got, want = getattr(same, field), getattr(forest, field)
+        assert torch.equal(got, want), f"the identity edit changed {field}: expected {want[:5]}, got {got[:5]}"
+    keep = torch.arange(n) % 3 != 0
+    less = part.update(forest, TopologyEdit.keep(keep), case.gaussians.rows(keep))
+    less.validate()
+    assert canonical(less.node_of) == canonical(forest.node_of[keep]), "survivors of a removal were grouped anew"
+    if int(torch.bincount(forest.node_of).max()) == 1:
+        return  # one node each: a copy cannot share its source's
+    source = torch.cat([torch.arange(n), torch.tensor([4])])
+    edit = TopologyEdit(source, source.new_zeros(n + 1, dtype=torch.bool))
+    more = part.update(forest, edit, case.gaussians.rows(source))
+    got, want = int(more.node_of[n]), int(more.node_of[4])
+    assert got == want, f"a copy of row 4 got node {got}; expected its source's, {want}"
+
+
+@check("structure")
+def check_structure_edits_compose(part: Structure) -> None:
+    """Two edits one after the other group as their composition does."""
+    case = world("cloud")
+    forest, n = _built(part, case), len(case.gaussians)
+    first = TopologyEdit.keep(torch.arange(n) % 4 != 0)
+    second = TopologyEdit.permute(torch.randperm(len(first.source), generator=torch.Generator().manual_seed(2)))
+    both = first.then(second)
+    middle = part.update(forest, first, case.gaussians.rows(first.source))
+    stepwise = part.update(middle, second, case.gaussians.rows(both.source))
+    at_once = part.update(forest, both, case.gaussians.rows(both.source))
+    a, b = canonical(stepwise.node_of), canonical(at_once.node_of)
+    assert a == b, f"two edits and their composition disagree on {sum(x != y for x, y in zip(a, b, strict=True))} rows"
+    assert stepwise.num_nodes == at_once.num_nodes, f"nodes: {stepwise.num_nodes} and {at_once.num_nodes}"
+
+
+@check("structure", trait="idempotent")
+def check_structure_idempotent(part: Structure) -> None:
+    """Building again from the same Gaussians, also stored node by node, gives the same forest."""
+    case = world("cloud")
+    forest = _built(part, case)
+    order = torch.argsort(forest.node_of, stable=True)
+    again = _built(part, case.permuted(order))
+    wrong = (again.node_of != forest.node_of[order]).nonzero()[:, 0]
+    assert len(wrong) == 0, f"stored node by node, {len(wrong)} of {len(order)} rows got another node: resume drifts"
+    assert torch.equal(again.parent, forest.parent), "parents differ after storing node by node"
+
+
+@check("structure")
+def check_structure_degenerate(part: Structure) -> None:
+    """Coincident, collapsed and far clouds: a valid forest, at most N nodes per level, M = 0 for N = 0."""
+    coincident = world("cloud")
+    coincident.gaussians.means[:] = 0.25
+    cases = [("coincident", coincident)] + [(name, world(name)) for name in ("empty", "far", "thin", "two identical")]
+    for name, case in cases:
+        forest = _built(part, case)
+        forest.validate()
+        deepest = int(forest.level.max()) + 1 if forest.num_nodes else 1
+        bound = len(case.gaussians) * deepest
+        assert forest.num_nodes <= bound, f"{name}: {forest.num_nodes} nodes; expected at most N x levels = {bound}"
+
+
+@check("structure")
+def check_structure_no_gradient(part: Structure) -> None:
+    """Nothing it returns carries a gradient."""
+    case = world("cloud")
+    case = replace(case, gaussians=case.gaussians.map(lambda t: t.clone().requires_grad_(True)))
+    forest = _built(part, case)
+    carried = [name for name in ("node_of", "parent", "level") if getattr(forest, name).requires_grad]
+    assert not carried, f"carries a gradient: {', '.join(carried)}"
+    touched = [name for name, value in case.gaussians.items() if not value.requires_grad or value.grad is not None]
+    assert not touched, f"requires_grad or .grad of the Gaussians changed: {', '.join(touched)}"
+
+
+@check("structure")
+def check_structure_seed(part: Structure) -> None:
+    """Anchors are finite, levels index cell sizes, cells are positive and never grow; no points raise InputError."""
+    case = world("cloud")
+    anchors = part.seed(case.points, case.cameras)
+    n = len(anchors.positions)
+    shapes = tuple(anchors.positions.shape), tuple(anchors.colors.shape)
+    assert shapes == ((n, 3), (n, 3)), f"positions and colors: expected shapes [{n}, 3], got {shapes}"
+    assert n > 0, "no anchors were placed"
+    finite("positions", anchors.positions)
+    levels = len(anchors.cell_sizes)
+    low, high = int(anchors.levels.min()), int(anchors.levels.max())
+    assert low >= 0 and high < levels, f"levels: expected [0, {levels}), got {low} to {high}"
+    assert float(anchors.cell_sizes.min()) > 0, f"cell_sizes: expected positive, got {anchors.cell_sizes.tolist()}"
+    assert bool((anchors.cell_sizes.diff() <= 0).all()), f"cell_sizes grow: {anchors.cell_sizes.tolist()}"
+    nothing = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), "nothing")
+    try:
+        part.seed(nothing, case.cameras)
+    except InputError:
+        return
+    raise AssertionError("no points were accepted; expected InputError saying what to do")

@@ -1,0 +1,41 @@
+"""Share of the largest change: how far a change in the images pulls a Gaussian, against the strongest pull."""
+
+from __future__ import annotations
+
+from typing import final
+
+import torch
+from pydantic import Field
+
+from gsstream.api import ConfidenceEstimator, FrameContext, PartConfig, Traits, check_finite
+
+
+@final
+class ExampleConfidence(ConfidenceEstimator):
+    """z = gain * (|m| / max|m| - 1/2), |m| the mean over views of the screen gradient's norm (ours).
+
+    The gradient is that of half the squared difference of the two frames. Where nothing pulls, z is ``floor``.
+    """
+
+    class Config(PartConfig):
+        gain: float = Field(default=10.0, gt=0, le=100, description="steepness, logits per share of the largest pull")
+        floor: float = Field(default=-6.0, ge=-50, le=0, description="logit of a Gaussian that nothing pulls")
+
+    traits = Traits(needs_renderer=True, finds_motion=True, monotone_in_change=True)
+
+    def claims(self) -> Traits:
+        return Traits(needs_renderer=True, finds_motion=True, monotone_in_change=True, floor=self.config.floor)
+
+    def estimate(self, context: FrameContext) -> torch.Tensor:
+        pull = torch.zeros(len(context.gaussians), dtype=torch.float64)
+        for view in range(len(context.cameras)):
+            change = context.previous_image(view) - context.image(view)
+            check_finite(f"change of view {view}", change)
+            gradient, visible = context.screen_gradient(view, change)
+            pull += gradient.double().norm(dim=1) * visible
+        logits = torch.full_like(pull, self.config.floor)
+        pulled = pull > 0
+        if bool(pulled.any()):
+            share = pull[pulled] / pull.max()
+            logits[pulled] = (self.config.gain * (share - 0.5)).clamp_min(self.config.floor)
+        return logits.float()

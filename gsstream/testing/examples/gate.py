@@ -1,0 +1,48 @@
+"""Threshold gates: open or closed, with a straight-through gradient."""
+
+from __future__ import annotations
+
+from typing import final
+
+import torch
+from pydantic import Field
+
+from gsstream.api import GateSampler, GateState, PartConfig, Traits, check_finite
+
+
+@final
+class ExampleGate(GateSampler):
+    """g = 1 where z + n > 0, else 0, with n ~ Logistic(0, 1) while training: P(g = 1) = sigmoid(z) (ours).
+
+    The gradient is that of sigmoid((z + n) / temperature), straight through the step.
+    """
+
+    class Config(PartConfig):
+        temperature: float = Field(default=0.5, ge=0.05, le=10, description="softness of the gradient, no unit")
+        bound: float = Field(default=7.0, gt=0, le=50, description="logits are kept in [-bound, bound]")
+
+    traits = Traits(stochastic=True, differentiable=True, temperature=True)
+
+    @property
+    def num_levels(self) -> int:
+        return 1
+
+    def init(self, logits: torch.Tensor) -> GateState:
+        check_finite("logits", logits)
+        return self.bound(GateState(logits=logits.detach()))
+
+    def noise(self, num_nodes: int, generator: torch.Generator) -> torch.Tensor | None:
+        # Half a step away from 0 and 1, where the logarithms would be infinite.
+        u = torch.rand(num_nodes, generator=generator).double() + 2.0**-25
+        return (torch.log(u) - torch.log1p(-u)).float()
+
+    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
+        z = state.logits if noise is None else state.logits + noise.to(state.logits.dtype)
+        soft = torch.sigmoid(z / self.config.temperature)
+        return (z.detach() > 0).to(z.dtype) + (soft - soft.detach())
+
+    def open_probability(self, state: GateState) -> torch.Tensor:
+        return torch.sigmoid(state.logits)
+
+    def bound(self, state: GateState) -> GateState:
+        return GateState(logits=state.logits.clamp(-self.config.bound, self.config.bound))

@@ -1,0 +1,30 @@
+"""Tree maximum: a tree is as suspect as its most suspect Gaussian."""
+
+from __future__ import annotations
+
+from typing import final
+
+import torch
+from pydantic import Field
+
+from gsstream.api import Hierarchy, PartConfig, Propagation, Traits, check_finite, check_shape
+
+
+@final
+class ExamplePropagation(Propagation):
+    """z_node = max of z_i over the node's tree (ours, after the paper's propagation by a maximum)."""
+
+    class Config(PartConfig):
+        empty: float = Field(default=-50.0, ge=-1e4, le=0, description="logit of a tree without Gaussians")
+
+    traits = Traits(conservative=True, idempotent=True, differentiable=True, normalised=True, parent_bound=True)
+
+    def propagate(self, logits: torch.Tensor, hierarchy: Hierarchy) -> torch.Tensor:
+        check_shape("logits", logits, (hierarchy.num_gaussians,))
+        check_finite("logits", logits)
+        root = hierarchy.parent
+        for _ in range(len(root).bit_length()):
+            root = root[root]
+        best = logits.new_full((hierarchy.num_nodes,), self.config.empty)
+        best = best.scatter_reduce(0, root[hierarchy.node_of], logits, reduce="amax", include_self=False)
+        return best[root]

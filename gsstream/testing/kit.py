@@ -1,0 +1,126 @@
+"""The contract kit: what every part promises, checked. By pytest, by code, or by ``gsstream check NAME``."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from gsstream.core.part import Part
+from gsstream.testing.checks import common, confidence, gate, propagation, regularizer, structure
+from gsstream.testing.registry import BEHAVED, CHECKS, Check, Skip, checks_for, kind_of
+
+Status = Literal["passed", "failed", "expected failure", "skipped"]
+#: Importing these modules fills the registry; the order is that of the reports.
+MODULES = (common, structure, confidence, propagation, gate, regularizer)
+LEAST_REASON = 20
+
+
+@dataclass(frozen=True, slots=True)
+class CheckResult:
+    """Outcome of one check on one part. ``message``: numbers of the failure, or the reason of the skip."""
+
+    check: str
+    part: str
+    status: Status
+    message: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """Neither failed nor unexpectedly passed."""
+        return self.status != "failed"
+
+
+def run_check(entry: Check, subject: Any, expected: str | None = None) -> CheckResult:
+    """Make one check; whatever the part raises is a failure with its name."""
+    name = repr(subject)
+    if entry.trait is not None and not getattr(subject.claims(), entry.trait):
+        return CheckResult(entry.name, name, "skipped", f"not claimed: Traits.{entry.trait}")
+    try:
+        entry.function(subject)
+    except Skip as reason:
+        return CheckResult(entry.name, name, "skipped", str(reason))
+    except AssertionError as error:
+        status: Status = "failed" if expected is None else "expected failure"
+        return CheckResult(entry.name, name, status, str(error) if expected is None else f"{expected} ({error})")
+    except Exception as error:  # a part may raise anything; that is what is being found out
+        status = "failed" if expected is None else "expected failure"
+        return CheckResult(entry.name, name, status, f"raised {type(error).__name__}: {error}")
+    if expected is not None:
+        return CheckResult(entry.name, name, "failed", f"passed, but was expected to fail: {expected}; drop the entry")
+    return CheckResult(entry.name, name, "passed")
+
+
+def run_checks(part: Part, expected_failures: Mapping[str, str] | None = None) -> list[CheckResult]:
+    """Make every check of the part's kind.
+
+    Arguments:
+        expected_failures: check -> why it fails, at least 20 characters. Passing unexpectedly is a failure.
+
+    Raises:
+        ValueError: an expected failure names no check of this kind, or its reason is none.
+    """
+    expected = dict(expected_failures or {})
+    entries = checks_for(kind_of(part))
+    _check_reasons(expected, [entry.name for entry in entries])
+    return [run_check(entry, part, expected.get(entry.name)) for entry in entries]
+
+
+def parametrize_with_checks(
+    parts: Sequence[Part], expected_failures: Mapping[str, str] | None = None
+) -> Callable[[Callable[..., Any]], Any]:
+    """Decorate ``def test_contract(check): check()`` to make every check on every part, one test each.
+
+    A skipped check is a skipped test with its reason; an expected failure is an xfail, strictly.
+    """
+    import pytest
+
+    expected = dict(expected_failures or {})
+    known = {entry.name for part in parts for entry in checks_for(kind_of(part))}
+    _check_reasons(expected, known)
+    cases = []
+    for place, part in enumerate(parts):
+        label = type(part).__name__ if len(parts) == 1 else f"{type(part).__name__}{place}"
+        for entry in checks_for(kind_of(part)):
+            case = functools.partial(_as_test, entry, part, expected.get(entry.name))
+            cases.append(pytest.param(case, id=f"{label}-{entry.name.removeprefix('check_')}"))
+    return pytest.mark.parametrize("check", cases)
+
+
+def _as_test(entry: Check, part: Part, expected: str | None) -> None:
+    import pytest
+
+    result = run_check(entry, part, expected)
+    if result.status == "skipped":
+        pytest.skip(result.message)
+    if result.status == "expected failure":
+        pytest.xfail(result.message)
+    assert result.ok, f"{entry.name} on {result.part}: {result.message}"
+
+
+def _check_reasons(expected: Mapping[str, str], known: Iterable[str]) -> None:
+    for name, reason in expected.items():
+        if name not in known:
+            raise ValueError(f"expected_failures: no check named {name!r} is made on this kind of part")
+        if len(reason.strip()) < LEAST_REASON:
+            raise ValueError(
+                f"expected_failures[{name!r}]: expected a reason of at least {LEAST_REASON} characters, got {reason!r}"
+            )
+
+
+def all_checks() -> list[Check]:
+    """Every registered check, in the order of the reports."""
+    return list(CHECKS.values())
+
+
+def summary(results: Sequence[CheckResult]) -> str:
+    """"12 passed, 1 failed, 3 skipped": every status that occurs is counted."""
+    order: tuple[Status, ...] = ("passed", "failed", "expected failure", "skipped")
+    counts = {status: sum(result.status == status for result in results) for status in order}
+    return ", ".join(f"{number} {status}" for status, number in counts.items() if number)
+
+
+def behaviour_known(part: Part) -> bool:
+    """Whether the kit checks more of this kind than settings, freezing and declaration."""
+    return kind_of(part) in BEHAVED

@@ -1,0 +1,88 @@
+"""The list of checks: each registers itself with the kind of part it is for and the trait that calls for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from gsstream.confidence.base import ConfidenceEstimator
+from gsstream.core.part import Part
+from gsstream.gate.base import GateSampler
+from gsstream.loss.base import Loss
+from gsstream.propagation.base import Propagation
+from gsstream.regularizer.base import Regularizer
+from gsstream.render.base import Renderer
+from gsstream.residual.base import UpdateRule
+from gsstream.structure.base import Structure
+
+CONTRACTS: dict[str, type[Part]] = {
+    "structure": Structure,
+    "confidence": ConfidenceEstimator,
+    "propagation": Propagation,
+    "gate": GateSampler,
+    "regularizer": Regularizer,
+    "update": UpdateRule,
+    "renderer": Renderer,
+    "loss": Loss,
+}
+#: The kinds whose behaviour the kit knows; of the others it checks settings, freezing and declaration.
+BEHAVED = ("structure", "confidence", "propagation", "gate", "regularizer")
+
+CheckFunction = TypeVar("CheckFunction", bound=Callable[..., None])
+
+
+class Skip(Exception):
+    """Raised by a check that cannot be made here; the message says why. Skips are reported and counted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One property.
+
+    Arguments:
+        name: name of the function; stable, because expected failures are given by it.
+        kind: "common", a kind of part, "method" or "packet".
+        kinds: kinds of part it is made on.
+        trait: the claim (a field of ``Traits``) that calls for it; None: every part of these kinds.
+        function: raises AssertionError with numbers.
+    """
+
+    name: str
+    kind: str
+    kinds: tuple[str, ...]
+    trait: str | None
+    function: Callable[..., None]
+
+    @property
+    def meaning(self) -> str:
+        """First line of the function's docstring."""
+        return (self.function.__doc__ or "").strip().splitlines()[0]
+
+
+CHECKS: dict[str, Check] = {}
+
+
+def check(kind: str, trait: str | None = None, kinds: tuple[str, ...] | None = None) -> Callable[..., Any]:
+    """Register a function ``check_*(subject)``."""
+
+    def register(function: CheckFunction) -> CheckFunction:
+        name = function.__name__
+        assert name.startswith("check_") and name not in CHECKS, name
+        CHECKS[name] = Check(name, kind, kinds or (kind,), trait, function)
+        return function
+
+    return register
+
+
+def kind_of(part: Part) -> str:
+    """The kind whose abstract base class ``part`` implements. Raises TypeError when it is none of them."""
+    for kind, contract in CONTRACTS.items():
+        if isinstance(part, contract):
+            return kind
+    raise TypeError(f"expected a part of one of the kinds {', '.join(CONTRACTS)}, got {type(part).__name__}")
+
+
+def checks_for(kind: str) -> list[Check]:
+    """All checks made on a kind of part, common ones first."""
+    return [entry for entry in CHECKS.values() if kind in entry.kinds]

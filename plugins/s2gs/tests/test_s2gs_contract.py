@@ -1,0 +1,44 @@
+"""S2GS keeps the contract; where a released option breaks it, that is said here."""
+
+from __future__ import annotations
+
+from gsstream_s2gs.expected_sparsity import ExpectedSparsity
+from gsstream_s2gs.gumbel_sigmoid import GumbelSigmoid
+from gsstream_s2gs.hierarchical import HierarchicalMax
+from gsstream_s2gs.latent import LatentResidual
+from gsstream_s2gs.octree import StreamingOctree
+from gsstream_s2gs.view_gradient import ViewSpaceGradient
+
+from gsstream.testing import parametrize_with_checks
+
+Sparsity, Gate = ExpectedSparsity.Config, GumbelSigmoid.Config
+Octree, Gradient = StreamingOctree.Config, ViewSpaceGradient.Config
+RELEASED = Gradient(loss="l2norm", aggregate="sum-of-norms", normalisation="ratio")
+PARTS = [
+    StreamingOctree(), StreamingOctree(Octree(gate_level=2)), StreamingOctree(Octree(grouping="gaussian")),
+    ViewSpaceGradient(), ViewSpaceGradient(RELEASED), ViewSpaceGradient(Gradient(normalisation="minmax")),
+    ViewSpaceGradient(Gradient(epsilon_mode="relative")), HierarchicalMax(),
+    GumbelSigmoid(), GumbelSigmoid(Gate(levels=1)), GumbelSigmoid(Gate(noise="none")),
+    ExpectedSparsity(), ExpectedSparsity(Sparsity(reduction="sum", motion="half-mean")), LatentResidual(),
+]  # fmt: skip
+
+
+@parametrize_with_checks(PARTS)
+def test_contract(check) -> None:
+    check()
+
+
+@parametrize_with_checks(
+    [GumbelSigmoid(Gate(levels=1, clamp_gradient=True))],
+    expected_failures={"check_gate_gradient_flow": "the released clamp blocks every gradient of a 0/1 gate"},
+)
+def test_released_clamp(check) -> None:
+    check()
+
+
+@parametrize_with_checks(
+    [GumbelSigmoid(Gate(levels=1, noise="gumbel"))],
+    expected_failures={"check_gate_init_calibrated": "with one Gumbel draw confidence 0.5 opens 63 % of all gates"},
+)
+def test_released_noise_law(check) -> None:
+    check()

@@ -1,0 +1,75 @@
+"""The parts that ship with gsstream, and the examples that new plugins start from, keep the contract."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gsstream.api import Traits
+from gsstream.confidence.uniform import Uniform
+from gsstream.gate.always_open import AlwaysOpen
+from gsstream.loss.photometric import ReferenceLoss
+from gsstream.propagation.group_max import GroupMax
+from gsstream.regularizer.none import NoRegularizer
+from gsstream.render.reference import ReferenceRenderer
+from gsstream.residual.additive import Additive
+from gsstream.structure.flat import Flat
+from gsstream.testing import parametrize_with_checks, run_checks
+from gsstream.testing.examples.confidence import ExampleConfidence
+from gsstream.testing.examples.gate import ExampleGate
+from gsstream.testing.examples.propagation import ExamplePropagation
+from gsstream.testing.examples.regularizer import ExampleRegularizer
+from gsstream.testing.examples.structure import ExampleStructure
+from gsstream.testing.kit import all_checks, summary
+
+BUILTIN = [
+    Flat(), Uniform(), Uniform(Uniform.Config(logit=-50)), GroupMax(), AlwaysOpen(), NoRegularizer(), Additive(),
+    ReferenceRenderer(), ReferenceLoss(),
+]  # fmt: skip
+EXAMPLES = [ExampleStructure(), ExampleConfidence(), ExamplePropagation(), ExampleGate(), ExampleRegularizer()]
+
+
+@parametrize_with_checks([*BUILTIN, *EXAMPLES])
+def test_contract(check) -> None:
+    check()
+
+
+def test_every_part_that_is_declared_is_checked_here() -> None:
+    from gsstream.plugins.builtin import gsstream_components
+    from gsstream.plugins.catalog import CONTRACTS
+
+    declared = {spec.target.rpartition(":")[2] for spec in gsstream_components() if spec.kind in CONTRACTS}
+    assert declared == {type(part).__name__ for part in BUILTIN}
+
+
+def test_examples_claim_enough_for_every_check_of_the_five_kinds_to_run() -> None:
+    skipped = {r.check: r.message for part in EXAMPLES for r in run_checks(part) if r.status == "skipped"}
+    assert set(skipped) == {"check_cheap_spec"}, skipped
+
+
+def test_a_known_failure_needs_a_reason_and_must_still_fail() -> None:
+    with pytest.raises(ValueError, match="at least 20 characters"):
+        run_checks(AlwaysOpen(), {"check_gate_monotone": "FIXME"})
+    with pytest.raises(ValueError, match="no check named 'check_nothing'"):
+        run_checks(AlwaysOpen(), {"check_nothing": "there is no such check anywhere"})
+    results = run_checks(AlwaysOpen(), {"check_gate_monotone": "said to fail, but it does not at all"})
+    [result] = [r for r in results if not r.ok]
+    assert result.check == "check_gate_monotone"
+    assert "passed, but was expected to fail" in result.message
+
+
+def test_skips_are_counted_and_say_which_claim_is_missing() -> None:
+    results = run_checks(AlwaysOpen())
+    skipped = [r for r in results if r.status == "skipped"]
+    assert all(r.message.startswith("not claimed: Traits.") for r in skipped)
+    assert summary(results) == f"{len(results) - len(skipped)} passed, {len(skipped)} skipped"
+
+
+def test_names_and_meanings_of_checks() -> None:
+    checks = all_checks()
+    assert len(checks) > 50
+    for entry in checks:
+        assert entry.meaning.endswith((".", ")")), f"{entry.name}: {entry.meaning!r} is no sentence"
+        if entry.trait:
+            assert hasattr(Traits(), entry.trait)
+    assert not torch.is_inference_mode_enabled()

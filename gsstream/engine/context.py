@@ -9,6 +9,7 @@ from gsstream.core.context import ScreenGradient
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
+from gsstream.engine.active_set import Change
 from gsstream.engine.stream_state import StreamState
 from gsstream.metrics.noise import noise_sigma
 from gsstream.render.base import Renderer
@@ -21,10 +22,17 @@ class StepContext:
     """
 
     def __init__(
-        self, state: StreamState, frame: Frame, renderer: Renderer, background: tuple[float, float, float]
+        self,
+        state: StreamState,
+        frame: Frame,
+        renderer: Renderer,
+        background: tuple[float, float, float],
+        change: Change | None = None,
     ) -> None:
         self._state, self._frame, self._renderer, self._background = state, frame, renderer, background
+        self._change = change
         self._gaussians = state.gaussians
+        self._touched: dict[int, torch.Tensor] = {}
 
     @property
     def index(self) -> int:
@@ -55,9 +63,30 @@ class StepContext:
 
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
         upstream = image_gradient.float()
+        if self._change is not None:
+            if not bool(self._change.tiles[view].any()):
+                nothing = torch.zeros(len(self._gaussians), dtype=torch.bool)
+                self._touched.setdefault(view, nothing)
+                return ScreenGradient(torch.zeros(len(nothing), 2), nothing)
+            upstream = upstream * self._change.pixels(view)
         if self._state.exposure:
             upstream = self._state.exposure.pull(view, upstream)
-        return self._renderer.screen_gradient(self._gaussians, self.cameras, view, upstream.contiguous())
+        result = self._renderer.screen_gradient(self._gaussians, self.cameras, view, upstream.contiguous())
+        self._touched.setdefault(view, (result.gradient != 0).any(1))
+        return result
+
+    def touched(self) -> torch.Tensor:
+        """[N] bool: Gaussians visible in a changed tile of some view (all of them when change is not detected).
+
+        Views that the estimator already differentiated cost nothing here: what it got back shows whom they touch.
+        """
+        everyone = torch.ones(len(self._gaussians), dtype=torch.bool)
+        if self._change is None:
+            return everyone
+        for view in range(len(self.cameras)):
+            if view not in self._touched:
+                self.screen_gradient(view, torch.ones_like(self.image(view)))
+        return torch.stack(list(self._touched.values())).any(0) if self._touched else ~everyone
 
     def noise_sigma(self, view: int) -> float:
         return noise_sigma(self._state.previous.images[view], self._frame.images[view])

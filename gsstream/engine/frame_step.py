@@ -17,6 +17,7 @@ from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import IntArray
 from gsstream.core.state import GateState
+from gsstream.engine.active_set import detect_change
 from gsstream.engine.assemble import Assembly
 from gsstream.engine.context import StepContext
 from gsstream.engine.guard import guarded
@@ -29,16 +30,17 @@ from gsstream.residual.base import symbols as residual_symbols
 def frame_step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> Step:
     """Advance the stream by one frame. Pure: a failure leaves ``state`` as it was."""
     clock = [time.perf_counter()]
-    context = StepContext(state, frame, parts.renderer, parts.recipe.background)
+    change = detect_change(state.previous, frame, parts.recipe.stream.change_threshold)
+    context = StepContext(state, frame, parts.renderer, parts.recipe.background, change)
     with guarded("confidence", parts.confidence, frame.index):
         logits = parts.confidence.estimate(context)
     with guarded("propagation", parts.propagation, frame.index):
         node_logits = parts.propagation.propagate(logits, state.hierarchy)
     with guarded("gate", parts.gate, frame.index):
         gate = parts.gate.init(node_logits)
+    active = active_rows(parts, context, state, gate)
     clock.append(time.perf_counter())
 
-    active = active_set(parts, state, gate)
     problem = Problem(state, frame, active, state.gaussians.rows(active), gate)
     with guarded("method", parts.gate, frame.index):
         solution = optimise(parts, problem, rng.stream("frame", frame.index))
@@ -55,11 +57,11 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> S
     return Step(after, packet, "empty" if delta.is_empty else "delta", metrics)
 
 
-def active_set(parts: Assembly, state: StreamState, gate: GateState) -> torch.Tensor:
-    """[A] rows whose gate may open: open probability above the recipe's threshold."""
+def active_rows(parts: Assembly, context: StepContext, state: StreamState, gate: GateState) -> torch.Tensor:
+    """[A] rows that may change: visible in a changed tile, behind a gate that may open."""
     probability = parts.gate.open_probability(gate)
     may_open = probability > parts.recipe.stream.active_threshold
-    return may_open[state.hierarchy.node_of].nonzero()[:, 0]
+    return (may_open[state.hierarchy.node_of] & context.touched()).nonzero()[:, 0]
 
 
 def harden(parts: Assembly, problem: Problem, solution: Solution) -> Delta:

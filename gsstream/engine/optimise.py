@@ -9,6 +9,7 @@ import torch
 
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
+from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.state import GateState
 from gsstream.engine.assemble import Assembly
 from gsstream.engine.exposure import Exposure
@@ -49,6 +50,8 @@ class Solution:
 def optimise(parts: Assembly, problem: Problem, generator: torch.Generator) -> Solution:
     """Minimise photometric loss + penalty over epochs x views, one view per iteration."""
     recipe = parts.recipe
+    if len(problem.active) == 0:
+        return Solution({}, {}, problem.gate, problem.state.gate_moments, 0.0, 0)
     views = len(problem.frame.cameras)
     iterations = recipe.stream.epochs * views
     run = _FrameRun(parts, problem, generator)
@@ -67,7 +70,12 @@ class _FrameRun:
     def __init__(self, parts: Assembly, problem: Problem, generator: torch.Generator) -> None:
         self.parts, self.problem, self.generator = parts, problem, generator
         state, layout = problem.state, problem.state.player.layout
-        self.hierarchy = state.hierarchy.rows(problem.active)
+        nodes, node_of = torch.unique(state.hierarchy.node_of[problem.active], return_inverse=True)
+        if parts.recipe.gate_training.optimiser == "persistent":
+            nodes, node_of = torch.arange(state.hierarchy.num_nodes), state.hierarchy.node_of[problem.active]
+        # Only gates with active rows behind them are sampled and trained; parents matter to no gate.
+        self.nodes = nodes
+        self.hierarchy = Hierarchy(node_of, torch.arange(len(nodes)), torch.zeros_like(nodes))
         active = problem.active.numpy()
         self.units = torch.from_numpy(layout.units[active])
         self.levels = torch.from_numpy(layout.octree_levels[active].astype("int64"))
@@ -77,9 +85,8 @@ class _FrameRun:
         self.latents = AdamTable(latents, {name: codes[name].lr for name in latents})
         decoders = {name: state.decoders[name] for name in latents if name in state.decoders}
         self.decoders = AdamTable(decoders, {name: codes[name].decoder_lr for name in decoders})
-        self.gate = AdamTable({"logits": problem.gate.logits}, {"logits": parts.recipe.gate_training.lr})
+        self.gate = AdamTable({"logits": problem.gate.logits[nodes]}, {"logits": parts.recipe.gate_training.lr})
         self.gate.load_moments("logits", state.gate_moments)
-        # One gate per Gaussian and nothing to learn: sampling it anew every iteration would be wasted work.
         self.session = parts.renderer.open(
             state.gaussians, problem.active, problem.frame.cameras, parts.recipe.background
         )
@@ -136,7 +143,7 @@ class _FrameRun:
         return Solution(
             latents={name: leaf.detach() for name, leaf in self.latents.leaves.items()},
             decoders={name: leaf.detach() for name, leaf in self.decoders.leaves.items()},
-            gate=GateState(self.gate["logits"].detach()),
+            gate=GateState(self.problem.gate.logits.index_copy(0, self.nodes, self.gate["logits"].detach())),
             gate_moments=moments,
             loss=loss,
             iterations=iterations,

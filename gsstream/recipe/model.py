@@ -73,6 +73,11 @@ class Stream(Section):
     active_threshold: float = Field(
         default=0.0, ge=0, le=1, description="rows whose gate opens with at most this probability are left out"
     )
+    change_threshold: float = Field(
+        default=0.0, ge=0, le=100,
+        description="tiles whose pixels differ from the last frame by more than this many sigmas of camera noise count "
+        "as changed, and only Gaussians visible in them take part; 0: everything takes part",
+    )  # fmt: skip
     progressive: bool = Field(default=False, description="activate octree levels from floor(H/2) on (paper)")
     progressive_omega: float = Field(default=1.5, ge=1, description="iterations per level: N_{i+1} = omega N_i")
 

@@ -1,0 +1,85 @@
+"""What the documents promise: commands that exist, an example that runs, links that lead somewhere."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from gsstream.cli.main import run_command
+
+ROOT = Path(__file__).parents[1]
+#: Written when the measurements of a release are done; everything else must exist at any time.
+WRITTEN_LAST = ROOT / "docs" / "results.md"
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("plugins/*/README.md")])
+
+
+def blocks(page: str, language: str = "") -> list[str]:
+    """Fenced blocks of a page in one language."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+
+
+def section(page: str, heading: str) -> str:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return text.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+
+
+def test_the_quick_start_is_two_commands_that_make_knows() -> None:
+    (commands,) = re.findall(r"^```\n(.*?)^```$", section("README.md", "Quick start"), re.MULTILINE | re.DOTALL)
+    assert commands.splitlines() == ["make demo", "make test"]
+    for target in ("demo", "test"):
+        dry = ["make", "--dry-run", target]
+        assert subprocess.run(dry, cwd=ROOT, capture_output=True, timeout=60, check=False).returncode == 0
+
+
+def test_the_python_example_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (example,) = blocks("README.md", "python")
+    assert len(example.splitlines()) <= 12
+    source = "synthetic:frames=2&views=2&width=40&height=30"
+    settings = ["--set", "first_frame.max_iterations=5", "--set", "first_frame.fill_points=50"]
+    run = ["run", "--source", source, "--out", str(tmp_path / "runs" / "demo"), "--method", "s2gs-edge", *settings]
+    assert run_command([*run, "--quiet", "--no-video"]) == 0
+    monkeypatch.chdir(tmp_path)
+    done = subprocess.run([sys.executable, "-c", example], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    first, second = done.stdout.splitlines()
+    assert re.fullmatch(r"frame 0: \d+ Gaussians, \d+ bytes", first)
+    assert second.startswith("frame 1: ")
+    with Image.open(tmp_path / "last.png") as image:
+        assert image.size == (40, 30)
+        assert max(high for _, high in image.getextrema()) > 20
+
+
+def test_commands_in_the_readme_have_only_options_that_exist(capsys: pytest.CaptureFixture[str]) -> None:
+    text = "".join(blocks("README.md"))
+    lines = re.findall(r"^\.venv/bin/gsstream (\w+)(.*?)(?:#.*)?$", text, re.MULTILINE)
+    assert len(lines) >= 4
+    for command, rest in lines:
+        assert run_command([command, "--help"]) == 0
+        known = capsys.readouterr().out
+        for option in re.findall(r"--[\w-]+", rest):
+            assert f"{option} " in known, f"gsstream {command} has no {option}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
+        place = (page.parent / target).resolve()
+        if "://" not in target and place != WRITTEN_LAST:
+            assert place.exists(), f"{page.relative_to(ROOT)} links to {target}"
+
+
+def test_code_paths_named_in_the_flow_exist() -> None:
+    text = (ROOT / "docs" / "flow.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`((?:gsstream|plugins|tests|docs)/[\w/.]+\.\w+)`", text))
+    assert len(named) >= 10
+    assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
+
+
+def test_the_picture_is_small() -> None:
+    assert (ROOT / "docs" / "images" / "demo.png").stat().st_size < 300_000

@@ -1,8 +1,12 @@
 """What may change in a frame: cost follows change.
 
 A tile has changed when enough of its pixels differ from the last frame beyond the camera's measured noise. A Gaussian
-takes part when it is visible in a changed tile of some training view and its gate may open. Everything else is frozen:
-it is neither projected nor optimised nor sent.
+takes part when it is visible in a changed tile of some training view, its centre lies in or beside changed tiles in
+enough of the views that it projects into, and its gate may open. Everything else is frozen: it is neither projected nor
+optimised nor sent.
+
+The vote is what keeps many cameras from making everything suspect: a wall is behind a moving person in some view, but
+only what moves is in changed tiles in most of them (the idea of a visual hull).
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame
 from gsstream.core.shapes import FloatArray
 from gsstream.metrics import noise_sigma
@@ -40,6 +45,27 @@ class Change:
         """[H, W, 1] float mask of the pixels in changed tiles."""
         grown = self.tiles[view].repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)
         return grown[: self.height, : self.width, None].float()
+
+    def votes(self, means: torch.Tensor, cameras: Cameras) -> torch.Tensor:
+        """[N] share of the views a centre projects into in which its tile, or one beside it, has changed.
+
+        Arguments:
+            means: [N, 3] centres. A centre that projects into no view gets 0.
+        """
+        near = torch.nn.functional.max_pool2d(self.tiles[:, None].float(), 3, 1, 1)[:, 0]
+        hits, seen = torch.zeros(len(means)), torch.zeros(len(means))
+        for view in range(len(cameras)):
+            pose = torch.from_numpy(cameras.viewmats[view]).float()
+            K = torch.from_numpy(cameras.Ks[view]).float()
+            x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
+            inside = z > cameras.near
+            depth = torch.where(inside, z, torch.ones_like(z))
+            u, v = K[0, 0] * x / depth + K[0, 2], K[1, 1] * y / depth + K[1, 2]
+            inside &= (u >= 0) & (v >= 0) & (u < self.width) & (v < self.height)
+            row, column = (v[inside] / TILE).long(), (u[inside] / TILE).long()
+            seen += inside
+            hits[inside] += near[view, row, column]
+        return hits / seen.clamp_min(1)
 
 
 def detect_change(previous: Frame, frame: Frame, threshold: float) -> Change | None:

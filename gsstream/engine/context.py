@@ -75,8 +75,10 @@ class StepContext:
         self._touched.setdefault(view, (result.gradient != 0).any(1))
         return result
 
-    def touched(self) -> torch.Tensor:
-        """[N] bool: Gaussians visible in a changed tile of some view (all of them when change is not detected).
+    def suspects(self, least_votes: float) -> torch.Tensor:
+        """[N] bool: Gaussians visible in a changed tile of some view, with at least this share of votes.
+
+        All of them when change is not detected.
 
         Views that the estimator already differentiated cost nothing here: what it got back shows whom they touch.
         """
@@ -86,7 +88,8 @@ class StepContext:
         for view in range(len(self.cameras)):
             if view not in self._touched:
                 self.screen_gradient(view, torch.ones_like(self.image(view)))
-        return torch.stack(list(self._touched.values())).any(0) if self._touched else ~everyone
+        touched = torch.stack(list(self._touched.values())).any(0) if self._touched else ~everyone
+        return touched & (self._change.votes(self._gaussians.means, self.cameras) >= least_votes)
 
     def noise_sigma(self, view: int) -> float:
         return noise_sigma(self._state.previous.images[view], self._frame.images[view])

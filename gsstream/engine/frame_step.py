@@ -58,10 +58,10 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> S
 
 
 def active_rows(parts: Assembly, context: StepContext, state: StreamState, gate: GateState) -> torch.Tensor:
-    """[A] rows that may change: visible in a changed tile, behind a gate that may open."""
+    """[A] rows that may change: suspect by what the cameras saw, and behind a gate that may open."""
     probability = parts.gate.open_probability(gate)
     may_open = probability > parts.recipe.stream.active_threshold
-    return (may_open[state.hierarchy.node_of] & context.touched()).nonzero()[:, 0]
+    return (may_open[state.hierarchy.node_of] & context.suspects(parts.recipe.stream.change_votes)).nonzero()[:, 0]
 
 
 def harden(parts: Assembly, problem: Problem, solution: Solution) -> Delta:

@@ -78,6 +78,10 @@ class Stream(Section):
         description="tiles whose pixels differ from the last frame by more than this many sigmas of camera noise count "
         "as changed, and only Gaussians visible in them take part; 0: everything takes part",
     )  # fmt: skip
+    change_votes: float = Field(
+        default=0.5, ge=0, le=1,
+        description="least share of the views a Gaussian projects into in which it must lie in or beside changed tiles",
+    )  # fmt: skip
     progressive: bool = Field(default=False, description="activate octree levels from floor(H/2) on (paper)")
     progressive_omega: float = Field(default=1.5, ge=1, description="iterations per level: N_{i+1} = omega N_i")
 

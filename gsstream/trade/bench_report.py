@@ -1,0 +1,133 @@
+"""What every benchmark shares: timings, interleaving, facts about the machine, JSON on disk."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsstream.core.errors import OutputError
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """Milliseconds of several repetitions."""
+
+    samples: tuple[float, ...]
+
+    @property
+    def minimum(self) -> float:
+        return min(self.samples)
+
+    @property
+    def median(self) -> float:
+        return statistics.median(self.samples)
+
+    def to_json(self) -> dict[str, float]:
+        """Least and median, ms."""
+        return {"min": round(self.minimum, 5), "median": round(self.median, 5)}
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """Something to time: steps that follow each other, by name; ``prepare`` runs before them, untimed."""
+
+    steps: Mapping[str, Callable[[], object]]
+    prepare: Callable[[], object] = lambda: None
+
+
+def interleaved(cases: Sequence[Steps], repetitions: int, warm_up: int) -> list[dict[str, Timing]]:
+    """Time all cases in turn, ``repetitions`` times over: a slow second of the machine falls on all of them alike.
+
+    The first ``warm_up`` rounds are not counted.
+    """
+    found: list[dict[str, list[float]]] = [{name: [] for name in case.steps} for case in cases]
+    for round_ in range(warm_up + repetitions):
+        for case, samples in zip(cases, found, strict=True):
+            case.prepare()
+            for name, step in case.steps.items():
+                started = time.perf_counter()
+                step()
+                elapsed = time.perf_counter() - started
+                if round_ >= warm_up:
+                    samples[name].append(1000 * elapsed)
+    return [{name: Timing(tuple(values)) for name, values in samples.items()} for samples in found]
+
+
+@contextmanager
+def torch_threads(count: int) -> Any:
+    """Torch with this many threads inside the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def machine_facts() -> dict[str, Any]:
+    """Date, processor, load and versions: what a number means nothing without."""
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
+    return {
+        "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "processor": _processor(),
+        "processors_usable": usable,
+        "gpu": gpu,
+        "load_average": load,
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "numpy": version("numpy"),
+        "torch": torch.__version__,
+        "gsstream": version("gsstream"),
+    }
+
+
+def _processor() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith(("model name", "Model")):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Write a benchmark's data. Raises OutputError when the file cannot be written, before nothing else is lost."""
+    try:
+        path.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}; choose another --out") from error
+
+
+def check_writable(path: Path) -> None:
+    """Raise OutputError now rather than after minutes of measuring."""
+    if path.is_dir() or not path.parent.is_dir():
+        raise OutputError(f"cannot write {path}: expected a file in a folder that exists")
+
+
+def headline(machine: Mapping[str, Any]) -> str:
+    """One line about the machine for a Markdown report."""
+    gpu = f", {machine['gpu']}" if machine["gpu"] else ""
+    load = "" if machine["load_average"] is None else f", load {machine['load_average']:.1f} at the start"
+    return f"{machine['date']}, {machine['processor']}, {machine['processors_usable']} processors{gpu}{load}"
+
+
+def cell(value: float | None, form: str = ".2f") -> str:
+    """A number for a table; "-" for what was not measured."""
+    return "-" if value is None or not math.isfinite(value) else format(value, form)

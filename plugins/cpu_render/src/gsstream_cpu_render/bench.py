@@ -1,0 +1,73 @@
+"""What `gsstream bench render` asks of a compiled renderer (entry point group `gsstream.bench`): threads, the machine's
+peaks, and the kernels without torch around them. Imports no torch.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gsstream_cpu_render import _native
+from gsstream_cpu_render.arrays import SplatArrays, new_gradients
+from gsstream_cpu_render.checks import Float32
+from gsstream_cpu_render.rasterizer import NumpyRasterizer
+from gsstream_cpu_render.threads import copy_peak as copy_peak
+from gsstream_cpu_render.threads import fma_peak as fma_peak
+from gsstream_cpu_render.threads import num_threads as num_threads
+from gsstream_cpu_render.threads import set_num_threads as set_num_threads
+
+
+def isa() -> str:
+    """The instruction set in use: avx512, avx2, baseline or neon."""
+    return str(_native.active_isa())
+
+
+class Kernel:
+    """One scene, camera and tile mask with all memory at hand: `forward` and `backward` are nothing but kernel calls.
+
+    Arguments:
+        arrays: raw float32 parameters in the order of SplatArrays.
+        tile_mask: [tile rows, tile columns] bool; None: all.
+        active: ascending rows that change while all others are cached; None: all rows are drawn anew.
+        v_image: [H, W, 3] float32, the gradient that backward starts from.
+    """
+
+    def __init__(
+        self,
+        arrays: tuple[Float32, ...],
+        viewmat: ArrayLike,
+        K: ArrayLike,
+        width: int,
+        height: int,
+        near: float,
+        tile_mask: NDArray[np.bool_] | None,
+        active: NDArray[np.int64] | None,
+        v_image: Float32,
+    ) -> None:
+        self._rasterizer = NumpyRasterizer(viewmat, K, width, height, near=near)
+        self._splats, self._mask, self._v_image = SplatArrays(*arrays), tile_mask, v_image
+        self._incremental = active is not None
+        self._image, self._transmittance = self._rasterizer.forward(self._splats, tile_mask=tile_mask)
+        if active is not None:
+            self._rasterizer.freeze(tile_mask, active.astype(np.uint32))
+            self._splats = SplatArrays(*(np.ascontiguousarray(array[active]) for array in arrays))
+        self._out = new_gradients(len(self._splats.means), self._splats.shN.shape[1] + 1)
+
+    def forward(self) -> Any:
+        """One forward pass into the same memory."""
+        into = {"image": self._image, "transmittance": self._transmittance}
+        if self._incremental:
+            return self._rasterizer.forward_active(self._splats, touched_only=True, **into)
+        return self._rasterizer.forward(self._splats, tile_mask=self._mask, **into)
+
+    def backward(self) -> Any:
+        """The backward pass of the last forward into the same memory."""
+        if self._incremental:
+            return self._rasterizer.backward_active(self._v_image, out=self._out)
+        return self._rasterizer.backward(self._v_image, out=self._out)
+
+    def statistics(self) -> dict[str, int]:
+        """Counts of the last pass (visible, pairs, entries) and bytes of scratch memory."""
+        return {**self._rasterizer.statistics(), "memory_bytes": self._rasterizer.memory_bytes()}

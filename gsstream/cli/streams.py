@@ -1,4 +1,4 @@
-"""``gsstream play``, ``evaluate`` and ``info``: what can be done with a stream."""
+"""``gsstream play`` and ``evaluate``: pictures of a stream and how good they are."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsstream.cli.listing import plural, table
+from gsstream.cli.listing import plural
 
 if TYPE_CHECKING:
     from gsstream.player.playback import Playback
 
 Stream = Annotated[Path, typer.Argument(help="A stream (.gss), or the output folder of a run.")]
+Frames = Annotated[
+    str | None, typer.Option("--frames", metavar="A:B", help="Frames A to B - 1; either may be left out.")
+]
 
 
 def play(
@@ -25,22 +28,20 @@ def play(
         str | None,
         typer.Option("--camera", help="Camera id, orbit, spiral, or train, test, all; default: the first test camera."),
     ] = None,
-    frames: Annotated[
-        str | None, typer.Option("--frames", metavar="A:B", help="Frames A to B - 1; either may be left out.")
-    ] = None,
+    frames: Frames = None,
 ) -> None:
     """Decode a stream and render it, without torch or the recording."""
-    first, last = _frame_range(frames)
+    first, last = frame_range(frames)
     file = stream_file(stream)
     from gsstream.player.play import play as play_stream
     from gsstream.player.playback import Playback
 
     with Playback(file) as playback:
         cameras = _cameras(playback, camera)
-        chosen = _frames(playback, first, last)
+        chosen = chosen_frames(playback, first, last)
     for name in cameras:
         target = out if len(cameras) == 1 else _one_of_many(out, name or "")
-        played = play_stream(file, target, camera=name, frames=chosen, progress=_progress(name or "camera"))
+        played = play_stream(file, target, camera=name, frames=chosen, progress=progress_on(name or "camera"))
         typer.echo(f"{played.path}: {plural(played.frames, 'picture')}")
 
 
@@ -65,21 +66,10 @@ def evaluate(
         raise InputError(f"{file} does not say which recording it was made from; name it with --source")
     recording = open_recording(str(uri), float(meta.recipe.get("scale", 1.0)), load_catalog())
     try:
-        evaluation = evaluate_stream(file, recording, progress=_progress("frame"))
+        evaluation = evaluate_stream(file, recording, progress=progress_on("frame"))
     finally:
         recording.close()
     typer.echo(evaluation.table())
-
-
-def info(stream: Stream) -> None:
-    """Say what a stream holds: method, cameras, packets and their sizes."""
-    file = stream_file(stream)
-    from gsstream.player.playback import Playback
-
-    with Playback(file) as playback:
-        typer.echo(f"{file}: {_describe(playback)}")
-        if playback.reader.damage is not None:
-            raise playback.reader.damage
 
 
 def stream_file(path: Path) -> Path:
@@ -93,27 +83,6 @@ def stream_file(path: Path) -> Path:
     if not file.is_file():
         raise InputError(f"no stream at {file}: expected a .gss file or the output folder of a run")
     return file
-
-
-def _describe(playback: Playback) -> str:
-    meta, reader = playback.meta, playback.reader
-    frames = playback.frames
-    size = f"{meta.train.width} x {meta.train.height} pixels"
-    rows = [
-        ("method", f"{meta.method} (recipe {meta.recipe_hash})"),
-        ("recording", f"{meta.source} ({meta.extra.get('source_uri', 'unknown')})"),
-        ("cameras", f"{len(meta.train)} train, {len(meta.test)} test, {size}, {meta.fps:g} frames/s"),
-        ("Gaussians", f"{len(playback.state_at(frames[0]))} in frame {frames[0]}"),
-        ("written by", ", ".join(f"{name} {version}" for name, version in sorted(meta.plugins.items()))),
-    ]
-    if reader.unfinished is not None:
-        rows.append(("unfinished", f"{reader.unfinished.size} bytes from byte {reader.unfinished.offset}"))
-    lines = [plural(len(frames), "frame"), *(f"  {key:<11}{value}" for key, value in rows), ""]
-    sizes: dict[str, list[int]] = {}
-    for entry in reader.frames:
-        sizes.setdefault(entry.kind.name.lower(), []).append(entry.size)
-    packets = [(kind, str(len(n)), f"{sum(n)}", f"{sum(n) / len(n):.0f}", f"{max(n)}") for kind, n in sizes.items()]
-    return "\n".join(lines) + table(("PACKETS", "NUMBER", "BYTES", "MEAN", "LARGEST"), packets, indent="  ")
 
 
 def _one_of_many(out: Path, camera: str) -> Path:
@@ -135,7 +104,8 @@ def _cameras(playback: Playback, wanted: str | None) -> list[str | None]:
     return list(found)
 
 
-def _frames(playback: Playback, first: int | None, last: int | None) -> list[int]:
+def chosen_frames(playback: Playback, first: int | None, last: int | None) -> list[int]:
+    """Frame indices from ``first`` to ``last`` - 1, by default all. Raises InputError outside the stream."""
     start = playback.frames[0] if first is None else first
     stop = playback.frames[-1] + 1 if last is None else last
     for edge in (start, stop - 1):
@@ -143,7 +113,8 @@ def _frames(playback: Playback, first: int | None, last: int | None) -> list[int
     return list(range(start, stop))
 
 
-def _frame_range(text: str | None) -> tuple[int | None, int | None]:
+def frame_range(text: str | None) -> tuple[int | None, int | None]:
+    """A and B of "A:B"; None where one is left out."""
     from gsstream.core.errors import InputError
 
     match = re.fullmatch(r"(\d*):(\d*)", ":" if text is None else text)
@@ -153,7 +124,7 @@ def _frame_range(text: str | None) -> tuple[int | None, int | None]:
     return first, last
 
 
-def _progress(what: str) -> Callable[[int, int], None] | None:
+def progress_on(what: str) -> Callable[[int, int], None] | None:
     """A counter that overwrites itself on a terminal; silent elsewhere."""
     if not sys.stderr.isatty():
         return None

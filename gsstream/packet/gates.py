@@ -20,9 +20,7 @@ def encode_gates(gates: IntArray, num_levels: int) -> bytes:
         raise ShapeError(f"num_levels: expected 1 to 255, got {num_levels}")
     if gates.ndim != 1 or (gates.size and not 0 <= int(gates.min()) <= int(gates.max()) <= num_levels):
         raise ShapeError(f"gates: expected [M] levels from 0 to {num_levels}, got shape {list(gates.shape)}")
-    opened = gates != 0
-    edges = np.flatnonzero(opened[1:] != opened[:-1]) + 1
-    runs = np.diff(np.concatenate([[0], edges, [len(gates)]])) if len(gates) else np.zeros(0, np.int64)
+    opened, runs = gates != 0, _runs(gates)
     head = BitWriter()
     head.gamma(num_levels - 1)
     head.gamma(len(runs))
@@ -62,6 +60,19 @@ def decode_gates(data: bytes, num_nodes: int) -> tuple[IntArray, int]:
             raise PacketError(f"gate level outside 1 to {num_levels}")
         gates[opened] = levels
     return gates, num_levels
+
+
+def run_tokens(gates: IntArray) -> tuple[list[IntArray], int]:
+    """The two token tables [., 1] of :func:`encode_gates` and the number of bits sent beside them."""
+    coded = [_tokens(part - 1) for part in _split(_runs(gates)[:-1])]
+    return [tokens[:, None] for tokens, _, _ in coded], sum(int(widths.sum()) for _, _, widths in coded)
+
+
+def _runs(gates: IntArray) -> IntArray:
+    """Lengths of the alternating runs of closed and open nodes."""
+    opened = gates != 0
+    edges = np.flatnonzero(opened[1:] != opened[:-1]) + 1
+    return np.diff(np.concatenate([[0], edges, [len(gates)]])) if len(gates) else np.zeros(0, np.int64)
 
 
 def _split(runs: IntArray) -> tuple[IntArray, IntArray]:

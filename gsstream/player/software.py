@@ -69,13 +69,14 @@ def _project(
     ty = np.clip(y / depth, -cy / fy - margin_y, (height - cy) / fy + margin_y)
     zero = np.zeros_like(depth)
     jacobian = np.stack([fx / depth, zero, -fx * tx / depth, zero, fy / depth, -fy * ty / depth], -1).reshape(-1, 2, 3)
-    axes = _rotations(quats.astype(np.float64)) * np.exp(scales.astype(np.float64))[:, None, :]
+    axes = rotation_matrices(quats.astype(np.float64)) * np.exp(scales.astype(np.float64))[:, None, :]
     footprint = jacobian @ (viewmat[:3, :3] @ axes)
     full = footprint @ footprint.transpose(0, 2, 1)
     return means2d, np.stack([full[:, 0, 0] + BLUR, full[:, 0, 1], full[:, 1, 1] + BLUR], -1)
 
 
-def _rotations(quats: FloatArray) -> FloatArray:
+def rotation_matrices(quats: FloatArray) -> FloatArray:
+    """[N, 3, 3] rotations of [N, 4] quaternions wxyz of any norm."""
     w, x, y, z = (quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-10)).T
     entries = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),

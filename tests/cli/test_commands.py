@@ -21,6 +21,9 @@ CHEAP = [
     ["play", "--help"],
     ["evaluate", "--help"],
     ["info", "--help"],
+    ["export", "--help"],
+    ["manifest", "--help"],
+    ["view", "--help"],
     ["recipe", "show", "dense"],
 ]
 
@@ -35,7 +38,10 @@ OPTIONS = {
     ],
     "gsstream play": ["STREAM", "--out", "--camera", "--frames"],
     "gsstream evaluate": ["STREAM", "--source"],
-    "gsstream info": ["STREAM"],
+    "gsstream info": ["STREAM", "--json"],
+    "gsstream export": ["STREAM", "--out", "--format", "--frames"],
+    "gsstream manifest": ["STREAM", "--out"],
+    "gsstream view": ["STREAM", "--port", "--host"],
     "gsstream methods": [],
     "gsstream methods show": ["NAME"],
     "gsstream plugins": ["--check"],

@@ -1,0 +1,67 @@
+"""``gsstream export``, ``manifest`` and ``view``: streams for other programs, for web servers and for the browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gsstream.cli.listing import plural
+from gsstream.cli.streams import Frames, Stream, chosen_frames, frame_range, progress_on, stream_file
+
+
+def export(
+    stream: Stream,
+    out: Annotated[Path, typer.Option("--out", help="Folder for the files, one per frame.")],
+    kind: Annotated[
+        str, typer.Option("--format", help="ply (3DGS), spz (needs splat-transform), or sequence (PLYs and a list).")
+    ] = "ply",
+    frames: Frames = None,
+) -> None:
+    """Write decoded frames to files that other programs open."""
+    first, last = frame_range(frames)
+    file = stream_file(stream)
+    from gsstream.player.export import export as export_stream
+    from gsstream.player.playback import Playback
+
+    with Playback(file) as playback:
+        chosen = chosen_frames(playback, first, last)
+    written = export_stream(file, out, kind, frames=chosen, progress=progress_on("frame"))
+    size = sum(path.stat().st_size for path in written)
+    typer.echo(f"{out}: {plural(len(written), 'file')}, {size / 1e6:.1f} MB")
+
+
+def manifest(
+    stream: Stream,
+    out: Annotated[Path | None, typer.Option("--out", help="File to write to; default: standard output.")] = None,
+) -> None:
+    """Print byte ranges of all packets as JSON, so that any static web server can serve the stream."""
+    file = stream_file(stream)
+    from gsstream.core.errors import OutputError
+    from gsstream.player.manifest import manifest_json
+
+    text = manifest_json(file)
+    if out is None:
+        typer.echo(text, nl=False)
+        return
+    try:
+        out.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"cannot write {out}: {error.strerror or error}") from error
+
+
+def view(
+    stream: Stream,
+    port: Annotated[int, typer.Option("--port", min=1, max=65535, help="Port of the page.")] = 8080,
+    host: Annotated[
+        str, typer.Option("--host", help="Address to serve at; 0.0.0.0 lets other machines look.")
+    ] = "127.0.0.1",
+) -> None:
+    """Show a stream in the browser, with a time slider (extra: viewer)."""
+    file = stream_file(stream)
+    from gsstream.player.view import Viewer
+
+    with Viewer(file, host=host, port=port) as viewer:
+        typer.echo(f"{file}: {viewer.url} (Ctrl-C ends)")
+        viewer.wait()

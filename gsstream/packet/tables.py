@@ -1,0 +1,84 @@
+"""The entropy-coded tables of a packet and what they could cost at best: for measuring the coder, not for decoding."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from gsstream.core.delta import Layout
+from gsstream.core.gaussians import ATTRIBUTES
+from gsstream.core.shapes import IntArray
+from gsstream.packet.base import PacketKind, Section
+from gsstream.packet.bits import unpack_blobs
+from gsstream.packet.gates import decode_gates, run_tokens
+from gsstream.packet.symbols import decode_symbols
+
+_KEY_HEAD, _DELTA_HEAD, _MEANS_HEAD, _LAYOUT_HEAD = 2, 6, 3, 9
+
+
+class Table(NamedTuple):
+    """A coded section or part: its bytes, and the empirical entropy of what they say."""
+
+    name: str
+    size: int
+    entropy_bits: float
+
+
+def coded_tables(sections: Mapping[str, Section], kind: PacketKind, layout: Layout) -> list[Table]:
+    """Tables of a sound packet; ``layout`` is that of the last key packet (a key packet's own)."""
+    if kind == PacketKind.KEY:
+        return list(_key_tables({name: section.data for name, section in sections.items()}, layout))
+    if kind == PacketKind.DELTA:
+        return list(_delta_tables({name: section.data for name, section in sections.items()}, layout))
+    return []
+
+
+def table_entropy(data: bytes, symbols: IntArray) -> float:
+    """Bits: zero-order entropy of the symbols, by channel or of all together, whichever ``data`` was modelled by."""
+    if symbols.size == 0:
+        return 0.0
+    shared = unpack_blobs(data, 2)[0][0] >> 7
+    groups = [symbols] if shared else list(symbols.T)
+    return sum(_entropy(group) for group in groups)
+
+
+def _entropy(values: IntArray) -> float:
+    _, counts = np.unique(values, return_counts=True)
+    return float((counts * np.log2(counts.sum() / counts)).sum())
+
+
+def _key_tables(data: Mapping[str, bytes], layout: Layout) -> Iterator[Table]:
+    number, nodes = len(layout.octree_levels), len(layout.node_counts)
+    parts = unpack_blobs(data["layout"][_LAYOUT_HEAD + 4 * len(layout.cell_sizes) :], 2)
+    for part, rows in zip(parts, (nodes, number), strict=True):
+        yield _table("layout", part, rows, 1)
+    if number:
+        cells, local = unpack_blobs(data["means"][_MEANS_HEAD:], 2)
+        yield _table("means", cells, number, 3)
+        yield Table("means", len(local), 8.0 * len(local))
+    for name in ATTRIBUTES:
+        if name != "means":
+            width = data[name][1] + (name == "quats")
+            yield _table(name, data[name][_KEY_HEAD:], number, width)
+
+
+def _delta_tables(data: Mapping[str, bytes], layout: Layout) -> Iterator[Table]:
+    gates, num_levels = decode_gates(data["gates"], len(layout.node_counts))
+    rows = int(np.asarray(layout.node_counts)[gates != 0].sum())
+    tokens, plain_bits = run_tokens(gates)
+    parts = unpack_blobs(data["gates"], 4)[1:]
+    levels = gates[gates != 0].astype(np.int32)[:, None] if num_levels > 1 else np.zeros((0, 1), np.int32)
+    best = [table_entropy(part, table) for part, table in zip(parts, [*tokens, levels], strict=True)]
+    yield Table("gates", len(data["gates"]), sum(best) + plain_bits)
+    for name in ATTRIBUTES:
+        if name in data:
+            yield _table(name, data[name][_DELTA_HEAD:], rows, data[name][1])
+
+
+def _table(name: str, data: bytes, rows: int, channels: int) -> Table:
+    bits = table_entropy(data, decode_symbols(data, rows, channels))
+    assert math.isfinite(bits)
+    return Table(name, len(data), bits)

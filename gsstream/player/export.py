@@ -1,0 +1,103 @@
+"""Export decoded frames to files that other programs open: 3DGS PLY, SPZ, or a sequence with a description."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from gsstream.core.errors import InputError, OutputError
+from gsstream.player.playback import Playback
+from gsstream.player.ply import write_ply
+
+FORMATS = ("ply", "spz", "sequence")
+#: Where the converter is looked for: this variable, then the path.
+CONVERTER_VARIABLE = "GSSTREAM_SPLAT_TRANSFORM"
+_CONVERTER = "splat-transform"
+
+
+def export(
+    stream: str | os.PathLike[str], out: str | os.PathLike[str], kind: str, *, frames: Sequence[int] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Path]:  # fmt: skip
+    """Write one file per frame into the folder ``out``; returns the files.
+
+    Arguments:
+        kind: ``ply``; ``spz`` (through splat-transform, an npm package); ``sequence``: PLYs and ``sequence.json`` with
+            frame indices, times and the cameras.
+        frames: frame indices; default: all.
+
+    Raises InputError for an unknown format or frame, PacketError for a damaged stream, OutputError when the folder
+    cannot be written or the converter is missing or fails.
+    """
+    if kind not in FORMATS:
+        raise InputError(f"cannot export to {kind!r}: expected one of {', '.join(FORMATS)}")
+    converter = find_converter() if kind == "spz" else ""
+    folder, written = Path(out), []
+    with Playback(stream) as playback:
+        chosen = list(playback.frames if frames is None else frames)
+        for frame in chosen:
+            playback.entry(frame)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for done, frame in enumerate(chosen, 1):
+                file = folder / f"{frame:06d}.{'spz' if kind == 'spz' else 'ply'}"
+                if converter:
+                    _write_spz(file, playback, frame, converter)
+                else:
+                    write_ply(file, playback.state_at(frame))
+                written.append(file)
+                if progress is not None:
+                    progress(done, len(chosen))
+            if kind == "sequence":
+                (folder / "sequence.json").write_text(_description(playback, chosen), encoding="utf-8")
+        except OSError as error:
+            raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
+    return written
+
+
+def find_converter() -> str:
+    """The splat-transform program. Raises OutputError that says how to get it."""
+    named = os.environ.get(CONVERTER_VARIABLE)
+    found = shutil.which(named or _CONVERTER)
+    if found is None:
+        where = f"{CONVERTER_VARIABLE} names {named!r}, which is no program" if named else f"{_CONVERTER} is not found"
+        raise OutputError(
+            f"SPZ is written through the npm package @playcanvas/splat-transform, and {where}; install it "
+            f"(npm install -g @playcanvas/splat-transform), or set {CONVERTER_VARIABLE} to the program, or export ply"
+        )
+    return found
+
+
+def _write_spz(file: Path, playback: Playback, frame: int, converter: str) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / "frame.ply"
+        write_ply(plain, playback.state_at(frame))
+        done = subprocess.run(
+            [converter, "--overwrite", str(plain), str(file)], capture_output=True, text=True, check=False
+        )
+    if done.returncode != 0 or not file.is_file():
+        tail = (done.stderr or done.stdout).strip().splitlines()[-3:]
+        raise OutputError(f"{converter} could not write {file} (exit code {done.returncode}): {' '.join(tail)}")
+
+
+def _description(playback: Playback, frames: Sequence[int]) -> str:
+    meta = playback.meta
+    cameras = [
+        {
+            "id": name, "split": split, "width": rig.width, "height": rig.height, "viewmat": view.tolist(),
+            "K": K.tolist(),
+        }
+        for split, rig in (("train", meta.train), ("test", meta.test))
+        for name, view, K in zip(rig.ids, rig.viewmats, rig.Ks, strict=True)
+    ]  # fmt: skip
+    files = [{"frame": frame, "seconds": frame / meta.fps, "file": f"{frame:06d}.ply"} for frame in frames]
+    data = {
+        "format": "3DGS PLY, one file per frame", "fps": meta.fps, "background": list(meta.background),
+        "viewmat": "world to camera, OpenCV axes", "frames": files, "cameras": cameras,
+    }  # fmt: skip
+    return json.dumps(data, indent=1) + "\n"

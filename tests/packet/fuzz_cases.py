@@ -1,0 +1,177 @@
+"""Mutations of small streams for the fuzzing job. Most repair the checksums, so that what is behind is reached."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from packet_scenes import decode_all, make_packets
+
+from gsstream.core.gaussians import Gaussians
+from gsstream.packet import EncodedPacket, PacketKind
+from gsstream.packet.base import PACKET_HEADER, build_packet, file_header, parse_packet
+from gsstream.packet.bulk import compress, decompress
+from gsstream.packet.reader import index_body
+
+_LIES = (0, 1, 2, 127, 255, 1 << 15, 0xFFFF, 1 << 20, 4_000_000, 1 << 30, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
+
+
+@dataclass(frozen=True)
+class Base:
+    """A sound stream: its bytes, the end of every frame's packet, the scenes it decodes to, and its packets."""
+
+    data: bytes
+    ends: tuple[int, ...]
+    scenes: tuple[Gaussians, ...]
+    packets: tuple[EncodedPacket, ...]
+
+
+def bases() -> list[Base]:
+    """Streams with every packet kind; without view-dependent colour, with one Gaussian, with an index."""
+    settings = [
+        {"seed": 21, "frames": 5, "key_at": 3, "number": 8, "nodes": 4, "sh_rest": 0},
+        {"seed": 22, "frames": 4, "key_at": 9, "number": 40, "nodes": 12, "sh_rest": 3},
+        {"seed": 23, "frames": 3, "key_at": 9, "number": 1, "nodes": 1, "sh_rest": 15},
+        {"seed": 24, "frames": 4, "key_at": 9, "number": 300, "nodes": 90, "sh_rest": 0},
+    ]
+    return [_base(make_packets(**kwargs)) for kwargs in settings]
+
+
+def _base(packets: list[EncodedPacket]) -> Base:
+    ends = 16 + np.cumsum([len(p.data) for p in packets])
+    scenes = tuple(state.gaussians for state in decode_all(packets))
+    return Base(_join(packets), tuple(int(end) for end in ends), scenes, tuple(packets))
+
+
+def _join(packets: Sequence[EncodedPacket | bytes]) -> bytes:
+    """A stream file of these packets, its index naming the keys where they are."""
+    out, keys, frame = file_header(), [], 0
+    for packet in packets:
+        data = packet if isinstance(packet, bytes) else packet.data
+        kind, _, _, frame, _, _ = PACKET_HEADER.unpack_from(data)
+        if kind == PacketKind.KEY:
+            keys.append((frame, len(out)))
+        out += data
+    return out + build_packet(PacketKind.INDEX, frame, [("index", index_body(keys, len(out)))]).data
+
+
+def mutate(corpus: Sequence[Base], seed: int, number: int) -> tuple[str, bytes, Base]:
+    """Case ``number``: the name of the mutation, the mutated file, and the stream it comes from."""
+    rng = np.random.default_rng((seed, number))
+    base = corpus[int(rng.integers(len(corpus)))]
+    name = list(_MUTATIONS)[int(rng.choice(len(_MUTATIONS), p=_WEIGHTS))]
+    return name, _MUTATIONS[name](rng, base), base
+
+
+def _scramble(rng: np.random.Generator, data: bytes) -> bytes:
+    out = bytearray(data)
+    for _ in range(int(rng.geometric(0.5))):
+        action, at, span = int(rng.integers(6)), int(rng.integers(len(out) + 1)), int(rng.integers(1, 9))
+        if action == 0 and at < len(out):
+            out[at] ^= 1 << int(rng.integers(8))
+        elif action == 1:
+            del out[at : at + span]
+        elif action == 2:
+            out[at:at] = rng.bytes(span)
+        elif action == 3:
+            out[at : at + 4] = struct.pack("<I", int(rng.choice(_LIES)))
+        elif action == 4 and at < len(out):
+            out[at] = int(rng.choice(_LIES[:5]))
+        elif action == 5 and out:
+            start = int(rng.integers(len(out)))
+            out[at:at] = out[start : start + span]
+    return bytes(out)
+
+
+def _cut(rng: np.random.Generator, base: Base) -> bytes:
+    return base.data[: int(rng.integers(len(base.data)))]
+
+
+def _damage(rng: np.random.Generator, base: Base) -> bytes:
+    return _scramble(rng, base.data)
+
+
+def _sections(rng: np.random.Generator, base: Base) -> bytes:
+    """The payload of one section changed, everything around it repaired."""
+    packets: list[EncodedPacket | bytes] = list(base.packets)
+    at = int(rng.integers(len(packets)))
+    header, sections = parse_packet(base.packets[at].data)
+    if not sections:
+        return _damage(rng, base)
+    names = list(sections)
+    target = names[int(rng.integers(len(names)))]
+    changed = [(n, _payload(rng, n, s.data) if n == target else s.data) for n, s in sections.items()]
+    packets[at] = build_packet(header.kind, header.frame, changed)
+    return _join(packets)
+
+
+def _payload(rng: np.random.Generator, name: str, data: bytes) -> bytes:
+    # Compressed text is opened first: a flipped bit in a zstandard frame would never reach the reader of the text.
+    if name == "meta" and rng.random() < 0.8:
+        return compress(_scramble(rng, decompress(data, 1 << 24)))
+    return _scramble(rng, data) if rng.random() < 0.95 else rng.bytes(int(rng.integers(40)))
+
+
+def _lying_sections(rng: np.random.Generator, base: Base) -> bytes:
+    """Numbers, counts and lengths of sections changed under correct checksums."""
+    packets: list[EncodedPacket | bytes] = list(base.packets)
+    at = int(rng.integers(len(packets)))
+    data = base.packets[at].data
+    kind, count, _, frame, _, _ = PACKET_HEADER.unpack_from(data)
+    body = bytearray(data[PACKET_HEADER.size :])
+    where = 0
+    for _ in range(int(rng.integers(count)) if count else 0):
+        where += 5 + int.from_bytes(body[where + 1 : where + 5], "little")
+    if body and rng.random() < 0.7:
+        body[where + 1 : where + 5] = struct.pack("<I", int(rng.choice(_LIES)))
+    elif body:
+        body[where] = int(rng.integers(256))
+    if rng.random() < 0.3:
+        count = int(rng.integers(256))
+    packets[at] = _seal(kind, count, frame, len(body), bytes(body))
+    return _join(packets)
+
+
+def _lying_header(rng: np.random.Generator, base: Base) -> bytes:
+    """Type, frame or length of a packet changed under a correct header check."""
+    packets: list[EncodedPacket | bytes] = list(base.packets)
+    at = int(rng.integers(len(packets)))
+    data = base.packets[at].data
+    kind, count, _, frame, length, _ = PACKET_HEADER.unpack_from(data)
+    what = int(rng.integers(3))
+    kind = int(rng.integers(6)) if what == 0 else kind
+    frame = int(rng.choice(_LIES)) if what == 1 else frame
+    length = int(rng.choice(_LIES)) if what == 2 else length
+    packets[at] = _seal(kind, count, frame, length, data[PACKET_HEADER.size :])
+    return _join(packets)
+
+
+def _order(rng: np.random.Generator, base: Base) -> bytes:
+    """Packets left out, doubled, exchanged, or taken from another scene with the frame index this one needs."""
+    packets: list[EncodedPacket | bytes] = list(base.packets)
+    at, other = int(rng.integers(len(packets))), int(rng.integers(len(packets)))
+    action = int(rng.integers(3))
+    if action == 0:
+        del packets[at]
+    elif action == 1:
+        packets.insert(other, packets[at])
+    else:
+        header, sections = parse_packet(base.packets[at].data)
+        packets[other] = build_packet(header.kind, other, [(n, s.data) for n, s in sections.items()])
+    return _join(packets) if packets else file_header()
+
+
+def _seal(kind: int, count: int, frame: int, length: int, body: bytes) -> bytes:
+    checksum = zlib.crc32(body, zlib.crc32(struct.pack("<BBII", kind, count, frame, length)))
+    check = zlib.crc32(struct.pack("<BBIII", kind, count, frame, length, checksum)) & 0xFFFF
+    return PACKET_HEADER.pack(kind, count, check, frame, length, checksum) + body
+
+
+_MUTATIONS: dict[str, Callable[[np.random.Generator, Base], bytes]] = {
+    "cut": _cut, "damage": _damage, "sections": _sections, "lying sections": _lying_sections,
+    "lying header": _lying_header, "order": _order,
+}  # fmt: skip
+_WEIGHTS = (0.05, 0.1, 0.65, 0.1, 0.05, 0.05)

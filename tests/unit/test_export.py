@@ -1,0 +1,136 @@
+"""Exports are read back by readers that share no code with the writers."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import struct
+import subprocess
+
+import numpy as np
+import pytest
+from test_player import make_scene, make_stream
+
+from gsstream.core.errors import InputError, OutputError
+from gsstream.player.export import CONVERTER_VARIABLE, export
+from gsstream.player.playback import Playback
+from gsstream.player.ply import ply_bytes
+
+CONVERTER = shutil.which(os.environ.get(CONVERTER_VARIABLE, "splat-transform"))
+needs_converter = pytest.mark.skipif(CONVERTER is None, reason="the npm package @playcanvas/splat-transform is missing")
+
+SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
+CODES = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}
+
+
+def read_ply(data: bytes) -> dict[str, list[float]]:
+    """Vertices of a binary little-endian PLY, written from the format's description: property -> values."""
+    lines, at = [], 0
+    while not lines or lines[-1] != "end_header":
+        stop = data.index(b"\n", at)
+        lines.append(data[at:stop].decode("ascii").strip())
+        at = stop + 1
+    assert lines[0] == "ply"
+    assert lines[1] == "format binary_little_endian 1.0"
+    words = [line.split() for line in lines[2:-1] if not line.startswith(("comment", "obj_info"))]
+    (element,) = [w for w in words if w[0] == "element"]
+    properties = [(w[2], w[1]) for w in words if w[0] == "property"]
+    row = struct.Struct("<" + "".join(CODES[kind] for _, kind in properties))
+    assert row.size == sum(SIZES[kind] for _, kind in properties)
+    assert len(data) - at == int(element[2]) * row.size
+    table = list(row.iter_unpack(data[at:]))
+    return {name: [values[i] for values in table] for i, (name, _) in enumerate(properties)}
+
+
+def columns(found: dict[str, list[float]], *names: str) -> np.ndarray:
+    return np.array([found[name] for name in names], np.float32).T
+
+
+@pytest.mark.parametrize("sh_rest", [0, 3, 8, 15])
+@pytest.mark.parametrize("number", [0, 1, 37])
+def test_ply_holds_the_scene_by_the_names_of_3dgs(sh_rest, number):
+    scene = make_scene(3, number, sh_rest)
+    found = read_ply(ply_bytes(scene))
+    assert list(found)[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    assert list(found)[9 + 3 * sh_rest :] == [
+        "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"
+    ]  # fmt: skip
+    for i in range(number):
+        assert [found[n][i] for n in "xyz"] == scene.means[i].tolist()
+        assert [found[f"f_dc_{c}"][i] for c in range(3)] == scene.sh0[i, 0].tolist()
+        for channel in range(3):
+            for k in range(sh_rest):
+                assert found[f"f_rest_{channel * sh_rest + k}"][i] == scene.shN[i, k, channel]
+        assert found["opacity"][i] == scene.opacities[i]
+        assert [found[f"scale_{a}"][i] for a in range(3)] == scene.scales[i].tolist()
+        assert [found[f"rot_{a}"][i] for a in range(4)] == scene.quats[i].tolist()
+
+
+def test_sequence_names_files_times_and_cameras(tmp_path):
+    stream = make_stream(tmp_path / "s.gss")
+    written = export(stream, tmp_path / "out", "sequence", frames=[1, 3])
+    described = json.loads((tmp_path / "out" / "sequence.json").read_text())
+    assert [tmp_path / "out" / entry["file"] for entry in described["frames"]] == written
+    assert [(e["frame"], e["seconds"]) for e in described["frames"]] == [(1, 0.04), (3, 0.12)]
+    assert [(c["id"], c["split"]) for c in described["cameras"]][-1] == ("cam3", "test")
+    with Playback(stream) as playback:
+        for frame, file in zip((1, 3), written, strict=True):
+            assert np.array_equal(columns(read_ply(file.read_bytes()), "x", "y", "z"), playback.state_at(frame).means)
+
+
+def test_mistakes_of_an_export_are_named(tmp_path, monkeypatch):
+    stream = make_stream(tmp_path / "s.gss", 2)
+    with pytest.raises(InputError, match="expected one of ply, spz, sequence"):
+        export(stream, tmp_path / "out", "glb")
+    with pytest.raises(InputError, match="frame 2"):
+        export(stream, tmp_path / "out", "ply", frames=[2])
+    monkeypatch.setenv(CONVERTER_VARIABLE, str(tmp_path / "no-program"))
+    with pytest.raises(OutputError, match=r"npm package @playcanvas/splat-transform.*names .*no-program"):
+        export(stream, tmp_path / "out", "spz")
+    assert not (tmp_path / "out").exists()
+    failing = tmp_path / "failing"
+    failing.write_text("#!/bin/sh\necho broken converter >&2\nexit 3\n")
+    failing.chmod(0o755)
+    monkeypatch.setenv(CONVERTER_VARIABLE, str(failing))
+    with pytest.raises(OutputError, match=r"exit code 3.*broken converter"):
+        export(stream, tmp_path / "out", "spz")
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(OutputError, match="cannot write"):
+        export(stream, tmp_path / "file", "ply")
+
+
+@needs_converter
+def test_splat_transform_reads_our_ply(tmp_path):
+    """Through its own reader and writer: the values come back bit by bit."""
+    scene = make_scene(7, 60, 15)
+    (tmp_path / "ours.ply").write_bytes(ply_bytes(scene))
+    command = [CONVERTER, "--overwrite", str(tmp_path / "ours.ply"), str(tmp_path / "theirs.ply")]
+    subprocess.run(command, check=True, capture_output=True)
+    found = read_ply((tmp_path / "theirs.ply").read_bytes())
+    assert np.array_equal(columns(found, "x", "y", "z"), scene.means)
+    rest = columns(found, *(f"f_rest_{i}" for i in range(45)))
+    assert np.array_equal(rest, scene.shN.transpose(0, 2, 1).reshape(60, 45))
+    assert np.array_equal(columns(found, *(f"rot_{i}" for i in range(4))), scene.quats)
+    assert np.array_equal(columns(found, "opacity")[:, 0], scene.opacities)
+
+
+@needs_converter
+def test_spz_read_back_is_the_scene_to_its_precision(tmp_path):
+    stream = make_stream(tmp_path / "s.gss", 2)
+    (file,) = export(stream, tmp_path / "out", "spz", frames=[1])
+    assert file.read_bytes()[:4] != b"ply\n"
+    subprocess.run([CONVERTER, "--overwrite", str(file), str(tmp_path / "b.ply")], check=True, capture_output=True)
+    found = read_ply((tmp_path / "b.ply").read_bytes())
+    with Playback(stream) as playback:
+        scene = playback.state_at(1)
+    back = columns(found, "x", "y", "z")
+    # The writer may store Gaussians in another order.
+    nearest = np.linalg.norm(back[None] - scene.means[:, None], axis=2).argmin(1)
+    assert len(set(nearest.tolist())) == len(scene)
+    assert np.abs(back[nearest] - scene.means).max() < 1e-3
+    scales = columns(found, "scale_0", "scale_1", "scale_2")[nearest]
+    assert np.abs(scales - np.clip(scene.scales, -10, 6)).max() < 0.07
+    quats = columns(found, *(f"rot_{i}" for i in range(4)))[nearest]
+    cosine = np.abs((quats * scene.quats).sum(1)) / np.linalg.norm(quats, axis=1) / np.linalg.norm(scene.quats, axis=1)
+    assert cosine.min() > 0.999

@@ -68,7 +68,7 @@ def render(
 
 @app.command()
 def frame(
-    method: Annotated[str, typer.Option("--method", help="Method of the gated variant.")] = "s2gs-edge",
+    method: Annotated[str, typer.Option("--method", help="Method whose recipe is measured.")] = "s2gs-edge",
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change a recipe value; repeatable.")
     ] = None,
@@ -85,10 +85,11 @@ def frame(
     out: Out = None,
     quiet: Quiet = False,
 ) -> None:
-    """Time one frame step by phase on a synthetic scene, gated and dense.
+    """Time one frame step by phase on a synthetic scene.
 
     Two sweeps: the share of image tiles that change, and the size of the part that stands still while the same object
-    moves. Dense is the same recipe with every gate open.
+    moves. Three variants of the recipe: dense (every gate open, everything takes part), gated (its own gates), active
+    (and only what changed beyond the noise takes part: stream.change_threshold, 4 where the recipe has none).
     """
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe

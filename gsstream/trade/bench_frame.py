@@ -1,4 +1,4 @@
-"""``gsstream bench frame``: one frame step by phase, against the share that changes and the size of what does not.
+"""``gsstream bench frame``: one frame step by phase, against the share that changes and the size of the rest.
 
 The scene is synthetic: everything within a ball moves by a pixel between two frames, the rest stands still, both
 images carry camera noise. Nothing is read from disk and frame 0 is not optimised: it is drawn from the scene itself.
@@ -44,6 +44,8 @@ SCHEMA = "gsstream-bench-frame-1"
 #: A tile has changed when a pixel of it did by more than this without noise, [0, 1] units.
 CHANGED = 3 / 255
 NOISE = 1.5 / 255
+#: Of the variant "active" where the recipe itself has none: sigmas of noise.
+CHANGE_THRESHOLD = 4.0
 #: Slots that decide what may change, as parts that let everything change.
 DENSE = {"confidence": "uniform", "propagation": "group-max", "gate": "always-open", "regularizer": "none"}
 
@@ -53,7 +55,7 @@ class FramePlan:
     """What is measured.
 
     Arguments:
-        recipe: of the gated variant; the dense one differs in the slots of DENSE.
+        recipe: what :func:`variants` are made of.
         shares: of tiles that change, [0, 1], at ``static[0]`` Gaussians.
         static: Gaussians of the part that stands still; at every size the object alone moves in one case.
         moving: Gaussians of the object.
@@ -104,22 +106,23 @@ class _Case:
 def bench_frame(plan: FramePlan, catalog: Catalog, progress: Progress) -> dict[str, Any]:
     """Measure everything in the plan; plain JSON values."""
     machine = machine_facts()
-    variants = {"gated": assemble(plan.recipe, catalog), "dense": assemble(dense(plan.recipe), catalog)}
+    parts = {name: assemble(recipe, catalog) for name, recipe in variants(plan.recipe).items()}
     results: list[dict[str, Any]] = []
     # One torch thread, as in a run: see engine.session.
     with torch_threads(1):
         for static in plan.static:
-            for sweep, ball in _balls(plan, variants["gated"], static, progress):
+            for sweep, ball in _balls(plan, parts["active"], static, progress):
                 progress(f"{static / 1000:g}k static Gaussians, {sweep}: frame")
-                cases = {name: _case(plan, parts, static, ball) for name, parts in variants.items()}
-                for name, step, timing in _timed(plan, variants, cases):
+                cases = {name: _case(plan, part, static, ball) for name, part in parts.items()}
+                for name, step, timing in _timed(plan, parts, cases):
                     facts = {"sweep": sweep, "variant": name, "static": static, **cases[name].facts}
-                    results.append({**facts, **_outcome(variants[name], cases[name], step), **timing})
+                    results.append({**facts, **_outcome(parts[name], cases[name], step), **timing})
     return {
         "schema": SCHEMA,
         "machine": machine,
         "settings": {
-            "method": plan.recipe.method, "renderer": variants["gated"].recipe.renderer.name,
+            "method": plan.recipe.method, "renderer": parts["active"].recipe.renderer.name,
+            "change_threshold": parts["active"].recipe.stream.change_threshold,
             "epochs": plan.recipe.stream.epochs, "views": plan.views, "width": plan.width, "height": plan.height,
             "moving": plan.moving, "shift_pixels": plan.shift, "noise": NOISE, "seed": plan.seed,
             "repetitions": plan.repetitions, "warm_up": plan.warm_up, "torch_threads": 1,
@@ -129,9 +132,13 @@ def bench_frame(plan: FramePlan, catalog: Catalog, progress: Progress) -> dict[s
     }  # fmt: skip
 
 
-def dense(recipe: Recipe) -> Recipe:
-    """The same recipe with every gate open: what the frame costs when everything may change."""
-    return recipe.model_copy(update={slot: ComponentRef(name=name) for slot, name in DENSE.items()})
+def variants(recipe: Recipe) -> dict[str, Recipe]:
+    """dense: every gate open, everything takes part; gated: the recipe's gates; active: and only what changed."""
+    threshold = recipe.stream.change_threshold or CHANGE_THRESHOLD
+    active = recipe.model_copy(update={"stream": recipe.stream.model_copy(update={"change_threshold": threshold})})
+    gated = recipe.model_copy(update={"stream": recipe.stream.model_copy(update={"change_threshold": 0.0})})
+    dense = gated.model_copy(update={slot: ComponentRef(name=name) for slot, name in DENSE.items()})
+    return {"dense": dense, "gated": gated, "active": active}
 
 
 def _balls(plan: FramePlan, parts: Assembly, static: int, progress: Progress) -> list[tuple[str, _Ball]]:
@@ -233,14 +240,14 @@ def _changed_share(before: FloatArray, after: FloatArray) -> float:
 
 
 def _timed(
-    plan: FramePlan, variants: Mapping[str, Assembly], cases: Mapping[str, _Case]
+    plan: FramePlan, assemblies: Mapping[str, Assembly], cases: Mapping[str, _Case]
 ) -> Sequence[tuple[str, Step, dict[str, Any]]]:
     """Every variant's step in turn, several times over: (variant, last step, ms of the whole and by phase)."""
-    total: dict[str, list[float]] = {name: [] for name in variants}
-    phases: dict[str, dict[str, list[float]]] = {name: {} for name in variants}
+    total: dict[str, list[float]] = {name: [] for name in assemblies}
+    phases: dict[str, dict[str, list[float]]] = {name: {} for name in assemblies}
     last: dict[str, Step] = {}
     for round_ in range(plan.warm_up + plan.repetitions):
-        for name, parts in variants.items():
+        for name, parts in assemblies.items():
             started = time.perf_counter()
             last[name] = frame_step(parts, cases[name].state, cases[name].frame, Rng(plan.seed))
             elapsed = time.perf_counter() - started

@@ -102,7 +102,7 @@ def test_frame_by_phase(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert data["schema"] == "gsstream-bench-frame-1"
     sweeps = [(case["sweep"], case["static"], case["variant"]) for case in data["cases"]]
     wanted = [("object moves", 400), ("25% of tiles", 400), ("0% of tiles", 400), ("object moves", 800)]
-    assert sweeps == [(*case, variant) for case in wanted for variant in ("gated", "dense")]
+    assert sweeps == [(*case, variant) for case in wanted for variant in ("dense", "gated", "active")]
     for case in data["cases"]:
         assert set(case) >= FRAME_KEYS
         assert sum(phase["min"] for phase in case["phases_ms"].values()) <= 1.01 * case["total_ms"]["min"]

@@ -12,6 +12,7 @@ only what moves is in changed tiles in most of them (the idea of a visual hull).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,13 +20,19 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame
 from gsstream.core.shapes import FloatArray
-from gsstream.metrics import noise_sigma
 from gsstream.render.base import TILE
 
-#: Pixels of a 16 x 16 tile that must exceed the threshold; beyond 4 sigma of normal noise five never meet by chance.
-LEAST_PIXELS = 5
-#: Noise of 8-bit images below rounding: half a level in each of two frames.
-LEAST_SIGMA = 0.4 / 255
+BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
+#: Standard deviation of a normal variable over its median absolute deviation.
+MAD_TO_SIGMA = 1.4826
+#: Differences are averaged over BLOCK x BLOCK pixels first: noise of neighbouring pixels is mostly independent and
+#: averages out (rendered noise is heavy-tailed, so a threshold on single pixels finds it everywhere), motion does not.
+BLOCK = 4
+#: Blocks of a 16 x 16 tile (of 16) that must exceed the threshold.
+LEAST_BLOCKS = 2
+#: Least noise of a block's mean difference. Compressed video repeats still blocks exactly; without a floor the change of
+#: half a grey level by the encoder would count as motion.
+LEAST_SIGMA = 0.5 / 255
 
 
 @dataclass(frozen=True)
@@ -72,7 +79,7 @@ def detect_change(previous: Frame, frame: Frame, threshold: float) -> Change | N
     """Compare two frames view by view.
 
     Arguments:
-        threshold: multiple of the noise of a difference of two images; 0 switches the detection off (None).
+        threshold: multiple of the robust spread of block differences; 0 switches the detection off (None).
     """
     if threshold == 0:
         return None
@@ -80,20 +87,27 @@ def detect_change(previous: Frame, frame: Frame, threshold: float) -> Change | N
     return Change(torch.from_numpy(np.stack(tiles)), frame.cameras.height, frame.cameras.width)
 
 
-def _changed(before: FloatArray, after: FloatArray, threshold: float) -> np.ndarray:
+def _changed(before: FloatArray, after: FloatArray, threshold: float) -> BoolArray:
     """[rows, columns] bool of one view."""
-    # A quarter of the pixels gives the same robust estimate at a quarter of the cost.
-    sigma = max(noise_sigma(before[::2, ::2], after[::2, ::2]), LEAST_SIGMA)
-    moved = (np.abs(after - before) > threshold * np.sqrt(2) * sigma).any(-1)
-    height, width = moved.shape
-    rows, columns = -(-height // TILE), -(-width // TILE)
-    padded = np.zeros((rows * TILE, columns * TILE), bool)
-    padded[:height, :width] = moved
-    counts = padded.reshape(rows, TILE, columns, TILE).sum((1, 3))
-    # A clipped tile at the border has fewer pixels to show a change with.
-    least = np.minimum(LEAST_PIXELS, np.outer(_sizes(height, rows), _sizes(width, columns)))
-    return np.asarray(counts >= least)
+    means = _block_means(after - before)
+    spread = np.median(np.abs(means - np.median(means)))
+    sigma = max(MAD_TO_SIGMA * float(spread), LEAST_SIGMA)
+    moved = (np.abs(means) > threshold * sigma).any(-1)
+    side = TILE // BLOCK
+    rows, columns = -(-moved.shape[0] // side), -(-moved.shape[1] // side)
+    padded = np.zeros((rows * side, columns * side), bool)
+    padded[: moved.shape[0], : moved.shape[1]] = moved
+    # A tile cut off by the border has fewer blocks to show a change with.
+    inside = np.zeros_like(padded)
+    inside[: moved.shape[0], : moved.shape[1]] = True
+    count, blocks = (x.reshape(rows, side, columns, side).sum((1, 3)) for x in (padded, inside))
+    return np.asarray(count >= np.minimum(LEAST_BLOCKS, blocks))
 
 
-def _sizes(length: int, tiles: int) -> np.ndarray:
-    return np.minimum(TILE, length - TILE * np.arange(tiles))
+def _block_means(difference: FloatArray) -> FloatArray:
+    """[ceil(H / 4), ceil(W / 4), 3] means; blocks at the border average the pixels they have."""
+    height, width = difference.shape[:2]
+    starts = np.arange(0, height, BLOCK), np.arange(0, width, BLOCK)
+    sums = np.add.reduceat(np.add.reduceat(difference, starts[0], 0), starts[1], 1)
+    sizes = [np.minimum(BLOCK, n - s) for n, s in zip((height, width), starts, strict=True)]
+    return np.asarray(sums / np.outer(*sizes)[..., None])

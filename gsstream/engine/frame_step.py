@@ -53,6 +53,7 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> S
     decoders = {**state.decoders, **{name: torch.from_numpy(value) for name, value in player.decoders.items()}}
     after = replace(state, player=player, previous=frame, decoders=decoders, gate_moments=solution.gate_moments)
     metrics = step_metrics(delta, after, packet, solution, active)
+    metrics["changed_tiles"] = 1.0 if change is None else change.share
     metrics["seconds"] = dict(zip(("confidence", "optimise", "code"), np.diff(clock).tolist(), strict=True))
     return Step(after, packet, "empty" if delta.is_empty else "delta", metrics)
 

@@ -89,13 +89,14 @@ class _Run:
         if state is None:
             save_resolved(self.out / RECIPE, self.parts.resolved)
         last = None if state is None else state.player.frame
-        # Also when resuming finds no complete frame 0: what a kill left of it is cut off and frame 0 starts again.
-        writer = StreamWriter.open(
-            self.out / STREAM, resume=resume, last_frame=last, fsync=self.parts.recipe.codec.fsync
-        )
-        indices = range(done, self.total)
-        interrupt = _stop_on_interrupt(self.progress.say)
-        with writer, self.progress, interrupt as stop, Prefetcher(self.source, indices) as frames:
+        indices, fsync = range(done, self.total), self.parts.recipe.codec.fsync
+        with (
+            _stop_on_interrupt(self.progress.say) as stop,
+            # Also when resuming finds no complete frame 0: what a kill left of it is cut off, and it starts again.
+            StreamWriter.open(self.out / STREAM, resume=resume, last_frame=last, fsync=fsync) as writer,
+            self.progress,
+            Prefetcher(self.source, indices) as frames,
+        ):
             for train, test, waited in _timed(frames):
                 state = self._advance(writer, state, self._with_near(train), self._with_near(test), waited)
                 done = train.index + 1

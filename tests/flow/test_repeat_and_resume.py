@@ -190,3 +190,18 @@ def test_interrupt_ends_after_the_current_frame(tmp_path: Path, moment: str) -> 
     assert 1 <= done < 40
     assert [line["frame"] for line in metrics(out)] == list(range(done))
     assert (out / "contact_sheet.png").exists()
+
+
+def test_interrupted_twice_it_stops_at_once(tmp_path: Path) -> None:
+    """A second Ctrl-C does not wait for frame 0, which would take hours here."""
+    out, options = tmp_path / "o", {"first_frame__max_iterations": 10_000_000, "first_frame__epochs": 10_000_000}
+    process = start(*arguments(out, **options))
+    wait_for((out / "stream.gss").exists, process)
+    for _ in range(2):
+        os.kill(process.pid, signal.SIGINT)
+        time.sleep(0.2)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, "interrupted\n")
+    with StreamReader(out / "stream.gss") as reader:
+        assert reader.entries == []
+        assert reader.damage is None

@@ -21,6 +21,7 @@ from gsstream.packet import (
     encode_key,
     quantise_decoders,
 )
+from gsstream.packet.base import build_packet, parse_packet
 
 
 def make_scene(rng: np.random.Generator, number: int, sh_rest: int = 3) -> Gaussians:
@@ -100,3 +101,14 @@ def write_stream(path: Path, packets: list[EncodedPacket], index: bool = True) -
 def same_bits(first: Gaussians, second: Gaussians) -> bool:
     pairs = zip(first.items(), second.items(), strict=True)
     return all(a.shape == b.shape and a.dtype == b.dtype and a.tobytes() == b.tobytes() for (_, a), (_, b) in pairs)
+
+
+def resealed(packet, mutate):
+    """The packet with mutated section payloads and correct checksums: only the decoders can notice."""
+    header, sections = parse_packet(packet.data)
+    return build_packet(header.kind, header.frame, [(name, mutate(name, s.data)) for name, s in sections.items()]).data
+
+
+def replaced(packet, name, data):
+    """The packet with another payload of one section."""
+    return resealed(packet, lambda n, old: data if n == name else old)

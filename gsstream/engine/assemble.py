@@ -85,6 +85,10 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog) -> Assembly:
             parts[slot] = built
             refs[slot] = ComponentRef(name=ref.name, params=built.config.model_dump(mode="json"))
     loss = _loss(resolved, catalog, problems)
+    if resolved.recipe.codec.key_every:
+        # The format and the player know later key packets, the encoder does not make them yet: said, not ignored.
+        where = resolved.near(("codec", "key_every")).where
+        problems.append(f"{where}: codec.key_every: only frame 0 is written as a key packet so far; leave it at 0")
     join_problems(problems)
     parts["loss"] = loss
     owners = sorted({catalog.entry(slot, ref.name).distribution for slot, ref in refs.items()})

@@ -1,4 +1,4 @@
-"""Writes api.md, cli.md and recipe.md from the code, so that they cannot drift: ``python docs/reference/generate.py``.
+"""Writes the pages of this folder from the code, so that they cannot drift: ``python docs/reference/generate.py``.
 
 ``tests/test_architecture.py`` fails while a page on disk differs from what this module makes.
 """
@@ -71,7 +71,32 @@ def recipe() -> str:
     return "\n".join(lines) + "\n"
 
 
-PAGES = {"api.md": api, "cli.md": cli, "recipe.md": recipe}
+def checks() -> str:
+    """Every check of the contract kit, the claim that calls for it, and the saboteur that proves it can fail."""
+    from gsstream.testing.kit import all_checks
+    from gsstream.testing.saboteurs import saboteur_of
+
+    lines = [NOTE, "# Checks of the contract kit", ""]
+    lines += [
+        "What every part promises. `gsstream check NAME` makes the checks of a part, a plugin or a method;",
+        "`gsstream.testing.parametrize_with_checks` makes one test of each. A check with a claim is made on parts",
+        "whose traits claim it, and is otherwise skipped and counted. Each check has a saboteur: a part that is wrong in one",
+        "way and fails this check alone (`tests/contract/test_saboteurs.py`).",
+        "",
+    ]
+    kinds = list(dict.fromkeys(entry.kind for entry in all_checks()))
+    for kind in kinds:
+        lines += [f"## {kind}", "", "| check | meaning | claim | saboteur |", "|---|---|---|---|"]
+        for entry in all_checks():
+            if entry.kind == kind:
+                claim = f"`{entry.trait}`" if entry.trait else "-"
+                meaning = entry.meaning.replace("|", chr(92) + "|")
+                lines.append(f"| `{entry.name}` | {meaning} | {claim} | {saboteur_of(entry.name)} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+PAGES = {"api.md": api, "checks.md": checks, "cli.md": cli, "recipe.md": recipe}
 
 if __name__ == "__main__":
     for page, make in PAGES.items():

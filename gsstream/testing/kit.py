@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from gsstream.core.part import Part
-from gsstream.testing.checks import common, confidence, gate, propagation, regularizer, structure
+from gsstream.testing.checks import common, confidence, gate, method, packet, propagation, regularizer, structure
 from gsstream.testing.registry import BEHAVED, CHECKS, Check, Skip, checks_for, kind_of
 
 Status = Literal["passed", "failed", "expected failure", "skipped"]
 #: Importing these modules fills the registry; the order is that of the reports.
-MODULES = (common, structure, confidence, propagation, gate, regularizer)
+MODULES = (common, structure, confidence, propagation, gate, regularizer, method, packet)
 LEAST_REASON = 20
 
 
@@ -62,9 +62,28 @@ def run_checks(part: Part, expected_failures: Mapping[str, str] | None = None) -
         ValueError: an expected failure names no check of this kind, or its reason is none.
     """
     expected = dict(expected_failures or {})
-    entries = checks_for(kind_of(part))
+    return run_subject(kind_of(part), part, expected)
+
+
+def run_method_checks(name: str, expected_failures: Mapping[str, str] | None = None) -> list[CheckResult]:
+    """Make the checks of whole methods on a named method, with a tiny budget.
+
+    Raises RecipeError, UnknownName or PluginUnavailable when it cannot be assembled.
+    """
+    return run_subject("method", method.MethodUnderTest(name), dict(expected_failures or {}))
+
+
+def run_packet_checks(codec: packet.PacketCodec | None = None) -> list[CheckResult]:
+    """Make the checks of the packet format."""
+    return run_subject("packet", codec or packet.PacketCodec(), {})
+
+
+def run_subject(kind: str, subject: Any, expected: Mapping[str, str] | None = None) -> list[CheckResult]:
+    """Make every check of a kind on something that is no part of a recipe."""
+    expected = expected or {}
+    entries = checks_for(kind)
     _check_reasons(expected, [entry.name for entry in entries])
-    return [run_check(entry, part, expected.get(entry.name)) for entry in entries]
+    return [run_check(entry, subject, expected.get(entry.name)) for entry in entries]
 
 
 def parametrize_with_checks(

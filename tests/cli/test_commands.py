@@ -44,6 +44,7 @@ OPTIONS = {
     "gsstream export": ["STREAM", "--out", "--format", "--frames"],
     "gsstream manifest": ["STREAM", "--out"],
     "gsstream view": ["STREAM", "--port", "--host"],
+    "gsstream check": ["NAME", "--quiet"],
     "gsstream bench": [],
     "gsstream bench render": [
         "--sizes", "--shares", "--threads", "--renderers", "--points", "--repetitions", "--seed", "--quick", "--out",

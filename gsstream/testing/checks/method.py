@@ -1,0 +1,199 @@
+"""What a whole method promises, on a recording of 32 x 24 pixels."""
+
+from __future__ import annotations
+
+import functools
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsstream.core.frame import Frame
+from gsstream.core.rng import Rng
+from gsstream.core.shapes import check_finite
+from gsstream.engine.assemble import Assembly, assemble
+from gsstream.engine.begin import begin
+from gsstream.engine.frame_step import frame_step
+from gsstream.engine.points import gather_points
+from gsstream.engine.resume import resume_state
+from gsstream.engine.stream_state import Step, StreamState
+from gsstream.packet import PlayerState, StreamMeta, StreamWriter, decode_packet
+from gsstream.plugins.catalog import load_catalog
+from gsstream.recipe.load import resolve_recipe
+from gsstream.source.open import open_source
+from gsstream.testing.cases import fingerprint
+from gsstream.testing.registry import check
+
+SOURCE = "synthetic:frames=4&views=3&width=32&height=24&supersample=1"
+TINY = (
+    "first_frame.max_iterations=8", "first_frame.max_points=200", "first_frame.fill_points=0", "stream.epochs=1",
+    "first_frame.points=recording",
+)  # fmt: skip
+FRAMES = 3
+CUT = 2
+
+
+class MethodUnderTest:
+    """A method with a tiny budget; frames are stepped in memory. Saboteurs override one method."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        catalog = load_catalog()
+        resolved = resolve_recipe(name, catalog.recipe_path, None, [("the contract kit", text) for text in TINY])
+        self.parts: Assembly = assemble(resolved, catalog)
+        self.seed = self.parts.recipe.seed
+
+    def __repr__(self) -> str:
+        return f"method {self.name}"
+
+    def begin(self, frame: Frame, uri: str = SOURCE) -> Step:
+        """Frame 0."""
+        source = open_source(uri)
+        rng = Rng(self.seed)
+        points = gather_points(source, frame, self.parts.recipe.first_frame, rng)
+        recipe, info = self.parts.recipe, source.info
+        meta = StreamMeta(
+            recipe.method, info.name, recipe.model_dump(mode="json"), frame.cameras, info.test, info.fps,
+            recipe.background, {},
+        )  # fmt: skip
+        return begin(self.parts, points, frame, meta, rng, lambda *_: None)
+
+    def step(self, state: StreamState, frame: Frame) -> Step:
+        """A later frame."""
+        return frame_step(self.parts, state, frame, Rng(self.seed))
+
+    def resume(self, stream: Path) -> StreamState | None:
+        """The encoder's state after the last packet of a stream."""
+        source = open_source(SOURCE)
+        return resume_state(self.parts, stream, source, Rng(self.seed), source.info.train.near)
+
+    def play(self, state: PlayerState | None, data: bytes) -> PlayerState:
+        """What a player does with a packet."""
+        return decode_packet(state, data)
+
+    def chain(self, uri: str = SOURCE, choose: Callable[[Frame], Frame] | None = None) -> list[Step]:
+        """All frames of a recording."""
+        source = open_source(uri)
+        frames = [source.frame(index) for index in range(FRAMES)]
+        frames = [choose(frame) for frame in frames] if choose else frames
+        steps = [self.begin(frames[0], uri)]
+        for frame in frames[1:]:
+            steps.append(self.step(steps[-1].state, frame))
+        return steps
+
+    @functools.cached_property
+    def steps(self) -> list[Step]:
+        """The chain that most checks look at, encoded once."""
+        return self.chain()
+
+
+def _bytes(what: str, got: Step, expected: Step) -> None:
+    a, b = got.packet.data, expected.packet.data
+    if a == b:
+        return
+    pairs = zip(a, b, strict=False)
+    place = next((i for i, (x, y) in enumerate(pairs) if x != y), min(len(a), len(b)))
+    frame = expected.packet.frame
+    raise AssertionError(f"{what}: packet of frame {frame} differs from byte {place} on ({len(a)} and {len(b)} bytes)")
+
+
+@check("method")
+def check_method_closed_loop(method: MethodUnderTest) -> None:
+    """A fresh player that has the packets alone reaches the encoder's state bit by bit, frame by frame."""
+    player: PlayerState | None = None
+    for step in method.steps:
+        player = method.play(player, step.packet.data)
+        for name, value in step.state.player.gaussians.items():
+            off = np.abs(getattr(player.gaussians, name) - value)
+            drift = float(off.max()) if off.size else 0.0
+            assert drift == 0.0, f"frame {player.frame}: {name} drifted by {drift:.3g}; expected 0, bitwise on the CPU"
+
+
+@check("method")
+def check_method_deterministic(method: MethodUnderTest) -> None:
+    """The same seed gives the same packets, byte by byte."""
+    for again, first in zip(method.chain(), method.steps, strict=True):
+        _bytes("second run", again, first)
+
+
+@check("method")
+def check_method_resume(method: MethodUnderTest) -> None:
+    """Stopped after frame 1 and continued from the stream alone, the rest is byte by byte the same."""
+    with tempfile.TemporaryDirectory() as folder:
+        stream = Path(folder, "stream.gss")
+        with StreamWriter.open(stream) as writer:
+            for step in method.steps[:CUT]:
+                writer.append(step.packet)
+        state = method.resume(stream)
+    assert state is not None, "nothing to resume was found in a stream of two frames"
+    source = open_source(SOURCE)
+    for index in range(CUT, FRAMES):
+        again = method.step(state, source.frame(index))
+        _bytes("resumed run", again, method.steps[index])
+        state = again.state
+
+
+@check("method")
+def check_method_failed_frame(method: MethodUnderTest) -> None:
+    """A frame that fails leaves the state as it was; the next attempt gives what it would have given."""
+    state = method.steps[1].state
+    before = fingerprint(state.player)
+    frame = open_source(SOURCE).frame(2)
+    broken = replace(frame, images=frame.images[:, :-1])
+    try:
+        method.step(state, broken)
+    except Exception as error:  # which error is the method's business; that the state survives is ours
+        assert str(error), f"a frame one row short raised {type(error).__name__} without a message"
+    assert fingerprint(state.player) == before, "the failed frame changed the state"
+    _bytes("after a failed frame", method.step(state, frame), method.steps[2])
+
+
+@check("method")
+def check_method_static_video(method: MethodUnderTest) -> None:
+    """When nothing moves, frames cost no more than when something does."""
+    still = method.chain(SOURCE + "&static=true")
+    sizes = [[len(step.packet.data) for step in steps[1:]] for steps in (still, method.steps)]
+    got, bound = (sum(size) for size in sizes)
+    assert got <= 1.1 * bound, (
+        f"a static recording takes {sizes[0]} bytes, the moving one {sizes[1]}; expected at most a tenth more (without "
+        "gates every frame spends its whole budget)"
+    )
+
+
+@check("method")
+def check_method_one_camera(method: MethodUnderTest) -> None:
+    """One camera is enough to run, and everything stays finite."""
+
+    def first_camera(frame: Frame) -> Frame:
+        return replace(frame, images=frame.images[:1], cameras=frame.cameras.select([0]))
+
+    for step in method.chain(choose=first_camera):
+        for name, value in step.state.player.gaussians.items():
+            check_finite(f"frame {step.packet.frame}: {name}", value)
+
+
+@check("method")
+def check_method_size_is_true(method: MethodUnderTest) -> None:
+    """Reported bytes are the bytes written, and no more gates or Gaussians are active than there are."""
+    for step in method.steps:
+        metrics: Any = step.metrics
+        total = sum(metrics["bytes"].values())
+        frame = step.packet.frame
+        assert total == len(step.packet.data), f"frame {frame}: says {total} bytes, wrote {len(step.packet.data)}"
+        for name in ("gaussians", "gates"):
+            active, have = metrics[f"active_{name}"], metrics[f"num_{name}"]
+            assert 0 <= active <= have, f"frame {frame}: {active} active {name} of {have}"
+
+
+@check("method")
+def check_method_global_rng(method: MethodUnderTest) -> None:
+    """Torch's global generator is neither read nor moved by a frame."""
+    state, frame = method.steps[0].state, open_source(SOURCE).frame(1)
+    before = torch.get_rng_state()
+    again = method.step(state, frame)
+    assert torch.equal(before, torch.get_rng_state()), "the frame drew from torch's global generator"
+    _bytes("frame 1 again", again, method.steps[1])

@@ -1,0 +1,96 @@
+"""Saboteurs of the common checks."""
+
+from __future__ import annotations
+
+from typing import Any, final
+
+import torch
+
+from gsstream.core.state import GateState
+from gsstream.testing.examples.confidence import ExampleConfidence
+from gsstream.testing.examples.gate import ExampleGate
+from gsstream.testing.examples.propagation import ExamplePropagation
+from gsstream.testing.saboteurs.register import spoils
+
+# The examples are final; only a saboteur may inherit from them, and only behind the type checker's back.
+Gate: Any = ExampleGate
+Propagation: Any = ExamplePropagation
+Confidence: Any = ExampleConfidence
+
+
+@spoils("check_config_round_trip")
+class Undescribed(Gate):
+    """A setting without a description."""
+
+    class Config(ExampleGate.Config):
+        secret: float = 1.0
+
+
+@spoils("check_frozen_and_final", leave=True)
+class Open(Gate):
+    """Not marked final (ours, wrong on purpose)."""
+
+
+@spoils("check_docstring", leave=True)
+@final
+class Unsourced(Gate):
+    """Threshold gates."""
+
+
+@spoils("check_pure")
+class Meddler(Propagation):
+    """Changes the logits it is given, by the last bit of the first."""
+
+    def propagate(self, logits: torch.Tensor, hierarchy: Any) -> torch.Tensor:
+        spread: torch.Tensor = super().propagate(logits, hierarchy)
+        if not logits.requires_grad:
+            logits[:1] = torch.nextafter(logits[:1], torch.full_like(logits[:1], torch.inf))
+        return spread
+
+
+@spoils("check_rng_isolated")
+class Gambler(Gate):
+    """Draws from the global generator besides its own."""
+
+    def noise(self, num_nodes: int, generator: torch.Generator) -> torch.Tensor | None:
+        torch.rand(1)
+        noise: torch.Tensor | None = super().noise(num_nodes, generator)
+        return noise
+
+
+@spoils("check_dtype_and_device")
+class Narrow(Gate):
+    """Gates are float32, whatever the logits are."""
+
+    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
+        gates: torch.Tensor = super().sample(state, noise)
+        return gates.float()
+
+
+@spoils("check_empty_and_one")
+class NeverEmpty(Gate):
+    """Takes the maximum of no logits."""
+
+    def init(self, logits: torch.Tensor) -> GateState:
+        logits.max()
+        state: GateState = super().init(logits)
+        return state
+
+
+@spoils("check_rejects_nonfinite")
+class Mender(Propagation):
+    """Replaces what is not finite by 0 and says nothing."""
+
+    def propagate(self, logits: torch.Tensor, hierarchy: Any) -> torch.Tensor:
+        mended = torch.where(torch.isfinite(logits), logits, torch.zeros_like(logits))
+        spread: torch.Tensor = super().propagate(mended, hierarchy)
+        return spread
+
+
+@spoils("check_permutation")
+class Ranked(Confidence):
+    """Later rows are trusted less."""
+
+    def estimate(self, context: Any) -> torch.Tensor:
+        logits: torch.Tensor = super().estimate(context)
+        return logits - 0.01 * torch.arange(len(logits)) / max(len(logits), 1)

@@ -1,0 +1,29 @@
+"""The table check -> saboteur."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar, final
+
+from gsstream.core.part import Part
+
+Saboteur = TypeVar("Saboteur", bound=type)
+
+SABOTEURS: dict[str, type[Part]] = {}
+
+
+def spoils(check: str, *, leave: bool = False) -> Callable[[Any], Any]:
+    """Enter a class as the saboteur of a check. Its docstring says what is wrong with it.
+
+    ``leave`` keeps the class as it is; otherwise it is made final and its docstring given a source, as checks demand.
+    """
+
+    def enter(cls: Saboteur) -> Saboteur:
+        assert check not in SABOTEURS, check
+        SABOTEURS[check] = cls
+        if leave:
+            return cls
+        cls.__doc__ = f"{cls.__doc__} (ours, wrong on purpose)"
+        return final(cls)
+
+    return enter

@@ -1,0 +1,83 @@
+"""``gsstream check``: what it says, what it counts, how it exits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gsstream.cli.main import run_command
+
+BROKEN = '''
+from typing import final
+from gsstream.api import GateSampler, GateState
+import torch
+
+
+@final
+class Half(GateSampler):
+    """Half open gates (ours)."""
+
+    @property
+    def num_levels(self): return 1
+    def init(self, logits): return GateState(logits.clamp(-5, 5))
+    def noise(self, num_nodes, generator): return None
+    def sample(self, state, noise): return torch.full_like(state.logits, 0.5)
+    def open_probability(self, state): return torch.ones_like(state.logits)
+    def bound(self, state): return GateState(state.logits.clamp(-5, 5))
+'''
+PLUGIN = '''
+from gsstream.spec import ComponentSpec, hookimpl
+
+
+@hookimpl
+def gsstream_components():
+    return [ComponentSpec(kind="gate", name="half", target="gsstream_half_gate:Half", summary="half open")]
+'''
+
+
+def test_a_sound_part(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["check", "group-max"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("propagation group-max (from gsstream ")
+    assert "  ✓ propagation_monotone\n" in out
+    assert "  ⚠ propagation_parent_bound (skipped): not claimed: Traits.parent_bound\n" in out
+    assert "19 passed, 1 skipped" in out.splitlines()[-1]
+
+
+def test_kind_and_name_choose_one_of_several(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["check", "loss/reference", "--quiet"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("loss reference (from gsstream ")
+    assert "renderer" not in out
+    assert "✓" not in out
+
+
+def test_packets(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["check", "packets"]) == 0
+    assert "10 passed" in capsys.readouterr().out
+
+
+def test_a_broken_part_exits_with_1_and_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "gsstream_half_gate.py").write_text(BROKEN)
+    (tmp_path / "gsstream_half_plugin.py").write_text(PLUGIN)
+    info = tmp_path / "gsstream_half-0.1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: gsstream-half\nVersion: 0.1\n")
+    (info / "entry_points.txt").write_text("[gsstream]\nhalves = gsstream_half_plugin\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name in ("half", "gate/half", "halves", "gsstream-half"):
+        assert run_command(["check", name, "--quiet"]) == 1
+        out = capsys.readouterr().out
+        assert "gate half (from gsstream-half 0.1)" in out
+        assert "✗ gate_range_and_levels: without noise: k / num_levels: largest deviation 0.5" in out
+        assert "failed" in out.splitlines()[-1]
+
+
+def test_a_wrong_name_offers_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["check", "grup-max"]) == 2
+    assert "did you mean 'group-max'?" in capsys.readouterr().err
+    assert run_command(["check", "doors/group-max"]) == 2
+    assert "no kind of part named 'doors'" in capsys.readouterr().err

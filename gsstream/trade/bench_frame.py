@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -176,9 +177,10 @@ def _case(plan: FramePlan, parts: Assembly, static: int, ball: _Ball) -> _Case:
     player = _first_player(parts, _scene(plan, static), rig)
     before = _draw(parts, player.gaussians, rig)
     noise = Rng(plan.seed).numpy("bench noise")
-    first = Frame(0, 0.0, _noisy(before, noise), rig)
-    state = begin_from(parts, player, first, player.meta, Rng(plan.seed)).state
-    # The method stores rows in an order of its own: what moves is found again by where it is.
+    state = begin_from(parts, player, Frame(0, 0.0, before, rig), player.meta, Rng(plan.seed)).state
+    # Stored in the method's own order the scene is rounded anew: what stands still must look as it did.
+    before = _draw(parts, state.player.gaussians, rig)
+    state = replace(state, previous=Frame(0, 0.0, _noisy(before, noise), rig))
     after = _draw(parts, _moved(plan, state.player.gaussians, rig, ball), rig)
     inside = ball.holds(state.player.gaussians)
     facts = {
@@ -244,22 +246,25 @@ def _timed(
 ) -> Sequence[tuple[str, Step, dict[str, Any]]]:
     """Every variant's step in turn, several times over: (variant, last step, ms of the whole and by phase)."""
     total: dict[str, list[float]] = {name: [] for name in assemblies}
+    work: dict[str, list[float]] = {name: [] for name in assemblies}
     phases: dict[str, dict[str, list[float]]] = {name: {} for name in assemblies}
     last: dict[str, Step] = {}
     for round_ in range(plan.warm_up + plan.repetitions):
         for name, parts in assemblies.items():
-            started = time.perf_counter()
+            started, worked = time.perf_counter(), time.process_time()
             last[name] = frame_step(parts, cases[name].state, cases[name].frame, Rng(plan.seed))
-            elapsed = time.perf_counter() - started
+            elapsed, spent = time.perf_counter() - started, time.process_time() - worked
             if round_ < plan.warm_up:
                 continue
             total[name].append(1000 * elapsed)
+            work[name].append(1000 * spent)
             for phase, seconds in last[name].metrics["seconds"].items():
                 phases[name].setdefault(phase, []).append(1000 * seconds)
     out = []
     for name, step in last.items():
-        by_phase = {phase: Timing(tuple(values)).to_json() for phase, values in phases[name].items()}
-        out.append((name, step, {"total_ms": Timing(tuple(total[name])).to_json(), "phases_ms": by_phase}))
+        by_phase = {phase: {"min": min(v), "median": median(v)} for phase, v in phases[name].items()}
+        timing = Timing(tuple(total[name]), tuple(work[name])).to_json()
+        out.append((name, step, {"total_ms": timing, "phases_ms": by_phase}))
     return out
 
 

@@ -26,7 +26,7 @@ from gsstream.trade.bench_floor import (
     pixels_of,
 )
 from gsstream.trade.bench_native import NativeBench, find_native, measure_peaks
-from gsstream.trade.bench_report import Progress, Steps, Timing, interleaved, machine_facts, torch_threads
+from gsstream.trade.bench_report import Progress, Steps, interleaved, machine_facts, torch_threads
 from gsstream.trade.bench_scene import Points, bench_camera, make_gaussians, synthetic_points
 
 SCHEMA = "gsstream-bench-render-1"
@@ -234,10 +234,10 @@ def _timed(
     results = []
     for case, timing in zip(cases, timings, strict=True):
         forward, backward = timing["forward"], timing["backward"]
-        total = Timing(tuple(f + b for f, b in zip(forward.samples, backward.samples, strict=True)))
-        times = {"forward_ms": forward.to_json(), "backward_ms": backward.to_json(), "total_ms": total.to_json()}
+        times = {"forward_ms": forward, "backward_ms": backward, "total_ms": forward + backward}
         counts = dict(case.statistics()) if case.statistics else None
-        results.append({**case.facts, "threads": threads, **times, "statistics": counts})
+        found = {name: timing.to_json() for name, timing in times.items()}
+        results.append({**case.facts, "threads": threads, **found, "statistics": counts})
     return results
 
 

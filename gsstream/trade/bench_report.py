@@ -25,9 +25,16 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Milliseconds of several repetitions."""
+    """Milliseconds of several repetitions: that passed, and of processor time over all threads."""
 
     samples: tuple[float, ...]
+    cpu: tuple[float, ...]
+
+    def __add__(self, other: Timing) -> Timing:
+        """Repetition by repetition."""
+        both = ((self.samples, other.samples), (self.cpu, other.cpu))
+        samples, cpu = (tuple(a + b for a, b in zip(*pair, strict=True)) for pair in both)
+        return Timing(samples, cpu)
 
     @property
     def minimum(self) -> float:
@@ -38,8 +45,8 @@ class Timing:
         return statistics.median(self.samples)
 
     def to_json(self) -> dict[str, float]:
-        """Least and median, ms."""
-        return {"min": round(self.minimum, 5), "median": round(self.median, 5)}
+        """Least and median, and the least processor time, ms."""
+        return {"min": round(self.minimum, 5), "median": round(self.median, 5), "cpu": round(min(self.cpu), 5)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,17 +62,17 @@ def interleaved(cases: Sequence[Steps], repetitions: int, warm_up: int) -> list[
 
     The first ``warm_up`` rounds are not counted.
     """
-    found: list[dict[str, list[float]]] = [{name: [] for name in case.steps} for case in cases]
+    found: list[dict[str, list[tuple[float, float]]]] = [{name: [] for name in case.steps} for case in cases]
     for round_ in range(warm_up + repetitions):
         for case, samples in zip(cases, found, strict=True):
             case.prepare()
             for name, step in case.steps.items():
-                started = time.perf_counter()
+                started, worked = time.perf_counter(), time.process_time()
                 step()
-                elapsed = time.perf_counter() - started
+                elapsed, work = time.perf_counter() - started, time.process_time() - worked
                 if round_ >= warm_up:
-                    samples[name].append(1000 * elapsed)
-    return [{name: Timing(tuple(values)) for name, values in samples.items()} for samples in found]
+                    samples[name].append((1000 * elapsed, 1000 * work))
+    return [{name: Timing(*zip(*values, strict=True)) for name, values in samples.items()} for samples in found]
 
 
 @contextmanager

@@ -83,16 +83,19 @@ def test_the_reference_renderer_is_left_out_where_it_would_take_minutes(tmp_path
 
 def test_peaks_keep_the_better_of_two_measurements() -> None:
     class Machine:
-        rates = iter([10.0, 1.0, 8.0, 3.0])
+        flops = iter([4.0, 10.0, 7.0, 5.0, 6.0, 8.0, 1.0, 9.0, 2.0, 3.0])
+        bytes_ = iter([0.5, 1.0, 0.7, 3.0, 2.0, 1.0])
 
-        def fma_peak(self, threads: int) -> float:
-            return next(self.rates)
+        def fma_peak(self, threads: int, seconds: float) -> float:
+            return next(self.flops)
 
-        copy_peak = fma_peak
+        def copy_peak(self, threads: int) -> float:
+            return next(self.bytes_)
 
     native: Any = Machine()
     once = measure_peaks(native, (1,), {})
     twice = measure_peaks(native, (1,), once)
+    assert (once[1].gflops, once[1].gbytes_per_second) == (10.0, 1.0)
     assert (twice[1].gflops, twice[1].gbytes_per_second) == (10.0, 3.0)
     assert measure_peaks(None, (1,), {}) == {}
 

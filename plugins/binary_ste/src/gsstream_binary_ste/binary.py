@@ -1,0 +1,80 @@
+"""Binary straight-through gates: a node moves entirely or not at all."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Literal, final
+
+import torch
+from pydantic import Field
+
+from gsstream.api import GateSampler, GateState, PartConfig, Traits, check_finite
+
+
+@final
+class BinarySteGate(GateSampler):
+    """g = 1 where sigmoid((z + n) / tau) > 1/2, else 0, n ~ Logistic(0, 1) (paper, "Binary STE").
+
+    P(g = 1) = sigmoid(z) whatever tau is: the temperature shapes only the gradient, that of the soft gate, straight
+    through the step.
+
+    The paper reports that these gates collapse. In the released code a clamp follows the rounding; its derivative is 0
+    at both ends, which is where every binary gate is. So no gate feels the images, only the price of being open, and
+    all of them close. ``clamp_gradient`` reproduces that; without it binary gates train.
+    """
+
+    class Config(PartConfig):
+        temperature: float = Field(
+            default=0.3, ge=0.01, le=10, description="tau, softness of the gradient, no unit, 0.01 to 10 (paper: 0.3)"
+        )
+        logit_bound: float = Field(
+            default=math.log(1000.0), gt=0, le=50,
+            description="logits are kept in [-bound, bound], 0 to 50; ln(1000) is p = 0.001 to 0.999 (released code)",
+        )  # fmt: skip
+        noise: Literal["logistic", "none"] = Field(
+            default="logistic", description="while training; logistic: paper; none: released training"
+        )
+        clamp_gradient: bool = Field(
+            default=False, description="block every gradient through a gate at 0 or 1, as the released clamp does"
+        )
+
+    traits = Traits(stochastic=True, differentiable=True, temperature=True)
+
+    def claims(self) -> Traits:
+        return replace(self.traits, stochastic=self.config.noise == "logistic")
+
+    @property
+    def num_levels(self) -> int:
+        return 1
+
+    def init(self, logits: torch.Tensor) -> GateState:
+        """Start from confidence logits [M], limited to the documented bound. Raises ShapeError if one is not finite."""
+        check_finite("confidence logits", logits)
+        return self.bound(GateState(logits=logits.detach()))
+
+    def noise(self, num_nodes: int, generator: torch.Generator) -> torch.Tensor | None:
+        """[num_nodes] float32, or None when ``noise`` is none."""
+        if self.config.noise == "none":
+            return None
+        # Half a step of the lattice k / 2^24: finite also where the generator gives exactly 0.
+        u = torch.rand(num_nodes, generator=generator, device=generator.device).double() + 2.0**-25
+        return (torch.log(u) - torch.log1p(-u)).float()
+
+    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
+        """Gates [M], each exactly 0.0 or 1.0, dtype of the logits; a soft gate of exactly 1/2 is closed."""
+        z = state.logits if noise is None else state.logits + noise.detach().to(state.logits.dtype)
+        soft = torch.sigmoid(z / self.config.temperature)
+        # soft - soft is exactly 0, so the value is exactly 0 or 1.
+        through = soft - soft.detach()
+        if self.config.clamp_gradient:
+            through = 0.0 * through
+        return (z.detach() > 0).to(z.dtype) + through
+
+    def open_probability(self, state: GateState) -> torch.Tensor:
+        """[M] sigmoid(z), the probability that z plus logistic noise is positive."""
+        return torch.sigmoid(state.logits)
+
+    def bound(self, state: GateState) -> GateState:
+        """Project the logits into [-logit_bound, logit_bound]."""
+        return GateState(logits=state.logits.clamp(-self.config.logit_bound, self.config.logit_bound))

@@ -1,0 +1,1 @@
+"""Fixed-threshold pruning as a propagation of gsstream. Importing this package imports no torch."""

@@ -18,6 +18,7 @@ from typing import Any, Protocol, cast
 from gsstream.trade.bench_floor import Peak
 
 ENTRY_POINT_GROUP = "gsstream.bench"
+LOOKS = 40
 
 
 class NativeKernel(Protocol):
@@ -50,8 +51,8 @@ class NativeBench(Protocol):
     def fma_peak(self, threads: int, seconds: float) -> float:
         """10^9 float32 operations a second, measured in registers for so long."""
 
-    def copy_peak(self, threads: int) -> float:
-        """10^9 bytes read plus written a second, measured by copying."""
+    def copy_peak(self, threads: int, megabytes: float) -> float:
+        """10^9 bytes read plus written a second, measured by copying so much a thread."""
 
 
 def find_native(name: str) -> NativeBench | None:
@@ -71,9 +72,9 @@ def measure_peaks(native: NativeBench | None, threads: tuple[int, ...], known: d
         return known
     found = dict(known)
     for count in threads:
-        # Short looks: one of them may fall between the work of other programs.
-        gflops = max(native.fma_peak(count, 0.04) for _ in range(5))
-        gbytes = max(native.copy_peak(count) for _ in range(3))
+        # Many short looks: some of them fall between the work of other programs.
+        gflops = max(native.fma_peak(count, 0.004) for _ in range(LOOKS))
+        gbytes = max(native.copy_peak(count, 64.0) for _ in range(LOOKS // 4))
         if count in known:
             gflops, gbytes = max(gflops, known[count].gflops), max(gbytes, known[count].gbytes_per_second)
         found[count] = Peak(count, gflops, gbytes)

@@ -61,7 +61,7 @@ def frame_table(data: Mapping[str, Any]) -> str:
         f"{s['height']}, one torch thread; peak memory of the benchmark {data['peak_memory_mb']:.0f} MB.",
         "dense: every gate open, everything takes part; gated: the recipe's gates; active: only what changed beyond",
         f"{s['change_threshold']:g} sigmas takes part. Seconds, least of the repetitions (cpu: processor time of all",
-        "threads). changed: share of tiles in which a pixel differs by more than 3/255. rows: Gaussians that took part.",
-        "PSNR: against the frame without noise; held: had nothing been sent.",
+        "threads). changed: share of tiles in which a pixel differs by more than 3/255. rows: Gaussians that took",
+        "part. PSNR: against the frame without noise; held: had nothing been sent.",
     ]
     return format_table(rows) + "\n\n" + "\n".join(notes)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from gsstream.cli.main import run_command
-from gsstream.trade.bench_native import find_native, measure_peaks
+from gsstream.trade.bench_native import LOOKS, find_native, measure_peaks
 
 RENDER_KEYS = {
     "renderer", "level", "gaussians", "width", "height", "share", "tiles", "path", "rows", "drawn", "live_pairs",
@@ -83,13 +83,13 @@ def test_the_reference_renderer_is_left_out_where_it_would_take_minutes(tmp_path
 
 def test_peaks_keep_the_better_of_two_measurements() -> None:
     class Machine:
-        flops = iter([4.0, 10.0, 7.0, 5.0, 6.0, 8.0, 1.0, 9.0, 2.0, 3.0])
-        bytes_ = iter([0.5, 1.0, 0.7, 3.0, 2.0, 1.0])
+        flops = iter([*[4.0] * 7, 10.0, *[5.0] * (LOOKS - 8), *[9.0] * LOOKS])
+        bytes_ = iter([*[0.5] * (LOOKS // 4 - 1), 1.0, 3.0, *[2.0] * (LOOKS // 4 - 1)])
 
         def fma_peak(self, threads: int, seconds: float) -> float:
             return next(self.flops)
 
-        def copy_peak(self, threads: int) -> float:
+        def copy_peak(self, threads: int, megabytes: float) -> float:
             return next(self.bytes_)
 
     native: Any = Machine()

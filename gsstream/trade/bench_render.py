@@ -242,10 +242,15 @@ def _timed(
 
 
 def _add_floor(result: dict[str, Any], peak: Peak | None) -> None:
-    """The floor of the case and the distance to it, from the best peaks seen during the whole benchmark."""
+    """The floor of the case and the distance to it, from the best peaks seen during the whole benchmark.
+
+    ``ratio_cpu`` takes the processor time, spread evenly over the threads, in place of the time that passed: what the
+    ratio would be on a machine with nothing else to do.
+    """
     if peak is None:
-        result |= {"floor_ms": None, "ratio": None}
+        result |= {"floor_ms": None, "ratio": None, "ratio_cpu": None}
         return
     keys = {"pairs": "live_pairs", "visible": "drawn", "rows": "rows", "pixels": "pixels", "floats": "floats"}
     floor = sum(floor_ms(peak, **{key: result[name] for key, name in keys.items()}))
-    result |= {"floor_ms": round(floor, 5), "ratio": round(result["total_ms"]["min"] / floor, 3)}
+    least, work = result["total_ms"]["min"], result["total_ms"]["cpu"] / result["threads"]
+    result |= {"floor_ms": round(floor, 5), "ratio": round(least / floor, 3), "ratio_cpu": round(work / floor, 3)}

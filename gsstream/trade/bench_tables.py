@@ -11,7 +11,7 @@ from gsstream.trade.summary import format_table
 
 def render_table(data: Mapping[str, Any]) -> str:
     """``bench render``: one row per case, times in ms, least of the repetitions unless it says median."""
-    times = ["forward", "backward", "both", "median", "cpu", "floor", "x floor"]
+    times = ["forward", "backward", "both", "median", "cpu", "floor", "x floor", "cpu x"]
     rows = [["renderer", "rows", "scene", "tiles", "thr", *times]]
     for case in data["cases"]:
         scene = f"{case['gaussians'] / 1000:g}k {case['width']}x{case['height']}"
@@ -20,6 +20,7 @@ def render_table(data: Mapping[str, Any]) -> str:
             scene, f"{case['share']:.0%}", str(case["threads"]), cell(case["forward_ms"]["min"]),
             cell(case["backward_ms"]["min"]), cell(case["total_ms"]["min"]), cell(case["total_ms"]["median"]),
             cell(case["total_ms"]["cpu"]), cell(case["floor_ms"]), cell(case["ratio"], ".1f"),
+            cell(case["ratio_cpu"], ".1f"),
         ])  # fmt: skip
     isa = f", {data['machine']['isa']}" if data["machine"]["isa"] else ""
     peaks = [
@@ -31,6 +32,7 @@ def render_table(data: Mapping[str, Any]) -> str:
         "Times in ms, least of the repetitions. kernel: memory at hand, no torch; part: what the engine pays. A number",
         "of rows: only these change, the rest is cached. cpu: processor time of all threads, which other programs",
         "inflate less than the time that passes. Floor: counted work at the peaks (gsstream/trade/bench_floor.py).",
+        "cpu x: distance to the floor had the threads run undisturbed (processor time over threads).",
         *(f"Not run: {s['renderer']} at {s['size']}: {s['why']}" for s in data["skipped"]),
     ]
     return format_table(rows) + "\n\n" + "\n".join(notes)

@@ -14,6 +14,7 @@ from gsstream.trade.bench_native import LOOKS, find_native, measure_peaks
 RENDER_KEYS = {
     "renderer", "level", "gaussians", "width", "height", "share", "tiles", "path", "rows", "drawn", "live_pairs",
     "pixels", "floats", "threads", "forward_ms", "backward_ms", "total_ms", "statistics", "floor_ms", "ratio",
+    "ratio_cpu",
 }  # fmt: skip
 FRAME_KEYS = {
     "sweep", "variant", "static", "gaussians", "moving", "changed_tiles", "status", "bytes", "psnr", "psnr_if_held",

@@ -8,11 +8,22 @@ import struct
 import subprocess
 import sys
 
+import numpy as np
 import pytest
-from packet_scenes import decode_all, make_packets, same_bits, write_stream
+from packet_scenes import decode_all, make_delta, make_key, make_packets, same_bits, write_stream
 
+from gsstream.core.delta import apply_delta
 from gsstream.core.errors import InputError, OutputError, PacketError, SourceError
-from gsstream.packet import PacketKind, StreamReader, StreamWriter, encode_empty
+from gsstream.packet import (
+    PacketKind,
+    StreamReader,
+    StreamWriter,
+    encode_delta,
+    encode_empty,
+    encode_key,
+    next_decoders,
+    quantise_key,
+)
 from gsstream.packet.base import FILE_HEADER, file_header
 from gsstream.packet.reader import key_offsets, parse_index
 from gsstream.player.playback import Playback
@@ -41,6 +52,28 @@ def test_playback_equals_the_encoder_in_any_order(tmp_path):
         assert [frame for frame, _ in playback] == list(range(7))
         with pytest.raises(InputError, match="frame 7"):
             playback.state_at(7)
+
+
+def test_three_hundred_frames_without_drift(tmp_path):
+    """The encoder adds up its own symbols, the player what it reads: equal bits, not tolerances, after every frame."""
+    rng = np.random.default_rng(12)
+    key = make_key(rng, 120, 30)
+    scene, decoders, expected = quantise_key(key.gaussians), {}, []
+    with StreamWriter.open(tmp_path / "s.gss") as writer:
+        writer.append(encode_key(key))
+        expected.append(scene)
+        for frame in range(1, 300):
+            delta = make_delta(rng, key.layout, share=0.1, latent=frame % 7 == 0)
+            packet = encode_delta(delta, key.layout, decoders, frame=frame)
+            decoders = next_decoders(decoders, delta)
+            scene = apply_delta(scene, key.layout, delta)
+            writer.append(packet)
+            expected.append(scene)
+    with Playback(tmp_path / "s.gss") as playback:
+        for frame, shown in playback:
+            assert same_bits(shown, expected[frame])
+        assert same_bits(playback.state_at(150), expected[150])
+    assert np.abs(expected[-1].means - expected[0].means).max() > 0.05
 
 
 def test_stepping_forward_decodes_each_packet_once(tmp_path, monkeypatch):

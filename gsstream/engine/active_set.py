@@ -30,8 +30,8 @@ MAD_TO_SIGMA = 1.4826
 BLOCK = 4
 #: Blocks of a 16 x 16 tile (of 16) that must exceed the threshold.
 LEAST_BLOCKS = 2
-#: Least noise of a block's mean difference. Compressed video repeats still blocks exactly; without a floor the change of
-#: half a grey level by the encoder would count as motion.
+#: Least noise of a block's mean difference. Compressed video repeats still blocks exactly; without a floor the change
+#: of half a grey level by the encoder would count as motion.
 LEAST_SIGMA = 0.5 / 255
 
 

@@ -75,8 +75,8 @@ class Stream(Section):
     )
     change_threshold: float = Field(
         default=0.0, ge=0, le=100,
-        description="tiles whose pixels differ from the last frame by more than this many sigmas of their own spread count "
-        "as changed, and only Gaussians visible in them take part; 0: everything takes part",
+        description="tiles whose pixels differ from the last frame by more than this many sigmas of their own spread "
+        "count as changed, and only Gaussians visible in them take part; 0: everything takes part",
     )  # fmt: skip
     change_votes: float = Field(
         default=0.5, ge=0, le=1,

@@ -7,6 +7,7 @@ are stored along a space-filling curve, so the cell of one predicts the next. Ou
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -125,23 +126,31 @@ def _cost(means: FloatArray, exponents: IntArray, cell: int) -> float:
 
 
 def _pack_local(local: IntArray, depth: IntArray) -> bytes:
-    deepest = int(depth.max())
-    shifts = np.arange(deepest - 1, -1, -1)
-    fields = (local[:, :, None] >> shifts & 1).astype(np.uint8)
-    return np.packbits(fields[np.broadcast_to(shifts < depth[:, None, None], fields.shape)]).tobytes()
+    stream = np.zeros(3 * int(depth.sum()), np.uint8)
+    for bit, rows, where in _bit_places(depth):
+        stream[where] = local[rows] >> (depth[rows, None] - 1 - bit) & 1
+    return np.packbits(stream).tobytes()
 
 
 def _unpack_local(data: bytes, depth: IntArray) -> IntArray:
-    total, deepest = 3 * int(depth.sum()), int(depth.max())
+    total = 3 * int(depth.sum())
     if len(data) != (total + 7) // 8:
         raise PacketError(f"means: expected {(total + 7) // 8} bytes of positions in cells, got {len(data)}")
     stream = np.unpackbits(np.frombuffer(data, np.uint8))
     if stream[total:].any():
         raise PacketError("means: padding after the last position is not zero")
-    local, start = np.zeros((len(depth), 3), np.int64), np.cumsum(3 * depth) - 3 * depth
-    # Level by level: memory stays at a few values per Gaussian however deep the cells are.
-    for bit in range(deepest):
-        rows = np.flatnonzero(depth > bit)
-        where = start[rows, None] + np.arange(3) * depth[rows, None] + bit
+    local = np.zeros((len(depth), 3), np.int64)
+    for _, rows, where in _bit_places(depth):
         local[rows] = local[rows] << 1 | stream[where]
     return local
+
+
+def _bit_places(depth: IntArray) -> Iterator[tuple[int, IntArray, IntArray]]:
+    """From the highest bit down: its number, the rows that have it, and where it lies [rows, 3] in the bit stream.
+
+    Bit by bit, so that memory stays at a few values per Gaussian however deep the cells are.
+    """
+    start = np.cumsum(3 * depth) - 3 * depth
+    for bit in range(int(depth.max())):
+        rows = np.flatnonzero(depth > bit)
+        yield bit, rows, start[rows, None] + np.arange(3) * depth[rows, None] + bit

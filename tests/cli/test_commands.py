@@ -45,6 +45,7 @@ OPTIONS = {
     "gsstream manifest": ["STREAM", "--out"],
     "gsstream view": ["STREAM", "--port", "--host"],
     "gsstream check": ["NAME", "--quiet"],
+    "gsstream new-plugin": ["NAME", "--kind", "--out"],
     "gsstream bench": [],
     "gsstream bench render": [
         "--sizes", "--shares", "--threads", "--renderers", "--points", "--repetitions", "--seed", "--quick", "--out",

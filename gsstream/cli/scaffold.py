@@ -1,0 +1,145 @@
+"""``gsstream new-plugin``: a complete distribution with one working part, ready to be changed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import gsstream
+
+
+class PartKind(StrEnum):
+    """Kinds that a plugin can start from."""
+
+    structure = "structure"
+    confidence = "confidence"
+    propagation = "propagation"
+    gate = "gate"
+    regularizer = "regularizer"
+
+
+def new_plugin(
+    name: Annotated[str, typer.Argument(help="Name of the part in recipes: lower case letters, digits, - and _.")],
+    kind: Annotated[PartKind, typer.Option("--kind", help="What the part is.")] = PartKind.gate,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder to write; by default gsstream-NAME.")] = None,
+) -> None:
+    """Write a distribution with one working part, its settings, contract test and README."""
+    from gsstream.core.errors import InputError, OutputError
+    from gsstream.plugins.catalog import load_catalog
+
+    if not re.fullmatch(r"[a-z][a-z0-9_-]*", name):
+        raise InputError(f"plugin name: expected lower case letters, digits, - and _, a letter first; got {name!r}")
+    taken = load_catalog().entries.get((kind.value, name))
+    if taken is not None:
+        raise InputError(f"the {kind.value} {name!r} is already provided by {taken.origin}; choose another name")
+    folder = out or Path(f"gsstream-{name}")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputError(f"{folder} exists and is not an empty folder; choose another --out")
+    for path, text in files(name, kind.value).items():
+        target = folder / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(text, encoding="utf-8")
+        typer.echo(f"wrote {target}")
+    typer.echo(f"\nnext:\n  pip install -e {folder}\n  gsstream check {kind.value}/{name}")
+
+
+def files(name: str, kind: str) -> Mapping[str, str]:
+    """path -> text of every file of the distribution."""
+    package = "gsstream_" + name.replace("-", "_")
+    words = "".join(word.capitalize() for word in re.split("[-_]", name) if word)
+    cls = words if words.endswith(kind.capitalize()) else words + kind.capitalize()
+    # The example is one that the contract kit is proven on; it is read as text, so that nothing heavy is imported.
+    example = Path(gsstream.__file__).parent / "testing" / "examples" / f"{kind}.py"
+    part = example.read_text(encoding="utf-8").replace(f"Example{kind.capitalize()}", cls)
+    summary = part.splitlines()[0].strip('"')
+    values = {"name": name, "kind": kind, "package": package, "cls": cls, "summary": summary, "module": kind}
+    texts = {path: _fill(text, values) for path, text in TEMPLATES.items()}
+    return {
+        **{_fill(path, values): text for path, text in texts.items()},
+        f"src/{package}/{kind}.py": part,
+    }
+
+
+def _fill(text: str, values: Mapping[str, str]) -> str:
+    return re.sub(r"<(\w+)>", lambda match: values[match[1]], text)
+
+
+TEMPLATES: Mapping[str, str] = {
+    "pyproject.toml": """\
+[build-system]
+requires = ["hatchling>=1.27"]
+build-backend = "hatchling.build"
+
+[project]
+name = "gsstream-<name>"
+version = "0.1.0"
+description = "<summary>"
+readme = "README.md"
+requires-python = ">=3.11"
+dependencies = ["gsstream"]
+
+[project.optional-dependencies]
+test = ["pytest"]
+
+[project.entry-points.gsstream]
+<name> = "<package>.plugin"
+
+[tool.hatch.build.targets.wheel]
+packages = ["src/<package>"]
+""",
+    "README.md": """\
+# gsstream-<name>
+
+<summary>
+
+One part for gsstream: the <kind> `<name>`.
+
+```
+pip install -e .
+gsstream check <kind>/<name>
+gsstream plugins show <kind>/<name>
+gsstream run --method dense --set <kind>=<name> --source demo --out run/
+```
+
+The part is in `src/<package>/<module>.py`. Change it and its docstring, and check again:
+`gsstream check <kind>/<name>`, or `pytest` for one test per check. A claim in `traits` is a promise that is checked;
+what is not claimed is skipped.
+""",
+    "src/<package>/__init__.py": '"""<summary> Importing this package imports no torch."""\n',
+    "src/<package>/plugin.py": '''\
+"""What this plugin ships, described without importing torch."""
+
+from __future__ import annotations
+
+from gsstream.spec import ComponentSpec, hookimpl
+
+
+@hookimpl
+def gsstream_components() -> list[ComponentSpec]:
+    return [
+        ComponentSpec(
+            kind="<kind>",
+            name="<name>",
+            target="<package>.<module>:<cls>",
+            summary="<summary>",
+        )
+    ]
+''',
+    "tests/test_<package>_contract.py": '''\
+"""The part keeps the contract."""
+
+from <package>.<module> import <cls>
+
+from gsstream.testing import parametrize_with_checks
+
+
+@parametrize_with_checks([<cls>()])
+def test_contract(check) -> None:
+    check()
+''',
+}

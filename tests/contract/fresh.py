@@ -1,0 +1,35 @@
+"""Installing a distribution for fresh processes without an installer: its sources and metadata on the path."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+
+def install(project: Path, site: Path) -> None:
+    """Make a project's ``src`` importable and its entry points known to processes that have ``site`` on their path."""
+    data = tomllib.loads((project / "pyproject.toml").read_text())["project"]
+    info = site / f"{data['name'].replace('-', '_')}-{data['version']}.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {data['name']}\nVersion: {data['version']}\n")
+    points = [f"{name} = {module}" for name, module in data["entry-points"]["gsstream"].items()]
+    (info / "entry_points.txt").write_text("\n".join(["[gsstream]", *points, ""]))
+    with (site / "paths").open("a") as paths:
+        paths.write(f"{project / 'src'}\n")
+
+
+def python(site: Path, *args: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """A fresh interpreter that has what was installed into ``site``."""
+    sources = (site / "paths").read_text().split() if (site / "paths").exists() else []
+    path = os.pathsep.join([str(site), *sources, *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = {**os.environ, "PYTHONPATH": path, "PYTHONIOENCODING": "utf-8", "OMP_NUM_THREADS": "2"}
+    command = [sys.executable, *args]
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=180, check=False)
+
+
+def gsstream(site: Path, *args: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """The command line in a fresh process."""
+    return python(site, "-c", "from gsstream.cli.main import main; main()", *args, cwd=cwd)

@@ -13,8 +13,8 @@ from gsstream.init.seeding import fill_volume, photo_consistent_seeds, thin_poin
 from gsstream.recipe.model import FirstFrame
 from gsstream.source.base import FrameSource
 
-#: Fewer points than this cannot carry a scene: "auto" then asks triangulation for more.
-SPARSE = 500
+#: Fewer points than this cannot carry a scene: "auto" then sweeps the views for more.
+SPARSE = 2000
 SWEEP_WIDTH = 160
 
 
@@ -23,7 +23,9 @@ def gather_points(source: FrameSource, frame: Frame, settings: FirstFrame, rng: 
 
     Raises InputError when the recipe asks for a kind of points that the recording does not have, or nothing is left.
     """
-    cloud = thin_points(_base_points(source, frame, settings), settings.max_points)
+    pixels = frame.images[..., 0].size
+    limit = max(1, int(pixels / settings.pixels_per_seed)) if settings.pixels_per_seed else settings.max_points
+    cloud = thin_points(_base_points(source, frame, settings), min(settings.max_points, limit))
     if settings.fill_points == 0:
         if len(cloud) == 0:
             raise InputError("no points to start from: the recording ships none; set first_frame.fill_points above 0")
@@ -32,7 +34,7 @@ def gather_points(source: FrameSource, frame: Frame, settings: FirstFrame, rng: 
         cloud,
         frame.images,
         frame.cameras,
-        settings.fill_points,
+        min(settings.fill_points, limit),
         min_views=settings.fill_min_views,
         min_distance=settings.fill_min_distance * frame.cameras.extent,
         rng=rng.numpy("fill", frame.index),
@@ -50,26 +52,25 @@ def join(first: PointCloud, second: PointCloud) -> PointCloud:
 
 
 def _base_points(source: FrameSource, frame: Frame, settings: FirstFrame) -> PointCloud:
-    empty = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), "none")
-    if settings.points == "sfm":
+    wanted = settings.points
+    if wanted == "sfm":
         return _triangulate(frame)
-    if settings.points == "sweep":
+    if wanted == "sweep":
         return _sweep(frame, settings)
-    shipped = source.points("sparse" if settings.points == "sparse" else "recording")
-    if shipped is not None:
-        return shipped
-    if settings.points != "auto":
+    shipped = source.points("sparse" if wanted == "sparse" else "recording")
+    if shipped is None and wanted != "auto":
         raise InputError(
-            f"first_frame.points = {settings.points!r}, but the recording {source.info.name!r} ships no points; "
-            "use 'auto' or 'sfm'"
+            f"first_frame.points = {wanted!r}, but the recording {source.info.name!r} ships no points; "
+            "use 'auto', 'sweep' or 'sfm'"
         )
+    if shipped is not None and (wanted != "auto" or len(shipped) >= SPARSE):
+        return shipped
     try:
-        return _triangulate(frame)
+        return _sweep(frame, settings)
     except InputError:
-        # Without the optional triangulation the common view volume is still seeded.
-        if settings.fill_points == 0:
-            raise
-        return empty
+        # Fewer than three cameras, or views that agree nowhere: what ships, or only seeds of the view volume.
+        empty = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), "none")
+        return empty if shipped is None else shipped
 
 
 def _triangulate(frame: Frame) -> PointCloud:

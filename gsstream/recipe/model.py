@@ -33,11 +33,16 @@ class FirstFrame(Section):
     sh_degree: int = Field(default=2, ge=0, le=3, description="degree of the spherical harmonics (paper's code: 2)")
     points: Literal["auto", "recording", "sparse", "sfm", "sweep"] = Field(
         default="auto",
-        description="auto: the recording's points, else triangulation; sparse: the recording's thinned set; "
+        description="auto: the recording's points, else sweep; sparse: the recording's thinned set; "
         "sfm: triangulation; sweep: points that several views agree on (plane sweep, ours)",
     )
-    max_points: int = Field(default=40_000, ge=1, description="points kept before the structure seeds anchors")
-    fill_points: int = Field(default=20_000, ge=0, description="random seeds in uncovered common view volume (ours)")
+    max_points: int = Field(default=12_000, ge=1, description="points kept before the structure seeds anchors")
+    pixels_per_seed: float = Field(
+        default=64.0, ge=0,
+        description="at most one seed per this many training pixels (points and fill seeds each): more seeds than the "
+        "images can pin down overfit the training views (ours)",
+    )  # fmt: skip
+    fill_points: int = Field(default=5_000, ge=0, description="random seeds in uncovered common view volume (ours)")
     fill_min_views: int = Field(default=3, ge=1, description="a fill seed must be seen by this many training cameras")
     fill_min_distance: float = Field(
         default=0.3, ge=0, description="least distance of a fill seed to any camera, fraction of the rig's extent"
@@ -50,17 +55,17 @@ class FirstFrame(Section):
     lr_opacities: float = Field(default=0.05, ge=0, description="learning rate of opacity logits")
     lr_sh0: float = Field(default=0.0025, ge=0, description="learning rate of degree-0 colour")
     lr_shN: float = Field(default=0.000125, ge=0, description="learning rate of higher colour coefficients")
-    densify_from: int = Field(default=500, ge=0, description="first iteration of densification and pruning")
+    densify_from: int = Field(default=300, ge=0, description="first iteration of densification and pruning")
     densify_until: float = Field(default=0.6, ge=0, le=1, description="last, as a fraction of all iterations")
     densify_every: int = Field(default=100, ge=1, description="iterations between two densifications")
     densify_gradient: float = Field(
-        default=2e-4, gt=0, description="mean screen gradient (half-width units) above which a Gaussian is densified"
+        default=3e-4, gt=0, description="mean screen gradient (half-width units) above which a Gaussian is densified"
     )
-    max_gaussians: int = Field(default=100_000, ge=1, description="upper bound on the number of Gaussians")
-    prune_opacity: float = Field(default=0.005, ge=0, lt=1, description="Gaussians below this opacity are removed")
+    max_gaussians: int = Field(default=60_000, ge=1, description="upper bound on the number of Gaussians")
+    prune_opacity: float = Field(default=0.01, ge=0, lt=1, description="Gaussians below this opacity are removed")
     max_scale: float = Field(default=0.3, gt=0, description="Gaussians wider than this fraction of the rig's extent go")
-    scale_penalty: float = Field(default=0.0, ge=0, description="weight of the mean scale, in rig extents (ours)")
-    opacity_penalty: float = Field(default=0.0, ge=0, description="weight of the mean opacity (ours)")
+    scale_penalty: float = Field(default=0.1, ge=0, description="weight of the mean scale, in rig extents (ours)")
+    opacity_penalty: float = Field(default=0.01, ge=0, description="weight of the mean opacity (ours)")
     exposure: bool = Field(
         default=False, description="fit an affine colour map per training camera while optimising frame 0 (ours)"
     )

@@ -25,9 +25,9 @@ class Additive(UpdateRule):
     class Config(PartConfig):
         means: DirectCode = Field(default=DirectCode(step=0.02, lr=0.1), description="centres, in cells")
         quats: DirectCode = Field(default=DirectCode(step=0.01, lr=0.005), description="raw quaternion entries")
-        scales: DirectCode = Field(default=DirectCode(step=0.02, lr=0.005), description="log scales")
-        opacities: DirectCode = Field(default=DirectCode(step=0.1, lr=0.05), description="opacity logits")
-        sh0: DirectCode = Field(default=DirectCode(step=0.02, lr=0.01), description="degree-0 colour coefficients")
+        scales: DirectCode = Field(default=DirectCode(step=0.02, lr=0.02), description="log scales")
+        opacities: DirectCode = Field(default=DirectCode(step=0.1, lr=0.15), description="opacity logits")
+        sh0: DirectCode = Field(default=DirectCode(step=0.02, lr=0.02), description="degree-0 colour coefficients")
         shN: DirectCode = Field(default=DirectCode(step=0.01, lr=0.0005), description="higher colour coefficients")
 
     def codes(self) -> Mapping[str, AttributeCode]:

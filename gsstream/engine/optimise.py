@@ -15,7 +15,7 @@ from gsstream.engine.assemble import Assembly
 from gsstream.engine.exposure import Exposure
 from gsstream.engine.parameters import AdamTable
 from gsstream.engine.stream_state import StreamState
-from gsstream.residual.base import apply_residual, init_latents
+from gsstream.residual.base import add_changes, decode_changes, init_latents, pull_back
 
 
 @dataclass(frozen=True)
@@ -97,43 +97,58 @@ class _FrameRun:
         """One iteration on one view; returns the photometric loss."""
         parts = self.parts
         gate = GateState(self.gate["logits"])
-        gates = parts.gate.sample(gate, parts.gate.noise(self.hierarchy.num_nodes, self.generator))
-        rows = self._rows(gates, fraction)
+        gates = self._row_gates(gate, fraction)
+        with torch.no_grad():
+            changes = decode_changes(parts.update, self.latents.leaves, self.decoders.leaves)
+            rows = add_changes(self.problem.base, changes, gates.detach(), self.units)
+        rows = rows.map(lambda value: value.detach().requires_grad_())
+        loss = self._render(view, rows)
+        back = pull_back(rows.map(_gradient), changes, self.decoders.leaves, gates.detach(), self.units)
+        self._step_gates(gate, gates, back.gates, learning=fraction >= parts.recipe.gate_training.warmup)
+        self.latents.step(back.latents)
+        self.decoders.step(back.decoders)
+        return loss
+
+    def _render(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
+        """Loss of one view; leaves its gradient on the rows."""
         output = self.session.render(view, rows)
         raw = output.image.detach()
         seen = self.exposure.apply(view, raw) if self.exposure else raw
-        value, gradient = parts.loss.evaluate(seen, self.targets[view], parts.recipe.loss.dssim)
+        value, gradient = self.parts.loss.evaluate(seen, self.targets[view], self.parts.recipe.loss.dssim)
         upstream = self.exposure.pull(view, gradient) if self.exposure else gradient
-        learning = fraction >= parts.recipe.gate_training.warmup
-        penalties = list(self._penalty(gate).values()) if learning else []
-        roots = [output.image, *(p for p in penalties if p.requires_grad)]
-        torch.autograd.backward(roots, [upstream, *[None] * (len(roots) - 1)])
-        for table in (self.latents, self.decoders):
-            table.step()
-        self._step_gates(learning)
+        torch.autograd.backward([output.image], [upstream])
         return value
 
-    def _step_gates(self, learning: bool) -> None:
-        """Move the logits and keep them in their bounds; before the warm-up ends, drop what they felt."""
+    def _step_gates(self, gate: GateState, gates: torch.Tensor, upstream: torch.Tensor, *, learning: bool) -> None:
+        """Move the logits by what the images and the penalty say, and keep them in their bounds."""
         if not learning:
-            self.gate["logits"].grad = None
             return
+        roots, gradients = [], []
+        if gates.requires_grad:
+            roots, gradients = [gates], [upstream]
+        for penalty in self._penalty(gate).values():
+            if penalty.requires_grad:
+                roots.append(penalty)
+                gradients.append(torch.ones_like(penalty))
+        if not roots:
+            return
+        torch.autograd.backward(roots, gradients)
         self.gate.step()
         bounded = self.parts.gate.bound(GateState(self.gate["logits"].detach())).logits
         self.gate["logits"].data.copy_(bounded)
 
-    def _rows(self, gates: torch.Tensor, fraction: float) -> Gaussians[torch.Tensor]:
-        per_row = gates[self.hierarchy.node_of]
+    def _row_gates(self, gate: GateState, fraction: float) -> torch.Tensor:
+        """[A] gate of every active row; rows of levels that are not yet active hold still."""
+        noise = self.parts.gate.noise(self.hierarchy.num_nodes, self.generator)
+        per_row = self.parts.gate.sample(gate, noise)[self.hierarchy.node_of]
         if self.schedule:
             per_row = per_row * (self.levels <= current_level(self.schedule, fraction))
-        return apply_residual(
-            self.parts.update, self.problem.base, per_row, self.latents.leaves, self.decoders.leaves, self.units
-        )
+        return per_row
 
     def _penalty(self, gate: GateState) -> Mapping[str, torch.Tensor]:
-        residual = self.latents.leaves.get("means")
-        if residual is None:
-            residual = torch.zeros(len(self.problem.base), 3)
+        means = self.latents.leaves.get("means")
+        # The motion term also pulls on the residual itself; that gradient waits on the leaf for the latents' step.
+        residual = torch.zeros(len(self.problem.base), 3) if means is None else means
         probability = self.parts.gate.open_probability(gate)
         total = self.problem.state.hierarchy.num_gaussians
         return self.parts.regularizer.penalty(probability, residual, self.hierarchy, total)
@@ -148,6 +163,11 @@ class _FrameRun:
             loss=loss,
             iterations=iterations,
         )
+
+
+def _gradient(value: torch.Tensor) -> torch.Tensor:
+    """Gradient of a leaf; zeros where nothing reached it."""
+    return torch.zeros_like(value) if value.grad is None else value.grad
 
 
 def level_schedule(parts: Assembly, num_levels: int) -> tuple[tuple[float, int], ...]:

@@ -30,8 +30,11 @@ class AdamTable:
         assert self._adam is not None
         next(group for group in self._adam.param_groups if group["name"] == name)["lr"] = lr
 
-    def step(self) -> None:
-        """One Adam step from the leaves' gradients, which are then dropped."""
+    def step(self, gradients: Mapping[str, torch.Tensor] | None = None) -> None:
+        """One Adam step from the leaves' gradients, which are then dropped; ``gradients`` are added to them first."""
+        for name, gradient in (gradients or {}).items():
+            leaf = self.leaves[name]
+            leaf.grad = gradient if leaf.grad is None else leaf.grad + gradient
         if self._adam is not None:
             self._adam.step()
             self._adam.zero_grad(set_to_none=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 
@@ -75,6 +76,34 @@ def quantise(latents: torch.Tensor, step: float) -> torch.Tensor:
     return torch.round(latents.detach() / step) * step + (latents - latents.detach())
 
 
+class Change(NamedTuple):
+    """One attribute's ungated residual: quantised latents [A, L] and what they decode to [A, D]."""
+
+    latents: torch.Tensor
+    decoded: torch.Tensor
+
+
+def decode_changes(
+    rule: UpdateRule, latents: Mapping[str, torch.Tensor], decoders: Mapping[str, torch.Tensor]
+) -> dict[str, Change]:
+    """Attribute -> quantised and decoded residual."""
+    codes = rule.codes()
+    quantised = {name: quantise(latent, codes[name].step) for name, latent in latents.items()}
+    return {name: Change(q, q @ decoders[name] if name in decoders else q) for name, q in quantised.items()}
+
+
+def add_changes(
+    base: Gaussians[torch.Tensor], changes: Mapping[str, Change], gates: torch.Tensor, units: torch.Tensor
+) -> Gaussians[torch.Tensor]:
+    """a_t = a_{t-1} + g * change; position changes are in cells, ``units`` [A] scene units."""
+    changed = dict(base.items())
+    for name, change in changes.items():
+        scale = gates * units if name == "means" else gates
+        value = changed[name]
+        changed[name] = value + (change.decoded * scale[:, None]).reshape(value.shape)
+    return Gaussians(**changed)
+
+
 def apply_residual(
     rule: UpdateRule,
     base: Gaussians[torch.Tensor],
@@ -83,7 +112,7 @@ def apply_residual(
     decoders: Mapping[str, torch.Tensor],
     units: torch.Tensor,
 ) -> Gaussians[torch.Tensor]:
-    """Gated, quantised, decoded residual on the A rows of ``base``.
+    """Gated, quantised, decoded residual on the A rows of ``base``; differentiable.
 
     Arguments:
         gates: [A] in [0, 1].
@@ -91,16 +120,40 @@ def apply_residual(
         decoders: attribute -> [L, D].
         units: [A] cell of each anchor, scene units.
     """
-    changed = dict(base.items())
-    codes = rule.codes()
-    for name, latent in latents.items():
-        change = quantise(latent, codes[name].step)
+    return add_changes(base, decode_changes(rule, latents, decoders), gates, units)
+
+
+class Pullback(NamedTuple):
+    """Gradients of latents and decoders by attribute, and of the gates [A]."""
+
+    latents: dict[str, torch.Tensor]
+    decoders: dict[str, torch.Tensor]
+    gates: torch.Tensor
+
+
+def pull_back(
+    upstream: Gaussians[torch.Tensor],
+    changes: Mapping[str, Change],
+    decoders: Mapping[str, torch.Tensor],
+    gates: torch.Tensor,
+    units: torch.Tensor,
+) -> Pullback:
+    """The gradient of :func:`apply_residual`, written out: the map is bilinear, and a graph of forty small nodes per
+    iteration costs more than its arithmetic. ``upstream`` [A] are gradients of the changed attributes.
+    """
+    by_latent, by_decoder = {}, {}
+    by_gate = torch.zeros_like(gates)
+    for name, change in changes.items():
+        gradient = getattr(upstream, name).reshape(change.decoded.shape)
+        if name == "means":
+            gradient = gradient * units[:, None]
+        by_gate += (gradient * change.decoded).sum(1)
+        gradient = gradient * gates[:, None]
         if name in decoders:
-            change = change @ decoders[name]
-        scale = gates * units if name == "means" else gates
-        value = changed[name]
-        changed[name] = value + (change * scale[:, None]).reshape(value.shape)
-    return Gaussians(**changed)
+            by_decoder[name] = change.latents.T @ gradient
+            gradient = gradient @ decoders[name].T
+        by_latent[name] = gradient
+    return Pullback(by_latent, by_decoder, by_gate)
 
 
 def symbols(rule: UpdateRule, latents: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:

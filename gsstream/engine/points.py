@@ -1,4 +1,4 @@
-"""Seeds of frame 0: the recording's points, else triangulation; topped up where no seed covers the view volume."""
+"""Seeds of frame 0: the recording's points, else a plane sweep; topped up where no seed covers the view."""
 
 from __future__ import annotations
 

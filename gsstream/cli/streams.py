@@ -50,15 +50,28 @@ def evaluate(
     source: Annotated[
         str | None, typer.Option("--source", help="Recording to compare with; default: the one it was made from.")
     ] = None,
+    lpips_onnx: Annotated[
+        Path | None, typer.Option("--lpips-onnx", help="LPIPS as an ONNX file (docs/howto/lpips.md); default: not measured.")
+    ] = None,
+    lpips_range: Annotated[
+        str | None,
+        typer.Option(
+            "--lpips-range", metavar="-1|0", help="Lower end of the inputs of --lpips-onnx; default: as its metadata say."
+        ),
+    ] = None,
 ) -> None:
     """Render the decoded frames and compare them with the recording's test cameras."""
     file = stream_file(stream)
     from gsstream.core.errors import InputError
     from gsstream.engine.recording import open_recording
+    from gsstream.metrics import OnnxLpips
     from gsstream.player.playback import Playback
     from gsstream.plugins.catalog import load_catalog
     from gsstream.trade.evaluate import evaluate as evaluate_stream
 
+    if lpips_range is not None and lpips_onnx is None:
+        raise InputError(f"--lpips-range {lpips_range}: without --lpips-onnx there is no LPIPS to give it to")
+    lpips = None if lpips_onnx is None else OnnxLpips(lpips_onnx, lpips_range)
     with Playback(file) as playback:
         meta = playback.meta
     uri = source or meta.extra.get("source_uri")
@@ -66,7 +79,7 @@ def evaluate(
         raise InputError(f"{file} does not say which recording it was made from; name it with --source")
     recording = open_recording(str(uri), float(meta.recipe.get("scale", 1.0)), load_catalog())
     try:
-        evaluation = evaluate_stream(file, recording, progress=progress_on("frame"))
+        evaluation = evaluate_stream(file, recording, lpips=lpips, progress=progress_on("frame"))
     finally:
         recording.close()
     typer.echo(evaluation.table())

@@ -32,6 +32,8 @@ class StepContext:
         self._state, self._frame, self._renderer, self._background = state, frame, renderer, background
         self._change = change
         self._gaussians = state.gaussians
+        #: What estimators make the renderer project and sort is not done again by the optimisation.
+        self.session = renderer.open(self._gaussians, None, frame.cameras, background)
         self._touched: dict[int, torch.Tensor] = {}
 
     @property
@@ -71,7 +73,7 @@ class StepContext:
             upstream = upstream * self._change.pixels(view)
         if self._state.exposure:
             upstream = self._state.exposure.pull(view, upstream)
-        result = self._renderer.screen_gradient(self._gaussians, self.cameras, view, upstream.contiguous())
+        result = self.session.screen_gradient(view, upstream.contiguous())
         self._touched.setdefault(view, (result.gradient != 0).any(1))
         return result
 
@@ -89,7 +91,9 @@ class StepContext:
             if view not in self._touched:
                 self.screen_gradient(view, torch.ones_like(self.image(view)))
         touched = torch.stack(list(self._touched.values())).any(0) if self._touched else ~everyone
-        return touched & (self._change.votes(self._gaussians.means, self.cameras) >= least_votes)
+        rows = touched.nonzero()[:, 0]
+        touched[rows] = self._change.votes(self._gaussians.means[rows], self.cameras) >= least_votes
+        return touched
 
     def noise_sigma(self, view: int) -> float:
         return noise_sigma(self._state.previous.images[view], self._frame.images[view])

@@ -41,7 +41,9 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> S
     active = active_rows(parts, context, state, gate)
     clock.append(time.perf_counter())
 
-    problem = Problem(state, frame, active, state.gaussians.rows(active), gate)
+    if len(active) < len(context.gaussians):
+        context.session.narrow(active)
+    problem = Problem(state, frame, active, context.gaussians.rows(active), gate, context.session)
     with guarded("method", parts.gate, frame.index):
         solution = optimise(parts, problem, rng.stream("frame", frame.index))
     clock.append(time.perf_counter())

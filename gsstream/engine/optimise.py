@@ -15,6 +15,7 @@ from gsstream.engine.assemble import Assembly
 from gsstream.engine.exposure import Exposure
 from gsstream.engine.parameters import AdamTable
 from gsstream.engine.stream_state import StreamState
+from gsstream.render.base import RenderSession
 from gsstream.residual.base import add_changes, decode_changes, init_latents, pull_back
 
 
@@ -26,6 +27,7 @@ class Problem:
         active: [A] int64 rows that may change, ascending.
         base: those rows of the decoded previous scene.
         gate: initial gate state [M].
+        session: an open render session in which only ``active`` changes.
     """
 
     state: StreamState
@@ -33,6 +35,7 @@ class Problem:
     active: torch.Tensor
     base: Gaussians[torch.Tensor]
     gate: GateState
+    session: RenderSession
 
 
 @dataclass(frozen=True)
@@ -87,9 +90,7 @@ class _FrameRun:
         self.decoders = AdamTable(decoders, {name: codes[name].decoder_lr for name in decoders})
         self.gate = AdamTable({"logits": problem.gate.logits[nodes]}, {"logits": parts.recipe.gate_training.lr})
         self.gate.load_moments("logits", state.gate_moments)
-        self.session = parts.renderer.open(
-            state.gaussians, problem.active, problem.frame.cameras, parts.recipe.background
-        )
+        self.session = problem.session
         self.targets = [parts.loss.prepare(torch.from_numpy(image)) for image in problem.frame.images]
         self.exposure: Exposure | None = state.exposure
 

@@ -1,5 +1,6 @@
 """What is measured on decoded frames. Numpy only."""
 
+from gsstream.metrics.lpips import OnnxLpips as OnnxLpips
 from gsstream.metrics.moving import moving_mask as moving_mask
 from gsstream.metrics.moving import psnr_moving as psnr_moving
 from gsstream.metrics.noise import noise_sigma as noise_sigma

@@ -6,7 +6,7 @@ counts while the transmittance before it exceeds 1e-4, near plane ``cameras.near
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import torch
@@ -33,7 +33,7 @@ class RenderOutput:
     alpha: torch.Tensor
 
 
-class RenderSession:
+class RenderSession(ABC):
     """Renders a scene of which only some rows change, from a fixed rig (one frame step).
 
     ``rows`` are the A active rows; all other Gaussians stay as they were when the session was opened.
@@ -55,6 +55,17 @@ class RenderSession:
             probe: [A, 2] zeros that require grad; its gradient is the gradient of the 2-D means in pixels.
             tile_mask: [ceil(H / 16), ceil(W / 16)] bool; None renders everything.
         """
+
+    @abstractmethod
+    def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
+        """Pull an upstream image gradient [H, W, 3] back to the 2-D means (pixels) of the scene as it was opened.
+
+        What this projects and sorts, ``render`` need not do again.
+        """
+
+    @abstractmethod
+    def narrow(self, active: torch.Tensor) -> None:
+        """From now on only the rows ``active`` [A], ascending, change. For a session opened without active rows."""
 
 
 class Renderer(Part):
@@ -113,3 +124,9 @@ class ScatterSession(RenderSession):
             base = dict(self._gaussians.items())
             whole = Gaussians(**{n: base[n].index_copy(0, self._active, value) for n, value in rows.items()})
         return self._renderer.render(whole, self._cameras, view, self._background)
+
+    def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
+        return self._renderer.screen_gradient(self._gaussians, self._cameras, view, image_gradient)
+
+    def narrow(self, active: torch.Tensor) -> None:
+        self._active = active

@@ -14,7 +14,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
 from gsstream.core.shapes import FloatArray
-from gsstream.metrics import SSIM_VARIANT, moving_mask, noise_sigma, psnr, slope_per_100, ssim
+from gsstream.metrics import SSIM_VARIANT, OnnxLpips, moving_mask, noise_sigma, psnr, slope_per_100, ssim
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, find_renderer, render
 from gsstream.source.base import FrameSource
@@ -24,7 +24,7 @@ from gsstream.trade.summary import format_table
 
 @dataclass(frozen=True, slots=True)
 class ViewQuality:
-    """One test camera at one frame; dB and SSIM; nan where nothing moves, inf for equal images."""
+    """One test camera at one frame; dB, SSIM, LPIPS; nan where nothing moves or not measured, inf for equal images."""
 
     frame: int
     camera: str
@@ -35,6 +35,8 @@ class ViewQuality:
     hold_psnr: float
     hold_ssim: float
     hold_psnr_moving: float
+    lpips: float = math.nan
+    hold_lpips: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,11 +47,13 @@ class Evaluation:
         views: in the order of frames, then cameras.
         sigmas: camera -> noise of one image, [0, 1] units.
         renderer: name of the player's renderer.
+        lpips_variant: which LPIPS was measured; None: none, and neither table nor JSON speak of it.
     """
 
     views: tuple[ViewQuality, ...]
     sigmas: Mapping[str, float]
     renderer: str
+    lpips_variant: str | None = None
 
     def series(self, name: str) -> dict[int, float]:
         """Frame -> mean over cameras of a quantity of :class:`ViewQuality` (views where it is not finite left out)."""
@@ -58,31 +62,38 @@ class Evaluation:
 
     def to_json(self) -> str:
         """Everything as JSON; nan and inf become null."""
-        views = [{k: _plain(v) for k, v in asdict(view).items()} for view in self.views]
-        data = {"ssim_variant": SSIM_VARIANT, "renderer": self.renderer, "sigmas": dict(self.sigmas), "views": views}
+        unknown = () if self.lpips_variant else ("lpips", "hold_lpips")
+        views = [{k: _plain(v) for k, v in asdict(view).items() if k not in unknown} for view in self.views]
+        variants = {"ssim_variant": SSIM_VARIANT}
+        if self.lpips_variant:
+            variants["lpips_variant"] = self.lpips_variant
+        data = {**variants, "renderer": self.renderer, "sigmas": dict(self.sigmas), "views": views}
         return json.dumps(data, indent=1, allow_nan=False)
 
     def table(self) -> str:
-        """Markdown: decoded and held, frame 0, mean of later frames, slope, SSIM, moving pixels."""
+        """Markdown: decoded and held, frame 0, mean of later frames, slope, SSIM, moving pixels, LPIPS if measured."""
+        names, forms = ["ssim", "psnr_moving"], [".2f", ".2f", "+.2f", ".4f", ".2f"]
         rows = [["", "PSNR 0", "PSNR", "dB/100", "SSIM", "moving"]]
+        if self.lpips_variant:
+            names, forms, rows = [*names, "lpips"], [*forms, ".4f"], [[*rows[0], "LPIPS"]]
         for label, prefix in (("decoded", ""), ("frame 0 held", "hold_")):
             whole = self.series(prefix + "psnr")
             (first, psnr_first), later = next(iter(whole.items())), dict(list(whole.items())[1:])
             known = {t: v for t, v in later.items() if math.isfinite(v)}
             slope = slope_per_100(list(known), list(known.values()))
-            rest = [mean(v for t, v in self.series(prefix + n).items() if t != first) for n in ("ssim", "psnr_moving")]
+            rest = [mean(v for t, v in self.series(prefix + n).items() if t != first) for n in names]
             numbers = [psnr_first, mean(known.values()), slope, *rest]
-            forms = [".2f", ".2f", "+.2f", ".4f", ".2f"]
             cells = zip(numbers, forms, strict=True)
             rows.append([label, *(format(v, form) if math.isfinite(v) else "-" for v, form in cells)])
-        notes = f"{SSIM_VARIANT}; renderer {self.renderer}; means over cameras, then over frames 1..T-1"
+        variants = "; ".join(filter(None, (SSIM_VARIANT, self.lpips_variant)))
+        notes = f"{variants}; renderer {self.renderer}; means over cameras, then over frames 1..T-1"
         return f"{format_table(rows)}\n\n{notes}"
 
 
 def evaluate(
     stream: str | os.PathLike[str], source: FrameSource, *, frames: Sequence[int] | None = None,
     split: Literal["train", "test"] = "test", renderer: PlayerRenderer | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    lpips: OnnxLpips | None = None, progress: Callable[[int, int], None] | None = None,
 ) -> Evaluation:  # fmt: skip
     """Render a stream's packets with the player and compare every test view with the recording.
 
@@ -91,6 +102,7 @@ def evaluate(
 
     Arguments:
         frames: frame indices; default all of the stream.
+        lpips: measured besides the rest; default: not measured.
         progress: called with (done, total) after every frame.
 
     Raises InputError when the recording's cameras are not those of the stream, PacketError for a damaged stream.
@@ -113,16 +125,19 @@ def evaluate(
             truth = _truth(source, frame, split, order)
             for i, name in enumerate(rig.ids):
                 mask = moving_mask(truth[i], truth_first[i], sigmas[i])
-                views.append(_compare(frame, name, images[i], held[i], truth[i], mask))
+                views.append(_compare(frame, name, images[i], held[i], truth[i], mask, lpips))
             if progress is not None:
                 progress(done, len(chosen))
-    return Evaluation(tuple(views), dict(zip(rig.ids, sigmas, strict=True)), renderer.name)
+    return Evaluation(tuple(views), dict(zip(rig.ids, sigmas, strict=True)), renderer.name, lpips and lpips.variant)
 
 
-def _compare(frame: int, name: str, image: FloatArray, held: FloatArray, truth: FloatArray, mask: Any) -> ViewQuality:
+def _compare(
+    frame: int, name: str, image: FloatArray, held: FloatArray, truth: FloatArray, mask: Any, lpips: OnnxLpips | None
+) -> ViewQuality:
+    distances = () if lpips is None else (lpips(image, truth), lpips(held, truth))
     return ViewQuality(
         frame, name, psnr(image, truth), ssim(image, truth), psnr(image, truth, mask), float(mask.mean()),
-        psnr(held, truth), ssim(held, truth), psnr(held, truth, mask),
+        psnr(held, truth), ssim(held, truth), psnr(held, truth, mask), *distances,
     )  # fmt: skip
 
 

@@ -199,3 +199,26 @@ def test_rasterisers_return_to_the_pool() -> None:
     assert release_idle_memory() == 0  # all three wait for their backward
     del outputs
     assert release_idle_memory() > 1.5 * one > 0
+
+
+def test_a_session_that_is_narrowed_reuses_what_the_screen_gradient_projected() -> None:
+    """screen_gradient of a session, then narrow and render: the same bits as without the session."""
+    whole, cameras = scene(), rig()
+    generator = torch.Generator().manual_seed(11)
+    upstream = torch.randn(cameras.height, cameras.width, 3, generator=generator)
+    session = CpuRenderer().open(whole, None, cameras, (0.0, 0.0, 0.0))
+    for view in range(len(cameras)):
+        for _ in range(2):  # asking again gives the same answer
+            got = session.screen_gradient(view, upstream)
+            want = CpuRenderer().screen_gradient(whole, cameras, view, upstream)
+            assert torch.equal(got.gradient, want.gradient)
+            assert torch.equal(got.visible, want.visible)
+    assert bool((want.gradient != 0).any())
+    active = torch.arange(0, len(whole), 3)
+    session.narrow(active)
+    fresh = CpuRenderer().open(whole, active, cameras, (0.0, 0.0, 0.0))
+    moved = whole.rows(active).map(lambda value: value + 0.01)
+    for view in range(len(cameras)):
+        images = [s.render(view, moved.map(lambda v: v.clone().requires_grad_())).image for s in (session, fresh)]
+        assert torch.equal(images[0], images[1])
+        assert not torch.equal(images[0], CpuRenderer().render(whole, cameras, view, (0.0, 0.0, 0.0)).image)

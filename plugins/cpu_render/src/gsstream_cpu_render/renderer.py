@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import SplatArrays
 from gsstream_cpu_render.checks import Float32, as_array
 from gsstream_cpu_render.pool import Lease, Passes, lease
+from gsstream_cpu_render.rasterizer import NumpyRasterizer
 from gsstream_cpu_render.view import Background
 
 
@@ -51,10 +52,7 @@ class CpuRenderer(Renderer):
     ) -> ScreenGradient:
         held = lease(cameras, view, (0.0, 0.0, 0.0))
         held.rasterizer.forward(_splats(gaussians))
-        gradient = held.rasterizer.backward_screen(as_array("image_gradient", image_gradient.contiguous()))
-        visible = torch.zeros(len(gradient), dtype=torch.bool)
-        visible[torch.from_numpy(held.rasterizer.visible_rows().astype(np.int64))] = True
-        return ScreenGradient(torch.from_numpy(gradient), visible)
+        return _screen_gradient(held.rasterizer, image_gradient)
 
     def open(
         self,
@@ -81,13 +79,26 @@ class CpuSession(RenderSession):
     ) -> None:
         self._gaussians, self._cameras, self._background = gaussians, cameras, background
         self._views: dict[int, _FrozenView] = {}
+        self._opened: dict[int, _OpenedView] = {}
         self._order: torch.Tensor | None = None
         self._ids: np.ndarray[Any, np.dtype[np.uint32]] | None = None
         if active is not None:
-            ids, order = torch.sort(active)
-            self._ids = ids.numpy().astype(np.uint32)
-            # The kernels want ascending rows; callers mostly have them so.
-            self._order = None if bool((order[1:] > order[:-1]).all()) else order
+            self.narrow(active)
+
+    def narrow(self, active: torch.Tensor) -> None:
+        ids, order = torch.sort(active)
+        self._ids = ids.numpy().astype(np.uint32)
+        # The kernels want ascending rows; callers mostly have them so.
+        self._order = None if bool((order[1:] > order[:-1]).all()) else order
+
+    def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
+        if view not in self._opened:
+            self._opened[view] = self._open(view)
+        return _screen_gradient(self._opened[view].held.rasterizer, image_gradient)
+
+    def _open(self, view: int) -> _OpenedView:
+        held = lease(self._cameras, view, self._background)
+        return _OpenedView(held, *held.rasterizer.forward(_splats(self._gaussians)))
 
     def render(
         self,
@@ -101,8 +112,8 @@ class CpuSession(RenderSession):
         if self._ids is None:
             return _differentiable(_FullPass(lease(self._cameras, view, self._background), mask), rows, probe)
         if view not in self._views:
-            held = lease(self._cameras, view, self._background)
-            self._views[view] = _FrozenView(held, _splats(self._gaussians), self._ids)
+            opened = self._opened.pop(view, None) or self._open(view)
+            self._views[view] = _FrozenView(opened, self._ids)
         if self._order is not None:
             rows = rows.rows(self._order)
             probe = None if probe is None else probe[self._order]
@@ -122,14 +133,21 @@ class _FullPass(Passes):
         return self._held.rasterizer.backward(v_image, v_alpha)
 
 
+class _OpenedView(NamedTuple):
+    """A rasteriser that has just rendered the whole scene, and what it rendered."""
+
+    held: Lease
+    image: Float32
+    transmittance: Float32
+
+
 class _FrozenView:
     """A camera's cache and its render of the scene as it was when the session opened."""
 
-    def __init__(self, held: Lease, splats: SplatArrays, ids: np.ndarray[Any, np.dtype[np.uint32]]) -> None:
-        self.rasterizer = held.rasterizer
-        self._held, self._ids = held, ids
+    def __init__(self, opened: _OpenedView, ids: np.ndarray[Any, np.dtype[np.uint32]]) -> None:
+        self._held, self.image, self.transmittance = opened
+        self.rasterizer, self._ids = self._held.rasterizer, ids
         self._mask: Any = None
-        self.image, self.transmittance = self.rasterizer.forward(splats)
         self.rasterizer.forget()
         self.rasterizer.freeze(None, ids)
 
@@ -184,6 +202,14 @@ class _Rasterize(torch.autograd.Function):
         gradients = ctx.passes.backward(splats, as_array("gradient of the image", v_image.contiguous()), upstream)
         *attributes, means2d = (torch.from_numpy(g) for g in gradients)
         return None, (means2d if ctx.needs_input_grad[1] else None), *attributes
+
+
+def _screen_gradient(rasterizer: NumpyRasterizer, image_gradient: torch.Tensor) -> ScreenGradient:
+    """Of the scene the rasteriser rendered last."""
+    gradient = rasterizer.backward_screen(as_array("image_gradient", image_gradient.contiguous()))
+    visible = torch.zeros(len(gradient), dtype=torch.bool)
+    visible[torch.from_numpy(rasterizer.visible_rows().astype(np.int64))] = True
+    return ScreenGradient(torch.from_numpy(gradient), visible)
 
 
 def _differentiable(passes: Passes, gaussians: Gaussians[torch.Tensor], probe: torch.Tensor | None) -> RenderOutput:

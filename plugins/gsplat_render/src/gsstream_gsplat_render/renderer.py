@@ -86,8 +86,11 @@ class GsplatSession(RenderSession):
     ) -> None:
         self._kernels, self._device = kernels, device
         self._cameras, self._background = cameras, background
-        self._active = None if active is None else active.to(device)
-        self._frozen = None if active is None else _moved(gaussians.map(torch.Tensor.detach), device)
+        self._gaussians = gaussians
+        self._active: torch.Tensor | None = None
+        self._frozen: Gaussians[torch.Tensor] | None = None
+        if active is not None:
+            self.narrow(active)
         self._targets: dict[int, Target] = {}
         self._cached: dict[int, Drawn] = {}
 
@@ -109,6 +112,15 @@ class GsplatSession(RenderSession):
             image = torch.where(inside[..., None], image, cached.image)
             alpha = torch.where(inside, alpha, cached.alpha)
         return RenderOutput(image.cpu(), alpha.cpu())
+
+    def narrow(self, active: torch.Tensor) -> None:
+        self._active = active.to(self._device)
+        self._frozen = _moved(self._gaussians.map(torch.Tensor.detach), self._device)
+
+    def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
+        return screen_gradient(
+            self._kernels, self._device, self._gaussians, self._cameras, view, image_gradient
+        )
 
     def _merged(
         self, rows: Gaussians[torch.Tensor], probe: torch.Tensor | None

@@ -31,6 +31,8 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> S
     """Advance the stream by one frame. Pure: a failure leaves ``state`` as it was."""
     clock = [time.perf_counter()]
     change = detect_change(state.previous, frame, parts.recipe.stream.change_threshold)
+    if change is not None and change.share == 0:
+        return still_step(state, frame, time.perf_counter() - clock[0])
     context = StepContext(state, frame, parts.renderer, parts.recipe.background, change)
     with guarded("confidence", parts.confidence, frame.index):
         logits = parts.confidence.estimate(context)
@@ -53,11 +55,27 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> S
     player = decode_packet(state.player, packet.data)
     clock.append(time.perf_counter())
     decoders = {**state.decoders, **{name: torch.from_numpy(value) for name, value in player.decoders.items()}}
-    after = replace(state, player=player, previous=frame, decoders=decoders, gate_moments=solution.gate_moments)
+    # A frame that changed nothing is not what the scene shows: the next one is compared with the last that did, so that
+    # a change too slow to see from frame to frame adds up until it is seen.
+    shown = state.previous if delta.is_empty else frame
+    after = replace(state, player=player, previous=shown, decoders=decoders, gate_moments=solution.gate_moments)
     metrics = step_metrics(delta, after, packet, solution, active)
     metrics["changed_tiles"] = 1.0 if change is None else change.share
     metrics["seconds"] = dict(zip(("confidence", "optimise", "code"), np.diff(clock).tolist(), strict=True))
     return Step(after, packet, "empty" if delta.is_empty else "delta", metrics)
+
+
+def still_step(state: StreamState, frame: Frame, seconds: float) -> Step:
+    """A frame in which no tile of any view changed: an empty packet, and no part is asked."""
+    started = time.perf_counter()
+    packet = encode_empty(frame=frame.index)
+    after = replace(state, player=decode_packet(state.player, packet.data))
+    gates = np.zeros(len(state.player.layout.node_counts), np.uint8)
+    solution = Solution({}, {}, GateState(torch.zeros(0)), {}, 0.0, 0)
+    metrics = step_metrics(Delta(gates, 1), after, packet, solution, torch.zeros(0))
+    metrics["changed_tiles"] = 0.0
+    metrics["seconds"] = {"confidence": seconds, "optimise": 0.0, "code": time.perf_counter() - started}
+    return Step(after, packet, "empty", metrics)
 
 
 def active_rows(parts: Assembly, context: StepContext, state: StreamState, gate: GateState) -> torch.Tensor:

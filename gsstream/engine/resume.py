@@ -42,7 +42,8 @@ def resume_state(
         _check_recipe(parts, meta)
         _check_recording(source.info, meta)
         state = _replay(parts, reader, rng)
-    frame = source.frame(state.player.frame, "train")
+        shown = [e.frame for e in reader.frames if e.kind != PacketKind.EMPTY and e.frame <= state.player.frame]
+    frame = source.frame(shown[-1], "train")
     return replace(state, previous=replace(frame, cameras=replace(frame.cameras, near=near)))
 
 

@@ -23,7 +23,7 @@ class StreamState:
     Arguments:
         player: exactly what every player has after the last packet (decoded from its bytes).
         hierarchy: groups of the layout in ``player``.
-        previous: training images of the last frame.
+        previous: training images of the last frame whose packet changed the scene: what the scene shows.
         decoders: linear decoders to continue from; equal to the player's once they were sent.
         exposure: colour maps of the training cameras, or None.
         gate_moments: Adam moments of the gate logits when the recipe carries them over (released code), else empty.

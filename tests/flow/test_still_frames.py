@@ -1,0 +1,76 @@
+"""Frames in which nothing changes: almost no bytes, no optimisation, and nothing forgotten."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flow_runs import Witness, demo_copy, encode, metrics
+from PIL import Image
+
+from gsstream.packet import PacketKind, StreamReader
+
+#: Frames of the demo recording that the prepared folder shows: it stands still from 1 to 3.
+SHOWN = [0, 1, 1, 1, 2]
+
+
+def paused(folder: Path) -> Path:
+    """A copy of the demo that repeats frame 1, image file by image file."""
+    demo_copy(folder, frames=len(SHOWN))
+    for camera in (path for path in folder.iterdir() if path.is_dir()):
+        originals = {i: (camera / f"{i:06d}.jpg").read_bytes() for i in set(SHOWN)}
+        for place, i in enumerate(SHOWN):
+            (camera / f"{place:06d}.jpg").write_bytes(originals[i])
+    return folder
+
+
+def kinds(out: Path) -> list[PacketKind]:
+    with StreamReader(out / "stream.gss") as reader:
+        return [entry.kind for entry in reader.frames]
+
+
+def deltas(out: Path) -> list[bytes]:
+    """Packets after frame 0 (whose recipe says how many frames were asked for)."""
+    with StreamReader(out / "stream.gss") as reader:
+        return [reader.read(entry) for entry in reader.frames[1:]]
+
+
+def test_a_pause_costs_a_few_bytes_and_no_optimisation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    witness = Witness(monkeypatch)
+    encode(tmp_path / "o", source=str(paused(tmp_path / "world")), method="s2gs-edge")
+    still = [PacketKind.EMPTY] * 2
+    assert kinds(tmp_path / "o") == [PacketKind.KEY, PacketKind.DELTA, *still, PacketKind.DELTA]
+    lines = metrics(tmp_path / "o")
+    assert [line["iterations"] for line in lines[2:4]] == [0, 0]
+    assert all(sum(line["bytes"].values()) <= 32 for line in lines[2:4])
+    before, paused_state = witness.states[1], witness.states[3]
+    for (name, a), (_, b) in zip(before.player.gaussians.items(), paused_state.player.gaussians.items(), strict=True):
+        assert np.array_equal(a, b), name
+    # What the scene shows is still frame 1.
+    assert paused_state.previous.index == 1
+
+
+def test_resuming_after_a_pause_gives_the_same_bytes(tmp_path: Path) -> None:
+    source = str(paused(tmp_path / "world"))
+    encode(tmp_path / "whole", source=source, method="s2gs-edge")
+    encode(tmp_path / "part", "--frames", "4", source=source, method="s2gs-edge")
+    encode(tmp_path / "part", "--resume", source=source, method="s2gs-edge")
+    assert deltas(tmp_path / "part") == deltas(tmp_path / "whole")
+
+
+def test_a_fade_too_slow_to_see_from_frame_to_frame_is_seen_in_the_end(tmp_path: Path) -> None:
+    """One part of the picture darkens by half a grey level per frame: below the threshold each time, not together."""
+    world = demo_copy(tmp_path / "world", frames=9)
+    for camera in (path for path in world.iterdir() if path.is_dir()):
+        first = np.asarray(Image.open(camera / "000000.jpg").convert("RGB"), np.float32)
+        for place in range(9):
+            image = first.copy()
+            image[40:90, 40:120] -= 0.75 * place
+            Image.fromarray(np.clip(np.rint(image), 0, 255).astype(np.uint8)).save(camera / f"{place:06d}.png")
+    text = (world / "cameras.json").read_text().replace(".jpg", ".png")
+    (world / "cameras.json").write_text(text)
+    encode(tmp_path / "o", source=str(world), method="s2gs-edge")
+    lines = metrics(tmp_path / "o")
+    assert lines[1]["changed_tiles"] == 0
+    assert any(line["iterations"] > 0 for line in lines[1:])

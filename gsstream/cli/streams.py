@@ -51,12 +51,13 @@ def evaluate(
         str | None, typer.Option("--source", help="Recording to compare with; default: the one it was made from.")
     ] = None,
     lpips_onnx: Annotated[
-        Path | None, typer.Option("--lpips-onnx", help="LPIPS as an ONNX file (docs/howto/lpips.md); default: not measured.")
+        Path | None,
+        typer.Option("--lpips-onnx", help="LPIPS as an ONNX file (docs/howto/lpips.md); default: not measured."),
     ] = None,
     lpips_range: Annotated[
         str | None,
         typer.Option(
-            "--lpips-range", metavar="-1|0", help="Lower end of the inputs of --lpips-onnx; default: as its metadata say."
+            "--lpips-range", metavar="-1|0", help="Lower end of the range that file is given; default: its metadata."
         ),
     ] = None,
 ) -> None:

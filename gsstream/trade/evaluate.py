@@ -128,7 +128,8 @@ def evaluate(
                 views.append(_compare(frame, name, images[i], held[i], truth[i], mask, lpips))
             if progress is not None:
                 progress(done, len(chosen))
-    return Evaluation(tuple(views), dict(zip(rig.ids, sigmas, strict=True)), renderer.name, lpips and lpips.variant)
+    variant = None if lpips is None else lpips.variant
+    return Evaluation(tuple(views), dict(zip(rig.ids, sigmas, strict=True)), renderer.name, variant)
 
 
 def _compare(

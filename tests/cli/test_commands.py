@@ -98,7 +98,8 @@ def test_every_option_says_what_it_does() -> None:
 def test_cheap_commands_import_no_torch(args: list[str]) -> None:
     code = (
         "import sys\nfrom gsstream.cli.main import run_command\ncode = run_command(sys.argv[1:])\n"
-        "heavy = sorted({'torch', 'kornia', 'matplotlib', 'constriction', 'pycolmap', 'av', 'onnxruntime'} & set(sys.modules))\n"
+        "known = {'torch', 'kornia', 'matplotlib', 'constriction', 'pycolmap', 'av', 'onnxruntime'}\n"
+        "heavy = sorted(known & set(sys.modules))\n"
         "print(code, heavy, file=sys.stderr)\n"
     )
     command = [sys.executable, "-c", code, *args]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -56,8 +57,9 @@ def _tree(values: Mapping[str, Any], path: KeyPath, resolved: ResolvedRecipe | N
 def _inline(value: Any) -> Any:
     """A value on one line, so that a comment can stand behind it."""
     out: Any
-    if isinstance(value, str) and not value.isprintable():
-        return DoubleQuotedScalarString(value)
+    if isinstance(value, str):
+        # Plain words stay plain. Anything else is quoted: in a list, "?0" without quotes would read as a key.
+        return value if re.fullmatch(r"[A-Za-z][\w.-]*", value, re.ASCII) else DoubleQuotedScalarString(value)
     if isinstance(value, list):
         out = CommentedSeq([_inline(item) for item in value])
     elif isinstance(value, Mapping):

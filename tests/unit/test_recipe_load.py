@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gsstream.core.errors import RecipeError, UnknownName
@@ -201,6 +201,8 @@ json_values = st.recursive(
 )
 
 
+@example(params={"0": ["?0"]})
+@example(params={"0": [{"?0": "- a"}, "yes", "", " x", "#", "1e3", "null"]})
 @settings(max_examples=50, deadline=None)
 @given(params=st.dictionaries(st.text(min_size=1, max_size=6), json_values, max_size=4))
 def test_saved_recipes_read_back_equal(params: dict, tmp_path_factory: pytest.TempPathFactory) -> None:

@@ -20,11 +20,10 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame
 from gsstream.core.shapes import FloatArray
+from gsstream.metrics.noise import MAD_TO_SIGMA, median_deviation
 from gsstream.render.base import TILE
 
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
-#: Standard deviation of a normal variable over its median absolute deviation.
-MAD_TO_SIGMA = 1.4826
 #: Differences are averaged over BLOCK x BLOCK pixels first: noise of neighbouring pixels is mostly independent and
 #: averages out (rendered noise is heavy-tailed, so a threshold on single pixels finds it everywhere), motion does not.
 BLOCK = 4
@@ -90,8 +89,7 @@ def detect_change(previous: Frame, frame: Frame, threshold: float) -> Change | N
 def _changed(before: FloatArray, after: FloatArray, threshold: float) -> BoolArray:
     """[rows, columns] bool of one view."""
     means = _block_means(after - before)
-    spread = np.median(np.abs(means - np.median(means)))
-    sigma = max(MAD_TO_SIGMA * float(spread), LEAST_SIGMA)
+    sigma = max(MAD_TO_SIGMA * float(median_deviation(means)), LEAST_SIGMA)
     moved = (np.abs(means) > threshold * sigma).any(-1)
     side = TILE // BLOCK
     rows, columns = -(-moved.shape[0] // side), -(-moved.shape[1] // side)

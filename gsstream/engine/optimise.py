@@ -12,7 +12,7 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.state import GateState
 from gsstream.engine.assemble import Assembly
-from gsstream.engine.exposure import Exposure
+from gsstream.engine.exposure import Exposure, backward_view
 from gsstream.engine.parameters import AdamTable
 from gsstream.engine.stream_state import StreamState
 from gsstream.render.base import RenderSession
@@ -113,12 +113,8 @@ class _FrameRun:
     def _render(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
         """Loss of one view; leaves its gradient on the rows."""
         output = self.session.render(view, rows)
-        raw = output.image.detach()
-        seen = self.exposure.apply(view, raw) if self.exposure else raw
-        value, gradient = self.parts.loss.evaluate(seen, self.targets[view], self.parts.recipe.loss.dssim)
-        upstream = self.exposure.pull(view, gradient) if self.exposure else gradient
-        torch.autograd.backward([output.image], [upstream])
-        return value
+        weight, target = self.parts.recipe.loss.dssim, self.targets[view]
+        return backward_view(output.image, view, self.exposure, self.parts.loss, target, weight)[0]
 
     def _step_gates(self, gate: GateState, gates: torch.Tensor, upstream: torch.Tensor, *, learning: bool) -> None:
         """Move the logits by what the images and the penalty say, and keep them in their bounds."""

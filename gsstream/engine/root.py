@@ -18,7 +18,7 @@ from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.topology import TopologyEdit
 from gsstream.engine.densify import DensifyStatistics, grow_and_prune
-from gsstream.engine.exposure import Exposure, ExposureFit
+from gsstream.engine.exposure import Exposure, ExposureFit, backward_view
 from gsstream.engine.parameters import AdamTable
 from gsstream.loss.base import Loss
 from gsstream.recipe.model import FirstFrame, Recipe
@@ -144,15 +144,12 @@ class _RootRun:
 
     def _backward(self, view: int, image: torch.Tensor) -> float:
         """Loss, its gradient into the leaves, and the exposure step."""
-        weight = self.recipe.loss.dssim
-        raw = image.detach()
-        seen = self.exposure.exposure.apply(view, raw) if self.exposure else raw
-        value, gradient = self.loss.evaluate(seen, self.targets[view], weight)
-        upstream = self.exposure.exposure.pull(view, gradient) if self.exposure else gradient
-        torch.autograd.backward(image, upstream)
+        exposure = self.exposure.exposure if self.exposure else None
+        target, weight = self.targets[view], self.recipe.loss.dssim
+        value, gradient = backward_view(image, view, exposure, self.loss, target, weight)
         self._penalise()
         if self.exposure:
-            self.exposure = self.exposure.step(view, raw, gradient, lr=0.005, pull=1e-3)
+            self.exposure = self.exposure.step(view, image.detach(), gradient, lr=0.005, pull=1e-3)
             if sum(self.exposure.steps) % CENTER_EVERY == 0:
                 self.exposure = self.exposure.centered()
         return value

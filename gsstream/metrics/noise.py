@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +12,12 @@ from gsstream.metrics.psnr import check_pair
 
 #: Standard deviation of a normal variable over its median absolute deviation.
 MAD_TO_SIGMA = 1.4826
+
+
+def median_deviation(values: FloatArray) -> np.floating[Any]:
+    """Median absolute deviation from the median, in the precision of ``values``."""
+    deviation: np.floating[Any] = np.median(np.abs(values - np.median(values)))
+    return deviation
 
 
 def noise_sigma(first: FloatArray, second: FloatArray) -> float:
@@ -26,5 +33,4 @@ def noise_sigma(first: FloatArray, second: FloatArray) -> float:
     """
     check_pair(first, second)
     difference = np.asarray(second, np.float32) - np.asarray(first, np.float32)
-    spread = np.median(np.abs(difference - np.median(difference)))
-    return float(MAD_TO_SIGMA * spread / math.sqrt(2))
+    return float(MAD_TO_SIGMA * median_deviation(difference) / math.sqrt(2))

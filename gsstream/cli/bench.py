@@ -99,7 +99,7 @@ def frame(
     overrides = [("--set", text) for text in settings or ()]
     if quick:
         overrides.insert(0, ("--quick", "stream.epochs=1"))
-    recipe = resolve_recipe(method, catalog.recipe_path, None, overrides).recipe
+    recipe = resolve_recipe(method, catalog.recipe_path, (), overrides).recipe
     from gsstream.trade.bench_frame import FramePlan, bench_frame
     from gsstream.trade.bench_tables import frame_table
 

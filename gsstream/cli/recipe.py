@@ -18,7 +18,9 @@ def _group() -> None:
 @app.command()
 def show(
     method: Annotated[str, typer.Argument(help="Name of a method.")],
-    recipe: Annotated[Path | None, typer.Option("--recipe", help="Recipe file laid over the method's.")] = None,
+    recipe: Annotated[
+        list[Path] | None, typer.Option("--recipe", help="Recipe file laid over the method's; repeatable.")
+    ] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value; repeatable.")
     ] = None,
@@ -33,7 +35,7 @@ def show(
 
     overrides = [("--set", text) for text in settings or ()]
     catalog = load_catalog()
-    resolved = resolve_recipe(method, catalog.recipe_path, recipe, overrides)
+    resolved = resolve_recipe(method, catalog.recipe_path, recipe or (), overrides)
     if full:
         from gsstream.engine.assemble import assemble
 

@@ -24,7 +24,8 @@ def run(
         str | None, typer.Option("--method", help="Method (see 'gsstream methods'); by default the recipe file's.")
     ] = None,
     recipe: Annotated[
-        Path | None, typer.Option("--recipe", help="YAML file with differences from the method's recipe.")
+        list[Path] | None,
+        typer.Option("--recipe", help="YAML file with differences from the method's recipe; repeatable, last wins."),
     ] = None,
     settings: Annotated[
         list[str] | None,
@@ -56,7 +57,7 @@ def run(
     short = {"frames": frames, "scale": scale, "seed": seed, "renderer": renderer}
     overrides += [(f"--{key}", f"{key}={value}") for key, value in short.items() if value is not None]
     catalog = load_catalog()
-    resolved = resolve_recipe(method, catalog.recipe_path, recipe, overrides)
+    resolved = resolve_recipe(method, catalog.recipe_path, recipe or (), overrides)
     # The slow imports come last, so that a mistake on the command line is answered at once.
     from gsstream.engine.assemble import assemble
     from gsstream.engine.recording import open_recording, read_first_frame

@@ -1,4 +1,4 @@
-"""Layers -> one recipe: model defaults <- the method's file <- a recipe file <- the command line.
+"""Layers -> one recipe: model defaults <- the method's file <- recipe files <- the command line.
 
 A file may say ``base: NAME`` (a method) or ``base: other.yaml`` (a file beside it) and then only its differences.
 Naming another part in a slot drops the parameters that lower layers gave to the former one.
@@ -47,33 +47,35 @@ class ResolvedRecipe:
 
 
 def resolve_recipe(
-    method: str | None, find_method: FindMethod, file: Path | None = None, overrides: Sequence[tuple[str, str]] = ()
+    method: str | None, find_method: FindMethod, files: Sequence[Path] = (), overrides: Sequence[tuple[str, str]] = ()
 ) -> ResolvedRecipe:
     """Stack the layers and validate the result; every problem found is reported in one error.
 
     Arguments:
-        method: name given by --method; None takes the one the file is based on, else "dense".
+        method: name given by --method; None takes the one the first file is based on, else "dense".
         find_method: name -> YAML file (``Catalog.recipe_path``).
-        file: a recipe file with differences.
+        files: recipe files with differences, later ones win; only the first may say which method it belongs to.
         overrides: (option, "a.b=value") of the command line, e.g. ("--set", "gate.temperature=0.3"); later ones win.
 
     Raises:
         RecipeError: unknown keys (with the nearest valid name), values out of range, contradictions.
         UnknownName, PluginUnavailable: from ``find_method``.
     """
-    chain = _file_chain(file, find_method, ()) if file else []
+    chain = [layer for file in files[:1] for layer in _file_chain(file, find_method, ())]
+    later = [layer for file in files[1:] for layer in _later_file(file, find_method)]
     stated = [layer.leaves[("method",)] for layer in chain if ("method",) in layer.leaves]
     named = stated[-1].value if stated else None
     if stated and not isinstance(named, str):
         raise RecipeError(f"{stated[-1].origin.where}: method: expected a name, got {named!r}")
     if method and named and named != method:
         raise RecipeError(
-            f"{stated[-1].origin.where}: {file} belongs to the method {named!r}, but --method says {method!r}: leave "
-            "--method out, or change the file's 'base' or 'method'"
+            f"{stated[-1].origin.where}: {files[0]} belongs to the method {named!r}, but --method says {method!r}: "
+            "leave --method out, or change the file's 'base' or 'method'"
         )
     name = method or named or "dense"
     if not any(leaf.origin.label.startswith("method ") for leaf in stated):
         chain = _method_chain(name, find_method, ()) + chain
+    chain += later
     if overrides:
         leaves: dict[KeyPath, Leaf] = {}
         for option, text in overrides:
@@ -82,6 +84,17 @@ def resolve_recipe(
             leaves[path] = leaf
         chain = [*chain, Layer(leaves, shorthand=True)]
     return stack(chain)
+
+
+def _later_file(path: Path, find_method: FindMethod) -> list[Layer]:
+    """The layers of a file laid over another: it must not bring a method, which would undo what lies below."""
+    layers = _file_chain(path, find_method, ())
+    for leaf in (layer.leaves[("method",)] for layer in layers if ("method",) in layer.leaves):
+        raise RecipeError(
+            f"{leaf.origin.where}: {path} belongs to the method {leaf.value!r}, and only the first recipe file may "
+            "belong to one: give it first"
+        )
+    return layers
 
 
 def load_recipe(path: Path) -> ResolvedRecipe:

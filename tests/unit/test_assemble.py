@@ -23,7 +23,7 @@ def builtin(monkeypatch: pytest.MonkeyPatch) -> Catalog:
 
 def resolve(catalog: Catalog, *sets: str) -> ResolvedRecipe:
     overrides = [("--set", item) for item in ("renderer=reference", *sets)]
-    return resolve_recipe("dense", catalog.recipe_path, None, overrides)
+    return resolve_recipe("dense", catalog.recipe_path, (), overrides)
 
 
 def test_the_null_parts_assemble(builtin: Catalog) -> None:

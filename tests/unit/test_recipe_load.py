@@ -40,8 +40,8 @@ def lab(tmp_path: Path):
             return path
 
         def resolve(self, method: str | None = "soft", text: str | None = None, *sets: str) -> ResolvedRecipe:
-            file = None if text is None else self.write("run.yaml", text)
-            return resolve_recipe(method, self.find, file, [("--set", item) for item in sets])
+            files = () if text is None else (self.write("run.yaml", text),)
+            return resolve_recipe(method, self.find, files, [("--set", item) for item in sets])
 
         def refuse(self, text: str | None, *sets: str, method: str | None = "soft") -> str:
             with pytest.raises(RecipeError) as caught:
@@ -96,6 +96,29 @@ def test_base_method_and_base_file(lab) -> None:
     assert (quick.recipe.method, quick.recipe.stream.epochs, quick.recipe.gate.name) == ("quick", 1, "soft")
     assert (label(quick, "stream.epochs"), label(quick, "gate.name")) == ("method quick", "method soft")
     assert lab.resolve(None, "method: quick\n").recipe.stream.epochs == 1
+
+
+def test_several_files_lie_on_each_other(lab) -> None:
+    first = lab.write("ablation.yaml", "base: soft\nseed: 3\nstream: {epochs: 5}\n")
+    second = lab.write("recording.yaml", "stream: {epochs: 6}\nscale: 0.5\n")
+    for method in (None, "soft"):
+        resolved = resolve_recipe(method, lab.find, [first, second], [("--set", "scale=0.25")])
+        recipe = resolved.recipe
+        assert (recipe.method, recipe.seed, recipe.stream.epochs, recipe.scale) == ("soft", 3, 6, 0.25)
+        assert recipe.gate.name == "soft"
+        assert label(resolved, "stream.epochs") == f"file {second}:1"
+    # The other way round the method's file would undo the first file's values: refused, not guessed.
+    with pytest.raises(RecipeError, match=r"ablation\.yaml belongs to the method 'soft', .*: give it first"):
+        resolve_recipe(None, lab.find, [second, first])
+    with pytest.raises(RecipeError, match="belongs to the method 'hard'"):
+        resolve_recipe("soft", lab.find, [second, lab.write("saved.yaml", "method: hard\n")])
+
+
+def test_another_part_in_a_later_file_drops_the_settings_of_an_earlier_one(lab) -> None:
+    first = lab.write("a.yaml", "gate: {params: {levels: 1}}\n")
+    second = lab.write("b.yaml", "gate: hard\n")
+    assert resolve_recipe("soft", lab.find, [first]).recipe.gate.params == {"temperature": 0.3, "levels": 1}
+    assert resolve_recipe("soft", lab.find, [first, second]).recipe.gate.model_dump() == {"name": "hard", "params": {}}
 
 
 def test_no_method_means_dense(lab) -> None:

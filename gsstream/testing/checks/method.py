@@ -43,7 +43,7 @@ class MethodUnderTest:
     def __init__(self, name: str) -> None:
         self.name = name
         catalog = load_catalog()
-        resolved = resolve_recipe(name, catalog.recipe_path, None, [("the contract kit", text) for text in TINY])
+        resolved = resolve_recipe(name, catalog.recipe_path, (), [("the contract kit", text) for text in TINY])
         self.parts: Assembly = assemble(resolved, catalog)
         self.seed = self.parts.recipe.seed
 

@@ -66,7 +66,7 @@ def run(
     assembly = assemble(resolved, catalog)
     # Read before the folder is touched: --overwrite must not delete a run for the sake of a faulty recording.
     first = None if first_frame is None else read_first_frame(stream_file(first_frame))
-    recording = open_recording(source, assembly.recipe.scale, catalog)
+    recording = open_recording(source, assembly.recipe, catalog)
     try:
         prepare_output(out, resume=resume, overwrite=overwrite)
         result = run_session(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first)

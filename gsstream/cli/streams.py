@@ -64,7 +64,7 @@ def evaluate(
     """Render the decoded frames and compare them with the recording's test cameras."""
     file = stream_file(stream)
     from gsstream.core.errors import InputError
-    from gsstream.engine.recording import open_recording
+    from gsstream.engine.recording import reopen_recording
     from gsstream.metrics import OnnxLpips
     from gsstream.player.playback import Playback
     from gsstream.plugins.catalog import load_catalog
@@ -78,7 +78,7 @@ def evaluate(
     uri = source or meta.extra.get("source_uri")
     if not uri:
         raise InputError(f"{file} does not say which recording it was made from; name it with --source")
-    recording = open_recording(str(uri), float(meta.recipe.get("scale", 1.0)), load_catalog())
+    recording = reopen_recording(str(uri), meta.recipe, load_catalog())
     try:
         evaluation = evaluate_stream(file, recording, lpips=lpips, progress=progress_on("frame"))
     finally:

@@ -19,7 +19,7 @@ SWEEP_WIDTH = 160
 
 
 def gather_points(source: FrameSource, frame: Frame, settings: FirstFrame, rng: Rng) -> PointCloud:
-    """Points to seed from. Test cameras take no part.
+    """Points to seed from. Only the cameras of ``frame`` take part, and points that the source vouches for.
 
     Raises InputError when the recipe asks for a kind of points that the recording does not have, or nothing is left.
     """
@@ -42,6 +42,18 @@ def gather_points(source: FrameSource, frame: Frame, settings: FirstFrame, rng: 
     return join(cloud, fill)
 
 
+def with_test_views(source: FrameSource, frame: Frame) -> Frame:
+    """The frame with the test cameras' images behind its own: what ``data.leak = points`` lets seeding see."""
+    test = source.frame(frame.index, "test")
+    cameras = replace(
+        frame.cameras,
+        ids=(*frame.cameras.ids, *test.cameras.ids),
+        viewmats=np.concatenate([frame.cameras.viewmats, test.cameras.viewmats]),
+        Ks=np.concatenate([frame.cameras.Ks, test.cameras.Ks]),
+    )
+    return replace(frame, images=np.concatenate([frame.images, test.images]), cameras=cameras)
+
+
 def join(first: PointCloud, second: PointCloud) -> PointCloud:
     """Both clouds, in order."""
     return PointCloud(
@@ -60,8 +72,8 @@ def _base_points(source: FrameSource, frame: Frame, settings: FirstFrame) -> Poi
     shipped = source.points("sparse" if wanted == "sparse" else "recording")
     if shipped is None and wanted != "auto":
         raise InputError(
-            f"first_frame.points = {wanted!r}, but the recording {source.info.name!r} ships no points; "
-            "use 'auto', 'sweep' or 'sfm'"
+            f"first_frame.points = {wanted!r}, but the recording {source.info.name!r} ships no points, "
+            "or none that its test cameras took no part in; use 'auto', 'sweep' or 'sfm'"
         )
     if shipped is not None and (wanted != "auto" or len(shipped) >= SPARSE):
         return shipped

@@ -2,26 +2,61 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from gsstream.core.errors import GsstreamError, PacketError, PluginUnavailable
+from pydantic import ValidationError
+
+from gsstream.core.errors import GsstreamError, PacketError, PluginUnavailable, RecipeError
 from gsstream.packet import PlayerState, StreamReader, decode_packet
 from gsstream.plugins.catalog import Catalog
+from gsstream.recipe.model import Recipe
 from gsstream.source.base import FrameSource
 from gsstream.source.open import open_source
+from gsstream.source.options import DataOptions
+from gsstream.source.transformed import transformed
 
 
-def open_recording(uri: str, scale: float, catalog: Catalog) -> FrameSource:
-    """Open ``uri``: a source part of a plugin when its scheme names one, else one of the built-in sources.
+def open_recording(uri: str, recipe: Recipe, catalog: Catalog) -> FrameSource:
+    """Open ``uri`` at the scale, with the split and through the transforms that a recipe asks for.
 
     Arguments:
         uri: "demo", "synthetic:...", a folder, or "NAME:..." where NAME is a part of the kind "source".
-        scale: images are shrunk by this factor in (0, 1] on reading.
 
     Raises:
-        SourceError: the recording cannot be read.
+        SourceError: the recording cannot be read, or the recipe's ``data`` section names cameras it does not have.
         PluginUnavailable: the source's plugin cannot be loaded or failed to open the recording.
     """
+    return _open(uri, recipe.scale, recipe.data, recipe.seed, catalog)
+
+
+def reopen_recording(uri: str, recipe: Mapping[str, Any], catalog: Catalog) -> FrameSource:
+    """Open ``uri`` as the run did whose recipe a stream carries (``StreamMeta.recipe``).
+
+    Raises RecipeError when the stream's recipe has data options that this version does not know, else as
+    :func:`open_recording`.
+    """
+    try:
+        data = DataOptions.model_validate_json(json.dumps(recipe.get("data", {})))
+    except ValidationError as error:
+        key = ".".join(map(str, error.errors()[0]["loc"]))
+        raise RecipeError(f"the stream's recipe: data.{key}: {error.errors()[0]['msg']}; upgrade gsstream") from error
+    return _open(uri, float(recipe.get("scale", 1.0)), data, int(recipe.get("seed", 0)), catalog)
+
+
+def _open(uri: str, scale: float, data: DataOptions, seed: int, catalog: Catalog) -> FrameSource:
+    source = _open_plain(uri, scale, catalog)
+    try:
+        return transformed(source, data, seed)
+    except BaseException:
+        source.close()
+        raise
+
+
+def _open_plain(uri: str, scale: float, catalog: Catalog) -> FrameSource:
+    """A source part of a plugin when the scheme names one, else one of the built-in sources."""
     scheme = uri.partition(":")[0]
     entry = catalog.entries.get(("source", scheme))
     if entry is None or entry.plugin == "builtin":

@@ -23,7 +23,7 @@ from gsstream.engine.assemble import Assembly
 from gsstream.engine.begin import begin, begin_from
 from gsstream.engine.frame_step import frame_step
 from gsstream.engine.measure import HeldOut
-from gsstream.engine.points import gather_points
+from gsstream.engine.points import gather_points, with_test_views
 from gsstream.engine.progress import RunProgress
 from gsstream.engine.resume import resume_state
 from gsstream.engine.stream_state import Step, StreamState
@@ -121,7 +121,9 @@ class _Run:
     def _first(self, frame: Frame) -> Step:
         if self.first_frame is not None:
             return begin_from(self.parts, self.first_frame, frame, self._meta(frame.cameras), self.rng)
-        points = gather_points(self.source, frame, self.parts.recipe.first_frame, self.rng)
+        recipe = self.parts.recipe
+        seen = with_test_views(self.source, frame) if recipe.data.leak == "points" else frame
+        points = gather_points(self.source, seen, recipe.first_frame, self.rng)
         return begin(self.parts, points, frame, self._meta(frame.cameras), self.rng, self.progress.root)
 
     def _metrics(self, step: Step, index: int, test: Frame, total: float, waited: float) -> dict[str, Any]:

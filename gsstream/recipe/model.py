@@ -9,6 +9,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from gsstream.source.options import DataOptions
+
 SCHEMA_VERSION = "1.0"
 
 
@@ -141,6 +143,7 @@ class Recipe(Section):
     loss: Loss = Field(default=Loss(), description="photometric loss")
     gate_training: GateTraining = Field(default=GateTraining(), description="optimisation of gates")
     codec: Codec = Field(default=Codec(), description="packets")
+    data: DataOptions = Field(default=DataOptions(), description="the split, and disturbances for experiments")
     scale: float = Field(default=1.0, gt=0, le=1, description="images are downscaled by this factor on reading")
     frames: int | None = Field(default=None, ge=1, description="number of frames to process; all when absent")
     near: float = Field(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.errors import SourceError
 from gsstream.core.frame import Frame, PointCloud
+from gsstream.core.shapes import FloatArray
 
 Split = Literal["train", "test"]
 PointKind = Literal["recording", "sparse"]
@@ -51,3 +54,28 @@ class FrameSource(Protocol):
 
     def close(self) -> None:
         """Release files and threads."""
+
+
+@runtime_checkable
+class SingleImages(Protocol):
+    """What a source may offer besides: one camera's image without decoding the others'."""
+
+    def image(self, index: int, camera: str) -> FloatArray:
+        """[H, W, 3] float32 in [0, 1] of one camera, of either split; the same bits as in ``frame``."""
+
+
+@runtime_checkable
+class AttributedPoints(Protocol):
+    """What a source may offer besides: points chosen by the cameras that saw them."""
+
+    def points_seen_by(self, cameras: Sequence[str], kind: PointKind = "recording") -> PointCloud | None:
+        """Points that these cameras alone pin down: seen by at least two of them."""
+
+
+def check_index(info: SourceInfo, index: int) -> None:
+    """Raise SourceError when a recording has no such frame."""
+    if index < 0 or (info.num_frames is not None and index >= info.num_frames):
+        raise SourceError(
+            f"recording {info.name!r} has no frame {index}; it has {info.num_frames}, counted from 0 "
+            "(lower the number of frames, or record more)"
+        )

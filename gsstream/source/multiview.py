@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -12,12 +11,11 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.shapes import FloatArray
-from gsstream.source.base import SourceInfo, Split
+from gsstream.source.base import PointKind, SourceInfo, Split, check_index
 from gsstream.source.calibration import Calibration, frame_path, read_calibration
 from gsstream.source.images import read_image
 
 POINTS_FILE = "points_frame0.npz"
-PointKind = Literal["recording", "sparse"]
 
 
 class MultiviewSource:
@@ -60,9 +58,13 @@ class MultiviewSource:
         cameras = info.train if split == "train" else info.test
         images: FloatArray = np.empty((len(cameras), self._target[1], self._target[0], 3), np.float32)
         for i, camera_id in enumerate(cameras.ids):
-            path = self._folder / frame_path(self._patterns[camera_id], index)
-            images[i] = read_image(path, self._native, self._target)
+            images[i] = self.image(index, camera_id)
         return Frame(index, index / info.fps, images, cameras)
+
+    def image(self, index: int, camera: str) -> FloatArray:
+        """One camera's image [H, W, 3]. Raises SourceError like ``frame``."""
+        check_index(self._info, index)
+        return read_image(self._folder / frame_path(self._patterns[camera], index), self._native, self._target)
 
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
         """Points of frame 0 that ship with the recording, or None when it ships none.
@@ -86,15 +88,6 @@ def scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
     if not 0 < scale <= 1:
         raise SourceError(f"scale: expected a factor in (0, 1], got {scale!r}; recordings are never enlarged")
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
-
-
-def check_index(info: SourceInfo, index: int) -> None:
-    """Raise SourceError when a recording has no such frame."""
-    if index < 0 or (info.num_frames is not None and index >= info.num_frames):
-        raise SourceError(
-            f"recording {info.name!r} has no frame {index}; it has {info.num_frames}, counted from 0 "
-            "(lower the number of frames, or record more)"
-        )
 
 
 def read_points(path: Path, kind: PointKind) -> PointCloud:

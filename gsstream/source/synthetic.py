@@ -13,8 +13,8 @@ from gsstream.core.errors import SourceError, suggest
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
-from gsstream.source.base import SourceInfo, Split
-from gsstream.source.multiview import PointKind, check_index, scaled_size
+from gsstream.source.base import PointKind, SourceInfo, Split, check_index
+from gsstream.source.multiview import scaled_size
 from gsstream.source.primitives import BoolArray, Hits, Placed, cast, lit
 from gsstream.source.toyroom import LIGHT, arc_cameras, moving_shapes, object_centers, static_shapes
 

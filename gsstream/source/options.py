@@ -1,0 +1,60 @@
+"""DataOptions: the section ``data`` of a recipe. Imports nothing heavy, because recipes do not."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Leak = Literal["none", "points", "training"]
+LostAs = Literal["hold", "black"]
+
+
+class DataOptions(BaseModel):
+    """Section ``data`` of a recipe: the split, and disturbances for experiments."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+    test_cameras: tuple[str, ...] | None = Field(
+        default=None, description="cameras that only judge, by id; null: the recording's own split; []: none"
+    )
+    train_cameras: tuple[str, ...] | None = Field(
+        default=None, description="cameras that train, by id; null: all that do not test"
+    )
+    train_views: int | None = Field(
+        default=None, ge=2, description="keep this many training cameras, far from each other; null: all"
+    )
+    leak: Leak = Field(
+        default="none",
+        description="what test cameras may give: none; points: seeds of frame 0 (the paper's released code); "
+        "training: they train, too (some published numbers)",
+    )
+    time_offset: tuple[str, ...] = Field(
+        default=(), description='"ID=FRAMES" per camera: its frame t + FRAMES stands for frame t, e.g. ["c3=2"]'
+    )
+    gain: float = Field(default=1.0, gt=0, le=4, description="factor on all images, clipped to [0, 1]")
+    gain_amplitude: float = Field(
+        default=0.0, ge=0, lt=1, description="the factor of frame t lies in gain * (1 -/+ this) (paper: 0.2 to 0.5)"
+    )
+    gain_pattern: Literal["sine", "random"] = Field(
+        default="sine", description="sine: smooth, frame 0 has factor gain; random: uniform, anew in every frame"
+    )
+    gain_period: float = Field(default=60.0, gt=0, description="frames per period of the sine")
+    noise_sigma: float = Field(
+        default=0.0, ge=0, le=255, description="noise on training images, 8-bit levels, clipped to [0, 1] (paper: 0-30)"
+    )
+    noise_frames: int = Field(default=1, ge=1, description="the first so many frames are noisy (paper: frame 0 alone)")
+    lost_cameras: tuple[str, ...] = Field(
+        default=(), description='"ID=A:B": this training camera gives nothing in frames A to B - 1, e.g. ["c3=10:20"]'
+    )
+    lost_share: float = Field(
+        default=0.0, ge=0, lt=1, description="each training image after frame 0 is lost with this probability"
+    )
+    lost_as: LostAs = Field(
+        default="hold", description="a lost image is: hold: the camera's last one; black: a black one"
+    )
+
+    @property
+    def touches_nothing(self) -> bool:
+        """Whether the recording passes as it is."""
+        return self == DataOptions()

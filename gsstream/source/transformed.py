@@ -1,0 +1,147 @@
+"""A recording seen through ``DataOptions``: another split, shifted clocks, changed light, noise, lost images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import SourceError
+from gsstream.core.frame import Frame, PointCloud
+from gsstream.core.rng import Rng
+from gsstream.core.shapes import FloatArray
+from gsstream.source.base import (
+    AttributedPoints,
+    FrameSource,
+    PointKind,
+    SingleImages,
+    SourceInfo,
+    Split,
+    check_index,
+)
+from gsstream.source.options import DataOptions
+from gsstream.source.transforms import (
+    choose_split,
+    gain_at,
+    is_lost,
+    parse_losses,
+    parse_offsets,
+    with_gain,
+    with_noise,
+)
+
+
+def transformed(source: FrameSource, options: DataOptions, seed: int) -> FrameSource:
+    """``source`` as ``options`` want it; the very same object when they change nothing.
+
+    Arguments:
+        seed: seed of the run; equal seeds give equal gains, noise and losses.
+
+    Raises SourceError when an option names a camera that does not exist or leaves nothing to train on.
+    """
+    return source if options.touches_nothing else TransformedSource(source, options, seed)
+
+
+class TransformedSource:
+    """A frame source over another one. Thread-safe when the inner source is; the same seed gives the same bits.
+
+    Frame t of the run is frame ``start + t + offset`` of the recording for each camera, where ``start`` makes room for
+    negative offsets; the run is shorter by the span of the offsets, so that no frame is shown twice.
+    Order: time offset, gain (all cameras), noise and losses (training cameras).
+    """
+
+    def __init__(self, source: FrameSource, options: DataOptions, seed: int) -> None:
+        self._source, self._options, self._rng = source, options, Rng(seed)
+        info = source.info
+        both = _joined(info.train, info.test)
+        self._home: dict[str, Split] = dict.fromkeys(info.test.ids, "test")
+        self._home.update(dict.fromkeys(info.train.ids, "train"))
+        train, test = choose_split(options, info.train, info.test)
+        self._offsets = parse_offsets(options.time_offset, both.ids)
+        self._losses = parse_losses(options.lost_cameras, train)
+        used = [self._offsets.get(i, 0) for i in {*train, *test}]
+        self._start = max(0, -min(used))
+        frames = info.num_frames
+        if frames is not None:
+            frames -= self._start + max(0, *used)
+            if frames < 1:
+                raise SourceError(
+                    f"data.time_offset: offsets from {min(used)} to {max(used)} leave no common frame of the "
+                    f"{info.num_frames} that {info.name!r} has; use smaller offsets"
+                )
+        place = both.ids.index
+        self._info = replace(
+            info,
+            num_frames=frames,
+            train=both.select([place(i) for i in train]),
+            test=both.select([place(i) for i in test]),
+        )
+
+    @property
+    def info(self) -> SourceInfo:
+        """The inner recording's, with the cameras and the number of frames that are left."""
+        return self._info
+
+    def frame(self, index: int, split: Split = "train") -> Frame:
+        """Read one instant. Raises SourceError as the inner source does."""
+        check_index(self._info, index)
+        cameras = self._info.train if split == "train" else self._info.test
+        images: FloatArray = np.empty((len(cameras), cameras.height, cameras.width, 3), np.float32)
+        cache: dict[tuple[int, Split], Frame] = {}
+        for row, name in enumerate(cameras.ids):
+            shown = self._last_shown(name, index) if split == "train" else index
+            images[row] = 0 if shown is None else self._image(name, shown, split, cache)
+        return Frame(index, index / self._info.fps, images, cameras)
+
+    def points(self, kind: PointKind = "recording") -> PointCloud | None:
+        """The inner source's points, unless a test camera of this split took part in them.
+
+        Sources that know which camera saw which point leave out what only test cameras pin down; of others, points are
+        withheld (None) when a camera that they count as training is a test camera here. ``leak`` lifts both.
+        """
+        allowed = (*self._info.train.ids, *(() if self._options.leak == "none" else self._info.test.ids))
+        if isinstance(self._source, AttributedPoints):
+            return self._source.points_seen_by(allowed, kind)
+        taken = [i for i in self._info.test.ids if self._home[i] == "train"]
+        return None if taken and self._options.leak == "none" else self._source.points(kind)
+
+    def close(self) -> None:
+        """Close the inner source."""
+        self._source.close()
+
+    def _last_shown(self, name: str, index: int) -> int | None:
+        """The frame whose image this camera delivers at ``index``; None: a black one."""
+        while is_lost(self._options, self._losses, name, index, self._rng):
+            if self._options.lost_as == "black":
+                return None
+            index -= 1
+        return index
+
+    def _image(self, name: str, index: int, split: Split, cache: dict[tuple[int, Split], Frame]) -> FloatArray:
+        options = self._options
+        image = self._read(name, self._start + index + self._offsets.get(name, 0), cache)
+        image = with_gain(image, gain_at(options, index, self._rng))
+        if split == "train" and options.noise_sigma > 0 and index < options.noise_frames:
+            image = with_noise(image, options.noise_sigma, name, index, self._rng)
+        return image
+
+    def _read(self, name: str, index: int, cache: dict[tuple[int, Split], Frame]) -> FloatArray:
+        """One camera's image; a source that only has whole frames is asked for each of them once."""
+        if isinstance(self._source, SingleImages):
+            return self._source.image(index, name)
+        key = (index, self._home[name])
+        if key not in cache:
+            cache[key] = self._source.frame(*key)
+        frame = cache[key]
+        image: FloatArray = frame.images[frame.cameras.ids.index(name)]
+        return image
+
+
+def _joined(train: Cameras, test: Cameras) -> Cameras:
+    return replace(
+        train,
+        ids=(*train.ids, *test.ids),
+        viewmats=np.concatenate([train.viewmats, test.viewmats]),
+        Ks=np.concatenate([train.Ks, test.Ks]),
+    )

@@ -1,0 +1,129 @@
+"""What is done to a recording before a run sees it: who trains, time shifts, gain, noise, lost images. Pure functions.
+
+Everything is decided by the options and the run's seed. With the defaults nothing is touched.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import SourceError, suggest
+from gsstream.core.rng import Rng
+from gsstream.core.shapes import FloatArray
+from gsstream.source.options import DataOptions
+
+
+def parse_offsets(entries: Sequence[str], ids: Sequence[str]) -> dict[str, int]:
+    """Camera -> frames, from "ID=FRAMES". Raises SourceError naming the entry."""
+    found: dict[str, int] = {}
+    for entry in entries:
+        name, _, value = entry.rpartition("=")
+        if not re.fullmatch(r"[+-]?\d+", value):
+            raise SourceError(f"data.time_offset: expected ID=FRAMES with whole frames, e.g. cam03=2, got {entry!r}")
+        found[_known("data.time_offset", name, ids, found)] = int(value)
+    return found
+
+
+def parse_losses(entries: Sequence[str], ids: Sequence[str]) -> dict[str, list[range]]:
+    """Camera -> frames in which it gives nothing, from "ID=A:B". Frame 0 cannot be lost: it is the key picture."""
+    found: dict[str, list[range]] = {}
+    for entry in entries:
+        name, _, value = entry.rpartition("=")
+        match = re.fullmatch(r"(\d+):(\d+)", value)
+        first, last = (int(n) for n in match.groups()) if match else (0, 0)
+        if not 1 <= first < last:
+            raise SourceError(
+                f"data.lost_cameras: expected ID=A:B with 1 <= A < B, e.g. cam03=10:20, got {entry!r}; "
+                "frame 0 needs every training camera (leave one out with data.train_cameras)"
+            )
+        found.setdefault(_known("data.lost_cameras", name, ids, ()), []).append(range(first, last))
+    return found
+
+
+def _known(key: str, name: str, ids: Sequence[str], taken: Sequence[str] | dict[str, int]) -> str:
+    if name not in ids:
+        raise SourceError(f"{key}: no camera {name!r}{suggest(name, ids)}")
+    if name in taken:
+        raise SourceError(f"{key}: camera {name!r} is given twice")
+    return name
+
+
+def choose_split(options: DataOptions, train: Cameras, test: Cameras) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """(training ids, test ids) after ``test_cameras``, ``train_cameras``, ``train_views`` and ``leak``.
+
+    Raises SourceError for unknown or repeated ids, a camera on both sides, or no training camera left.
+    """
+    ids = (*train.ids, *test.ids)
+    tests = test.ids if options.test_cameras is None else _named("data.test_cameras", options.test_cameras, ids)
+    left = tuple(i for i in ids if i not in tests)
+    trains = left if options.train_cameras is None else _named("data.train_cameras", options.train_cameras, ids)
+    if both := [i for i in trains if i in tests]:
+        raise SourceError(
+            f"data.train_cameras: {', '.join(both)} would train and test; name other cameras, or say "
+            "data.leak=training if that is meant"
+        )
+    if options.train_views is not None:
+        trains = _far_apart(trains, options.train_views, train, test)
+    if options.leak == "training":
+        trains = (*trains, *tests)
+    if not trains:
+        raise SourceError(f"data: no training camera is left; test cameras: {', '.join(tests)}")
+    return trains, tests
+
+
+def _named(key: str, wanted: tuple[str, ...], ids: tuple[str, ...]) -> tuple[str, ...]:
+    for position, name in enumerate(wanted):
+        _known(key, name, ids, wanted[:position])
+    return wanted
+
+
+def _far_apart(names: tuple[str, ...], count: int, train: Cameras, test: Cameras) -> tuple[str, ...]:
+    """The first ``count`` cameras of a farthest-point order, so that fewer views are a subset of more; in rig order."""
+    if count > len(names):
+        raise SourceError(f"data.train_views: there are only {len(names)} training cameras, got {count}")
+    places = dict(zip((*train.ids, *test.ids), np.concatenate([train.centers, test.centers]), strict=True))
+    centers = np.stack([places[name] for name in names])
+    chosen = [int(np.linalg.norm(centers - centers.mean(0), axis=1).argmin())]
+    while len(chosen) < count:
+        gaps = np.linalg.norm(centers[:, None] - centers[None, chosen], axis=2).min(1)
+        gaps[chosen] = -1  # cameras may share a place
+        chosen.append(int(gaps.argmax()))
+    return tuple(names[i] for i in sorted(chosen))
+
+
+def gain_at(options: DataOptions, index: int, rng: Rng) -> float:
+    """Factor on all images of frame ``index``, training and test, in gain * [1 - amplitude, 1 + amplitude]."""
+    if options.gain_pattern == "sine":
+        wave = math.sin(2 * math.pi * index / options.gain_period)
+    else:
+        wave = float(rng.numpy("data gain", index).uniform(-1, 1))
+    return options.gain * (1 + options.gain_amplitude * wave)
+
+
+def with_gain(image: FloatArray, factor: float) -> FloatArray:
+    """The image times a factor; what exceeds 1 saturates, as in a camera."""
+    if factor == 1:
+        return image
+    out: FloatArray = np.minimum(image * np.float32(factor), np.float32(1))
+    return out
+
+
+def with_noise(image: FloatArray, sigma: float, camera: str, index: int, rng: Rng) -> FloatArray:
+    """The image with Gaussian noise of ``sigma`` 8-bit levels, clipped to [0, 1] (paper, first-frame noise)."""
+    noise = rng.numpy(f"data noise {camera}", index).standard_normal(image.shape, np.float32)
+    out: FloatArray = np.clip(image + noise * np.float32(sigma / 255), 0, 1)
+    return out
+
+
+def is_lost(options: DataOptions, losses: dict[str, list[range]], camera: str, index: int, rng: Rng) -> bool:
+    """Whether a training camera gives nothing at a frame; never at frame 0."""
+    if index == 0:
+        return False
+    if any(index in frames for frames in losses.get(camera, ())):
+        return True
+    return options.lost_share > 0 and bool(rng.numpy(f"data loss {camera}", index).random() < options.lost_share)

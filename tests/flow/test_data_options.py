@@ -1,0 +1,54 @@
+"""Runs under ``data.*``: the stream carries the options; resuming and evaluating see the same disturbed data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from flow_runs import arguments, encode, finish, metrics
+
+from gsstream.cli.main import run_command
+from gsstream.engine import session
+from gsstream.source.open import open_source
+
+DISTURBED = {"data__gain_amplitude": 0.3, "data__noise_sigma": 8, "data__lost_share": 0.4, "data__train_views": 2}
+
+
+def test_a_disturbed_run_resumes_to_the_same_bytes_and_is_judged_on_what_it_saw(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = "synthetic:frames=5&views=3&width=64&height=48&supersample=1"
+    name = open_source(world).info.test.ids[0]
+    options = {**DISTURBED, "data__time_offset": f'["{name}=1"]'}
+    once = encode(tmp_path / "whole", source=world, method="s2gs-edge", **options)
+    assert len(metrics(tmp_path / "whole")) == 4  # the offset costs one frame
+
+    def impatient(parts, state, frame, rng):
+        if frame.index == 2:
+            raise KeyboardInterrupt
+        return step(parts, state, frame, rng)
+
+    step = session.frame_step
+    monkeypatch.setattr(session, "frame_step", impatient)
+    assert run_command(arguments(tmp_path / "halves", source=world, method="s2gs-edge", **options)) == 130
+    monkeypatch.undo()
+    assert encode(tmp_path / "halves", "--resume", source=world, method="s2gs-edge", **options) == once
+    capsys.readouterr()
+    assert run_command(["evaluate", str(tmp_path / "whole")]) == 0
+    mean = sum(next(iter(line["psnr"].values())) for line in metrics(tmp_path / "whole")[1:]) / 3
+    assert f"{mean:.2f}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("leak", ["points", "training"])
+def test_leaks_change_the_stream_only_when_asked_for(tmp_path: Path, leak: str) -> None:
+    world = "synthetic:frames=2&views=3&width=64&height=48&supersample=1"
+    options = {"source": world, "first_frame__points": "sweep", "stream__epochs": 1}
+    honest = encode(tmp_path / "honest", **options)
+    assert encode(tmp_path / leak, data__leak=leak, **options) != honest
+
+
+def test_a_camera_that_is_not_there_ends_with_one_line(tmp_path: Path) -> None:
+    code, _, err = finish(*arguments(tmp_path / "o", "--set", 'data.lost_cameras=["cam9=1:2"]'))
+    assert code == 2
+    assert "data.lost_cameras: no camera 'cam9'" in err
+    assert not (tmp_path / "o" / "stream.gss").exists()

@@ -1,0 +1,202 @@
+"""Splits, clocks, light, noise and losses: what the options say happens, exactly and repeatably, and nothing else."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gsstream.core.errors import RecipeError, SourceError
+from gsstream.core.rng import Rng
+from gsstream.engine.recording import reopen_recording
+from gsstream.plugins.catalog import load_catalog
+from gsstream.recipe.load import resolve_recipe
+from gsstream.source.open import open_source
+from gsstream.source.options import DataOptions
+from gsstream.source.transformed import transformed
+from gsstream.source.transforms import gain_at
+
+WORLD = "synthetic:frames=12&views=4&width=16&height=12&supersample=1&motion=3"
+
+
+def opened(uri: str = WORLD, seed: int = 0, **options: Any):
+    return transformed(open_source(uri), DataOptions(**options), seed)
+
+
+def test_defaults_are_the_source_itself() -> None:
+    source = open_source(WORLD)
+    assert transformed(source, DataOptions(), 3) is source
+
+
+@pytest.mark.parametrize("uri", [WORLD, "demo"])
+def test_a_change_that_touches_no_frame_leaves_every_bit(uri: str) -> None:
+    """A loss far behind the end: the wrapper is there and must be invisible."""
+    plain = open_source(uri)
+    wrapped = opened(uri, lost_cameras=(f"{plain.info.train.ids[1]}=900:901",))
+    assert wrapped is not plain
+    for index in (0, 7):
+        for split in ("train", "test"):
+            theirs, ours = plain.frame(index, split), wrapped.frame(index, split)
+            assert ours.cameras.ids == theirs.cameras.ids
+            assert ours.images.tobytes() == theirs.images.tobytes()
+            assert ours.timestamp == theirs.timestamp
+    cloud = wrapped.points()
+    assert cloud is not None
+    assert cloud.xyz.tobytes() == plain.points().xyz.tobytes()
+
+
+def test_a_test_camera_leaves_training_and_takes_its_points_along() -> None:
+    plain = open_source(WORLD)
+    a, b, *rest = plain.info.train.ids
+    source = opened(test_cameras=(b, a))
+    assert source.info.test.ids == (b, a)
+    assert source.info.train.ids == (*rest, *plain.info.test.ids)
+    np.testing.assert_array_equal(source.frame(2, "test").images, plain.frame(2).images[[1, 0]])
+    np.testing.assert_array_equal(source.frame(2).images[-1], plain.frame(2, "test").images[0])
+    np.testing.assert_array_equal(source.info.test.viewmats, plain.info.train.viewmats[[1, 0]])
+    assert source.points() is None  # made with a and b, which are held out now
+    assert opened(test_cameras=(b,), leak="points").points() is not None
+    assert opened(test_cameras=()).points() is not None
+
+
+def test_leak_into_training_is_asked_for_and_complete() -> None:
+    plain, source = open_source(WORLD), opened(leak="training")
+    assert source.info.train.ids == (*plain.info.train.ids, *plain.info.test.ids)
+    assert source.info.test.ids == plain.info.test.ids
+    np.testing.assert_array_equal(source.frame(1).images[-1], plain.frame(1, "test").images[0])
+
+
+@given(st.integers(2, 7))
+@settings(max_examples=12, deadline=None)
+def test_fewer_views_are_subsets_of_more(count: int) -> None:
+    def chosen(n: int) -> tuple[str, ...]:
+        return opened(WORLD.replace("views=4", "views=8"), train_views=n).info.train.ids
+
+    ids = open_source(WORLD.replace("views=4", "views=8")).info.train.ids
+    assert len(chosen(count)) == count
+    assert set(chosen(count)) < set(chosen(count + 1))
+    assert list(chosen(count)) == sorted(chosen(count), key=ids.index)
+
+
+@given(st.lists(st.integers(-3, 3), min_size=5, max_size=5))
+@settings(max_examples=20, deadline=None)
+def test_clocks_are_shifted_and_no_frame_is_shown_twice(offsets: list[int]) -> None:
+    plain = open_source(WORLD)
+    ids = (*plain.info.train.ids, *plain.info.test.ids)
+    source = opened(time_offset=tuple(f"{i}={o:+d}" for i, o in zip(ids, offsets, strict=True)))
+    start = max(0, -min(offsets))
+    assert source.info.num_frames == 12 - max(0, -min(offsets)) - max(0, max(offsets))
+    for index in (0, source.info.num_frames - 1):
+        frame = source.frame(index)
+        assert frame.index == index
+        for row, offset in enumerate(offsets[:-1]):
+            np.testing.assert_array_equal(frame.images[row], plain.frame(start + index + offset).images[row])
+    with pytest.raises(SourceError, match="has no frame"):
+        source.frame(source.info.num_frames)
+
+
+@given(
+    st.sampled_from(["sine", "random"]), st.floats(0.2, 2), st.floats(0, 0.9), st.integers(0, 400), st.integers(0, 9)
+)
+@settings(max_examples=60, deadline=None)
+def test_gain_stays_in_its_range(pattern: Any, gain: float, amplitude: float, index: int, seed: int) -> None:
+    options = DataOptions(gain=gain, gain_amplitude=amplitude, gain_pattern=pattern)
+    value = gain_at(options, index, Rng(seed))
+    assert gain * (1 - amplitude) - 1e-9 <= value <= gain * (1 + amplitude) + 1e-9
+    if pattern == "sine" and index % 60 == 0:
+        assert value == pytest.approx(gain)
+    if pattern == "sine" and index % 60 == 15:
+        assert value == pytest.approx(gain * (1 + amplitude))
+
+
+def test_gain_touches_test_cameras_and_saturates() -> None:
+    plain, source = open_source(WORLD), opened(gain=3.0)
+    for split in ("train", "test"):
+        truth = np.minimum(plain.frame(4, split).images * np.float32(3), 1)
+        np.testing.assert_array_equal(source.frame(4, split).images, truth)
+        assert truth.max() == 1
+
+
+def test_noise_has_its_sigma_hits_training_images_of_the_first_frames_and_follows_the_seed() -> None:
+    plain = open_source(WORLD.replace("width=16&height=12", "width=96&height=72"))
+    source = transformed(plain, DataOptions(noise_sigma=10, noise_frames=2), 5)
+    for index in (0, 1):
+        before, after = plain.frame(index).images, source.frame(index).images
+        inside = (before > 0.2) & (before < 0.8)
+        assert (after - before)[inside].std() * 255 == pytest.approx(10, rel=0.02)
+        assert abs((after - before)[inside].mean()) * 255 < 0.2
+        assert 0 <= after.min() <= after.max() <= 1
+    assert source.frame(2).images.tobytes() == plain.frame(2).images.tobytes()
+    assert source.frame(0, "test").images.tobytes() == plain.frame(0, "test").images.tobytes()
+    again, other = (transformed(plain, DataOptions(noise_sigma=10), seed).frame(0).images for seed in (5, 6))
+    assert again.tobytes() == source.frame(0).images.tobytes() != other.tobytes()
+
+
+def test_lost_images_hold_the_last_one_or_are_black() -> None:
+    plain = open_source(WORLD)
+    name = plain.info.train.ids[2]
+    hold = opened(lost_cameras=(f"{name}=3:6", f"{name}=8:9"))
+    black = opened(lost_cameras=(f"{name}=3:6",), lost_as="black")
+    for index in range(10):
+        shown = 2 if 3 <= index < 6 else 7 if index == 8 else index
+        np.testing.assert_array_equal(hold.frame(index).images[2], plain.frame(shown).images[2])
+        np.testing.assert_array_equal(hold.frame(index).images[[0, 1, 3]], plain.frame(index).images[[0, 1, 3]])
+        assert (black.frame(index).images[2].max() == 0) == (3 <= index < 6)
+
+
+def test_random_losses_have_their_share_and_spare_frame_0_and_the_test_camera() -> None:
+    source = opened(WORLD.replace("frames=12", "frames=200"), lost_share=0.3, lost_as="black")
+    lost = np.array([source.frame(i).images.max(axis=(1, 2, 3)) == 0 for i in range(200)])
+    assert not lost[0].any()
+    assert abs(lost[1:].mean() - 0.3) < 4 * math.sqrt(0.21 / lost[1:].size)
+    assert source.frame(5, "test").images.max() > 0
+
+
+FAULTS: dict[str, tuple[dict[str, Any], str]] = {
+    "ghost test": ({"test_cameras": ("cam9",)}, "data.test_cameras: no camera 'cam9'"),
+    "ghost train": ({"train_cameras": ("cam9",)}, "data.train_cameras: no camera 'cam9'"),
+    "both sides": ({"train_cameras": ("TEST",)}, "would train and test"),
+    "twice": ({"test_cameras": ("TEST", "TEST")}, "given twice"),
+    "nobody": ({"train_cameras": ()}, "no training camera is left"),
+    "too many": ({"train_views": 9}, "there are only 4 training cameras, got 9"),
+    "offset form": ({"time_offset": ("TEST",)}, "expected ID=FRAMES"),
+    "offset half": ({"time_offset": ("TEST=0.5",)}, "whole frames"),
+    "offset ghost": ({"time_offset": ("cam9=1",)}, "data.time_offset: no camera 'cam9'"),
+    "offset twice": ({"time_offset": ("TEST=1", "TEST=2")}, "given twice"),
+    "offset span": ({"time_offset": ("TEST=12",)}, "leave no common frame of the 12"),
+    "loss form": ({"lost_cameras": ("TEST=3",)}, "expected ID=A:B"),
+    "loss order": ({"lost_cameras": ("TEST=5:5",)}, "expected ID=A:B with 1 <= A < B"),
+    "loss of frame 0": ({"lost_cameras": ("TEST=0:5",)}, "frame 0 needs every training camera"),
+    "loss of a test camera": ({"lost_cameras": ("TEST=1:5",)}, "data.lost_cameras: no camera"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faulty_options_are_explained(fault: str) -> None:
+    options, message = FAULTS[fault]
+    test = open_source(WORLD).info.test.ids[0]
+    named = {
+        key: tuple(v.replace("TEST", test) for v in value) if isinstance(value, tuple) else value
+        for key, value in options.items()
+    }
+    with pytest.raises(SourceError, match=message):
+        opened(**named)
+
+
+def test_options_are_recipe_keys_with_provenance_and_travel_with_the_stream() -> None:
+    catalog = load_catalog()
+    overrides = [("--set", "data.gain_amplitude=0.3"), ("--set", 'data.time_offset=["cam_0=2"]')]
+    resolved = resolve_recipe("dense", catalog.recipe_path, None, overrides)
+    assert resolved.recipe.data == DataOptions(gain_amplitude=0.3, time_offset=("cam_0=2",))
+    assert resolved.origin(("data", "gain_amplitude")).label == "command line"
+    with pytest.raises(RecipeError, match=r"data\.gain_amplitud.*did you mean 'gain_amplitude'"):
+        resolve_recipe("dense", catalog.recipe_path, None, [("--set", "data.gain_amplitud=0.3")])
+    recipe = resolve_recipe("dense", catalog.recipe_path, None, [("--set", "data.noise_sigma=9"), ("--seed", "seed=4")])
+    again = reopen_recording(WORLD, recipe.recipe.model_dump(mode="json"), catalog)
+    assert again.frame(0).images.tobytes() == opened(seed=4, noise_sigma=9).frame(0).images.tobytes()
+    with pytest.raises(RecipeError, match=r"data\.fog.*upgrade gsstream"):
+        reopen_recording(WORLD, {"data": {"fog": 1}}, catalog)

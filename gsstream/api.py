@@ -25,6 +25,8 @@ from gsstream.core.frame import PointCloud as PointCloud
 from gsstream.core.gaussians import ATTRIBUTES as ATTRIBUTES
 from gsstream.core.gaussians import Gaussians as Gaussians
 from gsstream.core.hierarchy import Hierarchy as Hierarchy
+from gsstream.core.hierarchy import tree_max as tree_max
+from gsstream.core.hierarchy import tree_roots as tree_roots
 from gsstream.core.part import Part as Part
 from gsstream.core.part import PartConfig as PartConfig
 from gsstream.core.part import Traits as Traits

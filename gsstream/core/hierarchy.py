@@ -56,6 +56,38 @@ class Hierarchy:
             raise ShapeError("level: expected one more than the parent's level at every node that is not a root")
 
 
+def tree_roots(parent: torch.Tensor) -> torch.Tensor:
+    """[M] root of each node, by pointer jumping: log2(M) gathers instead of one per level.
+
+    Raises:
+        ShapeError: some node ends in a circle instead of at a root.
+    """
+    root = parent
+    for _ in range(len(parent).bit_length()):
+        root = root[root]
+    # Checked at the end: a circle whose length is a power of two looks settled on the way.
+    if bool((parent[root] == root).all()):
+        return root
+    raise ShapeError(f"parent: expected every node to end at a root, got a cycle among {len(parent)} nodes")
+
+
+def tree_max(values: torch.Tensor, hierarchy: Hierarchy, empty: float) -> torch.Tensor:
+    """[M] the largest of ``values`` [N] over the members of each node's whole tree, given to every node of the tree.
+
+    Differentiable; at ties the gradient is shared equally between the tied members.
+
+    Arguments:
+        empty: value of a tree without members.
+
+    Raises:
+        ShapeError: some node ends in a circle instead of at a root.
+    """
+    root = tree_roots(hierarchy.parent)
+    best = values.new_full((hierarchy.num_nodes,), empty)
+    best = best.scatter_reduce(0, root[hierarchy.node_of], values, reduce="amax", include_self=False)
+    return best[root]
+
+
 def _arange_like(index: torch.Tensor) -> torch.Tensor:
     import torch
 

@@ -4,6 +4,10 @@
 """
 
 from gsstream.testing.cases import World as World
+from gsstream.testing.cases import images as images
+from gsstream.testing.cases import make_world as make_world
+from gsstream.testing.cases import rig as rig
+from gsstream.testing.cases import scene as scene
 from gsstream.testing.cases import world as world
 from gsstream.testing.kit import CheckResult as CheckResult
 from gsstream.testing.kit import parametrize_with_checks as parametrize_with_checks

@@ -37,6 +37,7 @@ class World:
         residual: [N, 3] some position residual, cells.
         hierarchy: three trees of two levels; flat when there are fewer than twelve Gaussians.
         points, anchors: what a structure is given.
+        sigma: noise of every camera as the context reports it, full scale 1.
     """
 
     name: str
@@ -51,6 +52,7 @@ class World:
     points: PointCloud
     anchors: Anchors
     index: int = 1
+    sigma: float = 0.002
 
     def image(self, view: int) -> torch.Tensor:
         return self.now[view]
@@ -72,7 +74,7 @@ class World:
         return _copy(_GRADIENTS[key])  # type: ignore[no-any-return]
 
     def noise_sigma(self, view: int) -> float:
-        return 0.002
+        return self.sigma
 
     def blended(self, share: float) -> World:
         """The same world with only a share of the change between the frames."""
@@ -142,15 +144,7 @@ def forest(n: int) -> Hierarchy:
     return Hierarchy(torch.arange(n) * 7 % 12 + 3, parent, torch.tensor([0] * 3 + [1] * 12))
 
 
-def trees(hierarchy: Hierarchy) -> torch.Tensor:
-    """[M] root of each node, by following parents."""
-    root = hierarchy.parent
-    for _ in range(hierarchy.num_nodes):
-        root = hierarchy.parent[root]
-    return root
-
-
-def make(name: str, before: Scene, cameras: Cameras, *, shift: float = 0.0) -> World:
+def make_world(name: str, before: Scene, cameras: Cameras, *, shift: float = 0.0) -> World:
     """A world whose Gaussians with x > 0.3 and in view move by ``shift`` between the frames."""
     n = len(before)
     moved = (before.means[:, 0] > 0.3) & (before.means[:, 1].abs() < 5) & (shift != 0)
@@ -162,13 +156,14 @@ def make(name: str, before: Scene, cameras: Cameras, *, shift: float = 0.0) -> W
     sizes = torch.tensor([0.5, 0.25]) * max(1.0, float(before.means.abs().max()) if n else 1.0)
     origin = before.means.amin(0) - 0.1 if n else torch.zeros(3)
     return World(
-        name, before, cameras, _images(before, cameras), _images(replace(before, means=means), cameras), moved,
+        name, before, cameras, images(before, cameras), images(replace(before, means=means), cameras), moved,
         3 * torch.randn(n, generator=g), torch.randn(n, 3, generator=g), forest(n),
         PointCloud(xyz, rgb.numpy(), name), Anchors(before.means.clone(), rgb, levels, sizes, origin),
     )  # fmt: skip
 
 
-def _images(gaussians: Scene, cameras: Cameras) -> tuple[torch.Tensor, ...]:
+def images(gaussians: Scene, cameras: Cameras) -> tuple[torch.Tensor, ...]:
+    """What the cameras see, without noise: one [H, W, 3] per camera, by the reference renderer."""
     with torch.no_grad():
         return tuple(RENDERER.render(gaussians, cameras, view, BLACK).image for view in range(len(cameras)))
 
@@ -190,25 +185,25 @@ def _thin() -> Scene:
 
 
 def _moving(name: str, views: int = 3) -> World:
-    return make(name, scene(_cloud()), rig(views), shift=0.08)
+    return make_world(name, scene(_cloud()), rig(views), shift=0.08)
 
 
 def _huge(name: str) -> World:
-    world = make(name, scene(_cloud(24)), rig())
+    world = make_world(name, scene(_cloud(24)), rig())
     return replace(world, logits=1e4 * torch.sign(world.logits))
 
 
 WORLDS: dict[str, Callable[[], World]] = {
-    "empty": lambda: make("empty", scene(torch.zeros(0, 3)), rig()),
-    "one": lambda: make("one", scene(torch.tensor([[0.1, 0.0, 0.0]])), rig()),
-    "two identical": lambda: make("two identical", scene(torch.full((2, 3), 0.1)), rig()),
-    "line": lambda: make("line", scene(torch.linspace(-0.6, 0.6, 20)[:, None] * torch.ones(3)), rig(), shift=0.05),
+    "empty": lambda: make_world("empty", scene(torch.zeros(0, 3)), rig()),
+    "one": lambda: make_world("one", scene(torch.tensor([[0.1, 0.0, 0.0]])), rig()),
+    "two identical": lambda: make_world("two identical", scene(torch.full((2, 3), 0.1)), rig()),
+    "line": lambda: make_world("line", scene(torch.linspace(-0.6, 0.6, 20)[:, None] * torch.ones(3)), rig(), shift=0.05),
     "cloud": lambda: _moving("cloud"),
-    "far": lambda: make("far", scene(_cloud(30) + 1e6), rig()),
-    "thin": lambda: make("thin", _thin(), rig(), shift=0.05),
-    "static": lambda: make("static", scene(_cloud()), rig()),
+    "far": lambda: make_world("far", scene(_cloud(30) + 1e6), rig()),
+    "thin": lambda: make_world("thin", _thin(), rig(), shift=0.05),
+    "static": lambda: make_world("static", scene(_cloud()), rig()),
     "moving": lambda: _moving("moving"),
-    "unseen": lambda: make("unseen", scene(_unseen()), rig(), shift=0.08),
+    "unseen": lambda: make_world("unseen", scene(_unseen()), rig(), shift=0.08),
     "one camera": lambda: _moving("one camera", 1),
     "huge logits": lambda: _huge("huge logits"),
 }

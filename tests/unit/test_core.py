@@ -27,7 +27,7 @@ from gsstream.core.errors import (
 )
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
-from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.hierarchy import Hierarchy, tree_max, tree_roots
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import check_finite, check_shape
 from gsstream.core.state import GateState, edit_state, rows
@@ -203,6 +203,35 @@ class TestHierarchy:
         part = self.forest().rows(torch.tensor([3, 0]))
         assert part.node_of.tolist() == [2, 2]
         assert part.num_nodes == 4
+
+    @given(st.lists(st.integers(0, 30), min_size=1, max_size=40), st.integers(0, 2**31))
+    @settings(max_examples=60, deadline=None)
+    def test_tree_roots_and_tree_max_agree_with_walking_up(self, choices: list[int], seed: int) -> None:
+        g = torch.Generator().manual_seed(seed)
+        # Every node hangs on an earlier one or on itself; then the nodes are renamed.
+        rename = torch.randperm(len(choices), generator=g)
+        parent = torch.empty(len(choices), dtype=torch.int64)
+        for node, choice in enumerate(choices):
+            parent[rename[node]] = rename[min(choice, node)]
+        node_of = torch.randint(0, len(choices), (25,), generator=g)
+        values = torch.randn(25, generator=g)
+
+        def walk(node: int) -> int:
+            return node if int(parent[node]) == node else walk(int(parent[node]))
+
+        roots = [walk(node) for node in range(len(choices))]
+        assert tree_roots(parent).tolist() == roots
+        best = dict.fromkeys(roots, -9.0)
+        for value, node in zip(values.tolist(), node_of.tolist(), strict=True):
+            best[roots[node]] = max(value, best[roots[node]])
+        found = tree_max(values, Hierarchy(node_of, parent, torch.zeros_like(parent)), -9.0)
+        assert found.tolist() == [best[root] for root in roots]
+
+    @pytest.mark.parametrize("length", [2, 3, 4, 8])
+    def test_a_circle_of_parents_is_an_error_whatever_its_length(self, length: int) -> None:
+        parent = torch.cat([torch.tensor([0]), 1 + (torch.arange(length) + 1) % length])
+        with pytest.raises(ShapeError, match=f"a cycle among {length + 1} nodes"):
+            tree_roots(parent)
 
 
 @st.composite

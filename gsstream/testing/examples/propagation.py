@@ -7,7 +7,7 @@ from typing import final
 import torch
 from pydantic import Field
 
-from gsstream.api import Hierarchy, PartConfig, Propagation, Traits, check_finite, check_shape
+from gsstream.api import Hierarchy, PartConfig, Propagation, Traits, check_finite, check_shape, tree_max
 
 
 @final
@@ -22,9 +22,4 @@ class ExamplePropagation(Propagation):
     def propagate(self, logits: torch.Tensor, hierarchy: Hierarchy) -> torch.Tensor:
         check_shape("logits", logits, (hierarchy.num_gaussians,))
         check_finite("logits", logits)
-        root = hierarchy.parent
-        for _ in range(len(root).bit_length()):
-            root = root[root]
-        best = logits.new_full((hierarchy.num_nodes,), self.config.empty)
-        best = best.scatter_reduce(0, root[hierarchy.node_of], logits, reduce="amax", include_self=False)
-        return best[root]
+        return tree_max(logits, hierarchy, self.config.empty)

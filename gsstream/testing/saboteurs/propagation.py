@@ -6,8 +6,7 @@ from typing import Any
 
 import torch
 
-from gsstream.core.hierarchy import Hierarchy
-from gsstream.testing.cases import trees
+from gsstream.core.hierarchy import Hierarchy, tree_roots
 from gsstream.testing.examples.propagation import ExamplePropagation
 from gsstream.testing.saboteurs.register import spoils
 
@@ -23,7 +22,7 @@ def _inner(hierarchy: Hierarchy) -> torch.Tensor:
 
 def _tree_mean(logits: torch.Tensor, hierarchy: Hierarchy) -> torch.Tensor:
     """[M] mean over the members of each node's tree."""
-    root = trees(hierarchy)
+    root = tree_roots(hierarchy.parent)
     start = logits.new_zeros(hierarchy.num_nodes)
     return start.scatter_reduce(0, root[hierarchy.node_of], logits, reduce="mean", include_self=False)[root]
 

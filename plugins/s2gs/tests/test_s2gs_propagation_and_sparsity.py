@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 from gsstream_s2gs.expected_sparsity import ExpectedSparsity
-from gsstream_s2gs.hierarchical import HierarchicalMax, roots
+from gsstream_s2gs.hierarchical import HierarchicalMax
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from gsstream.api import Hierarchy, ShapeError
+from gsstream.api import Hierarchy, ShapeError, tree_roots
 
 
 @st.composite
@@ -84,7 +84,7 @@ class TestHierarchicalMax:
         raised[data.draw(st.integers(0, len(z) - 1))] += 5.0
         before, after = self.part.propagate(z, hierarchy), self.part.propagate(raised, hierarchy)
         assert bool((after >= before).all())
-        home = roots(hierarchy.parent)
+        home = tree_roots(hierarchy.parent)
         tree = home[hierarchy.node_of[(raised != z).nonzero()[0, 0]]]
         assert torch.equal(before[home != tree], after[home != tree])
 

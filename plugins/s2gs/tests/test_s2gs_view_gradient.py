@@ -14,7 +14,7 @@ from gsstream_s2gs.view_gradient import ViewSpaceGradient
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
-from s2gs_scene import SIZE, Context, gaussians, images, moving, rig, told
+from s2gs_scene import SIZE, context, gaussians, images, moving, rig, told
 
 from gsstream.api import ShapeError
 
@@ -112,7 +112,7 @@ class TestInvariances:
     def test_static_frames_give_at_most_the_floor(self, normalisation: str, loss: str) -> None:
         scene, cameras = gaussians(), rig()
         still = images(scene, cameras)
-        z = estimator(normalisation=normalisation, loss=loss).estimate(Context(scene, cameras, still, still))
+        z = estimator(normalisation=normalisation, loss=loss).estimate(context(scene, cameras, still, still))
         assert bool((z <= FLOOR + 1e-6).all())
         assert z.dtype == torch.float32
         assert z.shape == (60,)

@@ -8,7 +8,7 @@ from typing import final
 import torch
 from pydantic import Field
 
-from gsstream.api import Hierarchy, PartConfig, Propagation, ShapeError, Traits, check_finite, check_shape
+from gsstream.api import Hierarchy, PartConfig, Propagation, Traits, check_finite, check_shape, tree_max
 
 
 @final
@@ -37,17 +37,4 @@ class FixedThreshold(Propagation):
         tau: float = self.config.tau
         # A logit below the floor already is closed; lifting it to the floor would invent suspicion.
         kept = torch.where(logits >= math.log(tau) - math.log1p(-tau), logits, logits.clamp_max(self.config.floor))
-        root = _roots(hierarchy.parent)
-        best = kept.new_full((hierarchy.num_nodes,), self.config.floor)
-        best = best.scatter_reduce(0, root[hierarchy.node_of], kept, reduce="amax", include_self=False)
-        return best[root]
-
-
-def _roots(parent: torch.Tensor) -> torch.Tensor:
-    """[M] root of each node, by pointer jumping. Raises ShapeError for a cycle."""
-    root = parent
-    for _ in range(len(parent).bit_length()):
-        root = root[root]
-    if torch.equal(parent[root], root):
-        return root
-    raise ShapeError(f"parent: expected every node to end at a root, got a cycle among {len(parent)} nodes")
+        return tree_max(kept, hierarchy, self.config.floor)

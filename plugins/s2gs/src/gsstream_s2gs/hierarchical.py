@@ -7,7 +7,7 @@ from typing import final
 import torch
 from pydantic import Field
 
-from gsstream.api import Hierarchy, PartConfig, Propagation, ShapeError, Traits, check_finite, check_shape
+from gsstream.api import Hierarchy, PartConfig, Propagation, Traits, check_finite, check_shape, tree_max
 
 
 @final
@@ -33,18 +33,4 @@ class HierarchicalMax(Propagation):
         """[N] logits -> [M] logits. Raises ShapeError for a wrong length, a value that is not finite, or a cycle."""
         check_shape("logits", logits, (hierarchy.num_gaussians,))
         check_finite("logits", logits)
-        root = roots(hierarchy.parent)
-        best = logits.new_full((hierarchy.num_nodes,), self.config.empty)
-        best = best.scatter_reduce(0, root[hierarchy.node_of], logits, reduce="amax", include_self=False)
-        return best[root]
-
-
-def roots(parent: torch.Tensor) -> torch.Tensor:
-    """[M] root of each node, by pointer jumping: log2(M) gathers instead of one per level. Raises for a cycle."""
-    root = parent
-    for _ in range(len(parent).bit_length()):
-        root = root[root]
-    # Checked at the end: a circle whose length is a power of two looks settled on the way.
-    if torch.equal(parent[root], root):
-        return root
-    raise ShapeError(f"parent: expected every node to end at a root, got a cycle among {len(parent)} nodes")
+        return tree_max(logits, hierarchy, self.config.empty)

@@ -172,6 +172,10 @@ def _cloud(n: int = 200, seed: int = 0) -> torch.Tensor:
     return torch.randn(n, 3, generator=torch.Generator().manual_seed(seed)) * 0.35
 
 
+def _line() -> torch.Tensor:
+    return torch.linspace(-0.6, 0.6, 20)[:, None] * torch.ones(3)
+
+
 def _unseen() -> torch.Tensor:
     means = _cloud(60)
     means[::2, 1] += 30.0
@@ -197,7 +201,7 @@ WORLDS: dict[str, Callable[[], World]] = {
     "empty": lambda: make_world("empty", scene(torch.zeros(0, 3)), rig()),
     "one": lambda: make_world("one", scene(torch.tensor([[0.1, 0.0, 0.0]])), rig()),
     "two identical": lambda: make_world("two identical", scene(torch.full((2, 3), 0.1)), rig()),
-    "line": lambda: make_world("line", scene(torch.linspace(-0.6, 0.6, 20)[:, None] * torch.ones(3)), rig(), shift=0.05),
+    "line": lambda: make_world("line", scene(_line()), rig(), shift=0.05),
     "cloud": lambda: _moving("cloud"),
     "far": lambda: make_world("far", scene(_cloud(30) + 1e6), rig()),
     "thin": lambda: make_world("thin", _thin(), rig(), shift=0.05),

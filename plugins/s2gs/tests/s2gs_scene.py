@@ -1,4 +1,4 @@
-"""Scenes for the tests of S2GS, made with the contract kit's worlds, and contexts whose screen gradients are dictated."""
+"""Scenes for the tests of S2GS, made with the kit's worlds, and contexts whose screen gradients are dictated."""
 
 from __future__ import annotations
 

@@ -5,12 +5,16 @@ Importing this module imports torch (the parts are torch code); ``gsstream.spec`
 
 from gsstream import API_VERSION as API_VERSION
 from gsstream.confidence.base import ConfidenceEstimator as ConfidenceEstimator
+from gsstream.core.births import Births as Births
+from gsstream.core.births import in_nodes as in_nodes
+from gsstream.core.births import own_nodes as own_nodes
 from gsstream.core.cameras import Cameras as Cameras
 from gsstream.core.context import FrameContext as FrameContext
 from gsstream.core.context import ScreenGradient as ScreenGradient
 from gsstream.core.delta import Delta as Delta
 from gsstream.core.delta import Layout as Layout
 from gsstream.core.delta import apply_delta as apply_delta
+from gsstream.core.delta import next_layout as next_layout
 from gsstream.core.errors import ComponentError as ComponentError
 from gsstream.core.errors import GsstreamError as GsstreamError
 from gsstream.core.errors import InputError as InputError

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from gsstream.core.births import Births, check_births, check_deaths, gather_rows, join_rows, next_counts
 from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.shapes import FloatArray, IntArray
@@ -17,7 +18,7 @@ from gsstream.core.shapes import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What stays fixed between two key packets and both ends know.
+    """How Gaussians are stored, known to both ends; between two key packets only births and deaths change it.
 
     Arguments:
         node_counts: [M] int32, number of Gaussians of each node; Gaussians are stored node by node.
@@ -46,7 +47,7 @@ class Layout:
 
 @dataclass(frozen=True, slots=True)
 class Delta:
-    """One frame's change.
+    """One frame's change: rows behind open gates move, then some are removed, then some are added.
 
     Arguments:
         gates: [M] uint8 gate levels; 0 is closed, ``num_levels`` is fully open.
@@ -55,6 +56,8 @@ class Delta:
             An attribute without an entry does not change.
         steps: attribute -> quantisation step (position: fraction of the anchor's cell).
         decoders: attribute -> [L, D] float32 linear decoder; an attribute without one uses its symbols directly.
+        births: Gaussians added, or None.
+        deaths: [D] int64 rows removed (of the scene before the births), ascending.
     """
 
     gates: IntArray
@@ -62,10 +65,17 @@ class Delta:
     symbols: Mapping[str, IntArray] = field(default_factory=dict)
     steps: Mapping[str, float] = field(default_factory=dict)
     decoders: Mapping[str, FloatArray] = field(default_factory=dict)
+    births: Births | None = None
+    deaths: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
     def is_empty(self) -> bool:
-        return not bool(np.any(self.gates))
+        return not bool(np.any(self.gates)) and not self.edits_rows
+
+    @property
+    def edits_rows(self) -> bool:
+        """Whether Gaussians are added or removed."""
+        return self.births is not None or len(self.deaths) > 0
 
 
 def active_rows(layout: Layout, gates: IntArray) -> IntArray:
@@ -79,12 +89,47 @@ def active_rows(layout: Layout, gates: IntArray) -> IntArray:
 
 
 def apply_delta(gaussians: Gaussians[FloatArray], layout: Layout, delta: Delta) -> Gaussians[FloatArray]:
-    """Return the next frame's Gaussians: a_t = a_{t-1} + g * (step * symbols) W, in raw parameter space.
+    """Return the next frame's Gaussians: a_t = a_{t-1} + g * (step * symbols) W, in raw parameter space; then deaths
+    leave and births join (:func:`next_layout` says where).
 
     Rows behind closed gates keep their bits. All arithmetic is float32 in a fixed order, so two calls on one machine
     agree bitwise. Raises ShapeError when the delta does not fit the scene.
     """
     _check_fit(layout, delta)
+    moved = _move(gaussians, layout, delta)
+    if not delta.edits_rows:
+        return moved
+    born = delta.births
+    if born is not None:
+        widths = [(name, int(np.prod(value.shape[1:]))) for name, value in moved.items()]
+        check_births(born, len(layout.node_counts), len(layout.cell_sizes), widths)
+    source = gather_rows(layout.node_of, born, delta.deaths)
+    rows = {n: join_rows(v, None if born is None else getattr(born.gaussians, n), source) for n, v in moved.items()}
+    return Gaussians(**rows)
+
+
+def next_layout(layout: Layout, delta: Delta) -> Layout:
+    """The layout after a delta's births and deaths; the same object when it has none."""
+    if not delta.edits_rows:
+        return layout
+    node_of, born = layout.node_of, delta.births
+    source = gather_rows(node_of, born, delta.deaths)
+    levels = join_rows(layout.octree_levels, None if born is None else born.octree_levels, source)
+    counts = next_counts(layout.node_counts, node_of, born, delta.deaths)
+    return Layout(counts, levels.astype(np.uint8), layout.cell_sizes)
+
+
+def row_gates(layout: Layout, delta: Delta) -> FloatArray:
+    """[N'] float32 gate, 0 to 1, of every row after the delta; ``layout`` is that before it. Births count as open."""
+    gates = np.repeat(delta.gates, layout.node_counts).astype(np.float32) / np.float32(delta.num_levels)
+    if not delta.edits_rows:
+        return np.asarray(gates)
+    born = None if delta.births is None else np.ones(len(delta.births), np.float32)
+    return join_rows(gates, born, gather_rows(layout.node_of, delta.births, delta.deaths))
+
+
+def _move(gaussians: Gaussians[FloatArray], layout: Layout, delta: Delta) -> Gaussians[FloatArray]:
+    """The Gaussians behind open gates changed; births and deaths not yet."""
     index = active_rows(layout, delta.gates)
     if len(index) == 0:
         return gaussians
@@ -119,6 +164,7 @@ def _check_fit(layout: Layout, delta: Delta) -> None:
         )
     if delta.gates.size and int(delta.gates.max()) > delta.num_levels:
         raise ShapeError(f"gates: expected levels 0 to {delta.num_levels}, got {int(delta.gates.max())}")
+    check_deaths(delta.deaths, len(layout.octree_levels))
     for name, symbols in delta.symbols.items():
         if name not in ATTRIBUTES:
             raise ShapeError(f"symbols: expected attributes among {', '.join(ATTRIBUTES)}, got {name!r}")

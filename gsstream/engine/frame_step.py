@@ -22,6 +22,7 @@ from gsstream.engine.assemble import Assembly
 from gsstream.engine.context import StepContext
 from gsstream.engine.guard import guarded
 from gsstream.engine.optimise import Problem, Solution, optimise
+from gsstream.engine.rows import follow
 from gsstream.engine.stream_state import Step, StreamState
 from gsstream.packet import EncodedPacket, decode_packet, encode_delta, encode_empty, quantise_decoders
 from gsstream.residual.base import symbols as residual_symbols
@@ -54,11 +55,10 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> S
     packet = encode(delta, state, frame.index)
     player = decode_packet(state.player, packet.data)
     clock.append(time.perf_counter())
-    decoders = {**state.decoders, **{name: torch.from_numpy(value) for name, value in player.decoders.items()}}
     # A frame that changed nothing is not what the scene shows: the next one is compared with the last that did, so that
     # a change too slow to see from frame to frame adds up until it is seen.
     shown = state.previous if delta.is_empty else frame
-    after = replace(state, player=player, previous=shown, decoders=decoders, gate_moments=solution.gate_moments)
+    after = follow(replace(state, previous=shown, gate_moments=solution.gate_moments), player)
     metrics = step_metrics(delta, after, packet, solution, active)
     metrics["changed_tiles"] = 1.0 if change is None else change.share
     metrics["seconds"] = dict(zip(("confidence", "optimise", "code"), np.diff(clock).tolist(), strict=True))
@@ -129,12 +129,12 @@ def step_metrics(
     delta: Delta, after: StreamState, packet: EncodedPacket, solution: Solution, active: torch.Tensor
 ) -> dict[str, object]:
     """Numbers of one frame step that need no rendering."""
-    counts = after.player.layout.node_counts
+    counts = (after.player.before or after.player.layout).node_counts
     sizes: Mapping[str, int] = packet.sizes
     return {
         "bytes": dict(sizes),
         "active_gaussians": int(counts[delta.gates != 0].sum()),
-        "num_gaussians": int(counts.sum()),
+        "num_gaussians": len(after.player.gaussians),
         "active_gates": int((delta.gates != 0).sum()),
         "num_gates": len(delta.gates),
         "candidate_gaussians": len(active),

@@ -13,6 +13,7 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.engine.assemble import Assembly
 from gsstream.engine.begin import decoded_anchors, exposure_from_meta
+from gsstream.engine.rows import follow
 from gsstream.engine.stream_state import StreamState
 from gsstream.packet import PacketKind, PlayerState, StreamMeta, StreamReader, decode_packet
 from gsstream.packet.base import FILE_HEADER
@@ -56,10 +57,11 @@ def _replay(parts: Assembly, reader: StreamReader, rng: Rng) -> StreamState:
             player = decode_packet(player, reader.read(entry), offset=entry.offset)
         except PacketError:
             break
-        state = key_state_from_player(parts, player, rng) if entry.kind == PacketKind.KEY else state
-        assert state is not None
-        decoders = {**state.decoders, **{name: torch.from_numpy(value) for name, value in player.decoders.items()}}
-        state = replace(state, player=player, decoders=decoders)
+        if entry.kind == PacketKind.KEY:
+            state = key_state_from_player(parts, player, rng)
+        else:
+            assert state is not None
+            state = follow(state, player)
     if state is None:
         raise PacketError("the first key packet of the stream is damaged", 0)
     return state

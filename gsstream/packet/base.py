@@ -13,7 +13,7 @@ from typing import NamedTuple
 from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import ATTRIBUTES
 
-FORMAT_MAJOR, FORMAT_MINOR = 1, 0
+FORMAT_MAJOR, FORMAT_MINOR = 1, 1
 FORMAT_VERSION = f"{FORMAT_MAJOR}.{FORMAT_MINOR}"
 #: First byte not ASCII, a CR LF and a lone LF: text-mode transfers and terminals are noticed, as in PNG.
 MAGIC = b"\x89GSS\r\n\x1a\n"
@@ -46,7 +46,8 @@ class PacketKind(IntEnum):
 
 
 SECTION_NAMES: Mapping[int, str] = {
-    1: "meta", 2: "layout", 3: "gates", 4: "decoders", 5: "index", **{16 + i: name for i, name in enumerate(ATTRIBUTES)}
+    1: "meta", 2: "layout", 3: "gates", 4: "decoders", 5: "index", 6: "deaths", 7: "births",
+    **{16 + i: name for i, name in enumerate(ATTRIBUTES)}
 }  # fmt: skip
 SECTION_IDS: Mapping[str, int] = {name: number for number, name in SECTION_NAMES.items()}
 
@@ -106,8 +107,8 @@ def file_header() -> bytes:
     return head + struct.pack("<I", zlib.crc32(head))
 
 
-def check_file_header(data: bytes) -> None:
-    """Raise PacketError unless ``data`` begins a stream that this version can read."""
+def check_file_header(data: bytes) -> str:
+    """The format version a stream was written in. Raises PacketError unless this version can read it."""
     if len(data) < FILE_HEADER.size:
         raise PacketError(f"not a gsstream file: expected {FILE_HEADER.size} header bytes, got {len(data)}", 0)
     magic, major, minor, crc = FILE_HEADER.unpack_from(data)
@@ -122,6 +123,7 @@ def check_file_header(data: bytes) -> None:
         )  # fmt: skip
     if minor > FORMAT_MINOR:
         raise PacketError(f"packet format {major}.{minor} is newer than {FORMAT_VERSION}: upgrade gsstream", 8)
+    return f"{major}.{minor}"
 
 
 def build_packet(kind: PacketKind, frame: int, sections: Sequence[tuple[str, bytes]]) -> EncodedPacket:

@@ -1,4 +1,4 @@
-"""Delta packets: gates, and the residual symbols of the rows behind open gates. Empty packets: nothing changed."""
+"""Delta packets: gates, residual symbols of the rows behind open gates, births and deaths. Empty: nothing changed."""
 
 from __future__ import annotations
 
@@ -7,11 +7,23 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from gsstream.core.births import Births, check_births, check_deaths
 from gsstream.core.delta import Delta, Layout
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.shapes import FloatArray, IntArray
-from gsstream.packet.base import MAX_CHANNELS, WIDTHS, EncodedPacket, PacketKind, Section, build_packet, expect, located
+from gsstream.packet.base import (
+    MAX_CHANNELS,
+    MAX_GAUSSIANS,
+    WIDTHS,
+    EncodedPacket,
+    PacketKind,
+    Section,
+    build_packet,
+    expect,
+    located,
+)  # fmt: skip
+from gsstream.packet.births import decode_births, decode_deaths, encode_births, encode_deaths
 from gsstream.packet.gates import decode_gates, encode_gates
 from gsstream.packet.symbols import decode_symbols, encode_symbols
 
@@ -51,7 +63,7 @@ def encode_delta(
 
     Arguments:
         delta: its decoders must come from :func:`quantise_decoders`.
-        layout: that of the last key packet.
+        layout: that of the frame before.
         previous_decoders: the decoders last sent since the last key packet (:func:`next_decoders`).
 
     Raises ShapeError when the delta does not fit the layout.
@@ -67,6 +79,10 @@ def encode_delta(
             mode = _LATENT if name in delta.decoders else _DIRECT
             head = _ATTRIBUTE.pack(mode, symbols.shape[1], delta.steps[name])
             sections.append((name, head + encode_symbols(symbols)))
+    if len(delta.deaths):
+        sections.append(("deaths", encode_deaths(delta.deaths, len(layout.octree_levels))))
+    if delta.births is not None:
+        sections.append(("births", encode_births(delta.births, len(layout.node_counts))))
     return build_packet(PacketKind.DELTA, frame, sections)
 
 
@@ -75,7 +91,7 @@ def decode_delta(
 ) -> Delta:
     """Decode a complete delta packet; the arguments are those of :func:`encode_delta`. Raises PacketError."""
     _, sections = expect(data, offset, PacketKind.DELTA)
-    if "gates" not in sections or not set(sections) <= {"gates", "decoders", *ATTRIBUTES}:
+    if "gates" not in sections or not set(sections) <= {"gates", "decoders", *ATTRIBUTES, "deaths", "births"}:
         raise PacketError(f"delta packet: unexpected sections {sorted(sections)}", offset)
     with located(sections["gates"].offset):
         gates, num_levels = decode_gates(sections["gates"].data, len(layout.node_counts))
@@ -95,7 +111,22 @@ def decode_delta(
                 decoders[name] = known[name]
     if not set(sent) <= set(decoders):
         raise PacketError("delta packet: a decoder is sent that no attribute uses", sections["decoders"].offset)
-    return Delta(gates, num_levels, symbols, steps, decoders)
+    deaths, births = _decode_edit(sections, layout)
+    return Delta(gates, num_levels, symbols, steps, decoders, births, deaths)
+
+
+def _decode_edit(sections: Mapping[str, Section], layout: Layout) -> tuple[IntArray, Births | None]:
+    """Rows that leave, and what is born."""
+    number = len(layout.octree_levels)
+    deaths: IntArray = np.zeros(0, np.int64)
+    if "deaths" in sections:
+        with located(sections["deaths"].offset):
+            deaths = decode_deaths(sections["deaths"].data, number)
+    if "births" not in sections:
+        return deaths, None
+    most = MAX_GAUSSIANS - (number - len(deaths))
+    with located(sections["births"].offset):
+        return deaths, decode_births(sections["births"], len(layout.node_counts), len(layout.cell_sizes), most)
 
 
 def decode_empty(data: bytes, *, offset: int = 0) -> None:
@@ -123,10 +154,25 @@ def _check_delta(delta: Delta, layout: Layout) -> None:
         problem = _misfit(name, table.shape[1], float(np.float32(delta.steps[name])), delta.decoders.get(name))
         if problem:
             raise ShapeError(problem)
+    check_deaths(delta.deaths, len(layout.octree_levels))
+    if delta.births is not None:
+        _check_births(delta.births, layout, len(delta.deaths))
     rounded = quantise_decoders(delta.decoders)
     for name, decoder in delta.decoders.items():
         if decoder.dtype != np.float32 or not _same(decoder, rounded[name]):
             raise ShapeError(f"decoder of {name}: expected float32 values from quantise_decoders(), got others")
+
+
+def _check_births(births: Births, layout: Layout, leaving: int) -> None:
+    births.gaussians.validate()
+    check_births(births, len(layout.node_counts), len(layout.cell_sizes), [])
+    after = len(layout.octree_levels) - leaving + len(births)
+    nodes = len(layout.node_counts) + len(births.parents)
+    if len(births) == 0 or after > MAX_GAUSSIANS or nodes > MAX_GAUSSIANS:
+        raise ShapeError(
+            f"births: expected at least 1, and at most {MAX_GAUSSIANS} Gaussians and nodes afterwards, got "
+            f"{len(births)}, {after} and {nodes}; without any leave births None"
+        )
 
 
 def _misfit(name: str, channels: int, step: float, decoder: FloatArray | None) -> str | None:

@@ -10,30 +10,26 @@ import numpy as np
 from gsstream.core.delta import Layout
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
-from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.core.shapes import FloatArray
 from gsstream.packet.base import (
     FREE_GAUSSIANS,
     MAX_GAUSSIANS,
     MAX_GAUSSIANS_PER_BYTE,
     MAX_LEVELS,
     MAX_META,
-    WIDTHS,
     EncodedPacket,
     PacketKind,
-    Section,
     build_packet,
     expect,
     located,
 )  # fmt: skip
 from gsstream.packet.bits import pack_blobs, unpack_blobs
 from gsstream.packet.bulk import compress, decompress
-from gsstream.packet.grids import KEY_BITS, MAX_BITS, MAX_CODE, fold_quats, from_codes, to_codes, unfold_quats
 from gsstream.packet.meta import StreamMeta, meta_from_json, meta_to_json
-from gsstream.packet.positions import decode_positions, encode_positions, quantise_positions
+from gsstream.packet.rows import decode_rows, decoded_rows, encode_rows, row_codes
 from gsstream.packet.symbols import decode_symbols, encode_symbols
 
 _LAYOUT = struct.Struct("<IIB")
-_FIXED = struct.Struct("<bB")
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +48,7 @@ def quantise_key(gaussians: Gaussians[FloatArray]) -> Gaussians[FloatArray]:
     values that are not finite, far out of range, or quaternions of norm zero.
     """
     gaussians.validate()
-    return _decoded(gaussians, _codes(gaussians))
+    return decoded_rows(gaussians, row_codes(gaussians))
 
 
 def encode_key(state: KeyState, *, frame: int = 0) -> EncodedPacket:
@@ -60,13 +56,8 @@ def encode_key(state: KeyState, *, frame: int = 0) -> EncodedPacket:
     gaussians, layout = state.gaussians, state.layout
     gaussians.validate()
     _check_layout(gaussians, layout)
-    codes = _codes(gaussians)
-    means = _decoded(gaussians, codes).means
     sections = [("meta", compress(meta_to_json(state.meta))), ("layout", _encode_layout(layout))]
-    sections.append(("means", encode_positions(means, codes["scales"], KEY_BITS["scales"])))
-    for name, table in codes.items():
-        head = _FIXED.pack(KEY_BITS[name], table.shape[1])
-        sections.append((name, head + encode_symbols(fold_quats(table, KEY_BITS[name]) if name == "quats" else table)))
+    sections += encode_rows(gaussians).items()
     packet = build_packet(PacketKind.KEY, frame, sections)
     if len(gaussians) > most_gaussians(len(packet.data)):
         raise ShapeError(
@@ -92,33 +83,8 @@ def decode_key(data: bytes, *, offset: int = 0) -> KeyState:
     with located(sections["layout"].offset):
         layout = _decode_layout(sections["layout"].data, most_gaussians(len(data)))
     number = len(layout.octree_levels)
-    arrays: dict[str, FloatArray] = {}
-    for name in KEY_BITS:
-        with located(sections[name].offset):
-            codes, bits = _decode_codes(name, sections[name], number)
-            arrays[name] = _shaped(name, from_codes(name, codes, bits))
-        if name == "scales":
-            with located(sections["means"].offset):
-                arrays["means"] = decode_positions(sections["means"].data, codes, bits)
-    return KeyState(Gaussians(**arrays), layout, meta)
-
-
-def _codes(gaussians: Gaussians[FloatArray]) -> dict[str, IntArray]:
-    """Attribute -> [N, width] int32 fixed-point codes."""
-    return {name: to_codes(name, getattr(gaussians, name), bits) for name, bits in KEY_BITS.items()}
-
-
-def _decoded(gaussians: Gaussians[FloatArray], codes: dict[str, IntArray]) -> Gaussians[FloatArray]:
-    out = {name: _shaped(name, from_codes(name, table, KEY_BITS[name])) for name, table in codes.items()}
-    out["means"] = quantise_positions(gaussians.means, codes["scales"], KEY_BITS["scales"])
-    return Gaussians(**out)
-
-
-def _shaped(name: str, flat: FloatArray) -> FloatArray:
-    """[N, width] in the shape of the attribute."""
-    number, width = flat.shape
-    shapes = {"opacities": (number,), "sh0": (number, 1, 3), "shN": (number, width // 3, 3)}
-    return flat.reshape(shapes.get(name, (number, width)))
+    gaussians = decode_rows({name: sections[name] for name in ATTRIBUTES}, number)
+    return KeyState(gaussians, layout, meta)
 
 
 def _check_layout(gaussians: Gaussians[FloatArray], layout: Layout) -> None:
@@ -166,19 +132,3 @@ def _decode_layout(data: bytes, most: int) -> Layout:
     if not (np.isfinite(cells).all() and (cells > 0).all()):
         raise PacketError("layout: cell sizes must be finite and positive")
     return Layout(np.ascontiguousarray(counts), octree.astype(np.uint8), cells)
-
-
-def _decode_codes(name: str, section: Section, number: int) -> tuple[IntArray, int]:
-    """[N, width] int32 codes of an attribute and their fractional bits."""
-    if len(section.data) < _FIXED.size:
-        raise PacketError(f"{name} cut short")
-    bits, width = _FIXED.unpack_from(section.data)
-    if width not in WIDTHS[name] or not 1 <= bits <= MAX_BITS:
-        raise PacketError(f"{name}: {width} channels of {bits} fractional bits cannot be")
-    payload = section.data[_FIXED.size :]
-    if name == "quats":
-        return unfold_quats(decode_symbols(payload, number, width + 1), bits), bits
-    codes = decode_symbols(payload, number, width)
-    if codes.size and max(int(codes.max()), -int(codes.min())) >= MAX_CODE:
-        raise PacketError(f"{name}: code out of range")
-    return codes, bits

@@ -56,7 +56,8 @@ class StreamReader:
         self.unfinished: UnfinishedTail | None = None
         self.damage: PacketError | None = None
         try:
-            check_file_header(self._file.read(FILE_HEADER.size))
+            #: Format version of the file, "major.minor".
+            self.version = check_file_header(self._file.read(FILE_HEADER.size))
         except PacketError:
             self._file.close()
             raise

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from gsstream.core.delta import Delta, Layout, apply_delta
+from gsstream.core.delta import Delta, Layout, apply_delta, next_layout
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
@@ -22,9 +22,10 @@ class PlayerState:
     Arguments:
         frame: frame index.
         gaussians: the scene of that frame.
-        layout, meta: those of the last key packet.
+        layout: how the scene is stored. meta: that of the last key packet.
         decoders: the decoders last sent since then.
         delta: what the packet of this frame changed; None after a key or an empty packet.
+        before: the layout that ``delta`` refers to, that of the frame before; None without a delta.
     """
 
     frame: int
@@ -33,6 +34,7 @@ class PlayerState:
     meta: StreamMeta
     decoders: Mapping[str, FloatArray]
     delta: Delta | None = None
+    before: Layout | None = None
 
 
 def decode_packet(state: PlayerState | None, data: bytes, *, offset: int = 0) -> PlayerState:
@@ -54,8 +56,8 @@ def decode_packet(state: PlayerState | None, data: bytes, *, offset: int = 0) ->
     delta = decode_delta(data, state.layout, state.decoders, offset=offset)
     try:
         gaussians = apply_delta(state.gaussians, state.layout, delta)
+        layout = next_layout(state.layout, delta)
     except ShapeError as error:
         raise PacketError(str(error), offset) from error
-    return PlayerState(
-        header.frame, gaussians, state.layout, state.meta, next_decoders(state.decoders, delta), delta
-    )
+    decoders = next_decoders(state.decoders, delta)
+    return PlayerState(header.frame, gaussians, layout, state.meta, decoders, delta, state.layout)

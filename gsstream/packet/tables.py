@@ -11,7 +11,8 @@ import numpy as np
 from gsstream.core.delta import Layout
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.shapes import IntArray
-from gsstream.packet.base import PacketKind, Section
+from gsstream.packet.base import MAX_GAUSSIANS, PacketKind, Section
+from gsstream.packet.births import HEAD_PARTS, decode_births
 from gsstream.packet.bits import unpack_blobs
 from gsstream.packet.gates import decode_gates, run_tokens
 from gsstream.packet.symbols import decode_symbols
@@ -55,6 +56,11 @@ def _key_tables(data: Mapping[str, bytes], layout: Layout) -> Iterator[Table]:
     parts = unpack_blobs(data["layout"][_LAYOUT_HEAD + 4 * len(layout.cell_sizes) :], 2)
     for part, rows in zip(parts, (nodes, number), strict=True):
         yield _table("layout", part, rows, 1)
+    yield from _row_tables(data, number)
+
+
+def _row_tables(data: Mapping[str, bytes], number: int) -> Iterator[Table]:
+    """Attributes of whole Gaussians."""
     if number:
         cells, local = unpack_blobs(data["means"][_MEANS_HEAD:], 2)
         yield _table("means", cells, number, 3)
@@ -76,6 +82,33 @@ def _delta_tables(data: Mapping[str, bytes], layout: Layout) -> Iterator[Table]:
     for name in ATTRIBUTES:
         if name in data:
             yield _table(name, data[name][_DELTA_HEAD:], rows, data[name][1])
+
+
+    if "deaths" in data:
+        gone, _ = decode_gates(data["deaths"], len(layout.octree_levels))
+        yield _runs_table("deaths", data["deaths"], gone)
+    if "births" in data:
+        yield from _birth_tables(data["births"], layout)
+
+
+def _runs_table(name: str, data: bytes, marks: IntArray) -> Table:
+    """Marks coded as runs without levels."""
+    tokens, plain_bits = run_tokens(marks)
+    best = [table_entropy(part, table) for part, table in zip(unpack_blobs(data, 4)[1:3], tokens, strict=True)]
+    return Table(name, len(data), sum(best) + plain_bits)
+
+
+def _birth_tables(data: bytes, layout: Layout) -> Iterator[Table]:
+    nodes = len(layout.node_counts)
+    births = decode_births(Section(data, 0), nodes, len(layout.cell_sizes), MAX_GAUSSIANS)
+    blobs = unpack_blobs(data, HEAD_PARTS + len(ATTRIBUTES))
+    used, _ = decode_gates(blobs[2], nodes + len(births.parents))
+    yield _table("births", blobs[1], len(births.parents), 1)
+    yield _runs_table("births", blobs[2], used)
+    yield _table("births", blobs[3], int(np.count_nonzero(used)), 1)
+    yield _table("births", blobs[4], len(births), 1)
+    rows = dict(zip(ATTRIBUTES, blobs[HEAD_PARTS:], strict=True))
+    yield from (table._replace(name="births") for table in _row_tables(rows, len(births)))
 
 
 def _table(name: str, data: bytes, rows: int, channels: int) -> Table:

@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import BinaryIO
 
 from gsstream.core.errors import OutputError, PacketError
-from gsstream.packet.base import EncodedPacket, PacketKind, build_packet, file_header
+from gsstream.packet.base import FORMAT_VERSION, EncodedPacket, PacketKind, build_packet, file_header
 from gsstream.packet.reader import Entry, StreamReader, index_body, key_offsets
 
 
@@ -93,6 +93,11 @@ class StreamWriter:
 def _sound_part(path: Path, last_frame: int | None) -> tuple[list[Entry], int]:
     """Packets to keep and the byte after them."""
     with StreamReader(path) as reader:
+        if reader.version != FORMAT_VERSION:
+            raise OutputError(
+                f"{path} is of packet format {reader.version}, this gsstream writes {FORMAT_VERSION}: it can be played "
+                "but not continued; start again in another place"
+            )
         total = path.stat().st_size
         if reader.damage is not None and not _blank(path, reader.end):
             raise reader.damage

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from gsstream.core.delta import Delta, Layout
+from gsstream.core.delta import row_gates
 from gsstream.core.errors import InputError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
 from gsstream.metrics import psnr
+from gsstream.packet import PlayerState
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, render, to_bytes
 from gsstream.source.base import FrameSource
@@ -83,7 +84,7 @@ def sheet_of_stream(
             state = playback.player_state(frame)
             image = np.clip(render(state.gaussians, rig, 0, meta.background, renderer), 0, 1)
             truth = source.frame(frame, split).images[recorded.ids.index(rig.ids[0])]
-            painted = paint_gates(state.gaussians, state.layout, state.delta)
+            painted = paint_gates(state)
             active = None if frame == playback.frames[0] else render(painted, rig, 0, (0.0, 0.0, 0.0), renderer)
             columns.append(Column(f"frame {frame}   {psnr(image, truth):.2f} dB", truth, image, active))
     out = Path(out)
@@ -92,11 +93,12 @@ def sheet_of_stream(
     return out
 
 
-def paint_gates(gaussians: Gaussians[FloatArray], layout: Layout, delta: Delta | None) -> Gaussians[FloatArray]:
+def paint_gates(state: PlayerState) -> Gaussians[FloatArray]:
     """The scene in two colours: grey behind closed gates, orange behind open ones, between them by gate level."""
+    gaussians = state.gaussians
     share: FloatArray = np.zeros(len(gaussians), np.float32)
-    if delta is not None:
-        share = np.repeat(delta.gates, layout.node_counts).astype(np.float32) / delta.num_levels
+    if state.delta is not None and state.before is not None:
+        share = row_gates(state.before, state.delta)
     closed, opened = np.array(_CLOSED), np.array(_OPEN)
     color = closed + share[:, None] * (opened - closed)
     return Gaussians(

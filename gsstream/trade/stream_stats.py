@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import zstandard
 
+from gsstream.core.births import gather_rows
 from gsstream.core.delta import active_rows
 from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
@@ -160,23 +161,29 @@ def paper_estimate(state: PlayerState, kind: PacketKind) -> float:
     active Gaussians as float32, the entropy of the other symbols over all Gaussians (closed gates count as zeros) and
     of the open/closed map. Headers, model tables, gate levels and anchors are not counted there.
     """
-    number = len(state.gaussians)
     if kind == PacketKind.KEY:
-        colors = np.asarray(state.gaussians.shN).reshape(number, -1)
-        plain = sum(array.nbytes for name, array in state.gaussians.items() if name != "shN")
-        return float(plain) + sum(entropy_bits(column) for column in colors.T) / 8
+        return _plain_estimate(state.gaussians)
     if state.delta is None:
         return 0.0
     delta, bits = state.delta, 0.0
     bits += 32 * sum(decoder.size for decoder in delta.decoders.values())
-    rows = len(active_rows(state.layout, delta.gates))
+    assert state.before is not None
+    number, rows = len(state.before.octree_levels), len(active_rows(state.before, delta.gates))
     for name, table in delta.symbols.items():
         if name == "means":
             bits += 96.0 * rows
             continue
         for column in table.T:
             bits += entropy_bits(np.concatenate([column, np.zeros(number - rows, column.dtype)]))
-    return (bits + entropy_bits(delta.gates != 0)) / 8
+    born = 0.0 if delta.births is None else _plain_estimate(delta.births.gaussians)
+    return (bits + entropy_bits(delta.gates != 0)) / 8 + born
+
+
+def _plain_estimate(gaussians: Gaussians[FloatArray]) -> float:
+    """Bytes of whole Gaussians by the rule of frame 0; also used for births, which the paper's method does not have."""
+    colors = np.asarray(gaussians.shN).reshape(len(gaussians), -1)
+    plain = sum(array.nbytes for name, array in gaussians.items() if name != "shN")
+    return float(plain) + sum(entropy_bits(column) for column in colors.T) / 8
 
 
 def entropy_bits(values: Any) -> float:
@@ -187,16 +194,30 @@ def entropy_bits(values: Any) -> float:
 
 def float16_bytes(gaussians: Gaussians[FloatArray], names: Sequence[str], rows: IntArray) -> int:
     """Bytes of these rows as float16 by zstandard level 19: what a plain codec would send."""
-    parts = [getattr(gaussians, name)[rows].reshape(len(rows), -1).astype(np.float16).tobytes() for name in names]
+    parts = [getattr(gaussians, name)[rows].astype(np.float16).tobytes() for name in names]
     return len(zstandard.ZstdCompressor(level=19).compress(b"".join(parts)))
+
+
+def _plain_bytes(state: PlayerState, rows: IntArray) -> int:
+    """:func:`float16_bytes` of a packet: moved rows by what moved, whole Gaussians for keys and births."""
+    delta = state.delta
+    if delta is None:
+        return float16_bytes(state.gaussians, ATTRIBUTES, rows)
+    born = 0
+    if delta.births is not None:
+        born = float16_bytes(delta.births.gaussians, ATTRIBUTES, np.arange(len(delta.births)))
+    if not delta.edits_rows:
+        return float16_bytes(state.gaussians, tuple(delta.symbols), rows)
+    assert state.before is not None
+    source = gather_rows(state.before.node_of, delta.births, delta.deaths)
+    return born + float16_bytes(state.gaussians, tuple(delta.symbols), np.flatnonzero(np.isin(source, rows)))
 
 
 def _packet(entry: Entry, data: bytes, state: PlayerState, seconds: float) -> PacketStats:
     _, sections = parse_packet(data, entry.offset)
     sizes = {name: len(section.data) for name, section in sections.items()}
-    layout, delta = state.layout, state.delta
+    layout, delta = state.before or state.layout, state.delta
     rows = np.arange(len(state.gaussians)) if delta is None else active_rows(layout, delta.gates)
-    names = ATTRIBUTES if delta is None else tuple(delta.symbols)
     empty = entry.kind == PacketKind.EMPTY
     tables = coded_tables(sections, entry.kind, layout)
     return PacketStats(
@@ -206,7 +227,7 @@ def _packet(entry: Entry, data: bytes, state: PlayerState, seconds: float) -> Pa
         active_nodes=0 if empty else int(np.count_nonzero(delta.gates)) if delta else len(layout.node_counts),
         coded=sum(table.size for table in tables),
         entropy=sum(table.entropy_bits for table in tables) / 8,
-        float16_zstd=0 if empty else float16_bytes(state.gaussians, names, rows),
+        float16_zstd=0 if empty else _plain_bytes(state, rows),
         paper=paper_estimate(state, entry.kind), decode_ms=1000 * seconds,
     )  # fmt: skip
 

@@ -30,12 +30,13 @@ class Base:
 
 
 def bases() -> list[Base]:
-    """Streams with every packet kind; without view-dependent colour, with one Gaussian, with an index."""
+    """Streams with every packet kind; no view-dependent colour, one Gaussian, births and deaths, an index each."""
     settings = [
         {"seed": 21, "frames": 5, "key_at": 3, "number": 8, "nodes": 4, "sh_rest": 0},
         {"seed": 22, "frames": 4, "key_at": 9, "number": 40, "nodes": 12, "sh_rest": 3},
         {"seed": 23, "frames": 3, "key_at": 9, "number": 1, "nodes": 1, "sh_rest": 15},
         {"seed": 24, "frames": 4, "key_at": 9, "number": 300, "nodes": 90, "sh_rest": 0},
+        {"seed": 25, "frames": 5, "key_at": 9, "number": 30, "nodes": 9, "sh_rest": 3, "edits": (1, 3)},
     ]
     return [_base(make_packets(**kwargs)) for kwargs in settings]
 

@@ -23,12 +23,12 @@ def digest(gaussians: Gaussians) -> str:
 
 
 def main() -> None:
-    packets = make_packets(seed=11, number=30, nodes=9)
+    packets = make_packets(seed=11, number=30, nodes=9, edits=(3, 6))
     folder = SAMPLES / FORMAT_VERSION
     folder.mkdir(parents=True)
     write_stream(folder / "stream.gss", packets)
-    for name, packet in (("key", packets[0]), ("delta", packets[1]), ("empty", packets[2])):
-        (folder / f"{name}.bin").write_bytes(packet.data)
+    for name, packet in (("key", 0), ("delta", 1), ("empty", 2), ("births", 3)):
+        (folder / f"{name}.bin").write_bytes(packets[packet].data)
     expected = [digest(state.gaussians) for state in decode_all(packets)]
     (folder / "expected.json").write_text(json.dumps(expected, indent=1) + "\n")
 

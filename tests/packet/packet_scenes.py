@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from gsstream.core.births import Births
 from gsstream.core.cameras import Cameras
 from gsstream.core.delta import Delta, Layout, active_rows
 from gsstream.core.gaussians import Gaussians
@@ -66,8 +68,27 @@ def make_delta(
     return Delta(gates.astype(np.uint8), levels, symbols, dict.fromkeys(widths, 0.01), decoders)
 
 
-def make_packets(seed: int = 0, frames: int = 7, key_at: int = 4, **sizes: int) -> list[EncodedPacket]:
-    """Key, deltas with a decoder that changes once, an empty packet at frame 2, a second key."""
+def make_births(rng: np.random.Generator, layout: Layout, number: int, new: int, sh_rest: int = 3) -> Births:
+    nodes = len(layout.node_counts)
+    parents = nodes + np.arange(new) - rng.integers(0, 3, new).clip(0, nodes)
+    where = np.sort(rng.integers(0, nodes + new, number))
+    return Births(make_scene(rng, number, sh_rest), where, rng.integers(0, 3, number).astype(np.uint8), parents)
+
+
+def make_edit(rng: np.random.Generator, state: PlayerState, births: int = 3, deaths: float = 0.2) -> Delta:
+    """A delta with births in old and new nodes and some deaths; one in three moves nothing else."""
+    delta = make_delta(rng, state.layout, share=0.4 * int(rng.random() < 0.7))
+    gone = np.flatnonzero(rng.random(len(state.gaussians)) < deaths)
+    born = None
+    if births:
+        born = make_births(rng, state.layout, births, int(rng.integers(0, 3)), state.gaussians.shN.shape[1])
+    return replace(delta, births=born, deaths=gone)
+
+
+def make_packets(
+    seed: int = 0, frames: int = 7, key_at: int = 4, edits: tuple[int, ...] = (), **sizes: int
+) -> list[EncodedPacket]:
+    """Key, deltas with a decoder that changes once, an empty packet at frame 2, a second key; births at ``edits``."""
     rng = np.random.default_rng(seed)
     state: PlayerState | None = None
     packets = []
@@ -76,6 +97,8 @@ def make_packets(seed: int = 0, frames: int = 7, key_at: int = 4, **sizes: int) 
             packet = encode_key(make_key(rng, **sizes), frame=frame)
         elif frame == 2:
             packet = encode_empty(frame=frame)
+        elif frame in edits:
+            packet = encode_delta(make_edit(rng, state), state.layout, state.decoders, frame=frame)
         else:
             packet = encode_delta(make_delta(rng, state.layout), state.layout, state.decoders, frame=frame)
         packets.append(packet)

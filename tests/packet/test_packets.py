@@ -25,7 +25,7 @@ from gsstream.packet import (
     quantise_key,
 )
 from gsstream.packet.base import SECTION_NAMES, parse_packet
-from gsstream.packet.key import KEY_BITS
+from gsstream.packet.grids import KEY_BITS
 
 SEEDS = st.integers(0, 2**32 - 1)
 

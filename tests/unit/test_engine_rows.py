@@ -1,0 +1,95 @@
+"""Encoder state over births and deaths: hierarchy, moments and decoders follow the packet and nothing else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsstream.core.births import Births, gather_rows, in_nodes, own_nodes
+from gsstream.core.delta import Delta, Layout
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.hierarchy import Hierarchy
+from gsstream.engine.parameters import AdamTable
+from gsstream.engine.rows import edit_of, follow
+from gsstream.engine.stream_state import StreamState
+from gsstream.packet import decode_packet, encode_delta, encode_key
+from gsstream.testing.checks.packet import tiny_key
+
+
+def scene(number: int, seed: int = 0) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (3, 3)}
+    return Gaussians(**{n: rng.normal(size=(number, *s)).astype(np.float32) for n, s in shapes.items()})
+
+
+@pytest.fixture
+def state() -> StreamState:
+    player = decode_packet(None, encode_key(tiny_key()).data)
+    nodes = len(player.layout.node_counts)
+    parent = torch.tensor([0] * 3 + [0] * (nodes - 3))
+    parent[1:3] = torch.tensor([1, 2])
+    level = (parent != torch.arange(nodes)).long()
+    hierarchy = Hierarchy(torch.from_numpy(player.layout.node_of), parent, level)
+    moments = {"step": torch.tensor(7.0), "exp_avg": torch.arange(nodes).float(), "exp_avg_sq": torch.ones(nodes)}
+    return StreamState(player, hierarchy, None, {"sh0": torch.ones(2, 3)}, gate_moments=moments)
+
+
+def step(state: StreamState, delta: Delta) -> StreamState:
+    player = state.player
+    packet = encode_delta(delta, player.layout, player.decoders, frame=player.frame + 1)
+    return follow(state, decode_packet(player, packet.data))
+
+
+def delta_of(layout: Layout, births: Births | None, deaths: list[int] | None = None) -> Delta:
+    gates = np.zeros(len(layout.node_counts), np.uint8)
+    return Delta(gates, 1, births=births, deaths=np.array(deaths or [], np.int64))
+
+
+def test_the_forest_grows_with_the_packet(state):
+    nodes = len(state.player.layout.node_counts)
+    # Two new nodes: one below node 4 (which is below node 0), one below that one, and a new root.
+    parents = np.array([4, nodes, nodes + 2])
+    born = Births(scene(4), np.array([2, nodes, nodes + 1, nodes + 2]), np.zeros(4, np.uint8), parents)
+    after = step(state, delta_of(state.player.layout, born, [0, 7]))
+    after.hierarchy.validate()
+    assert after.hierarchy.num_gaussians == len(after.player.gaussians) == 42
+    assert after.hierarchy.level.tolist()[nodes:] == [2, 3, 0]
+    assert after.hierarchy.parent.tolist()[nodes:] == [4, nodes, nodes + 2]
+    assert np.array_equal(after.hierarchy.node_of.numpy(), after.player.layout.node_of)
+    assert torch.equal(after.hierarchy.parent[:nodes], state.hierarchy.parent)
+
+
+def test_gate_moments_stay_with_their_nodes(state):
+    nodes = len(state.player.layout.node_counts)
+    after = step(state, delta_of(state.player.layout, own_nodes(scene(3), np.zeros(3), nodes), [1]))
+    assert after.gate_moments["step"] == 7
+    assert after.gate_moments["exp_avg"].tolist() == [*range(nodes), 0, 0, 0]
+    assert after.gate_moments["exp_avg_sq"].tolist() == [1] * nodes + [0] * 3
+
+
+def test_a_packet_without_births_leaves_the_forest_alone(state):
+    gates = np.ones(len(state.player.layout.node_counts), np.uint8)
+    symbols = {"opacities": np.ones((40, 1), np.int32)}
+    after = step(state, Delta(gates, 1, symbols, {"opacities": 0.1}))
+    assert after.hierarchy is state.hierarchy
+    assert after.gate_moments is state.gate_moments
+    assert torch.equal(after.decoders["sh0"], torch.ones(2, 3))
+
+
+def test_per_gaussian_moments_follow_the_edit(state):
+    layout = state.player.layout
+    table = AdamTable({"x": torch.arange(40.0)[:, None]}, {"x": 0.0})
+    table.step({"x": torch.arange(40.0)[:, None] + 1})
+    delta = delta_of(layout, in_nodes(scene(3), [int(layout.node_of[0]), 5, 11], [0, 0, 0]), [0, 20, 39])
+    edit = edit_of(layout, delta)
+    source = gather_rows(layout.node_of, delta.births, delta.deaths)
+    assert torch.equal(edit.fresh, torch.from_numpy(source >= 40))
+    assert int(edit.fresh.sum()) == 3
+    assert int(edit.source.max()) < 40
+    table.edit(edit)
+    moments = table.moments("x")["exp_avg"][:, 0]
+    assert moments[edit.fresh].tolist() == [0, 0, 0]
+    kept = ~edit.fresh
+    torch.testing.assert_close(moments[kept], 0.1 * (torch.from_numpy(source)[kept] + 1.0))
+    assert table["x"][kept, 0].tolist() == source[kept.numpy()].tolist()

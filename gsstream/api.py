@@ -44,6 +44,7 @@ from gsstream.gate.base import GateSampler as GateSampler
 from gsstream.loss.base import Loss as Loss
 from gsstream.propagation.base import Propagation as Propagation
 from gsstream.regularizer.base import Regularizer as Regularizer
+from gsstream.render.base import RenderCache as RenderCache
 from gsstream.render.base import Renderer as Renderer
 from gsstream.render.base import RenderOutput as RenderOutput
 from gsstream.render.base import RenderSession as RenderSession

@@ -7,7 +7,8 @@ counts while the transmittance before it exceeds 1e-4, near plane ``cameras.near
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import torch
 
@@ -33,10 +34,37 @@ class RenderOutput:
     alpha: torch.Tensor
 
 
-class RenderSession(ABC):
-    """Renders a scene of which only some rows change, from a fixed rig (one frame step).
+@dataclass(frozen=True, slots=True)
+class RenderCache:
+    """Memory a session keeps for its cameras.
 
-    ``rows`` are the A active rows; all other Gaussians stay as they were when the session was opened.
+    Arguments:
+        per_view: bytes of each view that is cached, scratch and images included; views drawn anew each time are absent.
+        gaussians: N of the scene.
+    """
+
+    per_view: Mapping[int, int] = field(default_factory=dict)
+    gaussians: int = 0
+
+    @property
+    def total(self) -> int:
+        """Bytes of all views."""
+        return sum(self.per_view.values())
+
+    @property
+    def per_camera_and_gaussian(self) -> float:
+        """Bytes per cached camera and Gaussian; 0 where nothing is cached."""
+        count = len(self.per_view) * self.gaussians
+        return self.total / count if count else 0.0
+
+
+class RenderSession(ABC):
+    """Renders a scene of which only some rows change, from a fixed rig.
+
+    A session begins wide: every row may change. ``narrow`` says which rows change from then on; all others stay as they
+    are in the session's scene. ``commit`` ends a frame: it gives the session of the next scene, wide again, which
+    renders and differentiates exactly as one opened anew would, and in which a renderer may keep whatever did not
+    change. ``screen_gradient`` belongs to the session's scene and may be asked for at any time.
     """
 
     @abstractmethod
@@ -51,21 +79,47 @@ class RenderSession(ABC):
         """Differentiable render of camera ``view``.
 
         Arguments:
-            rows: the A active rows, raw parameters.
+            rows: the A active rows, raw parameters; all N of a session that was not narrowed.
             probe: [A, 2] zeros that require grad; its gradient is the gradient of the 2-D means in pixels.
-            tile_mask: [ceil(H / 16), ceil(W / 16)] bool; None renders everything.
+            tile_mask: [ceil(H / 16), ceil(W / 16)] bool; None renders everything. Inside, image and alpha are those
+                of the scene with these rows, and gradients are sums over these pixels alone. Outside, a narrowed
+                session shows its scene as it was before these rows changed, or, where it keeps no cache, the scene with
+                these rows; so a mask must cover what the rows touch and touched, and an SSIM window that looks beyond
+                it sees the right picture. Outside, the gradient of the image is taken as zero.
         """
 
     @abstractmethod
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
-        """Pull an upstream image gradient [H, W, 3] back to the 2-D means (pixels) of the scene as it was opened.
+        """Pull an upstream image gradient [H, W, 3] back to the 2-D means (pixels) of the session's scene.
 
-        What this projects and sorts, ``render`` need not do again.
+        What this projects and sorts, ``render`` need not do again. Where the gradient is zero in most of the image, a
+        renderer may spend work only on the rest.
         """
 
     @abstractmethod
     def narrow(self, active: torch.Tensor) -> None:
-        """From now on only the rows ``active`` [A], ascending, change. For a session opened without active rows."""
+        """From now on only the rows ``active`` [A], ascending, change. Replaces an earlier choice."""
+
+    @abstractmethod
+    def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
+        """The session of the next scene: wide, and equal bit for bit to one opened anew with ``gaussians``.
+
+        This session gives its caches away; it stays correct, but has to fill them again. Backward through what it
+        rendered is no longer possible. Call it when nothing can fail any more, with decoded values: a frame that failed
+        after rendering changed nothing here, its session can be kept or dropped.
+
+        Arguments:
+            gaussians: the whole next scene, as many rows as now; not copied, so never change it in place.
+            changed: [A] int64 rows in which it may differ from the session's scene, whether they were active or not;
+                in no other row may it differ. May be empty.
+
+        Raises:
+            InputError: another number of rows, values that are not finite.
+        """
+
+    def cache_bytes(self) -> RenderCache:
+        """What is kept for the cameras; empty for a renderer that caches nothing."""
+        return RenderCache()
 
 
 class Renderer(Part):
@@ -130,3 +184,6 @@ class ScatterSession(RenderSession):
 
     def narrow(self, active: torch.Tensor) -> None:
         self._active = active
+
+    def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
+        return ScatterSession(self._renderer, gaussians, None, self._cameras, self._background)

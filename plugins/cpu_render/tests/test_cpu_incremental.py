@@ -78,18 +78,19 @@ def test_depth_ties_between_active_and_frozen_keep_memory_order() -> None:
     assert equal_bits(subject.forward_active(rows_of(splats, ids)), rasterizer().forward(splats))
 
 
-def test_commit_equals_a_full_forward_and_can_be_repeated() -> None:
+def test_update_equals_a_full_forward_and_can_be_repeated() -> None:
     splats = random_splats(200, 6, 4)
     subject = rasterizer()
-    subject.forward(splats)
+    shown = subject.forward(splats)
     for frame in range(4):
         ids, mask = some_ids(200, 25, frame), random_mask(frame)
         subject.freeze(mask, ids)
         rows = moved(rows_of(splats, ids), frame)
         subject.forward_active(rows)
-        subject.commit(rows)
+        subject.update(ids, rows, *shown)
         splats = with_rows(splats, ids, rows)
         assert equal_bits(subject.forward_cached(), rasterizer().forward(splats))
+        assert equal_bits(shown, rasterizer().forward(splats))
     subject.freeze(None, some_ids(200, 25, 99))
     ids = some_ids(200, 25, 99)
     subject.forward_active(rows_of(splats, ids))
@@ -148,7 +149,7 @@ def test_order_of_calls_is_checked() -> None:
         subject.backward(*upstream(0))
     with pytest.raises(InputError, match="expected shape"):
         subject.forward_active(splats)
-    subject.commit(rows_of(splats, ids))
+    subject.update(ids, rows_of(splats, ids), *subject.forward_cached())
     with pytest.raises(InputError, match="expected freeze"):
         subject.forward_active(rows_of(splats, ids))
 

@@ -12,6 +12,7 @@ namespace gsstream_cpu {
 using FloatArray = nanobind::ndarray<float, nanobind::c_contig, nanobind::device::cpu>;
 using ConstFloatArray = nanobind::ndarray<const float, nanobind::c_contig, nanobind::device::cpu>;
 using ByteArray = nanobind::ndarray<const uint8_t, nanobind::c_contig, nanobind::device::cpu>;
+using ByteOutArray = nanobind::ndarray<uint8_t, nanobind::c_contig, nanobind::device::cpu>;
 using IndexArray = nanobind::ndarray<const uint32_t, nanobind::c_contig, nanobind::device::cpu>;
 using IndexOutArray = nanobind::ndarray<uint32_t, nanobind::c_contig, nanobind::device::cpu>;
 

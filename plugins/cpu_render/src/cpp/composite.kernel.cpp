@@ -77,7 +77,7 @@ GSS_INLINE uint32_t blend_entry(ForwardTile& tile, const Kernel& k, uint32_t blo
 }
 
 GSS_INLINE void blend_tile(const CompositeJob& job, ForwardTile& tile, uint32_t index, float x, float y) {
-  const uint32_t first = job.lists.offset[index], count = job.lists.offset[index + 1] - first;
+  const uint32_t first = job.lists.begin[index], count = job.lists.end[index] - first;
   const TileEntry* entries = job.lists.entries + first;
   const uint32_t* blocks = job.lists.blocks + first;
   uint32_t* contributed = job.contributed + first;
@@ -93,10 +93,10 @@ GSS_INLINE void blend_tile(const CompositeJob& job, ForwardTile& tile, uint32_t 
   for (; k < count; k++) contributed[k] = 0;
 }
 
-GSS_INLINE void finish_tile(const CompositeJob& job, ForwardTile& tile, std::size_t slot, uint32_t index, int tile_x,
-                            int tile_y) {
-  float* kept_transmittance = job.pixel_transmittance + slot * BLOCKS * BLOCK_PIXELS;
-  int32_t* kept_last = job.pixel_last + slot * BLOCKS * BLOCK_PIXELS;
+GSS_INLINE void finish_tile(const CompositeJob& job, ForwardTile& tile, uint32_t index, int tile_x, int tile_y) {
+  const std::size_t pixels = static_cast<std::size_t>(index) * BLOCKS * BLOCK_PIXELS;
+  float* kept_transmittance = job.pixel_transmittance + pixels;
+  int32_t* kept_last = job.pixel_last + pixels;
   for (uint32_t blocks = job.tile_blocks[index]; blocks; blocks &= blocks - 1) {
     const int b = __builtin_ctz(blocks);
     for (int q = 0; q < BLOCK_PIXELS; q += LANES) {
@@ -121,7 +121,7 @@ void forward(const CompositeJob& job, std::size_t first_tile, std::size_t end_ti
               y = static_cast<int>(index) / job.tiles_x * TILE_HEIGHT;
     start_tile(tile, job.tile_blocks[index]);
     blend_tile(job, tile, index, static_cast<float>(x), static_cast<float>(y));
-    finish_tile(job, tile, slot, index, x, y);
+    finish_tile(job, tile, index, x, y);
   }
 }
 
@@ -135,12 +135,13 @@ struct BackwardTile {
 };
 
 // False if the upstream gradient is zero all over the tile (NaN is not zero).
-GSS_INLINE bool start_backward_tile(const CompositeBackwardJob& job, BackwardTile& tile, std::size_t slot,
-                                    uint32_t index, int tile_x, int tile_y) {
+GSS_INLINE bool start_backward_tile(const CompositeBackwardJob& job, BackwardTile& tile, uint32_t index, int tile_x,
+                                    int tile_y) {
   const CompositeJob& fwd = job.forward;
   const float* background = fwd.background;
-  const float* kept_transmittance = fwd.pixel_transmittance + slot * BLOCKS * BLOCK_PIXELS;
-  const int32_t* kept_last = fwd.pixel_last + slot * BLOCKS * BLOCK_PIXELS;
+  const std::size_t pixels = static_cast<std::size_t>(index) * BLOCKS * BLOCK_PIXELS;
+  const float* kept_transmittance = fwd.pixel_transmittance + pixels;
+  const int32_t* kept_last = fwd.pixel_last + pixels;
   Ints magnitude{};
   for (uint32_t blocks = fwd.tile_blocks[index]; blocks; blocks &= blocks - 1) {
     const int b = __builtin_ctz(blocks);
@@ -223,11 +224,11 @@ GSS_INLINE void roll_back_entry(BackwardTile& tile, const Kernel& k, uint32_t bl
 
 // Entries in front of the first one that wants a gradient need no visit. Returns the index of that entry (or the
 // number of entries) and clears the moments of the pairs before it.
-GSS_INLINE uint32_t first_wanted(const CompositeBackwardJob& job, uint32_t first, uint32_t count, bool tile_matters) {
+GSS_INLINE uint32_t first_wanted(const CompositeBackwardJob& job, uint32_t first, uint32_t count, uint32_t wanted) {
   for (uint32_t k = 0; k < count; k++) {
     const uint32_t pair = job.forward.lists.entries[first + k].pair;
     if (pair == FROZEN) continue;
-    if (tile_matters && job.forward.contributed[first + k]) return k;
+    if (job.forward.contributed[first + k] & wanted) return k;
     std::memset(job.moments + static_cast<std::size_t>(pair) * MOMENT_STRIDE, 0, MOMENT_STRIDE * sizeof(float));
   }
   return count;
@@ -235,15 +236,16 @@ GSS_INLINE uint32_t first_wanted(const CompositeBackwardJob& job, uint32_t first
 
 GSS_INLINE void differentiate_tile(const CompositeBackwardJob& job, BackwardTile& tile, std::size_t slot) {
   const CompositeJob& fwd = job.forward;
-  const uint32_t index = fwd.tiles[slot], first = fwd.lists.offset[index], count = fwd.lists.offset[index + 1] - first;
+  const uint32_t index = fwd.tiles[slot], first = fwd.lists.begin[index], count = fwd.lists.end[index] - first;
   const int x = static_cast<int>(index) % fwd.tiles_x * TILE_WIDTH,
             y = static_cast<int>(index) / fwd.tiles_x * TILE_HEIGHT;
   const TileEntry* entries = fwd.lists.entries + first;
-  const bool matters = start_backward_tile(job, tile, slot, index, x, y);
-  const int32_t front = static_cast<int32_t>(first_wanted(job, first, count, matters));
+  // Forward may have drawn more blocks than are differentiated.
+  const uint32_t wanted = start_backward_tile(job, tile, index, x, y) ? fwd.tile_blocks[index] : 0;
+  const int32_t front = static_cast<int32_t>(first_wanted(job, first, count, wanted));
   for (int32_t k = static_cast<int32_t>(count) - 1; k >= front; k--) {
     if (k >= PREFETCH) __builtin_prefetch(&fwd.records[entries[k - PREFETCH].record]);
-    const uint32_t blocks = fwd.contributed[first + k], pair = entries[k].pair;
+    const uint32_t blocks = fwd.contributed[first + k] & wanted, pair = entries[k].pair;
     float* moments = job.moments + static_cast<std::size_t>(pair) * MOMENT_STRIDE;
     if (!blocks) {
       if (pair != FROZEN) std::memset(moments, 0, MOMENT_STRIDE * sizeof(float));

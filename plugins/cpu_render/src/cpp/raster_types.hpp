@@ -94,9 +94,9 @@ struct TileEntry {
   uint32_t pair;  // where its moments go, or FROZEN: no gradient wanted
 };
 
-// Depth-sorted entries of every tile: those of tile t are [offset[t], offset[t+1]).
+// Depth-sorted entries of every tile: those of tile t are [begin[t], end[t]).
 struct TileListsView {
-  const uint32_t* offset;
+  const uint32_t *begin, *end;
   const TileEntry* entries;
   const uint32_t* blocks;
 };
@@ -110,8 +110,8 @@ struct CompositeJob {
   float background[3];
   float *image, *transmittance;  // caller's [H,W,3] and [H,W]; only active blocks are written
   uint32_t* contributed;         // per entry: the blocks where it added light; backward visits only these
-  float* pixel_transmittance;    // per active tile, block order: final transmittance
-  int32_t* pixel_last;           // per active tile, block order: entries from this index on were not counted
+  float* pixel_transmittance;    // per tile of the image, block order: final transmittance
+  int32_t* pixel_last;           // per tile of the image, block order: entries from this index on were not counted
 };
 
 struct CompositeBackwardJob {

@@ -5,6 +5,7 @@
 #include <stdexcept>
 #include <string>
 
+#include "claim.hpp"
 #include "parallel.hpp"
 
 namespace gsstream_cpu {
@@ -17,22 +18,6 @@ constexpr std::size_t CLEAR_GRAIN = 16384;   // rows
 std::size_t chunk_count(std::size_t rows) { return (rows + PROJECT_CHUNK - 1) / PROJECT_CHUNK; }
 
 }  // namespace
-
-class Rasterizer::Claim {
- public:
-  explicit Claim(std::atomic<bool>& busy) : busy_(busy) {
-    if (busy_.exchange(true))
-      throw std::runtime_error(
-          "this Rasterizer is already running in another thread; expected one Rasterizer per camera "
-          "and thread. Create a second one.");
-  }
-  ~Claim() { busy_.store(false); }
-  Claim(const Claim&) = delete;
-  Claim& operator=(const Claim&) = delete;
-
- private:
-  std::atomic<bool>& busy_;
-};
 
 Rasterizer::Rasterizer()
     : isa_(active_isa()),
@@ -94,26 +79,26 @@ void Rasterizer::join_chunks(std::size_t chunks) {
 }
 
 // Stage 3.
-void Rasterizer::composite(const TileLists& lists, const TileSelection& selection, const Target& target) {
-  const std::size_t pixels = selection.active.size() * BLOCKS * BLOCK_PIXELS;
-  job_ = {};
-  job_.records = records_.data();
-  job_.lists = lists.view();
-  job_.tiles = selection.active.data();
-  job_.tile_blocks = selection.blocks.data();
-  job_.tiles_x = selection.tiles_x;
-  job_.width = camera_.width;
-  job_.height = camera_.height;
-  std::copy_n(target.background, 3, job_.background);
-  job_.image = target.image;
-  job_.transmittance = target.transmittance;
-  job_.contributed = contributed_.require(lists.size);
-  job_.pixel_transmittance = pixel_transmittance_.require(pixels);
-  job_.pixel_last = pixel_last_.require(pixels);
+CompositeJob Rasterizer::composite(const TileListsView& lists, const TileSelection& selection, const Target& target,
+                                   uint32_t* contributed, PixelTrace& trace) {
+  const std::size_t pixels = selection.blocks.size() * BLOCKS * BLOCK_PIXELS;
+  CompositeJob job{};
+  job.records = records_.data();
+  job.lists = lists;
+  job.tiles = selection.active.data();
+  job.tile_blocks = selection.blocks.data();
+  job.tiles_x = selection.tiles_x;
+  job.width = camera_.width;
+  job.height = camera_.height;
+  std::copy_n(target.background, 3, job.background);
+  job.image = target.image;
+  job.transmittance = target.transmittance;
+  job.contributed = contributed;
+  job.pixel_transmittance = trace.transmittance.require(pixels);
+  job.pixel_last = trace.last.require(pixels);
   parallel_for(selection.active.size(), TILE_GRAIN,
-               [&](std::size_t begin, std::size_t end) { composite_kernels_.forward(job_, begin, end); });
-  job_tiles_ = selection.active.size();
-  lists_ = &lists;
+               [&](std::size_t begin, std::size_t end) { composite_kernels_.forward(job, begin, end); });
+  return job;
 }
 
 uint32_t Rasterizer::forward(const Scene& scene, const Camera& camera, const uint8_t* mask, const Target& target) {
@@ -126,11 +111,17 @@ uint32_t Rasterizer::forward(const Scene& scene, const Camera& camera, const uin
   const uint32_t faults = project(scene, selection_, records_.require(scene.count));
   if (faults) return faults;
   sort_by_depth(visible_.by_depth, sort_scratch_, visible_.count);
-  build_tile_lists(visible_, selection_.blocks.size(), 0, cached_lists_);
-  composite(cached_lists_, selection_, target);
+  build_tile_lists(visible_, selection_.blocks.size(), 0, merged_lists_);
+  entry_count_ = merged_lists_.size;
+  cached_lists_.adopt(merged_lists_);
+  job_ = composite(cached_lists_.view(), selection_, target, cached_lists_.contributed.data(), cached_trace_);
+  job_tiles_ = selection_.active.size();
+  cached_visible_.clear(scene.count);
+  for (std::size_t i = 0; i < visible_.count; i++) cached_visible_.insert(visible_.rows[i]);
   scene_ = scene;
   scene_count_ = scene.count;
   cached_selection_ = selection_;
+  std::copy_n(target.background, 3, cached_background_);
   cached_ = true;
   mode_ = Mode::full;
   return 0;
@@ -141,34 +132,35 @@ void Rasterizer::freeze(const uint8_t* mask, const uint32_t* active, std::size_t
   if (!cached_)
     throw std::invalid_argument(
         "freeze: expected a forward pass of the whole scene before, got none. Call forward first.");
-  for (std::size_t i = 0; i < count; i++)
-    if (active[i] >= scene_count_ || (i > 0 && active[i] <= active[i - 1]))
-      throw std::invalid_argument("freeze: active_ids must be strictly ascending rows below " +
-                                  std::to_string(scene_count_) + ", got " + std::to_string(active[i]) + " at index " +
-                                  std::to_string(i) + ". Sort them and drop duplicates.");
   TileSelection wanted;
   wanted.build(camera_.width, camera_.height, mask);
   if (!cached_selection_.contains(wanted))
     throw std::invalid_argument(
         "freeze: tile_mask has tiles that the cached forward pass did not cover. Run forward with a mask that covers "
         "them.");
-  mode_ = Mode::none;
+  set_active(active, count, "freeze: active_ids");
   selection_ = std::move(wanted);
+  filter_tile_lists(cached_lists_.view(), selection_.blocks, is_active_, frozen_lists_, dropped_blocks_);
+  frozen_ = true;
+}
+
+void Rasterizer::set_active(const uint32_t* active, std::size_t count, const char* name) {
+  for (std::size_t i = 0; i < count; i++)
+    if (active[i] >= scene_count_ || (i > 0 && active[i] <= active[i - 1]))
+      throw std::invalid_argument(std::string(name) + " must be strictly ascending rows below " +
+                                  std::to_string(scene_count_) + ", got " + std::to_string(active[i]) + " at index " +
+                                  std::to_string(i) + ". Sort them and drop duplicates.");
+  mode_ = Mode::none;
   is_active_.resize(scene_count_, 0);
   for (uint32_t row : active_rows_)
     if (row < is_active_.size()) is_active_[row] = 0;
   active_rows_.assign(active, active + count);
   for (uint32_t row : active_rows_) is_active_[row] = 1;
   records_.require_keeping(scene_count_ + count, scene_count_);
-  filter_tile_lists(cached_lists_, selection_.blocks, is_active_, frozen_lists_, dropped_blocks_);
-  frozen_ = true;
 }
 
 // Projects the active rows and leaves their lists over `selection` in active_lists_.
 uint32_t Rasterizer::list_active(const Scene& rows, const TileSelection& selection) {
-  if (!frozen_)
-    throw std::invalid_argument(
-        "expected freeze(tile_mask, active_ids) before an active pass, got none since the last forward or commit.");
   const uint32_t base = static_cast<uint32_t>(scene_count_);
   const uint32_t faults = project(rows, selection, records_.data() + base);
   if (faults) return faults;
@@ -181,6 +173,9 @@ uint32_t Rasterizer::forward_active(const Scene& rows, const Target& target, boo
   const Claim claim(busy_);
   mode_ = Mode::none;
   passes_++;
+  if (!frozen_)
+    throw std::invalid_argument(
+        "expected freeze(tile_mask, active_ids) before an active pass, got none since the last forward or update.");
   const uint32_t faults = list_active(rows, selection_);
   if (faults) return faults;
   if (touched_only) {
@@ -191,7 +186,9 @@ uint32_t Rasterizer::forward_active(const Scene& rows, const Target& target, boo
   const TileSelection& wanted = touched_only ? touched_ : selection_;
   merge_tile_lists(frozen_lists_, active_lists_, wanted.blocks, records_.data(), static_cast<uint32_t>(scene_count_),
                    active_rows_, merged_lists_);
-  composite(merged_lists_, wanted, target);
+  entry_count_ = merged_lists_.size;
+  job_ = composite(merged_lists_.view(), wanted, target, contributed_.require(entry_count_), trace_);
+  job_tiles_ = wanted.active.size();
   scene_ = rows;
   mode_ = Mode::active;
   return 0;
@@ -208,26 +205,7 @@ void Rasterizer::forward_cached(const uint8_t* mask, const Target& target) {
     throw std::invalid_argument("forward_cached: tile_mask has tiles that the cached forward pass did not cover.");
   mode_ = Mode::none;
   passes_++;
-  composite(cached_lists_, wanted, target);
-}
-
-uint32_t Rasterizer::commit(const Scene& rows) {
-  const Claim claim(busy_);
-  mode_ = Mode::none;
-  if (frozen_) filter_tile_lists(cached_lists_, cached_selection_.blocks, is_active_, frozen_lists_, dropped_blocks_);
-  const uint32_t faults = list_active(rows, cached_selection_);
-  frozen_ = false;
-  if (faults) return faults;
-  const uint32_t base = static_cast<uint32_t>(scene_count_);
-  merge_tile_lists(frozen_lists_, active_lists_, cached_selection_.blocks, records_.data(), base, active_rows_,
-                   merged_lists_);
-  for (std::size_t e = 0; e < merged_lists_.size; e++) {
-    uint32_t& record = merged_lists_.entries[e].record;
-    if (record >= base) record = active_rows_[record - base];
-  }
-  for (std::size_t slot = 0; slot < active_rows_.size(); slot++) records_[active_rows_[slot]] = records_[base + slot];
-  cached_lists_.swap(merged_lists_);
-  return 0;
+  composite(cached_lists_.view(), wanted, target, contributed_.require(cached_lists_.used), trace_);
 }
 
 void Rasterizer::clear_gradients(const GradientArrays& out) const {
@@ -271,17 +249,6 @@ void Rasterizer::backward(const float* image_gradient, const float* alpha_gradie
 void Rasterizer::backward_active(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out) {
   const Claim claim(busy_);
   differentiate(Mode::active, image_gradient, alpha_gradient, out, false);
-}
-
-std::size_t Rasterizer::memory_bytes() const {
-  std::size_t bytes = visible_.bytes() + sort_scratch_.bytes() + contributed_.bytes() + pixel_transmittance_.bytes() +
-                      moments_.bytes() + pixel_last_.bytes() + records_.bytes() +
-                      active_rows_.capacity() * sizeof(uint32_t) + is_active_.capacity();
-  for (const TileLists* lists : {&cached_lists_, &frozen_lists_, &active_lists_, &merged_lists_})
-    bytes += lists->bytes();
-  for (std::size_t c = 0; c < chunk_capacity_; c++)
-    bytes += sizeof(ProjectChunk) + chunks_[c].pairs.capacity * sizeof(Pair);
-  return bytes;
 }
 
 }  // namespace gsstream_cpu

@@ -1,8 +1,8 @@
 // The rasteriser of one camera: runs the stages, owns their scratch and, in the incremental mode, the cached scene.
 //
 //   full path         forward -> backward
-//   incremental mode  forward (fills the cache) -> freeze -> { forward_active -> backward_active }* -> commit -> freeze
-//   ...
+//   incremental mode  forward (fills the cache) -> freeze -> { forward_active -> backward_active }* -> update -> freeze
+//   ...               at any time after forward: backward_cached, forward_cached
 //
 // The incremental mode gives the same bits as the full path over the same tiles, without any cost that grows with the
 // number of frozen Gaussians. Results do not depend on the number of threads. Not re-entrant: concurrent use of one
@@ -17,8 +17,10 @@
 #include "buffer.hpp"
 #include "raster_kernels.hpp"
 #include "raster_types.hpp"
+#include "screen_pass.hpp"
 #include "tile_lists.hpp"
 #include "tile_selection.hpp"
+#include "tile_store.hpp"
 
 namespace gsstream_cpu {
 
@@ -31,6 +33,13 @@ struct Scene {
 struct Target {
   float background[3];
   float *image, *transmittance;
+};
+
+// What a backward needs of the pixels of its forward, tile by tile.
+struct PixelTrace {
+  Buffer<float> transmittance;
+  Buffer<int32_t> last;
+  std::size_t bytes() const { return transmittance.bytes() + last.bytes(); }
 };
 
 class Rasterizer {
@@ -47,6 +56,12 @@ class Rasterizer {
   // Renders from the cache alone (no projection, no gradients).
   void forward_cached(const uint8_t* mask, const Target& target);
 
+  // Gradient of the 2-D means [N,2] of the cached scene, from what its forward left: nothing is rendered. Costs follow
+  // the pixels at which the image gradient is not zero. `scene`: the values that the cache was made of.
+  void backward_cached(const Scene& scene, const float* image_gradient, float* means2d_gradient);
+  // out [N]: 1 for the rows of the cached scene that touch a cached tile.
+  void visible_in_cache(uint8_t* out) const;
+
   // Ends the life of the arrays given to the last forward; no backward may follow.
   void forget() { mode_ = Mode::none; }
   // out.means null: only out.means2d is written. Outputs have one row per Gaussian (zero where unseen), or with
@@ -57,19 +72,24 @@ class Rasterizer {
 
   // active: strictly ascending rows of the cached scene.
   void freeze(const uint8_t* mask, const uint32_t* active, std::size_t count);
-  // Puts the final values of the active rows into the cache. Ends the freeze.
-  uint32_t commit(const Scene& rows);
+  // Puts new values of some rows (strictly ascending) into the cache and renders anew, into `target`, the tiles that
+  // these rows touched or touch. The cache is then as after a forward of the changed scene. Ends the freeze. Returns
+  // Fault bits; if any is set nothing was changed.
+  uint32_t update(const uint32_t* changed, const Scene& rows, const Target& target);
+  // Lets go of the memory that only a full pass needs. No backward may follow.
+  void shed_scratch();
 
   const VisibleSet& visible() const { return visible_; }
   std::size_t pair_count() const { return visible_.pair_count; }
-  std::size_t entry_count() const { return lists_ ? lists_->size : 0; }
+  std::size_t entry_count() const { return entry_count_; }
   std::size_t scene_count() const { return scene_count_; }
   std::size_t active_count() const { return active_rows_.size(); }
   int width() const { return camera_.width; }
   int height() const { return camera_.height; }
   Isa isa() const { return isa_; }
   uint64_t passes() const { return passes_; }
-  std::size_t memory_bytes() const;
+  std::size_t memory_bytes() const;  // cache_bytes() and scratch
+  std::size_t cache_bytes() const;
 
  private:
   enum class Mode { none, full, active };
@@ -77,8 +97,11 @@ class Rasterizer {
 
   uint32_t project(const Scene& scene, const TileSelection& selection, Record* records);
   void join_chunks(std::size_t chunks);
+  void set_active(const uint32_t* active, std::size_t count, const char* name);
   uint32_t list_active(const Scene& rows, const TileSelection& selection);
-  void composite(const TileLists& lists, const TileSelection& selection, const Target& target);
+  CompositeJob composite(const TileListsView& lists, const TileSelection& selection, const Target& target,
+                         uint32_t* contributed, PixelTrace& trace);
+  void replace_tiles(const std::vector<uint32_t>& changed_tiles);
   void differentiate(Mode mode, const float* image_gradient, const float* alpha_gradient, const GradientArrays& out,
                      bool compact);
   void clear_gradients(const GradientArrays& out) const;
@@ -94,7 +117,7 @@ class Rasterizer {
   Camera camera_{};
   Scene scene_;  // of the last forward
   CompositeJob job_{};
-  std::size_t job_tiles_ = 0;
+  std::size_t job_tiles_ = 0, entry_count_ = 0;
   TileSelection selection_;
   TileSelection touched_;  // of the last active pass with touched_only
   std::vector<uint32_t> dropped_blocks_;
@@ -104,16 +127,21 @@ class Rasterizer {
   VisibleSet visible_;
   Buffer<DepthItem> sort_scratch_;
   Buffer<uint32_t> contributed_;
-  Buffer<float> pixel_transmittance_, moments_;
-  Buffer<int32_t> pixel_last_;
-  const TileLists* lists_ = nullptr;  // of the last forward
+  PixelTrace trace_;
+  Buffer<float> moments_;
+  ScreenPass screen_;
 
-  // The cache: records of all Gaussians (then of the active rows) and depth-sorted lists of the whole scene.
+  // The cache: records of all Gaussians (then of the active rows), depth-sorted lists of the whole scene, what its
+  // forward left at the pixels, and who is visible.
   bool cached_ = false, frozen_ = false;
   std::size_t scene_count_ = 0;
   Buffer<Record> records_;
   TileSelection cached_selection_;
-  TileLists cached_lists_, frozen_lists_, active_lists_, merged_lists_;
+  float cached_background_[3] = {};
+  TileStore cached_lists_;
+  PixelTrace cached_trace_;
+  RowSet cached_visible_;
+  TileLists frozen_lists_, active_lists_, merged_lists_;  // merged_lists_ also receives the lists of a full pass
   std::vector<uint32_t> active_rows_;
   std::vector<uint8_t> is_active_;
 };

@@ -74,18 +74,19 @@ void build_tile_lists(const VisibleSet& visible, std::size_t tiles, uint32_t rec
   });
 }
 
-void filter_tile_lists(const TileLists& from, const std::vector<uint32_t>& tile_blocks,
+void filter_tile_lists(const TileListsView& from, const std::vector<uint32_t>& tile_blocks,
                        const std::vector<uint8_t>& is_active, TileLists& out, std::vector<uint32_t>& dropped) {
+  const std::size_t tiles = tile_blocks.size();
   std::size_t most = 0;
-  for (std::size_t tile = 0; tile < from.tiles; tile++)
-    if (tile_blocks[tile]) most += from.offset[tile + 1] - from.offset[tile];
-  out.resize(from.tiles, most);
-  dropped.assign(from.tiles, 0);
+  for (std::size_t tile = 0; tile < tiles; tile++)
+    if (tile_blocks[tile]) most += from.end[tile] - from.begin[tile];
+  out.resize(tiles, most);
+  dropped.assign(tiles, 0);
   uint32_t next = 0;
-  for (std::size_t tile = 0; tile < from.tiles; tile++) {
+  for (std::size_t tile = 0; tile < tiles; tile++) {
     out.offset[tile] = next;
     if (!tile_blocks[tile]) continue;
-    for (uint32_t e = from.offset[tile]; e < from.offset[tile + 1]; e++) {
+    for (uint32_t e = from.begin[tile]; e < from.end[tile]; e++) {
       const uint32_t blocks = from.blocks[e] & tile_blocks[tile];
       if (is_active[from.entries[e].record]) {
         dropped[tile] |= blocks;
@@ -95,8 +96,17 @@ void filter_tile_lists(const TileLists& from, const std::vector<uint32_t>& tile_
       }
     }
   }
-  out.offset[from.tiles] = next;
+  out.offset[tiles] = next;
   out.size = next;
+}
+
+void find_active_blocks(const TileListsView& lists, const std::vector<uint8_t>& is_active,
+                        std::vector<uint32_t>& touched) {
+  for (std::size_t tile = 0; tile < touched.size(); tile++) {
+    touched[tile] = 0;
+    for (uint32_t e = lists.begin[tile]; e < lists.end[tile]; e++)
+      if (is_active[lists.entries[e].record]) touched[tile] |= lists.blocks[e];
+  }
 }
 
 void add_touched_blocks(const TileLists& lists, std::vector<uint32_t>& touched) {

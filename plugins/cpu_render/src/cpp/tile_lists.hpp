@@ -25,7 +25,7 @@ struct TileLists {
   Buffer<uint32_t> offset;  // [tiles+1]
   Buffer<TileEntry> entries;
   Buffer<uint32_t> blocks;
-  TileListsView view() const { return {offset.data(), entries.data(), blocks.data()}; }
+  TileListsView view() const { return {offset.data(), offset.data() + 1, entries.data(), blocks.data()}; }
   std::size_t bytes() const { return offset.bytes() + entries.bytes() + blocks.bytes(); }
   void resize(std::size_t tile_count, std::size_t entry_count);
   void swap(TileLists& other);
@@ -36,11 +36,15 @@ void build_tile_lists(const VisibleSet& visible, std::size_t tiles, uint32_t rec
 
 // Entries of `from` in wanted tiles whose Gaussian is not marked in is_active, all FROZEN. `dropped` [tiles] becomes
 // the union of the blocks of those that are.
-void filter_tile_lists(const TileLists& from, const std::vector<uint32_t>& tile_blocks,
+void filter_tile_lists(const TileListsView& from, const std::vector<uint32_t>& tile_blocks,
                        const std::vector<uint8_t>& is_active, TileLists& out, std::vector<uint32_t>& dropped);
 
 // Adds the blocks of the entries of every tile to `touched` [tiles].
 void add_touched_blocks(const TileLists& lists, std::vector<uint32_t>& touched);
+
+// Blocks of every tile that hold an entry of a Gaussian marked in is_active.
+void find_active_blocks(const TileListsView& lists, const std::vector<uint8_t>& is_active,
+                        std::vector<uint32_t>& touched);
 
 // Merges two depth-sorted families of lists by (depth, row), in wanted tiles. Entries of `frozen` refer to
 // record = row; those of `active` to record = record_base + index into active_rows.

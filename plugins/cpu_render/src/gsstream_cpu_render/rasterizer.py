@@ -8,24 +8,13 @@ max(0, 0.5 + harmonics). Results are bit-identical for any number of threads. So
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gsstream_cpu_render import _native
-from gsstream_cpu_render.arrays import (
-    SplatArrays,
-    SplatGradients,
-    gradient_shapes,
-    new_gradients,
-    raise_on_faults,
-    require_float32,
-    require_mask,
-    require_splats,
-)
-from gsstream_cpu_render.checks import Float32, refuse, refuse_value
-from gsstream_cpu_render.view import NEAR, Background, checked_view
+from gsstream_cpu_render.arrays import SplatArrays, SplatGradients, raise_on_faults, require_mask, require_splats
+from gsstream_cpu_render.checks import Float32, native_array, refuse
+from gsstream_cpu_render.native import NativeRasterizer
+from gsstream_cpu_render.view import NEAR, Background
 
 
 def render_numpy(
@@ -45,7 +34,7 @@ def render_numpy(
     return NumpyRasterizer(viewmat, K, width, height, background, near).forward(splats)[0]
 
 
-class NumpyRasterizer:
+class NumpyRasterizer(NativeRasterizer):
     """Rasteriser of one fixed camera. Keeps its scratch memory: reuse it for many frames.
 
     Not for use by two threads at once (raises RuntimeError); different objects may run side by side.
@@ -61,23 +50,6 @@ class NumpyRasterizer:
     Raises:
         InputError: camera matrices of wrong shape, not finite, with skew or without a positive focal length.
     """
-
-    def __init__(
-        self,
-        viewmat: ArrayLike,
-        K: ArrayLike,
-        width: int,
-        height: int,
-        background: Background = (0.0, 0.0, 0.0),
-        near: float = NEAR,
-        *,
-        native: Any = None,
-    ) -> None:
-        self._view = checked_view(viewmat, K, width, height, background, near)
-        self.width, self.height = self._view.width, self._view.height
-        self._native = _native.Rasterizer() if native is None else native
-        self._coefficients = 1
-        self._scene_rows = 0
 
     # ---- the full path
 
@@ -201,14 +173,43 @@ class NumpyRasterizer:
         self._call("backward_active", *self._upstream(v_image, v_alpha), *gradients)
         return gradients
 
-    def commit(self, rows: SplatArrays) -> None:
-        """Put final values of the active rows into the cache, as if `forward` had seen them. Ends the freeze.
+    def update(
+        self, changed: NDArray[np.uint32], rows: SplatArrays, image: Float32, transmittance: Float32
+    ) -> None:
+        """Put new values of some rows into the cache and render anew the tiles these rows touched or touch.
+
+        Afterwards the cache, and ``image`` and ``transmittance`` if they held the cached render, have the bits that
+        `forward` of the changed scene would have given them. Ends the freeze.
+
+        Arguments:
+            changed: [A] uint32, strictly ascending rows of the cached scene. rows: their new values, A rows.
+            image, transmittance: [H, W, 3] and [H, W], written where a touched tile lies.
 
         Raises:
-            InputError: as forward_active.
+            InputError: as forward, unordered ids, no full forward yet. Nothing was changed then.
         """
-        rows = require_splats(rows, self._native.active_count)
-        raise_on_faults(self._call("commit", *rows), rows)
+        changed = native_array("changed", changed, np.uint32, ("A",))
+        rows = require_splats(rows, len(changed))
+        target = self._target(image, transmittance)
+        raise_on_faults(self._call("update", changed, *rows, self._view.background, *target), rows)
+
+    def backward_cached(self, splats: SplatArrays, v_image: Float32) -> tuple[Float32, NDArray[np.bool_]]:
+        """Gradient of sum(v_image * image) of the cached scene by its 2-D means [N, 2], and who is visible [N] bool.
+
+        Nothing is rendered, and work follows the pixels at which ``v_image`` [H, W, 3] is not zero. Same bits as
+        `backward_screen` of a full forward. A backward of an active pass may still follow.
+
+        Arguments:
+            splats: the values the cache was made of (`forward`, then every `update`).
+
+        Raises:
+            InputError: wrong dtype, shape or layout, no full forward yet, another number of rows.
+        """
+        splats = require_splats(splats)
+        v_means2d, visible = np.empty((len(splats.means), 2), np.float32), np.empty(len(splats.means), np.uint8)
+        self._call("backward_cached", *splats, self._upstream(v_image, None)[0], v_means2d)
+        self._call("visible_in_cache", visible)
+        return v_means2d, visible.view(np.bool_)
 
     def forward_cached(
         self,
@@ -225,66 +226,3 @@ class NumpyRasterizer:
         target = self._target(image, transmittance)
         self._call("forward_cached", self._view.background, require_mask(tile_mask, self.width, self.height), *target)
         return target
-
-    def forget(self) -> None:
-        """Let go of the arrays kept for backward (the cache stays). No backward may follow."""
-        self._native.forget()
-        self._coefficients, self._scene_rows = 1, 0
-
-    def release(self) -> Any:
-        """Give away the native object with its memory. This object is of no use afterwards."""
-        native, self._native = self._native, None
-        native.forget()
-        return native
-
-    # ---- facts
-
-    @property
-    def passes(self) -> int:
-        """Number of passes so far: tells whether a backward still belongs to its forward."""
-        return int(self._native.passes)
-
-    def memory_bytes(self) -> int:
-        """Bytes of scratch and cache held by this object: about 64 per Gaussian and 100 per (Gaussian, tile) pair."""
-        return int(self._native.memory_bytes())
-
-    def statistics(self) -> dict[str, int]:
-        """Counts of the last pass: visible Gaussians, (Gaussian, tile) pairs with gradients, entries composited."""
-        return {
-            "visible": self._native.visible_count,
-            "pairs": self._native.pair_count,
-            "entries": self._native.entry_count,
-        }
-
-    # ---- checks
-
-    def _call(self, name: str, *arguments: object) -> int:
-        try:
-            return getattr(self._native, name)(*arguments) or 0
-        except ValueError as error:
-            refuse_value(str(error))
-
-    def _target(self, image: Float32 | None, transmittance: Float32 | None) -> tuple[Float32, Float32]:
-        h, w = self.height, self.width
-        if image is None:
-            image = np.empty((h, w, 3), np.float32)
-            image[:] = self._view.background
-        if transmittance is None:
-            transmittance = np.ones((h, w), np.float32)
-        return (
-            require_float32("image", image, (h, w, 3), writable=True),
-            require_float32("transmittance", transmittance, (h, w), writable=True),
-        )
-
-    def _upstream(self, v_image: Float32, v_alpha: Float32 | None) -> tuple[Float32, Float32 | None]:
-        require_float32("v_image", v_image, (self.height, self.width, 3))
-        if v_alpha is not None:
-            require_float32("v_alpha", v_alpha, (self.height, self.width))
-        return v_image, v_alpha
-
-    def _gradients(self, rows: int, out: SplatGradients | None) -> SplatGradients:
-        if out is None:
-            return new_gradients(rows, self._coefficients)
-        for name, value, shape in zip(out._fields, out, gradient_shapes(rows, self._coefficients), strict=True):
-            require_float32(f"out.{name}", value, shape, writable=True)
-        return out

@@ -117,6 +117,9 @@ class GsplatSession(RenderSession):
         self._active = active.to(self._device)
         self._frozen = _moved(self._gaussians.map(torch.Tensor.detach), self._device)
 
+    def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
+        return GsplatSession(self._kernels, self._device, gaussians, None, self._cameras, self._background)
+
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
         return screen_gradient(
             self._kernels, self._device, self._gaussians, self._cameras, view, image_gradient

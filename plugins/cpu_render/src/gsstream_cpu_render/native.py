@@ -1,0 +1,107 @@
+"""The native rasteriser of one camera, arguments checked: what NumpyRasterizer is built on. Imports no torch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gsstream_cpu_render import _native
+from gsstream_cpu_render.arrays import SplatGradients, gradient_shapes, new_gradients, require_float32
+from gsstream_cpu_render.checks import Float32, refuse_value
+from gsstream_cpu_render.view import NEAR, Background, checked_view
+
+
+class NativeRasterizer:
+    """Life, memory and checks of a native rasteriser; arguments: see NumpyRasterizer."""
+
+    def __init__(
+        self,
+        viewmat: ArrayLike,
+        K: ArrayLike,
+        width: int,
+        height: int,
+        background: Background = (0.0, 0.0, 0.0),
+        near: float = NEAR,
+        *,
+        native: Any = None,
+    ) -> None:
+        self._view = checked_view(viewmat, K, width, height, background, near)
+        self.width, self.height = self._view.width, self._view.height
+        self._native = _native.Rasterizer() if native is None else native
+        self._coefficients = 1
+        self._scene_rows = 0
+
+    # ---- memory
+
+    def forget(self) -> None:
+        """Let go of the arrays kept for backward (the cache stays). No backward may follow."""
+        self._native.forget()
+        self._coefficients, self._scene_rows = 1, 0
+
+    def shed_scratch(self) -> None:
+        """Free the memory that only full passes need; the cache stays. No backward may follow; call freeze again."""
+        self._native.shed_scratch()
+
+    def release(self) -> Any:
+        """Give away the native object with its memory. This object is of no use afterwards."""
+        native, self._native = self._native, None
+        native.forget()
+        return native
+
+    # ---- facts
+
+    @property
+    def passes(self) -> int:
+        """Number of passes so far: tells whether a backward still belongs to its forward."""
+        return int(self._native.passes)
+
+    def memory_bytes(self) -> int:
+        """Bytes of scratch and cache held by this object: about 64 per Gaussian and 100 per (Gaussian, tile) pair."""
+        return int(self._native.memory_bytes())
+
+    def cache_bytes(self) -> int:
+        """Bytes of the cache alone: 64 per Gaussian, 16 per (Gaussian, tile) pair, 8 per pixel."""
+        return int(self._native.cache_bytes())
+
+    def statistics(self) -> dict[str, int]:
+        """Counts of the last pass: visible Gaussians, (Gaussian, tile) pairs with gradients, entries composited."""
+        return {
+            "visible": self._native.visible_count,
+            "pairs": self._native.pair_count,
+            "entries": self._native.entry_count,
+        }
+
+    # ---- checks
+
+    def _call(self, name: str, *arguments: object) -> int:
+        try:
+            return getattr(self._native, name)(*arguments) or 0
+        except ValueError as error:
+            refuse_value(str(error))
+
+    def _target(self, image: Float32 | None, transmittance: Float32 | None) -> tuple[Float32, Float32]:
+        h, w = self.height, self.width
+        if image is None:
+            image = np.empty((h, w, 3), np.float32)
+            image[:] = self._view.background
+        if transmittance is None:
+            transmittance = np.ones((h, w), np.float32)
+        return (
+            require_float32("image", image, (h, w, 3), writable=True),
+            require_float32("transmittance", transmittance, (h, w), writable=True),
+        )
+
+    def _upstream(self, v_image: Float32, v_alpha: Float32 | None) -> tuple[Float32, Float32 | None]:
+        require_float32("v_image", v_image, (self.height, self.width, 3))
+        if v_alpha is not None:
+            require_float32("v_alpha", v_alpha, (self.height, self.width))
+        return v_image, v_alpha
+
+    def _gradients(self, rows: int, out: SplatGradients | None) -> SplatGradients:
+        if out is None:
+            return new_gradients(rows, self._coefficients)
+        for name, value, shape in zip(out._fields, out, gradient_shapes(rows, self._coefficients), strict=True):
+            require_float32(f"out.{name}", value, shape, writable=True)
+        return out

@@ -1,0 +1,225 @@
+"""Render sessions: what stays the same from one iteration to the next, and from one frame to the next, is kept."""
+
+from __future__ import annotations
+
+from typing import Any, final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsstream.api import Cameras, Gaussians, InputError, RenderCache, RenderOutput, RenderSession, ScreenGradient
+from gsstream_cpu_render.arrays import SplatArrays
+from gsstream_cpu_render.autograd import differentiable, splats_of
+from gsstream_cpu_render.checks import Float32, as_array
+from gsstream_cpu_render.pool import Lease, Passes, lease
+from gsstream_cpu_render.view import Background
+
+Ids = NDArray[np.uint32]
+
+
+@final
+class CpuSession(RenderSession):
+    """Keeps one rasteriser and one render per view that was asked for, while the budget lasts.
+
+    A view beyond the budget is drawn as a whole each time: same bits, but its cost grows with the scene.
+
+    Arguments:
+        gaussians: the scene; rows outside `active` are read once per view.
+        active: [A] rows that change, any order, no duplicates; None: all.
+        cameras, background: the rig and the colour behind everything.
+        budget: bytes that the caches of all views may take together; None: no limit.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians[torch.Tensor],
+        active: torch.Tensor | None,
+        cameras: Cameras,
+        background: Background,
+        budget: int | None = None,
+    ) -> None:
+        self._gaussians, self._cameras, self._background, self._budget = gaussians, cameras, background, budget
+        self._views: dict[int, _CachedView] = {}
+        self._refused: set[int] = set()  # views that do not fit into the budget
+        self._order: torch.Tensor | None = None
+        self._ids: Ids | None = None
+        if active is not None:
+            self.narrow(active)
+
+    def narrow(self, active: torch.Tensor) -> None:
+        self._ids, self._order = _ascending(active)
+        for view in self._views.values():
+            view.thaw()
+
+    def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
+        upstream = as_array("image_gradient", image_gradient.contiguous())
+        splats = splats_of(self._gaussians)
+        cached = self._view(view)
+        held = self._lease(view) if cached is None else cached.held
+        if cached is None:
+            held.rasterizer.forward(splats)
+        gradient, visible = held.rasterizer.backward_cached(splats, upstream)
+        return ScreenGradient(torch.from_numpy(gradient), torch.from_numpy(visible))
+
+    def render(
+        self,
+        view: int,
+        rows: Gaussians[torch.Tensor],
+        *,
+        probe: torch.Tensor | None = None,
+        tile_mask: torch.Tensor | None = None,
+    ) -> RenderOutput:
+        mask = None if tile_mask is None else as_array("tile_mask", tile_mask)
+        if self._ids is None:
+            return differentiable(FullPass(self._lease(view), mask), rows, probe)
+        if self._order is not None:
+            rows = rows.rows(self._order)
+            probe = None if probe is None else probe[self._order]
+        cached = self._view(view)
+        passes: Passes
+        if cached is None:
+            passes = _UncachedPass(self._lease(view), splats_of(self._gaussians), self._ids, mask)
+        else:
+            passes = _ActivePass(cached, self._ids, mask)
+        return differentiable(passes, rows, probe)
+
+    def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
+        if len(gaussians) != len(self._gaussians):
+            raise InputError(
+                f"gaussians: expected the {len(self._gaussians)} rows of the session, got {len(gaussians)}; "
+                "open a new session when rows are added or removed"
+            )
+        ids, order = _ascending(changed)
+        after = CpuSession(gaussians, None, self._cameras, self._background, self._budget)
+        after._refused = self._refused
+        views, self._views = self._views, {}
+        if len(ids):
+            rows = gaussians.rows(changed if order is None else changed[order])
+            for view in views.values():
+                view.update(ids, splats_of(rows))
+        for view in views.values():
+            view.thaw()
+        after._views = views
+        return after
+
+    def cache_bytes(self) -> RenderCache:
+        return RenderCache({index: view.bytes() for index, view in self._views.items()}, len(self._gaussians))
+
+    def _lease(self, view: int) -> Lease:
+        return lease(self._cameras, view, self._background)
+
+    def _view(self, view: int) -> _CachedView | None:
+        """The cache of a view, filled if that is not done yet; None if it does not fit into the budget."""
+        if view in self._refused:
+            return None
+        if view not in self._views:
+            opened = _CachedView(self._lease(view), splats_of(self._gaussians))
+            if self._budget is not None and opened.bytes() + self.cache_bytes().total > self._budget:
+                self._refused.add(view)
+                return None
+            self._views[view] = opened
+        return self._views[view]
+
+
+def _ascending(rows: torch.Tensor) -> tuple[Ids, torch.Tensor | None]:
+    """Rows in ascending order as the kernels want them, and the order to put values in (None: they are in order)."""
+    ids, order = torch.sort(rows)
+    in_order = bool((order[1:] > order[:-1]).all())
+    return ids.numpy().astype(np.uint32), None if in_order else order
+
+
+class FullPass(Passes):
+    """Forward and backward of a whole scene with a rasteriser of its own."""
+
+    def __init__(self, held: Lease, mask: Any) -> None:
+        self._held, self._mask = held, mask
+
+    def forward(self, splats: SplatArrays) -> tuple[Float32, Float32]:
+        return self._held.rasterizer.forward(splats, tile_mask=self._mask)
+
+    def backward(self, splats: SplatArrays, v_image: Float32, v_alpha: Float32 | None) -> tuple[Float32, ...]:
+        return self._held.rasterizer.backward(v_image, v_alpha)
+
+
+class _CachedView:
+    """A camera's cache and its render of the scene as it was when the session opened or last was committed."""
+
+    def __init__(self, held: Lease, splats: SplatArrays) -> None:
+        self.held, self.rasterizer = held, held.rasterizer
+        self.image, self.transmittance = self.rasterizer.forward(splats)
+        self.rasterizer.forget()
+        self.rasterizer.shed_scratch()
+        self._frozen: tuple[Ids, Any] | None = None
+        self.scenes = 0  # how many changes of the scene it has seen
+
+    def thaw(self) -> None:
+        """Other rows may change from now on."""
+        self._frozen = None
+
+    def freeze(self, ids: Ids, mask: Any) -> None:
+        """Let these rows change, in these tiles; does nothing if that is already so."""
+        if self._frozen is not None and self._frozen[0] is ids and _same(self._frozen[1], mask):
+            return
+        self.rasterizer.freeze(mask, ids)
+        self._frozen = ids, None if mask is None else mask.copy()
+
+    def update(self, ids: Ids, rows: SplatArrays) -> None:
+        """Bring cache and render to the scene in which these rows have these values."""
+        self.scenes += 1
+        self.rasterizer.update(ids, rows, self.image, self.transmittance)
+
+    def bytes(self) -> int:
+        return self.rasterizer.memory_bytes() + self.image.nbytes + self.transmittance.nbytes
+
+
+def _same(a: Any, b: Any) -> bool:
+    return a is b or (a is not None and b is not None and np.array_equal(a, b))
+
+
+class _ActivePass(Passes):
+    """Forward and backward of the active rows over a view's cache, which it shares with other passes."""
+
+    def __init__(self, view: _CachedView, ids: Ids, mask: Any) -> None:
+        self._view, self._ids, self._mask = view, ids, mask
+        self._pass, self._scene = -1, view.scenes
+
+    def forward(self, splats: SplatArrays) -> tuple[Float32, Float32]:
+        if self._scene != self._view.scenes:
+            raise InputError(
+                "backward: expected the session that rendered, got one whose changes were committed since; "
+                "differentiate before the commit"
+            )
+        self._view.freeze(self._ids, self._mask)
+        image, transmittance = self._view.image.copy(), self._view.transmittance.copy()
+        rasterizer = self._view.rasterizer
+        rasterizer.forward_active(splats, image=image, transmittance=transmittance, touched_only=True)
+        self._pass = rasterizer.passes
+        return image, transmittance
+
+    def backward(self, splats: SplatArrays, v_image: Float32, v_alpha: Float32 | None) -> tuple[Float32, ...]:
+        if self._view.rasterizer.passes != self._pass:
+            self.forward(splats)  # the view was rendered again since; the same inputs give the same bits
+        return self._view.rasterizer.backward_active(v_image, v_alpha)
+
+
+class _UncachedPass(Passes):
+    """The active rows put back into the whole scene, which is drawn anew."""
+
+    def __init__(self, held: Lease, scene: SplatArrays, ids: Ids, mask: Any) -> None:
+        self._held, self._scene, self._ids, self._mask = held, scene, ids, mask
+        self._whole: SplatArrays | None = None
+
+    def forward(self, splats: SplatArrays) -> tuple[Float32, Float32]:
+        rasterizer = self._held.rasterizer
+        image = transmittance = None
+        if self._mask is not None:
+            image, transmittance = rasterizer.forward(self._scene)  # what lies outside of the mask
+        self._whole = SplatArrays(*(part.copy() for part in self._scene))
+        for part, rows in zip(self._whole, splats, strict=True):
+            part[self._ids] = rows
+        return rasterizer.forward(self._whole, tile_mask=self._mask, image=image, transmittance=transmittance)
+
+    def backward(self, splats: SplatArrays, v_image: Float32, v_alpha: Float32 | None) -> tuple[Float32, ...]:
+        gradients = self._held.rasterizer.backward(v_image, v_alpha)
+        return tuple(gradient[self._ids] for gradient in gradients)

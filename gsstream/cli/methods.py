@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from gsstream.cli.listing import table
+
+if TYPE_CHECKING:
+    from gsstream.plugins.catalog import Catalog
+    from gsstream.recipe.load import ResolvedRecipe
 
 app = typer.Typer(help="List the methods, or show one.", rich_markup_mode=None)
 
@@ -27,31 +32,73 @@ def methods(context: typer.Context) -> None:
 
 
 @app.command()
-def show(name: Annotated[str, typer.Argument(help="Name of a method.")]) -> None:
+def show(
+    name: Annotated[str, typer.Argument(help="Name of a method.")],
+    full: Annotated[
+        bool, typer.Option("--full", help="Import the parts (slow): every setting with default, range and meaning.")
+    ] = False,
+) -> None:
     """Show a method's parts and the values it sets."""
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
-    from gsstream.recipe.model import ComponentRef
 
     catalog = load_catalog()
     entry = catalog.entry("method", name)
     resolved = resolve_recipe(name, catalog.recipe_path)
     typer.echo(f"{name} (from {entry.origin}): {entry.spec.summary}\nrecipe: {catalog.recipe_path(name)}\n")
-    refs = [(slot, value.name) for slot, value in resolved.recipe if isinstance(value, ComponentRef)]
-    rows = []
-    for slot, part in refs:
-        found = catalog.entries.get((slot, part))
-        summary = found.spec.summary if found else "the fastest that works here" if part == "auto" else "not installed"
-        rows.append((slot, part, found.origin if found else "-", summary))
-    typer.echo(table(("SLOT", "PART", "FROM", "SUMMARY"), rows))
+    typer.echo(table(("SLOT", "PART", "FROM", "SUMMARY"), _slots(resolved, catalog)))
+    if full:
+        heading = ("SETTING", "VALUE", "SET BY", "DEFAULT", "TYPE", "MEANING")
+        typer.echo("\n" + table(heading, _everything(resolved, catalog)))
+        return
     values = resolved.recipe.model_dump(mode="json")
     settings = []
     for path, origin in resolved.origins.items():
-        value = values
-        for key in path:
-            value = value[key]
         if path[-1] != "name" and path[0] not in ("method", "schema_version"):
-            settings.append((".".join(path), repr(value), origin.label))
+            settings.append((".".join(path), repr(_at(values, path)), origin.label))
     if settings:
-        typer.echo("\n" + table(("SETTING", "VALUE", "FROM"), settings))
-    typer.echo(f"\nevery value: gsstream recipe show {name}")
+        typer.echo("\n" + table(("SETTING", "VALUE", "SET BY"), settings))
+    typer.echo(f"\nevery setting with its default and meaning: gsstream methods show {name} --full")
+
+
+def _slots(resolved: ResolvedRecipe, catalog: Catalog) -> Iterator[tuple[str, str, str, str]]:
+    """(slot, part, who ships it, what it is)."""
+    from gsstream.recipe.model import ComponentRef
+
+    for slot, ref in resolved.recipe:
+        if isinstance(ref, ComponentRef):
+            found = catalog.entries.get((slot, ref.name))
+            missing = "the fastest that works here" if ref.name == "auto" else "not installed"
+            yield slot, ref.name, found.origin if found else "-", found.spec.summary if found else missing
+
+
+def _everything(resolved: ResolvedRecipe, catalog: Catalog) -> Iterator[tuple[str, ...]]:
+    """One row per setting of the recipe and of the parts it names; values nobody set say so."""
+    from gsstream.cli.plugins import setting_rows
+    from gsstream.recipe.model import ComponentRef, Recipe
+
+    values = resolved.recipe.model_dump(mode="json")
+    refs = {slot: ref for slot, ref in resolved.recipe if isinstance(ref, ComponentRef)}
+    for key, kind, default, meaning in setting_rows(Recipe):
+        path = tuple(key.split("."))
+        if path[0] not in refs:
+            yield key, repr(_at(values, path)), resolved.origin(path).label, default, kind, meaning
+        elif path[1] == "name":
+            ref = refs[path[0]]
+            yield key, repr(ref.name), resolved.origin(path).label, default, kind, meaning
+            if ref.name == "auto":
+                continue
+            for name, *facts in setting_rows(catalog.resolve(path[0], ref.name).Config):
+                inner = (path[0], "params", *name.split("."))
+                own_default = facts[1]
+                written = inner in resolved.origins
+                value = repr(_at(values, inner)) if written else own_default
+                label = resolved.origin(inner).label if written else "default"
+                yield ".".join(inner), value, label, own_default, facts[0], facts[2]
+
+
+def _at(values: Mapping[str, Any], path: tuple[str, ...]) -> Any:
+    """The value at a path of nested mappings."""
+    for key in path:
+        values = values[key]
+    return values

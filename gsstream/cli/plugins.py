@@ -74,7 +74,7 @@ def _check(catalog: Catalog) -> bool:
 
 @app.command()
 def show(part: Annotated[str, typer.Argument(help="NAME, or KIND/NAME where several parts share a name.")]) -> None:
-    """Show a part's settings with their defaults, ranges and meaning."""
+    """Show a part's settings with their defaults, ranges and meaning, and which methods set them."""
     from gsstream.core.errors import UnknownName
     from gsstream.plugins.catalog import load_catalog
     from gsstream.spec import KINDS
@@ -100,12 +100,35 @@ def _describe(catalog: Catalog, kind: str, name: str, entry: Entry) -> str:
     if isinstance(entry.spec, MethodSpec):
         return f"{heading}\nsee: gsstream methods show {name}"
     target = catalog.resolve(kind, name)
-    lines = [heading, f"target: {entry.spec.target}, component API {entry.spec.api}"]
+    lines = [heading, f"target: {entry.spec.target}, component API {entry.spec.api}; defaults: its Config"]
     config = getattr(target, "Config", None)
     rows = list(setting_rows(config)) if config is not None else []
-    if not rows:
-        return "\n".join([*lines, "no settings"])
-    return "\n".join([*lines, "", table(("SETTING", "TYPE", "DEFAULT", "MEANING"), rows)])
+    lines += ["", table(("SETTING", "TYPE", "DEFAULT", "MEANING"), rows)] if rows else ["no settings"]
+    users = list(_users(catalog, kind, name))
+    return "\n".join([*lines, "", table(("METHOD", "SETTING", "VALUE", "SET BY"), users)] if users else lines)
+
+
+def _users(catalog: Catalog, kind: str, name: str) -> Iterator[tuple[str, str, str, str]]:
+    """(method, key, value, who set it) of every method that uses a part; methods that cannot be read are left out."""
+    from gsstream.core.errors import GsstreamError
+    from gsstream.recipe.load import resolve_recipe
+
+    for method in catalog.names("method"):
+        try:
+            resolved = resolve_recipe(method, catalog.recipe_path)
+        except GsstreamError:
+            continue  # 'gsstream methods' and 'plugins --check' say what is wrong with it
+        ref = getattr(resolved.recipe, kind, None)
+        if getattr(ref, "name", None) != name:
+            continue
+        written = {path: origin for path, origin in resolved.origins.items() if path[:2] == (kind, "params")}
+        if not written:
+            yield method, "-", "-", "all defaults"
+        for path, origin in written.items():
+            value = getattr(resolved.recipe, kind).params
+            for key in path[2:]:
+                value = value[key]
+            yield method, ".".join(path[2:]), repr(value), origin.label
 
 
 def setting_rows(config: type[BaseModel]) -> Iterator[tuple[str, ...]]:

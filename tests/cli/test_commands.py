@@ -56,10 +56,11 @@ OPTIONS = {
         "--quick", "--out", "--quiet",
     ],
     "gsstream methods": [],
-    "gsstream methods show": ["NAME"],
+    "gsstream methods show": ["NAME", "--full"],
     "gsstream plugins": ["--check"],
     "gsstream plugins show": ["PART"],
     "gsstream recipe": [],
+    "gsstream recipe schema": ["METHOD", "--out"],
     "gsstream recipe show": ["METHOD", "--recipe", "--set", "--full"],
 }  # fmt: skip
 
@@ -183,3 +184,31 @@ def test_recipe_show_checks_parts_when_asked(capsys: pytest.CaptureFixture[str])
     code, _, err = run(capsys, *typo, "--full")
     assert code == 2
     assert err.endswith("unknown key 'structure.params.resoluton'; did you mean 'resolution'?\n")
+
+
+def test_full_listing_says_value_source_default_and_meaning(capsys: pytest.CaptureFixture[str]) -> None:
+    out = run(capsys, "methods", "show", "dense", "--full")[1]
+    rows = {line.split()[0]: line for line in out.splitlines() if line}
+    assert rows["stream.epochs"].split()[1:4] == ["20", "default", "20"]
+    assert rows["gate.name"].split()[1:5] == ["'always-open'", "method", "dense", "'always-open'"]
+    resolution = rows["structure.params.resolution"]
+    assert resolution.split()[1:4] == ["1024", "default", "1024"]
+    assert "integer >= 1, <= 65536" in resolution
+    assert resolution.endswith("position residuals are measured in (scene diameter / resolution); 1 to 65536")
+    assert "update.params.means.step" in rows
+    assert "renderer.params" not in out
+
+
+def test_show_says_which_methods_set_what(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = tmp_path / "mine.yaml"
+    recipe.write_text("base: dense\nstructure: {name: flat, params: {resolution: 77}}\n")
+    from gsstream.plugins.catalog import Catalog
+
+    found = Catalog.recipe_path
+    monkeypatch.setattr(Catalog, "names", lambda _, kind: ["dense", "mine"] if kind == "method" else ["flat"])
+    monkeypatch.setattr(Catalog, "recipe_path", lambda self, name: recipe if name == "mine" else found(self, name))
+    rows = [line.split() for line in run(capsys, "plugins", "show", "structure/flat")[1].splitlines()]
+    assert ["dense", "-", "-", "all", "defaults"] in rows
+    assert ["mine", "resolution", "77", "method", "mine"] in rows

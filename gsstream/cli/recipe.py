@@ -11,7 +11,9 @@ if TYPE_CHECKING:
     from gsstream.plugins.catalog import Catalog
     from gsstream.recipe.schema import PartSchema
 
-app = typer.Typer(help="Show resolved recipes; write their schema for editors.", no_args_is_help=True, rich_markup_mode=None)
+app = typer.Typer(
+    help="Show resolved recipes; write their schema for editors.", no_args_is_help=True, rich_markup_mode=None
+)
 
 
 @app.callback()

@@ -54,7 +54,8 @@ def recipe_schema(parts: Mapping[str, Mapping[str, PartSchema]], resolved: Resol
         _set_defaults(schema, resolved.recipe.model_dump(mode="json"), definitions)
     title = f"gsstream recipe based on the method {resolved.recipe.method}" if resolved else "gsstream recipe"
     whole = {**schema, "$schema": DIALECT, "title": title, "$defs": definitions}
-    return _optional(whole)
+    free: Schema = _optional(whole)
+    return free
 
 
 def _slot(
@@ -80,7 +81,7 @@ def _slot(
         "enum": names,
     }
     unread = any(part.config is None for part in parts.values())
-    any_part = {"type": "object", "description": "the part's own settings"}
+    any_part: Schema = {"type": "object", "description": "the part's own settings"}
     if not unread:
         any_part["propertyNames"] = {"enum": sorted(keys)}
     section = {

@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 
 def run(
     source: Annotated[
-        str, typer.Option("--source", help="Recording: demo, synthetic:KEY=VALUE&..., or a folder with cameras.json.")
+        str,
+        typer.Option(
+            "--source", help="Recording: demo, synthetic:KEY=VALUE&..., a folder with cameras.json, watch:FOLDER."
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", help="Output folder; must not hold another run.")],
     method: Annotated[

@@ -6,6 +6,7 @@
     ├── InputError (ValueError)        something the user gave is wrong
     │   ├── ShapeError                 an array has the wrong shape, dtype or a non-finite value
     │   ├── SourceError                a recording cannot be read or contradicts itself
+    │   │   └── EndOfRecording         a growing recording ended before this frame; ends a run, fails none
     │   ├── RecipeError                a recipe key or value is unknown or out of range
     │   ├── UnknownName                a method, part or source that nobody registered
     │   └── OutputError                the place to write to is unusable (holds another run, not writable)
@@ -47,6 +48,10 @@ class ShapeError(InputError):
 
 class SourceError(InputError):
     """A recording cannot be read or contradicts itself."""
+
+
+class EndOfRecording(SourceError):
+    """A recording that grew has ended before the frame that was asked for: a run ends here, and has not failed."""
 
 
 class RecipeError(InputError):

@@ -17,12 +17,15 @@ class Frame:
         timestamp: seconds since the first frame.
         images: [C, H, W, 3] float32 in [0, 1].
         cameras: the C cameras, in the order of ``images``.
+        effort: share of the recipe's epochs that this frame is worth, in [0, 1]. A live source lowers it when the run
+            falls behind; 0 asks for an empty packet, so that numbering and time go on. Frame 0 is always done in full.
     """
 
     index: int
     timestamp: float
     images: FloatArray
     cameras: Cameras
+    effort: float = 1.0
 
     def validate(self) -> None:
         """Raise ShapeError when images disagree with the cameras or hold a non-finite value."""

@@ -31,6 +31,8 @@ from gsstream.residual.base import symbols as residual_symbols
 def frame_step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> Step:
     """Advance the stream by one frame. Pure: a failure leaves ``state`` as it was."""
     clock = [time.perf_counter()]
+    if frame.effort == 0:
+        return still_step(state, frame, 0.0)
     change = detect_change(state.previous, frame, parts.recipe.stream.change_threshold)
     if change is not None and change.share == 0:
         return still_step(state, frame, time.perf_counter() - clock[0])
@@ -66,7 +68,7 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> S
 
 
 def still_step(state: StreamState, frame: Frame, seconds: float) -> Step:
-    """A frame in which no tile of any view changed: an empty packet, and no part is asked."""
+    """A frame in which no tile of any view changed, or that is skipped: an empty packet, and no part is asked."""
     started = time.perf_counter()
     packet = encode_empty(frame=frame.index)
     after = replace(state, player=decode_packet(state.player, packet.data))

@@ -56,7 +56,7 @@ def optimise(parts: Assembly, problem: Problem, generator: torch.Generator) -> S
     if len(problem.active) == 0:
         return Solution({}, {}, problem.gate, problem.state.gate_moments, 0.0, 0)
     views = len(problem.frame.cameras)
-    iterations = recipe.stream.epochs * views
+    iterations = max(1, round(recipe.stream.epochs * problem.frame.effort)) * views
     run = _FrameRun(parts, problem, generator)
     order: list[int] = []
     recent: list[float] = []

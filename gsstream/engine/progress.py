@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 class RunProgress:
     """Frame 0 as a bar over iterations, later frames as a bar over frames with PSNR, KB, seconds and active share."""
 
-    def __init__(self, total_frames: int, quiet: bool) -> None:
+    def __init__(self, total_frames: int | None, quiet: bool) -> None:
         self._total, self._quiet = total_frames, quiet
         self._console = Console(stderr=True)
         self._live = not quiet and sys.stderr.isatty()
@@ -67,8 +67,8 @@ class RunProgress:
             console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-def frame_line(metrics: Mapping[str, Any], total: int) -> str:
-    """``frame 3/29: 27.31 dB (moving 24.90), 8.4 KB, 0.52 s, 4.1 % active``."""
+def frame_line(metrics: Mapping[str, Any], total: int | None) -> str:
+    """``frame 3/29: 27.31 dB (moving 24.90), 8.4 KB, 0.52 s, 4.1 % active``; ``total``: None while nobody knows."""
     values = [v for v in metrics.get("psnr", {}).values() if v is not None]
     moving = [v for v in metrics.get("psnr_moving", {}).values() if v is not None]
     parts = []
@@ -79,4 +79,5 @@ def frame_line(metrics: Mapping[str, Any], total: int) -> str:
     parts.append(f"{sum(metrics['seconds'].values()):.2f} s")
     if metrics["num_gaussians"]:
         parts.append(f"{100 * metrics['active_gaussians'] / metrics['num_gaussians']:.1f} % active")
-    return f"frame {metrics['frame']}/{total - 1}: " + ", ".join(parts)
+    last = "" if total is None else f"/{total - 1}"
+    return f"frame {metrics['frame']}{last}: " + ", ".join(parts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import signal
 import threading
@@ -16,7 +17,6 @@ from typing import Any
 import torch
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.errors import SourceError
 from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
 from gsstream.engine.assemble import Assembly
@@ -30,7 +30,7 @@ from gsstream.engine.stream_state import Step, StreamState
 from gsstream.metrics import peak_memory_mb
 from gsstream.packet import PlayerState, StreamMeta, StreamWriter
 from gsstream.recipe.save import save_resolved
-from gsstream.source.base import FrameSource, SourceInfo
+from gsstream.source.base import FrameSource, GrowingSource, SourceInfo
 from gsstream.source.prefetch import Prefetcher
 
 STREAM, METRICS, RECIPE = "stream.gss", "metrics.jsonl", "recipe.yaml"
@@ -89,9 +89,10 @@ class _Run:
         if state is None:
             save_resolved(self.out / RECIPE, self.parts.resolved)
         last = None if state is None else state.player.frame
-        indices, fsync = range(done, self.total), self.parts.recipe.codec.fsync
+        indices = itertools.count(done) if self.total is None else range(done, self.total)
+        fsync = self.parts.recipe.codec.fsync
         with (
-            _stop_on_interrupt(self.progress.say) as stop,
+            _stop_on_interrupt(self.progress.say, self.source) as stop,
             # Also when resuming finds no complete frame 0: what a kill left of it is cut off, and it starts again.
             StreamWriter.open(self.out / STREAM, resume=resume, last_frame=last, fsync=fsync) as writer,
             self.progress,
@@ -102,7 +103,7 @@ class _Run:
                 done = train.index + 1
                 if stop.is_set():
                     break
-        return RunResult(self.out, done, stop.is_set() and done < self.total)
+        return RunResult(self.out, done, stop.is_set() and (self.total is None or done < self.total))
 
     def _advance(
         self, writer: StreamWriter, state: StreamState | None, train: Frame, test: Frame, waited: float
@@ -178,11 +179,9 @@ def _one_torch_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _num_frames(info: SourceInfo, wanted: int | None) -> int:
-    have = info.num_frames
-    if have is None and wanted is None:
-        raise SourceError(f"the recording {info.name!r} does not say how many frames it has; give --frames")
-    return min(number for number in (have, wanted) if number is not None)
+def _num_frames(info: SourceInfo, wanted: int | None) -> int | None:
+    """None: until a growing recording ends."""
+    return min((number for number in (info.num_frames, wanted) if number is not None), default=None)
 
 
 def _timed(frames: Prefetcher) -> Iterator[tuple[Frame, Frame, float]]:
@@ -197,7 +196,7 @@ def _timed(frames: Prefetcher) -> Iterator[tuple[Frame, Frame, float]]:
 
 
 @contextmanager
-def _stop_on_interrupt(say: Callable[[str], None]) -> Iterator[threading.Event]:
+def _stop_on_interrupt(say: Callable[[str], None], source: FrameSource) -> Iterator[threading.Event]:
     """First Ctrl-C: finish the frame in flight. Second: stop at once (the stream stays valid up to the last packet)."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -208,6 +207,8 @@ def _stop_on_interrupt(say: Callable[[str], None]) -> Iterator[threading.Event]:
         if stop.is_set():
             raise KeyboardInterrupt
         stop.set()
+        if isinstance(source, GrowingSource):
+            source.interrupt()  # the frame in flight may be one that nobody has captured yet
         say("stopping after this frame; interrupt again to stop at once")
 
     previous = signal.signal(signal.SIGINT, handler)

@@ -22,6 +22,7 @@ def gsstream_components() -> list[ComponentSpec]:
         _part("loss", "reference", "loss.photometric:ReferenceLoss", "L1 + D-SSIM in torch, slow, defines the truth"),
         _part("source", "demo", "source.open:open_source", "the small recording that ships with gsstream"),
         _part("source", "synthetic", "source.open:open_source", "an analytic moving scene: synthetic:KEY=VALUE&..."),
+        _part("source", "watch", "source.open:open_source", "a folder that grows: watch:DIR?KEY=VALUE&..."),
         _part("source", "folder", "source.open:open_source", "a folder of images per camera with cameras.json"),
     ]
 

@@ -79,3 +79,11 @@ def check_index(info: SourceInfo, index: int) -> None:
             f"recording {info.name!r} has no frame {index}; it has {info.num_frames}, counted from 0 "
             "(lower the number of frames, or record more)"
         )
+
+
+@runtime_checkable
+class GrowingSource(FrameSource, Protocol):
+    """A recording that is still being written: ``frame`` waits, and raises EndOfRecording after the last one."""
+
+    def interrupt(self) -> None:
+        """End all waits: frames that are not there yet raise EndOfRecording from now on."""

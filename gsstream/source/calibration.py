@@ -19,7 +19,10 @@ CALIBRATION_FILE = "cameras.json"
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What cameras.json says. ``patterns`` maps camera id to its image path pattern relative to the folder."""
+    """What cameras.json says. ``patterns`` maps camera id to its image path pattern relative to the folder.
+
+    ``num_frames`` is 0 where a growing recording does not say yet.
+    """
 
     name: str
     fps: float
@@ -30,8 +33,8 @@ class Calibration:
     patterns: dict[str, str]
 
 
-def read_calibration(folder: Path) -> Calibration:
-    """Read and check ``folder/cameras.json``.
+def read_calibration(folder: Path, *, growing: bool = False) -> Calibration:
+    """Read and check ``folder/cameras.json``; ``growing``: the number of frames may be left out.
 
     Raises SourceError saying which file, camera or key is wrong, and what was expected.
     """
@@ -54,7 +57,7 @@ def read_calibration(folder: Path) -> Calibration:
     return Calibration(
         name=str(data.get("name", folder.name)),
         fps=_positive(path, "fps", data.get("fps", 30.0)),
-        num_frames=_count(path, data.get("frames")),
+        num_frames=0 if growing and "frames" not in data else _count(path, data.get("frames")),
         licence=str(data.get("licence", "")),
         train=rig.select(train),
         test=rig.select([i for i, split in enumerate(splits) if split == "test"]),

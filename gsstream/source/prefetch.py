@@ -8,9 +8,9 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
-from gsstream.core.errors import InputError
+from gsstream.core.errors import EndOfRecording, InputError
 from gsstream.core.frame import Frame
-from gsstream.source.base import FrameSource
+from gsstream.source.base import FrameSource, GrowingSource
 
 FramePair = tuple[Frame, Frame]
 
@@ -19,7 +19,8 @@ class Prefetcher:
     """Iterate (training frame, test frame) pairs in the given order, at most ``depth`` pairs ahead of the consumer.
 
     Memory: ``depth`` pairs plus the one the consumer holds. An error while reading a frame is raised when that frame's
-    turn comes, after all earlier frames were delivered; iteration then ends. Use as a context manager, or call
+    turn comes, after all earlier frames were delivered; iteration then ends. It also ends, without an error, where a
+    growing recording does. Use as a context manager, or call
     ``close``, so that threads end even when the consumer stops early.
 
     Arguments:
@@ -54,6 +55,9 @@ class Prefetcher:
             raise StopIteration
         try:
             pair, seconds = self._pending.popleft().result()
+        except EndOfRecording:
+            self.close()
+            raise StopIteration from None
         except BaseException:
             self.close()
             raise
@@ -75,6 +79,8 @@ class Prefetcher:
             future.cancel()
         self._pending.clear()
         self._todo = iter(())
+        if isinstance(self._source, GrowingSource):
+            self._source.interrupt()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _submit(self) -> None:

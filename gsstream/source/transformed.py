@@ -14,6 +14,7 @@ from gsstream.core.shapes import FloatArray
 from gsstream.source.base import (
     AttributedPoints,
     FrameSource,
+    GrowingSource,
     PointKind,
     SingleImages,
     SourceInfo,
@@ -30,6 +31,8 @@ from gsstream.source.transforms import (
     with_gain,
     with_noise,
 )
+
+SPLITS: tuple[Split, ...] = ("train", "test")
 
 
 def transformed(source: FrameSource, options: DataOptions, seed: int) -> FrameSource:
@@ -89,10 +92,17 @@ class TransformedSource:
         cameras = self._info.train if split == "train" else self._info.test
         images: FloatArray = np.empty((len(cameras), cameras.height, cameras.width, 3), np.float32)
         cache: dict[tuple[int, Split], Frame] = {}
+        if isinstance(self._source, GrowingSource):
+            # Its frames say how much they are worth, and which test cameras are there: both are read first.
+            cache = {(self._start + index, home): self._source.frame(self._start + index, home) for home in SPLITS}
+            there = {name for frame in cache.values() for name in frame.cameras.ids}
+            cameras = cameras if there.issuperset(cameras.ids) else cameras.select([])
+            images = images[: len(cameras)]
+        effort = min((frame.effort for frame in cache.values()), default=1.0)
         for row, name in enumerate(cameras.ids):
             shown = self._last_shown(name, index) if split == "train" else index
             images[row] = 0 if shown is None else self._image(name, shown, split, cache)
-        return Frame(index, index / self._info.fps, images, cameras)
+        return Frame(index, index / self._info.fps, images, cameras, effort)
 
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
         """The inner source's points, unless a test camera of this split took part in them.
@@ -105,6 +115,11 @@ class TransformedSource:
             return self._source.points_seen_by(allowed, kind)
         taken = [i for i in self._info.test.ids if self._home[i] == "train"]
         return None if taken and self._options.leak == "none" else self._source.points(kind)
+
+    def interrupt(self) -> None:
+        """End the waits of an inner source that grows; others never wait."""
+        if isinstance(self._source, GrowingSource):
+            self._source.interrupt()
 
     def close(self) -> None:
         """Close the inner source."""

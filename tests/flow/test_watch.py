@@ -1,0 +1,180 @@
+"""A run that follows a capture process: real processes write, stall, are late and are killed."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from gsstream.cli.main import run_command
+from gsstream.engine.assemble import assemble
+from gsstream.engine.session import STREAM, run
+from gsstream.packet import StreamReader
+from gsstream.plugins.catalog import load_catalog
+from gsstream.recipe.load import resolve_recipe
+from gsstream.source.open import open_source
+from tests.flow import capture
+from tests.flow.flow_runs import TINY, arguments, demo_copy, encode, metrics, start
+
+CAPTURE = Path(capture.__file__)
+FRAMES = 4
+QUICK = {"first_frame__max_iterations": 8, "stream__epochs": 1, "scale": 0.5}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished recording: three training cameras (the first is cam00), one test camera."""
+    return demo_copy(tmp_path_factory.mktemp("watch") / "scene", frames=FRAMES)
+
+
+@contextmanager
+def capturing(finished: Path, folder: Path, fps: float = 10, **options) -> Iterator[Path]:
+    """A capture process at work on ``folder`` (which has the calibration, and is named as the recording is)."""
+    capture.begin(finished, folder)
+    command = [sys.executable, str(CAPTURE), str(finished), str(folder), str(fps), json.dumps(options)]
+    with subprocess.Popen(command) as process:
+        yield folder
+        process.wait(timeout=60)
+
+
+def packets(stream: Path) -> list[bytes]:
+    """The packets of all frames but the first, whose text names the recording's folder."""
+    with StreamReader(stream) as reader:
+        return [reader.read(entry) for entry in reader.frames[1:]]
+
+
+def watch(source: str, out: Path, **settings) -> list[bytes]:
+    """Encode without pictures; the packets after the first."""
+    values = {**TINY, **{key.replace("__", "."): value for key, value in {**QUICK, **settings}.items()}}
+    catalog = load_catalog()
+    resolved = resolve_recipe("dense", catalog.recipe_path, None, [("test", f"{k}={v}") for k, v in values.items()])
+    recording = open_source(source, resolved.recipe.scale)
+    run(assemble(resolved, catalog), recording, prepared(out), quiet=True)
+    return packets(out / STREAM)
+
+
+def prepared(out: Path) -> Path:
+    out.mkdir()
+    return out
+
+
+def follow(folder: Path, out: Path, query: str = "", **settings) -> list[bytes]:
+    """Run on the growing folder, here; the packets after the first."""
+    return watch(f"watch:{folder}{query}", out, **settings)
+
+
+@pytest.fixture(scope="module")
+def truth(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
+    """What a run on the finished folder writes."""
+    return watch(str(finished), tmp_path_factory.mktemp("watch-truth") / "run")
+
+
+def test_the_stream_of_a_growing_folder_is_that_of_the_finished_one(finished: Path, tmp_path: Path) -> None:
+    with capturing(finished, tmp_path / "live") as live:
+        encode(tmp_path / "followed", source=f"watch:{live}", **QUICK)
+    complete = json.loads((finished / "cameras.json").read_text())
+    (live / "cameras.json").write_text(json.dumps(complete))
+    assert encode(tmp_path / "after", source=str(live), **QUICK) == (tmp_path / "followed/stream.gss").read_bytes()
+    assert len(metrics(tmp_path / "followed")) == FRAMES
+
+
+def test_files_written_in_place_with_pauses_are_read_when_whole(
+    finished: Path, tmp_path: Path, truth: list[bytes]
+) -> None:
+    # The pause is longer than 'settle': the size is stable in the middle of a file, and only decoding tells.
+    with capturing(finished, tmp_path / "live", fps=50, slow=0.15) as live:
+        assert follow(live, tmp_path / "run", "?settle=0.05") == truth
+
+
+def test_a_killed_writer_ends_the_run_cleanly_before_the_half_written_frame(
+    finished: Path, tmp_path: Path, truth: list[bytes]
+) -> None:
+    with capturing(finished, tmp_path / "live", half=["cam01", 2]) as live, pytest.warns(UserWarning, match="ends") as said:
+        assert follow(live, tmp_path / "run", "?timeout=1") == truth[:1]
+    (text,) = (str(one.message) for one in said)
+    assert "ends after 2 frames: nothing came for 1 s; frame 2 is left out (no whole image of cam01, " in text
+    assert "cam01/000002.jpg: the image cannot be decoded (image file is truncated" in text
+
+
+def test_a_late_camera_is_waited_for(finished: Path, tmp_path: Path, truth: list[bytes]) -> None:
+    with capturing(finished, tmp_path / "live", late=["cam01", 2, 1.5]) as live:
+        assert follow(live, tmp_path / "run") == truth
+
+
+@pytest.mark.parametrize(("policy", "status"), [("hold", "delta"), ("drop", "empty")])
+def test_an_absent_camera_is_held_or_its_frame_is_dropped(
+    finished: Path, tmp_path: Path, truth: list[bytes], policy: str, status: str
+) -> None:
+    with capturing(finished, tmp_path / "live", absent=["cam01", 2]) as live:
+        got = follow(live, tmp_path / "run", f"?missing={policy}&grace=0.2")
+    lines = metrics(tmp_path / "run")
+    assert [line["status"] for line in lines] == ["key", "delta", status, "delta"]
+    assert got[0] == truth[0]
+    assert got[1] != truth[1]
+    assert all("psnr" in line for line in lines), "the test camera was there all the time"
+
+
+def test_an_absent_camera_ends_the_run_when_the_policy_is_to_wait(
+    finished: Path, tmp_path: Path
+) -> None:
+    message = r"ends after 2 frames: END was written; frame 2 is left out \(no whole image of cam01\)"
+    with (
+        capturing(finished, tmp_path / "live", absent=["cam01", 2]) as live,
+        pytest.warns(UserWarning, match=message),
+    ):
+        assert len(follow(live, tmp_path / "run")) == 1
+
+
+def test_a_repeated_frame_is_encoded_as_the_finished_folder_has_it(finished: Path, tmp_path: Path) -> None:
+    repeated = tmp_path / "repeated"
+    shutil.copytree(finished, repeated)
+    for folder in repeated.glob("cam*/"):
+        shutil.copy(folder / "000001.jpg", folder / "000002.jpg")
+    with capturing(repeated, tmp_path / "live") as live:
+        got = follow(live, tmp_path / "run", stream__change_threshold=3.0)
+    assert got == watch(str(repeated), tmp_path / "after", stream__change_threshold=3.0)
+    assert metrics(tmp_path / "run")[2]["status"] == "empty"
+
+
+@pytest.mark.parametrize(("policy", "effort"), [("drop", [0, 0, 1]), ("hurry", [0.5, 1, 1])])
+def test_a_run_that_falls_behind_drops_or_hurries(
+    finished: Path, tmp_path: Path, policy: str, effort: list[float]
+) -> None:
+    # All frames are there at once: more wait than the queue may hold, from the first look on.
+    shutil.copytree(finished, tmp_path / "live")
+    follow(tmp_path / "live", tmp_path / "run", f"?behind={policy}&queue=1", stream__epochs=4)
+    done = [line["iterations"] / (4 * 3) for line in metrics(tmp_path / "run")[1:]]
+    assert done == effort
+
+
+def test_interrupting_while_waiting_ends_at_once_and_resume_goes_on(
+    finished: Path, tmp_path: Path, truth: list[bytes]
+) -> None:
+    live, out = tmp_path / "live", tmp_path / "run"
+    capture.begin(finished, live)
+    for camera in json.loads((live / "cameras.json").read_text())["cameras"]:
+        (live / camera["id"]).mkdir()
+        for t in range(2):
+            shutil.copy(finished / (camera["frames"] % t), live / (camera["frames"] % t))
+    command = arguments(out, source=f"watch:{live}?timeout=60", **QUICK)
+    with start(*command) as process:
+        deadline = time.monotonic() + 50
+        while not (out / "metrics.jsonl").exists() or len(metrics(out)) < 2:
+            assert time.monotonic() < deadline, "two frames were not encoded in time"
+            time.sleep(0.05)
+        time.sleep(0.3)  # now it waits for frame 2
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=15)
+    assert process.returncode == 130
+    assert packets(out / "stream.gss") == truth[:1]
+    capture.main(finished, live, 100, {})
+    assert run_command([*command, "--resume"]) == 0
+    assert packets(out / "stream.gss") == truth

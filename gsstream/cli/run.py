@@ -17,10 +17,7 @@ if TYPE_CHECKING:
 
 def run(
     source: Annotated[
-        str,
-        typer.Option(
-            "--source", help="Recording: demo, synthetic:KEY=VALUE&..., a folder with cameras.json, watch:FOLDER."
-        ),
+        str, typer.Option("--source", help="Recording: demo, synthetic:KEY=VALUE&..., a folder, or watch:FOLDER.")
     ],
     out: Annotated[Path, typer.Option("--out", help="Output folder; must not hold another run.")],
     method: Annotated[

@@ -55,7 +55,7 @@ def watch(source: str, out: Path, **settings) -> list[bytes]:
     """Encode without pictures; the packets after the first."""
     values = {**TINY, **{key.replace("__", "."): value for key, value in {**QUICK, **settings}.items()}}
     catalog = load_catalog()
-    resolved = resolve_recipe("dense", catalog.recipe_path, None, [("test", f"{k}={v}") for k, v in values.items()])
+    resolved = resolve_recipe("dense", catalog.recipe_path, (), [("test", f"{k}={v}") for k, v in values.items()])
     recording = open_source(source, resolved.recipe.scale)
     run(assemble(resolved, catalog), recording, prepared(out), quiet=True)
     return packets(out / STREAM)
@@ -97,7 +97,10 @@ def test_files_written_in_place_with_pauses_are_read_when_whole(
 def test_a_killed_writer_ends_the_run_cleanly_before_the_half_written_frame(
     finished: Path, tmp_path: Path, truth: list[bytes]
 ) -> None:
-    with capturing(finished, tmp_path / "live", half=["cam01", 2]) as live, pytest.warns(UserWarning, match="ends") as said:
+    with (
+        capturing(finished, tmp_path / "live", half=["cam01", 2]) as live,
+        pytest.warns(UserWarning, match="ends after 2 frames") as said,
+    ):
         assert follow(live, tmp_path / "run", "?timeout=1") == truth[:1]
     (text,) = (str(one.message) for one in said)
     assert "ends after 2 frames: nothing came for 1 s; frame 2 is left out (no whole image of cam01, " in text

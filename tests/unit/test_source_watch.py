@@ -1,0 +1,103 @@
+"""A growing folder, read frame by frame in this process."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsstream.core.errors import EndOfRecording, SourceError
+from gsstream.source.base import GrowingSource
+from gsstream.source.multiview import MultiviewSource
+from gsstream.source.open import DEMO_FOLDER, open_source
+from gsstream.source.options import DataOptions
+from gsstream.source.prefetch import Prefetcher
+from gsstream.source.transformed import transformed
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The demo recording, finished, in a place where it can be spoiled; the test camera is cam03 or so."""
+    shutil.copytree(DEMO_FOLDER, tmp_path / "live")
+    return tmp_path / "live"
+
+
+@pytest.fixture
+def test_camera() -> str:
+    return MultiviewSource(DEMO_FOLDER).info.test.ids[0]
+
+
+def test_it_reads_what_the_folder_reader_reads(folder: Path) -> None:
+    live, finished = open_source(f"watch:{folder}", 0.5), open_source(str(folder), 0.5)
+    assert isinstance(live, GrowingSource)
+    assert live.info.uri == finished.info.uri
+    for split in ("train", "test"):
+        assert np.array_equal(live.frame(3, split).images, finished.frame(3, split).images)
+    with pytest.raises(EndOfRecording, match="ended after 12 frames"):
+        live.frame(12)
+
+
+def test_an_absent_test_camera_is_not_measured(folder: Path, test_camera: str) -> None:
+    (folder / test_camera / "000001.jpg").unlink()
+    live = open_source(f"watch:{folder}?missing=hold&grace=0", 0.25)
+    assert [len(live.frame(t, "test").cameras) for t in range(3)] == [1, 0, 1]
+    assert live.frame(1).effort == 1
+    through = transformed(live, DataOptions(gain=0.5), 0)
+    assert [len(through.frame(t, "test").cameras) for t in range(3)] == [1, 0, 1]
+    assert np.array_equal(through.frame(1).images, np.float32(0.5) * live.frame(1).images)
+
+
+def test_transforms_keep_what_a_dropped_frame_is_worth(folder: Path) -> None:
+    live = open_source(f"watch:{folder}?behind=drop&queue=2", 0.25)
+    assert [transformed(live, DataOptions(gain=0.5), 0).frame(t).effort for t in (0, 9, 10)] == [0, 0, 0]
+    assert live.frame(11).effort == 1
+
+
+def test_a_file_written_again_changes_no_frame_that_was_decided(folder: Path) -> None:
+    live = open_source(f"watch:{folder}?missing=hold&grace=0", 0.25)
+    name = live.info.train.ids[0]
+    image = folder / name / "000001.jpg"
+    image.rename(folder / "later.jpg")
+    held = live.frame(1).images
+    (folder / "later.jpg").rename(image)
+    assert np.array_equal(live.frame(1).images, held), "the same frame gives the same bits"
+    assert np.array_equal(live.frame(1).images[0], live.frame(0).images[0])
+
+
+def test_interrupting_wakes_a_waiting_prefetcher(folder: Path) -> None:
+    data = json.loads((folder / "cameras.json").read_text())
+    del data["frames"]
+    (folder / "cameras.json").write_text(json.dumps(data))
+    live = open_source(f"watch:{folder}", 0.25)
+    threading.Timer(0.5, live.interrupt).start()
+    began = time.monotonic()
+    with Prefetcher(live, range(11, 1000)) as frames:
+        assert [pair[0].index for pair in frames] == [11]
+    assert time.monotonic() - began < 20, "not the time-out of 30 s"
+    assert live.info.num_frames == 12
+
+
+def test_frame_0_needs_every_camera(folder: Path) -> None:
+    shutil.rmtree(folder / "cam02")
+    with pytest.raises(SourceError, match=r"frame 0 needs every camera \(no whole image of cam02\); start the capture"):
+        open_source(f"watch:{folder}?timeout=0.2", 0.25).frame(0)
+
+
+@pytest.mark.parametrize(
+    ("uri", "message"),
+    [
+        ("watch:", "expected watch:DIR"),
+        ("watch:nowhere", "no such folder"),
+        ("watch:{}?policy=drop", "unknown option 'policy'"),
+        ("watch:{}?behind=skip", "option 'behind' = 'skip'.*'block', 'drop' or 'hurry'"),
+        ("watch:{}?queue", "expected key=value"),
+    ],
+)
+def test_wrong_options_are_named(uri: str, message: str) -> None:
+    with pytest.raises(SourceError, match=message):
+        open_source(uri.format(DEMO_FOLDER))

@@ -100,7 +100,6 @@ class RenderSession(ABC):
     def narrow(self, active: torch.Tensor) -> None:
         """From now on only the rows ``active`` [A], ascending, change. Replaces an earlier choice."""
 
-    @abstractmethod
     def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
         """The session of the next scene: wide, and equal bit for bit to one opened anew with ``gaussians``.
 
@@ -115,7 +114,11 @@ class RenderSession(ABC):
 
         Raises:
             InputError: another number of rows, values that are not finite.
+            NotImplementedError: the renderer was built before sessions could go on; install its plugin again.
         """
+        raise NotImplementedError(
+            f"{type(self).__name__} has no method 'commit' to go on to the next frame; install its plugin again"
+        )
 
     def cache_bytes(self) -> RenderCache:
         """What is kept for the cameras; empty for a renderer that caches nothing."""

@@ -36,18 +36,25 @@ class Exposure:
 
 
 def backward_view(
-    image: torch.Tensor, view: int, exposure: Exposure | None, loss: Loss, target: Any, dssim: float
+    image: torch.Tensor,
+    view: int,
+    exposure: Exposure | None,
+    loss: Loss,
+    target: Any,
+    dssim: float,
+    tiles: torch.Tensor | None = None,
 ) -> tuple[float, torch.Tensor]:
     """Judge a rendered view as its camera records it, and pull the loss back into whatever ``image`` was rendered from.
 
     Arguments:
         image: [H, W, 3] scene colours, with a graph.
         target: what ``loss.prepare`` made of the recorded image.
+        tiles: the only tiles that what is optimised can change (``RenderOutput.tiles``).
 
     Returns the loss, and its gradient [H, W, 3] with respect to the recorded colours.
     """
     raw = image.detach()
-    value, gradient = loss.evaluate(exposure.apply(view, raw) if exposure else raw, target, dssim)
+    value, gradient = loss.evaluate(exposure.apply(view, raw) if exposure else raw, target, dssim, tiles)
     torch.autograd.backward([image], [exposure.pull(view, gradient) if exposure else gradient])
     return value, gradient
 

@@ -114,7 +114,7 @@ class _FrameRun:
         """Loss of one view; leaves its gradient on the rows."""
         output = self.session.render(view, rows)
         weight, target = self.parts.recipe.loss.dssim, self.targets[view]
-        return backward_view(output.image, view, self.exposure, self.parts.loss, target, weight)[0]
+        return backward_view(output.image, view, self.exposure, self.parts.loss, target, weight, output.tiles)[0]
 
     def _step_gates(self, gate: GateState, gates: torch.Tensor, upstream: torch.Tensor, *, learning: bool) -> None:
         """Move the logits by what the images and the penalty say, and keep them in their bounds."""

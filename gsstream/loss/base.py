@@ -23,6 +23,9 @@ class Loss(Part):
     ) -> tuple[float, torch.Tensor]:
         """Return the loss of ``image`` [H, W, 3] and its gradient [H, W, 3].
 
-        With a tile mask [ceil(H / 16), ceil(W / 16)] the sum runs over the pixels of active tiles only, divided by the
-        number of all pixels, so that a full mask equals no mask.
+        Arguments:
+            tile_mask: [ceil(H / 16), ceil(W / 16)] bool, the only tiles that differ from an image judged before. The
+                sum then runs over them and the tiles beside them, whose windows see them, divided by the number of all
+                pixels. In masked tiles the gradient is that of the whole loss; elsewhere it is 0. A full mask equals
+                no mask. The tiles beside must hold what the whole image has there.
         """

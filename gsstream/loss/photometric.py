@@ -28,18 +28,23 @@ class ReferenceLoss(Loss):
     ) -> tuple[float, torch.Tensor]:
         leaf = image.detach().requires_grad_()
         with torch.enable_grad():
-            weight = _pixel_weight(image, tile_mask)
+            weight = _pixel_weight(image, None if tile_mask is None else _with_neighbours(tile_mask))
             absolute = ((leaf - prepared).abs() * weight).mean()
             similarity = (ssim_map(leaf, prepared) * weight).mean()
             value = (1 - dssim) * absolute + dssim * (weight.mean() - similarity)
             (gradient,) = torch.autograd.grad(value, leaf)
-        return float(value.detach()), gradient
+        return float(value.detach()), gradient if tile_mask is None else gradient * _pixel_weight(image, tile_mask)
 
 
 def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """[H, W, 3] structural similarity of two images in [0, 1]."""
     planes = [torch.nn.functional.pad(x.permute(2, 0, 1)[None], (5, 5, 5, 5)) for x in (image, target)]
     return ssim(planes[0], planes[1], 11, eps=0.0, padding="valid")[0].permute(1, 2, 0)
+
+
+def _with_neighbours(tile_mask: torch.Tensor) -> torch.Tensor:
+    """The windows of pixels in neighbouring tiles see a changed tile: radius 5 is less than a tile."""
+    return torch.nn.functional.max_pool2d(tile_mask[None].float(), 3, 1, 1)[0]
 
 
 def _pixel_weight(image: torch.Tensor, tile_mask: torch.Tensor | None) -> torch.Tensor:

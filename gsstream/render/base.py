@@ -28,10 +28,13 @@ class RenderOutput:
         image: [H, W, 3] composited colour; with a tile mask only active tiles are defined (others hold the cached
             render in a session, the background elsewhere).
         alpha: [H, W] 1 - transmittance.
+        tiles: [ceil(H / 16), ceil(W / 16)] bool, in a session: the tiles that the active rows are in, now or as the
+            session was opened. All others hold the same image in every render of the session. None: any may differ.
     """
 
     image: torch.Tensor
     alpha: torch.Tensor
+    tiles: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -182,6 +182,25 @@ def test_session_with_a_tile_mask_keeps_the_cached_render_elsewhere() -> None:
     assert torch.equal(session.render(0, rows).image, new)
 
 
+@pytest.mark.parametrize("ids", [[], [7], [3, 17, 80]])
+def test_session_tells_the_tiles_its_rows_are_in(ids: list[int]) -> None:
+    index = torch.tensor(ids, dtype=torch.int64)
+    session = CpuRenderer().open(scene(), index, rig(), BACKGROUND)
+    old = CpuRenderer().render(scene(), rig(), 1, BACKGROUND).image
+    for step in range(3):
+        rows = leaves(scene().rows(index).map(lambda t, s=step: t + 0.1 * s))
+        output = session.render(1, rows)
+        assert output.tiles is not None
+        assert output.tiles.shape == (-(-HEIGHT // 16), -(-WIDTH // 16))
+        inside = output.tiles.repeat_interleave(16, 0).repeat_interleave(16, 1)[:HEIGHT, :WIDTH]
+        assert torch.equal(output.image[~inside], old[~inside])
+        # Nor does anything outside pull on the rows.
+        outside = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(step)) * ~inside[..., None]
+        (output.image * outside).sum().backward()
+        assert not any(bool(g.any()) for g in grads(rows) if g is not None)
+        assert bool(inside.any()) == bool(ids)
+
+
 def test_full_session_with_a_mask_shows_the_background_elsewhere() -> None:
     mask = torch.zeros(3, 4, dtype=torch.bool)
     mask[0, 0] = True

@@ -298,3 +298,38 @@ def test_non_finite_pixels_are_named(value: float) -> None:
     for call in (_wrong(image=bad), _wrong(target=bad), lambda: PhotometricTarget(bad)):
         with pytest.raises(ShapeError, match=r"index \[19, 39, 2\]"):
             call()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_around_gives_the_dense_gradient_in_masked_tiles(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    height, width = int(rng.integers(20, 150)), int(rng.integers(20, 300))
+    image, target = near_pair(rng, height, width)
+    mask = rng.random(tile_shape(height, width)) < rng.choice([0.05, 0.3])
+    dense = photometric_loss(image, target)
+    part = photometric_loss(image, PhotometricTarget(target), tile_mask=mask, around=True)
+    inside = np.broadcast_to(pixels_of(mask, height, width) != 0, image.shape)
+    assert dense.gradient is not None
+    assert part.gradient is not None
+    np.testing.assert_allclose(part.gradient[inside], dense.gradient[inside], rtol=1e-5, atol=1e-9)
+    assert not part.gradient[~inside].any()
+
+
+def test_around_changes_by_what_the_whole_loss_changes_by() -> None:
+    """What a masked tile does to the windows of its neighbours is in the sum."""
+    rng = np.random.default_rng(9)
+    image, target = near_pair(rng, 64, 96)
+    mask = np.zeros((4, 6), bool)
+    mask[1, 2:4] = True
+    changed = image.copy()
+    changed[16:32, 32:64] += 0.05 * rng.normal(size=(16, 32, 3)).astype(np.float32)
+    part = [photometric_loss(x, target, tile_mask=mask, around=True).value for x in (image, changed)]
+    whole = [photometric_loss(x, target).value for x in (image, changed)]
+    assert abs(part[1] - part[0]) > 1e-4
+    assert part[1] - part[0] == pytest.approx(whole[1] - whole[0], abs=1e-7)
+
+
+def test_around_and_halo_gradient_exclude_each_other() -> None:
+    image = np.zeros((20, 20, 3), np.float32)
+    with pytest.raises(InputError, match="expected at most one"):
+        photometric_loss(image, image, around=True, halo_gradient=True)

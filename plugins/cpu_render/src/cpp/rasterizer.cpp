@@ -182,8 +182,10 @@ uint32_t Rasterizer::forward_active(const Scene& rows, const Target& target, boo
     std::vector<uint32_t> touched = dropped_blocks_;
     add_touched_blocks(active_lists_, touched);
     touched_.restrict(selection_, touched);
+  } else {
+    touched_ = selection_;
   }
-  const TileSelection& wanted = touched_only ? touched_ : selection_;
+  const TileSelection& wanted = touched_;
   merge_tile_lists(frozen_lists_, active_lists_, wanted.blocks, records_.data(), static_cast<uint32_t>(scene_count_),
                    active_rows_, merged_lists_);
   entry_count_ = merged_lists_.size;

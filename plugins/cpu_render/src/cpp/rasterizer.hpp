@@ -79,6 +79,8 @@ class Rasterizer {
   // Lets go of the memory that only a full pass needs. No backward may follow.
   void shed_scratch();
 
+  // Tiles rendered by the last forward_active.
+  const TileSelection& touched() const { return touched_; }
   const VisibleSet& visible() const { return visible_; }
   std::size_t pair_count() const { return visible_.pair_count; }
   std::size_t entry_count() const { return entry_count_; }
@@ -119,7 +121,7 @@ class Rasterizer {
   CompositeJob job_{};
   std::size_t job_tiles_ = 0, entry_count_ = 0;
   TileSelection selection_;
-  TileSelection touched_;  // of the last active pass with touched_only
+  TileSelection touched_;  // of the last active pass
   std::vector<uint32_t> dropped_blocks_;
 
   std::unique_ptr<ProjectChunk[]> chunks_;

@@ -140,6 +140,12 @@ class PyRasterizer {
     std::copy_n(rasterizer_.visible().rows.data(), rasterizer_.visible().count, out.data());
   }
 
+  void touched_tiles(ByteOutArray out) const {
+    const auto cells = [](int pixels) { return static_cast<std::size_t>((pixels + MASK_TILE - 1) / MASK_TILE); };
+    require_shape(out, {cells(rasterizer_.height()), cells(rasterizer_.width())}, "out");
+    rasterizer_.touched().write_mask(rasterizer_.width(), rasterizer_.height(), out.data());
+  }
+
   const Rasterizer& rasterizer() const { return rasterizer_; }
 
  private:
@@ -225,6 +231,7 @@ void bind_rasterizer(nb::module_& module) {
       .def("forward_cached", &PyRasterizer::forward_cached, strict("background"), strict("tile_mask").none(),
            GSS_TARGET)
       .def("visible_rows", &PyRasterizer::visible_rows, strict("out"))
+      .def("touched_tiles", &PyRasterizer::touched_tiles, strict("out"))
       .def_prop_ro("visible_count", [](const PyRasterizer& r) { return r.rasterizer().visible().count; })
       .def_prop_ro("active_count", [](const PyRasterizer& r) { return r.rasterizer().active_count(); })
       .def_prop_ro("scene_count", [](const PyRasterizer& r) { return r.rasterizer().scene_count(); })

@@ -1,5 +1,8 @@
 #include "tile_selection.hpp"
 
+#include <algorithm>
+#include <cstddef>
+
 namespace gsstream_cpu {
 
 // Blocks of the cells of the caller's mask (16x16) that lie in one raster tile (32x16), inside the image.
@@ -39,6 +42,19 @@ void TileSelection::restrict(const TileSelection& within, const std::vector<uint
   for (uint32_t tile : within.active) {
     blocks[tile] = within.blocks[tile] & wanted[tile];
     if (blocks[tile]) active.push_back(tile);
+  }
+}
+
+void TileSelection::write_mask(int width, int height, uint8_t* mask) const {
+  const int columns = (width + MASK_TILE - 1) / MASK_TILE, rows = (height + MASK_TILE - 1) / MASK_TILE;
+  std::fill_n(mask, static_cast<std::size_t>(rows) * columns, uint8_t{0});
+  for (uint32_t tile : active) {
+    const int left = static_cast<int>(tile) % tiles_x * TILE_WIDTH, top = static_cast<int>(tile) / tiles_x * TILE_HEIGHT;
+    for (int b = 0; b < BLOCKS; b++)
+      if (blocks[tile] >> b & 1u) {
+        const int x = left + b % BLOCKS_X * BLOCK_SIDE, y = top + b / BLOCKS_X * BLOCK_SIDE;
+        mask[y / MASK_TILE * columns + x / MASK_TILE] = 1;
+      }
   }
 }
 

@@ -18,6 +18,8 @@ struct TileSelection {
   // mask: [ceil(height/16), ceil(width/16)], or null for everything.
   void build(int width, int height, const uint8_t* mask);
   bool contains(const TileSelection& other) const;
+  // The inverse of build: 1 for every cell of the caller's mask [ceil(height/16), ceil(width/16)] with a block in it.
+  void write_mask(int width, int height, uint8_t* mask) const;
 };
 
 }  // namespace gsstream_cpu

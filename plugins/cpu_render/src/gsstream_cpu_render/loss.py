@@ -72,6 +72,7 @@ def photometric_loss(
     tile_mask: Any | None = None,
     gradient: bool = True,
     halo_gradient: bool = False,
+    around: bool = False,
     out: Float32 | None = None,
 ) -> PhotometricLoss:
     """Evaluate the loss over all pixels, or over the pixels of active tiles.
@@ -86,6 +87,8 @@ def photometric_loss(
         gradient: compute the gradient.
         halo_gradient: also write the gradient at pixels of inactive tiles that are seen by windows of active ones.
             Without it the gradient of inactive tiles is left as it is in ``out`` (zero without ``out``).
+        around: sum also over the tiles beside masked ones, whose windows see them; the gradient is written in masked
+            tiles alone and is there that of the dense loss.
         out: [H, W, 3] float32 to write the gradient into, if given.
 
     Raises:
@@ -99,7 +102,11 @@ def photometric_loss(
     goal = native_array("target", target if known is None else known.image, np.float32, image.shape)
     height, width, _ = image.shape
     active = _mask(tile_mask, height, width)
-    wanted = _dilated(active) if halo_gradient else active
+    if around and halo_gradient:
+        refuse_value("around and halo_gradient: expected at most one of them; around=True needs no gradient beside")
+    # Without a mask there is nothing beside, and the kernel takes the whole image in one go.
+    wanted = _dilated(active) if halo_gradient and tile_mask is not None else active
+    active = _dilated(active) if around and tile_mask is not None else active
     if not gradient:
         result = None
     elif out is None:

@@ -21,6 +21,7 @@ class CpuLoss(Loss):
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
     ) -> tuple[float, torch.Tensor]:
         mask = None if tile_mask is None else tile_mask.numpy()
-        result = photometric_loss(image.detach().contiguous().numpy(), prepared, dssim_weight=dssim, tile_mask=mask)
+        pixels = image.detach().contiguous().numpy()
+        result = photometric_loss(pixels, prepared, dssim_weight=dssim, tile_mask=mask, around=True)
         assert result.gradient is not None
         return result.value, torch.from_numpy(result.gradient)

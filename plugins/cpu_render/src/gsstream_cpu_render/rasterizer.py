@@ -11,7 +11,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gsstream_cpu_render.arrays import SplatArrays, SplatGradients, raise_on_faults, require_mask, require_splats
+from gsstream_cpu_render.arrays import (
+    MASK_TILE,
+    SplatArrays,
+    SplatGradients,
+    raise_on_faults,
+    require_mask,
+    require_splats,
+)
 from gsstream_cpu_render.checks import Float32, native_array, refuse
 from gsstream_cpu_render.native import NativeRasterizer
 from gsstream_cpu_render.view import NEAR, Background
@@ -118,6 +125,18 @@ class NumpyRasterizer(NativeRasterizer):
         rows = np.empty(self._native.visible_count, np.uint32)
         self._native.visible_rows(rows)
         return rows
+
+    def touched_tiles(self) -> NDArray[np.bool_]:
+        """[ceil(H / 16), ceil(W / 16)] bool: the tiles that the last active pass rendered.
+
+        With ``touched_only``: where active rows are now or were when cached; nothing else differs from the cache.
+
+        Raises:
+            InputError: no active pass yet.
+        """
+        tiles = np.empty((-(-self.height // MASK_TILE), -(-self.width // MASK_TILE)), np.bool_)
+        self._call("touched_tiles", tiles.view(np.uint8))
+        return tiles
 
     # ---- the incremental mode
 

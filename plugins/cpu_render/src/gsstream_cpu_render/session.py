@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, final
 
 import numpy as np
@@ -77,12 +78,12 @@ class CpuSession(RenderSession):
             rows = rows.rows(self._order)
             probe = None if probe is None else probe[self._order]
         cached = self._view(view)
-        passes: Passes
         if cached is None:
-            passes = _UncachedPass(self._lease(view), splats_of(self._gaussians), self._ids, mask)
-        else:
-            passes = _ActivePass(cached, self._ids, mask)
-        return differentiable(passes, rows, probe)
+            whole = _UncachedPass(self._lease(view), splats_of(self._gaussians), self._ids, mask)
+            return differentiable(whole, rows, probe)
+        active = _ActivePass(cached, self._ids, mask)
+        output = differentiable(active, rows, probe)
+        return replace(output, tiles=torch.from_numpy(active.tiles))
 
     def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
         if len(gaussians) != len(self._gaussians):
@@ -183,6 +184,7 @@ class _ActivePass(Passes):
     def __init__(self, view: _CachedView, ids: Ids, mask: Any) -> None:
         self._view, self._ids, self._mask = view, ids, mask
         self._pass, self._scene = -1, view.scenes
+        self.tiles: NDArray[np.bool_] = np.zeros((0, 0), np.bool_)  # known after a forward
 
     def forward(self, splats: SplatArrays) -> tuple[Float32, Float32]:
         if self._scene != self._view.scenes:
@@ -194,7 +196,7 @@ class _ActivePass(Passes):
         image, transmittance = self._view.image.copy(), self._view.transmittance.copy()
         rasterizer = self._view.rasterizer
         rasterizer.forward_active(splats, image=image, transmittance=transmittance, touched_only=True)
-        self._pass = rasterizer.passes
+        self._pass, self.tiles = rasterizer.passes, rasterizer.touched_tiles()
         return image, transmittance
 
     def backward(self, splats: SplatArrays, v_image: Float32, v_alpha: Float32 | None) -> tuple[Float32, ...]:

@@ -109,11 +109,11 @@ class _Run:
         self, writer: StreamWriter, state: StreamState | None, train: Frame, test: Frame, waited: float
     ) -> StreamState:
         train.validate()
-        started = time.perf_counter()
+        started, worked = time.perf_counter(), time.process_time()
         step = self._first(train) if state is None else frame_step(self.parts, state, train, self.rng)
         writer.append(step.packet)
-        total = time.perf_counter() - started
-        metrics = self._metrics(step, train.index, test, total, waited)
+        total, cpu = time.perf_counter() - started, time.process_time() - worked
+        metrics = {**self._metrics(step, train.index, test, total, waited), "cpu_seconds": cpu}
         with (self.out / METRICS).open("a", encoding="utf-8") as log:
             log.write(json.dumps(metrics) + "\n")
         self.progress.frame(metrics)

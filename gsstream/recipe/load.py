@@ -47,8 +47,9 @@ class ResolvedRecipe:
 
 
 def resolve_recipe(
-    method: str | None, find_method: FindMethod, files: Sequence[Path] = (), overrides: Sequence[tuple[str, str]] = ()
-) -> ResolvedRecipe:
+    method: str | None, find_method: FindMethod, files: Sequence[Path] = (), overrides: Sequence[tuple[str, str]] = (),
+    layers: Sequence[Layer] = (),
+) -> ResolvedRecipe:  # fmt: skip
     """Stack the layers and validate the result; every problem found is reported in one error.
 
     Arguments:
@@ -56,6 +57,7 @@ def resolve_recipe(
         find_method: name -> YAML file (``Catalog.recipe_path``).
         files: recipe files with differences, later ones win; only the first may say which method it belongs to.
         overrides: (option, "a.b=value") of the command line, e.g. ("--set", "gate.temperature=0.3"); later ones win.
+        layers: laid over all of it, lowest first (a sweep's scenes, variants and axes).
 
     Raises:
         RecipeError: unknown keys (with the nearest valid name), values out of range, contradictions.
@@ -83,7 +85,7 @@ def resolve_recipe(
             leaves.pop(path, None)  # a repeated key counts where it was given last
             leaves[path] = leaf
         chain = [*chain, Layer(leaves, shorthand=True)]
-    return stack(chain)
+    return stack([*chain, *layers])
 
 
 def _later_file(path: Path, find_method: FindMethod) -> list[Layer]:

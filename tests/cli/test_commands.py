@@ -26,6 +26,7 @@ CHEAP = [
     ["export", "--help"],
     ["manifest", "--help"],
     ["view", "--help"],
+    ["sweep", "--help"],
     ["recipe", "show", "dense"],
 ]
 
@@ -44,6 +45,7 @@ OPTIONS = {
     "gsstream export": ["STREAM", "--out", "--format", "--frames"],
     "gsstream manifest": ["STREAM", "--out"],
     "gsstream view": ["STREAM", "--port", "--host"],
+    "gsstream sweep": ["CONFIG", "--out", "--data", "--workers", "--threads", "--dry-run", "--quiet"],
     "gsstream check": ["NAME", "--quiet"],
     "gsstream new-plugin": ["NAME", "--kind", "--out"],
     "gsstream bench": [],

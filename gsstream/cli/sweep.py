@@ -1,0 +1,80 @@
+"""``gsstream sweep``: many recipes on many scenes, into one table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from gsstream.cli.listing import plural, table
+
+if TYPE_CHECKING:
+    from gsstream.trade.sweep.executor import Executor
+    from gsstream.trade.sweep.plan import Plan
+
+
+def sweep(
+    config: Annotated[Path, typer.Argument(help="YAML file that describes the sweep (docs/howto/sweep.md).")],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the table and streams; a sweep there is continued.")],
+    data: Annotated[
+        Path | None, typer.Option("--data", help="Folder of the recordings that the file names by relative paths.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", min=1, help="Cells at a time; default: one for each processor.")
+    ] = None,
+    threads: Annotated[int, typer.Option("--threads", min=1, help="Threads of each worker.")] = 1,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would run, and what is there already.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print only warnings, errors and failed cells.")] = False,
+) -> None:
+    """Run every recipe of a sweep on every scene with every seed.
+
+    Cells that the table holds are kept; those that failed or were cut off are made again. A cell that fails is recorded
+    and the others go on (exit code 1 at the end). Ctrl-C stops at once; the same command continues.
+    """
+    from gsstream.plugins.catalog import load_catalog
+    from gsstream.trade.sweep.config import read_sweep
+    from gsstream.trade.sweep.plan import make_plan
+
+    plan = make_plan(read_sweep(config), config.parent, load_catalog().recipe_path)
+    if dry_run:
+        typer.echo(_describe(plan, out))
+        return
+    from gsstream.trade.sweep.drive import run_sweep
+
+    executor = _executor(workers, threads)
+    result = run_sweep(plan, out, executor, data=data, say=(lambda _: None) if quiet else typer.echo)
+    if not quiet:
+        made = plural(result.made - len(result.failed), "cell")
+        typer.echo(f"{out / 'table.jsonl'}: {made} made, {result.kept} kept; next: gsstream report {out}")
+    if result.failed:
+        typer.echo(f"{plural(len(result.failed), 'cell')} failed; the table holds the reasons:", err=True)
+        for key, reason in result.failed.items():
+            typer.echo(f"  {plan.cells[key].label}: {reason}", err=True)
+        raise typer.Exit(1)
+
+
+def _executor(workers: int | None, threads: int) -> Executor:
+    from gsstream.trade.sweep.executor import LocalExecutor, usable_processors
+    from gsstream.trade.sweep.job import run_job
+
+    return LocalExecutor(workers or max(1, usable_processors() // threads), threads, run_job)
+
+
+def _describe(plan: Plan, out: Path) -> str:
+    """What a sweep would do, cell by cell."""
+    from gsstream.trade.sweep.drive import first_frame_file
+    from gsstream.trade.sweep.table import TABLE, TableData, read_table
+
+    known = read_table(out) if (out / TABLE).is_file() else TableData()
+    done = known.done()
+    rows = []
+    for cell in plan.cells.values():
+        axes = " ".join(f"{key}={value}" for key, value in cell.axes.items())
+        failed = known.cells.get(cell.id, {}).get("error")
+        state = "kept" if cell.id in done else f"again, failed: {failed}" if failed else "to make"
+        rows.append([cell.id, cell.scene.name, cell.variant, axes, str(cell.seed), cell.first or "own", state])
+    open_ = sum(row[-1] != "kept" for row in rows)
+    firsts = sum(not first_frame_file(out, key).is_file() for key in plan.firsts)
+    text = table(["cell", "scene", "variant", "axes", "seed", "frame 0", "state"], rows)
+    return f"{text}\n\n{plural(len(rows), 'cell')}, {open_} to make; {plural(firsts, 'shared frame 0')} to make first"

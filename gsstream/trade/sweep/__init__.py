@@ -1,0 +1,1 @@
+"""Sweeps: recipes x scenes x seeds, run by workers, in one append-only table."""

@@ -1,0 +1,234 @@
+"""Runs a plan: frames 0 first, cells as soon as theirs is there; every result is on disk before the next is awaited."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gsstream.core.errors import OutputError
+from gsstream.trade.records import mean
+from gsstream.trade.sweep.executor import Executor, Finished
+from gsstream.trade.sweep.job import Job, Outcome
+from gsstream.trade.sweep.plan import Cell, FirstFrameRun, Plan
+from gsstream.trade.sweep.table import FORMAT, TableWriter
+
+FIRST_FRAMES, CELLS, WORK, LOCK = "first_frames", "cells", "work", "sweep.lock"
+#: A worker that dies is given its job again this often.
+RETRIES = 1
+
+
+@dataclass(frozen=True, slots=True)
+class SweepResult:
+    """How a sweep ended: runs made now, those that were there already, and those that failed with their reason."""
+
+    made: int
+    kept: int
+    failed: Mapping[str, str] = field(default_factory=dict)
+
+
+def run_sweep(
+    plan: Plan, out: Path, executor: Executor, *, data: Path | None = None, say: Callable[[str], None] = print
+) -> SweepResult:
+    """Make every cell of a plan that the table in ``out`` does not hold yet.
+
+    Arguments:
+        out: folder of the table (``table.jsonl``), the streams (``cells/ID.gss``) and the shared frames 0.
+        data: folder in which relative recordings are looked up.
+        say: told one line at a time.
+
+    Raises OutputError when another sweep works in ``out`` or it cannot be written. KeyboardInterrupt passes through,
+    with everything that is finished on disk and no worker left.
+    """
+    try:
+        for folder in (out, out / FIRST_FRAMES, out / CELLS):
+            folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"the output folder {out} cannot be used: {error}") from error
+    with _only_one(out):
+        shutil.rmtree(out / WORK, ignore_errors=True)
+        (out / WORK).mkdir()
+        try:
+            return _Drive(plan, out, executor, data, say).run()
+        finally:
+            executor.close()
+            shutil.rmtree(out / WORK, ignore_errors=True)
+
+
+class _Drive:
+    """The moving parts of a sweep; lives only inside :func:`run_sweep`."""
+
+    def __init__(
+        self, plan: Plan, out: Path, executor: Executor, data: Path | None, say: Callable[[str], None]
+    ) -> None:
+        self.plan, self.out, self.executor, self.data, self.say = plan, out, executor, data, say
+        self.table = TableWriter(out)
+        cells, done = plan.cells, self.table.data.done()
+        self.kept = [key for key in cells if key in done]
+        self.cells = {key: cell for key, cell in cells.items() if key not in done}
+        made = (key for key, row in self.table.data.first_frames.items() if row["status"] == "done")
+        self.have = {key for key in made if first_frame_file(out, key).is_file()}
+        self.deaths: dict[str, int] = {}
+        self.failed: dict[str, str] = {}
+        self.made, self.started = 0, time.monotonic()
+
+    def run(self) -> SweepResult:
+        self._write_plan()
+        needed = dict.fromkeys(cell.first for cell in self.cells.values() if cell.first and cell.first not in self.have)
+        waiting: list[Cell | FirstFrameRun] = [self.plan.firsts[key] for key in needed]
+        waiting += self.cells.values()
+        running: dict[str, Cell | FirstFrameRun] = {}
+        while waiting or running:
+            ready = [task for task in waiting if self._ready(task)]
+            for task in ready[: max(0, self.executor.slots - len(running))]:
+                waiting.remove(task)
+                running[task.id] = task
+                self.executor.submit(self._job(task))
+            finished = self.executor.next()
+            task = running.pop(finished.id)
+            if finished.outcome is None and self.deaths.get(task.id, 0) < RETRIES:
+                self.deaths[task.id] = self.deaths.get(task.id, 0) + 1
+                self.say(f"{task.label}: {finished.reason}; once more")
+                waiting.insert(0, task)
+            elif isinstance(task, FirstFrameRun):
+                waiting = self._after_first_frame(task, finished, waiting)
+            else:
+                self._after_cell(task, finished)
+        return SweepResult(self.made, len(self.kept), self.failed)
+
+    def _ready(self, task: Cell | FirstFrameRun) -> bool:
+        return isinstance(task, FirstFrameRun) or task.first is None or task.first in self.have
+
+    def _job(self, task: Cell | FirstFrameRun) -> Job:
+        uri, work = _where(task.scene.uri, self.data), str((self.out / WORK).resolve())
+        if isinstance(task, FirstFrameRun):
+            return Job(task.id, uri, task.resolved, work=work)
+        first = first_frame_file(self.out, task.first).read_bytes() if task.first else None
+        return Job(task.id, uri, task.resolved, first, self.plan.config.measure, work)
+
+    def _after_first_frame(
+        self, task: FirstFrameRun, finished: Finished, waiting: list[Cell | FirstFrameRun]
+    ) -> list[Cell | FirstFrameRun]:
+        """Record a frame 0; without it, the cells that wait for it fail with its reason."""
+        outcome = finished.outcome or Outcome(task.id, error=finished.reason)
+        if outcome.error is None:
+            write_whole(first_frame_file(self.out, task.id), outcome.stream)
+        self._record("first_frame", task, outcome, {})
+        if outcome.error is None:
+            self.have.add(task.id)
+            self.say(f"{task.label}: {_seconds(outcome):.0f} s")
+            return waiting
+        self.say(f"{task.label}: FAILED: {outcome.error}")
+        lost = [t for t in waiting if isinstance(t, Cell) and t.first == task.id]
+        for cell in lost:
+            self._after_cell(cell, Finished(cell.id, Outcome(cell.id, error=f"frame 0: {outcome.error}")))
+        return [t for t in waiting if t not in lost]
+
+    def _after_cell(self, cell: Cell, finished: Finished) -> None:
+        outcome = finished.outcome or Outcome(cell.id, error=finished.reason)
+        if outcome.error is None:
+            write_whole(cell_file(self.out, cell.id), outcome.stream)
+        place = {"scene": cell.scene.name, "variant": cell.variant, "axes": dict(cell.axes), "seed": cell.seed}
+        self._record("cell", cell, outcome, {**place, "first_frame": cell.first})
+        self.made += 1
+        count = f"[{len(self.kept) + self.made}/{len(self.kept) + len(self.cells)}]"
+        if outcome.error is not None:
+            self.failed[cell.id] = outcome.error
+            self.say(f"{count} {cell.label}: FAILED: {outcome.error}")
+            return
+        left = (len(self.cells) - self.made) * (time.monotonic() - self.started) / self.made
+        self.say(f"{count} {cell.label}: {summary_line(outcome.frames)}; about {left / 60:.0f} min left")
+
+    def _record(self, record: str, task: Cell | FirstFrameRun, outcome: Outcome, place: Mapping[str, Any]) -> None:
+        values: dict[str, Any] = {"id": task.id, **place}
+        if outcome.error is not None:
+            self.table.append(
+                record, {**values, "status": "failed", "error": outcome.error, "details": outcome.details}
+            )
+            return
+        machine = stable_id(outcome.machine)
+        self.table.append_once("machine", machine, {"facts": dict(outcome.machine)})
+        self.table.append_once("recipe", outcome.recipe_hash, {"values": dict(outcome.recipe)})
+        values |= {"status": "done", "recipe": outcome.recipe_hash, "machine": machine, "workers": self.executor.slots}
+        self.table.append(record, {**values, **outcome.run, "frames": list(outcome.frames)})
+
+    def _write_plan(self) -> None:
+        config = self.plan.config
+        points = [
+            {"cell": p.id, "scene": p.scene.name, "variant": p.variant, "axes": dict(p.axes), "seed": p.seed}
+            for p in self.plan.points
+        ]
+        values = {"format": FORMAT, "config": config.model_dump(mode="json"), "points": points}
+        known = self.table.data.plan
+        if known is None or {**values, "record": "plan"} != known:
+            self.table.append("plan", values)
+
+
+def stable_id(facts: Mapping[str, Any]) -> str:
+    """Short id of a machine's facts."""
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def first_frame_file(out: Path, key: str) -> Path:
+    """Where a shared frame 0 lies."""
+    return out / FIRST_FRAMES / f"{key}.gss"
+
+
+def cell_file(out: Path, key: str) -> Path:
+    """Where the stream of a cell lies."""
+    return out / CELLS / f"{key}.gss"
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file that is there whole or not at all. Raises OutputError."""
+    part = path.with_suffix(".part")
+    try:
+        part.write_bytes(content)
+        os.replace(part, path)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}; free some space and go on") from error
+
+
+def summary_line(frames: Sequence[Mapping[str, Any]]) -> str:
+    """``31.22 dB (moving 29.27), 25.6 KB, 0.45 s/frame``: means over the frames after the first."""
+    later = frames[1:] or frames
+    whole, moving = (
+        mean(value for frame in later for value in frame.get(name, {}).values() if value is not None)
+        for name in ("psnr", "psnr_moving")
+    )
+    size, seconds = (mean(sum(frame[name].values()) for frame in later) for name in ("bytes", "seconds"))
+    return f"{whole:.2f} dB (moving {moving:.2f}), {size / 1000:.1f} KB, {seconds:.2f} s/frame"
+
+
+def _seconds(outcome: Outcome) -> float:
+    return float(sum(outcome.frames[0]["seconds"].values()))
+
+
+def _where(uri: str, data: Path | None) -> str:
+    """The recording as a worker opens it: a relative folder lies in ``data``."""
+    if data is None or ":" in uri or uri == "demo" or Path(uri).is_absolute():
+        return uri
+    return str((data / uri).resolve())
+
+
+@contextmanager
+def _only_one(out: Path) -> Iterator[None]:
+    """Hold the folder for one sweep; the lock goes with the process, however it ends."""
+    try:
+        import fcntl
+    except ImportError:  # no such lock on this system: nobody is kept out
+        yield
+        return
+    with (out / LOCK).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise OutputError(f"another sweep works in {out}; wait for it, or choose another --out") from error
+        yield

@@ -1,0 +1,140 @@
+"""Who runs the cells: an Executor; here processes on this machine, one for each cell."""
+
+from __future__ import annotations
+
+import multiprocessing
+import multiprocessing.connection
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+from typing import Any, Protocol
+
+from gsstream.trade.sweep.job import Job, Outcome
+
+#: Libraries with thread pools of their own read these when they are imported.
+_THREAD_VARIABLES = ("GSSTREAM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+Work = Callable[[Job], Outcome]
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """A job that is over. ``outcome`` is None when its worker died: ``reason`` says how."""
+
+    id: str
+    outcome: Outcome | None
+    reason: str = ""
+
+
+class Executor(Protocol):
+    """Runs jobs somewhere, several at a time."""
+
+    @property
+    def slots(self) -> int:
+        """How many jobs it is worth handing over at once."""
+
+    def submit(self, job: Job) -> None:
+        """Start a job, or queue it."""
+
+    def next(self) -> Finished:
+        """Wait until a submitted job is over."""
+
+    def close(self) -> None:
+        """End what still runs, at once, and release everything."""
+
+
+def usable_processors() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def thread_environment(threads: int) -> dict[str, str]:
+    """Environment of a worker with this many threads."""
+    return dict.fromkeys(_THREAD_VARIABLES, str(threads))
+
+
+class LocalExecutor:
+    """Spawned processes, a fresh one for each job: peak memory is the cell's own, and nothing leaks between cells.
+
+    Arguments:
+        workers: jobs at a time.
+        threads: threads of each.
+        work: what a process does with a job (a function that can be imported).
+    """
+
+    def __init__(self, workers: int, threads: int, work: Work) -> None:
+        self.slots, self._threads, self._work = workers, threads, work
+        self._running: dict[Connection, tuple[str, SpawnProcess]] = {}
+
+    def submit(self, job: Job) -> None:
+        """Start a process for the job."""
+        context = multiprocessing.get_context("spawn")
+        here, there = context.Pipe(duplex=False)
+        process = context.Process(target=_serve, args=(there, self._work, job), name=f"cell {job.id}", daemon=True)
+        with _environment(thread_environment(self._threads)):
+            process.start()
+        there.close()
+        self._running[here] = (job.id, process)
+
+    def next(self) -> Finished:
+        """Wait for a process; a closed pipe without an outcome is a death."""
+        assert self._running, "next() without a submitted job"
+        ready = multiprocessing.connection.wait(list(self._running))[0]
+        assert isinstance(ready, Connection)
+        key, process = self._running.pop(ready)
+        try:
+            outcome: Outcome | None = ready.recv()
+        except EOFError:
+            outcome = None
+        ready.close()
+        process.join()
+        return Finished(key, outcome, "" if outcome else _how_it_ended(process.exitcode))
+
+    def close(self) -> None:
+        """Kill what runs: a cell that is not finished is made again anyway."""
+        for connection, (_, process) in self._running.items():
+            process.kill()
+            process.join()
+            connection.close()
+        self._running.clear()
+
+
+def _serve(pipe: Connection, work: Work, job: Job) -> None:
+    """The body of a worker process."""
+    # Ctrl-C reaches the whole group; the sweep decides what becomes of its workers.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+    pipe.send(work(job))
+
+
+def _die_with_parent() -> None:
+    """A worker whose sweep was killed must not work on: the resumed sweep makes its cell again."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+@contextmanager
+def _environment(changes: Mapping[str, str]) -> Iterator[None]:
+    before: dict[str, Any] = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _how_it_ended(code: int | None) -> str:
+    if code is not None and code < 0:
+        name = signal.Signals(-code).name
+        return f"the worker process was killed by {name}" + ("; out of memory?" if name == "SIGKILL" else "")
+    return f"the worker process ended with code {code} and no result"

@@ -1,0 +1,202 @@
+"""One cell in a worker process: data in, data out. A worker writes nothing that outlives it."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import statistics
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gsstream.recipe.load import ResolvedRecipe
+from gsstream.trade.sweep.config import Measure
+
+if TYPE_CHECKING:
+    from gsstream.engine.assemble import Assembly
+    from gsstream.source.base import FrameSource
+    from gsstream.trade.evaluate import Evaluation
+
+#: Measured per view by ``evaluate``; the rest of a view says where it belongs.
+_PLACE = ("frame", "camera")
+_FPS_WARM_UP, _FPS_RENDERS = 5, 30
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What a worker is sent.
+
+    Arguments:
+        id: of the cell or frame 0.
+        uri: the recording, as this worker opens it.
+        first_frame: bytes of a stream whose frame 0 is taken over, or None.
+        measure: what to measure; None for a frame 0 that is only to be shared.
+        work: folder for temporary files, or None for the system's.
+    """
+
+    id: str
+    uri: str
+    resolved: ResolvedRecipe
+    first_frame: bytes | None = None
+    measure: Measure | None = None
+    work: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a worker sends back.
+
+    Arguments:
+        frames: per frame: what the run wrote down, and what was measured on the decoded frame.
+        recipe: with every part's settings written out; ``recipe_hash`` of it.
+        stream: the bytes of the stream.
+        machine: facts that stay; ``run``: facts of this run (date, load, seconds, noise of cameras, pictures/second).
+        error, details: why there is nothing else, and the traceback.
+    """
+
+    id: str
+    frames: tuple[Mapping[str, Any], ...] = ()
+    recipe: Mapping[str, Any] = field(default_factory=dict)
+    recipe_hash: str = ""
+    stream: bytes = b""
+    machine: Mapping[str, Any] = field(default_factory=dict)
+    run: Mapping[str, Any] = field(default_factory=dict)
+    error: str | None = None
+    details: str = ""
+
+
+def run_job(job: Job) -> Outcome:
+    """Run a cell here; whatever goes wrong becomes part of the outcome, so that the sweep goes on."""
+    try:
+        with tempfile.TemporaryDirectory(dir=job.work, prefix="cell-") as folder:
+            return _run(job, Path(folder))
+    except Exception as error:  # the seam of a sweep: one bad cell is a record, not the end
+        return Outcome(job.id, error=f"{type(error).__name__}: {error}", details=traceback.format_exc())
+
+
+def _run(job: Job, folder: Path) -> Outcome:
+    from gsstream.engine.assemble import assemble
+    from gsstream.engine.recording import open_recording, read_first_frame
+    from gsstream.engine.session import METRICS, STREAM, run
+    from gsstream.plugins.catalog import load_catalog
+    from gsstream.recipe.load import recipe_hash
+
+    started, catalog = time.perf_counter(), load_catalog()
+    parts = assemble(job.resolved, catalog)
+    first = None
+    if job.first_frame is not None:
+        (folder / "first.gss").write_bytes(job.first_frame)
+        first = read_first_frame(folder / "first.gss")
+    recording = open_recording(job.uri, parts.recipe.scale, catalog)
+    _import_what_torch_puts_off()
+    try:
+        result = run(parts, recording, folder, quiet=True, measure=False, first_frame=first)
+        if result.interrupted:
+            raise InterruptedError("the run was interrupted; the sweep's next start makes this cell again")
+        lines = (folder / METRICS).read_text(encoding="utf-8").splitlines()
+        frames = [json.loads(line) for line in lines]
+        facts: dict[str, Any] = {}
+        if job.measure is not None:
+            facts = _measure(job.measure, folder / STREAM, recording, frames)
+    finally:
+        recording.close()
+    machine, when = _machine(parts)
+    facts |= {**when, "cell_seconds": time.perf_counter() - started, "threads": os.environ.get("GSSTREAM_THREADS")}
+    return Outcome(
+        job.id, tuple(frames), parts.recipe.model_dump(mode="json"), recipe_hash(parts.recipe),
+        (folder / STREAM).read_bytes(), machine, facts,
+    )  # fmt: skip
+
+
+def _import_what_torch_puts_off() -> None:
+    """The first optimiser of a process imports seconds' worth of modules: not part of any frame's time."""
+    import torch
+
+    torch.optim.Adam([torch.zeros(1)])
+
+
+def _measure(measure: Measure, stream: Path, recording: FrameSource, frames: list[dict[str, Any]]) -> dict[str, Any]:
+    """Measure decoded frames; their values go into ``frames``. Returns facts about the whole stream."""
+    from gsstream.metrics import SSIM_VARIANT, OnnxLpips
+    from gsstream.trade.evaluate import evaluate
+
+    if len(recording.info.test) == 0:
+        return {"not_measured": "the recording has no test cameras"}
+    lpips = None if measure.lpips_onnx is None else OnnxLpips(Path(measure.lpips_onnx), None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # the run has said already that nothing fast renders here
+        evaluation = evaluate(stream, recording, lpips=lpips)
+    for frame in frames:
+        frame |= frame_values(evaluation, int(frame["frame"]), lpips is not None)
+    facts: dict[str, Any] = {"ssim_variant": SSIM_VARIANT, "renderer": evaluation.renderer}
+    facts["sigmas"] = dict(evaluation.sigmas)
+    if lpips is not None:
+        facts["lpips_variant"] = lpips.variant
+    if measure.fps:
+        facts["fps"] = frames_per_second(stream)
+    return facts
+
+
+def frame_values(evaluation: Evaluation, frame: int, lpips: bool) -> dict[str, dict[str, float | None]]:
+    """Quantity -> camera -> value of one frame; None where it is not defined."""
+    views = [view for view in evaluation.views if view.frame == frame]
+    names = [name for name in views[0].__slots__ if name not in _PLACE and (lpips or "lpips" not in name)]
+    return {name: {view.camera: _plain(getattr(view, name)) for view in views} for name in names}
+
+
+def frames_per_second(stream: Path) -> float:
+    """Pictures per second of the last frame, first test camera: median of 30 renders after 5 that do not count."""
+    from gsstream.player.playback import Playback
+    from gsstream.player.render import render
+
+    with Playback(stream) as playback:
+        scene, meta = playback.state_at(playback.frames[-1]), playback.meta
+        seconds = []
+        for _ in range(_FPS_WARM_UP + _FPS_RENDERS):
+            started = time.perf_counter()
+            render(scene, meta.test, 0, meta.background)
+            seconds.append(time.perf_counter() - started)
+    return 1 / statistics.median(seconds[_FPS_WARM_UP:])
+
+
+def _machine(parts: Assembly) -> tuple[dict[str, Any], dict[str, Any]]:
+    """(what stays, what changes from run to run) of the machine and the code."""
+    from importlib.metadata import version
+
+    from gsstream.trade.bench_report import machine_facts
+
+    facts = machine_facts()
+    when = {name: facts.pop(name) for name in ("date", "load_average")}
+    distributions = sorted({"gsstream", *parts.distributions})
+    facts["distributions"] = {name: version(name) for name in distributions}
+    facts["code"] = _code_hash(parts)
+    return facts, when
+
+
+def _code_hash(parts: Assembly) -> str:
+    """Hash of the sources in use: tells two states of a checkout apart that have the same version."""
+    import importlib
+
+    used = (parts.structure, parts.confidence, parts.propagation, parts.gate, parts.regularizer, parts.update,
+            parts.renderer, parts.loss)  # fmt: skip
+    digest = hashlib.sha256()
+    for name in sorted({"gsstream", *(type(part).__module__.partition(".")[0] for part in used)}):
+        for folder in importlib.import_module(name).__path__:
+            files = (p for p in Path(folder).rglob("*") if p.suffix in (".py", ".so", ".pyd", ".yaml"))
+            for path in sorted(files):
+                digest.update(str(path.relative_to(folder)).encode())
+                with contextlib.suppress(FileNotFoundError):
+                    digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _plain(value: float) -> float | None:
+    return value if math.isfinite(value) else None

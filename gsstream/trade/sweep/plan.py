@@ -1,0 +1,180 @@
+"""A sweep's file -> its cells: every recipe resolved, every frame 0 that can be shared found. Nothing runs here."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+import random
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsstream.recipe.document import Layer, Leaf, Origin
+from gsstream.recipe.load import FindMethod, ResolvedRecipe, recipe_hash, resolve_recipe
+from gsstream.trade.sweep.config import Axis, Range, Scene, SweepConfig, Variant, flat_settings
+
+#: Sections of a recipe that decide frame 0, besides its seed.
+FIRST_FRAME_KEYS = ("structure", "renderer", "first_frame", "loss", "scale", "near", "background")
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One run.
+
+    Arguments:
+        id: hash of everything that decides the run: equal ids are the same run.
+        first: id of the frame 0 it takes over; None: it makes its own.
+        axes: recipe key -> value where the cell differs from its variant.
+    """
+
+    id: str
+    scene: Scene
+    variant: str
+    axes: Mapping[str, Any]
+    seed: int
+    resolved: ResolvedRecipe
+    first: str | None
+
+    @property
+    def label(self) -> str:
+        """``basketball edge stream.epochs=3 seed 0``."""
+        axes = "".join(f" {key}={json.dumps(value)}" for key, value in self.axes.items())
+        return f"{self.scene.name} {self.variant}{axes} seed {self.seed}"
+
+
+@dataclass(frozen=True, slots=True)
+class FirstFrameRun:
+    """A frame 0 that several cells take over: the recipe of the first of them, one frame long."""
+
+    id: str
+    scene: Scene
+    seed: int
+    resolved: ResolvedRecipe
+
+    @property
+    def label(self) -> str:
+        """``basketball frame 0 seed 0``."""
+        return f"{self.scene.name} frame 0 seed {self.seed}"
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Everything a sweep will do.
+
+    Arguments:
+        points: all (scene, variant, axes, seed) in the order of the file; two points may be the same run, then they
+            are cells of the same id.
+        firsts: id -> frame 0.
+    """
+
+    config: SweepConfig
+    points: tuple[Cell, ...]
+    firsts: Mapping[str, FirstFrameRun]
+
+    @property
+    def cells(self) -> dict[str, Cell]:
+        """Id -> cell; each run once."""
+        out: dict[str, Cell] = {}
+        for point in self.points:
+            out.setdefault(point.id, point)
+        return out
+
+
+def make_plan(config: SweepConfig, folder: Path, find_method: FindMethod) -> Plan:
+    """Resolve every cell of a sweep.
+
+    Arguments:
+        folder: where the sweep's file lies; recipe files are relative to it.
+        find_method: name -> recipe file (``Catalog.recipe_path``).
+
+    Raises RecipeError for keys and values that no recipe has, UnknownName for methods.
+    """
+    points: list[Cell] = []
+    firsts: dict[str, FirstFrameRun] = {}
+    for scene, seed in itertools.product(config.scenes, config.seeds):
+        lead: ResolvedRecipe | None = None
+        for variant in config.variants:
+            for axes in combinations(config, variant):
+                resolved = _resolve(config, scene, variant, axes, seed, folder, find_method)
+                lead = resolved if lead is None else lead
+                first = None
+                if config.first_frame.share != "own":
+                    made = _first_frame(config, scene, lead if config.first_frame.share == "scene" else resolved, seed)
+                    first = firsts.setdefault(made.id, made).id
+                points.append(
+                    Cell(_cell_id(config, scene, resolved, first), scene, variant.name, axes, seed, resolved, first)
+                )
+    return Plan(config, tuple(points), firsts)
+
+
+def combinations(config: SweepConfig, variant: Variant) -> Iterator[dict[str, Any]]:
+    """The axis values of a variant's cells, in order."""
+    axes: dict[str, Axis] = {**config.axes, **variant.axes}
+    if config.search == "random":
+        # Drawn from the seed and the variant's name alone: the same file always means the same cells.
+        draw = random.Random(f"{config.search_seed} {variant.name}")
+        for _ in range(config.samples or 0):
+            yield {key: _draw(axis, draw) for key, axis in axes.items()}
+        return
+    lists = {key: axis for key, axis in axes.items() if isinstance(axis, list)}
+    if config.search == "each":
+        yield {}
+        yield from ({key: value} for key, values in lists.items() for value in values)
+        return
+    yield from (dict(zip(lists, values, strict=True)) for values in itertools.product(*lists.values()))
+
+
+def _draw(axis: Axis, draw: random.Random) -> Any:
+    if isinstance(axis, list):
+        return draw.choice(axis)
+    value = _uniform(axis, draw)
+    return round(value) if axis.integer else value
+
+
+def _uniform(axis: Range, draw: random.Random) -> float:
+    if axis.log:
+        # exp and log may leave the range by a rounding.
+        return min(max(math.exp(draw.uniform(math.log(axis.low), math.log(axis.high))), axis.low), axis.high)
+    return draw.uniform(axis.low, axis.high)
+
+
+def _resolve(
+    config: SweepConfig, scene: Scene, variant: Variant, axes: Mapping[str, Any], seed: int, folder: Path,
+    find_method: FindMethod,
+) -> ResolvedRecipe:  # fmt: skip
+    """Method <- variant's file <- scene's file <- set of all, of the scene, of the variant <- axes <- seed and size."""
+    size = {"seed": seed, "scale": scene.scale, "frames": scene.frames}
+    written = [
+        ("set", config.set),
+        (f"scene {scene.name}: set", scene.set),
+        (f"variant {variant.name}: set", variant.set),
+        (f"axes of variant {variant.name}", axes),
+        (f"scene {scene.name}", {key: value for key, value in size.items() if value is not None}),
+    ]
+    files = [folder / name for name in (variant.recipe, scene.recipe) if name]
+    layers = []
+    for where, values in written:
+        origin = Origin(f"sweep, {where}", f"sweep, {where}")
+        leaves = {path: Leaf(value, origin) for path, value in flat_settings(values, where).items()}
+        layers.append(Layer(leaves, shorthand=True))
+    return resolve_recipe(variant.method, find_method, files, layers=layers)
+
+
+def _first_frame(config: SweepConfig, scene: Scene, resolved: ResolvedRecipe, seed: int) -> FirstFrameRun:
+    seed = seed if config.first_frame.seed is None else config.first_frame.seed
+    recipe = resolved.recipe.model_copy(update={"seed": seed, "frames": 1})
+    values = recipe.model_dump(mode="json")
+    key = _hash([scene.uri, seed, {name: values[name] for name in FIRST_FRAME_KEYS}])
+    return FirstFrameRun(key, scene, seed, ResolvedRecipe(recipe, resolved.origins))
+
+
+def _cell_id(config: SweepConfig, scene: Scene, resolved: ResolvedRecipe, first: str | None) -> str:
+    return _hash([scene.uri, recipe_hash(resolved.recipe), first, config.measure.model_dump(mode="json")])
+
+
+def _hash(value: Any) -> str:
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -95,7 +95,7 @@ def _run(job: Job, folder: Path) -> Outcome:
     if job.first_frame is not None:
         (folder / "first.gss").write_bytes(job.first_frame)
         first = read_first_frame(folder / "first.gss")
-    recording = open_recording(job.uri, parts.recipe.scale, catalog)
+    recording = open_recording(job.uri, parts.recipe, catalog)
     _import_what_torch_puts_off()
     try:
         result = run(parts, recording, folder, quiet=True, measure=False, first_frame=first)

@@ -16,8 +16,11 @@ from gsstream.recipe.document import Layer, Leaf, Origin
 from gsstream.recipe.load import FindMethod, ResolvedRecipe, recipe_hash, resolve_recipe
 from gsstream.trade.sweep.config import Axis, Range, Scene, SweepConfig, Variant, flat_settings
 
-#: Sections of a recipe that decide frame 0, besides its seed.
-FIRST_FRAME_KEYS = ("structure", "renderer", "first_frame", "loss", "scale", "near", "background")
+#: Sections of a recipe that say nothing of frame 0; a section that nobody thought of counts as one that does.
+LATER_KEYS = (
+    "schema_version", "method", "seed", "frames", "confidence", "propagation", "gate", "regularizer", "update",
+    "stream", "gate_training", "codec",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +170,7 @@ def _first_frame(config: SweepConfig, scene: Scene, resolved: ResolvedRecipe, se
     seed = seed if config.first_frame.seed is None else config.first_frame.seed
     recipe = resolved.recipe.model_copy(update={"seed": seed, "frames": 1})
     values = recipe.model_dump(mode="json")
-    key = _hash([scene.uri, seed, {name: values[name] for name in FIRST_FRAME_KEYS}])
+    key = _hash([scene.uri, seed, {k: v for k, v in values.items() if k not in LATER_KEYS}])
     return FirstFrameRun(key, scene, seed, ResolvedRecipe(recipe, resolved.origins))
 
 

@@ -25,10 +25,11 @@ from gsstream import API_VERSION
 
 ENTRY_POINT_GROUP = "gsstream"
 Kind = Literal[
-    "structure", "confidence", "propagation", "gate", "regularizer", "update", "renderer", "loss", "source", "metric",
-    "method",
+    "structure", "confidence", "propagation", "gate", "regularizer", "update", "whole", "renderer", "loss", "source",
+    "metric",
 ]  # fmt: skip
-KINDS: tuple[str, ...] = get_args(Kind)
+#: Of whatever has a name: kinds of parts, and named methods (recipes).
+KINDS: tuple[str, ...] = (*get_args(Kind), "method")
 
 hookspec = pluggy.HookspecMarker("gsstream")
 hookimpl = pluggy.HookimplMarker("gsstream")

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from gsstream.plugins.catalog import Catalog
     from gsstream.recipe.load import ResolvedRecipe
 
+#: Of a method made of parts.
+SLOTS = ("structure", "confidence", "propagation", "gate", "regularizer", "update", "renderer")
+
 app = typer.Typer(help="List the methods, or show one.", rich_markup_mode=None)
 
 
@@ -65,8 +68,10 @@ def _slots(resolved: ResolvedRecipe, catalog: Catalog) -> Iterator[tuple[str, st
     """(slot, part, who ships it, what it is)."""
     from gsstream.recipe.model import ComponentRef
 
+    # A method is either whole or made of parts; the other's slots would say nothing about it.
+    shown = ("whole", "renderer") if resolved.recipe.whole.name != "none" else SLOTS
     for slot, ref in resolved.recipe:
-        if isinstance(ref, ComponentRef):
+        if isinstance(ref, ComponentRef) and slot in shown:
             found = catalog.entries.get((slot, ref.name))
             missing = "the fastest that works here" if ref.name == "auto" else "not installed"
             yield slot, ref.name, found.origin if found else "-", found.spec.summary if found else missing
@@ -86,7 +91,7 @@ def _everything(resolved: ResolvedRecipe, catalog: Catalog) -> Iterator[tuple[st
         elif path[1] == "name":
             ref = refs[path[0]]
             yield key, repr(ref.name), resolved.origin(path).label, default, kind, meaning
-            if ref.name == "auto":
+            if ref.name in ("auto", "none"):
                 continue
             for name, *facts in setting_rows(catalog.resolve(path[0], ref.name).Config):
                 inner = (path[0], "params", *name.split("."))

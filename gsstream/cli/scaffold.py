@@ -21,6 +21,7 @@ class PartKind(StrEnum):
     propagation = "propagation"
     gate = "gate"
     regularizer = "regularizer"
+    whole = "whole"
 
 
 def new_plugin(

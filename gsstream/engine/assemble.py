@@ -10,8 +10,10 @@ from typing import Any
 from gsstream.confidence.base import ConfidenceEstimator
 from gsstream.core.errors import PluginUnavailable, UnknownName
 from gsstream.core.part import Part
+from gsstream.engine.heeded import unheeded
 from gsstream.gate.base import GateSampler
 from gsstream.loss.base import Loss
+from gsstream.method.base import StreamingMethod
 from gsstream.plugins.catalog import Catalog
 from gsstream.propagation.base import Propagation
 from gsstream.recipe.check import join_problems, validate
@@ -39,6 +41,7 @@ class Assembly:
 
     Arguments:
         recipe: the recipe with every part's parameters written out and the renderer that was chosen.
+        whole: the whole method that runs in place of the parts; None: the parts are the method.
         origins: path -> origin of every value that is not a default (for ``recipe.save.save_resolved``).
         distributions: installed distributions that the parts come from.
     """
@@ -52,6 +55,7 @@ class Assembly:
     update: UpdateRule
     renderer: Renderer
     loss: Loss
+    whole: StreamingMethod[Any] | None = None
     origins: Mapping[KeyPath, Origin] = field(default_factory=dict)
     distributions: tuple[str, ...] = ()
 
@@ -85,6 +89,14 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog) -> Assembly:
             parts[slot] = built
             refs[slot] = ComponentRef(name=ref.name, params=built.config.model_dump(mode="json"))
     loss = _loss(resolved, catalog, problems)
+    whole = _whole(resolved, catalog, problems)
+    if whole is not None:
+        parts["whole"] = whole
+        name = resolved.recipe.whole.name
+        refs["whole"] = ComponentRef(name=name, params=whole.config.model_dump(mode="json"))
+        hint = f"the whole method {name!r} does not read it; its own settings: gsstream plugins show whole/{name}"
+        paths = unheeded(resolved.recipe.model_copy(update=refs), whole, parts)
+        problems += [f"{resolved.near(path).where}: {'.'.join(path)}: {hint}" for path in paths]
     if resolved.recipe.codec.key_every:
         # The format and the player know later key packets, the encoder does not make them yet: said, not ignored.
         where = resolved.near(("codec", "key_every")).where
@@ -115,6 +127,18 @@ def _construct(slot: str, name: str, cls: type[Any], config: Any, catalog: Catal
         origin = catalog.entry(slot, name).origin
         raise PluginUnavailable(f"{slot} {name!r} (from {origin}) could not be built: {error}") from error
     return part
+
+
+def _whole(resolved: ResolvedRecipe, catalog: Catalog, problems: list[str]) -> StreamingMethod[Any] | None:
+    """The whole method the recipe names, if it names one."""
+    ref = resolved.recipe.whole
+    if ref.name != "none":
+        part = _build("whole", ref, resolved, catalog, problems)
+        return part if isinstance(part, StreamingMethod) else None
+    if ref.params:
+        where = resolved.near(("whole", "params", next(iter(ref.params)))).where
+        problems.append(f"{where}: whole.params needs a named whole method, but whole.name is 'none'")
+    return None
 
 
 def _loss(resolved: ResolvedRecipe, catalog: Catalog, problems: list[str]) -> Part | None:

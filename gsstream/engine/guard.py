@@ -19,13 +19,13 @@ def guarded(slot: str, part: Part, frame: int | None) -> Iterator[None]:
     except GsstreamError:
         raise
     except Exception as error:
-        raise ComponentError(
-            f"{type(error).__name__}: {error}",
-            slot=slot,
-            part=type(part).__name__,
-            distribution=_distribution(type(part).__module__.partition(".")[0]),
-            frame=frame,
-        ) from error
+        raise fault(f"{type(error).__name__}: {error}", slot, part, frame) from error
+
+
+def fault(message: str, slot: str, part: Part, frame: int | None) -> ComponentError:
+    """The error about a part that failed, or did not do what it must."""
+    owner = _distribution(type(part).__module__.partition(".")[0])
+    return ComponentError(message, slot=slot, part=type(part).__name__, distribution=owner, frame=frame)
 
 
 def _distribution(package: str) -> str:

@@ -10,7 +10,7 @@ import torch
 
 from gsstream.core.frame import Frame
 from gsstream.core.shapes import FloatArray
-from gsstream.engine.stream_state import StreamState
+from gsstream.method.base import MethodState
 from gsstream.metrics import moving_mask, noise_sigma, psnr, ssim
 from gsstream.render.base import Renderer
 
@@ -27,7 +27,7 @@ class HeldOut:
         self._first: Frame | None = None
         self._sigma: list[float] = []
 
-    def measure(self, state: StreamState, frame: Frame) -> dict[str, Any]:
+    def measure(self, state: MethodState, frame: Frame) -> dict[str, Any]:
         """PSNR, SSIM and moving-pixel PSNR per test camera; None where undefined (nothing moves, or equal images)."""
         if self._first is None:
             self._first = frame
@@ -49,10 +49,11 @@ class HeldOut:
         if second is not None:
             self._sigma = [noise_sigma(a, b) for a, b in zip(first.images, second.images, strict=True)]
 
-    def render(self, state: StreamState, frame: Frame, view: int) -> FloatArray:
+    def render(self, state: MethodState, frame: Frame, view: int) -> FloatArray:
         """[H, W, 3] decoded image in [0, 1]."""
+        gaussians = state.player.gaussians.map(torch.from_numpy)
         with torch.no_grad():
-            output = self._renderer.render(state.gaussians, frame.cameras, view, self._background)
+            output = self._renderer.render(gaussians, frame.cameras, view, self._background)
         return np.asarray(np.clip(output.image.numpy(), 0, 1))
 
     def _moving(self, image: FloatArray, truth: FloatArray, view: int) -> float | None:

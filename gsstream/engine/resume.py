@@ -28,24 +28,48 @@ def resume_state(
     Raises OutputError when the recipe or the recording is not the one the stream was written with, or when the recipe
     carries state that a stream does not hold (gate moments across frames).
     """
-    if path.stat().st_size < FILE_HEADER.size:
-        return None
     if parts.recipe.gate_training.optimiser == "persistent":
         raise OutputError(
             "gate_training.optimiser = 'persistent' carries Adam moments that no stream holds: such a run cannot be "
             "resumed; start it again with --overwrite"
         )
+    # Before the replay: other parts would fail over a stream that is not theirs, and say something else.
+    if not check_stream(parts, path, source.info):
+        return None
     with StreamReader(path) as reader:
-        if not reader.frames or reader.frames[0].kind != PacketKind.KEY:
-            return None
-        # Before the replay: other parts would fail over a stream that is not theirs, and say something else.
-        meta = decode_packet(None, reader.read(reader.frames[0])).meta
-        _check_recipe(parts, meta)
-        _check_recording(source.info, meta)
         state = _replay(parts, reader, rng)
         shown = [e.frame for e in reader.frames if e.kind != PacketKind.EMPTY and e.frame <= state.player.frame]
     frame = source.frame(shown[-1], "train")
     return replace(state, previous=replace(frame, cameras=replace(frame.cameras, near=near)))
+
+
+def check_stream(parts: Assembly, path: Path, info: SourceInfo) -> bool:
+    """Whether a stream has a complete frame 0 to go on from.
+
+    Raises OutputError when the recipe or the recording is not the one it was written with.
+    """
+    if path.stat().st_size < FILE_HEADER.size:
+        return False
+    with StreamReader(path) as reader:
+        if not reader.frames or reader.frames[0].kind != PacketKind.KEY:
+            return False
+        meta = decode_packet(None, reader.read(reader.frames[0])).meta
+    _check_recipe(parts, meta)
+    _check_recording(info, meta)
+    return True
+
+
+def replay(reader: StreamReader) -> PlayerState:
+    """What every player has after the last complete packet."""
+    player: PlayerState | None = None
+    for entry in reader.frames:
+        try:
+            player = decode_packet(player, reader.read(entry), offset=entry.offset)
+        except PacketError:
+            break
+    if player is None:
+        raise PacketError("the first key packet of the stream is damaged", 0)
+    return player
 
 
 def _replay(parts: Assembly, reader: StreamReader, rng: Rng) -> StreamState:

@@ -26,7 +26,8 @@ from gsstream.engine.measure import HeldOut
 from gsstream.engine.points import gather_points, with_test_views
 from gsstream.engine.progress import RunProgress
 from gsstream.engine.resume import resume_state
-from gsstream.engine.stream_state import Step, StreamState
+from gsstream.engine.whole import WholeTools, begin_whole, resume_whole, step_whole
+from gsstream.method.base import MethodState, Step
 from gsstream.metrics import peak_memory_mb
 from gsstream.packet import PlayerState, StreamMeta, StreamWriter
 from gsstream.recipe.save import save_resolved
@@ -82,6 +83,9 @@ class _Run:
         self.total = _num_frames(source.info, parts.recipe.frames)
         self.held_out = HeldOut(parts.renderer, parts.recipe.background) if measure else None
         self.progress = RunProgress(self.total, quiet)
+        self.tools = WholeTools(
+            parts, source, self.rng, self.near, lambda frame: self._meta(frame.cameras), first_frame, self.progress.root
+        )
 
     def encode(self, resume: bool) -> RunResult:
         state = self._resume() if resume else None
@@ -105,12 +109,10 @@ class _Run:
                     break
         return RunResult(self.out, done, stop.is_set() and (self.total is None or done < self.total))
 
-    def _advance(
-        self, writer: StreamWriter, state: StreamState | None, train: Frame, test: Frame, waited: float
-    ) -> StreamState:
+    def _advance(self, writer: StreamWriter, state: Any, train: Frame, test: Frame, waited: float) -> Any:
         train.validate()
         started, worked = time.perf_counter(), time.process_time()
-        step = self._first(train) if state is None else frame_step(self.parts, state, train, self.rng)
+        step = self._first(train) if state is None else self._next(state, train)
         writer.append(step.packet)
         total, cpu = time.perf_counter() - started, time.process_time() - worked
         metrics = {**self._metrics(step, train.index, test, total, waited), "cpu_seconds": cpu}
@@ -119,7 +121,14 @@ class _Run:
         self.progress.frame(metrics)
         return step.state
 
-    def _first(self, frame: Frame) -> Step:
+    def _next(self, state: Any, frame: Frame) -> Step[Any]:
+        if self.parts.whole is not None:
+            return step_whole(self.parts.whole, self.tools, state, frame)
+        return frame_step(self.parts, state, frame, self.rng)
+
+    def _first(self, frame: Frame) -> Step[Any]:
+        if self.parts.whole is not None:
+            return begin_whole(self.parts.whole, self.tools, frame)
         if self.first_frame is not None:
             return begin_from(self.parts, self.first_frame, frame, self._meta(frame.cameras), self.rng)
         recipe = self.parts.recipe
@@ -127,7 +136,7 @@ class _Run:
         points = gather_points(self.source, seen, recipe.first_frame, self.rng)
         return begin(self.parts, points, frame, self._meta(frame.cameras), self.rng, self.progress.root)
 
-    def _metrics(self, step: Step, index: int, test: Frame, total: float, waited: float) -> dict[str, Any]:
+    def _metrics(self, step: Step[Any], index: int, test: Frame, total: float, waited: float) -> dict[str, Any]:
         metrics: dict[str, Any] = {"frame": index, "status": step.status, **step.metrics}
         known = sum(metrics["seconds"].values())
         metrics["seconds"] = {**metrics["seconds"], "other": max(0.0, total - known)}
@@ -155,8 +164,8 @@ class _Run:
     def _with_near(self, frame: Frame) -> Frame:
         return replace(frame, cameras=replace(frame.cameras, near=self.near))
 
-    def _resume(self) -> StreamState | None:
-        state = resume_state(self.parts, self.out / STREAM, self.source, self.rng, self.near)
+    def _resume(self) -> MethodState | None:
+        state = self._last_state(self.out / STREAM)
         _trim_metrics(self.out / METRICS, -1 if state is None else state.player.frame)
         if state is None:
             return None
@@ -164,6 +173,11 @@ class _Run:
             second = self.source.frame(1, "test") if state.player.frame >= 1 else None
             self.held_out.remember(self.source.frame(0, "test"), second)
         return state
+
+    def _last_state(self, stream: Path) -> MethodState | None:
+        if self.parts.whole is not None:
+            return resume_whole(self.parts.whole, self.tools, stream)
+        return resume_state(self.parts, stream, self.source, self.rng, self.near)
 
 
 @contextmanager

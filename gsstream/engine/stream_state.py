@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass
 
 import torch
 
@@ -13,7 +12,8 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.state import rows
 from gsstream.engine.exposure import Exposure
-from gsstream.packet import EncodedPacket, PlayerState
+from gsstream.method.base import Step as MethodStep
+from gsstream.packet import PlayerState
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,5 @@ class StreamState:
         return self.player.gaussians.map(torch.from_numpy)
 
 
-@dataclass(frozen=True)
-class Step:
-    """Outcome of one frame step: (state, frame) -> Step. Nothing is mutated, so a failed frame costs nothing."""
-
-    state: StreamState
-    packet: EncodedPacket
-    status: Literal["key", "delta", "empty"]
-    metrics: Mapping[str, Any] = field(default_factory=dict)
+#: Outcome of one frame step of the five-part path.
+Step = MethodStep[StreamState]

@@ -18,6 +18,7 @@ def gsstream_components() -> list[ComponentSpec]:
         _part("gate", "always-open", "gate.always_open:AlwaysOpen", "no sparsity: every gate is 1"),
         _part("regularizer", "none", "regularizer.none:NoRegularizer", "nothing costs anything"),
         _part("update", "additive", "residual.additive:Additive", "gated change added to raw attributes"),
+        _part("whole", "hold", "method.hold:Hold", "frame 0 and nothing after it"),
         _part("renderer", "reference", "render.reference:ReferenceRenderer", "pure torch, slow, defines the truth"),
         _part("loss", "reference", "loss.photometric:ReferenceLoss", "L1 + D-SSIM in torch, slow, defines the truth"),
         _part("source", "demo", "source.open:open_source", "the small recording that ships with gsstream"),
@@ -34,5 +35,10 @@ def gsstream_methods() -> list[MethodSpec]:
             name="dense",
             recipe="gsstream.recipe:methods/dense.yaml",
             summary="every Gaussian may change in every frame: the baseline",
-        )
+        ),
+        MethodSpec(
+            name="hold",
+            recipe="gsstream.recipe:methods/hold.yaml",
+            summary="frame 0 and nothing after it: the floor",
+        ),
     ]

@@ -14,8 +14,8 @@ from gsstream.core.errors import PluginUnavailable, UnknownName
 from gsstream.plugins.discovery import Discovered, PluginFault, discover, spec_key
 from gsstream.spec import ComponentSpec, MethodSpec
 
-#: The abstract base class of each kind, named so that listing parts imports none of them. The kinds source, metric and
-#: method are Protocols: there is no class to inherit from. A source's target is called as target(uri, scale).
+#: The abstract base class of each kind, named so that listing parts imports none of them. The kinds source and metric
+#: are Protocols: there is no class to inherit from. A source's target is called as target(uri, scale).
 CONTRACTS: Mapping[str, str] = {
     "structure": "gsstream.structure.base:Structure",
     "confidence": "gsstream.confidence.base:ConfidenceEstimator",
@@ -23,6 +23,7 @@ CONTRACTS: Mapping[str, str] = {
     "gate": "gsstream.gate.base:GateSampler",
     "regularizer": "gsstream.regularizer.base:Regularizer",
     "update": "gsstream.residual.base:UpdateRule",
+    "whole": "gsstream.method.base:StreamingMethod",
     "renderer": "gsstream.render.base:Renderer",
     "loss": "gsstream.loss.base:Loss",
 }
@@ -106,10 +107,7 @@ class Catalog:
             UnknownName: nobody declares it.
         """
         entry = self.entry("method", method)
-        if not isinstance(entry.spec, MethodSpec):
-            raise PluginUnavailable(
-                f"method {method!r} (from {entry.origin}) is a class, not a recipe: expected a method made of parts"
-            )
+        assert isinstance(entry.spec, MethodSpec), "only recipes have the kind method"
         package, _, inside = entry.spec.recipe.partition(":")
         try:
             found = importlib.util.find_spec(package)

@@ -165,5 +165,5 @@ def _check_unique(declared: list[Spec]) -> None:
 
 
 def spec_key(spec: Spec) -> tuple[str, str]:
-    """(kind, name); named methods and whole-method components share the kind "method"."""
+    """(kind, name); named methods have the kind "method"."""
     return ("method" if isinstance(spec, MethodSpec) else spec.kind, spec.name)

@@ -135,6 +135,10 @@ class Recipe(Section):
     gate: ComponentRef = Field(default=ComponentRef(name="always-open"), description="which nodes may move")
     regularizer: ComponentRef = Field(default=ComponentRef(name="none"), description="what openness costs")
     update: ComponentRef = Field(default=ComponentRef(name="additive"), description="how a gated change is applied")
+    whole: ComponentRef = Field(
+        default=ComponentRef(name="none"),
+        description="a whole method in place of the six parts above; none: the parts are the method",
+    )
     renderer: ComponentRef = Field(
         default=ComponentRef(name="auto"), description="auto: the fastest that works here, else the reference"
     )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from gsstream.core.part import Part
+from gsstream.method.base import StreamingMethod
 from gsstream.testing.checks import common, confidence, gate, method, packet, propagation, regularizer, structure
 from gsstream.testing.registry import BEHAVED, CHECKS, Check, Skip, checks_for, kind_of
 
@@ -37,6 +38,8 @@ def run_check(entry: Check, subject: Any, expected: str | None = None) -> CheckR
     name = repr(subject)
     if entry.trait is not None and not getattr(subject.claims(), entry.trait):
         return CheckResult(entry.name, name, "skipped", f"not claimed: Traits.{entry.trait}")
+    if entry.kind == "method" and isinstance(subject, StreamingMethod):
+        subject = method.around(subject)
     try:
         entry.function(subject)
     except Skip as reason:
@@ -142,4 +145,4 @@ def summary(results: Sequence[CheckResult]) -> str:
 
 def behaviour_known(part: Part) -> bool:
     """Whether the kit checks more of this kind than settings, freezing and declaration."""
-    return kind_of(part) in BEHAVED
+    return kind_of(part) in (*BEHAVED, "whole")

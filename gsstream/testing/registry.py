@@ -10,6 +10,7 @@ from gsstream.confidence.base import ConfidenceEstimator
 from gsstream.core.part import Part
 from gsstream.gate.base import GateSampler
 from gsstream.loss.base import Loss
+from gsstream.method.base import StreamingMethod
 from gsstream.propagation.base import Propagation
 from gsstream.regularizer.base import Regularizer
 from gsstream.render.base import Renderer
@@ -23,6 +24,7 @@ CONTRACTS: dict[str, type[Part]] = {
     "gate": GateSampler,
     "regularizer": Regularizer,
     "update": UpdateRule,
+    "whole": StreamingMethod,
     "renderer": Renderer,
     "loss": Loss,
 }

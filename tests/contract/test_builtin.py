@@ -9,6 +9,7 @@ from gsstream.api import Traits
 from gsstream.confidence.uniform import Uniform
 from gsstream.gate.always_open import AlwaysOpen
 from gsstream.loss.photometric import ReferenceLoss
+from gsstream.method.hold import Hold
 from gsstream.propagation.group_max import GroupMax
 from gsstream.regularizer.none import NoRegularizer
 from gsstream.render.reference import ReferenceRenderer
@@ -20,13 +21,15 @@ from gsstream.testing.examples.gate import ExampleGate
 from gsstream.testing.examples.propagation import ExamplePropagation
 from gsstream.testing.examples.regularizer import ExampleRegularizer
 from gsstream.testing.examples.structure import ExampleStructure
+from gsstream.testing.examples.whole import ExampleWhole
 from gsstream.testing.kit import all_checks, summary
 
 BUILTIN = [
     Flat(), Uniform(), Uniform(Uniform.Config(logit=-50)), GroupMax(), AlwaysOpen(), NoRegularizer(), Additive(),
-    ReferenceRenderer(), ReferenceLoss(),
+    ReferenceRenderer(), ReferenceLoss(), Hold(),
 ]  # fmt: skip
 EXAMPLES = [ExampleStructure(), ExampleConfidence(), ExamplePropagation(), ExampleGate(), ExampleRegularizer()]
+EXAMPLES += [ExampleWhole()]
 
 
 @parametrize_with_checks([*BUILTIN, *EXAMPLES])

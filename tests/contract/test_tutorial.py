@@ -1,4 +1,4 @@
-"""docs/tutorial/first-gate.md, executed from the first block to the last."""
+"""Pages of the documentation, executed from the first block to the last."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from fresh import gsstream, install, python
 
-PAGE = Path(__file__).parents[2] / "docs" / "tutorial" / "first-gate.md"
+DOCS = Path(__file__).parents[2] / "docs"
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -46,17 +46,25 @@ def execute(block: str, folder: Path, site: Path) -> None:
             assert line in codes or line in result.stdout.splitlines(), f"{command}: {line!r} is not in {result.stdout}"
 
 
-@pytest.mark.slow
-def test_first_gate(tmp_path: Path) -> None:
-    blocks = BLOCK.findall(PAGE.read_text(encoding="utf-8"))
-    assert len(blocks) >= 6
+def follow(page: Path, folder: Path) -> None:
+    """Do what a page says, block by block."""
+    blocks = BLOCK.findall(page.read_text(encoding="utf-8"))
+    assert len(blocks) >= 4
     for language, block in blocks:
         if language == "python":
-            write(block, tmp_path)
+            write(block, folder)
         elif language == "diff":
-            change(block, tmp_path)
+            change(block, folder)
         else:
-            execute(block, tmp_path, tmp_path / "site")
-    assert (tmp_path / "run" / "stream.gss").stat().st_size > 0
-    result = python(tmp_path / "site", "-m", "pytest", "-q", "-p", "no:cacheprovider", "gsstream-margin", cwd=tmp_path)
+            execute(block, folder, folder / "site")
+    assert (folder / "run" / "stream.gss").stat().st_size > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("page", "plugin"), [("tutorial/first-gate.md", "gsstream-margin"), ("howto/wrap-a-method.md", "gsstream-repaint")]
+)
+def test_the_page_does_what_it_says(page: str, plugin: str, tmp_path: Path) -> None:
+    follow(DOCS / page, tmp_path)
+    result = python(tmp_path / "site", "-m", "pytest", "-q", "-p", "no:cacheprovider", plugin, cwd=tmp_path)
     assert result.returncode == 0, result.stdout

@@ -13,17 +13,20 @@ import numpy as np
 import torch
 
 from gsstream.core.frame import Frame
+from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
-from gsstream.core.shapes import check_finite
+from gsstream.core.shapes import FloatArray, check_finite
 from gsstream.engine.assemble import Assembly, assemble
-from gsstream.engine.begin import begin
+from gsstream.engine.begin import begin, begin_from
 from gsstream.engine.frame_step import frame_step
 from gsstream.engine.points import gather_points
 from gsstream.engine.resume import resume_state
-from gsstream.engine.stream_state import Step, StreamState
-from gsstream.packet import PlayerState, StreamMeta, StreamWriter, decode_packet
+from gsstream.engine.whole import WholeTools, begin_whole, resume_whole, step_whole
+from gsstream.method.base import Step, StreamingMethod
+from gsstream.packet import PlayerState, StreamMeta, StreamWriter, decode_packet, quantise_key
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
+from gsstream.recipe.model import ComponentRef
 from gsstream.source.open import open_source
 from gsstream.testing.cases import fingerprint
 from gsstream.testing.registry import check
@@ -38,44 +41,73 @@ CUT = 2
 
 
 class MethodUnderTest:
-    """A method with a tiny budget; frames are stepped in memory. Saboteurs override one method."""
+    """A method, made of parts or whole, with a tiny budget; frames are stepped in memory. Saboteurs override one call.
+    """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, whole: StreamingMethod[Any] | None = None) -> None:
+        """Method ``name``; or a whole method under its recipe."""
         self.name = name
         catalog = load_catalog()
-        resolved = resolve_recipe(name, catalog.recipe_path, (), [("the contract kit", text) for text in TINY])
-        self.parts: Assembly = assemble(resolved, catalog)
+        overrides = [("the contract kit", text) for text in TINY]
+        recipe = resolve_recipe(name, catalog.recipe_path, (), overrides).recipe
+        if recipe.whole.name != "none":
+            heeds = catalog.resolve("whole", recipe.whole.name).heeds
+            overrides = [item for item in overrides if not item[1].startswith("stream.") or _key(item[1]) in heeds]
+        self.parts: Assembly = assemble(resolve_recipe(name, catalog.recipe_path, (), overrides), catalog)
+        if whole is not None:
+            ref = ComponentRef(name="under-test", params=whole.config.model_dump(mode="json"))
+            self.parts = replace(self.parts, whole=whole, recipe=self.parts.recipe.model_copy(update={"whole": ref}))
         self.seed = self.parts.recipe.seed
 
     def __repr__(self) -> str:
         return f"method {self.name}"
 
-    def begin(self, frame: Frame, uri: str = SOURCE) -> Step:
-        """Frame 0."""
+    def tools(self, uri: str = SOURCE, first: PlayerState | None = None) -> WholeTools:
+        """What the engine lends a whole method."""
         source = open_source(uri)
-        rng = Rng(self.seed)
-        points = gather_points(source, frame, self.parts.recipe.first_frame, rng)
-        recipe, info = self.parts.recipe, source.info
-        meta = StreamMeta(
-            recipe.method, info.name, recipe.model_dump(mode="json"), frame.cameras, info.test, info.fps,
-            recipe.background, {},
-        )  # fmt: skip
-        return begin(self.parts, points, frame, meta, rng, lambda *_: None)
+        info, recipe = source.info, self.parts.recipe
 
-    def step(self, state: StreamState, frame: Frame) -> Step:
+        def meta(frame: Frame) -> StreamMeta:
+            return StreamMeta(
+                recipe.method, info.name, recipe.model_dump(mode="json"), frame.cameras, info.test, info.fps,
+                recipe.background, {},
+            )  # fmt: skip
+
+        return WholeTools(self.parts, source, Rng(self.seed), info.train.near, meta, first)
+
+    def begin(self, frame: Frame, uri: str = SOURCE) -> Step[Any]:
+        """Frame 0."""
+        tools = self.tools(uri)
+        if self.parts.whole is not None:
+            return begin_whole(self.parts.whole, tools, frame)
+        points = gather_points(tools.source, frame, self.parts.recipe.first_frame, tools.rng)
+        return begin(self.parts, points, frame, tools.meta(frame), tools.rng, lambda *_: None)
+
+    def take_over(self, first: PlayerState, frame: Frame) -> Step[Any]:
+        """Frame 0 of another stream."""
+        tools = self.tools(first=first)
+        if self.parts.whole is not None:
+            return begin_whole(self.parts.whole, tools, frame)
+        return begin_from(self.parts, first, frame, tools.meta(frame), tools.rng)
+
+    def step(self, state: Any, frame: Frame) -> Step[Any]:
         """A later frame."""
+        if self.parts.whole is not None:
+            return step_whole(self.parts.whole, self.tools(), state, frame)
         return frame_step(self.parts, state, frame, Rng(self.seed))
 
-    def resume(self, stream: Path) -> StreamState | None:
+    def resume(self, stream: Path) -> Any:
         """The encoder's state after the last packet of a stream."""
-        source = open_source(SOURCE)
-        return resume_state(self.parts, stream, source, Rng(self.seed), source.info.train.near)
+        tools = self.tools()
+        if self.parts.whole is not None:
+            return resume_whole(self.parts.whole, tools, stream)
+        return resume_state(self.parts, stream, tools.source, tools.rng, tools.near)
 
     def play(self, state: PlayerState | None, data: bytes) -> PlayerState:
         """What a player does with a packet."""
         return decode_packet(state, data)
 
-    def chain(self, uri: str = SOURCE, choose: Callable[[Frame], Frame] | None = None) -> list[Step]:
+    def chain(self, uri: str = SOURCE, choose: Callable[[Frame], Frame] | None = None) -> list[Step[Any]]:
         """All frames of a recording."""
         source = open_source(uri)
         frames = [source.frame(index) for index in range(FRAMES)]
@@ -86,12 +118,22 @@ class MethodUnderTest:
         return steps
 
     @functools.cached_property
-    def steps(self) -> list[Step]:
+    def steps(self) -> list[Step[Any]]:
         """The chain that most checks look at, encoded once."""
         return self.chain()
 
 
-def _bytes(what: str, got: Step, expected: Step) -> None:
+@functools.lru_cache(maxsize=8)
+def around(whole: StreamingMethod[Any]) -> MethodUnderTest:
+    """A whole method as the subject of the checks of methods; its chain is encoded once."""
+    return MethodUnderTest("dense", whole)
+
+
+def _key(override: str) -> str:
+    return override.partition("=")[0]
+
+
+def _bytes(what: str, got: Step[Any], expected: Step[Any]) -> None:
     a, b = got.packet.data, expected.packet.data
     if a == b:
         return
@@ -101,7 +143,7 @@ def _bytes(what: str, got: Step, expected: Step) -> None:
     raise AssertionError(f"{what}: packet of frame {frame} differs from byte {place} on ({len(a)} and {len(b)} bytes)")
 
 
-@check("method")
+@check("method", kinds=("method", "whole"))
 def check_method_closed_loop(method: MethodUnderTest) -> None:
     """A fresh player that has the packets alone reaches the encoder's state bit by bit, frame by frame."""
     player: PlayerState | None = None
@@ -113,14 +155,14 @@ def check_method_closed_loop(method: MethodUnderTest) -> None:
             assert drift == 0.0, f"frame {player.frame}: {name} drifted by {drift:.3g}; expected 0, bitwise on the CPU"
 
 
-@check("method")
+@check("method", kinds=("method", "whole"))
 def check_method_deterministic(method: MethodUnderTest) -> None:
     """The same seed gives the same packets, byte by byte."""
     for again, first in zip(method.chain(), method.steps, strict=True):
         _bytes("second run", again, first)
 
 
-@check("method")
+@check("method", kinds=("method", "whole"))
 def check_method_resume(method: MethodUnderTest) -> None:
     """Stopped after frame 1 and continued from the stream alone, the rest is byte by byte the same."""
     with tempfile.TemporaryDirectory() as folder:
@@ -137,7 +179,7 @@ def check_method_resume(method: MethodUnderTest) -> None:
         state = again.state
 
 
-@check("method")
+@check("method", kinds=("method", "whole"))
 def check_method_failed_frame(method: MethodUnderTest) -> None:
     """A frame that fails leaves the state as it was; the next attempt gives what it would have given."""
     state = method.steps[1].state
@@ -152,7 +194,7 @@ def check_method_failed_frame(method: MethodUnderTest) -> None:
     _bytes("after a failed frame", method.step(state, frame), method.steps[2])
 
 
-@check("method")
+@check("method", kinds=("method", "whole"))
 def check_method_static_video(method: MethodUnderTest) -> None:
     """When nothing moves, frames cost no more than when something does."""
     still = method.chain(SOURCE + "&static=true")
@@ -164,7 +206,7 @@ def check_method_static_video(method: MethodUnderTest) -> None:
     )
 
 
-@check("method")
+@check("method", kinds=("method", "whole"))
 def check_method_one_camera(method: MethodUnderTest) -> None:
     """One camera is enough to run, and everything stays finite."""
 
@@ -176,7 +218,7 @@ def check_method_one_camera(method: MethodUnderTest) -> None:
             check_finite(f"frame {step.packet.frame}: {name}", value)
 
 
-@check("method")
+@check("method", kinds=("method", "whole"))
 def check_method_size_is_true(method: MethodUnderTest) -> None:
     """Reported bytes are the bytes written, and no more gates or Gaussians are active than there are."""
     for step in method.steps:
@@ -189,7 +231,7 @@ def check_method_size_is_true(method: MethodUnderTest) -> None:
             assert 0 <= active <= have, f"frame {frame}: {active} active {name} of {have}"
 
 
-@check("method")
+@check("method", kinds=("method", "whole"))
 def check_method_global_rng(method: MethodUnderTest) -> None:
     """Torch's global generator is neither read nor moved by a frame."""
     state, frame = method.steps[0].state, open_source(SOURCE).frame(1)
@@ -197,3 +239,50 @@ def check_method_global_rng(method: MethodUnderTest) -> None:
     again = method.step(state, frame)
     assert torch.equal(before, torch.get_rng_state()), "the frame drew from torch's global generator"
     _bytes("frame 1 again", again, method.steps[1])
+
+
+@check("method", kinds=("method", "whole"))
+def check_method_inputs_kept(method: MethodUnderTest) -> None:
+    """A frame leaves the images it was given and the state it started from as they were."""
+    state, frame = method.steps[1].state, open_source(SOURCE).frame(2)
+    before = fingerprint((frame.images, state.player))
+    method.step(state, frame)
+    assert fingerprint((frame.images, state.player)) == before, "the frame changed its images or the state before it"
+
+
+@check("method", kinds=("method", "whole"))
+def check_method_takes_first_frame(method: MethodUnderTest) -> None:
+    """Given frame 0 of another stream, it starts from exactly those Gaussians, in an order of its own."""
+    own = method.steps[0].state.player
+    given = quantise_key(replace(own.gaussians, means=own.gaussians.means / 2))
+    step = method.take_over(replace(own, gaussians=given), open_source(SOURCE).frame(0))
+    want, got = _sorted_rows(given), _sorted_rows(step.state.player.gaussians)
+    assert want.shape == got.shape, f"expected {len(want)} Gaussians of {want.shape[1]} values, got {list(got.shape)}"
+    off = int((want != got).any(1).sum())
+    assert off == 0, f"{off} of {len(want)} Gaussians are not those of the frame that was given"
+
+
+def _sorted_rows(gaussians: Gaussians[FloatArray]) -> FloatArray:
+    rows = np.concatenate([value.reshape(len(value), -1) for _, value in gaussians.items()], axis=1)
+    return np.asarray(rows[np.lexsort(rows.T)])
+
+
+@check("method", kinds=("method", "whole"))
+def check_method_says_what_it_is(method: MethodUnderTest) -> None:
+    """The key packet names the method and carries the recipe and the cameras of the run."""
+    meta, recipe = method.steps[0].state.player.meta, method.parts.recipe
+    assert meta.method == recipe.method, f"method: expected {recipe.method!r}, got {meta.method!r}"
+    assert meta.recipe == recipe.model_dump(mode="json"), "the recipe in the key packet is not the one of the run"
+    info = open_source(SOURCE).info
+    for split, want, have in (("training", info.train, meta.train), ("test", info.test, meta.test)):
+        assert have.ids == want.ids, f"{split} cameras: expected {want.ids}, got {have.ids}"
+
+
+@check("method", kinds=("method", "whole"))
+def check_method_skips(method: MethodUnderTest) -> None:
+    """A frame that is worth no effort becomes an empty packet, and the stream goes on from it."""
+    state, frame = method.steps[0].state, open_source(SOURCE).frame(1)
+    step = method.step(state, replace(frame, effort=0.0))
+    assert step.status == "empty", f"expected an empty packet for effort 0, got {step.status} ({step.packet.sizes})"
+    after = method.step(step.state, open_source(SOURCE).frame(2))
+    assert after.packet.frame == 2, f"expected to go on with frame 2, got {after.packet.frame}"

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
 from gsstream.core.frame import Frame
-from gsstream.engine.stream_state import Step, StreamState
-from gsstream.packet import PlayerState
+from gsstream.method.base import Step
+from gsstream.packet import KeyState, PlayerState, decode_packet, encode_key
 from gsstream.testing.cases import fingerprint
-from gsstream.testing.checks.method import SOURCE, MethodUnderTest
+from gsstream.testing.checks.method import FRAMES, SOURCE, MethodUnderTest
 
 METHOD_SABOTEURS: dict[str, type[MethodUnderTest]] = {}
 
@@ -22,16 +22,17 @@ METHOD_SABOTEURS: dict[str, type[MethodUnderTest]] = {}
 class Remembered(MethodUnderTest):
     """A sound method that encodes each frame once for all saboteurs: what they spoil lies around it."""
 
-    memory: ClassVar[dict[bytes, Step]] = {}
+    memory: ClassVar[dict[bytes, Step[Any]]] = {}
 
-    def begin(self, frame: Frame, uri: str = SOURCE) -> Step:
+    def begin(self, frame: Frame, uri: str = SOURCE) -> Step[Any]:
         key = b"".join([uri.encode(), *fingerprint(frame)])
         if key not in self.memory:
             self.memory[key] = super().begin(frame, uri)
         return self.memory[key]
 
-    def step(self, state: StreamState, frame: Frame) -> Step:
-        key = b"".join(fingerprint((state.player.gaussians, state.previous, frame)))
+    def step(self, state: Any, frame: Frame) -> Step[Any]:
+        seen = (state.player.gaussians, state.previous, frame)
+        key = b"".join([*fingerprint(seen), str(frame.effort).encode()])
         if key not in self.memory:
             self.memory[key] = super().step(state, frame)
         return self.memory[key]
@@ -61,7 +62,7 @@ class Moody(Remembered):
 
     runs = 0
 
-    def begin(self, frame: Frame, uri: str = SOURCE) -> Step:
+    def begin(self, frame: Frame, uri: str = SOURCE) -> Step[Any]:
         step = super().begin(frame, uri)
         self.runs += 1
         if self.runs == 1:
@@ -74,7 +75,7 @@ class Moody(Remembered):
 class Amnesiac(Remembered):
     """Resumes with a scene that is a hundredth off."""
 
-    def resume(self, stream: Path) -> StreamState | None:
+    def resume(self, stream: Path) -> Any:
         state = super().resume(stream)
         assert state is not None
         gaussians = replace(state.player.gaussians, means=state.player.gaussians.means + np.float32(0.01))
@@ -85,9 +86,9 @@ class Amnesiac(Remembered):
 class Clumsy(Remembered):
     """A failure spoils the state."""
 
-    memory: ClassVar[dict[bytes, Step]] = {}
+    memory: ClassVar[dict[bytes, Step[Any]]] = {}
 
-    def step(self, state: StreamState, frame: Frame) -> Step:
+    def step(self, state: Any, frame: Frame) -> Step[Any]:
         try:
             return super().step(state, frame)
         except Exception:
@@ -99,7 +100,7 @@ class Clumsy(Remembered):
 class Nervous(Remembered):
     """Sends most when nothing moves."""
 
-    def step(self, state: StreamState, frame: Frame) -> Step:
+    def step(self, state: Any, frame: Frame) -> Step[Any]:
         step = super().step(state, frame)
         if not np.array_equal(frame.images, state.previous.images):
             return step
@@ -110,7 +111,7 @@ class Nervous(Remembered):
 class Stereo(Remembered):
     """Needs two cameras."""
 
-    def step(self, state: StreamState, frame: Frame) -> Step:
+    def step(self, state: Any, frame: Frame) -> Step[Any]:
         if len(frame.cameras) < 2:
             raise ValueError("expected at least two cameras")
         return super().step(state, frame)
@@ -120,7 +121,7 @@ class Stereo(Remembered):
 class Boaster(Remembered):
     """Reports half of the bytes."""
 
-    def step(self, state: StreamState, frame: Frame) -> Step:
+    def step(self, state: Any, frame: Frame) -> Step[Any]:
         step = super().step(state, frame)
         sizes = {name: size // 2 for name, size in step.packet.sizes.items()}
         return replace(step, metrics={**step.metrics, "bytes": sizes})
@@ -130,6 +131,46 @@ class Boaster(Remembered):
 class Gambler(Remembered):
     """Draws from the global generator."""
 
-    def step(self, state: StreamState, frame: Frame) -> Step:
+    def step(self, state: Any, frame: Frame) -> Step[Any]:
         torch.rand(1)
         return super().step(state, frame)
+
+
+@_spoils("check_method_inputs_kept")
+class Scribbler(Remembered):
+    """Darkens the images of the last frame once it is done with them."""
+
+    def step(self, state: Any, frame: Frame) -> Step[Any]:
+        step = super().step(state, frame)
+        if frame.index == FRAMES - 1:
+            frame.images[...] *= np.float32(0.5)
+        return step
+
+
+@_spoils("check_method_takes_first_frame")
+class Stubborn(Remembered):
+    """Reconstructs frame 0 although it was given one."""
+
+    def take_over(self, first: PlayerState, frame: Frame) -> Step[Any]:
+        return self.begin(frame)
+
+
+@_spoils("check_method_says_what_it_is")
+class Impostor(Remembered):
+    """Signs its stream with another method's name."""
+
+    def begin(self, frame: Frame, uri: str = SOURCE) -> Step[Any]:
+        step = super().begin(frame, uri)
+        player = step.state.player
+        meta = replace(player.meta, method="somebody-else")
+        packet = encode_key(KeyState(player.gaussians, player.layout, meta), frame=frame.index)
+        state = replace(step.state, player=decode_packet(None, packet.data))
+        return replace(step, packet=packet, state=state, metrics={**step.metrics, "bytes": dict(packet.sizes)})
+
+
+@_spoils("check_method_skips")
+class Workaholic(Remembered):
+    """Does every frame in full, whatever it is worth."""
+
+    def step(self, state: Any, frame: Frame) -> Step[Any]:
+        return super().step(state, replace(frame, effort=1.0))

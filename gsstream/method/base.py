@@ -1,0 +1,91 @@
+"""StreamingMethod: a whole method behind three calls. What it sends is played by every player.
+
+The five-part path (``engine.frame_step``) asks a method for its parts. A method that is built differently implements
+this contract instead: it is given a frame and what the engine can do (``Tools``), and returns a packet and the state it
+goes on from. The engine keeps the rest: recordings, recipes, the stream on disk, metrics, resume.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar, final
+
+from gsstream.core.frame import Frame
+from gsstream.core.part import Part
+from gsstream.method.tools import Tools
+from gsstream.packet import EncodedPacket, PlayerState, decode_packet
+
+#: (state before or None, bytes of a packet) -> state after.
+PacketDecoder = Callable[[PlayerState | None, bytes], PlayerState]
+
+
+class MethodState(Protocol):
+    """What a method carries from frame to frame. Frozen: a failed frame costs nothing.
+
+    Whatever else it holds must follow from the packets sent so far, the images of the last frame that changed the scene
+    and the recipe; then ``resume`` can make it again.
+    """
+
+    @property
+    def player(self) -> PlayerState:
+        """Exactly what every player has after the last packet."""
+
+
+State = TypeVar("State", bound=MethodState)
+
+
+@dataclass(frozen=True)
+class Step(Generic[State]):
+    """Outcome of one frame: (state, frame) -> Step. Nothing is mutated, so a failed frame costs nothing.
+
+    Arguments:
+        state: what the next frame starts from.
+        packet: what is written.
+        status: kind of the packet.
+        metrics: numbers of this frame, plain JSON values; ``seconds`` (phase -> seconds) and ``loss`` are shown.
+    """
+
+    state: State
+    packet: EncodedPacket
+    status: Literal["key", "delta", "empty"]
+    metrics: Mapping[str, Any] = field(default_factory=dict)
+
+
+class StreamingMethod(Part, Generic[State]):
+    """A whole method. Pure: state goes in and comes out, random numbers come from ``tools.rng`` by name and frame.
+
+    ``heeds`` names the recipe keys that this method reads besides what the engine itself does (frame 0, loss, renderer,
+    recording, packets), for example ``("stream.epochs",)``. A run that changes a key of the five parts or of later
+    frames that is not listed here is refused: no option falls through.
+    """
+
+    heeds: ClassVar[tuple[str, ...]] = ()
+
+    @abstractmethod
+    def begin(self, frame: Frame, tools: Tools) -> Step[State]:
+        """Frame 0: a key packet. ``tools.first_frame(frame)`` reconstructs the scene, for methods that need nothing
+        of their own there.
+        """
+
+    @abstractmethod
+    def step(self, state: State, frame: Frame, tools: Tools) -> Step[State]:
+        """A later frame: a delta, empty or key packet.
+
+        ``state.player`` of the result must be ``decoder()(before.player, packet.data)``, bit for bit: the method goes
+        on from what it sent, not from what it trained. The engine decodes every packet and compares. A frame whose
+        ``effort`` is 0 is skipped: an empty packet, so that numbering and time go on.
+        """
+
+    @abstractmethod
+    def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> State:
+        """The state after the last packet of a stream, as ``step`` returned it there.
+
+        ``shown`` are the training images of the last frame whose packet was not empty: what the scene shows.
+        """
+
+    @final
+    def decoder(self) -> PacketDecoder:
+        """What turns packets into scenes: the one every player has, so no stream needs a plugin to be played."""
+        return decode_packet

@@ -1,0 +1,47 @@
+"""Packets and what every player makes of them, in one call each: a method goes on from the second."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from gsstream.core.delta import Delta, Layout
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.shapes import FloatArray
+from gsstream.packet import (
+    EncodedPacket,
+    KeyState,
+    PlayerState,
+    StreamMeta,
+    decode_packet,
+    encode_delta,
+    encode_empty,
+    encode_key,
+)
+
+
+class Sent(NamedTuple):
+    """A packet, and the state every player has after it."""
+
+    packet: EncodedPacket
+    player: PlayerState
+
+
+def send_key(gaussians: Gaussians[FloatArray], layout: Layout, meta: StreamMeta, frame: int) -> Sent:
+    """A key packet. Rows are stored node by node (``layout``). Raises ShapeError when they do not fit."""
+    packet = encode_key(KeyState(gaussians.map(np.ascontiguousarray), layout, meta), frame=frame)
+    return Sent(packet, decode_packet(None, packet.data))
+
+
+def send_delta(player: PlayerState, delta: Delta) -> Sent:
+    """The packet of the frame after ``player``; an empty one when every gate is closed.
+
+    ``delta.decoders`` must come from ``quantise_decoders``. Raises ShapeError when it does not fit the layout.
+    """
+    frame = player.frame + 1
+    if delta.is_empty:
+        packet = encode_empty(frame=frame)
+    else:
+        packet = encode_delta(delta, player.layout, player.decoders, frame=frame)
+    return Sent(packet, decode_packet(player, packet.data))

@@ -1,0 +1,81 @@
+"""What the engine lends to a whole method. Protocols: the engine implements them, methods only call."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import torch
+
+from gsstream.core.context import FrameContext
+from gsstream.core.delta import Layout
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.shapes import FloatArray
+from gsstream.packet import PlayerState, StreamMeta
+
+if TYPE_CHECKING:
+    from gsstream.core.frame import Frame
+    from gsstream.core.rng import Rng
+    from gsstream.render.base import Renderer, RenderSession
+
+
+@dataclass(frozen=True)
+class FirstFrame:
+    """Frame 0 as the engine reconstructs it, or as another stream has it (``--first-frame``).
+
+    Arguments:
+        gaussians: the scene, with the values that a key packet holds.
+        layout: one node per Gaussian and one cell size; a method may send another.
+        meta: what the key packet says about the run, colour maps of the training cameras included.
+        metrics: iterations and seconds.
+    """
+
+    gaussians: Gaussians[FloatArray]
+    layout: Layout
+    meta: StreamMeta
+    metrics: Mapping[str, Any]
+
+
+class FrameTools(FrameContext, Protocol):
+    """One frame: images, gradients of the scene before it, and the renderer with only some rows moving.
+
+    Images are as recorded. Colour maps of the cameras are applied and pulled through where they belong; a method need
+    not know them.
+    """
+
+    @property
+    def session(self) -> RenderSession:
+        """Opened on the scene of the frame before: ``narrow`` to the rows that may change, then ``render`` them."""
+
+    def backward(self, view: int, image: torch.Tensor, tile_mask: torch.Tensor | None = None) -> float:
+        """Judge a rendered view [H, W, 3] against what its camera recorded, and pull the loss back into its graph.
+
+        With a tile mask [ceil(H / 16), ceil(W / 16)] bool only active tiles count. Returns the loss, (1 - w) L1 +
+        w (1 - SSIM).
+        """
+
+
+class Tools(Protocol):
+    """What a whole method may use. Nothing here keeps state between frames."""
+
+    @property
+    def rng(self) -> Rng:
+        """Random streams by name and frame; draw from nothing else."""
+
+    @property
+    def renderer(self) -> Renderer: ...
+
+    @property
+    def background(self) -> tuple[float, float, float]: ...
+
+    def epochs(self, frame: Frame) -> int:
+        """Passes over the training cameras that a later frame is worth: ``stream.epochs`` (list it in ``heeds``), fewer
+        when a live run has fallen behind.
+        """
+
+    def first_frame(self, frame: Frame) -> FirstFrame:
+        """Reconstruct frame 0 by the recipe's ``first_frame``, or take it over from another stream."""
+
+    def open(self, player: PlayerState, previous: Frame, frame: Frame) -> FrameTools:
+        """Begin work on a frame. ``previous`` are the images that the scene of ``player`` is compared with."""

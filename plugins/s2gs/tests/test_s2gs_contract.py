@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from gsstream_s2gs.error_aware import ErrorAware
 from gsstream_s2gs.expected_sparsity import ExpectedSparsity
 from gsstream_s2gs.gumbel_sigmoid import GumbelSigmoid
 from gsstream_s2gs.hierarchical import HierarchicalMax
 from gsstream_s2gs.latent import LatentResidual
+from gsstream_s2gs.noise_normalised import NoiseNormalised
 from gsstream_s2gs.octree import StreamingOctree
+from gsstream_s2gs.selective_leaf import SelectiveLeaf
+from gsstream_s2gs.uniform_random import UniformRandom
 from gsstream_s2gs.view_gradient import ViewSpaceGradient
 
 from gsstream.testing import parametrize_with_checks
@@ -20,6 +24,9 @@ PARTS = [
     ViewSpaceGradient(Gradient(epsilon_mode="relative")), HierarchicalMax(),
     GumbelSigmoid(), GumbelSigmoid(Gate(levels=1)), GumbelSigmoid(Gate(noise="none")),
     ExpectedSparsity(), ExpectedSparsity(Sparsity(reduction="sum", motion="half-mean")), LatentResidual(),
+    NoiseNormalised(), NoiseNormalised(NoiseNormalised.Config(probes=4)),
+    ErrorAware(), ErrorAware(ErrorAware.Config(budget=0.0)),
+    SelectiveLeaf(), SelectiveLeaf(SelectiveLeaf.Config(suspect=-1.0, spread=1.0)),
 ]  # fmt: skip
 
 
@@ -41,4 +48,11 @@ def test_released_clamp(check) -> None:
     expected_failures={"check_gate_init_calibrated": "with one Gumbel draw confidence 0.5 opens 63 % of all gates"},
 )
 def test_released_noise_law(check) -> None:
+    check()
+
+
+@parametrize_with_checks(
+    [UniformRandom()], expected_failures={"check_permutation": "lots are drawn row by row, whoever stands in the row"}
+)
+def test_by_lot(check) -> None:
     check()

@@ -18,6 +18,30 @@ COMPONENTS = [
         summary="change of the view-space gradient between two frames, robustly normalised",
     ),
     ComponentSpec(
+        kind="confidence",
+        name="noise-normalised",
+        target="gsstream_s2gs.noise_normalised:NoiseNormalised",
+        summary="change in units of what each camera's noise alone would do",
+    ),
+    ComponentSpec(
+        kind="confidence",
+        name="error-aware",
+        target="gsstream_s2gs.error_aware:ErrorAware",
+        summary="change, or persistent reducible error within a budget",
+    ),
+    ComponentSpec(
+        kind="confidence",
+        name="uniform-random",
+        target="gsstream_s2gs.uniform_random:UniformRandom",
+        summary="confidence by lot (ablation)",
+    ),
+    ComponentSpec(
+        kind="propagation",
+        name="selective-leaf",
+        target="gsstream_s2gs.selective_leaf:SelectiveLeaf",
+        summary="one decision per region while it acts as one, else one per leaf",
+    ),
+    ComponentSpec(
         kind="propagation",
         name="hierarchical-max",
         target="gsstream_s2gs.hierarchical:HierarchicalMax",
@@ -57,7 +81,7 @@ METHODS = [
 
 @hookimpl
 def gsstream_components() -> list[ComponentSpec]:
-    """The six parts of S2GS."""
+    """The six parts of S2GS, and variants to ablate and to extend it."""
     return list(COMPONENTS)
 
 

@@ -1,0 +1,39 @@
+"""Uniform-random confidence: suspicion by lot."""
+
+from __future__ import annotations
+
+import math
+from typing import final
+
+import torch
+from pydantic import Field
+
+from gsstream.api import ConfidenceEstimator, FrameContext, PartConfig, Rng, Traits, check_finite
+
+
+@final
+class UniformRandom(ConfidenceEstimator):
+    """p_i drawn from U(0, 1) for each Gaussian and frame (paper, table of confidence estimators, "Uniform Random").
+
+    The logit of a uniform probability is a Logistic(0, 1) draw. Images are only looked at to refuse values that are not
+    finite. Draws belong to rows: a permutation of the Gaussians gives them other lots.
+    """
+
+    class Config(PartConfig):
+        seed: int = Field(default=0, ge=0, description="seed of the draws, any integer from 0")
+        limit: float = Field(
+            default=math.log(1000.0), gt=0, le=50, description="logits are kept in [-limit, limit], 0 to 50 (ours)"
+        )
+
+    def claims(self) -> Traits:
+        return Traits(floor=self.config.limit)
+
+    def estimate(self, context: FrameContext) -> torch.Tensor:
+        """Logits [N] float32 in [-limit, limit]. Raises ShapeError when an image is not finite."""
+        for view in range(len(context.cameras)):
+            check_finite(f"image of view {view} at frame {context.index}", context.image(view))
+        generator = Rng(self.config.seed).stream("s2gs/uniform-random", context.index)
+        uniform = torch.rand(len(context.gaussians), generator=generator, dtype=torch.float64)
+        # Half a step of the lattice k / 2^53: finite at both ends.
+        logits = torch.logit(uniform.clamp(2.0**-54, 1 - 2.0**-53))
+        return logits.clamp(-self.config.limit, self.config.limit).float().to(context.gaussians.means.device)

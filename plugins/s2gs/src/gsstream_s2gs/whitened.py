@@ -1,0 +1,63 @@
+"""Pulls of change and of error on Gaussians, in units of what each camera's noise alone would do."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+
+from gsstream.api import FrameContext, Rng, check_finite
+
+
+class Pulls(NamedTuple):
+    """Ratios to the noise, [N] float64: about 1 under noise alone, 0 for Gaussians that no pixel pulls or sees.
+
+    Arguments:
+        change_ratio: of the change between the two frames.
+        error_ratio: of what the render still lacks in both frames; zeros unless asked for.
+    """
+
+    change_ratio: torch.Tensor
+    error_ratio: torch.Tensor
+
+
+def pulls(context: FrameContext, least_sigma: float, probes: int, seed: int, *, error: bool) -> Pulls:
+    """Both ratios over all views: one backward pass per view for each, and one per probe.
+
+    Arguments:
+        least_sigma: least noise of a camera, image units.
+        probes: noise draws per view that the expectation is averaged over.
+        error: whether to measure the error too; it needs a render per view.
+
+    Raises ShapeError when an image's gradient is not finite.
+    """
+    means = context.gaussians.means
+    change = torch.zeros(len(means), dtype=torch.float64, device=means.device)
+    lacking, noise = change.clone(), change.clone()
+    for view in range(len(context.cameras)):
+        now, before = context.image(view), context.previous_image(view)
+        sigma = max(context.noise_sigma(view), least_sigma)
+        # Unit noise in either case: a difference holds the noise of two images, a mean half the variance of one.
+        change += _energy(context, view, (before - now) / (math.sqrt(2) * sigma))
+        if error:
+            residue = context.previous_render(view) - (before + now) / 2
+            lacking += _energy(context, view, residue * (math.sqrt(2) / sigma))
+        for probe in range(probes):
+            # By the camera's name, so that the order of the cameras does not matter.
+            generator = Rng(seed).stream(f"s2gs/whitened/{context.cameras.ids[view]}/{probe}", context.index)
+            draw = torch.randn(now.shape, generator=generator, dtype=now.dtype)
+            noise += _energy(context, view, draw.to(now.device)) / probes
+    return Pulls(_ratio(change, noise), _ratio(lacking, noise))
+
+
+def _energy(context: FrameContext, view: int, upstream: torch.Tensor) -> torch.Tensor:
+    """[N] squared length of the screen gradient; double precision, since float32 squares vanish below 1e-23."""
+    gradient, visible = context.screen_gradient(view, upstream)
+    check_finite(f"screen gradient of view {view} at frame {context.index}", gradient)
+    return gradient.double().square().sum(1) * visible
+
+
+def _ratio(energy: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+    felt = noise > 0
+    return (energy / noise.where(felt, torch.ones_like(noise))).sqrt() * felt

@@ -11,28 +11,29 @@ from gsstream_s2gs.gumbel_sigmoid import GumbelSigmoid
 from gsstream_s2gs.noise_normalised import NoiseNormalised
 from gsstream_s2gs.uniform_random import UniformRandom
 from gsstream_s2gs.whitened import pulls
-from s2gs_scene import SIZE, Context, gaussians, images, moving, rig
+from s2gs_scene import SIZE, context, gaussians, images, moving, rig
 
 from gsstream.api import ShapeError
+from gsstream.testing import World
 
 VIEWS = 4
 CLOSED = 1e-9
 
 
-def still(sigma: float, seed: int = 0, views: int = VIEWS) -> Context:
+def still(sigma: float, seed: int = 0, views: int = VIEWS) -> World:
     """A scene that stands still in front of noisy cameras."""
     scene, cameras = gaussians(), rig(views)
     clean = images(scene, cameras)
     g = torch.Generator().manual_seed(seed)
     before, now = ([image + sigma * torch.randn(SIZE, SIZE, 3, generator=g) for image in clean] for _ in range(2))
-    return Context(scene, cameras, before, now, sigma=sigma)
+    return context(scene, cameras, before, now, sigma)
 
 
-def displaced(context: Context, row: int, step: float) -> Context:
+def displaced(case: World, row: int, step: float) -> World:
     """The same recording seen by a scene in which one Gaussian stands in the wrong place."""
-    means = context.gaussians.means.clone()
+    means = case.gaussians.means.clone()
     means[row, 1] += step
-    return dataclasses.replace(context, gaussians=dataclasses.replace(context.gaussians, means=means))
+    return dataclasses.replace(case, gaussians=dataclasses.replace(case.gaussians, means=means))
 
 
 class TestNoiseNormalised:
@@ -59,41 +60,41 @@ class TestNoiseNormalised:
 
     def test_a_noisier_camera_weighs_less(self) -> None:
         """Each camera is divided by its own noise: one that says it is 1,000 times noisier is all but ignored."""
-        context, moved = moving()
+        case, moved = moving()
 
         @dataclasses.dataclass(frozen=True)
-        class Uneven(Context):
+        class Uneven(World):
             def noise_sigma(self, view: int) -> float:
                 return 10.0 if view == 2 else 0.01
 
-        parts = {f.name: getattr(context, f.name) for f in dataclasses.fields(Context)}
-        now = [*context.now[:2], torch.rand(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(0))]
+        parts = {f.name: getattr(case, f.name) for f in dataclasses.fields(World)}
+        now = (*case.now[:2], torch.rand(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(0)))
         spoilt = Uneven(**{**parts, "now": now})
-        calm = dataclasses.replace(context, now=now, sigma=0.01)
+        calm = dataclasses.replace(case, now=now, sigma=0.01)
         z = NoiseNormalised().estimate(spoilt)
         assert float(z[~moved][:30].median()) < float(NoiseNormalised().estimate(calm)[~moved][:30].median())
         assert float((z[moved] > 0).float().mean()) > 0.6
 
     def test_units_of_the_image_do_not_matter(self) -> None:
-        context, _ = moving()
-        loud = dataclasses.replace(context, sigma=0.01)
+        case, _ = moving()
+        loud = dataclasses.replace(case, sigma=0.01)
         half = dataclasses.replace(
-            loud, before=[i / 2 for i in loud.before], now=[i / 2 for i in loud.now], sigma=0.005
+            loud, before=tuple(i / 2 for i in loud.before), now=tuple(i / 2 for i in loud.now), sigma=0.005
         )
         torch.testing.assert_close(
             NoiseNormalised().estimate(half), NoiseNormalised().estimate(loud), rtol=1e-4, atol=1e-4
         )
 
     def test_the_least_sigma_bounds_the_ratio(self) -> None:
-        context, _ = moving()
-        strict = NoiseNormalised(NoiseNormalised.Config(least_sigma=0.1)).estimate(context)
-        assert float(strict.max()) < float(NoiseNormalised().estimate(context).max())
+        case, _ = moving()
+        strict = NoiseNormalised(NoiseNormalised.Config(least_sigma=0.1)).estimate(case)
+        assert float(strict.max()) < float(NoiseNormalised().estimate(case).max())
 
 
 class TestErrorAware:
     def test_without_a_budget_it_is_change_alone(self) -> None:
-        context, _ = moving()
-        loud = dataclasses.replace(context, sigma=0.01)
+        case, _ = moving()
+        loud = dataclasses.replace(case, sigma=0.01)
         change = NoiseNormalised().estimate(loud)
         z = ErrorAware(ErrorAware.Config(budget=0.0)).estimate(loud)
         risen = change > 0
@@ -105,10 +106,10 @@ class TestErrorAware:
         part = ErrorAware(ErrorAware.Config(budget=1 / 60 + CLOSED, turns=1))
         found = 0
         for row in (3, 9, 15):
-            context = displaced(still(0.005), row, 0.12)
-            opened = (part.estimate(context) == 1.0).nonzero()[:, 0]
+            case = displaced(still(0.005), row, 0.12)
+            opened = (part.estimate(case) == 1.0).nonzero()[:, 0]
             assert len(opened) <= 1
-            error = pulls(context, 0.001, 2, 0, error=True).error_ratio
+            error = pulls(case, 0.001, 2, 0, error=True).error_ratio
             assert opened.tolist() == [int(error.argmax())]
             found += int(opened[0]) == row
         # Neighbours in front of or behind the misplaced one feel its error as well.
@@ -137,16 +138,16 @@ class TestErrorAware:
 class TestUniformRandom:
     def test_half_are_above_one_half_and_frames_differ(self) -> None:
         scene = gaussians(4000)
-        context = Context(scene, rig(0), [], [])
-        z = UniformRandom().estimate(context)
+        case = context(scene, rig(0), [], [])
+        z = UniformRandom().estimate(case)
         assert float((z > 0).float().mean()) == pytest.approx(0.5, abs=4 * 0.5 / 4000**0.5)
         # P(z > logit 0.9) = 0.1.
         assert float((z > 2.1972).float().mean()) == pytest.approx(0.1, abs=4 * 0.3 / 4000**0.5)
-        assert not torch.equal(z, UniformRandom().estimate(dataclasses.replace(context, index=2)))
-        assert torch.equal(z, UniformRandom().estimate(context))
+        assert not torch.equal(z, UniformRandom().estimate(dataclasses.replace(case, index=2)))
+        assert torch.equal(z, UniformRandom().estimate(case))
 
     def test_refuses_images_that_are_not_finite(self) -> None:
-        context = still(0.0)
-        context.now[1][0, 0, 0] = float("nan")
+        case = still(0.0)
+        case.now[1][0, 0, 0] = float("nan")
         with pytest.raises(ShapeError, match="image of view 1"):
-            UniformRandom().estimate(context)
+            UniformRandom().estimate(case)

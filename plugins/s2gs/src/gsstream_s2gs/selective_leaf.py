@@ -7,8 +7,16 @@ from typing import final
 import torch
 from pydantic import Field
 
-from gsstream.api import Hierarchy, PartConfig, Propagation, ShapeError, Traits, check_finite, check_shape
-from gsstream_s2gs.hierarchical import roots
+from gsstream.api import (
+    Hierarchy,
+    PartConfig,
+    Propagation,
+    ShapeError,
+    Traits,
+    check_finite,
+    check_shape,
+    tree_roots,
+)
 
 
 @final
@@ -40,7 +48,7 @@ class SelectiveLeaf(Propagation):
         """[N] logits -> [M] logits. Raises ShapeError for a wrong length, a value that is not finite, or a cycle."""
         check_shape("logits", logits, (hierarchy.num_gaussians,))
         check_finite("logits", logits)
-        root = roots(hierarchy.parent)
+        root = tree_roots(hierarchy.parent)
         own = logits.new_full((hierarchy.num_nodes,), self.config.empty)
         own = own.scatter_reduce(0, hierarchy.node_of, logits, reduce="amax", include_self=False)
         best = self._subtrees(own, hierarchy)

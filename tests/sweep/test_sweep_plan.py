@@ -42,6 +42,19 @@ def test_each_changes_one_axis_at_a_time_and_shares_equal_runs(plan_of):
     assert len(plan.cells) == 3
 
 
+def test_base_seeds_repeat_the_unchanged_variant_alone(plan_of):
+    text = (
+        f"name: e\n{SCENE}variants: [{{name: v, method: dense, base_seeds: [1, 2]}}, {{name: w, method: dense}}]\n"
+        "search: each\naxes: {near: [0.1, 0.2]}\n"
+    )
+    found = [(p.variant, p.seed, p.axes.get("near")) for p in plan_of(text).points]
+    assert found == [(v, 0, near) for v in "vw" for near in (None, 0.1, 0.2)] + [("v", 1, None), ("v", 2, None)]
+    with pytest.raises(RecipeError, match="base_seeds of v"):
+        plan_of(text.replace("[1, 2]", "[0]"))
+    with pytest.raises(RecipeError, match="search 'grid'"):
+        plan_of(text.replace("search: each", "search: grid"))
+
+
 def test_settings_win_in_the_documented_order(plan_of, tmp_path):
     (tmp_path / "v.yaml").write_text("base: dense\nstream: {epochs: 2}\nnear: 0.2\nloss: {dssim: 0.2}\nseed: 99\n")
     (tmp_path / "s.yaml").write_text("near: 0.3\nloss: {dssim: 0.3}\nfirst_frame: {exposure: true}\n")

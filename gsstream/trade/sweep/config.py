@@ -62,6 +62,10 @@ class Variant(Section):
     recipe: str | None = Field(default=None, description="recipe file, relative to the sweep's file")
     set: dict[str, Any] = Field(default_factory=dict, description="recipe keys, e.g. stream.epochs: 10")
     axes: dict[str, Axis] = Field(default_factory=dict, description="axes of this variant, besides those of all")
+    base_seeds: list[int] = Field(
+        default_factory=list,
+        description="search 'each': further seeds of the variant as it is, to tell differences from noise",
+    )
 
 
 class FirstFrame(Section):
@@ -124,6 +128,13 @@ class SweepConfig(Section):
         for what, names in (("scenes", [s.name for s in self.scenes]), ("variants", [v.name for v in self.variants])):
             if len(set(names)) < len(names):
                 raise ValueError(f"two {what} have the same name: {names}")
+        for variant in self.variants:
+            seeds = [*self.seeds, *variant.base_seeds]
+            if variant.base_seeds and (self.search != "each" or len(set(seeds)) < len(seeds) or min(seeds) < 0):
+                raise ValueError(
+                    f"base_seeds of {variant.name}: expected search 'each' and integers from 0 on besides the sweep's "
+                    f"seeds {self.seeds}; got search {self.search!r} and {variant.base_seeds}"
+                )
         axes = [*self.axes.items(), *(item for variant in self.variants for item in variant.axes.items())]
         for key, axis in axes:
             if isinstance(axis, Range) and self.search != "random":

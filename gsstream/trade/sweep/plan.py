@@ -97,12 +97,11 @@ def make_plan(config: SweepConfig, folder: Path, find_method: FindMethod) -> Pla
     """
     points: list[Cell] = []
     firsts: dict[str, FirstFrameRun] = {}
-    for scene, seed in itertools.product(config.scenes, config.seeds):
-        lead: ResolvedRecipe | None = None
+    for scene, seed in itertools.product(config.scenes, _all_seeds(config)):
+        lead = _resolve(config, scene, config.variants[0], {}, seed, folder, find_method)
         for variant in config.variants:
-            for axes in combinations(config, variant):
+            for axes in _points(config, variant, seed):
                 resolved = _resolve(config, scene, variant, axes, seed, folder, find_method)
-                lead = resolved if lead is None else lead
                 first = None
                 if config.first_frame.share != "own":
                     made = _first_frame(config, scene, lead if config.first_frame.share == "scene" else resolved, seed)
@@ -111,6 +110,18 @@ def make_plan(config: SweepConfig, folder: Path, find_method: FindMethod) -> Pla
                     Cell(_cell_id(config, scene, resolved, first), scene, variant.name, axes, seed, resolved, first)
                 )
     return Plan(config, tuple(points), firsts)
+
+
+def _all_seeds(config: SweepConfig) -> list[int]:
+    return list(dict.fromkeys([*config.seeds, *(seed for variant in config.variants for seed in variant.base_seeds)]))
+
+
+def _points(config: SweepConfig, variant: Variant, seed: int) -> Iterator[dict[str, Any]]:
+    """The axis values of a variant with this seed: all, the unchanged variant alone, or none."""
+    if seed in config.seeds:
+        yield from combinations(config, variant)
+    elif seed in variant.base_seeds:
+        yield {}
 
 
 def combinations(config: SweepConfig, variant: Variant) -> Iterator[dict[str, Any]]:

@@ -24,6 +24,10 @@ def sweep(
         int | None, typer.Option("--workers", min=1, help="Cells at a time; default: one for each processor.")
     ] = None,
     threads: Annotated[int, typer.Option("--threads", min=1, help="Threads of each worker.")] = 1,
+    ray: Annotated[
+        str | None,
+        typer.Option("--ray", metavar="ADDRESS", help="Run on this Ray cluster (extra: ray); 'local' starts one here."),
+    ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would run, and what is there already.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print only warnings, errors and failed cells.")] = False,
 ) -> None:
@@ -42,7 +46,7 @@ def sweep(
         return
     from gsstream.trade.sweep.drive import run_sweep
 
-    executor = _executor(workers, threads)
+    executor = _executor(workers, threads, ray)
     result = run_sweep(plan, out, executor, data=data, say=(lambda _: None) if quiet else typer.echo)
     if not quiet:
         made = plural(result.made - len(result.failed), "cell")
@@ -54,10 +58,14 @@ def sweep(
         raise typer.Exit(1)
 
 
-def _executor(workers: int | None, threads: int) -> Executor:
+def _executor(workers: int | None, threads: int, ray: str | None) -> Executor:
     from gsstream.trade.sweep.executor import LocalExecutor, usable_processors
     from gsstream.trade.sweep.job import run_job
 
+    if ray is not None:
+        from gsstream.trade.sweep.ray_executor import RayExecutor
+
+        return RayExecutor(ray, workers, threads, run_job)
     return LocalExecutor(workers or max(1, usable_processors() // threads), threads, run_job)
 
 

@@ -45,7 +45,7 @@ OPTIONS = {
     "gsstream export": ["STREAM", "--out", "--format", "--frames"],
     "gsstream manifest": ["STREAM", "--out"],
     "gsstream view": ["STREAM", "--port", "--host"],
-    "gsstream sweep": ["CONFIG", "--out", "--data", "--workers", "--threads", "--dry-run", "--quiet"],
+    "gsstream sweep": ["CONFIG", "--out", "--data", "--workers", "--threads", "--ray", "--dry-run", "--quiet"],
     "gsstream check": ["NAME", "--quiet"],
     "gsstream new-plugin": ["NAME", "--kind", "--out"],
     "gsstream bench": [],

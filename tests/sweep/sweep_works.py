@@ -54,6 +54,15 @@ def hang(job: Job) -> Outcome:
     return make(job)
 
 
+def hang_once(job: Job) -> Outcome:
+    """Works until somebody kills it; the second attempt is over at once."""
+    mark = Path(os.environ["SWEEP_TEST_MARKS"]) / job.id
+    if not mark.exists():
+        mark.touch()
+        hang(job)
+    return make(job)
+
+
 def threads(job: Job) -> Outcome:
     """Tells what the libraries in a worker will see."""
     return Outcome(job.id, run={name: value for name, value in os.environ.items() if name.endswith("_THREADS")})

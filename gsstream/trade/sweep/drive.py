@@ -212,10 +212,9 @@ def _seconds(outcome: Outcome) -> float:
 
 
 def _where(uri: str, data: Path | None) -> str:
-    """The recording as a worker opens it: a relative folder lies in ``data``."""
-    if data is None or ":" in uri or uri == "demo" or Path(uri).is_absolute():
-        return uri
-    return str((data / uri).resolve())
+    """The recording as a worker opens it, wherever it works: a relative folder lies in ``data``, or here."""
+    folder = (data or Path()) / uri
+    return str(folder.resolve()) if uri != "demo" and folder.is_dir() else uri
 
 
 @contextmanager

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 
 def run(
-    source: Annotated[str, typer.Option("--source", help="demo, synthetic:KEY=VALUE&..., a folder, or watch:FOLDER.")],
+    source: Annotated[
+        str, typer.Option("--source", help="demo, synthetic:KEY=VALUE&..., watch:FOLDER, a folder, or LAYOUT:FOLDER.")
+    ],
     out: Annotated[Path, typer.Option("--out", help="Output folder; must not hold another run.")],
     method: Annotated[
         str | None, typer.Option("--method", help="Method (see 'gsstream methods'); by default the recipe file's.")

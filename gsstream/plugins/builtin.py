@@ -25,6 +25,12 @@ def gsstream_components() -> list[ComponentSpec]:
         _part("source", "synthetic", "source.open:open_source", "an analytic moving scene: synthetic:KEY=VALUE&..."),
         _part("source", "watch", "source.open:open_source", "a folder that grows: watch:DIR?KEY=VALUE&..."),
         _part("source", "folder", "source.open:open_source", "a folder of images per camera with cameras.json"),
+        _part("source", "n3dv", "source.open:open_source", "cam00.mp4 ... (or frames) and poses_bounds.npy"),
+        _part("source", "meetroom", "source.open:open_source", "cam_0.mp4 ... (or frames) and poses_bounds.npy"),
+        _part("source", "enerf", "source.open:open_source", "EasyMocap: intri.yml, extri.yml, images/00/"),
+        _part("source", "panoptic", "source.open:open_source", "Dynamic 3D Gaussians: train_meta.json, ims/"),
+        _part("source", "colmap", "source.open:open_source", "a COLMAP model with images or videos"),
+        _part("source", "nerfstudio", "source.open:open_source", "transforms.json with images or videos"),
     ]
 
 

@@ -66,10 +66,10 @@ class SingleImages(Protocol):
 
 @runtime_checkable
 class AttributedPoints(Protocol):
-    """What a source may offer besides: points chosen by the cameras that saw them."""
+    """What a source may offer besides: points by the cameras that took part in them."""
 
-    def points_seen_by(self, cameras: Sequence[str], kind: PointKind = "recording") -> PointCloud | None:
-        """Points that these cameras alone pin down: seen by at least two of them."""
+    def points_without(self, cameras: Sequence[str], kind: PointKind = "recording") -> PointCloud | None:
+        """The points in which none of these cameras took part; None when none are left."""
 
 
 def check_index(info: SourceInfo, index: int) -> None:

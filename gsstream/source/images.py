@@ -17,8 +17,12 @@ _RGB_COLOR_TYPE = 2
 _READABLE = "8-bit JPEG or PNG, or 16-bit PNG, without transparency"
 
 
-def read_image(path: Path, size: tuple[int, int], target: tuple[int, int]) -> FloatArray:
+def read_image(
+    path: Path, size: tuple[int, int], target: tuple[int, int], declared: str = "cameras.json declares"
+) -> FloatArray:
     """Decode an image of ``size`` (width, height) and average it down to ``target`` (width, height).
+
+    ``declared``: who says so, for the message.
 
     Returns [h, w, 3] float32 in [0, 1]; grey images are repeated over the three channels.
     Raises SourceError naming the file when it is missing, damaged, of another size, or of an unsupported kind.
@@ -27,7 +31,7 @@ def read_image(path: Path, size: tuple[int, int], target: tuple[int, int]) -> Fl
     height, width = pixels.shape[:2]
     if (width, height) != size:
         raise SourceError(
-            f"{path}: the image is {width} x {height} pixels, but cameras.json declares {size[0]} x {size[1]}; "
+            f"{path}: the image is {width} x {height} pixels, but {declared} {size[0]} x {size[1]}; "
             "correct the declared size (and K with it) or export the frames again"
         )
     return shrink(pixels, target) / np.float32(full_scale)

@@ -6,14 +6,16 @@ from pathlib import Path
 
 from gsstream.core.errors import SourceError
 from gsstream.source.base import FrameSource
+from gsstream.source.detect import LAYOUTS, detect, read_layout
 from gsstream.source.multiview import MultiviewSource
+from gsstream.source.recorded import RecordedSource
 
 DEMO_FOLDER = Path(__file__).parent / "demo" / "pickblocks_tiny_160"
 _KNOWN = (
     "'demo' (a small recording inside the package), "
     "'synthetic:' with options such as 'synthetic:frames=40&views=8' (an analytic scene of any length), "
     "'watch:DIR' (a folder that is still being written), "
-    "or the path of a folder with cameras.json"
+    f"or the path of a folder, read by its layout or as you say: folder:DIR, {':DIR, '.join(LAYOUTS)}:DIR"
 )
 
 
@@ -21,8 +23,8 @@ def open_source(uri: str, scale: float = 1.0) -> FrameSource:
     """Open a recording.
 
     Arguments:
-        uri: ``demo``, ``synthetic:key=value&...``, ``watch:DIR?key=value&...`` or the path of a folder
-            that holds cameras.json.
+        uri: ``demo``, ``synthetic:key=value&...``, ``watch:DIR?key=value&...``, the path of a folder in a known layout,
+            or LAYOUT:DIR.
         scale: images are shrunk by this factor in (0, 1] on reading.
 
     Raises SourceError for an unknown uri, naming what exists, and for a faulty recording.
@@ -38,8 +40,12 @@ def open_source(uri: str, scale: float = 1.0) -> FrameSource:
         from gsstream.source.watch import WatchSource
 
         return WatchSource.from_query(rest, scale=scale)
-    folder = Path(uri)
+    named = scheme if separator and scheme in (*LAYOUTS, "folder") else None
+    folder = Path(rest if named else uri)
     # An empty text is the current folder to Path, and never what was meant.
-    if uri and folder.exists():
+    if not named and not (uri and folder.exists()):
+        raise SourceError(f"source {uri!r}: no such folder and no known scheme; expected {_KNOWN}")
+    layout = named or detect(folder)
+    if layout == "folder":
         return MultiviewSource(folder, scale=scale, uri=uri)
-    raise SourceError(f"source {uri!r}: no such folder and no known scheme; expected {_KNOWN}")
+    return RecordedSource(read_layout(layout, folder), scale=scale, uri=uri)

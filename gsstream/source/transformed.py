@@ -107,14 +107,14 @@ class TransformedSource:
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
         """The inner source's points, unless a test camera of this split took part in them.
 
-        Sources that know which camera saw which point leave out what only test cameras pin down; of others, points are
-        withheld (None) when a camera that they count as training is a test camera here. ``leak`` lifts both.
+        Sources that know who took part in which point leave those points out; the points of others are withheld (None)
+        when a camera that they count as training is a test camera here. ``leak`` lifts both.
         """
-        allowed = (*self._info.train.ids, *(() if self._options.leak == "none" else self._info.test.ids))
+        held_out = self._info.test.ids if self._options.leak == "none" else ()
         if isinstance(self._source, AttributedPoints):
-            return self._source.points_seen_by(allowed, kind)
-        taken = [i for i in self._info.test.ids if self._home[i] == "train"]
-        return None if taken and self._options.leak == "none" else self._source.points(kind)
+            return self._source.points_without(held_out, kind)
+        taken = any(self._home[name] == "train" for name in held_out)
+        return None if taken else self._source.points(kind)
 
     def interrupt(self) -> None:
         """End the waits of an inner source that grows; others never wait."""

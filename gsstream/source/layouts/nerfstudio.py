@@ -1,0 +1,191 @@
+"""nerfstudio (and instant-ngp) transforms.json.
+
+``frames``: a list of ``file_path`` and ``transform_matrix``, camera to world with OpenGL axes (x right, y up, z back).
+Intrinsics ``fl_x fl_y cx cy w h`` and distortion ``k1 k2 k3 k4 p1 p2`` once or per frame, or ``camera_angle_x`` alone;
+``camera_model`` OPENCV (default), PINHOLE, SIMPLE_PINHOLE, OPENCV_FISHEYE. Pixels have their origin at the image
+corner, world units are whatever wrote the file.
+
+One camera per entry: its ``file_path`` is a video, a folder of frames, or one image (a still scene of one frame).
+Entries of one folder with equal poses are one camera's frames, in the order of ``time`` if given, else of their names.
+``test_filenames`` judge (and ``val_filenames`` too); without them no camera does. ``ply_file_path``: points, made from
+all images.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import SourceError
+from gsstream.core.shapes import FloatArray
+from gsstream.source.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip, natural
+from gsstream.source.distortion import Lens
+from gsstream.source.pointfiles import read_ply_points
+from gsstream.source.poses import from_opengl
+from gsstream.source.recorded import Recording, SeenPoints
+
+FILE = "transforms.json"
+_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
+
+
+def looks_like(folder: Path) -> bool:
+    """transforms.json."""
+    return (folder / FILE).is_file()
+
+
+def read(folder: Path) -> Recording:
+    """One rig of cameras that stand still. Raises SourceError for a camera that moves."""
+    path = folder / FILE
+    data = _load(path)
+    groups = _group(path, data["frames"])
+    poses, Ks, lenses, sizes = [], [], {}, {}
+    clips: dict[str, Clip] = {}
+    for name, entries in groups.items():
+        clips[name] = _clip(folder, entries)
+        merged = {**data, **entries[0]}
+        poses.append(from_opengl(_pose(path, entries[0])))
+        Ks.append(_intrinsics(path, merged, name, clips[name].size))
+        sizes[name] = (int(merged.get("w", clips[name].size[0])), int(merged.get("h", clips[name].size[1])))
+        lens = _lens(path, merged)
+        if lens is not None and not lens.is_identity:
+            lenses[name] = lens
+    if len(set(sizes.values())) > 1:
+        told = ", ".join(f"{name} {w} x {h}" for name, (w, h) in sizes.items())
+        raise SourceError(f"{path}: all cameras of a rig must share one image size, got {told}")
+    names = tuple(groups)
+    judges = {str(f) for key in ("test_filenames", "val_filenames") for f in data.get(key) or ()}
+    test = tuple(name for name, entries in groups.items() if any(e["file_path"] in judges for e in entries))
+    return Recording(
+        name=folder.resolve().name,
+        where=str(path),
+        rig=Cameras(names, np.stack(poses), np.stack(Ks), *sizes[names[0]]),
+        clips=clips,
+        test=test,
+        fps=float(data.get("fps", 30.0)),
+        lenses=lenses,
+        points=lambda: _points(folder, data, len(names)),
+    )
+
+
+def _load(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error}") from error
+    except ValueError as error:
+        raise SourceError(f"{path}: not valid JSON: {error}") from error
+    known: dict[str, Any] = data if isinstance(data, dict) else {}
+    frames = known.get("frames")
+    if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
+        raise SourceError(f"{path}: 'frames' must be a non-empty list of objects")
+    for number, frame in enumerate(frames):
+        name = frame.get("file_path")
+        if not isinstance(name, str) or not name:
+            raise SourceError(f"{path}: frame {number} has no 'file_path'")
+        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+            raise SourceError(f"{path}: file_path {name!r} must stay inside the folder")
+    if known.get("camera_model", "OPENCV") not in _MODELS:
+        raise SourceError(f"{path}: camera_model {known['camera_model']!r}; expected one of {', '.join(_MODELS)}")
+    return known
+
+
+def _group(path: Path, frames: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    """Camera id -> its entries, in time order."""
+    by_folder: dict[str, list[dict[str, Any]]] = {}
+    for frame in frames:
+        by_folder.setdefault(str(PurePosixPath(frame["file_path"]).parent), []).append(frame)
+    still = all(
+        np.allclose(_pose(path, entry), _pose(path, entries[0]), atol=1e-9)
+        for entries in by_folder.values()
+        for entry in entries
+    )
+    if still and len(by_folder) > 1:
+        names = [PurePosixPath(folder).name for folder in by_folder]
+        if len(set(names)) < len(names):
+            names = [folder.replace("/", "_") for folder in by_folder]
+        ordered = [sorted(entries, key=_when) for entries in by_folder.values()]
+        return dict(sorted(zip(names, ordered, strict=True), key=lambda item: natural(Path(item[0]))))
+    single = {PurePosixPath(frame["file_path"]).stem: [frame] for frame in frames}
+    if len(single) < len(frames) or len(by_folder) > 1:
+        raise SourceError(
+            f"{path}: a folder of frames has several poses: a camera that moves. Expected one camera per entry (a "
+            "video, a folder of frames or one image), or one folder per camera with one pose"
+        )
+    return dict(sorted(single.items(), key=lambda item: natural(Path(item[0]))))
+
+
+def _when(entry: dict[str, Any]) -> tuple[float, list[tuple[int, str]]]:
+    return float(entry.get("time", 0.0)), natural(Path(entry["file_path"]))
+
+
+def _clip(folder: Path, entries: list[dict[str, Any]]) -> Clip:
+    files = [folder / entry["file_path"] for entry in entries]
+    if len(files) > 1:
+        return ImageClip(files)
+    if files[0].is_dir():
+        return folder_clip(files[0])
+    if files[0].suffix.lower() in VIDEO_SUFFIXES:
+        from gsstream.source.video import VideoClip
+
+        return VideoClip(files[0])
+    if not files[0].suffix and not files[0].is_file():
+        files = [files[0].with_suffix(".png")]  # Blender's scenes leave it out
+    return ImageClip(files)
+
+
+def _pose(path: Path, entry: dict[str, Any]) -> FloatArray:
+    name = entry["file_path"]
+    try:
+        pose = np.asarray(entry.get("transform_matrix"), np.float64)
+    except (TypeError, ValueError) as error:
+        raise SourceError(f"{path}: transform_matrix of {name!r} is not a matrix of numbers ({error})") from error
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise SourceError(f"{path}: transform_matrix of {name!r} must be a finite 4 x 4 matrix, got {list(pose.shape)}")
+    return pose
+
+
+def _number(path: Path, data: dict[str, Any], key: str, name: str) -> float:
+    value = data[key]
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise SourceError(f"{path}: {key} of camera {name!r} must be a finite number, got {value!r}")
+    return float(value)
+
+
+def _intrinsics(path: Path, data: dict[str, Any], name: str, size: tuple[int, int]) -> FloatArray:
+    width, height = data.get("w", size[0]), data.get("h", size[1])
+    if "fl_x" in data:
+        fx = _number(path, data, "fl_x", name)
+        fy = _number(path, data, "fl_y", name) if "fl_y" in data else fx
+    elif "camera_angle_x" in data:
+        fx = fy = 0.5 * width / math.tan(0.5 * _number(path, data, "camera_angle_x", name))
+    else:
+        raise SourceError(f"{path}: camera {name!r} has neither fl_x nor camera_angle_x")
+    cx = _number(path, data, "cx", name) if "cx" in data else width / 2
+    cy = _number(path, data, "cy", name) if "cy" in data else height / 2
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+
+def _lens(path: Path, data: dict[str, Any]) -> Lens | None:
+    model = data.get("camera_model", "OPENCV")
+    k = tuple(_number(path, data, key, data["file_path"]) if key in data else 0.0 for key in ("k1", "k2", "k3", "k4"))
+    p = tuple(_number(path, data, key, data["file_path"]) if key in data else 0.0 for key in ("p1", "p2"))
+    if model == "OPENCV_FISHEYE":
+        return Lens("fisheye", k)
+    if model != "OPENCV":
+        return None
+    if k[3]:
+        raise SourceError(f"{path}: k4 = {k[3]:g} with camera_model OPENCV; is it an OPENCV_FISHEYE?")
+    return Lens("radial", k[:3], (p[0], p[1]))
+
+
+def _points(folder: Path, data: dict[str, Any], cameras: int) -> SeenPoints | None:
+    name = data.get("ply_file_path")
+    if not isinstance(name, str) or not (folder / name).is_file():
+        return None
+    cloud = read_ply_points(folder / name)
+    return SeenPoints(cloud, np.ones((len(cloud), cameras), bool))

@@ -1,0 +1,67 @@
+"""Conversions between camera conventions. Ours: world to camera, OpenCV axes, pixel origin at the image corner."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsstream.core.shapes import FloatArray
+
+#: Camera axes x right, y up, z back (OpenGL, NeRF, Blender) -> x right, y down, z forward (OpenCV). Its own inverse.
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def from_opengl(camera_to_world: FloatArray) -> FloatArray:
+    """[..., 4, 4] camera-to-world with OpenGL axes -> world-to-camera with OpenCV axes."""
+    return invert(camera_to_world @ OPENGL_TO_OPENCV)
+
+
+def from_llff(rows: FloatArray) -> FloatArray:
+    """[N, 3, 4] of poses_bounds.npy (camera-to-world, camera axes down, right, back) -> [N, 4, 4] world-to-camera."""
+    pose = np.zeros((len(rows), 4, 4))
+    pose[:, :3, 0] = rows[:, :, 1]  # right
+    pose[:, :3, 1] = rows[:, :, 0]  # down
+    pose[:, :3, 2] = -rows[:, :, 2]  # forward
+    pose[:, :3, 3] = rows[:, :, 3]
+    pose[:, 3, 3] = 1
+    return invert(pose)
+
+
+def from_quaternion(wxyz: FloatArray, translation: FloatArray) -> FloatArray:
+    """[4] and [3] of a COLMAP image (world to camera, OpenCV axes) -> [4, 4] world-to-camera; any non-zero norm."""
+    w, x, y, z = wxyz / np.linalg.norm(wxyz)
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    pose[:3, 3] = translation
+    return pose
+
+
+def from_rotation_vector(vector: FloatArray) -> FloatArray:
+    """[3] axis times angle in radians (Rodrigues) -> [3, 3] rotation."""
+    angle = float(np.linalg.norm(vector))
+    if angle == 0:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    rotation: FloatArray = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return rotation
+
+
+def invert(poses: FloatArray) -> FloatArray:
+    """[..., 4, 4] rigid transforms -> their inverses; exact transposes, so that a rotation stays one."""
+    out = np.zeros(poses.shape)
+    rotation = np.swapaxes(poses[..., :3, :3], -1, -2)
+    out[..., :3, :3] = rotation
+    out[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation, poses[..., :3, 3])
+    out[..., 3, 3] = 1
+    return out
+
+
+def from_pixel_centers(K: FloatArray) -> FloatArray:
+    """[..., 3, 3] intrinsics that put (0, 0) into the centre of the first pixel (OpenCV) -> origin at the corner."""
+    out: FloatArray = np.array(K, np.float64)
+    out[..., :2, 2] += 0.5
+    return out

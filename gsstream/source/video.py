@@ -42,10 +42,12 @@ class VideoClip:
                 for p in container.demux(stream)
                 if p.size and not p.is_discard
             ]
-            self._size = (stream.codec_context.width, stream.codec_context.height)
-            self._deep = any(c.bits > 8 for c in stream.codec_context.format.components)
-        if not table:
-            raise SourceError(f"{path}: the video holds no pictures; record or copy it again")
+            context = stream.codec_context
+            # A file cut right behind its header has a stream, but nothing to learn the kind of pictures from.
+            if not table or context.format is None:
+                raise SourceError(f"{path}: the video holds no pictures; record or copy it again")
+            self._size = (context.width, context.height)
+            self._deep = any(component.bits > 8 for component in context.format.components)
         if any(pts is None for pts, _, _ in table):
             raise SourceError(
                 f"{path}: pictures without time stamps; put the stream into a container: ffmpeg -i IN -c copy OUT.mp4"

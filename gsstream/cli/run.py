@@ -16,9 +16,7 @@ if TYPE_CHECKING:
 
 
 def run(
-    source: Annotated[
-        str, typer.Option("--source", help="demo, synthetic:KEY=VALUE&..., watch:FOLDER, a folder, or LAYOUT:FOLDER.")
-    ],
+    source: Annotated[str, typer.Option("--source", help="demo, synthetic:K=V&..., watch:DIR, DIR, or LAYOUT:DIR.")],
     out: Annotated[Path, typer.Option("--out", help="Output folder; must not hold another run.")],
     method: Annotated[
         str | None, typer.Option("--method", help="Method (see 'gsstream methods'); by default the recipe file's.")

@@ -190,12 +190,12 @@ def test_faulty_options_are_explained(fault: str) -> None:
 def test_options_are_recipe_keys_with_provenance_and_travel_with_the_stream() -> None:
     catalog = load_catalog()
     overrides = [("--set", "data.gain_amplitude=0.3"), ("--set", 'data.time_offset=["cam_0=2"]')]
-    resolved = resolve_recipe("dense", catalog.recipe_path, None, overrides)
+    resolved = resolve_recipe("dense", catalog.recipe_path, (), overrides)
     assert resolved.recipe.data == DataOptions(gain_amplitude=0.3, time_offset=("cam_0=2",))
     assert resolved.origin(("data", "gain_amplitude")).label == "command line"
     with pytest.raises(RecipeError, match=r"data\.gain_amplitud.*did you mean 'gain_amplitude'"):
-        resolve_recipe("dense", catalog.recipe_path, None, [("--set", "data.gain_amplitud=0.3")])
-    recipe = resolve_recipe("dense", catalog.recipe_path, None, [("--set", "data.noise_sigma=9"), ("--seed", "seed=4")])
+        resolve_recipe("dense", catalog.recipe_path, (), [("--set", "data.gain_amplitud=0.3")])
+    recipe = resolve_recipe("dense", catalog.recipe_path, (), [("--set", "data.noise_sigma=9"), ("--seed", "seed=4")])
     again = reopen_recording(WORLD, recipe.recipe.model_dump(mode="json"), catalog)
     assert again.frame(0).images.tobytes() == opened(seed=4, noise_sigma=9).frame(0).images.tobytes()
     with pytest.raises(RecipeError, match=r"data\.fog.*upgrade gsstream"):

@@ -17,6 +17,7 @@ from gsstream.engine.parameters import AdamTable
 from gsstream.engine.stream_state import StreamState
 from gsstream.render.base import RenderSession
 from gsstream.residual.base import add_changes, decode_changes, init_latents, pull_back
+from gsstream.residual.rate import rate_gradients
 
 
 @dataclass(frozen=True)
@@ -105,6 +106,7 @@ class _FrameRun:
         rows = rows.map(lambda value: value.detach().requires_grad_())
         loss = self._render(view, rows)
         back = pull_back(rows.map(_gradient), changes, self.decoders.leaves, gates.detach(), self.units)
+        add_rate(parts, self.latents.leaves, gates, back.latents, self.problem.frame)
         self._step_gates(gate, gates, back.gates, learning=fraction >= parts.recipe.gate_training.warmup)
         self.latents.step(back.latents)
         self.decoders.step(back.decoders)
@@ -160,6 +162,17 @@ class _FrameRun:
             loss=loss,
             iterations=iterations,
         )
+
+
+def add_rate(
+    parts: Assembly, latents: Mapping[str, torch.Tensor], gates: torch.Tensor, gradients: dict[str, torch.Tensor],
+    frame: Frame,
+) -> None:  # fmt: skip
+    """Add the gradient of what the residual will cost, when the recipe asks for it."""
+    if parts.recipe.stream.rate_weight > 0:
+        weight = parts.recipe.stream.rate_weight / (frame.cameras.width * frame.cameras.height)
+        for name, value in rate_gradients(parts.update, latents, gates, weight).items():
+            gradients[name] += value
 
 
 def _gradient(value: torch.Tensor) -> torch.Tensor:

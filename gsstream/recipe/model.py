@@ -89,6 +89,10 @@ class Stream(Section):
         default=0.5, ge=0, le=1,
         description="least share of the views a Gaussian projects into in which it must lie in or beside changed tiles",
     )  # fmt: skip
+    rate_weight: float = Field(
+        default=0.0, ge=0, le=1,
+        description="weight in the loss of the residual's estimated bits per pixel of one view; 0: none (ours)",
+    )  # fmt: skip
     progressive: bool = Field(default=False, description="activate octree levels from floor(H/2) on (paper)")
     progressive_omega: float = Field(default=1.5, ge=1, description="iterations per level: N_{i+1} = omega N_i")
 

@@ -21,11 +21,14 @@ class LatentCode(PartConfig):
     """One attribute's latents and decoder."""
 
     latent: int = Field(ge=1, le=64, description="latent channels per Gaussian, 1 to 64")
-    lr: float = Field(ge=0, le=10, description="Adam learning rate of the latents, symbols per iteration; 0 freezes")
+    lr: float = Field(ge=0, le=10, description="Adam learning rate of the latents, latent units per iteration; 0 freezes")
     decoder_std: float = Field(
-        gt=0, le=10, description="standard deviation of the decoder's initial entries, raw attribute units per symbol"
+        gt=0, le=10, description="standard deviation of the decoder's initial entries, raw attribute units per latent unit"
     )
     decoder_lr: float = Field(ge=0, le=1, description="Adam learning rate of the decoder, raw units per iteration")
+    step: float = Field(
+        default=1.0, gt=0, le=64, description="quantisation step of the latents; larger: fewer bits, coarser change"
+    )
 
 
 @final
@@ -35,6 +38,9 @@ class LatentResidual(UpdateRule):
     Sizes are the released ones: rotation 6 -> 4, size 8 -> 3, opacity 1 -> 1, colour 4 -> 3, higher colour 4 -> all.
     Decoders have no bias, so a Gaussian behind a closed gate keeps its bits (the released biases move every Gaussian in
     every frame). Rounding is real in the forward pass (the released code rounds only when it counts bits).
+
+    Quantisation: latents are rounded to multiples of ``step`` while they are trained (straight-through), and the packet
+    carries the multiples. A step changes how coarse a change is and nothing else: rates and scales are per latent unit.
 
     Rates and initial scales are ours, because the released ones cannot work with real rounding: at 0.001 to 0.0025 per
     iteration a latent does not reach 0.5, the first symbol, within a frame, and a released colour decoder (1e-4) turns
@@ -82,11 +88,11 @@ class LatentResidual(UpdateRule):
             }
 
     def codes(self) -> Mapping[str, AttributeCode]:
-        """Attribute -> code; an attribute with ``lr`` 0 never changes. The step of a latent is one symbol."""
+        """Attribute -> code; an attribute with ``lr`` 0 never changes."""
         entries = {"means": AttributeCode(step=self.config.means.step, lr=self.config.means.lr)}
         for name in ("quats", "scales", "opacities", "sh0", "shN"):
             code: LatentCode = getattr(self.config, name)
             entries[name] = AttributeCode(
-                step=1.0, lr=code.lr, latent=code.latent, decoder_lr=code.decoder_lr, decoder_std=code.decoder_std
+                step=code.step, lr=code.lr, latent=code.latent, decoder_lr=code.decoder_lr, decoder_std=code.decoder_std
             )
         return {name: code for name, code in entries.items() if code.lr > 0}

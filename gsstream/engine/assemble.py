@@ -97,10 +97,6 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog) -> Assembly:
         hint = f"the whole method {name!r} does not read it; its own settings: gsstream plugins show whole/{name}"
         paths = unheeded(resolved.recipe.model_copy(update=refs), whole, parts)
         problems += [f"{resolved.near(path).where}: {'.'.join(path)}: {hint}" for path in paths]
-    if resolved.recipe.codec.key_every:
-        # The format and the player know later key packets, the encoder does not make them yet: said, not ignored.
-        where = resolved.near(("codec", "key_every")).where
-        problems.append(f"{where}: codec.key_every: only frame 0 is written as a key packet so far; leave it at 0")
     join_problems(problems)
     parts["loss"] = loss
     owners = sorted({catalog.entry(slot, ref.name).distribution for slot, ref in refs.items()})

@@ -152,8 +152,9 @@ def key_state(
     player = decode_packet(None, packet.data)
     decoders = parts.update.init_decoders(gaussians, rng.stream("decoders", frame.index))
     state = StreamState(
-        player=player, hierarchy=hierarchy, previous=frame, decoders=decoders, exposure=exposure_from_meta(player.meta)
-    )
+        player=player, hierarchy=hierarchy, previous=frame, decoders=decoders,
+        exposure=exposure_from_meta(player.meta), key_frame=player.frame,
+    )  # fmt: skip
     return state, packet
 
 

@@ -11,7 +11,9 @@ from gsstream.recipe.model import Recipe
 
 #: Keys that only the five-part path reads.
 PART_SLOTS = ("structure", "confidence", "propagation", "gate", "regularizer", "update")
-PART_SECTIONS = ("stream", "gate_training")
+PART_SECTIONS = ("stream", "gate_training", "codec")
+#: Of those sections, what the session reads for every method.
+SESSION_KEYS = ("codec.fsync",)
 
 
 def unheeded(recipe: Recipe, whole: StreamingMethod[Any], parts: Mapping[str, Any]) -> Iterator[KeyPath]:
@@ -32,5 +34,5 @@ def unheeded(recipe: Recipe, whole: StreamingMethod[Any], parts: Mapping[str, An
     for section in PART_SECTIONS:
         now, usual = getattr(recipe, section), getattr(default, section)
         for key in type(now).model_fields:
-            if getattr(now, key) != getattr(usual, key) and f"{section}.{key}" not in whole.heeds:
+            if getattr(now, key) != getattr(usual, key) and f"{section}.{key}" not in (*whole.heeds, *SESSION_KEYS):
                 yield section, key

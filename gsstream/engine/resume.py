@@ -9,10 +9,12 @@ import numpy as np
 import torch
 
 from gsstream.core.errors import OutputError, PacketError
+from gsstream.core.frame import Frame
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.engine.assemble import Assembly
 from gsstream.engine.begin import decoded_anchors, exposure_from_meta
+from gsstream.engine.keyframes import with_key_quality
 from gsstream.engine.rows import follow
 from gsstream.engine.stream_state import StreamState
 from gsstream.packet import PacketKind, PlayerState, StreamMeta, StreamReader, decode_packet
@@ -38,9 +40,17 @@ def resume_state(
         return None
     with StreamReader(path) as reader:
         state = _replay(parts, reader, rng)
-        shown = [e.frame for e in reader.frames if e.kind != PacketKind.EMPTY and e.frame <= state.player.frame]
-    frame = source.frame(shown[-1], "train")
-    return replace(state, previous=replace(frame, cameras=replace(frame.cameras, near=near)))
+        shown = [e for e in reader.frames if e.kind != PacketKind.EMPTY and e.frame <= state.player.frame][-1]
+        key = decode_packet(None, reader.read(reader.frames[state.key_frame - reader.frames[0].frame]))
+
+    def training(index: int) -> Frame:
+        frame = source.frame(index, "train")
+        return replace(frame, cameras=replace(frame.cameras, near=near))
+
+    # A key packet says which picture its scene shows: it may stand for an older one.
+    index = shown.frame if shown.kind != PacketKind.KEY else int(state.player.meta.extra.get("shown", shown.frame))
+    at_key = with_key_quality(parts, replace(state, player=key), training(state.key_frame))
+    return replace(state, previous=training(index), key_quality=at_key.key_quality)
 
 
 def check_stream(parts: Assembly, path: Path, info: SourceInfo) -> bool:
@@ -101,6 +111,7 @@ def key_state_from_player(parts: Assembly, player: PlayerState, rng: Rng) -> Str
         previous=None,  # type: ignore[arg-type]
         decoders=decoders,
         exposure=exposure_from_meta(player.meta),
+        key_frame=player.frame,
     )
 
 

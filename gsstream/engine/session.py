@@ -22,6 +22,7 @@ from gsstream.core.rng import Rng
 from gsstream.engine.assemble import Assembly
 from gsstream.engine.begin import begin, begin_from
 from gsstream.engine.frame_step import frame_step
+from gsstream.engine.keyframes import refresh
 from gsstream.engine.measure import HeldOut
 from gsstream.engine.points import gather_points, with_test_views
 from gsstream.engine.progress import RunProgress
@@ -113,6 +114,8 @@ class _Run:
         train.validate()
         started, worked = time.perf_counter(), time.process_time()
         step = self._first(train) if state is None else self._next(state, train)
+        if self.parts.whole is None:
+            step = refresh(self.parts, step, train, self._meta, self.rng)
         writer.append(step.packet)
         total, cpu = time.perf_counter() - started, time.process_time() - worked
         metrics = {**self._metrics(step, train.index, test, total, waited), "cpu_seconds": cpu}

@@ -26,6 +26,8 @@ class StreamState:
         previous: training images of the last frame whose packet changed the scene: what the scene shows.
         decoders: linear decoders to continue from; equal to the player's once they were sent.
         exposure: colour maps of the training cameras, or None.
+        key_frame: frame of the last key packet.
+        key_quality: PSNR of that frame on the training views, dB; None when the recipe does not watch it.
         gate_moments: Adam moments of the gate logits when the recipe carries them over (released code), else empty.
     """
 
@@ -34,6 +36,8 @@ class StreamState:
     previous: Frame = rows(None)
     decoders: Mapping[str, torch.Tensor] = rows(None, default_factory=dict)
     exposure: Exposure | None = rows(None, default=None)
+    key_frame: int = rows(None, default=0)
+    key_quality: float | None = rows(None, default=None)
     gate_moments: Mapping[str, torch.Tensor] = rows("node", default_factory=dict)
 
     @property

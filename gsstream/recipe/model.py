@@ -123,7 +123,18 @@ class GateTraining(Section):
 class Codec(Section):
     """How packets are written."""
 
-    key_every: int = Field(default=0, ge=0, description="frames between key packets; 0: only the first")
+    key_every: int = Field(
+        default=0, ge=0, description="most frames from one key packet to the next, which replaces a delta; 0: no period"
+    )
+    key_change: float = Field(
+        default=0.0, ge=0, le=1,
+        description="share of Gaussians behind open gates from which on a frame becomes a key packet; 0: never",
+    )  # fmt: skip
+    key_error_growth: float = Field(
+        default=0.0, ge=0, le=100,
+        description="dB on the training views lost since the last key packet from which on a frame becomes one; costs "
+        "one rendering of every training view a frame; 0: not watched",
+    )  # fmt: skip
     fsync: bool = Field(default=False, description="force every packet to disk before the next frame starts")
 
 

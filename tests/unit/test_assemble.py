@@ -45,11 +45,6 @@ def test_an_assembled_recipe_assembles_to_the_same(builtin: Catalog) -> None:
     assert once.recipe.update.params["means"] == {"step": 0.5, "lr": 0.1}, "a section may be given in part"
 
 
-def test_later_key_packets_are_refused_and_not_ignored(builtin: Catalog) -> None:
-    with pytest.raises(RecipeError, match=r"codec\.key_every: only frame 0 is written as a key packet so far"):
-        assemble(resolve(builtin, "codec.key_every=5"), builtin)
-
-
 def test_all_problems_come_in_one_error(builtin: Catalog) -> None:
     sets = ["gate=always-opne", "structure.resoluton=3"]
     sets += ["update.means.stp=1", "update.quats.step=-1", "update.sh0.lr=x"]

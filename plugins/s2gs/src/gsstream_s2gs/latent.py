@@ -21,9 +21,9 @@ class LatentCode(PartConfig):
     """One attribute's latents and decoder."""
 
     latent: int = Field(ge=1, le=64, description="latent channels per Gaussian, 1 to 64")
-    lr: float = Field(ge=0, le=10, description="Adam learning rate of the latents, latent units per iteration; 0 freezes")
+    lr: float = Field(ge=0, le=10, description="Adam learning rate, latent units per iteration; 0 freezes")
     decoder_std: float = Field(
-        gt=0, le=10, description="standard deviation of the decoder's initial entries, raw attribute units per latent unit"
+        gt=0, le=10, description="standard deviation of the decoder's initial entries, raw units per latent unit"
     )
     decoder_lr: float = Field(ge=0, le=1, description="Adam learning rate of the decoder, raw units per iteration")
     step: float = Field(

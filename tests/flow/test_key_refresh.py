@@ -1,0 +1,171 @@
+"""Key packets in the middle of a stream: by period, by change, by error; late join, seek, resume and kills."""
+
+from __future__ import annotations
+
+import json
+import random
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from flow_runs import Witness, arguments, encode, finish, metrics, start
+
+from gsstream.cli.main import run_command
+from gsstream.engine import session
+from gsstream.packet import PacketKind, StreamReader, quantise_key
+from gsstream.packet.base import FILE_HEADER
+from gsstream.player.manifest import manifest
+from gsstream.player.playback import Playback
+
+PERIOD: dict[str, Any] = {"codec__key_every": 2}
+#: Frame 0 learned well, the others hardly: the training views lose quality as the scene moves.
+ERROR: dict[str, Any] = {"codec__key_error_growth": 0.05, "first_frame__max_iterations": 200, "stream__epochs": 1}
+METHODS = ["dense", "s2gs-edge"]
+
+
+def kinds(stream: Path) -> str:
+    with StreamReader(stream) as reader:
+        reader.check()
+        return "".join(entry.kind.name[0] for entry in reader.frames)
+
+
+def same(ours, theirs) -> bool:
+    return all(a.tobytes() == b.tobytes() for (_, a), (_, b) in zip(ours.items(), theirs.items(), strict=True))
+
+
+def rows_of(gaussians):
+    """The Gaussians in an order of their own."""
+    return np.unique(np.column_stack([value.reshape(len(value), -1) for _, value in gaussians.items()]), axis=0)
+
+
+class Refreshed(Witness):
+    """Also the state after a key packet took the place of a delta."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.states = []
+        self.before: list[Any] = []
+        original = session.refresh
+
+        def refresh(parts, step, *args):
+            outcome = original(parts, step, *args)
+            self.before.append(step.state)
+            self.states.append(outcome.state)
+            return outcome
+
+        monkeypatch.setattr(session, "refresh", refresh)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_key_packet_holds_the_scene_of_its_frame(tmp_path, monkeypatch, method):
+    witness = Refreshed(monkeypatch)
+    encode(tmp_path, method=method, **PERIOD)
+    stream = tmp_path / "stream.gss"
+    assert kinds(stream) == "KDKDKD"
+    with Playback(stream) as playback:
+        for frame, state in enumerate(witness.states):
+            theirs = playback.player_state(frame)
+            assert same(state.player.gaussians, theirs.gaussians)
+            assert state.hierarchy.node_of.tolist() == theirs.layout.node_of.tolist()
+            if frame in (2, 4):
+                # The optimised scene of this very frame, as a set of rows: the key packet only orders it anew.
+                mine = quantise_key(witness.before[frame].player.gaussians)
+                assert np.array_equal(rows_of(mine), rows_of(theirs.gaussians))
+    lines = metrics(tmp_path)
+    assert [line["status"][0] for line in lines] == list("kdkdkd")
+    assert [line.get("key_reason") for line in lines] == [None, None, "period", None, "period", None]
+    assert all(sum(line["bytes"].values()) == entry["range"][1] - entry["range"][0] + 1
+               for line, entry in zip(lines, manifest(stream)["packets"], strict=True))  # fmt: skip
+
+
+def test_who_joins_at_any_key_packet_sees_the_same_frames(tmp_path):
+    encode(tmp_path, method="s2gs-edge", **PERIOD)
+    stream = tmp_path / "stream.gss"
+    data, toc = stream.read_bytes(), manifest(stream)
+    assert [segment["frames"] for segment in toc["segments"]] == [[0, 1], [2, 3], [4, 5]]
+    with Playback(stream) as whole:
+        for segment in toc["segments"]:
+            late = tmp_path / "late.gss"
+            late.write_bytes(data[: FILE_HEADER.size] + data[segment["range"][0] :][: -12 - 21])  # any cut of the index
+            first = segment["frames"][0]
+            with Playback(late) as joined:
+                assert joined.frames[0] == first
+                for frame in (5, first, first + 1):
+                    assert same(joined.state_at(frame), whole.state_at(frame))
+    with Playback(stream) as seeking:
+        for frame in (5, 2, 3, 0, 4):
+            with Playback(stream) as other:
+                assert same(seeking.state_at(frame), other.state_at(frame))
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"codec__key_change": 0.02}, "change"), (ERROR, "error"),
+        ({"codec__key_change": 1.0, "codec__key_error_growth": 99}, None),
+    ],
+)  # fmt: skip
+def test_triggers(tmp_path, settings, expected):
+    encode(tmp_path, method="s2gs-edge", **settings)
+    reasons = [line.get("key_reason") for line in metrics(tmp_path)]
+    assert reasons[0] is None
+    assert set(reasons[1:]) <= {None, expected}
+    assert (expected is None) == (set(reasons) == {None})
+    assert kinds(tmp_path / "stream.gss").count("K") == 1 + sum(r is not None for r in reasons)
+
+
+@pytest.mark.parametrize(("settings", "cut"), [(PERIOD, 1), (PERIOD, 3), (ERROR, 2), (ERROR, 5)])
+def test_a_run_with_key_packets_resumes_to_the_same_bytes(tmp_path, settings, cut):
+    once = encode(tmp_path, method="s2gs-edge", **settings)
+    stream = tmp_path / "stream.gss"
+    with StreamReader(stream) as reader:
+        entry = reader.frames[cut]
+    with stream.open("r+b") as file:
+        file.truncate(entry.offset + 5)
+    assert encode(tmp_path, "--resume", method="s2gs-edge", **settings) == once
+
+
+def test_still_frames_and_key_packets_resume_to_the_same_bytes(tmp_path):
+    """A key packet after still frames shows an older picture: what is compared with it must survive resuming."""
+    source = "synthetic:frames=6&views=3&width=64&height=48&supersample=1&static=1"
+    once = encode(tmp_path, source=source, method="s2gs-edge", **PERIOD)
+    stream = tmp_path / "stream.gss"
+    assert kinds(stream) == "KEKEKE"
+    with Playback(stream) as playback:
+        assert playback.player_state(4).meta.extra["shown"] == 0
+    for cut in (3, 5):
+        with StreamReader(stream) as reader:
+            entry = reader.frames[cut]
+        with stream.open("r+b") as file:
+            file.truncate(entry.offset)
+        assert encode(tmp_path, "--resume", source=source, method="s2gs-edge", **PERIOD) == once
+
+
+def test_killed_at_any_moment_a_run_with_key_packets_resumes(tmp_path):
+    once = encode(tmp_path / "whole", method="s2gs-edge", **PERIOD)
+    out = tmp_path / "o"
+    process = start(*arguments(out, method="s2gs-edge", **PERIOD))
+    deadline = time.monotonic() + 60
+    while not (out / "stream.gss").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    delay = random.uniform(0, 2.5)
+    time.sleep(delay)
+    process.kill()
+    process.communicate()
+    code, _, err = finish(*arguments(out, "--resume", method="s2gs-edge", **PERIOD))
+    assert (code, err) == (0, "")
+    assert (out / "stream.gss").read_bytes() == once, f"killed after {delay} s"
+
+
+def test_info_and_play_know_later_key_packets(tmp_path, capsys):
+    encode(tmp_path / "o", method="s2gs-edge", **PERIOD)
+    capsys.readouterr()
+    stream = str(tmp_path / "o" / "stream.gss")
+    assert run_command(["info", stream, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [packet["kind"] for packet in found["packets"]] == ["key", "delta"] * 3
+    deltas = [packet["size"] for packet in found["packets"] if packet["kind"] == "delta"]
+    assert found["summary"]["kb_per_frame"] == pytest.approx(sum(deltas) / 3000)
+    assert PacketKind.KEY == 1

@@ -51,6 +51,10 @@ from gsstream.method.packets import send_key as send_key
 from gsstream.method.tools import FirstFrame as FirstFrame
 from gsstream.method.tools import FrameTools as FrameTools
 from gsstream.method.tools import Tools as Tools
+from gsstream.optimiser.base import ADAM_BETAS as ADAM_BETAS
+from gsstream.optimiser.base import ADAM_EPS as ADAM_EPS
+from gsstream.optimiser.base import AdamState as AdamState
+from gsstream.optimiser.base import RowOptimiser as RowOptimiser
 from gsstream.packet import EncodedPacket as EncodedPacket
 from gsstream.packet import PlayerState as PlayerState
 from gsstream.packet import StreamMeta as StreamMeta

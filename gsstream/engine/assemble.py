@@ -14,6 +14,7 @@ from gsstream.engine.heeded import unheeded
 from gsstream.gate.base import GateSampler
 from gsstream.loss.base import Loss
 from gsstream.method.base import StreamingMethod
+from gsstream.optimiser.base import RowOptimiser
 from gsstream.plugins.catalog import Catalog
 from gsstream.propagation.base import Propagation
 from gsstream.recipe.check import join_problems, validate
@@ -29,6 +30,7 @@ SLOTS = ("structure", "confidence", "propagation", "gate", "regularizer", "updat
 #: What "auto" tries, fastest first, before it falls back to the reference.
 AUTO_RENDERERS = ("cpu",)
 AUTO_LOSSES = ("cpu", "reference")
+AUTO_OPTIMISERS = ("cpu", "reference")
 
 
 class SlowRendererWarning(UserWarning):
@@ -55,6 +57,7 @@ class Assembly:
     update: UpdateRule
     renderer: Renderer
     loss: Loss
+    optimiser: RowOptimiser
     whole: StreamingMethod[Any] | None = None
     origins: Mapping[KeyPath, Origin] = field(default_factory=dict)
     distributions: tuple[str, ...] = ()
@@ -99,6 +102,7 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog) -> Assembly:
         problems += [f"{resolved.near(path).where}: {'.'.join(path)}: {hint}" for path in paths]
     join_problems(problems)
     parts["loss"] = loss
+    parts["optimiser"] = _optimiser(catalog)
     owners = sorted({catalog.entry(slot, ref.name).distribution for slot, ref in refs.items()})
     recipe = resolved.recipe.model_copy(update=refs)
     return Assembly(recipe=recipe, origins=resolved.origins, distributions=tuple(owners), **parts)
@@ -148,6 +152,18 @@ def _loss(resolved: ResolvedRecipe, catalog: Catalog, problems: list[str]) -> Pa
             if wanted != "auto":
                 problems.append(f"{resolved.near(('loss', 'backend')).where}: loss.backend: {error}")
     return None
+
+
+def _optimiser(catalog: Catalog) -> Part:
+    """The fastest optimiser that works here; they agree to 1e-6, so a recipe does not choose."""
+    for name in AUTO_OPTIMISERS[:-1]:
+        try:
+            cls = catalog.resolve("optimiser", name)
+            return _construct("optimiser", name, cls, cls.Config(), catalog)
+        except (UnknownName, PluginUnavailable):
+            continue  # what keeps a plugin from working is shown where its renderer is chosen
+    cls = catalog.resolve("optimiser", AUTO_OPTIMISERS[-1])
+    return _construct("optimiser", AUTO_OPTIMISERS[-1], cls, cls.Config(), catalog)
 
 
 def _auto_renderer(

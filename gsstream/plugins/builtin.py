@@ -21,6 +21,7 @@ def gsstream_components() -> list[ComponentSpec]:
         _part("whole", "hold", "method.hold:Hold", "frame 0 and nothing after it"),
         _part("renderer", "reference", "render.reference:ReferenceRenderer", "pure torch, slow, defines the truth"),
         _part("loss", "reference", "loss.photometric:ReferenceLoss", "L1 + D-SSIM in torch, slow, defines the truth"),
+        _part("optimiser", "reference", "optimiser.adam:ReferenceAdam", "Adam by rows in torch, defines the truth"),
         _part("source", "demo", "source.open:open_source", "the small recording that ships with gsstream"),
         _part("source", "synthetic", "source.open:open_source", "an analytic moving scene: synthetic:KEY=VALUE&..."),
         _part("source", "watch", "source.open:open_source", "a folder that grows: watch:DIR?KEY=VALUE&..."),

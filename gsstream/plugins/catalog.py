@@ -26,6 +26,7 @@ CONTRACTS: Mapping[str, str] = {
     "whole": "gsstream.method.base:StreamingMethod",
     "renderer": "gsstream.render.base:Renderer",
     "loss": "gsstream.loss.base:Loss",
+    "optimiser": "gsstream.optimiser.base:RowOptimiser",
 }
 
 

@@ -11,6 +11,7 @@ from gsstream.core.part import Part
 from gsstream.gate.base import GateSampler
 from gsstream.loss.base import Loss
 from gsstream.method.base import StreamingMethod
+from gsstream.optimiser.base import RowOptimiser
 from gsstream.propagation.base import Propagation
 from gsstream.regularizer.base import Regularizer
 from gsstream.render.base import Renderer
@@ -27,6 +28,7 @@ CONTRACTS: dict[str, type[Part]] = {
     "whole": StreamingMethod,
     "renderer": Renderer,
     "loss": Loss,
+    "optimiser": RowOptimiser,
 }
 #: The kinds whose behaviour the kit knows; of the others it checks settings, freezing and declaration.
 BEHAVED = ("structure", "confidence", "propagation", "gate", "regularizer")

@@ -7,7 +7,7 @@ from gsstream.spec import ComponentSpec, hookimpl
 
 @hookimpl
 def gsstream_components() -> list[ComponentSpec]:
-    """The renderer `cpu` and the loss `cpu`."""
+    """The renderer, the loss and the optimiser `cpu`."""
     return [
         ComponentSpec(
             kind="renderer",
@@ -20,5 +20,11 @@ def gsstream_components() -> list[ComponentSpec]:
             name="cpu",
             target="gsstream_cpu_render.loss_part:CpuLoss",
             summary="native L1 + D-SSIM with its gradient, on tile masks",
+        ),
+        ComponentSpec(
+            kind="optimiser",
+            name="cpu",
+            target="gsstream_cpu_render.adam_part:CpuAdam",
+            summary="native Adam by rows, fused and threaded",
         ),
     ]

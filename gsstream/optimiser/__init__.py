@@ -1,0 +1,1 @@
+"""Optimisers of table rows: how a gradient moves what is trained."""

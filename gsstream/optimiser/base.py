@@ -1,0 +1,60 @@
+"""RowOptimiser: Adam on tables of which every row counts its own steps."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+
+from gsstream.core.part import Part
+
+ADAM_BETAS = (0.9, 0.999)
+ADAM_EPS = 1e-15  # released code and 3DGS: tiny gradients of tiny Gaussians must still move them
+
+
+@dataclass(frozen=True, slots=True)
+class AdamState:
+    """Moments of one table of n rows; float32, contiguous.
+
+    Arguments:
+        exp_avg, exp_avg_sq: like the table, running means of the gradient and of its square.
+        steps: [n] int32, updates that each row has taken. A row that joins later starts with zeros.
+    """
+
+    exp_avg: torch.Tensor
+    exp_avg_sq: torch.Tensor
+    steps: torch.Tensor
+
+    @staticmethod
+    def start(values: torch.Tensor) -> AdamState:
+        """No step taken yet. ``values`` [n, ...]."""
+        zeros = torch.zeros_like(values, requires_grad=False)
+        return AdamState(zeros, zeros.clone(), torch.zeros(len(values), dtype=torch.int32))
+
+
+class RowOptimiser(Part):
+    """Adam (Kingma and Ba 2015, algorithm 1; betas 0.9 / 0.999, eps 1e-15) with each row's bias corrected by its count.
+
+    Where all rows take all steps this is ``torch.optim.Adam``, to 1e-6.
+    """
+
+    @abstractmethod
+    def step(
+        self,
+        values: Mapping[str, torch.Tensor],
+        gradients: Mapping[str, torch.Tensor],
+        states: Mapping[str, AdamState],
+        lrs: Mapping[str, float],
+    ) -> None:
+        """One update of every named table that has a gradient. Changes ``values`` and ``states`` in place.
+
+        Arguments:
+            values: name -> [n, ...] float32, contiguous; leaves of a graph are allowed.
+            gradients: like the table each; names that are missing are not moved and count no step.
+            states: their moments. lrs: their learning rates, >= 0.
+
+        Raises:
+            ShapeError: shapes that differ, a gradient that is not finite (that table is not changed then).
+        """

@@ -1,0 +1,50 @@
+"""Adam by rows as a gsstream part."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import final
+
+import torch
+
+from gsstream.api import ADAM_BETAS, ADAM_EPS, AdamState, RowOptimiser
+from gsstream_cpu_render import _native
+from gsstream_cpu_render.checks import native_array, refuse, refuse_value
+
+
+@final
+class CpuAdam(RowOptimiser):
+    """Native and fused: one call per table, threaded where a table is large."""
+
+    def step(
+        self,
+        values: Mapping[str, torch.Tensor],
+        gradients: Mapping[str, torch.Tensor],
+        states: Mapping[str, AdamState],
+        lrs: Mapping[str, float],
+    ) -> None:
+        for name, gradient in gradients.items():
+            _step(name, values[name].detach(), gradient, states[name], lrs[name])
+
+
+def _step(name: str, value: torch.Tensor, gradient: torch.Tensor, state: AdamState, lr: float) -> None:
+    if gradient.shape != value.shape:
+        refuse(f"gradient of {name}: expected shape {list(value.shape)}, got {list(gradient.shape)}")
+    if value.numel() == 0:
+        return
+    rows = len(value)
+    # The kernel checks shape, dtype and layout again; only what it would say less well is looked at here.
+    table = [part.numpy().reshape(rows, -1) for part in (value, gradient.detach().contiguous())]
+    moments = [part.numpy().reshape(rows, -1) for part in (state.exp_avg, state.exp_avg_sq)]
+    try:
+        bad = _native.adam_update(
+            *table, *moments, state.steps.numpy(), 1, None, None, lr, None, None, *ADAM_BETAS, ADAM_EPS, False, True
+        )
+    except (TypeError, ValueError) as error:
+        for label, tensor in (("values", value), ("gradient", gradient), ("exp_avg", state.exp_avg)):
+            native_array(f"{label} of {name}", tensor, table[0].dtype.type, tuple(value.shape))
+        refuse_value(f"{name}: {error}")
+    if bad >= 0:
+        row, column = divmod(bad, table[1].shape[1])
+        got = f"{table[1][row, column]} in row {row}, column {column}"
+        refuse(f"gradient of {name}: expected finite values, got {got}; its table was not changed")

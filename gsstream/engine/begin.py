@@ -150,7 +150,8 @@ def key_state(
     arrays: Gaussians[FloatArray] = gaussians.map(lambda t: np.ascontiguousarray(t.numpy()))
     packet = encode_key(KeyState(arrays, layout, replace(meta, extra=extra)), frame=frame.index)
     player = decode_packet(None, packet.data)
-    decoders = parts.update.init_decoders(gaussians, rng.stream("decoders", frame.index))
+    with guarded("update", parts.update, frame.index):
+        decoders = parts.update.init_decoders(gaussians, rng.stream("decoders", frame.index))
     state = StreamState(
         player=player, hierarchy=hierarchy, previous=frame, decoders=decoders,
         exposure=exposure_from_meta(player.meta), key_frame=player.frame,

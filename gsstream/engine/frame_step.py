@@ -6,6 +6,7 @@ context -> estimate -> propagate -> init gates -> optimise -> harden -> encode -
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ import numpy as np
 import torch
 
 from gsstream.core.delta import Delta
+from gsstream.core.errors import ComponentError, ShapeError
 from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import IntArray
@@ -20,7 +22,7 @@ from gsstream.core.state import GateState
 from gsstream.engine.active_set import detect_change
 from gsstream.engine.assemble import Assembly
 from gsstream.engine.context import StepContext
-from gsstream.engine.guard import guarded
+from gsstream.engine.guard import check_output, guarded
 from gsstream.engine.optimise import Problem, Solution, optimise
 from gsstream.engine.rows import follow
 from gsstream.engine.stream_state import Step, StreamState
@@ -29,28 +31,42 @@ from gsstream.residual.base import symbols as residual_symbols
 
 
 def frame_step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> Step:
-    """Advance the stream by one frame. Pure: a failure leaves ``state`` as it was."""
+    """Advance the stream by one frame. Pure: a failure leaves ``state`` as it was.
+
+    Raises ComponentError when a part fails, unless the recipe says ``stream.on_error: repeat``: then the frame changes
+    nothing, and its metrics and a warning say why.
+    """
+    started = time.perf_counter()
+    try:
+        return _step(parts, state, frame, rng)
+    except (ComponentError, ShapeError) as error:
+        if parts.recipe.stream.on_error == "raise":
+            raise
+        warnings.warn(f"frame {frame.index} repeats the one before it: {error}", RepeatedFrameWarning, stacklevel=2)
+        step = still_step(state, frame, time.perf_counter() - started)
+        return replace(step, metrics={**step.metrics, "error": str(error)})
+
+
+class RepeatedFrameWarning(UserWarning):
+    """A part failed, and its frame was sent as "nothing changed"."""
+
+
+def _step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> Step:
     clock = [time.perf_counter()]
     if frame.effort == 0:
         return still_step(state, frame, 0.0)
     change = detect_change(state.previous, frame, parts.recipe.stream.change_threshold)
     if change is not None and change.share == 0:
         return still_step(state, frame, time.perf_counter() - clock[0])
-    context = StepContext(state, frame, parts.renderer, parts.recipe.background, change)
-    with guarded("confidence", parts.confidence, frame.index):
-        logits = parts.confidence.estimate(context)
-    with guarded("propagation", parts.propagation, frame.index):
-        node_logits = parts.propagation.propagate(logits, state.hierarchy)
-    with guarded("gate", parts.gate, frame.index):
-        gate = parts.gate.init(node_logits)
-    active = active_rows(parts, context, state, gate)
+    with guarded("renderer", parts.renderer, frame.index):
+        context = StepContext(state, frame, parts.renderer, parts.recipe.background, change)
+    gate, active = suspects(parts, state, context)
     clock.append(time.perf_counter())
 
     if len(active) < len(context.gaussians):
         context.session.narrow(active)
     problem = Problem(state, frame, active, context.gaussians.rows(active), gate, context.session)
-    with guarded("method", parts.gate, frame.index):
-        solution = optimise(parts, problem, rng.stream("frame", frame.index))
+    solution = optimise(parts, problem, rng.stream("frame", frame.index))
     clock.append(time.perf_counter())
 
     delta = harden(parts, problem, solution)
@@ -80,11 +96,26 @@ def still_step(state: StreamState, frame: Frame, seconds: float) -> Step:
     return Step(after, packet, "empty", metrics)
 
 
-def active_rows(parts: Assembly, context: StepContext, state: StreamState, gate: GateState) -> torch.Tensor:
-    """[A] rows that may change: suspect by what the cameras saw, and behind a gate that may open."""
-    probability = parts.gate.open_probability(gate)
+def suspects(parts: Assembly, state: StreamState, context: StepContext) -> tuple[GateState, torch.Tensor]:
+    """Initial gates [M], and the rows [A] that may change: suspect to the cameras and behind a gate that may open.
+
+    What each part returns is looked at before the next one gets it.
+    """
+    index, nodes = context.index, state.hierarchy.num_nodes
+    with guarded("confidence", parts.confidence, index):
+        logits = parts.confidence.estimate(context)
+    check_output("confidence", parts.confidence, index, "estimate()", logits, (state.hierarchy.num_gaussians,))
+    with guarded("propagation", parts.propagation, index):
+        node_logits = parts.propagation.propagate(logits, state.hierarchy)
+    check_output("propagation", parts.propagation, index, "propagate()", node_logits, (nodes,))
+    with guarded("gate", parts.gate, index):
+        gate = parts.gate.init(node_logits)
+        probability = parts.gate.open_probability(gate)
+    check_output("gate", parts.gate, index, "init().logits", gate.logits, (nodes,))
+    check_output("gate", parts.gate, index, "open_probability()", probability, (nodes,), (0.0, 1.0))
     may_open = probability > parts.recipe.stream.active_threshold
-    return (may_open[state.hierarchy.node_of] & context.suspects(parts.recipe.stream.change_votes)).nonzero()[:, 0]
+    rows = may_open[state.hierarchy.node_of] & context.suspects(parts.recipe.stream.change_votes)
+    return gate, rows.nonzero()[:, 0]
 
 
 def harden(parts: Assembly, problem: Problem, solution: Solution) -> Delta:
@@ -93,7 +124,11 @@ def harden(parts: Assembly, problem: Problem, solution: Solution) -> Delta:
     A gate behind which every symbol is zero is closed: it would cost bits and change nothing (ours).
     """
     layout = problem.state.player.layout
-    gates = torch.round(parts.gate.sample(solution.gate, None) * parts.gate.num_levels).numpy().astype(np.uint8)
+    frame = problem.frame.index
+    with guarded("gate", parts.gate, frame):
+        final = parts.gate.sample(solution.gate, None)
+    check_output("gate", parts.gate, frame, "sample()", final, tuple(solution.gate.logits.shape), (0.0, 1.0))
+    gates = torch.round(final * parts.gate.num_levels).numpy().astype(np.uint8)
     active = problem.active.numpy()
     integers = {name: value.numpy() for name, value in residual_symbols(parts.update, solution.latents).items()}
     moving = np.zeros(len(active), bool)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import torch
@@ -10,9 +11,11 @@ import torch
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.part import Part
 from gsstream.core.state import GateState
 from gsstream.engine.assemble import Assembly
 from gsstream.engine.exposure import Exposure, backward_view
+from gsstream.engine.guard import check_terms, guarded
 from gsstream.engine.parameters import AdamTable
 from gsstream.engine.stream_state import StreamState
 from gsstream.render.base import RenderSession
@@ -63,7 +66,7 @@ def optimise(parts: Assembly, problem: Problem, generator: torch.Generator) -> S
     recent: list[float] = []
     for iteration in range(iterations):
         order = order or torch.randperm(views, generator=generator).tolist()
-        recent.append(run.step(order.pop(), iteration / iterations))
+        recent.append(run.step(order.pop(), iteration, iteration / iterations))
     loss = sum(recent[-views:]) / max(1, len(recent[-views:]))
     return run.solution(loss, iterations)
 
@@ -84,7 +87,9 @@ class _FrameRun:
         self.units = torch.from_numpy(layout.units[active])
         self.levels = torch.from_numpy(layout.octree_levels[active].astype("int64"))
         self.schedule = level_schedule(parts, len(layout.cell_sizes))
-        codes = parts.update.codes()
+        self.iteration = 0
+        with self._guarded("update", parts.update):
+            codes = parts.update.codes()
         latents = init_latents(parts.update, problem.base)
         self.latents = AdamTable(latents, {name: codes[name].lr for name in latents})
         decoders = {name: state.decoders[name] for name in latents if name in state.decoders}
@@ -92,12 +97,16 @@ class _FrameRun:
         self.gate = AdamTable({"logits": problem.gate.logits[nodes]}, {"logits": parts.recipe.gate_training.lr})
         self.gate.load_moments("logits", state.gate_moments)
         self.session = problem.session
-        self.targets = [parts.loss.prepare(torch.from_numpy(image)) for image in problem.frame.images]
+        with self._guarded("loss", parts.loss):
+            self.targets = [parts.loss.prepare(torch.from_numpy(image)) for image in problem.frame.images]
         self.exposure: Exposure | None = state.exposure
 
-    def step(self, view: int, fraction: float) -> float:
+    def _guarded(self, slot: str, part: Part) -> AbstractContextManager[None]:
+        return guarded(slot, part, self.problem.frame.index, self.iteration)
+
+    def step(self, view: int, iteration: int, fraction: float) -> float:
         """One iteration on one view; returns the photometric loss."""
-        parts = self.parts
+        parts, self.iteration = self.parts, iteration
         gate = GateState(self.gate["logits"])
         gates = self._row_gates(gate, fraction)
         with torch.no_grad():
@@ -114,9 +123,11 @@ class _FrameRun:
 
     def _render(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
         """Loss of one view; leaves its gradient on the rows."""
-        output = self.session.render(view, rows)
+        with self._guarded("renderer", self.parts.renderer):
+            output = self.session.render(view, rows)
         weight, target = self.parts.recipe.loss.dssim, self.targets[view]
-        return backward_view(output.image, view, self.exposure, self.parts.loss, target, weight, output.tiles)[0]
+        with self._guarded("loss", self.parts.loss):
+            return backward_view(output.image, view, self.exposure, self.parts.loss, target, weight, output.tiles)[0]
 
     def _step_gates(self, gate: GateState, gates: torch.Tensor, upstream: torch.Tensor, *, learning: bool) -> None:
         """Move the logits by what the images and the penalty say, and keep them in their bounds."""
@@ -131,15 +142,17 @@ class _FrameRun:
                 gradients.append(torch.ones_like(penalty))
         if not roots:
             return
-        torch.autograd.backward(roots, gradients)
-        self.gate.step()
-        bounded = self.parts.gate.bound(GateState(self.gate["logits"].detach())).logits
-        self.gate["logits"].data.copy_(bounded)
+        with self._guarded("gate", self.parts.gate):
+            torch.autograd.backward(roots, gradients)
+            self.gate.step()
+            bounded = self.parts.gate.bound(GateState(self.gate["logits"].detach())).logits
+            self.gate["logits"].data.copy_(bounded)
 
     def _row_gates(self, gate: GateState, fraction: float) -> torch.Tensor:
         """[A] gate of every active row; rows of levels that are not yet active hold still."""
-        noise = self.parts.gate.noise(self.hierarchy.num_nodes, self.generator)
-        per_row = self.parts.gate.sample(gate, noise)[self.hierarchy.node_of]
+        with self._guarded("gate", self.parts.gate):
+            noise = self.parts.gate.noise(self.hierarchy.num_nodes, self.generator)
+            per_row = self.parts.gate.sample(gate, noise)[self.hierarchy.node_of]
         if self.schedule:
             per_row = per_row * (self.levels <= current_level(self.schedule, fraction))
         return per_row
@@ -148,9 +161,13 @@ class _FrameRun:
         means = self.latents.leaves.get("means")
         # The motion term also pulls on the residual itself; that gradient waits on the leaf for the latents' step.
         residual = torch.zeros(len(self.problem.base), 3) if means is None else means
-        probability = self.parts.gate.open_probability(gate)
-        total = self.problem.state.hierarchy.num_gaussians
-        return self.parts.regularizer.penalty(probability, residual, self.hierarchy, total)
+        with self._guarded("gate", self.parts.gate):
+            probability = self.parts.gate.open_probability(gate)
+        total, regularizer = self.problem.state.hierarchy.num_gaussians, self.parts.regularizer
+        with self._guarded("regularizer", regularizer):
+            terms = regularizer.penalty(probability, residual, self.hierarchy, total)
+            check_terms(regularizer, self.problem.frame.index, self.iteration, terms)
+        return terms
 
     def solution(self, loss: float, iterations: int) -> Solution:
         moments = self.gate.moments("logits") if self.parts.recipe.gate_training.optimiser == "persistent" else {}

@@ -19,6 +19,7 @@ from gsstream.core.rng import Rng
 from gsstream.core.topology import TopologyEdit
 from gsstream.engine.densify import DensifyStatistics, grow_and_prune
 from gsstream.engine.exposure import Exposure, ExposureFit, backward_view
+from gsstream.engine.guard import guarded
 from gsstream.engine.parameters import AdamTable
 from gsstream.loss.base import Loss
 from gsstream.recipe.model import FirstFrame, Recipe
@@ -128,9 +129,11 @@ class _RootRun:
         densify = s.densify_from <= iteration + s.densify_every and iteration <= s.densify_until * self.iterations
         rows = self.gaussians()
         probe = torch.zeros(len(rows), 2, requires_grad=True) if densify else None
-        session = self.renderer.open(rows, None, self.frame.cameras, self.recipe.background)
-        output = session.render(view, rows, probe=probe)
-        value = self._backward(view, output.image)
+        with guarded("renderer", self.renderer, self.frame.index, iteration):
+            session = self.renderer.open(rows, None, self.frame.cameras, self.recipe.background)
+            output = session.render(view, rows, probe=probe)
+        with guarded("loss", self.loss, self.frame.index, iteration):
+            value = self._backward(view, output.image)
         fraction = iteration / self.iterations
         self.table.set_lr("means", self.extent * _log_linear(s.lr_means, s.lr_means_final, fraction))
         self.table.step()

@@ -93,6 +93,11 @@ class Stream(Section):
         default=0.0, ge=0, le=1,
         description="weight in the loss of the residual's estimated bits per pixel of one view; 0: none (ours)",
     )  # fmt: skip
+    on_error: Literal["raise", "repeat"] = Field(
+        default="raise",
+        description="when a part fails in a later frame; raise: the run ends, the stream holds every frame before it; "
+        "repeat: the frame changes nothing, which a warning and its metrics say",
+    )
     progressive: bool = Field(default=False, description="activate octree levels from floor(H/2) on (paper)")
     progressive_omega: float = Field(default=1.5, ge=1, description="iterations per level: N_{i+1} = omega N_i")
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
-from gsstream.core.errors import EndOfRecording, InputError
+from gsstream.core.errors import EndOfRecording, GsstreamError, InputError, SourceError
 from gsstream.core.frame import Frame
 from gsstream.source.base import FrameSource, GrowingSource
 
@@ -92,5 +92,11 @@ class Prefetcher:
 
 def _read_pair(source: FrameSource, index: int) -> tuple[FramePair, float]:
     start = time.perf_counter()
-    pair = source.frame(index, "train"), source.frame(index, "test")
+    try:
+        pair = source.frame(index, "train"), source.frame(index, "test")
+    except GsstreamError:
+        raise
+    except Exception as error:  # a source may be a plugin's: its failure is reported with its name
+        name = type(source).__name__
+        raise SourceError(f"{name} could not read frame {index}: {type(error).__name__}: {error}") from error
     return pair, time.perf_counter() - start

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
+
+BROKEN = Path(__file__).parent / "broken"
 
 REASONS = {
     "raises_at_import": "ModuleNotFoundError: No module named 'a_package_nobody_has'",
     "exits_at_import": "SystemExit: no licence found",
     "other_major": "from-the-future: built for component API 2.0, this gsstream speaks 1.0: upgrade gsstream",
     "newer_minor": "newer-gate: built for component API 1.3, this gsstream speaks 1.0: upgrade gsstream",
+    "older_major": "from-the-past: built for component API 0.9, this gsstream speaks 1.0: ask its author for a "
+    "newer version",
     "duplicate_name": "declares the gate 'always-open', which gsstream 0.1.0 already provides; rename it",
     "unknown_hook": "implements the hook 'gsstream_component', which this gsstream does not know; did you mean "
     "'gsstream_components'?",
@@ -138,3 +144,35 @@ def test_unknown_names_mention_quarantine(lab) -> None:
     assert result.stderr == (
         "error: no method named 's2gz'; known: dense (1 plugin could not be loaded: see 'gsstream plugins')\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("speaks", "refused", "advice"),
+    [
+        ("1.4", {"other_major": "2.0", "older_major": "0.9"}, "upgrade gsstream"),
+        ("1.2", {"other_major": "2.0", "older_major": "0.9", "newer_minor": "1.3"}, "upgrade gsstream"),
+        ("2.1", {"older_major": "0.9", "newer_minor": "1.3", "healthy": "1.0"}, "ask its author for a newer version"),
+    ],
+)
+def test_the_rule_for_versions_as_gsstream_grows(lab, speaks: str, refused: dict[str, str], advice: str) -> None:
+    """Tiny distributions written for 0.9, 1.0, 1.3 and 2.0, and a gsstream that speaks another version each time."""
+    for fault in ("other_major", "older_major"):
+        lab.install(fault)
+    newer = (BROKEN / "newer_minor.py").read_text().partition("@hookimpl\ndef gsstream_viewers")[0]
+    lab.add("newer_minor", newer)
+    lab.add("healthy", HEALTHY.replace('summary="mine"', 'summary="mine", api="1.0"'))
+    code = (
+        "import sys, gsstream\ngsstream.API_VERSION = sys.argv.pop(1)\n"
+        "import gsstream.plugins.builtin\nfrom gsstream.cli.main import main\nmain()\n"
+    )
+    listing = lab.python(code, speaks, "plugins")
+    assert listing.returncode == 0, listing.stderr
+    rows = {line.split()[0]: line for line in listing.stdout.splitlines() if line}
+    for name in ("other_major", "older_major", "newer_minor", "healthy"):
+        if name in refused:
+            reason = f"built for component API {refused[name]}, this gsstream speaks {speaks}: "
+            assert "quarantined: " in rows[name]
+            assert reason in rows[name]
+        else:
+            assert "quarantined" not in rows[name], "an older minor version, or the same one, is fine"
+    assert advice in "".join(rows[name] for name in refused)

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import enum
+import importlib
 import inspect
 import sys
 from collections.abc import Iterator
@@ -47,12 +49,25 @@ def cli() -> str:
         lines += [f"## {path}", "", (command.help or "").strip(), ""]
         shown = [param for param in command.params if param.name != "help"]
         if shown:
-            lines += ["| argument or option | meaning |", "|---|---|"]
+            lines += ["| argument or option | type | default | meaning |", "|---|---|---|---|"]
             for param in shown:
                 name = ", ".join(param.opts) if param.param_type_name == "option" else param.name.upper()
-                lines.append(f"| `{name}` | {getattr(param, 'help', '')} |")
+                default = getattr(param.default, "value", param.default)
+                shown = "required" if param.required else "-" if default in (None, False, ()) else f"`{default}`"
+                lines.append(f"| `{name}` | {_option_type(param)} | {shown} | {_cell(getattr(param, 'help', ''))} |")
             lines.append("")
     return "\n".join(lines)
+
+
+def _option_type(param: Any) -> str:
+    annotation = param.type_descriptor.annotation
+    if getattr(param, "is_bool_flag", False):
+        return "flag"
+    if inspect.isclass(annotation) and issubclass(annotation, enum.Enum):
+        kind = "one of " + ", ".join(choice.value for choice in annotation)
+    else:
+        kind = "path" if "Path" in str(annotation) else getattr(annotation, "__name__", str(annotation))
+    return kind.replace("list", "str") + (", repeatable" if getattr(param, "multiple", False) else "")
 
 
 def _commands(command: Any, path: str) -> Iterator[tuple[str, Any]]:
@@ -95,6 +110,82 @@ def checks() -> str:
                 meaning = entry.meaning.replace("|", chr(92) + "|")
                 lines.append(f"| `{entry.name}` | {meaning} | {claim} | {saboteur_of(entry.name)} |")
         lines.append("")
+    return "\n".join(lines)
+
+
+def hooks() -> str:
+    """Every hook, what it returns, and what a part of each kind has to implement, with exact signatures."""
+    from gsstream.cli.plugins import setting_rows
+    from gsstream.core.part import Traits
+    from gsstream.plugins import hookspecs
+    from gsstream.plugins.catalog import CONTRACTS
+    from gsstream.source.base import FrameSource
+    from gsstream.spec import KINDS, ComponentSpec, MethodSpec
+
+    lines = [NOTE, "# Hooks, specs and contracts of parts", "", "## Hooks", ""]
+    for name, hook in inspect.getmembers(hookspecs, inspect.isfunction):
+        if name.startswith("gsstream_"):
+            lines += [f"`{_signature(name, hook)}`", "", inspect.getdoc(hook) or "", ""]
+    for model in (ComponentSpec, MethodSpec):
+        lines += [f"## {model.__name__}", "", (inspect.getdoc(model) or "").splitlines()[0], ""]
+        lines += ["| field | type | default | meaning |", "|---|---|---|---|"]
+        lines += [f"| `{k}` | {_cell(t)} | `{d}` | {_cell(m)} |" for k, t, d, m in setting_rows(model)]
+        lines.append("")
+    lines += ["## Kinds", "", f"{', '.join(f'`{kind}`' for kind in KINDS)}.", ""]
+    contracts = {kind: _named(target) for kind, target in CONTRACTS.items()} | {"source": FrameSource}
+    for kind, contract in contracts.items():
+        lines += [f"### {kind}: `{contract.__module__}.{contract.__name__}`", "", inspect.getdoc(contract) or "", ""]
+        for name, member in vars(contract).items():
+            if not name.startswith("_") and (inspect.isfunction(member) or isinstance(member, property)):
+                function = member.fget if isinstance(member, property) else member
+                must = "abstract" if getattr(member, "__isabstractmethod__", False) else "has a default"
+                must = "expected" if contract is FrameSource else must
+                how = "property " if isinstance(member, property) else ""
+                about = (inspect.getdoc(function) or "").splitlines()
+                lines.append(f"- {how}`{_signature(name, function)}` ({must}){': ' + about[0] if about else ''}")
+        lines.append("")
+    lines += ["## Traits", "", "What a part claims, `traits = Traits(...)`; each claim calls for checks.", ""]
+    lines += ["```", inspect.getdoc(Traits) or "", "```", ""]
+    return "\n".join(lines)
+
+
+def _signature(name: str, function: Any) -> str:
+    return f"{name}{inspect.signature(function)}".replace("'", "")
+
+
+def _named(target: str) -> Any:
+    module, _, name = target.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", chr(92) + "|")
+
+
+def parts() -> str:
+    """Every setting of every part of this repository."""
+    from gsstream.cli.plugins import setting_rows
+    from gsstream.plugins.catalog import load_catalog
+    from gsstream.spec import KINDS
+
+    folders = (HERE.parents[1] / "plugins").glob("*/pyproject.toml")
+    ours = {"gsstream", *(f"gsstream-{path.parent.name.replace('_', '-')}" for path in folders)}
+    catalog = load_catalog()
+    lines = [NOTE, "# Settings of every part", ""]
+    lines += ["The parts of this repository. Of any part that is installed: `gsstream plugins show KIND/NAME`.", ""]
+    for kind in KINDS:
+        for name in catalog.names(kind):
+            entry = catalog.entry(kind, name)
+            config = None
+            if entry.distribution in ours and hasattr(entry.spec, "target"):
+                config = getattr(catalog.resolve(kind, name), "Config", None)
+            if config is None:
+                continue
+            lines += [f"## {kind} `{name}`", "", f"{entry.spec.summary} (`{entry.distribution}`).", ""]
+            rows = list(setting_rows(config))
+            lines += ["| setting | type | default | meaning |", "|---|---|---|---|"] if rows else ["No settings.", ""]
+            lines += [f"| `{k}` | {_cell(t)} | `{d}` | {_cell(m)} |" for k, t, d, m in rows]
+            lines += [""] if rows else []
     return "\n".join(lines)
 
 
@@ -146,7 +237,7 @@ def saboteurs() -> str:
     return "\n".join(lines)
 
 
-PAGES = {"api.md": api, "checks.md": checks, "cli.md": cli, "recipe.md": recipe}
+PAGES = {"api.md": api, "checks.md": checks, "cli.md": cli, "recipe.md": recipe, "hooks.md": hooks, "parts.md": parts}
 
 if __name__ == "__main__":
     if "--saboteurs" in sys.argv:

@@ -10,7 +10,9 @@ import numpy as np
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
 
-_SIDES = 64
+_SIDES, _RINGS = 64, 24
+#: Bounds of the new focal length, as a factor: nobody wants a picture stretched, or cut, more than this.
+_WIDEST, _NARROWEST = 0.25, 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,16 +74,17 @@ def pinhole_intrinsics(lens: Lens, K: FloatArray, size: tuple[int, int], where: 
     u = np.concatenate([steps, steps, zero, one]) * width
     v = np.concatenate([zero, one, steps, steps]) * height
 
-    def fits(zoom: float) -> bool:
-        # Also along the way in: a lens whose mapping turns back has its border inside and its middle outside.
-        for share in (1.0, 0.75, 0.5, 0.25):
-            inner = K[0, 2] + (u - K[0, 2]) * share, K[1, 2] + (v - K[1, 2]) * share
-            at_u, at_v = _source(lens, K, zoom, *inner)
-            if not ((at_u >= 0) & (at_u <= width) & (at_v >= 0) & (at_v <= height)).all():
-                return False
-        return True
+    shares = np.linspace(0, 1, _RINGS)[1:, None]
 
-    low, high = 0.25, 4.0
+    def fits(zoom: float) -> bool:
+        rings = K[0, 2] + (u - K[0, 2]) * shares, K[1, 2] + (v - K[1, 2]) * shares
+        at_u, at_v = _source(lens, K, zoom, *rings)
+        inside = (at_u[-1] >= 0) & (at_u[-1] <= width) & (at_v[-1] >= 0) & (at_v[-1] <= height)
+        # Outwards in the result must be outwards in the picture: else the lens folds it over itself.
+        outwards = np.diff(np.hypot(at_u - K[0, 2], at_v - K[1, 2]), axis=0) > 0
+        return bool(inside.all() and outwards[:, (u != K[0, 2]) | (v != K[1, 2])].all())
+
+    low, high = _WIDEST, _NARROWEST
     if not fits(high):
         raise SourceError(
             f"{where}: the distortion {lens.kind} k = {list(lens.k)}, p = {list(lens.p)} leaves no usable picture; "

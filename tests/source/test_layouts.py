@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import shutil
 import subprocess
 import sys
@@ -97,12 +98,12 @@ def test_points_made_from_all_views_need_a_leak(tmp_path: Path, world: World) ->
 
 
 @pytest.mark.sfm
+@pytest.mark.skipif(importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed")
 @pytest.mark.parametrize("extension", ["bin", "txt"])
 def test_models_written_by_pycolmap_are_read_as_pycolmap_reads_them(
     tmp_path: Path, world: World, extension: str
 ) -> None:
     """pycolmap loads our hand-written model, writes it in its own way, and projects: three independent paths."""
-    pytest.importorskip("pycolmap")
     folder = write_colmap(tmp_path / "scene", world, frames="images")
     sparse = folder / "sparse" / "0"
     code = (

@@ -59,6 +59,7 @@ def files(name: str, kind: str) -> Mapping[str, str]:
     part = example.read_text(encoding="utf-8").replace(f"Example{kind.capitalize()}", cls)
     summary = part.splitlines()[0].strip('"')
     values = {"name": name, "kind": kind, "package": package, "cls": cls, "summary": summary, "module": kind}
+    values["api"] = gsstream.API_VERSION  # stated, so that a later gsstream knows what it was written for
     texts = {path: _fill(text, values) for path, text in TEMPLATES.items()}
     return {
         **{_fill(path, values): text for path, text in texts.items()},
@@ -128,6 +129,7 @@ def gsstream_components() -> list[ComponentSpec]:
             name="<name>",
             target="<package>.<module>:<cls>",
             summary="<summary>",
+            api="<api>",
         )
     ]
 ''',

@@ -1,0 +1,69 @@
+"""docs/howto/write-*.md: every example is executed, and keeps the contract of its kind."""
+
+from __future__ import annotations
+
+import re
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsstream.core.part import Part
+from gsstream.engine.recording import open_recording
+from gsstream.plugins.catalog import CONTRACTS, load_catalog
+from gsstream.plugins.discovery import Discovered
+from gsstream.recipe.model import Recipe
+from gsstream.source.prefetch import Prefetcher
+from gsstream.spec import ComponentSpec
+from gsstream.testing import run_checks
+from gsstream.testing.registry import BEHAVED, kind_of
+
+HOWTOS = Path(__file__).parents[2] / "docs" / "howto"
+PAGES = {
+    "structure": "write-a-structure", "confidence": "write-a-confidence", "propagation": "write-a-propagation",
+    "gate": "write-a-gate", "regularizer": "write-a-regularizer", "update": "write-an-update-rule",
+    "renderer": "write-a-renderer",
+}  # fmt: skip
+
+
+def module(page: str, monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
+    """The one Python block of a page, as an importable module."""
+    (code,) = re.findall(r"^```python\n(.*?)^```$", (HOWTOS / f"{page}.md").read_text(), re.MULTILINE | re.DOTALL)
+    made = types.ModuleType(page.replace("-", "_"))
+    monkeypatch.setitem(sys.modules, made.__name__, made)
+    exec(compile(code, f"{page}.md", "exec"), vars(made))
+    return made
+
+
+@pytest.mark.parametrize("kind", PAGES)
+def test_the_example_passes_every_check_of_its_kind(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = module(PAGES[kind], monkeypatch)
+    classes = [value for value in vars(made).values() if isinstance(value, type) and issubclass(value, Part)]
+    (cls,) = [value for value in classes if value.__module__ == made.__name__]
+    part = cls()
+    assert kind_of(part) == kind
+    results = run_checks(part)
+    assert [f"{result.check}: {result.message}" for result in results if not result.ok] == []
+    skipped = {result.check for result in results if result.status == "skipped"}
+    assert skipped == {"check_cheap_spec"}, "the example claims all that can be claimed"
+    assert len(results) > (15 if kind in BEHAVED else 2)
+
+
+def test_there_is_a_page_for_every_kind_with_a_contract() -> None:
+    internal = {"loss", "optimiser", "whole"}  # whole methods have a page of their own
+    assert {*PAGES, *internal} >= set(CONTRACTS)
+
+
+def test_the_source_is_read_like_any_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = module("write-a-source", monkeypatch)
+    spec = ComponentSpec(kind="source", name="square", target=f"{made.__name__}:Square", summary="a square")
+    catalog = load_catalog([Discovered("square", "gsstream-square", "1", (spec,))])
+    source = open_recording("square:any", Recipe(), catalog)
+    with Prefetcher(source, range(5)) as pairs:
+        for index, (train, test) in enumerate(pairs):
+            train.validate()
+            test.validate()
+            assert np.array_equal(train.images, source.frame(index).images)
+    assert index == 4

@@ -42,7 +42,7 @@ def test_unknown_names_offer_the_nearest(builtin) -> None:
     assert str(caught.value) == "no gate named 'always-opne'; did you mean 'always-open'?"
     with pytest.raises(UnknownName) as caught:
         builtin.recipe_path("quite-different")
-    assert str(caught.value) == "no method named 'quite-different'; known: dense"
+    assert str(caught.value) == "no method named 'quite-different'; known: dense, hold"
     with pytest.raises(UnknownName, match="no structure named 'always-open'"):
         builtin.resolve("structure", "always-open")
 

@@ -13,21 +13,26 @@ from gsstream.cli.streams import Frames, Stream, chosen_frames, frame_range, pro
 
 def export(
     stream: Stream,
-    out: Annotated[Path, typer.Option("--out", help="Folder for the files, one per frame.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the files.")],
     kind: Annotated[
-        str, typer.Option("--format", help="ply (3DGS), spz (needs splat-transform), or sequence (PLYs and a list).")
+        str,
+        typer.Option("--format", help="ply (3DGS), spz (by splat-transform), sequence (PLYs, list), onnx (decoders)."),
     ] = "ply",
     frames: Frames = None,
 ) -> None:
     """Write decoded frames to files that other programs open."""
     first, last = frame_range(frames)
     file = stream_file(stream)
+    from gsstream.player.decoders import export_decoders
     from gsstream.player.export import export as export_stream
     from gsstream.player.playback import Playback
 
     with Playback(file) as playback:
         chosen = chosen_frames(playback, first, last)
-    written = export_stream(file, out, kind, frames=chosen, progress=progress_on("frame"))
+    if kind == "onnx":
+        written = export_decoders(file, out, frames=chosen)
+    else:
+        written = export_stream(file, out, kind, frames=chosen, progress=progress_on("frame"))
     size = sum(path.stat().st_size for path in written)
     typer.echo(f"{out}: {plural(len(written), 'file')}, {size / 1e6:.1f} MB")
 

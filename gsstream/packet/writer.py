@@ -27,6 +27,9 @@ class StreamWriter:
         Resuming verifies every packet, cuts an unfinished or torn last packet and the index off, and with
         ``last_frame`` every packet after that frame (a checkpoint may be older than the stream).
 
+        Every packet reaches the operating system before the call that wrote it returns: a killed process loses none.
+        With ``fsync`` it also reaches the disk (and the file its folder's list): a power cut loses none either.
+
         Raises OutputError when the file exists (or, with ``resume``, cannot be opened), PacketError when it is damaged
         before its last packet: nothing is cut then.
         """
@@ -37,6 +40,8 @@ class StreamWriter:
                 file = path.open("wb" if resume else "xb")
                 writer = cls(file, [], 0, fsync)
                 writer._write(file_header())
+                if fsync:
+                    _sync_folder(path.parent)
                 return writer
             entries, end = _sound_part(path, last_frame)
             file = path.open("r+b")
@@ -88,6 +93,18 @@ class StreamWriter:
         if self._fsync:
             os.fsync(self._file.fileno())
         self._offset += len(data)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make the name of a new file durable; where folders cannot be opened (Windows) the system does so itself."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _sound_part(path: Path, last_frame: int | None) -> tuple[list[Entry], int]:

@@ -35,7 +35,7 @@ def export(
     cannot be written or the converter is missing or fails.
     """
     if kind not in FORMATS:
-        raise InputError(f"cannot export to {kind!r}: expected one of {', '.join(FORMATS)}")
+        raise InputError(f"cannot export to {kind!r}: expected one of {', '.join(FORMATS)}, onnx")
     converter = find_converter() if kind == "spz" else ""
     folder, written = Path(out), []
     with Playback(stream) as playback:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import stat
 import struct
 import subprocess
 import sys
@@ -174,6 +175,26 @@ def test_resume_after_a_killed_writer(tmp_path):
         for packet in packets[3:]:
             writer.append(packet)
     assert path.read_bytes() == write_stream(tmp_path / "whole.gss", packets)
+
+
+@pytest.mark.parametrize("fsync", [False, True])
+def test_what_is_forced_to_disk(tmp_path, monkeypatch, fsync):
+    """Off: nothing. On: the folder once, and the file after every write, with all bytes handed over before."""
+    packets, path, forced = make_packets(), tmp_path / "s.gss", []
+    real = os.fsync
+
+    def recorded(descriptor):
+        real(descriptor)
+        here = os.fstat(descriptor)
+        forced.append("folder" if stat.S_ISDIR(here.st_mode) else here.st_size)
+
+    monkeypatch.setattr(os, "fsync", recorded)
+    with StreamWriter.open(path, fsync=fsync) as writer:
+        ends = [16]
+        for packet in packets:
+            ends.append(ends[-1] + writer.append(packet))
+            assert path.stat().st_size == ends[-1], "another process sees the packet at once"
+    assert forced == ([16, "folder", *ends[1:], path.stat().st_size] if fsync else [])
 
 
 def test_resume_cuts_a_torn_last_packet_and_unwritten_space(tmp_path):

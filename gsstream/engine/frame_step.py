@@ -23,6 +23,7 @@ from gsstream.engine.active_set import detect_change
 from gsstream.engine.assemble import Assembly
 from gsstream.engine.context import StepContext
 from gsstream.engine.guard import check_output, guarded
+from gsstream.engine.insertion import with_insertions
 from gsstream.engine.optimise import Problem, Solution, optimise
 from gsstream.engine.rows import follow
 from gsstream.engine.stream_state import Step, StreamState
@@ -69,7 +70,7 @@ def _step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> Step:
     solution = optimise(parts, problem, rng.stream("frame", frame.index))
     clock.append(time.perf_counter())
 
-    delta = harden(parts, problem, solution)
+    delta = with_insertions(parts, state, frame, harden(parts, problem, solution), rng)
     packet = encode(delta, state, frame.index)
     player = decode_packet(state.player, packet.data)
     clock.append(time.perf_counter())
@@ -174,6 +175,7 @@ def step_metrics(
         "num_gaussians": len(after.player.gaussians),
         "active_gates": int((delta.gates != 0).sum()),
         "num_gates": len(delta.gates),
+        "births": 0 if delta.births is None else len(delta.births),
         "candidate_gaussians": len(active),
         "loss": solution.loss,
         "iterations": solution.iterations,

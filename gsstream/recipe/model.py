@@ -125,6 +125,25 @@ class GateTraining(Section):
     )
 
 
+class Insertion(Section):
+    """Births for what no move of the others can show (future work in the paper; ours)."""
+
+    per_frame: int = Field(default=0, ge=0, description="most Gaussians born in one frame; 0: the hierarchy is fixed")
+    error: float = Field(
+        default=0.15, gt=0, le=1, description="change and error of a pixel beyond which the scene lacks something there"
+    )
+    votes: float = Field(
+        default=0.75, gt=0, le=1, description="least share of a point's views in which it lands in such a pixel"
+    )
+    least_views: int = Field(default=4, ge=2, description="least number of these views")
+    agreement: float = Field(
+        default=0.12, gt=0, le=1, description="largest standard deviation of a colour channel over these views"
+    )
+    rays: int = Field(default=64, ge=1, description="rays searched per view")
+    epochs: int = Field(default=4, ge=0, description="passes over the training cameras that fit the newborn alone")
+    least_opacity: float = Field(default=0.1, ge=0, lt=1, description="newborn below this opacity are dropped again")
+
+
 class Codec(Section):
     """How packets are written."""
 
@@ -166,6 +185,7 @@ class Recipe(Section):
     stream: Stream = Field(default=Stream(), description="later frames")
     loss: Loss = Field(default=Loss(), description="photometric loss")
     gate_training: GateTraining = Field(default=GateTraining(), description="optimisation of gates")
+    insertion: Insertion = Field(default=Insertion(), description="Gaussians born while streaming")
     codec: Codec = Field(default=Codec(), description="packets")
     data: DataOptions = Field(default=DataOptions(), description="the split, and disturbances for experiments")
     scale: float = Field(default=1.0, gt=0, le=1, description="images are downscaled by this factor on reading")

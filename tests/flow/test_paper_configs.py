@@ -32,7 +32,7 @@ CHEAP = [
     "propagation/ft-0.80.yaml", "discretisation/binary-released.yaml", "confidence/uniform-random.yaml",
     "confidence/constant-zero.yaml", "confidence/released-ratio.yaml", "illumination/0.5.yaml",
     "first-frame/noise-30.yaml", "extensions/noise-normalised.yaml", "extensions/error-aware.yaml",
-    "extensions/selective-leaf.yaml",
+    "extensions/selective-leaf.yaml", "extensions/insertion.yaml",
 ]  # fmt: skip
 
 

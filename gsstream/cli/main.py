@@ -13,7 +13,7 @@ import typer
 from typer.main import get_command
 
 from gsstream import API_VERSION, __version__
-from gsstream.cli import bench, check, deliver, info, methods, plugins, recipe, run, scaffold, streams, sweep
+from gsstream.cli import bench, check, deliver, info, methods, plugins, recipe, report, run, scaffold, streams, sweep
 from gsstream.core.errors import GsstreamError, InputError
 
 
@@ -60,6 +60,7 @@ app.command(name="export")(deliver.export)
 app.command(name="manifest")(deliver.manifest)
 app.command(name="view")(deliver.view)
 app.command(name="sweep")(sweep.sweep)
+app.command(name="report")(report.report)
 app.command(name="check")(check.check)
 app.command(name="new-plugin")(scaffold.new_plugin)
 app.add_typer(bench.app, name="bench")

@@ -66,7 +66,8 @@ def _executor(workers: int | None, threads: int, ray: str | None) -> Executor:
         from gsstream.trade.sweep.ray_executor import RayExecutor
 
         return RayExecutor(ray, workers, threads, run_job)
-    return LocalExecutor(workers or max(1, usable_processors() // threads), threads, run_job)
+    preload = ["gsstream.trade.sweep.warm"]
+    return LocalExecutor(workers or max(1, usable_processors() // threads), threads, run_job, preload)
 
 
 def _describe(plan: Plan, out: Path) -> str:

@@ -1,29 +1,84 @@
-"""Structural similarity, the variant of the Gaussian-splatting papers."""
+"""Structural similarity: the variant of the Gaussian-splatting papers, those of the libraries, and multi-scale."""
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
+from gsstream.core.errors import ShapeError
 from gsstream.core.shapes import FloatArray
 from gsstream.metrics.psnr import check_pair
 
 #: Printed in every table: SSIM variants differ by up to 0.02.
 SSIM_VARIANT = "SSIM 11x11 Gaussian 1.5, zero padding, mean over channels (3DGS)"
+MS_SSIM_VARIANT = "MS-SSIM 5 scales, 11x11 Gaussian 1.5, valid region, mean over channels (Wang 2003)"
 _RADIUS, _SIGMA, _C1, _C2 = 5, 1.5, 0.01**2, 0.03**2
+#: What stands beyond the border: zeros (3DGS), the mirrored image (kornia, torchmetrics), or nothing: only windows
+#: inside the image count (Wang's own code, scikit-image, pytorch-msssim).
+Border = Literal["zero", "reflect", "valid"]
+#: Exponents of the scales, finest first (Wang, Simoncelli, Bovik 2003).
+_SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
 
-def ssim(image: FloatArray, target: FloatArray) -> float:
-    """Mean SSIM of two [H, W, 3] images in [0, 1] (Wang et al. 2004; window and zero padding as in 3DGS, Kerbl 2023).
+def ssim(image: FloatArray, target: FloatArray, border: Border = "zero") -> float:
+    """Mean SSIM of two [H, W, 3] images in [0, 1] (Wang et al. 2004), by default padded as in 3DGS (Kerbl 2023).
 
-    Computed in float64. Raises ShapeError when shapes disagree.
+    Computed in float64. Raises ShapeError when shapes disagree, or are smaller than a window where one must fit.
+    """
+    luminance, structure = _ssim_maps(image, target, border)
+    return float((luminance * structure).mean())
+
+
+def ms_ssim(image: FloatArray, target: FloatArray) -> float:
+    """Multi-scale SSIM of two [H, W, 3] images in [0, 1] (Wang, Simoncelli, Bovik 2003): five scales, each halved.
+
+    Scales by the mean of 2 x 2 pixels, a last odd row or column left out. Negative structure counts as 0, as in the
+    libraries, because it has no real power. Computed in float64.
+
+    Raises ShapeError when shapes disagree or a side is below 176 pixels: the coarsest scale must hold a window.
     """
     check_pair(image, target)
-    x, y = np.asarray(image, np.float64), np.asarray(target, np.float64)
-    mean_x, mean_y, square_x, square_y, product = (_blur(v) for v in (x, y, x * x, y * y, x * y))
-    var_x, var_y, cov = square_x - mean_x**2, square_y - mean_y**2, product - mean_x * mean_y
-    value = (2 * mean_x * mean_y + _C1) * (2 * cov + _C2)
-    value /= (mean_x**2 + mean_y**2 + _C1) * (var_x + var_y + _C2)
+    least = (2 * _RADIUS + 1) << (len(_SCALES) - 1)
+    if min(image.shape[:2]) < least:
+        raise ShapeError(f"MS-SSIM: expected sides of at least {least} pixels, got {list(image.shape[:2])}")
+    x: FloatArray = np.asarray(image, np.float64)
+    y: FloatArray = np.asarray(target, np.float64)
+    value: FloatArray = np.ones(3)
+    for scale, exponent in enumerate(_SCALES):
+        luminance, structure = _ssim_maps(x, y, "valid")
+        last = scale == len(_SCALES) - 1
+        term = (luminance * structure if last else structure).mean((0, 1))
+        value = value * np.maximum(term, 0) ** exponent
+        x, y = _halve(x), _halve(y)
     return float(value.mean())
+
+
+def _ssim_maps(image: FloatArray, target: FloatArray, border: Border) -> tuple[FloatArray, FloatArray]:
+    """The two factors of SSIM, pixel by pixel: (luminance, contrast and structure)."""
+    check_pair(image, target)
+    if border != "zero" and min(image.shape[:2]) <= 2 * _RADIUS:
+        got = list(image.shape[:2])
+        raise ShapeError(f"SSIM with border {border!r}: expected sides above {2 * _RADIUS}, got {got}")
+    x, y = np.asarray(image, np.float64), np.asarray(target, np.float64)
+    mean_x, mean_y, square_x, square_y, product = (_window_mean(v, border) for v in (x, y, x * x, y * y, x * y))
+    var_x, var_y, cov = square_x - mean_x**2, square_y - mean_y**2, product - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + _C1) / (mean_x**2 + mean_y**2 + _C1)
+    return luminance, (2 * cov + _C2) / (var_x + var_y + _C2)
+
+
+def _window_mean(image: FloatArray, border: Border) -> FloatArray:
+    if border == "zero":
+        return _blur(image)
+    if border == "reflect":
+        image = np.pad(image, [(_RADIUS, _RADIUS), (_RADIUS, _RADIUS), (0, 0)], mode="reflect")
+    return _blur(image)[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
+
+
+def _halve(image: FloatArray) -> FloatArray:
+    height, width = (size // 2 * 2 for size in image.shape[:2])
+    even = image[:height, :width]
+    return (even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]) / 4
 
 
 def _blur(image: FloatArray) -> FloatArray:

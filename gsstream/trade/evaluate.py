@@ -6,7 +6,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -23,8 +23,31 @@ from gsstream.trade.summary import format_table
 
 
 @dataclass(frozen=True, slots=True)
+class ViewPair:
+    """What an extra metric is given: one test camera at one frame, [H, W, 3] in [0, 1], and the frame before it.
+
+    Arguments:
+        last_image, last_truth: of the evaluated frame before; None at the first.
+        sigma: noise of one recorded image.
+    """
+
+    image: FloatArray
+    truth: FloatArray
+    last_image: FloatArray | None
+    last_truth: FloatArray | None
+    sigma: float
+
+
+#: An extra metric of one view; nan where it is not defined.
+ViewMetric = Callable[[ViewPair], float]
+
+
+@dataclass(frozen=True, slots=True)
 class ViewQuality:
-    """One test camera at one frame; dB, SSIM, LPIPS; nan where nothing moves or not measured, inf for equal images."""
+    """One test camera at one frame; dB, SSIM, LPIPS; nan where nothing moves or not measured, inf for equal images.
+
+    ``extra``: name -> value of what was asked for besides.
+    """
 
     frame: int
     camera: str
@@ -37,6 +60,7 @@ class ViewQuality:
     hold_psnr_moving: float
     lpips: float = math.nan
     hold_lpips: float = math.nan
+    extra: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +86,10 @@ class Evaluation:
 
     def to_json(self) -> str:
         """Everything as JSON; nan and inf become null."""
-        unknown = () if self.lpips_variant else ("lpips", "hold_lpips")
+        unknown = ("extra",) if self.lpips_variant else ("lpips", "hold_lpips", "extra")
         views = [{k: _plain(v) for k, v in asdict(view).items() if k not in unknown} for view in self.views]
+        for row, view in zip(views, self.views, strict=True):
+            row |= {name: _plain(value) for name, value in view.extra.items()}
         variants = {"ssim_variant": SSIM_VARIANT}
         if self.lpips_variant:
             variants["lpips_variant"] = self.lpips_variant
@@ -93,7 +119,8 @@ class Evaluation:
 def evaluate(
     stream: str | os.PathLike[str], source: FrameSource, *, frames: Sequence[int] | None = None,
     split: Literal["train", "test"] = "test", renderer: PlayerRenderer | None = None,
-    lpips: OnnxLpips | None = None, progress: Callable[[int, int], None] | None = None,
+    lpips: OnnxLpips | None = None, extras: Mapping[str, ViewMetric] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Evaluation:  # fmt: skip
     """Render a stream's packets with the player and compare every test view with the recording.
 
@@ -102,7 +129,7 @@ def evaluate(
 
     Arguments:
         frames: frame indices; default all of the stream.
-        lpips: measured besides the rest; default: not measured.
+        lpips, extras: measured besides the rest; default: not measured.
         progress: called with (done, total) after every frame.
 
     Raises InputError when the recording's cameras are not those of the stream, PacketError for a damaged stream.
@@ -119,13 +146,17 @@ def evaluate(
         sigmas = [noise_sigma(a, b) for a, b in zip(truth_first, truth_next, strict=True)]
         held = _rendered(playback, chosen[0], rig, renderer)
         scene, images, views = playback.state_at(chosen[0]), held, []
+        last: tuple[Sequence[FloatArray | None], Sequence[FloatArray | None]] = ([None] * len(rig), [None] * len(rig))
         for done, frame in enumerate(chosen, 1):
             if playback.state_at(frame) is not scene:
                 scene, images = playback.state_at(frame), _rendered(playback, frame, rig, renderer)
             truth = _truth(source, frame, split, order)
             for i, name in enumerate(rig.ids):
                 mask = moving_mask(truth[i], truth_first[i], sigmas[i])
-                views.append(_compare(frame, name, images[i], held[i], truth[i], mask, lpips))
+                pair = ViewPair(images[i], truth[i], last[0][i], last[1][i], sigmas[i])
+                found = {key: metric(pair) for key, metric in (extras or {}).items()}
+                views.append(replace(_compare(frame, name, pair, held[i], mask, lpips), extra=found))
+            last = (images, list(truth))
             if progress is not None:
                 progress(done, len(chosen))
     variant = None if lpips is None else lpips.variant
@@ -133,8 +164,9 @@ def evaluate(
 
 
 def _compare(
-    frame: int, name: str, image: FloatArray, held: FloatArray, truth: FloatArray, mask: Any, lpips: OnnxLpips | None
+    frame: int, name: str, pair: ViewPair, held: FloatArray, mask: Any, lpips: OnnxLpips | None
 ) -> ViewQuality:
+    image, truth = pair.image, pair.truth
     distances = () if lpips is None else (lpips(image, truth), lpips(held, truth))
     return ViewQuality(
         frame, name, psnr(image, truth), ssim(image, truth), psnr(image, truth, mask), float(mask.mean()),

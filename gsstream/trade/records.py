@@ -70,7 +70,7 @@ def read_records(path: str | os.PathLike[str]) -> list[FrameRecord]:
         if not line.strip():
             continue
         try:
-            record = _record(json.loads(line))
+            record = record_of(json.loads(line))
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             if number == len(lines):
                 break  # a run that is being written, or was killed, ends in half a line
@@ -81,7 +81,8 @@ def read_records(path: str | os.PathLike[str]) -> list[FrameRecord]:
     return [found[frame] for frame in sorted(found)]
 
 
-def _record(data: dict[str, Any]) -> FrameRecord:
+def record_of(data: Mapping[str, Any]) -> FrameRecord:
+    """A line of ``metrics.jsonl`` that has been read; raises ValueError, TypeError, KeyError or AttributeError."""
     memory = data.get("peak_memory_mb")
     return FrameRecord(
         frame=int(data["frame"]),

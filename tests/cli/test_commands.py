@@ -27,6 +27,7 @@ CHEAP = [
     ["manifest", "--help"],
     ["view", "--help"],
     ["sweep", "--help"],
+    ["report", "--help"],
     ["recipe", "show", "dense"],
 ]
 
@@ -46,6 +47,7 @@ OPTIONS = {
     "gsstream manifest": ["STREAM", "--out"],
     "gsstream view": ["STREAM", "--port", "--host"],
     "gsstream sweep": ["CONFIG", "--out", "--data", "--workers", "--threads", "--ray", "--dry-run", "--quiet"],
+    "gsstream report": ["FOLDER", "--out", "--data", "--sheets"],
     "gsstream check": ["NAME", "--quiet"],
     "gsstream new-plugin": ["NAME", "--kind", "--out"],
     "gsstream bench": [],

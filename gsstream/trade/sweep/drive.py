@@ -107,7 +107,7 @@ class _Drive:
         return isinstance(task, FirstFrameRun) or task.first is None or task.first in self.have
 
     def _job(self, task: Cell | FirstFrameRun) -> Job:
-        uri, work = _where(task.scene.uri, self.data), str((self.out / WORK).resolve())
+        uri, work = recording_uri(task.scene.uri, self.data), str((self.out / WORK).resolve())
         if isinstance(task, FirstFrameRun):
             return Job(task.id, uri, task.resolved, work=work)
         first = first_frame_file(self.out, task.first).read_bytes() if task.first else None
@@ -211,7 +211,7 @@ def _seconds(outcome: Outcome) -> float:
     return float(sum(outcome.frames[0]["seconds"].values()))
 
 
-def _where(uri: str, data: Path | None) -> str:
+def recording_uri(uri: str, data: Path | None) -> str:
     """The recording as a worker opens it, wherever it works: a relative folder lies in ``data``, or here."""
     folder = (data or Path()) / uri
     return str(folder.resolve()) if uri != "demo" and folder.is_dir() else uri

@@ -7,11 +7,12 @@ import multiprocessing.connection
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
+from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
 from gsstream.trade.sweep.job import Job, Outcome
@@ -58,25 +59,36 @@ def thread_environment(threads: int) -> dict[str, str]:
 
 
 class LocalExecutor:
-    """Spawned processes, a fresh one for each job: peak memory is the cell's own, and nothing leaks between cells.
+    """A fresh process for each job: peak memory is the cell's own, and nothing leaks between cells.
+
+    Where the system can, processes come from a fork server: a process that has imported ``preload`` once, has no
+    threads, and is copied for each job, which saves seconds of imports. Elsewhere they are spawned.
 
     Arguments:
         workers: jobs at a time.
         threads: threads of each.
         work: what a process does with a job (a function that can be imported).
+        preload: modules that all jobs need.
     """
 
-    def __init__(self, workers: int, threads: int, work: Work) -> None:
+    def __init__(self, workers: int, threads: int, work: Work, preload: Sequence[str] = ()) -> None:
         self.slots, self._threads, self._work = workers, threads, work
-        self._running: dict[Connection, tuple[str, SpawnProcess]] = {}
+        self._running: dict[Connection, tuple[str, BaseProcess]] = {}
+        methods = multiprocessing.get_all_start_methods()
+        self._context: Any = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
+        if "forkserver" in methods:
+            self._context.set_forkserver_preload(list(preload))
+            with _environment(thread_environment(threads)):  # so that no library starts threads in the server itself
+                forkserver.ensure_running()
 
     def submit(self, job: Job) -> None:
         """Start a process for the job."""
-        context = multiprocessing.get_context("spawn")
-        here, there = context.Pipe(duplex=False)
-        process = context.Process(target=_serve, args=(there, self._work, job), name=f"cell {job.id}", daemon=True)
-        with _environment(thread_environment(self._threads)):
-            process.start()
+        here, there = self._context.Pipe(duplex=False)
+        # The fork server's environment is that of its start; a worker's is that of now.
+        environment = {**os.environ, **thread_environment(self._threads)}
+        arguments = (there, self._work, job, environment)
+        process = self._context.Process(target=_serve, args=arguments, name=f"cell {job.id}", daemon=True)
+        process.start()
         there.close()
         self._running[here] = (job.id, process)
 
@@ -103,8 +115,10 @@ class LocalExecutor:
         self._running.clear()
 
 
-def _serve(pipe: Connection, work: Work, job: Job) -> None:
+def _serve(pipe: Connection, work: Work, job: Job, environment: Mapping[str, str]) -> None:
     """The body of a worker process."""
+    os.environ.clear()
+    os.environ.update(environment)
     # Ctrl-C reaches the whole group; the sweep decides what becomes of its workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_die_with_parent, daemon=True).start()
@@ -121,16 +135,13 @@ def _die_with_parent() -> None:
 
 @contextmanager
 def _environment(changes: Mapping[str, str]) -> Iterator[None]:
-    before: dict[str, Any] = {name: os.environ.get(name) for name in changes}
+    before = dict(os.environ)
     os.environ.update(changes)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        os.environ.clear()
+        os.environ.update(before)
 
 
 def _how_it_ended(code: int | None) -> str:

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from gsstream.source.base import FrameSource
     from gsstream.trade.evaluate import Evaluation
 
-#: Measured per view by ``evaluate``; the rest of a view says where it belongs.
-_PLACE = ("frame", "camera")
+#: What says where a view belongs; the rest of it are numbers. Extra metrics are numbers, too, by their own names.
+_PLACE = ("frame", "camera", "extra")
 _FPS_WARM_UP, _FPS_RENDERS = 5, 30
 
 
@@ -96,7 +96,8 @@ def _run(job: Job, folder: Path) -> Outcome:
         (folder / "first.gss").write_bytes(job.first_frame)
         first = read_first_frame(folder / "first.gss")
     recording = open_recording(job.uri, parts.recipe, catalog)
-    _import_what_torch_puts_off()
+    import gsstream.trade.sweep.warm  # noqa: F401  # what torch imports late is not part of any frame's time
+
     try:
         result = run(parts, recording, folder, quiet=True, measure=False, first_frame=first)
         if result.interrupted:
@@ -116,27 +117,23 @@ def _run(job: Job, folder: Path) -> Outcome:
     )  # fmt: skip
 
 
-def _import_what_torch_puts_off() -> None:
-    """The first optimiser of a process imports seconds' worth of modules: not part of any frame's time."""
-    import torch
-
-    torch.optim.Adam([torch.zeros(1)])
-
-
 def _measure(measure: Measure, stream: Path, recording: FrameSource, frames: list[dict[str, Any]]) -> dict[str, Any]:
     """Measure decoded frames; their values go into ``frames``. Returns facts about the whole stream."""
     from gsstream.metrics import SSIM_VARIANT, OnnxLpips
     from gsstream.trade.evaluate import evaluate
+    from gsstream.trade.extras import VARIANTS, extras
 
     if len(recording.info.test) == 0:
         return {"not_measured": "the recording has no test cameras"}
+    wanted = ["flicker", *(name for name in ("ms_ssim", "flip") if getattr(measure, name))]
     lpips = None if measure.lpips_onnx is None else OnnxLpips(Path(measure.lpips_onnx), None)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # the run has said already that nothing fast renders here
-        evaluation = evaluate(stream, recording, lpips=lpips)
+        evaluation = evaluate(stream, recording, lpips=lpips, extras=extras(wanted))
     for frame in frames:
         frame |= frame_values(evaluation, int(frame["frame"]), lpips is not None)
     facts: dict[str, Any] = {"ssim_variant": SSIM_VARIANT, "renderer": evaluation.renderer}
+    facts["extra_variants"] = {name: VARIANTS[name] for name in wanted}
     facts["sigmas"] = dict(evaluation.sigmas)
     if lpips is not None:
         facts["lpips_variant"] = lpips.variant
@@ -149,7 +146,8 @@ def frame_values(evaluation: Evaluation, frame: int, lpips: bool) -> dict[str, d
     """Quantity -> camera -> value of one frame; None where it is not defined."""
     views = [view for view in evaluation.views if view.frame == frame]
     names = [name for name in views[0].__slots__ if name not in _PLACE and (lpips or "lpips" not in name)]
-    return {name: {view.camera: _plain(getattr(view, name)) for view in views} for name in names}
+    values = {name: {view.camera: _plain(getattr(view, name)) for view in views} for name in names}
+    return values | {name: {view.camera: _plain(view.extra[name]) for view in views} for name in views[0].extra}
 
 
 def frames_per_second(stream: Path) -> float:

@@ -1,0 +1,95 @@
+"""Figures of a report as PNG bytes: quality against cost, and curves over frames."""
+
+from __future__ import annotations
+
+import io
+import math
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from gsstream.trade.plots import COLORS, plot_runs
+from gsstream.trade.report.fronts import knee, pareto_front
+from gsstream.trade.report.groups import Group, seed_noise
+from gsstream.trade.report.quantities import BY_KEY, COSTS, GOODS
+
+_CURVES = len(COLORS)
+
+
+def measured_costs(groups: Sequence[Group]) -> list[str]:
+    """Costs that every group has."""
+    return [key for key in COSTS if all(math.isfinite(group.mean(key)) for group in groups)]
+
+
+def pareto_figure(groups: Sequence[Group], title: str) -> bytes:
+    """One panel per quality and cost: every group, its spread over seeds, the front as a line, the knee in a ring."""
+    costs = measured_costs(groups)
+    figure = Figure(figsize=(3.3 * len(costs), 5.6), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(len(GOODS), len(costs), squeeze=False, sharey="row", sharex="col")
+    variants = list(dict.fromkeys(group.variant for group in groups))
+    colors = {name: COLORS[i % len(COLORS)] for i, name in enumerate(variants)}
+    for row, good in enumerate(GOODS):
+        for column, cost in enumerate(costs):
+            axis = axes[row, column]
+            _panel(axis, groups, good, cost, colors)
+            if row == len(GOODS) - 1:
+                axis.set_xlabel(BY_KEY[cost].title, fontsize=9)
+        axes[row, 0].set_ylabel("PSNR, dB" if good == "psnr" else "PSNR on moving pixels, dB", fontsize=9)
+    handles = [axes[0, 0].scatter([], [], s=24, color=colors[name], label=name) for name in variants]
+    figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=9, frameon=False)
+    figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    return _png(figure)
+
+
+def _panel(axis: Any, groups: Sequence[Group], good: str, cost: str, colors: dict[str, str]) -> None:
+    points = [(group.mean(cost), group.mean(good)) for group in groups]
+    noise = {key: seed_noise(groups, key) for key in (good, cost)}
+    for group, (x, y) in zip(groups, points, strict=True):
+        bars = {"xerr": group.spread(cost), "yerr": group.spread(good)} if len(group.runs) > 1 else {}
+        size = 7 if not group.axes else 4
+        axis.errorbar(
+            x, y, fmt="o", markersize=size, color=colors[group.variant], alpha=0.9 if not group.axes else 0.6,
+            elinewidth=1, markeredgewidth=0, **bars,
+        )  # fmt: skip
+        if not group.axes:
+            axis.annotate(group.variant, (x, y), xytext=(5, 4), textcoords="offset points", fontsize=8)
+    order = pareto_front(points)
+    front = [points[i] for i in order]
+    axis.step(*zip(*front, strict=True), where="post", color="#444444", linewidth=1, zorder=0)
+    if (at := knee(front)) is not None:
+        axis.plot(*front[at], "o", markersize=13, markerfacecolor="none", markeredgecolor="#444444")
+    if math.isfinite(noise[good]):
+        axis.set_title(f"noise between seeds {noise[good]:.3f} dB", fontsize=7, loc="right", color="#666666")
+    if max(x for x, _ in points) > 8 * min(x for x, _ in points) > 0:
+        axis.set_xscale("log")
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.grid(color="#e5e5e5", linewidth=0.6)
+    axis.set_axisbelow(True)
+    axis.tick_params(labelsize=8)
+
+
+def frame_curves(groups: Sequence[Group], title: str) -> bytes:
+    """Curves over frames of the first seed of up to seven groups."""
+    runs = {group.label: list(group.runs[0].records) for group in groups[:_CURVES]}
+    with tempfile.TemporaryDirectory() as folder:
+        return plot_runs(runs, Path(folder) / "curves.png", title).read_bytes()
+
+
+def curve_groups(groups: Sequence[Group]) -> list[Group]:
+    """Whose curves are drawn: the variants as they are; where there are none, the front of PSNR against KB/frame."""
+    plain = [group for group in groups if not group.axes]
+    if plain:
+        return plain[:_CURVES]
+    front = pareto_front([(group.mean("kb"), group.mean("psnr")) for group in groups])
+    return [groups[i] for i in front][:_CURVES] or list(groups)[:_CURVES]
+
+
+def _png(figure: Figure) -> bytes:
+    out = io.BytesIO()
+    figure.savefig(out, format="png", metadata={"Software": None})
+    return out.getvalue()

@@ -1,0 +1,129 @@
+"""A sweep's table -> groups: the runs of one point with all its seeds, their means, and the noise between seeds."""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsstream.core.errors import InputError
+from gsstream.trade.records import FrameRecord, record_of
+from gsstream.trade.report.quantities import QUANTITIES, values_of
+from gsstream.trade.sweep.table import TableData, read_table
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One finished cell: its record, frames and numbers."""
+
+    id: str
+    seed: int
+    row: Mapping[str, Any]
+    records: tuple[FrameRecord, ...]
+    values: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """All finished seeds of a point."""
+
+    scene: str
+    variant: str
+    axes: Mapping[str, Any]
+    runs: tuple[Run, ...]
+
+    @property
+    def label(self) -> str:
+        """``edge`` or ``edge epochs=3``: the last word of each key."""
+        return " ".join([self.variant, *(f"{key.rpartition('.')[2]}={_short(v)}" for key, v in self.axes.items())])
+
+    def mean(self, key: str) -> float:
+        """Mean over seeds; nan when a seed did not measure it."""
+        return statistics.fmean(run.values[key] for run in self.runs)
+
+    def spread(self, key: str) -> float:
+        """Standard deviation over seeds; nan with a single one."""
+        values = [run.values[key] for run in self.runs]
+        return statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class SweepData:
+    """What a report is made from.
+
+    Arguments:
+        groups: in the order of the plan; only points with a finished run.
+        failed: label -> reason. missing: labels of cells that have not run.
+    """
+
+    config: Mapping[str, Any]
+    groups: tuple[Group, ...]
+    failed: Mapping[str, str]
+    missing: tuple[str, ...]
+    table: TableData
+
+    @property
+    def scenes(self) -> list[str]:
+        """Scenes with a finished run, in the order of the plan."""
+        return list(dict.fromkeys(group.scene for group in self.groups))
+
+    def of(self, scene: str) -> list[Group]:
+        """Groups of a scene."""
+        return [group for group in self.groups if group.scene == scene]
+
+    def measured(self) -> list[str]:
+        """Keys of quantities that at least one group has."""
+        return [q.key for q in QUANTITIES if any(math.isfinite(group.mean(q.key)) for group in self.groups)]
+
+
+def read_sweep_data(folder: Path) -> SweepData:
+    """Read a sweep's folder. Raises InputError when it holds no plan or no finished cell."""
+    table = read_table(folder)
+    if table.plan is None:
+        raise InputError(f"{folder}: the table holds no plan; expected the folder of 'gsstream sweep'")
+    found: dict[str, list[tuple[Mapping[str, Any], Run]]] = {}
+    failed, missing = {}, []
+    for point in table.plan["points"]:
+        row = table.cells.get(point["cell"])
+        key = json.dumps([point["scene"], point["variant"], point["axes"]])
+        if row is None or row["status"] != "done":
+            label = f"{Group(point['scene'], point['variant'], point['axes'], ()).label} seed {point['seed']}"
+            if row is None:
+                missing.append(f"{point['scene']} {label}")
+            else:
+                failed[f"{point['scene']} {label}"] = row["error"]
+            continue
+        records = tuple(record_of(frame) for frame in row["frames"])
+        run = Run(point["cell"], point["seed"], row, records, values_of(records, row))
+        found.setdefault(key, []).append((point, run))
+    if not found:
+        raise InputError(f"{folder}: no cell has finished yet ({len(failed)} failed); nothing to report")
+    groups = tuple(
+        Group(items[0][0]["scene"], items[0][0]["variant"], items[0][0]["axes"], tuple(run for _, run in items))
+        for items in found.values()
+    )
+    return SweepData(table.plan["config"], groups, failed, tuple(missing), table)
+
+
+def seed_noise(groups: Sequence[Group], key: str) -> float:
+    """Standard deviation between seeds of one point, pooled over all points with several; nan when there is none."""
+    parts = [(len(group.runs) - 1, group.spread(key)) for group in groups]
+    known = [(freedom, spread) for freedom, spread in parts if math.isfinite(spread)]
+    freedom = sum(f for f, _ in known)
+    return math.sqrt(sum(f * spread**2 for f, spread in known) / freedom) if freedom else math.nan
+
+
+def is_tie(first: Group, second: Group, key: str, noise: float) -> bool | None:
+    """Whether two means differ by no more than two standard errors of their difference; None: noise unknown."""
+    if not math.isfinite(noise):
+        return None
+    error = noise * math.sqrt(1 / len(first.runs) + 1 / len(second.runs))
+    return abs(first.mean(key) - second.mean(key)) <= 2 * error
+
+
+def _short(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)

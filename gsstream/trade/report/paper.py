@@ -1,0 +1,63 @@
+"""The paper's tables, from ``paper.yaml``: its numbers beside ours, labelled with recording and machine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+
+from gsstream.core.errors import UnknownName
+from gsstream.trade.report.document import Table
+from gsstream.trade.report.groups import Group
+from gsstream.trade.report.quantities import BY_KEY, cell
+
+_FILE = Path(__file__).with_name("paper.yaml")
+
+
+@dataclass(frozen=True, slots=True)
+class PaperTable:
+    """A table as printed: row name -> quantity -> value, nan where it prints none."""
+
+    name: str
+    title: str
+    data: str
+    machine: str
+    source: str
+    columns: tuple[str, ...]
+    rows: Mapping[str, Mapping[str, float]]
+
+
+def paper_table(name: str) -> PaperTable:
+    """A table by its name. Raises UnknownName, naming the nearest."""
+    content: Mapping[str, Any] = YAML(typ="safe", pure=True).load(_FILE.read_text(encoding="utf-8"))
+    if name not in content["tables"]:
+        raise UnknownName("table of the paper", name, content["tables"])
+    table = content["tables"][name]
+    columns = tuple(table["columns"])
+    rows = {
+        str(row): {key: math.nan if v is None else float(v) for key, v in zip(columns, values, strict=True)}
+        for row, values in table["rows"].items()
+    }
+    return PaperTable(name, table["title"], table["data"], content["machine"], content["source"], columns, rows)
+
+
+def beside_ours(table: PaperTable, groups: Sequence[Group], scene: str) -> Table:
+    """The paper's rows, each followed by our run of the variant of that name, in the paper's columns."""
+    ours = {group.variant: group for group in groups if not group.axes}
+    rows = [["", "whose", *(BY_KEY[key].title for key in table.columns)]]
+    for name, values in table.rows.items():
+        rows.append([name, "paper", *(_printed(key, values[key]) for key in table.columns)])
+        if name in ours:
+            group = ours[name]
+            cells = [cell(key, group.mean(key), group.spread(key)) for key in table.columns]
+            rows.append(["", f"ours, {scene}", *cells])
+    caption = f"{table.title}: the paper on {table.data}, {table.machine} ({table.source})"
+    return Table(f"{caption}; ours on {scene}, machine above", rows)
+
+
+def _printed(key: str, value: float) -> str:
+    return "-" if not math.isfinite(value) else cell(key, value)

@@ -97,6 +97,7 @@ def read_sweep_data(folder: Path) -> SweepData:
             else:
                 failed[f"{point['scene']} {label}"] = row["error"]
             continue
+        row = {**row, "first_seconds": _first_seconds(row, table)}
         records = tuple(record_of(frame) for frame in row["frames"])
         run = Run(point["cell"], point["seed"], row, records, values_of(records, row))
         found.setdefault(key, []).append((point, run))
@@ -107,6 +108,12 @@ def read_sweep_data(folder: Path) -> SweepData:
         for items in found.values()
     )
     return SweepData(table.plan["config"], groups, failed, tuple(missing), table)
+
+
+def _first_seconds(row: Mapping[str, Any], table: TableData) -> float | None:
+    """Seconds of the frame 0 of a cell: of the run that made it, where it is shared."""
+    made = row if row.get("first_frame") is None else table.first_frames.get(row["first_frame"])
+    return None if made is None or made["status"] != "done" else float(sum(made["frames"][0]["seconds"].values()))
 
 
 def seed_noise(groups: Sequence[Group], key: str) -> float:

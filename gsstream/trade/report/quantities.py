@@ -67,6 +67,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("cpu_seconds", "CPU s/frame", ".2f", False, _per_frame("cpu_seconds")),
     Quantity("memory", "peak MB", ".0f", False, lambda s, _, __: s.peak_memory_mb),
     Quantity("joules", "J/frame", ".2f", False, _joules),
+    Quantity("seconds_first", "s frame 0", ".1f", False, _of_run("first_seconds")),
     Quantity("fps", "pictures/s", ".0f", True, _of_run("fps")),
     Quantity("active", "active, %", ".1f", None, lambda s, _, __: 100 * s.active),
     Quantity("gates", "gates, k", ".3f", None, lambda _, f, __: mean(x["active_gates"] / 1000 for x in f)),

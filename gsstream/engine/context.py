@@ -12,7 +12,7 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.engine.active_set import Change
 from gsstream.engine.stream_state import StreamState
 from gsstream.metrics.noise import noise_sigma
-from gsstream.render.base import Renderer
+from gsstream.render.base import Renderer, RenderSession
 
 
 class StepContext:
@@ -32,9 +32,16 @@ class StepContext:
         self._state, self._frame, self._renderer, self._background = state, frame, renderer, background
         self._change = change
         self._gaussians = state.gaussians
-        #: What estimators make the renderer project and sort is not done again by the optimisation.
-        self.session = renderer.open(self._gaussians, None, frame.cameras, background)
+        #: What the last frame or an estimator made the renderer project and sort is not done again.
+        self.session = state.session or renderer.open(self._gaussians, None, frame.cameras, background)
         self._touched: dict[int, torch.Tensor] = {}
+
+    def session_for(self, active: torch.Tensor) -> RenderSession:
+        """The session in which only the rows ``active`` change. When all do, no cache is of use: a new one."""
+        if len(active) == len(self._gaussians):
+            return self._renderer.open(self._gaussians, None, self.cameras, self._background)
+        self.session.narrow(active)
+        return self.session
 
     @property
     def index(self) -> int:

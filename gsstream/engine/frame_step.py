@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from gsstream.core.delta import Delta
+from gsstream.core.delta import active_rows as changed_rows
 from gsstream.core.errors import ComponentError, ShapeError
 from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
@@ -27,7 +28,8 @@ from gsstream.engine.insertion import with_insertions
 from gsstream.engine.optimise import Problem, Solution, optimise
 from gsstream.engine.rows import follow
 from gsstream.engine.stream_state import Step, StreamState
-from gsstream.packet import EncodedPacket, decode_packet, encode_delta, encode_empty, quantise_decoders
+from gsstream.packet import EncodedPacket, PlayerState, decode_packet, encode_delta, encode_empty, quantise_decoders
+from gsstream.render.base import RenderCache, RenderSession
 from gsstream.residual.base import symbols as residual_symbols
 
 
@@ -64,9 +66,7 @@ def _step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> Step:
     gate, active = suspects(parts, state, context)
     clock.append(time.perf_counter())
 
-    if len(active) < len(context.gaussians):
-        context.session.narrow(active)
-    problem = Problem(state, frame, active, context.gaussians.rows(active), gate, context.session)
+    problem = Problem(state, frame, active, context.gaussians.rows(active), gate, context.session_for(active))
     solution = optimise(parts, problem, rng.stream("frame", frame.index))
     clock.append(time.perf_counter())
 
@@ -74,14 +74,27 @@ def _step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> Step:
     packet = encode(delta, state, frame.index)
     player = decode_packet(state.player, packet.data)
     clock.append(time.perf_counter())
+    session = committed(context.session, state, delta, player)
+    clock.append(time.perf_counter())
     # A frame that changed nothing is not what the scene shows: the next one is compared with the last that did, so that
     # a change too slow to see from frame to frame adds up until it is seen.
     shown = state.previous if delta.is_empty else frame
-    after = follow(replace(state, previous=shown, gate_moments=solution.gate_moments), player)
+    after = follow(replace(state, previous=shown, gate_moments=solution.gate_moments, session=session), player)
     metrics = step_metrics(delta, after, packet, solution, active)
     metrics["changed_tiles"] = 1.0 if change is None else change.share
-    metrics["seconds"] = dict(zip(("confidence", "optimise", "code"), np.diff(clock).tolist(), strict=True))
+    metrics["seconds"] = dict(zip(("confidence", "optimise", "code", "keep"), np.diff(clock).tolist(), strict=True))
     return Step(after, packet, "empty" if delta.is_empty else "delta", metrics)
+
+
+def committed(session: RenderSession, state: StreamState, delta: Delta, player: PlayerState) -> RenderSession | None:
+    """The session of the decoded scene, in which everything that did not change is still projected and sorted.
+
+    None where keeping costs more than it saves: rows came or went, or most of them changed.
+    """
+    rows = changed_rows(state.player.layout, delta.gates)
+    if delta.edits_rows or 2 * len(rows) > len(state.gaussians):
+        return None
+    return session.commit(player.gaussians.map(torch.from_numpy), torch.from_numpy(rows))
 
 
 def still_step(state: StreamState, frame: Frame, seconds: float) -> Step:
@@ -93,7 +106,7 @@ def still_step(state: StreamState, frame: Frame, seconds: float) -> Step:
     solution = Solution({}, {}, GateState(torch.zeros(0)), {}, 0.0, 0)
     metrics = step_metrics(Delta(gates, 1), after, packet, solution, torch.zeros(0))
     metrics["changed_tiles"] = 0.0
-    metrics["seconds"] = {"confidence": seconds, "optimise": 0.0, "code": time.perf_counter() - started}
+    metrics["seconds"] = {"confidence": seconds, "optimise": 0.0, "code": time.perf_counter() - started, "keep": 0.0}
     return Step(after, packet, "empty", metrics)
 
 
@@ -179,4 +192,15 @@ def step_metrics(
         "candidate_gaussians": len(active),
         "loss": solution.loss,
         "iterations": solution.iterations,
+        **cache_metrics(after.session),
     }
+
+
+def cache_metrics(session: RenderSession | None) -> dict[str, object]:
+    """What the renderer keeps from frame to frame; nothing where it keeps nothing."""
+    cache = RenderCache() if session is None else session.cache_bytes()
+    if not cache.per_view:
+        return {}
+    per_pair = round(cache.per_camera_and_gaussian, 1)
+    known = {"mb": cache.total / 1e6, "cameras": len(cache.per_view), "bytes_per_camera_and_gaussian": per_pair}
+    return {"cache": known}

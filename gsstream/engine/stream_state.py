@@ -14,6 +14,7 @@ from gsstream.core.state import rows
 from gsstream.engine.exposure import Exposure
 from gsstream.method.base import Step as MethodStep
 from gsstream.packet import PlayerState
+from gsstream.render.base import RenderSession
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,8 @@ class StreamState:
         key_frame: frame of the last key packet.
         key_quality: PSNR of that frame on the training views, dB; None when the recipe does not watch it.
         gate_moments: Adam moments of the gate logits when the recipe carries them over (released code), else empty.
+        session: what the renderer keeps of this scene from one frame to the next. Nothing but time depends on it: a
+            state without one (the first, a resumed one) goes on to the same bytes.
     """
 
     player: PlayerState
@@ -39,6 +42,7 @@ class StreamState:
     key_frame: int = rows(None, default=0)
     key_quality: float | None = rows(None, default=None)
     gate_moments: Mapping[str, torch.Tensor] = rows("node", default_factory=dict)
+    session: RenderSession | None = rows(None, default=None, compare=False, repr=False)
 
     @property
     def gaussians(self) -> Gaussians[torch.Tensor]:

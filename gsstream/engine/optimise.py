@@ -91,10 +91,11 @@ class _FrameRun:
         with self._guarded("update", parts.update):
             codes = parts.update.codes()
         latents = init_latents(parts.update, problem.base)
-        self.latents = AdamTable(latents, {name: codes[name].lr for name in latents})
+        self.latents = RowTable(latents, {name: codes[name].lr for name in latents}, parts.optimiser)
         decoders = {name: state.decoders[name] for name in latents if name in state.decoders}
-        self.decoders = AdamTable(decoders, {name: codes[name].decoder_lr for name in decoders})
-        self.gate = AdamTable({"logits": problem.gate.logits[nodes]}, {"logits": parts.recipe.gate_training.lr})
+        self.decoders = RowTable(decoders, {name: codes[name].decoder_lr for name in decoders}, parts.optimiser)
+        rates = {"logits": parts.recipe.gate_training.lr}
+        self.gate = RowTable({"logits": problem.gate.logits[nodes]}, rates, parts.optimiser)
         self.gate.load_moments("logits", state.gate_moments)
         self.session = problem.session
         with self._guarded("loss", parts.loss):
@@ -144,7 +145,7 @@ class _FrameRun:
             return
         with self._guarded("gate", self.parts.gate):
             torch.autograd.backward(roots, gradients)
-            self.gate.step()
+            self.gate.step({})
             bounded = self.parts.gate.bound(GateState(self.gate["logits"].detach())).logits
             self.gate["logits"].data.copy_(bounded)
 

@@ -42,9 +42,7 @@ def next_hierarchy(hierarchy: Hierarchy, delta: Delta, layout: Layout) -> Hierar
 
 
 def next_moments(value: torch.Tensor, num_nodes: int) -> torch.Tensor:
-    """One Adam moment of the gates: zero for new nodes. Counters (no axis) are shared by all nodes and stay."""
-    if value.ndim == 0:
-        return value
+    """One Adam moment, or the steps taken, of every gate: zero for new nodes."""
     return torch.cat([value, value.new_zeros(num_nodes - len(value), *value.shape[1:])])
 
 

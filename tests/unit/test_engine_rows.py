@@ -31,7 +31,8 @@ def state() -> StreamState:
     parent[1:3] = torch.tensor([1, 2])
     level = (parent != torch.arange(nodes)).long()
     hierarchy = Hierarchy(torch.from_numpy(player.layout.node_of), parent, level)
-    moments = {"step": torch.tensor(7.0), "exp_avg": torch.arange(nodes).float(), "exp_avg_sq": torch.ones(nodes)}
+    steps = torch.full((nodes,), 7, dtype=torch.int32)
+    moments = {"steps": steps, "exp_avg": torch.arange(nodes).float(), "exp_avg_sq": torch.ones(nodes)}
     return StreamState(player, hierarchy, None, {"sh0": torch.ones(2, 3)}, gate_moments=moments)
 
 
@@ -63,7 +64,7 @@ def test_the_forest_grows_with_the_packet(state):
 def test_gate_moments_stay_with_their_nodes(state):
     nodes = len(state.player.layout.node_counts)
     after = step(state, delta_of(state.player.layout, own_nodes(scene(3), np.zeros(3), nodes), [1]))
-    assert after.gate_moments["step"] == 7
+    assert after.gate_moments["steps"].tolist() == [7] * nodes + [0] * 3
     assert after.gate_moments["exp_avg"].tolist() == [*range(nodes), 0, 0, 0]
     assert after.gate_moments["exp_avg_sq"].tolist() == [1] * nodes + [0] * 3
 

@@ -1,0 +1,42 @@
+"""Trainable rows of one frame's optimisation: named leaf tensors and the Adam state of every row."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+
+from gsstream.optimiser.base import AdamState, RowOptimiser
+
+
+class RowTable:
+    """Named leaves [n, ...], one learning rate each, moved by a :class:`RowOptimiser`."""
+
+    def __init__(
+        self, values: Mapping[str, torch.Tensor], lrs: Mapping[str, float], optimiser: RowOptimiser
+    ) -> None:
+        self.leaves = {name: value.detach().clone().requires_grad_() for name, value in values.items()}
+        self._lrs, self._optimiser = dict(lrs), optimiser
+        self._states = {name: AdamState.start(leaf) for name, leaf in self.leaves.items()}
+
+    def __getitem__(self, name: str) -> torch.Tensor:
+        return self.leaves[name]
+
+    def step(self, gradients: Mapping[str, torch.Tensor]) -> None:
+        """One Adam step from ``gradients`` and whatever waits on the leaves, which is then dropped."""
+        total = dict(gradients)
+        for name, leaf in self.leaves.items():
+            if leaf.grad is not None:
+                total[name] = total[name] + leaf.grad if name in total else leaf.grad
+                leaf.grad = None
+        self._optimiser.step(self.leaves, total, self._states, self._lrs)
+
+    def moments(self, name: str) -> dict[str, torch.Tensor]:
+        """Adam state of one leaf, row by row."""
+        state = self._states[name]
+        return {"exp_avg": state.exp_avg, "exp_avg_sq": state.exp_avg_sq, "steps": state.steps}
+
+    def load_moments(self, name: str, moments: Mapping[str, torch.Tensor]) -> None:
+        """Continue from moments saved by :meth:`moments`; an empty mapping starts fresh."""
+        if moments:
+            self._states[name] = AdamState(**{key: value.clone() for key, value in moments.items()})

@@ -74,7 +74,8 @@ def _step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> Step:
     packet = encode(delta, state, frame.index)
     player = decode_packet(state.player, packet.data)
     clock.append(time.perf_counter())
-    session = committed(context.session, state, delta, player)
+    with guarded("renderer", parts.renderer, frame.index):
+        session = committed(context.session, state, delta, player)
     clock.append(time.perf_counter())
     # A frame that changed nothing is not what the scene shows: the next one is compared with the last that did, so that
     # a change too slow to see from frame to frame adds up until it is seen.
@@ -103,7 +104,7 @@ def still_step(state: StreamState, frame: Frame, seconds: float) -> Step:
     packet = encode_empty(frame=frame.index)
     after = replace(state, player=decode_packet(state.player, packet.data))
     gates = np.zeros(len(state.player.layout.node_counts), np.uint8)
-    solution = Solution({}, {}, GateState(torch.zeros(0)), {}, 0.0, 0)
+    solution = Solution(torch.zeros(0), {}, {}, GateState(torch.zeros(0)), {}, 0.0, 0)
     metrics = step_metrics(Delta(gates, 1), after, packet, solution, torch.zeros(0))
     metrics["changed_tiles"] = 0.0
     metrics["seconds"] = {"confidence": seconds, "optimise": 0.0, "code": time.perf_counter() - started, "keep": 0.0}
@@ -143,7 +144,7 @@ def harden(parts: Assembly, problem: Problem, solution: Solution) -> Delta:
         final = parts.gate.sample(solution.gate, None)
     check_output("gate", parts.gate, frame, "sample()", final, tuple(solution.gate.logits.shape), (0.0, 1.0))
     gates = torch.round(final * parts.gate.num_levels).numpy().astype(np.uint8)
-    active = problem.active.numpy()
+    active = solution.active.numpy()
     integers = {name: value.numpy() for name, value in residual_symbols(parts.update, solution.latents).items()}
     moving = np.zeros(len(active), bool)
     for value in integers.values():

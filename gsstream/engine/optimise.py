@@ -16,11 +16,15 @@ from gsstream.core.state import GateState
 from gsstream.engine.assemble import Assembly
 from gsstream.engine.exposure import Exposure, backward_view
 from gsstream.engine.guard import check_terms, guarded
-from gsstream.engine.parameters import AdamTable
+from gsstream.engine.row_table import RowTable
+from gsstream.engine.stopping import Gains, watch
 from gsstream.engine.stream_state import StreamState
 from gsstream.render.base import RenderSession
 from gsstream.residual.base import add_changes, decode_changes, init_latents, pull_back
 from gsstream.residual.rate import rate_gradients
+
+#: Leaving costs a freeze of every view: at least a tenth of the rows must go.
+WORTH_LEAVING = 0.9
 
 
 @dataclass(frozen=True)
@@ -44,8 +48,16 @@ class Problem:
 
 @dataclass(frozen=True)
 class Solution:
-    """Latents [A, L] per attribute, decoders, final gate logits, gate moments, and the mean loss of the last epoch."""
+    """What the optimisation found.
 
+    Arguments:
+        active: [A] int64 rows that stayed to the end, ascending; what other rows had is given up.
+        latents: attribute -> [A, L].
+        loss: mean over the last pass, of the tiles that took part.
+        iterations: views rendered.
+    """
+
+    active: torch.Tensor
     latents: Mapping[str, torch.Tensor]
     decoders: Mapping[str, torch.Tensor]
     gate: GateState
@@ -55,20 +67,29 @@ class Solution:
 
 
 def optimise(parts: Assembly, problem: Problem, generator: torch.Generator) -> Solution:
-    """Minimise photometric loss + penalty over epochs x views, one view per iteration."""
-    recipe = parts.recipe
+    """Minimise photometric loss + penalty over epochs x views, one view per iteration.
+
+    After every epoch rows whose gate has closed may leave, and the frame may stop, as the recipe says.
+    """
+    stream = parts.recipe.stream
     if len(problem.active) == 0:
-        return Solution({}, {}, problem.gate, problem.state.gate_moments, 0.0, 0)
+        return Solution(problem.active, {}, {}, problem.gate, problem.state.gate_moments, 0.0, 0)
     views = len(problem.frame.cameras)
-    iterations = max(1, round(recipe.stream.epochs * problem.frame.effort)) * views
-    run = _FrameRun(parts, problem, generator)
-    order: list[int] = []
-    recent: list[float] = []
-    for iteration in range(iterations):
-        order = order or torch.randperm(views, generator=generator).tolist()
-        recent.append(run.step(order.pop(), iteration, iteration / iterations))
-    loss = sum(recent[-views:]) / max(1, len(recent[-views:]))
-    return run.solution(loss, iterations)
+    epochs = max(1, round(stream.epochs * problem.frame.effort))
+    run, gains = _FrameRun(parts, problem, generator), Gains(views)
+    loss = 0.0
+    for epoch in range(epochs):
+        losses = []
+        for place, view in enumerate(reversed(torch.randperm(views, generator=generator).tolist())):
+            iteration = epoch * views + place
+            losses.append(run.step(view, iteration, iteration / (epochs * views)))
+            gains.note(view, losses[-1], run.judged_tiles)
+        loss = sum(losses) / views
+        if gains.end_epoch() < stream.min_gain:
+            return run.solution(loss, (epoch + 1) * views)
+        if stream.release_closed and epoch + 1 < epochs:
+            run.release((epoch + 1) / epochs)
+    return run.solution(loss, epochs * views)
 
 
 class _FrameRun:
@@ -82,6 +103,7 @@ class _FrameRun:
             nodes, node_of = torch.arange(state.hierarchy.num_nodes), state.hierarchy.node_of[problem.active]
         # Only gates with active rows behind them are sampled and trained; parents matter to no gate.
         self.nodes = nodes
+        self.logits, self.active, self.base = problem.gate.logits, problem.active, problem.base
         self.hierarchy = Hierarchy(node_of, torch.arange(len(nodes)), torch.zeros_like(nodes))
         active = problem.active.numpy()
         self.units = torch.from_numpy(layout.units[active])
@@ -101,6 +123,9 @@ class _FrameRun:
         with self._guarded("loss", parts.loss):
             self.targets = [parts.loss.prepare(torch.from_numpy(image)) for image in problem.frame.images]
         self.exposure: Exposure | None = state.exposure
+        self.watched: dict[int, torch.Tensor] = {}
+        #: Tiles that the last view's loss is a sum over; 0: all.
+        self.judged_tiles = 0
 
     def _guarded(self, slot: str, part: Part) -> AbstractContextManager[None]:
         return guarded(slot, part, self.problem.frame.index, self.iteration)
@@ -112,7 +137,7 @@ class _FrameRun:
         gates = self._row_gates(gate, fraction)
         with torch.no_grad():
             changes = decode_changes(parts.update, self.latents.leaves, self.decoders.leaves)
-            rows = add_changes(self.problem.base, changes, gates.detach(), self.units)
+            rows = add_changes(self.base, changes, gates.detach(), self.units)
         rows = rows.map(lambda value: value.detach().requires_grad_())
         loss = self._render(view, rows)
         back = pull_back(rows.map(_gradient), changes, self.decoders.leaves, gates.detach(), self.units)
@@ -126,9 +151,12 @@ class _FrameRun:
         """Loss of one view; leaves its gradient on the rows."""
         with self._guarded("renderer", self.parts.renderer):
             output = self.session.render(view, rows)
-        weight, target = self.parts.recipe.loss.dssim, self.targets[view]
+        weight, target, tiles = self.parts.recipe.loss.dssim, self.targets[view], output.tiles
+        if tiles is not None and self.parts.recipe.stream.min_gain > 0:
+            tiles = self.watched[view] = watch(self.watched.get(view), tiles)
+        self.judged_tiles = 0 if tiles is None else int(tiles.sum())
         with self._guarded("loss", self.parts.loss):
-            return backward_view(output.image, view, self.exposure, self.parts.loss, target, weight, output.tiles)[0]
+            return backward_view(output.image, view, self.exposure, self.parts.loss, target, weight, tiles)[0]
 
     def _step_gates(self, gate: GateState, gates: torch.Tensor, upstream: torch.Tensor, *, learning: bool) -> None:
         """Move the logits by what the images and the penalty say, and keep them in their bounds."""
@@ -161,7 +189,7 @@ class _FrameRun:
     def _penalty(self, gate: GateState) -> Mapping[str, torch.Tensor]:
         means = self.latents.leaves.get("means")
         # The motion term also pulls on the residual itself; that gradient waits on the leaf for the latents' step.
-        residual = torch.zeros(len(self.problem.base), 3) if means is None else means
+        residual = torch.zeros(len(self.base), 3) if means is None else means
         with self._guarded("gate", self.parts.gate):
             probability = self.parts.gate.open_probability(gate)
         total, regularizer = self.problem.state.hierarchy.num_gaussians, self.parts.regularizer
@@ -170,12 +198,44 @@ class _FrameRun:
             check_terms(regularizer, self.problem.frame.index, self.iteration, terms)
         return terms
 
+    def release(self, fraction: float) -> None:
+        """Let go of the rows whose gate has closed: they no longer cost anything in this frame.
+
+        A closed gate draws its rows as they were, so nothing that is seen changes. Rows of levels that are not yet
+        active had no say and stay.
+        """
+        if self.parts.recipe.gate_training.optimiser == "persistent":
+            return
+        with self._guarded("gate", self.parts.gate):
+            gates = self.parts.gate.sample(GateState(self.gate["logits"].detach()), None)
+        keep = (torch.round(gates * self.parts.gate.num_levels) > 0)[self.hierarchy.node_of]
+        if self.schedule:
+            keep |= self.levels > current_level(self.schedule, fraction)
+        if int(keep.sum()) > WORTH_LEAVING * len(keep):
+            return
+        self.logits = self._all_logits()
+        rows = keep.nonzero()[:, 0]
+        nodes, node_of = torch.unique(self.hierarchy.node_of[rows], return_inverse=True)
+        self.nodes = self.nodes[nodes]
+        self.hierarchy = Hierarchy(node_of, torch.arange(len(nodes)), torch.zeros_like(nodes))
+        self.gate.keep(nodes)
+        self.latents.keep(rows)
+        self.active, self.base = self.active[rows], self.base.rows(rows)
+        self.units, self.levels = self.units[rows], self.levels[rows]
+        with self._guarded("renderer", self.parts.renderer):
+            self.session.narrow(self.active)
+
+    def _all_logits(self) -> torch.Tensor:
+        """[M] logits of all gates; those that take part as they are now."""
+        return self.logits.index_copy(0, self.nodes, self.gate["logits"].detach())
+
     def solution(self, loss: float, iterations: int) -> Solution:
         moments = self.gate.moments("logits") if self.parts.recipe.gate_training.optimiser == "persistent" else {}
         return Solution(
+            active=self.active,
             latents={name: leaf.detach() for name, leaf in self.latents.leaves.items()},
             decoders={name: leaf.detach() for name, leaf in self.decoders.leaves.items()},
-            gate=GateState(self.problem.gate.logits.index_copy(0, self.nodes, self.gate["logits"].detach())),
+            gate=GateState(self._all_logits()),
             gate_moments=moments,
             loss=loss,
             iterations=iterations,

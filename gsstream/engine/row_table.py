@@ -31,6 +31,14 @@ class RowTable:
                 leaf.grad = None
         self._optimiser.step(self.leaves, total, self._states, self._lrs)
 
+    def keep(self, rows: torch.Tensor) -> None:
+        """Go on with these rows [K] of every leaf, and with the steps they have taken."""
+        self.leaves = {name: leaf.detach()[rows].requires_grad_() for name, leaf in self.leaves.items()}
+        self._states = {
+            name: AdamState(state.exp_avg[rows], state.exp_avg_sq[rows], state.steps[rows])
+            for name, state in self._states.items()
+        }
+
     def moments(self, name: str) -> dict[str, torch.Tensor]:
         """Adam state of one leaf, row by row."""
         state = self._states[name]

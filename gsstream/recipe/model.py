@@ -89,6 +89,15 @@ class Stream(Section):
         default=0.5, ge=0, le=1,
         description="least share of the views a Gaussian projects into in which it must lie in or beside changed tiles",
     )  # fmt: skip
+    release_closed: bool = Field(
+        default=False,
+        description="after each pass over the cameras, rows whose gate has closed leave the frame's optimisation (ours)",
+    )
+    min_gain: float = Field(
+        default=0.0, ge=0, lt=1,
+        description="a frame ends after a pass that gained less than this share of all it gained so far; 0: never "
+        "before its epochs (ours)",
+    )  # fmt: skip
     rate_weight: float = Field(
         default=0.0, ge=0, le=1,
         description="weight in the loss of the residual's estimated bits per pixel of one view; 0: none (ours)",

@@ -91,7 +91,7 @@ class Stream(Section):
     )  # fmt: skip
     release_closed: bool = Field(
         default=False,
-        description="after each pass over the cameras, rows whose gate has closed leave the frame's optimisation (ours)",
+        description="after each pass over the cameras, rows whose gate has closed leave the optimisation (ours)",
     )
     min_gain: float = Field(
         default=0.0, ge=0, lt=1,

@@ -1,0 +1,103 @@
+"""What a frame does not need is left out, and nothing but time depends on it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from flow_runs import Witness, demo_copy, encode, metrics
+from gsstream_cpu_render.renderer import CpuRenderer
+from gsstream_cpu_render.session import CpuSession
+
+from gsstream.engine import frame_step as step_module
+from gsstream.packet import StreamReader
+from gsstream.render.base import ScatterSession
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return str(demo_copy(tmp_path_factory.mktemp("world") / "demo", frames=4))
+
+
+def deltas(out: Path) -> list[bytes]:
+    with StreamReader(out / "stream.gss") as reader:
+        return [reader.read(entry) for entry in reader.frames[1:]]
+
+
+def test_threshold_zero_is_the_dense_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, world: str) -> None:
+    """Without a threshold every Gaussian takes part and every pixel is drawn: bit for bit a plain render per step."""
+    encode(tmp_path / "ours", source=world, method="s2gs-edge", stream__change_threshold=0)
+    lines = metrics(tmp_path / "ours")
+    assert [line["candidate_gaussians"] for line in lines[1:]] == [lines[1]["num_gaussians"]] * 3
+    monkeypatch.setattr(CpuRenderer, "open", lambda *arguments: ScatterSession(*arguments))
+    encode(tmp_path / "plain", source=world, method="s2gs-edge", stream__change_threshold=0)
+    assert deltas(tmp_path / "ours") == deltas(tmp_path / "plain")
+
+
+def test_what_the_renderer_keeps_changes_no_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, world: str) -> None:
+    commits: list[int] = []
+    commit = CpuSession.commit
+
+    def counted(self: CpuSession, gaussians: Any, changed: torch.Tensor) -> Any:
+        commits.append(len(changed))
+        return commit(self, gaussians, changed)
+
+    monkeypatch.setattr(CpuSession, "commit", counted)
+    kept = encode(tmp_path / "kept", source=world, method="s2gs-edge")
+    assert len(commits) == 3
+    assert any(commits), "a stream in which nothing changes proves nothing"
+    assert "cache" in metrics(tmp_path / "kept")[-1]
+    monkeypatch.setattr(step_module, "committed", lambda *_: None)
+    anew = encode(tmp_path / "anew", source=world, method="s2gs-edge")
+    assert kept == anew
+
+
+def test_a_cache_without_room_changes_no_byte(tmp_path: Path, world: str) -> None:
+    settings = {"method": "s2gs-edge", "source": world}
+    encode(tmp_path / "roomy", "--renderer", "cpu", **settings)
+    encode(tmp_path / "tight", "--renderer", "cpu", renderer__cache_mb=0, **settings)
+    assert "cache" in metrics(tmp_path / "roomy")[-1]
+    assert "cache" not in metrics(tmp_path / "tight")[-1]
+    # Views without a cache are judged as a whole, so sums round in another order: the same picture, not the same bits.
+    roomy, tight = (metrics(tmp_path / name) for name in ("roomy", "tight"))
+    for a, b in zip(roomy, tight, strict=True):
+        mean = [sum(line["psnr"].values()) / len(line["psnr"]) for line in (a, b)]
+        assert abs(mean[0] - mean[1]) < 0.3
+
+
+def test_rows_behind_closed_gates_leave_and_stay_as_they_were(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, world: str
+) -> None:
+    sizes: list[int] = []
+    narrow = CpuSession.narrow
+
+    def counted(self: CpuSession, active: torch.Tensor) -> None:
+        sizes.append(len(active))
+        narrow(self, active)
+
+    monkeypatch.setattr(CpuSession, "narrow", counted)
+    witness = Witness(monkeypatch)
+    encode(tmp_path / "o", source=world, method="s2gs-edge", stream__release_closed="true", stream__epochs=4)
+    assert len(sizes) > 3, "some frame let rows go"
+    lines = metrics(tmp_path / "o")
+    assert all(line["active_gaussians"] <= line["candidate_gaussians"] for line in lines[1:])
+    for before, after, line in zip(witness.states, witness.states[1:], lines[1:], strict=False):
+        moved = sum((a != b).reshape(len(a), -1).any(1) for a, b in _pairs(before, after)) > 0
+        assert int(moved.sum()) <= line["active_gaussians"]
+
+
+def test_a_frame_stops_when_it_gains_no_more(tmp_path: Path, world: str) -> None:
+    encode(tmp_path / "short", source=world, method="s2gs-edge", stream__epochs=8, stream__min_gain=0.9)
+    encode(tmp_path / "long", source=world, method="s2gs-edge", stream__epochs=8)
+    short, long = ([line["iterations"] for line in metrics(tmp_path / n)[1:]] for n in ("short", "long"))
+    assert long == [24] * 3
+    assert all(3 <= n < 24 and n % 3 == 0 for n in short)
+    again = encode(tmp_path / "again", source=world, method="s2gs-edge", stream__epochs=8, stream__min_gain=0.9)
+    assert again == (tmp_path / "short" / "stream.gss").read_bytes(), "no clock decides"
+
+
+def _pairs(before: Any, after: Any) -> list[tuple[Any, Any]]:
+    ours, theirs = before.player.gaussians.items(), after.player.gaussians.items()
+    return [(a, b) for (_, a), (_, b) in zip(ours, theirs, strict=True)]

@@ -237,7 +237,40 @@ def saboteurs() -> str:
     return "\n".join(lines)
 
 
-PAGES = {"api.md": api, "checks.md": checks, "cli.md": cli, "recipe.md": recipe, "hooks.md": hooks, "parts.md": parts}
+def scene_checks() -> str:
+    """Every check of ``scene validate``, and what it says about the bad scenes of the tests."""
+    import importlib
+    import json
+    import sys
+
+    from gsstream.scene.findings import CHECKS
+
+    root = HERE.parents[1]
+    sys.path.insert(0, str(root))
+    try:
+        table = importlib.import_module("tests.scene.bad_scenes")
+    finally:
+        sys.path.remove(str(root))
+    messages = json.loads(table.MESSAGES.read_text(encoding="utf-8"))
+    lines = [NOTE, "# Checks of scenes", ""]
+    lines += [
+        "`gsstream scene validate SCENE` makes these checks in this order and stops at the first stage with an error,",
+        "so that one fault gives one message. Below each check: the bad scenes that the tests make of a good one, with",
+        "what is said about them.",
+        "",
+    ]
+    for code, meaning in CHECKS.items():
+        lines += [f"## {code}", "", f"{meaning[0].upper()}{meaning[1:]}.", "", "| wrong | message |", "|---|---|"]
+        rows = [(bad.fault, messages[bad.name]) for bad in table.BAD if bad.code == code]
+        lines += [f"| {fault} | {' '.join(said).replace('|', chr(92) + '|')} |" for fault, said in rows]
+        lines.append("")
+    return "\n".join(lines)
+
+
+PAGES = {
+    "api.md": api, "checks.md": checks, "cli.md": cli, "recipe.md": recipe, "hooks.md": hooks, "parts.md": parts,
+    "scene-checks.md": scene_checks,
+}  # fmt: skip
 
 if __name__ == "__main__":
     if "--saboteurs" in sys.argv:

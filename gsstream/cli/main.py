@@ -13,7 +13,21 @@ import typer
 from typer.main import get_command
 
 from gsstream import API_VERSION, __version__
-from gsstream.cli import bench, check, deliver, info, methods, plugins, recipe, report, run, scaffold, streams, sweep
+from gsstream.cli import (
+    bench,
+    check,
+    deliver,
+    info,
+    methods,
+    plugins,
+    recipe,
+    report,
+    run,
+    scaffold,
+    scene,
+    streams,
+    sweep,
+)
 from gsstream.core.errors import GsstreamError, InputError
 
 
@@ -67,6 +81,7 @@ app.add_typer(bench.app, name="bench")
 app.add_typer(methods.app, name="methods")
 app.add_typer(plugins.app, name="plugins")
 app.add_typer(recipe.app, name="recipe")
+app.add_typer(scene.app, name="scene")
 
 
 def main(argv: Sequence[str] | None = None) -> None:

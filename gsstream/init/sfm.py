@@ -34,15 +34,11 @@ def triangulate_points(
     """
     check_shape("images", images, (len(cameras), cameras.height, cameras.width, 3))
     check_finite("images", images)
-    if importlib.util.find_spec("pycolmap") is None:
-        raise InputError(
-            "structure from motion needs pycolmap, which is not installed: pip install 'gsstream[sfm]', "
-            "or give the recording a points_frame0.npz"
-        )
     with tempfile.TemporaryDirectory(prefix="gsstream-sfm-") as name:
         folder = Path(name)
-        _write_input(folder, images, cameras)
-        _run(folder, timeout)
+        write_images(folder, images)
+        write_rig(folder, cameras)
+        run_pycolmap("triangulate", folder, timeout)
         with np.load(folder / "points.npz") as result:
             keep = np.isfinite(result["xyz"]).all(1) & (result["error"] <= max_error)
             xyz, rgb = result["xyz"][keep], result["rgb"][keep]
@@ -55,17 +51,31 @@ def triangulate_points(
     return PointCloud(xyz.astype(np.float32), colors, f"triangulated from {len(cameras)} training images")
 
 
-def _write_input(folder: Path, images: FloatArray, cameras: Cameras) -> None:
+def write_images(folder: Path, images: FloatArray) -> None:
+    """Write [C, H, W, 3] images in [0, 1] where the pycolmap process looks for them, numbered."""
     (folder / "images").mkdir()
     for i, image in enumerate(images):
         pixels = np.round(image * 255).astype(np.uint8)
         Image.fromarray(pixels).save(folder / "images" / f"{i:04d}.png", compress_level=1)
+
+
+def write_rig(folder: Path, cameras: Cameras) -> None:
+    """Write the known poses and pinhole intrinsics for the pycolmap process."""
     size = np.array([cameras.width, cameras.height])
     np.savez(folder / "rig.npz", viewmats=cameras.viewmats, Ks=cameras.Ks, size=size)
 
 
-def _run(folder: Path, timeout: float) -> None:
-    command = [sys.executable, "-m", "gsstream.init._pycolmap", str(folder)]
+def run_pycolmap(task: str, folder: Path, timeout: float) -> None:
+    """Run one task of ``gsstream.init._pycolmap`` on a folder, in a process of its own.
+
+    Raises InputError when pycolmap is not installed, and when the process fails or takes more than ``timeout`` seconds.
+    """
+    if importlib.util.find_spec("pycolmap") is None:
+        raise InputError(
+            "structure from motion needs pycolmap, which is not installed: pip install 'gsstream[sfm]', "
+            "or give the recording a points_frame0.npz"
+        )
+    command = [sys.executable, "-m", "gsstream.init._pycolmap", task, str(folder)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
     except subprocess.TimeoutExpired as error:

@@ -63,6 +63,11 @@ OPTIONS = {
     "gsstream methods show": ["NAME", "--full"],
     "gsstream plugins": ["--check"],
     "gsstream plugins show": ["PART"],
+    "gsstream scene": [],
+    "gsstream scene prepare": [
+        "RAW", "--out", "--test", "--lens", "--each", "--frames", "--width", "--max-points", "--fps", "--quiet",
+    ],
+    "gsstream scene validate": ["SCENE", "--frames", "--no-features"],
     "gsstream recipe": [],
     "gsstream recipe schema": ["METHOD", "--out"],
     "gsstream recipe show": ["METHOD", "--recipe", "--set", "--full"],

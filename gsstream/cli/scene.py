@@ -1,0 +1,94 @@
+"""``gsstream scene``: make a scene from raw recordings, and say what is wrong with one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(help="Prepare and validate scenes.", no_args_is_help=True, rich_markup_mode=None)
+
+
+@app.callback()
+def _group() -> None:
+    """Prepare and validate scenes."""
+
+
+@app.command()
+def prepare(
+    raw: Annotated[Path, typer.Argument(help="A folder of pictures or a video per camera, or a picture per camera.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the scene; must be empty or missing.")],
+    test: Annotated[
+        list[str] | None, typer.Option("--test", help="Camera that tests only, out of poses and points; repeatable.")
+    ] = None,
+    lens: Annotated[
+        str, typer.Option("--lens", help="pinhole, simple-radial, radial, opencv or opencv-fisheye.")
+    ] = "simple-radial",
+    each: Annotated[bool, typer.Option("--each", help="A lens per camera; else all cameras share one.")] = False,
+    frames: Annotated[int | None, typer.Option("--frames", help="Frames to take over; all by default.")] = None,
+    width: Annotated[int | None, typer.Option("--width", help="Shrink pictures to this width.")] = None,
+    max_points: Annotated[int, typer.Option("--max-points", help="Points to keep.")] = 50_000,
+    fps: Annotated[float, typer.Option("--fps", help="Frames per second, where poses are not given.")] = 30.0,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print only warnings and errors.")] = False,
+) -> None:
+    """Make a validated scene from raw synchronised recordings: poses, pinhole pictures, points, a report.
+
+    Poses are recovered from frame 0, or taken from a cameras.json in RAW. Needs gsstream[sfm]. Exit code 2 when the
+    scene was made but its validation found an error.
+    """
+    import time
+
+    from gsstream.scene.prepare import PrepareOptions
+    from gsstream.scene.prepare import prepare as make
+    from gsstream.scene.report import write_report
+    from gsstream.scene.validate import validate as find
+    from gsstream.source.open import open_source
+
+    began = time.perf_counter()
+    model = lens.upper().replace("-", "_")
+    options = PrepareOptions(tuple(test) if test else None, model, each, frames, width, max_points, fps=fps)
+    made = make(raw, out, options, lambda line: None if quiet else typer.echo(line))
+    # The features have just been matched; how well they fit is in the report.
+    found = find(lambda scale: open_source(str(out), scale), features=False)
+    written = write_report(out, made, found, time.perf_counter() - began)
+    for finding in found:
+        typer.echo(f"{finding.severity}: [{finding.code}] {finding.message}", err=True)
+    if made.left_out:
+        typer.echo(f"warning: no pose was found for {', '.join(made.left_out)}; they are left out", err=True)
+    if not quiet:
+        typer.echo("\n".join(f"wrote {path}" for path in (out / "cameras.json", *written)))
+    if any(finding.severity == "error" for finding in found):
+        raise typer.Exit(2)
+
+
+@app.command()
+def validate(
+    scene: Annotated[str, typer.Argument(help="Recording: a folder, or whatever --source of 'run' takes.")],
+    frames: Annotated[int, typer.Option("--frames", help="Frames, from the first, whose pictures are compared.")] = 40,
+    no_features: Annotated[
+        bool, typer.Option("--no-features", help="Do not match features between cameras (most of the time).")
+    ] = False,
+) -> None:
+    """Say what is wrong with a scene, and what to do. Exit code 2 when a run would be wasted on it."""
+    from gsstream.core.errors import InputError
+    from gsstream.engine.recording import open_recording
+    from gsstream.plugins.catalog import load_catalog
+    from gsstream.recipe.model import Recipe
+    from gsstream.scene.findings import CHECKS
+    from gsstream.scene.validate import validate as find
+
+    if frames < 1:
+        raise InputError(f"--frames: expected at least 1, got {frames}")
+    catalog = load_catalog()
+    found = find(
+        lambda scale: open_recording(scene, Recipe(scale=scale), catalog), frames=frames, features=not no_features
+    )
+    for finding in found:
+        typer.echo(f"{finding.severity}: [{finding.code}] {finding.message}")
+    errors = sum(finding.severity == "error" for finding in found)
+    if errors:
+        typer.echo(f"{scene}: {errors} error{'s' if errors > 1 else ''}; all checks: docs/reference/scene-checks.md")
+        raise typer.Exit(2)
+    remarks = f", {len(found)} remark{'s' if len(found) > 1 else ''}" if found else ""
+    typer.echo(f"{scene}: fine ({len(CHECKS) - no_features} checks{remarks})")

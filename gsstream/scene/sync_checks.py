@@ -1,0 +1,138 @@
+"""Is what moves at one place in all cameras at a time? A visual hull of motion, one camera left out at a time (ours).
+
+Where most other cameras see motion, something moves, and the camera that was left out must see motion there too. If it
+does so better some frames earlier or later, its clock is off; if it does so with another camera's pose, the two are
+swapped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.init.geometry import BoolArray, depth_range, focus_point, inside, project
+from gsstream.metrics.noise import noise_sigma
+from gsstream.scene.findings import Finding, error
+from gsstream.scene.picture_checks import Thumbnails
+
+GRID = 36
+#: Frames a clock may be off.
+REACH = 3
+AGREE, MARGIN = 0.45, 0.15
+LEAST_VOXELS = 40
+VOTES = 0.75
+
+
+@dataclass(frozen=True, slots=True)
+class _Motion:
+    """``masks`` [T, C, h w] moving pixels; ``seen`` [V, C] voxel in the image, ``place`` [V, C] its pixel."""
+
+    masks: BoolArray
+    seen: BoolArray
+    place: IntArray
+
+    def at(self, camera: int, pose: int) -> BoolArray:
+        """[T, V]: motion of ``camera`` at the pixels that the voxels have in the view of ``pose``."""
+        moving: BoolArray = self.masks[:, camera, self.place[:, pose]] & self.seen[:, pose]
+        return moving
+
+
+def check_sync(thumbs: Thumbnails) -> list[Finding]:
+    """Cameras whose clock is off, and pairs of cameras that are swapped; nothing where too little moves."""
+    cameras = thumbs.cameras
+    if len(cameras) < 5 or len(thumbs.images) < 2 * REACH + 2:
+        return []
+    motion = _motion(thumbs)
+    votes = np.stack([motion.at(c, c) for c in range(len(cameras))], axis=2).astype(np.int16)
+    total, seen = votes.sum(2), motion.seen.sum(1)
+    scores = []
+    for c in range(len(cameras)):
+        others, watched = total - votes[:, :, c], seen - motion.seen[:, c]
+        scores.append(_scores(_hull(others, watched), motion, c))
+    table = np.array(scores)
+    out_of_place = [c for c in range(len(cameras)) if 0 <= table[c, REACH] < AGREE and motion.masks[:, c].any()]
+    if swapped := _swapped(motion, cameras, out_of_place, total, seen, votes):
+        return swapped
+    found = []
+    for c, row in enumerate(table):
+        best = int(row.argmax())
+        if best != REACH and row[best] > max(AGREE, row[REACH] + MARGIN):
+            late = best - REACH
+            found.append(error("sync", (
+                f"camera {cameras.ids[c]!r} is {abs(late)} frame{'s' if abs(late) > 1 else ''} "
+                f"{'late' if late > 0 else 'early'}: what moves is at another place than in the other cameras. Shift "
+                f"its frames by {-late:+d}, or run with data.time_offset={cameras.ids[c]}={late}"
+            )))  # fmt: skip
+    return found
+
+
+def _motion(thumbs: Thumbnails) -> _Motion:
+    images, cameras = thumbs.images, thumbs.cameras
+    height, width = images.shape[2:4]
+    cameras = cameras.scaled(width, height)
+    masks = np.zeros((len(images) - 1, len(cameras), height, width), bool)
+    for c in range(len(cameras)):
+        sigma = noise_sigma(images[0, c], images[1, c])
+        masks[:, c] = np.abs(np.diff(images[:, c], axis=0)).max(-1) > max(8 / 255, 6 * sigma)
+    middle = focus_point(cameras)
+    half = 0.5 * float(np.median(depth_range(cameras, near=1.0)[:, 0]))
+    axis = np.linspace(-half, half, GRID)
+    voxels = middle + np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    seen, place = np.zeros((len(voxels), len(cameras)), bool), np.zeros((len(voxels), len(cameras)), np.int64)
+    for c in range(len(cameras)):
+        uv, depth = project(voxels, cameras, c)
+        seen[:, c] = inside(uv, depth, cameras)
+        column, row = np.where(seen[:, c, None], uv, 0).astype(np.int64).T
+        place[:, c] = row * width + column
+    return _Motion(_grown(masks).reshape(len(masks), len(cameras), -1), seen, place)
+
+
+def _grown(masks: BoolArray) -> BoolArray:
+    """Moving pixels and their four neighbours: thumbnails are coarse and so are voxels."""
+    grown = masks.copy()
+    grown[..., 1:, :] |= masks[..., :-1, :]
+    grown[..., :-1, :] |= masks[..., 1:, :]
+    grown[..., 1:] |= masks[..., :-1]
+    grown[..., :-1] |= masks[..., 1:]
+    return grown
+
+
+def _hull(votes: IntArray, watched: IntArray) -> BoolArray:
+    """[T, V] voxels in which at least three cameras, and most of those that see them, see motion."""
+    hull: BoolArray = (votes >= 3) & (votes >= VOTES * watched)
+    return hull
+
+
+def _scores(hull: BoolArray, motion: _Motion, c: int) -> FloatArray:
+    """[2 REACH + 1] share of the hull's voxels in which camera c sees motion so many frames later; -1: not known."""
+    mine, frames = motion.at(c, c), len(hull)
+    # Every offset is judged by the same frames.
+    core = hull[REACH : frames - REACH] & motion.seen[None, :, c]
+    if int(core.sum()) < LEAST_VOXELS:
+        return np.full(2 * REACH + 1, -1.0)
+    return np.array([float(mine[o : o + len(core)][core].mean()) for o in range(2 * REACH + 1)])
+
+
+def _swapped(
+    motion: _Motion, cameras: Cameras, lost: list[int], total: IntArray, seen: IntArray, votes: IntArray
+) -> list[Finding]:
+    """Pairs of cameras, each of which fits the motion that the rest sees when it has the other's pose."""
+    found = []
+    for a in lost:
+        for b in lost:
+            if b <= a:
+                continue
+            hull = _hull(total - votes[:, :, a] - votes[:, :, b], seen - motion.seen[:, a] - motion.seen[:, b])
+            fits = []
+            for camera, pose in ((a, b), (b, a)):
+                where = hull & motion.seen[None, :, pose]
+                fits.append(float(motion.at(camera, pose)[where].mean()) if int(where.sum()) >= LEAST_VOXELS else 0.0)
+            if min(fits) > AGREE + MARGIN:
+                found.append(error("sync", (
+                    f"cameras {cameras.ids[a]!r} and {cameras.ids[b]!r} are swapped: each sees what moves where the "
+                    "other should; exchange their images or their poses"
+                )))  # fmt: skip
+    return found

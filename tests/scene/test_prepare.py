@@ -1,0 +1,135 @@
+"""From raw pictures to a scene: known poses, unknown poses, lenses, and input that cannot work."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsstream.cli.main import run_command
+from gsstream.core.errors import InputError, SourceError
+from gsstream.scene.prepare import PrepareOptions, prepare
+from gsstream.scene.raw import find_cameras
+from gsstream.source.open import open_source
+from tests.scene.bad_scenes import save
+
+needs_pycolmap = pytest.mark.skipif(importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed")
+WORLD = "synthetic:width=240&height=180&views=6&frames=2&supersample=1&motion=4"
+
+
+def raw_pictures(folder: Path, frames: int = 2) -> Path:
+    """A folder of pictures per camera; the test camera of the world is called "test"."""
+    source = open_source(WORLD)
+    for split in ("train", "test"):
+        for t in range(frames):
+            frame = source.frame(t, split)
+            for name, image in zip(frame.cameras.ids, frame.images, strict=True):
+                (folder / name).mkdir(parents=True, exist_ok=True)
+                save(folder / name / f"shot{t}.png", image)
+    return folder
+
+
+def quiet(_: str) -> None:
+    pass
+
+
+@pytest.mark.sfm
+@needs_pycolmap
+def test_unknown_poses_are_recovered_and_the_test_camera_changes_nothing(tmp_path: Path) -> None:
+    raw = raw_pictures(tmp_path / "raw")
+    command = ["scene", "prepare", str(raw), "--out", str(tmp_path / "scene"), "--lens", "pinhole", "--quiet"]
+    assert run_command([*command, "--test", "test"]) == 0
+    scene, truth = open_source(str(tmp_path / "scene")).info, open_source(WORLD).info
+    assert scene.train.ids == truth.train.ids
+    assert scene.test.ids == ("test",)
+    # Up to a similarity: distances of the centres keep their ratios, the test camera's included.
+    def gaps(info):
+        centers = np.concatenate([info.train.centers, info.test.centers])
+        every = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+        return every / every.max()
+
+    assert np.abs(gaps(scene) - gaps(truth)).max() < 0.02
+    report = (tmp_path / "scene" / "report.md").read_text()
+    assert "7 of 7 placed, 1 of them for testing only; recovered poses" in report
+    assert (tmp_path / "scene" / "scene.png").stat().st_size > 5000
+    for path in (raw / "test").iterdir():
+        save(path, np.full((180, 240, 3), 0.5))
+    made = prepare(raw, tmp_path / "blind", PrepareOptions(test=("test",), model="PINHOLE", frames=1), quiet)
+    assert made.left_out == ("test",)
+    assert made.rig.viewmats.tobytes() == scene.train.viewmats.tobytes()
+
+
+@pytest.mark.sfm
+@needs_pycolmap
+def test_known_poses_are_kept_and_points_triangulated(tmp_path: Path) -> None:
+    raw, rig = raw_pictures(tmp_path / "raw"), open_source(WORLD).info
+    cameras = [
+        {"id": name, "split": split, "width": 240, "height": 180, "K": K.tolist(), "w2c": w2c.tolist(),
+         "frames": f"{name}/shot%d.png"}
+        for split, part in (("train", rig.train), ("test", rig.test))
+        for name, K, w2c in zip(part.ids, part.Ks, part.viewmats, strict=True)
+    ]  # fmt: skip
+    data = {"schema": "opencv-multiview-1", "name": "raw", "fps": 25, "frames": 2, "cameras": cameras}
+    (raw / "cameras.json").write_text(json.dumps(data))
+    made = prepare(raw, tmp_path / "scene", PrepareOptions(), quiet)
+    scene = open_source(str(tmp_path / "scene"))
+    assert scene.info.fps == 25
+    assert scene.info.test.ids == ("test",)
+    assert np.array_equal(scene.info.train.viewmats, rig.train.viewmats)
+    assert np.array_equal(scene.frame(1).images, open_source(WORLD).frame(1).images), "a pinhole's pictures are copied"
+    points = scene.points()
+    assert points is not None
+    assert len(points) == len(made.points) > 50
+    assert ((points.xyz >= made.bounds[0]) & (points.xyz <= made.bounds[1])).all()
+    assert np.nanmax(made.mapping.camera_error) < 1
+
+
+@pytest.mark.sfm
+@needs_pycolmap
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
+def test_undistorted_pixels_come_from_where_the_lens_shows_them(model: str) -> None:
+    from gsstream.init.mapping import Lens
+    from gsstream.scene.undistort import undistortion
+
+    lens = Lens(model, (90.0, 95.0, 62.0, 47.0, -0.12, 0.02, 0.003, -0.002))
+    made = undistortion(lens, (120, 90), (120, 90))
+    x = (np.arange(120) + 0.5 - made.K[0, 2]) / made.K[0, 0]
+    y = (np.arange(90) + 0.5 - made.K[1, 2]) / made.K[1, 1]
+    x, y = np.meshgrid(x, y)
+    k1, k2, p1, p2 = lens.params[4:]
+    r2 = x**2 + y**2
+    if model == "OPENCV":  # Brown's model, as in the documentation of OpenCV
+        radial = 1 + k1 * r2 + k2 * r2**2
+        u, v = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2), y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+    else:  # Kannala and Brandt: the four coefficients belong to powers of the angle
+        r = np.sqrt(r2)
+        angle = np.arctan(r)
+        bent = angle * (1 + k1 * angle**2 + k2 * angle**4 + p1 * angle**6 + p2 * angle**8) / r
+        u, v = x * bent, y * bent
+    expected = np.stack([90 * u + 62, 95 * v + 47], axis=-1)
+    assert np.abs(made.places - expected).max() < 1e-6
+    assert (made.places >= 0).all()
+    assert (made.places <= (120, 90)).all()
+    ramp = np.stack(np.meshgrid(np.arange(120) + 0.5, np.arange(90) + 0.5), axis=-1) / 120
+    image = np.concatenate([ramp, ramp[..., :1]], axis=-1).astype(np.float32)
+    inner = (slice(2, -2), slice(2, -2), slice(2))
+    assert np.abs(made.apply(image)[inner] - made.places[2:-2, 2:-2] / 120).max() < 1e-4
+
+
+def test_what_cannot_be_prepared_is_said(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="no such folder"):
+        find_cameras(tmp_path / "nowhere")
+    (tmp_path / "raw").mkdir()
+    save(tmp_path / "raw" / "only.png", np.zeros((8, 8, 3)))
+    with pytest.raises(SourceError, match="cameras found: 1; expected at least two"):
+        find_cameras(tmp_path / "raw")
+    save(tmp_path / "raw" / "other.png", np.zeros((8, 9, 3)))
+    with pytest.raises(InputError, match=r"differ in size \(8 x 8, 9 x 8\)"):
+        prepare(tmp_path / "raw", tmp_path / "scene", PrepareOptions(), quiet)
+    with pytest.raises(InputError, match="--test: no camera 'anything'"):
+        prepare(tmp_path / "raw", tmp_path / "scene", PrepareOptions(test=("anything",)), quiet)
+    with pytest.raises(InputError, match="not an empty folder"):
+        prepare(tmp_path / "raw", tmp_path / "raw", PrepareOptions(), quiet)

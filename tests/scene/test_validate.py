@@ -1,0 +1,79 @@
+"""Every bad scene gives one clear message; good ones give none."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+
+from gsstream.cli.main import run_command
+from gsstream.scene.findings import CHECKS
+from gsstream.scene.validate import validate
+from gsstream.source.open import open_source
+from tests.scene.bad_scenes import BAD, MESSAGES, BadScene, findings, said, spoiled, without_numbers, write_good
+
+needs_pycolmap = pytest.mark.skipif(importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed")
+RECORDINGS = Path(__file__).parents[3] / "shared" / "data"
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes") / "good"
+    write_good(folder)
+    return folder
+
+
+def one_message(good: Path, folder: Path, bad: BadScene) -> None:
+    folder = spoiled(good, folder / "scene", bad)
+    found = findings(folder)
+    assert [finding.code for finding in found] == [bad.code]
+    got = [f"{finding.severity}: {said(folder, finding)}" for finding in found]
+    expected = json.loads(MESSAGES.read_text())[bad.name]
+    assert list(map(without_numbers, got)) == list(map(without_numbers, expected))
+
+
+@pytest.mark.parametrize("bad", [bad for bad in BAD if bad.code != "epipolar"], ids=lambda bad: bad.name)
+def test_a_bad_scene_gives_one_message(good: Path, tmp_path: Path, bad: BadScene) -> None:
+    one_message(good, tmp_path, bad)
+
+
+@pytest.mark.sfm
+@needs_pycolmap
+@pytest.mark.parametrize("bad", [bad for bad in BAD if bad.code == "epipolar"], ids=lambda bad: bad.name)
+def test_a_calibration_that_the_pictures_contradict_gives_one_message(
+    good: Path, tmp_path: Path, bad: BadScene
+) -> None:
+    one_message(good, tmp_path, bad)
+
+
+def test_every_check_has_a_bad_scene_and_every_message_its_scene() -> None:
+    assert {bad.code for bad in BAD} == set(CHECKS)
+    assert list(json.loads(MESSAGES.read_text())) == [bad.name for bad in BAD]
+    assert len(BAD) >= 20
+
+
+@pytest.mark.sfm
+@needs_pycolmap
+def test_the_good_scene_and_the_demo_are_fine(good: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["scene", "validate", str(good)]) == 0
+    assert run_command(["scene", "validate", "demo", "--no-features"]) == 0
+    assert capsys.readouterr().out == f"{good}: fine ({len(CHECKS)} checks)\ndemo: fine ({len(CHECKS) - 1} checks)\n"
+
+
+def test_the_command_fails_on_a_bad_scene(good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bad = next(bad for bad in BAD if bad.name == "black")
+    folder = spoiled(good, tmp_path / "scene", bad)
+    assert run_command(["scene", "validate", str(folder), "--no-features"]) == 2
+    out = capsys.readouterr().out
+    assert "error: [blank] camera 'cam03' is black (mean 0.00, no structure); take it out" in out
+    assert "1 error;" in out
+
+
+@pytest.mark.parametrize("name", ["panoptic_basketball_30", "pickblocks_captured_320", "pickblocks_mujoco_320"])
+def test_recordings_at_hand_raise_no_alarm(name: str) -> None:
+    if not (RECORDINGS / name).is_dir():
+        pytest.skip(f"the recording {name} is not here")
+    found = validate(lambda scale: open_source(str(RECORDINGS / name), scale), frames=10, features=False)
+    assert [finding for finding in found if finding.severity != "note"] == []

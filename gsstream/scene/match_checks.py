@@ -131,16 +131,17 @@ def _each(cameras: Cameras, pairs: list[PairMatches], bad: list[int], limit: flo
     found = []
     for c in sorted(bad):
         inner, outer, middle = _by_radius(cameras, pairs, c)
-        cause = "its pose or K is wrong: calibrate it again"
+        text = (
+            f"matches lie {middle:.1f} pixels off their epipolar lines, expected at most {limit:.1f}; its pose or K is "
+            "wrong: calibrate it again"
+        )
         if outer > 3 * inner and inner < limit:
-            cause = (
-                f"{inner:.1f} in the middle of the image and {outer:.1f} towards its corners, as of a lens whose "
-                "distortion was not removed: undistort its images (gsstream scene prepare)"
+            text = (
+                f"matches lie {inner:.1f} pixels off their epipolar lines in the middle of the image and {outer:.1f} "
+                "towards its corners, as of a lens whose distortion was not removed: undistort its images (gsstream scene "
+                "prepare)"
             )
-        found.append(error("epipolar", (
-            f"camera {cameras.ids[c]!r}: matches lie {middle:.1f} pixels off their epipolar lines, expected at most "
-            f"{limit:.1f}; {cause}"
-        )))  # fmt: skip
+        found.append(error("epipolar", f"camera {cameras.ids[c]!r}: {text}"))
     return found
 
 

@@ -19,8 +19,8 @@ class OnnxConfidence(ConfidenceEstimator):
     """p = mean over the views that see a Gaussian's centre of the network's change there; z = logit p (ours).
 
     A flow of f pixels counts as a change of 1 - exp(-|f| / ``pixels``). Views whose two images are the same bits are
-    not shown to the network and count as unchanged. The mean is a vote: a wall behind a moving hand is in changed pixels in
-    some views only. Occlusion is not considered.
+    not shown to the network and count as unchanged. The mean is a vote: a wall behind a moving hand is in
+    changed pixels in some views only. Occlusion is not considered.
     """
 
     class Config(PartConfig):

@@ -178,11 +178,12 @@ def reconstruct(folder: Path) -> None:
 def _map(folder: Path, database: Path, names: list[str]) -> Any:
     """The mapping with most images, then least error, over a few settings: stock ones fail on few small images."""
     best, rank = None, (0, 0.0)
-    for attempt, (inliers, angle) in enumerate(((100, 16.0), (40, 8.0))):
+    for attempt, (inliers, angle, least) in enumerate(((100, 16.0, 30), (40, 8.0, 15))):
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads, options.random_seed, options.min_model_size = 1, 0, 2
         options.image_names = names
         options.mapper.init_min_num_inliers, options.mapper.init_min_tri_angle = inliers, angle
+        options.mapper.abs_pose_min_num_inliers = least
         sparse = folder / f"sparse{attempt}"
         sparse.mkdir()
         for made in pycolmap.incremental_mapping(database, folder / IMAGES, sparse, options=options).values():

@@ -138,8 +138,8 @@ def _each(cameras: Cameras, pairs: list[PairMatches], bad: list[int], limit: flo
         if outer > 3 * inner and inner < limit:
             text = (
                 f"matches lie {inner:.1f} pixels off their epipolar lines in the middle of the image and {outer:.1f} "
-                "towards its corners, as of a lens whose distortion was not removed: undistort its images (gsstream scene "
-                "prepare)"
+                "towards its corners, as of a lens whose distortion was not removed: undistort its images "
+                "(gsstream scene prepare)"
             )
         found.append(error("epipolar", f"camera {cameras.ids[c]!r}: {text}"))
     return found

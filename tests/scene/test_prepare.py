@@ -17,12 +17,14 @@ from gsstream.source.open import open_source
 from tests.scene.bad_scenes import save
 
 needs_pycolmap = pytest.mark.skipif(importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed")
+#: Structure from motion needs neighbours that are not far apart, and pixels.
+LARGE = "synthetic:width=320&height=240&views=10&frames=1&static=true"
 WORLD = "synthetic:width=240&height=180&views=6&frames=2&supersample=1&motion=4"
 
 
-def raw_pictures(folder: Path, frames: int = 2) -> Path:
+def raw_pictures(folder: Path, frames: int = 2, world: str = WORLD) -> Path:
     """A folder of pictures per camera; the test camera of the world is called "test"."""
-    source = open_source(WORLD)
+    source = open_source(world)
     for split in ("train", "test"):
         for t in range(frames):
             frame = source.frame(t, split)
@@ -39,10 +41,10 @@ def quiet(_: str) -> None:
 @pytest.mark.sfm
 @needs_pycolmap
 def test_unknown_poses_are_recovered_and_the_test_camera_changes_nothing(tmp_path: Path) -> None:
-    raw = raw_pictures(tmp_path / "raw")
+    raw = raw_pictures(tmp_path / "raw", 1, LARGE)
     command = ["scene", "prepare", str(raw), "--out", str(tmp_path / "scene"), "--lens", "pinhole", "--quiet"]
     assert run_command([*command, "--test", "test"]) == 0
-    scene, truth = open_source(str(tmp_path / "scene")).info, open_source(WORLD).info
+    scene, truth = open_source(str(tmp_path / "scene")).info, open_source(LARGE).info
     assert scene.train.ids == truth.train.ids
     assert scene.test.ids == ("test",)
     # Up to a similarity: distances of the centres keep their ratios, the test camera's included.
@@ -53,10 +55,10 @@ def test_unknown_poses_are_recovered_and_the_test_camera_changes_nothing(tmp_pat
 
     assert np.abs(gaps(scene) - gaps(truth)).max() < 0.02
     report = (tmp_path / "scene" / "report.md").read_text()
-    assert "7 of 7 placed, 1 of them for testing only; recovered poses" in report
+    assert "11 of 11 placed, 1 of them for testing only; recovered poses" in report
     assert (tmp_path / "scene" / "scene.png").stat().st_size > 5000
     for path in (raw / "test").iterdir():
-        save(path, np.full((180, 240, 3), 0.5))
+        save(path, np.full((240, 320, 3), 0.5))
     made = prepare(raw, tmp_path / "blind", PrepareOptions(test=("test",), model="PINHOLE", frames=1), quiet)
     assert made.left_out == ("test",)
     assert made.rig.viewmats.tobytes() == scene.train.viewmats.tobytes()

@@ -29,7 +29,7 @@ from gsstream.engine.progress import RunProgress
 from gsstream.engine.resume import resume_state
 from gsstream.engine.whole import WholeTools, begin_whole, resume_whole, step_whole
 from gsstream.method.base import MethodState, Step
-from gsstream.metrics import peak_memory_mb
+from gsstream.metrics import EnergyMeter, peak_memory_mb
 from gsstream.packet import PlayerState, StreamMeta, StreamWriter
 from gsstream.recipe.save import save_resolved
 from gsstream.source.base import FrameSource, GrowingSource, SourceInfo
@@ -56,6 +56,7 @@ def run(
     quiet: bool = False,
     measure: bool = True,
     first_frame: PlayerState | None = None,
+    energy: EnergyMeter | None = None,
 ) -> RunResult:
     """Encode a recording into ``out`` (stream.gss, metrics.jsonl, recipe.yaml).
 
@@ -66,9 +67,10 @@ def run(
         measure: render and compare the test cameras of every frame.
         first_frame: frame 0 of another stream (``engine.recording.read_first_frame``), taken over instead of being
             reconstructed again.
+        energy: counters to read around every frame; their joules stand in its metrics.
     """
     with _one_torch_thread():
-        return _Run(parts, source, out, quiet, measure, first_frame).encode(resume)
+        return _Run(parts, source, out, quiet, measure, first_frame, energy).encode(resume)
 
 
 class _Run:
@@ -76,9 +78,10 @@ class _Run:
 
     def __init__(
         self, parts: Assembly, source: FrameSource, out: Path, quiet: bool, measure: bool,
-        first_frame: PlayerState | None,
+        first_frame: PlayerState | None, energy: EnergyMeter | None,
     ) -> None:  # fmt: skip
         self.parts, self.source, self.out, self.first_frame = parts, source, out, first_frame
+        self.energy = energy
         self.rng = Rng(parts.recipe.seed)
         self.near = parts.recipe.near * source.info.train.extent
         self.total = _num_frames(source.info, parts.recipe.frames)
@@ -112,6 +115,7 @@ class _Run:
 
     def _advance(self, writer: StreamWriter, state: Any, train: Frame, test: Frame, waited: float) -> Any:
         train.validate()
+        joules = self.energy.read() if self.energy else {}
         started, worked = time.perf_counter(), time.process_time()
         step = self._first(train) if state is None else self._next(state, train)
         if self.parts.whole is None:
@@ -119,6 +123,8 @@ class _Run:
         writer.append(step.packet)
         total, cpu = time.perf_counter() - started, time.process_time() - worked
         metrics = {**self._metrics(step, train.index, test, total, waited), "cpu_seconds": cpu}
+        if self.energy and joules:
+            metrics["joules"] = {name: value - joules[name] for name, value in self.energy.read().items()}
         with (self.out / METRICS).open("a", encoding="utf-8") as log:
             log.write(json.dumps(metrics) + "\n")
         self.progress.frame(metrics)

@@ -108,10 +108,11 @@ class _Drive:
 
     def _job(self, task: Cell | FirstFrameRun) -> Job:
         uri, work = recording_uri(task.scene.uri, self.data), str((self.out / WORK).resolve())
+        alone = self.executor.slots == 1
         if isinstance(task, FirstFrameRun):
-            return Job(task.id, uri, task.resolved, work=work)
+            return Job(task.id, uri, task.resolved, work=work, alone=alone)
         first = first_frame_file(self.out, task.first).read_bytes() if task.first else None
-        return Job(task.id, uri, task.resolved, first, self.plan.config.measure, work)
+        return Job(task.id, uri, task.resolved, first, self.plan.config.measure, work, alone)
 
     def _after_first_frame(
         self, task: FirstFrameRun, finished: Finished, waiting: list[Cell | FirstFrameRun]

@@ -40,6 +40,7 @@ class Job:
         first_frame: bytes of a stream whose frame 0 is taken over, or None.
         measure: what to measure; None for a frame 0 that is only to be shared.
         work: folder for temporary files, or None for the system's.
+        alone: whether no other cell runs beside it, so that the machine's energy is its own.
     """
 
     id: str
@@ -48,6 +49,7 @@ class Job:
     first_frame: bytes | None = None
     measure: Measure | None = None
     work: str | None = None
+    alone: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +88,7 @@ def _run(job: Job, folder: Path) -> Outcome:
     from gsstream.engine.assemble import assemble
     from gsstream.engine.recording import open_recording, read_first_frame
     from gsstream.engine.session import METRICS, STREAM, run
+    from gsstream.metrics import EnergyMeter
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import recipe_hash
 
@@ -99,7 +102,8 @@ def _run(job: Job, folder: Path) -> Outcome:
     import gsstream.trade.sweep.warm  # noqa: F401  # what torch imports late is not part of any frame's time
 
     try:
-        result = run(parts, recording, folder, quiet=True, measure=False, first_frame=first)
+        with EnergyMeter() if job.alone else contextlib.nullcontext() as energy:
+            result = run(parts, recording, folder, quiet=True, measure=False, first_frame=first, energy=energy)
         if result.interrupted:
             raise InterruptedError("the run was interrupted; the sweep's next start makes this cell again")
         lines = (folder / METRICS).read_text(encoding="utf-8").splitlines()

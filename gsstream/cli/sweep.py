@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 def sweep(
     config: Annotated[Path, typer.Argument(help="YAML file that describes the sweep (docs/howto/sweep.md).")],
     out: Annotated[Path, typer.Option("--out", help="Folder of the table and streams; a sweep there is continued.")],
+    scenes: Annotated[
+        Path | None, typer.Option("--scenes", help="YAML file with 'scenes' that take the place of the sweep's own.")
+    ] = None,
     data: Annotated[
         Path | None, typer.Option("--data", help="Folder of the recordings that the file names by relative paths.")
     ] = None,
@@ -40,7 +43,7 @@ def sweep(
     from gsstream.trade.sweep.config import read_sweep
     from gsstream.trade.sweep.plan import make_plan
 
-    plan = make_plan(read_sweep(config), config.parent, load_catalog().recipe_path)
+    plan = make_plan(read_sweep(config, scenes), config.parent, load_catalog().recipe_path)
     if dry_run:
         typer.echo(_describe(plan, out))
         return

@@ -46,7 +46,9 @@ OPTIONS = {
     "gsstream export": ["STREAM", "--out", "--format", "--frames"],
     "gsstream manifest": ["STREAM", "--out"],
     "gsstream view": ["STREAM", "--port", "--host"],
-    "gsstream sweep": ["CONFIG", "--out", "--data", "--workers", "--threads", "--ray", "--dry-run", "--quiet"],
+    "gsstream sweep": [
+        "CONFIG", "--out", "--scenes", "--data", "--workers", "--threads", "--ray", "--dry-run", "--quiet",
+    ],
     "gsstream report": ["FOLDER", "--out", "--data", "--sheets"],
     "gsstream check": ["NAME", "--quiet"],
     "gsstream new-plugin": ["NAME", "--kind", "--out"],

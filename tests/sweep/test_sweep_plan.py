@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from sweep_works import TWO_SEEDS
 
 from gsstream.core.errors import RecipeError, UnknownName
-from gsstream.trade.sweep.config import Range, SweepConfig, flat_settings
-from gsstream.trade.sweep.plan import combinations
+from gsstream.plugins.catalog import load_catalog
+from gsstream.trade.sweep.config import Range, SweepConfig, flat_settings, read_sweep
+from gsstream.trade.sweep.plan import combinations, make_plan
 
 SCENE = 'scenes: [{name: a, uri: demo}]\n'
 
@@ -162,3 +165,24 @@ def test_an_unknown_method_is_named(plan_of):
 
 def test_settings_flatten():
     assert flat_settings({"a.b": 1, "c": {"d.e": {"f": [1]}}}, "x") == {("a", "b"): 1, ("c", "d", "e", "f"): [1]}
+
+
+ROOT = Path(__file__).parents[2] / "configs"
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "sweeps").rglob("*.yaml")), ids=lambda p: p.stem)
+def test_the_sweeps_that_ship_are_sound(path):
+    """Their keys, methods and files exist; a sweep of a table has a variant for each row that is ours to run."""
+    from gsstream.trade.report.paper import paper_table
+
+    config = read_sweep(path)
+    plan = make_plan(config, path.parent, load_catalog().recipe_path)
+    assert len(plan.cells) == len(plan.points), "two points of a table are the same run"
+    if config.paper_table:
+        rows, names = set(paper_table(config.paper_table).rows), {variant.name for variant in config.variants}
+        theirs = {"queen-l", "queen-s", "hicom", "3dgstream", "4dgc", "streamstgs", "recon-gs", "hierarchy"}
+        assert rows - theirs <= names
+    moved = read_sweep(path, ROOT / "scenes" / "at_hand.yaml")
+    assert [scene.name for scene in moved.scenes] == ["pickblocks", "basketball"]
+    first = make_plan(moved, path.parent, load_catalog().recipe_path).points[0]
+    assert first.resolved.recipe.first_frame.points == "sparse", "the scene's own recipe came along"

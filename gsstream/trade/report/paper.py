@@ -42,7 +42,8 @@ def paper_table(name: str) -> PaperTable:
         str(row): {key: math.nan if v is None else float(v) for key, v in zip(columns, values, strict=True)}
         for row, values in table["rows"].items()
     }
-    return PaperTable(name, table["title"], table["data"], content["machine"], content["source"], columns, rows)
+    machine = table.get("machine", content["machine"])
+    return PaperTable(name, table["title"], table["data"], machine, content["source"], columns, rows)
 
 
 def beside_ours(table: PaperTable, groups: Sequence[Group], scene: str) -> Table:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from gsstream.core.errors import RecipeError
-from gsstream.recipe.check import join_problems, validate
+from gsstream.recipe.check import Model, join_problems, validate
 from gsstream.recipe.document import Empty, Origin, read_file
 
 SCHEMA_VERSION = "1.0"
@@ -148,8 +149,30 @@ class SweepConfig(Section):
         return self
 
 
-def read_sweep(path: Path) -> SweepConfig:
-    """Read a sweep's YAML file. Raises RecipeError with file and line of every problem."""
+class SceneList(Section):
+    """A file of recordings that any sweep can run on."""
+
+    scenes: list[Scene] = Field(min_length=1, description="recordings")
+
+
+def read_sweep(path: Path, scenes: Path | None = None) -> SweepConfig:
+    """Read a sweep's YAML file; ``scenes``: a file whose recordings take the place of the sweep's.
+
+    Raises RecipeError with file and line of every problem.
+    """
+    config = _read(path, SweepConfig)
+    if scenes is None:
+        return config
+    found = [
+        scene.model_copy(update={"recipe": os.path.relpath(scenes.parent / scene.recipe, path.parent)})
+        if scene.recipe
+        else scene
+        for scene in _read(scenes, SceneList).scenes
+    ]
+    return SweepConfig.model_validate({**config.model_dump(), "scenes": [scene.model_dump() for scene in found]})
+
+
+def _read(path: Path, model: type[Model]) -> Model:
     layer = read_file(path)
     values: dict[str, Any] = {}
     for keys, leaf in layer.leaves.items():
@@ -165,8 +188,8 @@ def read_sweep(path: Path) -> SweepConfig:
         return Origin(str(path), str(path))
 
     problems: list[str] = []
-    config = validate(SweepConfig, values, origin, (), problems)
-    join_problems(problems, "the sweep")
+    config = validate(model, values, origin, (), problems)
+    join_problems(problems, str(path))
     assert config is not None, "an invalid sweep leaves at least one problem"
     return config
 

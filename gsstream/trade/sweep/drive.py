@@ -214,8 +214,9 @@ def _seconds(outcome: Outcome) -> float:
 
 def recording_uri(uri: str, data: Path | None) -> str:
     """The recording as a worker opens it, wherever it works: a relative folder lies in ``data``, or here."""
-    folder = (data or Path()) / uri
-    return str(folder.resolve()) if uri != "demo" and folder.is_dir() else uri
+    scheme, colon, rest = uri.rpartition(":")
+    folder = (data or Path()) / rest
+    return f"{scheme}{colon}{folder.resolve()}" if uri != "demo" and rest and folder.is_dir() else uri
 
 
 @contextmanager

@@ -176,13 +176,20 @@ def test_the_sweeps_that_ship_are_sound(path):
     from gsstream.trade.report.paper import paper_table
 
     config = read_sweep(path)
-    plan = make_plan(config, path.parent, load_catalog().recipe_path)
+    short = config.model_copy(update={"seeds": config.seeds[:1], "scenes": config.scenes[:1]})
+    plan = make_plan(short, path.parent, load_catalog().recipe_path)
     assert len(plan.cells) == len(plan.points), "two points of a table are the same run"
     if config.paper_table:
         rows, names = set(paper_table(config.paper_table).rows), {variant.name for variant in config.variants}
         theirs = {"queen-l", "queen-s", "hicom", "3dgstream", "4dgc", "streamstgs", "recon-gs", "hierarchy"}
         assert rows - theirs <= names
+
+
+def test_scenes_from_a_file_bring_their_recipes_along():
+    path = ROOT / "sweeps" / "paper" / "discretisation.yaml"
     moved = read_sweep(path, ROOT / "scenes" / "at_hand.yaml")
     assert [scene.name for scene in moved.scenes] == ["pickblocks", "basketball"]
-    first = make_plan(moved, path.parent, load_catalog().recipe_path).points[0]
-    assert first.resolved.recipe.first_frame.points == "sparse", "the scene's own recipe came along"
+    one = moved.model_copy(update={"seeds": [0], "variants": moved.variants[:1]})
+    recipes = [point.resolved.recipe for point in make_plan(one, path.parent, load_catalog().recipe_path).points]
+    assert [recipe.first_frame.points for recipe in recipes] == ["sparse", "sweep"]
+    assert [recipe.scale for recipe in recipes] == [1.0, 0.5]

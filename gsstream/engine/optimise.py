@@ -20,7 +20,8 @@ from gsstream.engine.row_table import RowTable
 from gsstream.engine.stopping import Gains, watch
 from gsstream.engine.stream_state import StreamState
 from gsstream.render.base import RenderSession
-from gsstream.residual.base import add_changes, decode_changes, init_latents, pull_back
+from gsstream.residual.base import init_latents
+from gsstream.residual.joint import JointCode, add_joint, decode_joint, join_features, joint_code, pull_back_joint
 from gsstream.residual.rate import rate_gradients
 
 #: Leaving costs a freeze of every view: at least a tenth of the rows must go.
@@ -113,9 +114,13 @@ class _FrameRun:
         with self._guarded("update", parts.update):
             codes = parts.update.codes()
         latents = init_latents(parts.update, problem.base)
-        self.latents = RowTable(latents, {name: codes[name].lr for name in latents}, parts.optimiser)
-        decoders = {name: state.decoders[name] for name in latents if name in state.decoders}
-        self.decoders = RowTable(decoders, {name: codes[name].decoder_lr for name in decoders}, parts.optimiser)
+        self.decoder_names = {name: state.decoders[name] for name in latents if name in state.decoders}
+        self.code = code = joint_code(codes, latents, self.decoder_names, problem.base)
+        self.features = join_features(code, problem.base)
+        start = torch.zeros(len(problem.base), code.width)
+        self.latents = RowTable({"latents": start}, {"latents": code.lrs}, parts.optimiser)
+        matrix = code.join_decoders(self.decoder_names)
+        self.decoders = RowTable({"matrix": matrix}, {"matrix": code.decoder_lrs}, parts.optimiser)
         rates = {"logits": parts.recipe.gate_training.lr}
         self.gate = RowTable({"logits": problem.gate.logits[nodes]}, rates, parts.optimiser)
         self.gate.load_moments("logits", state.gate_moments)
@@ -135,16 +140,18 @@ class _FrameRun:
         parts, self.iteration = self.parts, iteration
         gate = GateState(self.gate["logits"])
         gates = self._row_gates(gate, fraction)
-        with torch.no_grad():
-            changes = decode_changes(parts.update, self.latents.leaves, self.decoders.leaves)
-            rows = add_changes(self.base, changes, gates.detach(), self.units)
+        latents, matrix = self.latents["latents"].detach(), self.decoders["matrix"].detach()
+        change = decode_joint(self.code, latents, matrix, self.units)
+        shut = gates.detach()
+        rows = add_joint(self.code, self.base, self.features, change, shut)
         rows = rows.map(lambda value: value.detach().requires_grad_())
         loss = self._render(view, rows)
-        back = pull_back(rows.map(_gradient), changes, self.decoders.leaves, gates.detach(), self.units)
-        add_rate(parts, self.latents.leaves, gates, back.latents, self.problem.frame)
+        upstream = join_features(self.code, rows.map(_gradient))
+        back = pull_back_joint(self.code, upstream, change, matrix, shut, self.units)
+        add_rate(parts, self.code, latents, shut, back.latents, self.problem.frame)
         self._step_gates(gate, gates, back.gates, learning=fraction >= parts.recipe.gate_training.warmup)
-        self.latents.step(back.latents)
-        self.decoders.step(back.decoders)
+        self.latents.step({"latents": back.latents})
+        self.decoders.step({"matrix": back.matrix})
         return loss
 
     def _render(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
@@ -187,9 +194,9 @@ class _FrameRun:
         return per_row
 
     def _penalty(self, gate: GateState) -> Mapping[str, torch.Tensor]:
-        means = self.latents.leaves.get("means")
+        columns = self.code.latent.get("means")
         # The motion term also pulls on the residual itself; that gradient waits on the leaf for the latents' step.
-        residual = torch.zeros(len(self.base), 3) if means is None else means
+        residual = torch.zeros(len(self.base), 3) if columns is None else self.latents["latents"][:, columns]
         with self._guarded("gate", self.parts.gate):
             probability = self.parts.gate.open_probability(gate)
         total, regularizer = self.problem.state.hierarchy.num_gaussians, self.parts.regularizer
@@ -220,7 +227,7 @@ class _FrameRun:
         self.hierarchy = Hierarchy(node_of, torch.arange(len(nodes)), torch.zeros_like(nodes))
         self.gate.keep(nodes)
         self.latents.keep(rows)
-        self.active, self.base = self.active[rows], self.base.rows(rows)
+        self.active, self.base, self.features = self.active[rows], self.base.rows(rows), self.features[rows]
         self.units, self.levels = self.units[rows], self.levels[rows]
         with self._guarded("renderer", self.parts.renderer):
             self.session.narrow(self.active)
@@ -233,8 +240,8 @@ class _FrameRun:
         moments = self.gate.moments("logits") if self.parts.recipe.gate_training.optimiser == "persistent" else {}
         return Solution(
             active=self.active,
-            latents={name: leaf.detach() for name, leaf in self.latents.leaves.items()},
-            decoders={name: leaf.detach() for name, leaf in self.decoders.leaves.items()},
+            latents=self.code.split(self.latents["latents"].detach()),
+            decoders=self.code.split_decoders(self.decoders["matrix"].detach(), self.decoder_names),
             gate=GateState(self._all_logits()),
             gate_moments=moments,
             loss=loss,
@@ -243,14 +250,14 @@ class _FrameRun:
 
 
 def add_rate(
-    parts: Assembly, latents: Mapping[str, torch.Tensor], gates: torch.Tensor, gradients: dict[str, torch.Tensor],
-    frame: Frame,
-) -> None:  # fmt: skip
+    parts: Assembly, code: JointCode, latents: torch.Tensor, gates: torch.Tensor, gradients: torch.Tensor, frame: Frame
+) -> None:
     """Add the gradient of what the residual will cost, when the recipe asks for it."""
     if parts.recipe.stream.rate_weight > 0:
         weight = parts.recipe.stream.rate_weight / (frame.cameras.width * frame.cameras.height)
-        for name, value in rate_gradients(parts.update, latents, gates, weight).items():
-            gradients[name] += value
+        found = rate_gradients(parts.update, code.split(latents), gates, weight)
+        for name, value in found.items():
+            gradients[:, code.latent[name]] += value
 
 
 def _gradient(value: torch.Tensor) -> torch.Tensor:

@@ -13,7 +13,7 @@ class RowTable:
     """Named leaves [n, ...], one learning rate each, moved by a :class:`RowOptimiser`."""
 
     def __init__(
-        self, values: Mapping[str, torch.Tensor], lrs: Mapping[str, float], optimiser: RowOptimiser
+        self, values: Mapping[str, torch.Tensor], lrs: Mapping[str, float | torch.Tensor], optimiser: RowOptimiser
     ) -> None:
         self.leaves = {name: value.detach().clone().requires_grad_() for name, value in values.items()}
         self._lrs, self._optimiser = dict(lrs), optimiser

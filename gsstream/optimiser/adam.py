@@ -20,7 +20,7 @@ class ReferenceAdam(RowOptimiser):
         values: Mapping[str, torch.Tensor],
         gradients: Mapping[str, torch.Tensor],
         states: Mapping[str, AdamState],
-        lrs: Mapping[str, float],
+        lrs: Mapping[str, float | torch.Tensor],
     ) -> None:
         for name, gradient in gradients.items():
             value, state = values[name].detach(), states[name]

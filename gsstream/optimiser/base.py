@@ -46,14 +46,15 @@ class RowOptimiser(Part):
         values: Mapping[str, torch.Tensor],
         gradients: Mapping[str, torch.Tensor],
         states: Mapping[str, AdamState],
-        lrs: Mapping[str, float],
+        lrs: Mapping[str, float | torch.Tensor],
     ) -> None:
         """One update of every named table that has a gradient. Changes ``values`` and ``states`` in place.
 
         Arguments:
             values: name -> [n, ...] float32, contiguous; leaves of a graph are allowed.
             gradients: like the table each; names that are missing are not moved and count no step.
-            states: their moments. lrs: their learning rates, >= 0.
+            states: their moments.
+            lrs: their learning rates, >= 0: one number, [d] by column of [n, d], or [n, 1] by row.
 
         Raises:
             ShapeError: shapes that differ, a gradient that is not finite (that table is not changed then).

@@ -123,39 +123,6 @@ def apply_residual(
     return add_changes(base, decode_changes(rule, latents, decoders), gates, units)
 
 
-class Pullback(NamedTuple):
-    """Gradients of latents and decoders by attribute, and of the gates [A]."""
-
-    latents: dict[str, torch.Tensor]
-    decoders: dict[str, torch.Tensor]
-    gates: torch.Tensor
-
-
-def pull_back(
-    upstream: Gaussians[torch.Tensor],
-    changes: Mapping[str, Change],
-    decoders: Mapping[str, torch.Tensor],
-    gates: torch.Tensor,
-    units: torch.Tensor,
-) -> Pullback:
-    """The gradient of :func:`apply_residual`, written out: the map is bilinear, and a graph of forty small nodes per
-    iteration costs more than its arithmetic. ``upstream`` [A] are gradients of the changed attributes.
-    """
-    by_latent, by_decoder = {}, {}
-    by_gate = torch.zeros_like(gates)
-    for name, change in changes.items():
-        gradient = getattr(upstream, name).reshape(change.decoded.shape)
-        if name == "means":
-            gradient = gradient * units[:, None]
-        by_gate += (gradient * change.decoded).sum(1)
-        gradient = gradient * gates[:, None]
-        if name in decoders:
-            by_decoder[name] = change.latents.T @ gradient
-            gradient = gradient @ decoders[name].T
-        by_latent[name] = gradient
-    return Pullback(by_latent, by_decoder, by_gate)
-
-
 def symbols(rule: UpdateRule, latents: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """[A, L] int32 symbols that the packet carries."""
     codes = rule.codes()

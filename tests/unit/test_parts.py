@@ -33,6 +33,7 @@ from gsstream.regularizer.none import NoRegularizer
 from gsstream.render.reference import ReferenceRenderer
 from gsstream.residual.additive import Additive, DirectCode
 from gsstream.residual.base import AttributeCode, UpdateRule, apply_residual, init_latents, quantise, symbols
+from gsstream.residual.joint import add_joint, decode_joint, join_features, joint_code, pull_back_joint
 from gsstream.structure.flat import Flat
 
 PARTS = [Flat, Uniform, GroupMax, AlwaysOpen, NoRegularizer, Additive, ReferenceRenderer]
@@ -301,9 +302,7 @@ def test_every_input_of_the_residual_feels_the_loss() -> None:
 
 
 def test_written_out_gradient_equals_autograd() -> None:
-    """pull_back is the gradient of apply_residual, with and without decoders, in every argument."""
-    from gsstream.residual.base import decode_changes, pull_back
-
+    """The joint table is apply_residual and its gradient, with and without decoders, in every argument."""
     generator = torch.Generator().manual_seed(3)
 
     def draw(*shape: int) -> torch.Tensor:
@@ -324,10 +323,26 @@ def test_written_out_gradient_equals_autograd() -> None:
     pairs = zip(changed.items(), upstream.items(), strict=True)
     sum((value * weight).sum() for (_, value), (_, weight) in pairs).backward()
     with torch.no_grad():
-        changes = decode_changes(rule, latents, decoders)
-        back = pull_back(upstream, changes, decoders, gates, units)
+        code = joint_code(rule.codes(), latents, decoders, base)
+        joined, matrix = torch.cat(list(latents.values()), 1), code.join_decoders(decoders)
+        change = decode_joint(code, joined, matrix, units)
+        ours = add_joint(code, base, join_features(code, base), change, gates)
+        back = pull_back_joint(code, join_features(code, upstream), change, matrix, gates, units)
+    for (name, value), (_, truth) in zip(ours.items(), changed.items(), strict=True):
+        torch.testing.assert_close(value, truth, msg=name)
     torch.testing.assert_close(back.gates, gates.grad)
+    by_latent, by_decoder = code.split(back.latents), code.split_decoders(back.matrix, decoders)
     for name, latent in latents.items():
-        torch.testing.assert_close(back.latents[name], latent.grad)
+        torch.testing.assert_close(by_latent[name], latent.grad)
     for name, decoder in decoders.items():
-        torch.testing.assert_close(back.decoders[name], decoder.grad)
+        torch.testing.assert_close(by_decoder[name], decoder.grad)
+    # Nothing leaks into the blocks between attributes: there is nothing to train.
+    assert not bool(back.matrix[code.trained == 0].any())
+
+
+def test_joint_table_of_attributes_that_do_not_change() -> None:
+    base = make(4).map(torch.from_numpy)
+    code = joint_code(Additive().codes(), {}, {}, base)
+    change = decode_joint(code, torch.zeros(4, 0), code.join_decoders({}), torch.ones(4))
+    same = add_joint(code, base, join_features(code, base), change, torch.ones(4))
+    assert all(torch.equal(a, b) for (_, a), (_, b) in zip(same.items(), base.items(), strict=True))

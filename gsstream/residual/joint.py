@@ -1,0 +1,145 @@
+"""The residual of all attributes side by side, as one table: a few large operations instead of many small ones (ours).
+
+Latents of all attributes are the columns of one [A, L] table, their decoders the blocks of one [L, D] matrix (identity
+where an attribute has no decoder), what changes the columns of one [A, D] table. The map is that of
+:func:`gsstream.residual.base.apply_residual`, up to rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+
+from gsstream.core.gaussians import Gaussians
+from gsstream.residual.base import AttributeCode
+
+Columns = Mapping[str, slice]
+
+
+@dataclass(frozen=True)
+class JointCode:
+    """Where everything stands.
+
+    Arguments:
+        latent, feature: attribute -> its columns of the latents [A, L] and of the features [A, D].
+        steps: [L] quantisation steps, latent units.
+        lrs: [L] learning rates of the latents. decoder_lrs: [L, 1] those of the decoders, by row; 0: not trained.
+        trained: [L, D] 1 in the blocks of decoders, else 0.
+    """
+
+    latent: Columns
+    feature: Columns
+    steps: torch.Tensor
+    lrs: torch.Tensor
+    decoder_lrs: torch.Tensor
+    trained: torch.Tensor
+
+    @property
+    def width(self) -> int:
+        """L."""
+        return len(self.steps)
+
+    def split(self, latents: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Views of [A, L] by attribute."""
+        return {name: latents[:, columns] for name, columns in self.latent.items()}
+
+    def join_decoders(self, decoders: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """[L, D] of the decoders by attribute; identity for attributes without one."""
+        matrix = torch.zeros_like(self.trained)
+        for name, rows in self.latent.items():
+            block = matrix[rows, self.feature[name]]
+            block.copy_(decoders[name] if name in decoders else torch.eye(len(block)))
+        return matrix
+
+    def split_decoders(self, matrix: torch.Tensor, names: Mapping[str, object]) -> dict[str, torch.Tensor]:
+        """Decoder blocks of the attributes in ``names``."""
+        return {name: matrix[self.latent[name], self.feature[name]].clone() for name in names}
+
+
+def joint_code(
+    codes: Mapping[str, AttributeCode], latents: Mapping[str, torch.Tensor], decoders: Mapping[str, torch.Tensor],
+    base: Gaussians[torch.Tensor],
+) -> JointCode:  # fmt: skip
+    """The columns of attributes in ``latents`` [A, l], in their order."""
+    latent, feature, steps, lrs, decoder_lrs = {}, {}, [], [], []
+    at = wide = 0
+    for name, value in latents.items():
+        code, rows = codes[name], value.shape[1]
+        columns = _width(getattr(base, name))
+        latent[name], feature[name] = slice(at, at + rows), slice(wide, wide + columns)
+        at, wide = at + rows, wide + columns
+        steps += [code.step] * rows
+        lrs += [code.lr] * rows
+        decoder_lrs += [code.decoder_lr if name in decoders else 0.0] * rows
+    kind = base.means.dtype
+    trained = torch.zeros(at, wide, dtype=kind)
+    for name in decoders:
+        trained[latent[name], feature[name]] = 1
+    rates = torch.tensor(decoder_lrs, dtype=kind)[:, None]
+    return JointCode(
+        latent, feature, torch.tensor(steps, dtype=kind), torch.tensor(lrs, dtype=kind), rates, trained
+    )
+
+
+def join_features(code: JointCode, rows: Gaussians[torch.Tensor]) -> torch.Tensor:
+    """[A, D] of the attributes that may change."""
+    parts = [getattr(rows, name).reshape(len(rows), -1) for name in code.feature]
+    return torch.cat(parts, 1) if parts else torch.zeros(len(rows), 0)
+
+
+class JointChange(NamedTuple):
+    """Quantised latents [A, L] and the ungated change of the features [A, D] (positions in scene units)."""
+
+    latents: torch.Tensor
+    decoded: torch.Tensor
+
+
+def decode_joint(code: JointCode, latents: torch.Tensor, matrix: torch.Tensor, units: torch.Tensor) -> JointChange:
+    """Latents [A, L] as the decoder will have them, and what they decode to.
+
+    Arguments:
+        matrix: [L, D] of :meth:`JointCode.join_decoders`. units: [A] cell of each anchor, scene units.
+    """
+    quantised = torch.round(latents / code.steps).mul_(code.steps)
+    decoded = quantised @ matrix
+    if "means" in code.feature:
+        decoded[:, code.feature["means"]] *= units[:, None]
+    return JointChange(quantised, decoded)
+
+
+def add_joint(
+    code: JointCode, base: Gaussians[torch.Tensor], features: torch.Tensor, change: JointChange, gates: torch.Tensor
+) -> Gaussians[torch.Tensor]:
+    """a_t = a_{t-1} + g * change. ``features`` [A, D] are the changing attributes of ``base``."""
+    changed = torch.addcmul(features, change.decoded, gates[:, None])
+    parts = dict(base.items())
+    for name, columns in code.feature.items():
+        parts[name] = changed[:, columns].reshape(parts[name].shape).contiguous()
+    return Gaussians(**parts)
+
+
+class JointPullback(NamedTuple):
+    """Gradients of latents [A, L], decoders [L, D] and gates [A]."""
+
+    latents: torch.Tensor
+    matrix: torch.Tensor
+    gates: torch.Tensor
+
+
+def pull_back_joint(
+    code: JointCode, upstream: torch.Tensor, change: JointChange, matrix: torch.Tensor, gates: torch.Tensor,
+    units: torch.Tensor,
+) -> JointPullback:  # fmt: skip
+    """The gradient of the map, rounding taken as the identity. ``upstream`` [A, D] belongs to the changed features."""
+    by_gate = (upstream * change.decoded).sum(1)
+    gated = upstream * gates[:, None]
+    if "means" in code.feature:
+        gated[:, code.feature["means"]] *= units[:, None]
+    return JointPullback(gated @ matrix.T, (change.latents.T @ gated).mul_(code.trained), by_gate)
+
+
+def _width(value: torch.Tensor) -> int:
+    return int(torch.tensor(value.shape[1:]).prod())

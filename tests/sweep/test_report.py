@@ -15,8 +15,9 @@ from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError, UnknownName
 from gsstream.trade.report.build import build_report
 from gsstream.trade.report.document import Heading, Picture, Table, Text, to_html, to_markdown
+from gsstream.trade.report.figures import measured_costs
 from gsstream.trade.report.fronts import effects, knee, pareto_front
-from gsstream.trade.report.groups import is_tie, read_sweep_data, seed_noise
+from gsstream.trade.report.groups import is_tie, read_sweep_data, seed_noise, waited
 from gsstream.trade.report.paper import beside_ours, paper_table
 from gsstream.trade.report.quantities import BY_KEY
 from gsstream.trade.sweep.drive import summary_line
@@ -26,7 +27,7 @@ FLOATS = st.floats(-100, 100)
 BASE, CHANGED = {}, {"stream.epochs": 9}
 
 
-def make_table(folder: Path, cells, paper=None, failed=()) -> Path:
+def make_table(folder: Path, cells, paper=None, failed=(), cpu=1.0) -> Path:
     """A table of two-frame runs: (scene, variant, axes, seed, dB, KB, s)."""
     folder.mkdir(parents=True)
     writer = TableWriter(folder)
@@ -42,7 +43,7 @@ def make_table(folder: Path, cells, paper=None, failed=()) -> Path:
     for i, (_, _, _, seed, quality, kilobytes, seconds) in enumerate(cells):
         frames = [
             {"frame": t, "bytes": {"layout": 9000} if t == 0 else {"gates": round(1000 * kilobytes)},
-             "seconds": {"code": seconds}, "cpu_seconds": 2 * seconds, "num_gaussians": 10, "active_gaussians": 5,
+             "seconds": {"code": seconds}, "cpu_seconds": cpu * seconds, "num_gaussians": 10, "active_gaussians": 5,
              "num_gates": 4, "active_gates": 2, "peak_memory_mb": 100.0, "psnr": {"x": quality, "y": quality + 2},
              "ssim": {"x": 0.9}, "psnr_moving": {"x": quality - 5 if t else None}}
             for t in range(3)
@@ -99,7 +100,7 @@ def test_groups_have_means_spreads_and_noise(tmp_path):
     assert first.mean("psnr_moving") == pytest.approx(25.1)
     assert first.spread("psnr") == pytest.approx(math.sqrt(0.02))
     assert math.isnan(data.groups[1].spread("psnr"))
-    assert (first.mean("kb"), first.mean("seconds"), first.mean("cpu_seconds")) == (20.0, 1.0, 2.0)
+    assert (first.mean("kb"), first.mean("seconds"), first.mean("cpu_seconds")) == (20.0, 1.0, 1.0)
     assert (first.mean("key_kb"), first.mean("active"), first.mean("gates")) == (9.0, 50.0, 0.002)
     assert first.mean("seconds_first") == 1.0
     assert math.isnan(first.mean("flip"))
@@ -148,6 +149,14 @@ def test_a_report_holds_the_tables_numbers_and_nothing_from_the_network(tmp_path
     assert sorted(pictures) == ["a-frames.png", "a-pareto.png"]
     assert all((folder / "report" / name).read_bytes().startswith(b"\x89PNG") for name in pictures)
     assert "1 failed" in capsys.readouterr().err
+
+
+def test_wall_time_of_a_busy_machine_is_in_no_front(tmp_path):
+    calm, busy = (read_sweep_data(make_table(tmp_path / str(cpu), CELLS, cpu=cpu)).groups for cpu in (1.0, 0.5))
+    assert not waited(calm)
+    assert waited(busy)
+    assert "seconds" in measured_costs(calm)
+    assert measured_costs(busy) == ["kb", "cpu_seconds", "memory"]
 
 
 def test_one_seed_calls_nothing_a_tie(tmp_path):

@@ -9,7 +9,7 @@ from pathlib import Path
 from gsstream.trade.report.document import Block, Heading, Picture, Table, Text
 from gsstream.trade.report.figures import curve_groups, frame_curves, measured_costs, pareto_figure
 from gsstream.trade.report.fronts import Effect, effects, knee, pareto_front
-from gsstream.trade.report.groups import Group, SweepData, seed_noise
+from gsstream.trade.report.groups import Group, SweepData, seed_noise, waited
 from gsstream.trade.report.paper import beside_ours, paper_table
 from gsstream.trade.report.quantities import BY_KEY, GOODS, cell
 
@@ -17,6 +17,11 @@ _NOT_MEASURED = {"joules": "energy"}
 _MEANS = (
     "All quality is of frames decoded from packets. Means are over test cameras, then over the frames after the first; "
     "seconds are wall time, CPU s the time of the run's process."
+)
+
+_WAITED = (
+    "The machine had other work: frames took more than 1.5 times the processor time they used. So seconds (wall) are "
+    "in the table of all recipes alone, neither in a front nor in a figure of costs; compare CPU s."
 )
 
 
@@ -65,6 +70,8 @@ def _facts(data: SweepData) -> list[Block]:
     missing = [name for key, name in _NOT_MEASURED.items() if not any(math.isfinite(g.mean(key)) for g in data.groups)]
     if missing:
         notes.append(f"Not measured: {', '.join(missing)} (no counter on this machine, or several workers shared it).")
+    if waited(data.groups):
+        notes.append(_WAITED)
     if len(machines) > 1:
         notes.append("The runs are of several machines or states of the code: their seconds do not compare.")
     return [Text(" ".join(notes)), Table("Where it ran", [head, *lines])]

@@ -11,18 +11,20 @@ from typing import Any
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
 from gsstream.trade.plots import COLORS, plot_runs
 from gsstream.trade.report.fronts import knee, pareto_front
-from gsstream.trade.report.groups import Group, seed_noise
+from gsstream.trade.report.groups import Group, seed_noise, waited
 from gsstream.trade.report.quantities import BY_KEY, COSTS, GOODS
 
 _CURVES = len(COLORS)
 
 
 def measured_costs(groups: Sequence[Group]) -> list[str]:
-    """Costs that every group has."""
-    return [key for key in COSTS if all(math.isfinite(group.mean(key)) for group in groups)]
+    """Costs that every group has; no wall time of runs that waited for the processor."""
+    useless = {"seconds"} if waited(groups) else set()
+    return [key for key in COSTS if key not in useless and all(math.isfinite(group.mean(key)) for group in groups)]
 
 
 def pareto_figure(groups: Sequence[Group], title: str) -> bytes:
@@ -67,6 +69,8 @@ def _panel(axis: Any, groups: Sequence[Group], good: str, cost: str, colors: dic
         axis.set_title(f"noise between seeds {noise[good]:.3f} dB", fontsize=7, loc="right", color="#666666")
     if max(x for x, _ in points) > 8 * min(x for x, _ in points) > 0:
         axis.set_xscale("log")
+        axis.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axis.xaxis.set_minor_formatter(NullFormatter())
     axis.spines[["top", "right"]].set_visible(False)
     axis.grid(color="#e5e5e5", linewidth=0.6)
     axis.set_axisbelow(True)

@@ -116,6 +116,19 @@ def _first_seconds(row: Mapping[str, Any], table: TableData) -> float | None:
     return None if made is None or made["status"] != "done" else float(sum(made["frames"][0]["seconds"].values()))
 
 
+def waited(groups: Sequence[Group]) -> bool:
+    """Whether the runs waited for the processor: wall time of frames beyond 1.5 times what their threads account for.
+
+    Then seconds say more about the other programs than about the recipes.
+    """
+    shares = []
+    for run in (run for group in groups for run in group.runs):
+        cpu, threads = run.values["cpu_seconds"], float(run.row.get("threads") or math.nan)
+        if cpu > 0 and threads == 1:
+            shares.append(run.values["seconds"] / cpu)
+    return bool(shares) and statistics.median(shares) > 1.5
+
+
 def seed_noise(groups: Sequence[Group], key: str) -> float:
     """Standard deviation between seeds of one point, pooled over all points with several; nan when there is none."""
     parts = [(len(group.runs) - 1, group.spread(key)) for group in groups]

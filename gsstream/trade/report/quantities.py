@@ -60,7 +60,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("ms_ssim", "MS-SSIM", ".4f", True, _per_view("ms_ssim")),
     Quantity("lpips", "LPIPS", ".4f", False, _per_view("lpips")),
     Quantity("flip", "FLIP", ".4f", False, _per_view("flip")),
-    Quantity("flicker", "flicker, /255", ".2f", False, _per_view("flicker")),
+    Quantity("flicker", "flicker, /255", ".3f", False, _per_view("flicker")),
     Quantity("kb", "KB/frame", ".1f", False, lambda s, _, __: s.kb_per_frame),
     Quantity("key_kb", "key KB", ".0f", False, lambda s, _, __: s.key_kb),
     Quantity("seconds", "s/frame", ".2f", False, lambda s, _, __: s.seconds),

@@ -21,8 +21,8 @@ from gsstream.engine.stopping import Gains, watch
 from gsstream.engine.stream_state import StreamState
 from gsstream.render.base import RenderSession
 from gsstream.residual.base import init_latents
-from gsstream.residual.joint import JointCode, add_joint, decode_joint, join_features, joint_code, pull_back_joint
-from gsstream.residual.rate import rate_gradients
+from gsstream.residual.joint import add_joint, decode_joint, join_features, joint_code, pull_back_joint
+from gsstream.residual.rate import rate_gradient
 
 #: Leaving costs a freeze of every view: at least a tenth of the rows must go.
 WORTH_LEAVING = 0.9
@@ -128,6 +128,8 @@ class _FrameRun:
         with self._guarded("loss", parts.loss):
             self.targets = [parts.loss.prepare(torch.from_numpy(image)) for image in problem.frame.images]
         self.exposure: Exposure | None = state.exposure
+        cameras = problem.frame.cameras
+        self.bit_weight = parts.recipe.stream.rate_weight / (cameras.width * cameras.height)
         self.watched: dict[int, torch.Tensor] = {}
         #: Tiles that the last view's loss is a sum over; 0: all.
         self.judged_tiles = 0
@@ -148,7 +150,8 @@ class _FrameRun:
         loss = self._render(view, rows)
         upstream = join_features(self.code, rows.map(_gradient))
         back = pull_back_joint(self.code, upstream, change, matrix, shut, self.units)
-        add_rate(parts, self.code, latents, shut, back.latents, self.problem.frame)
+        if self.bit_weight:
+            back.latents.add_(rate_gradient(latents, self.code.steps, shut, self.bit_weight))
         self._step_gates(gate, gates, back.gates, learning=fraction >= parts.recipe.gate_training.warmup)
         self.latents.step({"latents": back.latents})
         self.decoders.step({"matrix": back.matrix})
@@ -247,17 +250,6 @@ class _FrameRun:
             loss=loss,
             iterations=iterations,
         )
-
-
-def add_rate(
-    parts: Assembly, code: JointCode, latents: torch.Tensor, gates: torch.Tensor, gradients: torch.Tensor, frame: Frame
-) -> None:
-    """Add the gradient of what the residual will cost, when the recipe asks for it."""
-    if parts.recipe.stream.rate_weight > 0:
-        weight = parts.recipe.stream.rate_weight / (frame.cameras.width * frame.cameras.height)
-        found = rate_gradients(parts.update, code.split(latents), gates, weight)
-        for name, value in found.items():
-            gradients[:, code.latent[name]] += value
 
 
 def _gradient(value: torch.Tensor) -> torch.Tensor:

@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsstream.packet.symbols import encode_symbols
-from gsstream.residual.additive import Additive
-from gsstream.residual.rate import MIN_SPREAD, channel_spread, laplace_bits, laplace_gradient, rate_gradients
+from gsstream.residual.rate import MIN_SPREAD, channel_spread, laplace_bits, laplace_gradient, rate_gradient
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -59,12 +58,14 @@ def test_it_is_within_an_eighth_of_what_the_coder_pays(spread):
 
 
 def test_rows_behind_closed_gates_cost_nothing_and_a_larger_weight_pulls_more():
-    rule = Additive(Additive.Config())
-    latents = {"scales": torch.full((4, 3), 0.3), "opacities": torch.zeros(4, 1)}
+    latents = torch.cat([torch.full((4, 3), 0.3), torch.zeros(4, 1)], 1)
     gates = torch.tensor([0.0, 0.1, 1.0, 0.0])
-    once = rate_gradients(rule, latents, gates, 1e-3)
-    assert once["scales"][0].eq(0).all()
-    assert once["scales"][1].gt(0).all()
-    assert once["opacities"].eq(0).all()
-    twice = rate_gradients(rule, latents, gates, 2e-3)
-    torch.testing.assert_close(twice["scales"], 2 * once["scales"])
+    steps = torch.tensor([0.1, 0.1, 0.1, 0.05])
+    once = rate_gradient(latents, steps, gates, 1e-3)
+    assert once[0].eq(0).all()
+    assert once[1, :3].gt(0).all()
+    assert once[:, 3].eq(0).all()
+    torch.testing.assert_close(rate_gradient(latents, steps, gates, 2e-3), 2 * once)
+    # Side by side, each channel by its own step: what every attribute would get alone.
+    alone = [rate_gradient(latents[:, c : c + 1], steps[c : c + 1], gates, 1e-3) for c in range(4)]
+    torch.testing.assert_close(once, torch.cat(alone, 1))

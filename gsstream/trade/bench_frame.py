@@ -41,6 +41,7 @@ from gsstream.trade.bench_scene import (
     object_points,
     synthetic_points,
 )
+from gsstream.trade.bench_state import under_way
 
 SCHEMA = "gsstream-bench-frame-1"
 #: A tile has changed when a pixel of it did by more than this without noise, [0, 1] units.
@@ -257,7 +258,7 @@ def _timed(
     last: dict[str, Step] = {}
     for round_ in range(plan.warm_up + plan.repetitions):
         for name, parts in assemblies.items():
-            state = _under_way(parts, cases[name].state, last.get(name))
+            state = under_way(parts, cases[name].state, last.get(name))
             started, worked = time.perf_counter(), time.process_time()
             last[name] = frame_step(parts, state, cases[name].frame, Rng(plan.seed))
             elapsed, spent = time.perf_counter() - started, time.process_time() - worked
@@ -273,22 +274,6 @@ def _timed(
         timing = Timing(tuple(total[name]), tuple(work[name])).to_json()
         out.append((name, step, {"total_ms": timing, "phases_ms": by_phase}))
     return out
-
-
-def _under_way(parts: Assembly, state: StreamState, last: Step | None) -> StreamState:
-    """The state as it is in the middle of a stream: with the caches that this variant's own step leaves behind.
-
-    A step hands its session's caches on to the next scene, so each repetition needs them anew.
-    """
-    left = None if last is None else last.state.session
-    if left is None:
-        return state
-    rig = state.previous.cameras
-    session = parts.renderer.open(state.gaussians, None, rig, parts.recipe.background)
-    nothing = torch.zeros(rig.height, rig.width, 3)
-    for view in left.cache_bytes().per_view:
-        session.screen_gradient(view, nothing)
-    return replace(state, session=session)
 
 
 def _outcome(parts: Assembly, case: _Case, step: Step) -> dict[str, Any]:

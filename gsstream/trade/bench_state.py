@@ -1,0 +1,26 @@
+"""The state that a frame step is timed from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from gsstream.engine.assemble import Assembly
+from gsstream.engine.stream_state import Step, StreamState
+
+
+def under_way(parts: Assembly, state: StreamState, last: Step | None) -> StreamState:
+    """The state as it is in the middle of a stream: with the caches that this variant's own step leaves behind.
+
+    A step hands its session's caches on to the next scene, so each repetition needs them anew.
+    """
+    left = None if last is None else last.state.session
+    if left is None:
+        return state
+    rig = state.previous.cameras
+    session = parts.renderer.open(state.gaussians, None, rig, parts.recipe.background)
+    nothing = torch.zeros(rig.height, rig.width, 3)
+    for view in left.cache_bytes().per_view:
+        session.screen_gradient(view, nothing)
+    return replace(state, session=session)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -69,14 +70,25 @@ def _draw(path: Path, made: Prepared) -> None:
         plot.set_ylim(min(low[1], (centers @ top).min()) - length, max(high[1], (centers @ top).max()) + length)
         plot.set_aspect("equal")
         plot.set_title(f"{title}: cameras and points, scene units")
-        plot.legend(loc="upper right")
-    bars = figure.add_subplot(1, 3, 3)
-    values = np.where(np.isfinite(made.mapping.camera_error), made.mapping.camera_error, 0)
-    bars.barh(range(len(made.names)), values, color="tab:gray")
+        if number == 0:
+            plot.legend(loc="upper right")
+    _draw_errors(figure.add_subplot(1, 3, 3), made)
+    figure.savefig(path, dpi=100)
+
+
+def _draw_errors(bars: Any, made: Prepared) -> None:
+    """A bar per camera; a camera whose error is unknown says so (no bar would read as an error of zero)."""
+    error = made.mapping.camera_error
+    known = np.isfinite(error)
+    colors = ["tab:red" if name in made.test else "tab:blue" for name in made.names]
+    bars.barh(range(len(made.names)), np.where(known, error, 0), color=colors)
+    for i in np.flatnonzero(~known):
+        why = "left out" if made.names[i] in made.left_out else "not measured"
+        bars.annotate(why, (0, i), (3, 0), textcoords="offset points", va="center", fontsize=7)
     bars.set_yticks(range(len(made.names)), made.names, fontsize=7)
     bars.invert_yaxis()
     bars.set_xlabel("mean reprojection error, pixels")
-    figure.savefig(path, dpi=100)
+    bars.set_title("how well points fit the pictures")
 
 
 def _axes(made: Prepared) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsstream.core.delta import row_gates
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.hierarchy import Hierarchy
@@ -173,13 +174,17 @@ def _difference(player: PlayerState, claimed: PlayerState) -> str:
 
 def _facts(player: PlayerState, step: Step[Any]) -> dict[str, Any]:
     """Sizes and counts, from the packet alone."""
-    counts = player.layout.node_counts
-    opened = np.zeros(len(counts), bool) if player.delta is None else player.delta.gates != 0
-    key = step.status == "key"
+    rows, gates = len(player.gaussians), 0
+    if player.delta is not None and player.before is not None:
+        born = 0 if player.delta.births is None else len(player.delta.births.parents)
+        rows = int((row_gates(player.before, player.delta) > 0).sum())
+        gates = int((player.delta.gates != 0).sum()) + born
+    elif step.status == "empty":
+        rows = 0
     return {
         "bytes": dict(step.packet.sizes),
         "num_gaussians": len(player.gaussians),
-        "active_gaussians": len(player.gaussians) if key else int(counts[opened].sum()),
-        "num_gates": len(counts),
-        "active_gates": int(opened.sum()),
+        "active_gaussians": rows,
+        "num_gates": len(player.layout.node_counts),
+        "active_gates": gates,
     }

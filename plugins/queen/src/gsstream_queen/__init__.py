@@ -1,0 +1,1 @@
+"""QUEEN as a whole method. Importing this package imports no torch."""

@@ -1,0 +1,73 @@
+"""What changed since the scene was last right: per Gaussian, and per tile of every view."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+
+from gsstream.api import FrameTools, Renderer
+from gsstream_queen.settings import MaskSettings
+
+TILE = 16
+#: Inside the root of the colour distance, image units squared: no 0/0 where a pixel is exact.
+EPSILON = 1e-12
+
+
+class Change(NamedTuple):
+    """``difference`` [N] sum over views of |d(E_t - E_{t-1}) / d centre|, half image widths; ``seen`` [N] bool."""
+
+    difference: torch.Tensor
+    seen: torch.Tensor
+
+
+def gradient_difference(work: FrameTools) -> Change:
+    """The view-space gradient difference. E is the mean Euclidean distance of pixel colours between an image and the
+    scene as it was before the frame.
+    """
+    number = len(work.gaussians)
+    total, seen = torch.zeros(number), torch.zeros(number, dtype=torch.bool)
+    half = torch.tensor([work.cameras.width / 2, work.cameras.height / 2])
+    for view in range(len(work.cameras)):
+        now, before = work.image(view), work.previous_image(view)
+        if torch.equal(now, before):
+            upstream = torch.zeros_like(now)
+        else:
+            shown = work.previous_render(view)
+            upstream = (_direction(shown, now) - _direction(shown, before)) / (now.shape[0] * now.shape[1])
+        found = work.screen_gradient(view, upstream)
+        total += (found.gradient * half).norm(dim=1)
+        seen |= found.visible
+    return Change(total, seen)
+
+
+def _direction(image: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    """Gradient of the colour distance of every pixel."""
+    difference = image - truth
+    return difference / (difference.square().sum(-1, keepdim=True) + EPSILON).sqrt()
+
+
+def changed_tiles(
+    work: FrameTools, dynamic: torch.Tensor, renderer: Renderer, settings: MaskSettings
+) -> list[torch.Tensor]:
+    """Per view [ceil(H / 16), ceil(W / 16)] bool: where the dynamic Gaussians [N] bool, drawn alone, are opaque."""
+    cameras = work.cameras
+    rows, columns = -(-cameras.height // TILE), -(-cameras.width // TILE)
+    if not bool(dynamic.any()):
+        return [torch.zeros(rows, columns, dtype=torch.bool)] * len(cameras)
+    alone = work.gaussians.rows(dynamic)
+    masks = []
+    for view in range(len(cameras)):
+        with torch.no_grad():
+            alpha = renderer.render(alone, cameras, view, (0.0, 0.0, 0.0)).alpha
+        opaque = torch.zeros(rows * TILE, columns * TILE)
+        opaque[: cameras.height, : cameras.width] = (alpha > settings.alpha).float()
+        count = opaque.reshape(rows, TILE, columns, TILE).sum((1, 3))
+        # A tile cut off by the border has fewer pixels to show a change with.
+        inside = torch.zeros_like(opaque)
+        inside[: cameras.height, : cameras.width] = 1
+        size = inside.reshape(rows, TILE, columns, TILE).sum((1, 3))
+        changed = (count >= size * settings.pixels / TILE**2).float()[None, None]
+        kernel = 2 * settings.dilate + 1
+        masks.append(torch.nn.functional.max_pool2d(changed, kernel, 1, settings.dilate)[0, 0] > 0)
+    return masks

@@ -1,0 +1,46 @@
+"""Hard-concrete gates without noise: logit -> sigmoid -> stretched -> clipped to [0, 1] (Louizos et al. 2018)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from gsstream_queen.settings import GateSettings
+
+#: Logits are kept within ln 1000: a gate can be surer than that of nothing (released code of the family).
+BOUND = math.log(1000.0)
+
+
+def shift(settings: GateSettings) -> float:
+    """Logit at which the stretched gate begins to open: temperature * ln(-gamma / eta)."""
+    return settings.temperature * math.log(-settings.gamma / settings.eta)
+
+
+def initial_logits(difference: torch.Tensor, seen: torch.Tensor, settings: GateSettings) -> torch.Tensor:
+    """[N] logits such that a gate is open with p = m / (m + median), the published confidence.
+
+    Arguments:
+        difference: [N] m, the view-space gradient difference, not negative.
+        seen: [N] bool; medians are taken over these. Who is not seen, or does not change, gets the lowest logit.
+    """
+    logits = torch.full_like(difference, -BOUND)
+    moved = seen & (difference > 0)
+    if not bool(moved.any()):
+        return logits
+    median = difference[seen].median()
+    # ln p / (1 - p) = ln m / median; over a median of 0 everything that changed is sure.
+    sure = torch.full_like(difference[moved], BOUND)
+    logits[moved] = (difference[moved] / median).log() + shift(settings) if float(median) > 0 else sure
+    return logits.clamp(-BOUND, BOUND)
+
+
+def gates(logits: torch.Tensor, settings: GateSettings) -> torch.Tensor:
+    """[N] in [0, 1], exactly 0 and 1 at the ends; no gradient there, as published."""
+    soft = torch.sigmoid(logits / settings.temperature)
+    return (soft * (settings.eta - settings.gamma) + settings.gamma).clamp(0, 1)
+
+
+def open_probability(logits: torch.Tensor, settings: GateSettings) -> torch.Tensor:
+    """[N] probability that a gate with noise would not be 0: what L0 counts."""
+    return torch.sigmoid(logits - shift(settings))

@@ -1,0 +1,148 @@
+"""QUEEN (Girish et al., NeurIPS 2024) as a whole method of gsstream."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+import torch
+
+from gsstream.api import (
+    Births,
+    Delta,
+    Frame,
+    FrameTools,
+    Gaussians,
+    Layout,
+    PlayerState,
+    Step,
+    StreamingMethod,
+    Tools,
+    quantise_decoders,
+    send_delta,
+    send_key,
+)
+from gsstream_queen.change import changed_tiles, gradient_difference
+from gsstream_queen.frame import Problem, Result, optimise
+from gsstream_queen.gates import initial_logits
+from gsstream_queen.latents import coded, initial_weights, weight_of
+from gsstream_queen.settings import QueenConfig
+
+
+@dataclass(frozen=True)
+class QueenState:
+    """``player``: what every player has. ``previous``: the images its scene shows. ``weights``: of the decoders."""
+
+    player: PlayerState
+    previous: Frame
+    weights: dict[str, torch.Tensor]
+
+
+@final
+class Queen(StreamingMethod[QueenState]):
+    """Every Gaussian has a residual in every frame (paper: Girish et al., NeurIPS 2024).
+
+    Centres move by a direct residual behind a hard-concrete gate of their own; all other attributes by integer latents
+    behind linear decoders. Dynamic Gaussians are cloned and split while a frame is optimised. What is sent is a delta
+    packet with one node per Gaussian: a Gaussian is open where any of its integers is not zero. Where this differs
+    from what is published, and why: README of this plugin.
+    """
+
+    Config = QueenConfig
+    heeds = ("stream.epochs",)
+
+    def begin(self, frame: Frame, tools: Tools) -> Step[QueenState]:
+        first = tools.first_frame(frame)
+        number = len(first.gaussians)
+        extent = np.array([frame.cameras.extent], np.float32)
+        layout = Layout(np.ones(number, np.int32), np.zeros(number, np.uint8), extent)
+        packet, player = send_key(first.gaussians, layout, first.meta, frame.index)
+        return Step(QueenState(player, frame, self._weights(player, tools)), packet, "key", first.metrics)
+
+    def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> QueenState:
+        return QueenState(player, shown, self._weights(player, tools))
+
+    def _weights(self, player: PlayerState, tools: Tools) -> dict[str, torch.Tensor]:
+        """Decoders as they were last sent, as they were first drawn where they never were."""
+        scene = player.gaussians.map(torch.from_numpy)
+        policies = coded(self.config.latents(), scene)
+        drawn = initial_weights(policies, scene, tools.rng)
+        sent = {n: weight_of(torch.from_numpy(value), policies[n]) for n, value in player.decoders.items()}
+        return {**drawn, **sent}
+
+    def step(self, state: QueenState, frame: Frame, tools: Tools) -> Step[QueenState]:
+        clock = [time.perf_counter()]
+        if frame.effort == 0:
+            return self._send(state, frame, tools, nothing(state.player), {})
+        work = tools.open(state.player, state.previous, frame)
+        change = gradient_difference(work)
+        clock.append(time.perf_counter())
+        if not bool((change.difference > 0).any()):
+            # Not a pixel differs from the images before: nothing to learn.
+            return self._send(state, frame, tools, nothing(state.player), {})
+        dynamic = change.difference > self.config.dynamic
+        active = torch.arange(len(dynamic)) if self.config.rows == "all" else dynamic.nonzero()[:, 0]
+        if len(active) == 0:
+            return self._send(state, frame, tools, nothing(state.player), {})
+        logits = initial_logits(change.difference, change.seen, self.config.gate)[active]
+        problem = Problem(
+            work, tools.renderer, tools.background, active, dynamic, self._masks(work, dynamic, tools), logits,
+            state.weights, tools.epochs(frame),
+        )  # fmt: skip
+        result = optimise(self.config, problem, tools.rng.stream("queen", frame.index))
+        clock.append(time.perf_counter())
+        delta = self._harden(state.player, active, result)
+        step = self._send(state, frame, tools, delta, {"loss": result.loss, "iterations": result.iterations})
+        clock.append(time.perf_counter())
+        facts = {
+            "dynamic_gaussians": int(dynamic.sum()), "births": len(result.born), "deaths": int(result.gone.sum()),
+            "moved_gaussians": int(result.solution.symbols["means"].any(1).sum()) if "means" in delta.symbols else 0,
+            "seconds": dict(zip(("confidence", "optimise", "code"), np.diff(clock).tolist(), strict=True)),
+        }  # fmt: skip
+        return replace(step, metrics={**step.metrics, **facts})
+
+    def _masks(self, work: FrameTools, dynamic: torch.Tensor, tools: Tools) -> list[torch.Tensor] | None:
+        if self.config.mask.share == 0:
+            return None
+        return changed_tiles(work, dynamic, tools.renderer, self.config.mask)
+
+    def _send(
+        self, state: QueenState, frame: Frame, tools: Tools, delta: Delta, metrics: dict[str, object]
+    ) -> Step[QueenState]:
+        packet, player = send_delta(state.player, delta)
+        if delta.is_empty:
+            return Step(replace(state, player=player), packet, "empty", metrics)
+        return Step(QueenState(player, frame, self._weights(player, tools)), packet, "delta", metrics)
+
+    def _harden(self, player: PlayerState, active: torch.Tensor, result: Result) -> Delta:
+        """The integers of the rows in which any is not zero; rows that leave send none."""
+        layout = player.layout
+        leaving = result.gone[active].numpy()
+        table = {name: np.where(leaving[:, None], 0, value.numpy()) for name, value in result.solution.symbols.items()}
+        changed = np.zeros(len(active), bool)
+        for value in table.values():
+            changed |= value.any(1)
+        gates = np.zeros(len(layout.node_counts), np.uint8)
+        gates[layout.node_of[active.numpy()[changed]]] = 1
+        symbols = {name: value[changed].astype(np.int32) for name, value in table.items() if value.any()}
+        steps = {name: self.config.means.step if name == "means" else 1.0 for name in symbols}
+        learned = {n: v.numpy() for n, v in result.solution.decoders.items() if n in symbols}
+        return Delta(
+            gates, 1, symbols, steps, quantise_decoders(learned), births(result.born, len(layout.node_counts)),
+            np.flatnonzero(result.gone.numpy()),
+        )  # fmt: skip
+
+
+def nothing(player: PlayerState) -> Delta:
+    """All gates closed."""
+    return Delta(np.zeros(len(player.layout.node_counts), np.uint8), 1)
+
+
+def births(born: Gaussians[torch.Tensor], nodes: int) -> Births | None:
+    """Each new Gaussian is a node of its own, behind the old ones."""
+    if len(born) == 0:
+        return None
+    own = nodes + np.arange(len(born), dtype=np.int64)
+    return Births(born.map(lambda value: value.numpy()), own, np.zeros(len(born), np.uint8), own)

@@ -1,0 +1,35 @@
+"""What this plugin ships, described without importing torch."""
+
+from __future__ import annotations
+
+from gsstream.spec import ComponentSpec, MethodSpec, hookimpl
+
+
+@hookimpl
+def gsstream_components() -> list[ComponentSpec]:
+    """The method as one part."""
+    return [
+        ComponentSpec(
+            kind="whole",
+            name="queen",
+            target="gsstream_queen.method:Queen",
+            summary="quantised latent residuals on every Gaussian, hard-concrete gates on positions, masked births",
+        )
+    ]
+
+
+@hookimpl
+def gsstream_methods() -> list[MethodSpec]:
+    """The published rates, and rates that suit short budgets."""
+    return [
+        MethodSpec(
+            name="queen",
+            recipe="gsstream_queen:recipes/queen.yaml",
+            summary="QUEEN: 10 epochs, measured rates",
+        ),
+        MethodSpec(
+            name="queen-published",
+            recipe="gsstream_queen:recipes/queen-published.yaml",
+            summary="QUEEN: 10 epochs, published rates",
+        ),
+    ]

@@ -1,0 +1,119 @@
+"""Settings: what happens to each attribute, the gates, the mask and the births. Defaults are the published values."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from gsstream.api import PartConfig
+
+
+class PositionPolicy(PartConfig):
+    """Centres: a direct residual behind a gate per Gaussian."""
+
+    policy: Literal["gated", "direct", "frozen"] = Field(
+        default="gated", description="gated: published; direct: without gates; frozen: centres never move"
+    )
+    step: float = Field(
+        default=1e-4, gt=0, le=1, description="quantisation step, rig extents, to 1 (published: float32)"
+    )
+    lr: float = Field(default=5e-4, ge=0, le=1, description="Adam learning rate, rig extents per iteration, to 1")
+
+
+class LatentPolicy(PartConfig):
+    """One attribute behind integer latents and a linear decoder."""
+
+    policy: Literal["latent", "frozen"] = Field(default="latent", description="latent: coded; frozen: never changes")
+    latent: int = Field(ge=1, le=64, description="latent channels per Gaussian, 1 to 64")
+    lr: float = Field(ge=0, le=10, description="Adam learning rate of the latents, symbols per iteration, to 10")
+    decoder_lr: float = Field(ge=0, le=1, description="Adam learning rate of the decoder, raw units per step, to 1")
+    decoder_std: float = Field(
+        gt=0, le=10, description="standard deviation of the decoder's initial entries, raw units per symbol, to 10"
+    )
+    basis: Literal["learned", "cosine"] = Field(
+        default="learned", description="learned: every entry; cosine: cosines times one learned number"
+    )
+
+
+class GateSettings(PartConfig):
+    """Hard-concrete gates (Louizos et al. 2018), without noise."""
+
+    temperature: float = Field(default=0.3, ge=0.01, le=10, description="temperature, 0.01 to 10")
+    gamma: float = Field(default=-0.5, ge=-10, lt=0, description="lower end of the stretched interval, -10 to 0")
+    eta: float = Field(default=1.01, gt=1, le=10, description="upper end of the stretched interval, 1 to 10")
+    lr: float = Field(default=0.1, ge=0, le=10, description="Adam learning rate of the logits, to 10")
+    l0: float = Field(default=0.01, ge=0, le=100, description="weight of the mean probability to be open, to 100")
+
+
+class MaskSettings(PartConfig):
+    """The first part of a frame looks only at what changed."""
+
+    share: float = Field(default=0.3, ge=0, le=1, description="share of a frame's iterations that are masked, 0 to 1")
+    alpha: float = Field(
+        default=0.5, gt=0, lt=1, description="a pixel changed where dynamic Gaussians alone reach this alpha, 0 to 1"
+    )
+    pixels: int = Field(
+        default=40, ge=1, le=256, description="changed pixels that make a 16 x 16 tile a changed one, 1 to 256"
+    )
+    dilate: int = Field(default=1, ge=0, le=16, description="tiles by which the mask grows, to 16 (published: 48 px)")
+
+
+class BirthSettings(PartConfig):
+    """Masked densification: dynamic Gaussians that the images pull at are cloned or split."""
+
+    every: int = Field(default=2, ge=0, le=1000, description="epochs between two densifications; 0: no births, to 1000")
+    after: float = Field(default=0.04, ge=0, le=1, description="share of the epochs before the first one, 0 to 1")
+    until: float = Field(default=0.8, ge=0, le=1, description="share of the epochs after which there is none, 0 to 1")
+    gradient: float = Field(
+        default=1.25e-3, gt=0, le=10, description="mean screen gradient that asks for a birth, half image widths, to 10"
+    )
+    most: int = Field(default=1000, ge=0, le=1_000_000, description="births per frame at most, to 1000000 (ours)")
+    prune_opacity: float = Field(
+        default=0.005, ge=0, lt=1, description="dynamic and new Gaussians below this opacity leave, 0 to 1 (3DGS)"
+    )
+
+
+class QueenConfig(PartConfig):
+    """Everything that can be told to the method."""
+
+    means: PositionPolicy = Field(default=PositionPolicy(), description="centres")
+    quats: LatentPolicy = Field(
+        default=LatentPolicy(latent=6, lr=0.025, decoder_lr=1e-3, decoder_std=1e-2), description="raw quaternions"
+    )
+    scales: LatentPolicy = Field(
+        default=LatentPolicy(latent=8, lr=0.01, decoder_lr=1e-4, decoder_std=1e-3), description="log sizes"
+    )
+    opacities: LatentPolicy = Field(
+        default=LatentPolicy(latent=3, lr=0.05, decoder_lr=1e-4, decoder_std=1e-4, basis="cosine"),
+        description="opacity logits",
+    )
+    sh0: LatentPolicy = Field(
+        default=LatentPolicy(latent=8, lr=0.0125, decoder_lr=1e-3, decoder_std=1e-4), description="degree-0 colour"
+    )
+    shN: LatentPolicy = Field(
+        default=LatentPolicy(latent=4, lr=0.000125, decoder_lr=1e-4, decoder_std=1e-1), description="higher colour"
+    )
+    gate: GateSettings = Field(default=GateSettings(), description="gates of positions")
+    mask: MaskSettings = Field(default=MaskSettings(), description="masked first part of a frame")
+    births: BirthSettings = Field(default=BirthSettings(), description="masked densification")
+    dynamic: float = Field(
+        default=1e-3, ge=0, le=1e6, description="gradient difference above which a Gaussian is dynamic, to 1e6"
+    )
+    rows: Literal["all", "dynamic"] = Field(
+        default="all", description="which Gaussians are trained; all: published; dynamic: only those (ours)"
+    )
+
+    @model_validator(mode="after")
+    def _order(self) -> QueenConfig:
+        if self.births.after > self.births.until:
+            raise ValueError(
+                f"births: expected after <= until, got {self.births.after} and {self.births.until}; "
+                "every: 0 switches births off"
+            )
+        return self
+
+    def latents(self) -> dict[str, LatentPolicy]:
+        """Attribute -> policy of those that are coded as latents."""
+        known = {name: getattr(self, name) for name in ("quats", "scales", "opacities", "sh0", "shN")}
+        return {name: policy for name, policy in known.items() if policy.policy == "latent" and policy.lr > 0}

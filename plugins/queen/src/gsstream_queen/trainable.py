@@ -1,0 +1,124 @@
+"""What a frame trains: latents, decoders, centres and gates of the old rows, and everything of the new ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+
+from gsstream.api import ATTRIBUTES, Gaussians
+from gsstream_queen.gates import BOUND, gates, open_probability
+from gsstream_queen.latents import Tensors, coded, decoder, rounded, width
+from gsstream_queen.settings import QueenConfig
+
+#: 3DGS, raw units per iteration (centres: fraction of the rig's extent from the settings).
+BORN_RATES = {"quats": 1e-3, "scales": 5e-3, "opacities": 0.05, "sh0": 2.5e-3, "shN": 1.25e-4}
+ADAM_EPS = 1e-15  # 3DGS: tiny gradients of tiny Gaussians must still move them
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What the old rows were trained to, as integers.
+
+    Arguments:
+        symbols: attribute -> [A, L] int32.
+        decoders: attribute -> [L, D].
+    """
+
+    symbols: Tensors
+    decoders: Tensors
+
+
+class OldRows:
+    """A rows of the scene before: base + residual, as it will be sent. Lives only while a frame is optimised."""
+
+    def __init__(
+        self, config: QueenConfig, base: Gaussians[torch.Tensor], logits: torch.Tensor,
+        weights: Mapping[str, torch.Tensor], extent: float, total: int,
+    ) -> None:  # fmt: skip
+        """``base`` are the A rows, ``logits`` [A] their gates, ``total`` the N that the penalty is a mean over."""
+        self._config, self._base, self._total = config, base, total
+        self._unit = config.means.step * extent
+        self._policies = coded(config.latents(), base)
+        self._latents = {n: torch.zeros(len(base), p.latent, requires_grad=True) for n, p in self._policies.items()}
+        self._weights = {name: weights[name].clone().requires_grad_() for name in self._policies}
+        self._shift = torch.zeros(len(base), 3, requires_grad=True)
+        self._logits = logits.clone().requires_grad_()
+        self._moving = config.means.policy != "frozen" and config.means.lr > 0
+        groups = [{"params": [self._latents[name]], "lr": policy.lr} for name, policy in self._policies.items()]
+        groups += [{"params": [self._weights[name]], "lr": p.decoder_lr} for name, p in self._policies.items()]
+        if self._moving:
+            # The shift is counted in steps of the quantiser, so that symbols are its rounded values.
+            groups.append({"params": [self._shift], "lr": config.means.lr / config.means.step})
+        if self._moving and config.means.policy == "gated":
+            groups.append({"params": [self._logits], "lr": config.gate.lr})
+        self._adam = torch.optim.Adam(groups, eps=ADAM_EPS, fused=True) if groups else None
+
+    def values(self) -> Gaussians[torch.Tensor]:
+        """The rows with their quantised residuals; differentiable."""
+        changed = dict(self._base.items())
+        for name, policy in self._policies.items():
+            base = changed[name]
+            weight = decoder(self._weights[name], policy, width(self._base, name))
+            changed[name] = base + (rounded(self._latents[name]) @ weight).reshape(base.shape)
+        if self._moving:
+            changed["means"] = self._base.means + rounded(self._gated_shift()) * self._unit
+        return Gaussians(**changed)
+
+    def _gated_shift(self) -> torch.Tensor:
+        if self._config.means.policy == "direct":
+            return self._shift
+        return self._shift * gates(self._logits, self._config.gate)[:, None]
+
+    def step(self) -> None:
+        """Add the pull of the L0 penalty, step everything once, keep the logits in their bounds."""
+        if self._adam is None:
+            return
+        if self._moving and self._config.means.policy == "gated" and self._config.gate.l0:
+            penalty = self._config.gate.l0 * open_probability(self._logits, self._config.gate).sum() / self._total
+            penalty.backward()  # type: ignore[no-untyped-call]
+        self._adam.step()
+        self._adam.zero_grad(set_to_none=True)
+        self._logits.data.clamp_(-BOUND, BOUND)
+
+    def solution(self) -> Solution:
+        """The integers, and the decoders they go through."""
+        with torch.no_grad():
+            symbols = {name: torch.round(value).to(torch.int32) for name, value in self._latents.items()}
+            if self._moving:
+                symbols["means"] = torch.round(self._gated_shift()).to(torch.int32)
+            decoders = {
+                name: decoder(self._weights[name], policy, width(self._base, name)).detach().clone()
+                for name, policy in self._policies.items()
+            }
+        return Solution(symbols, decoders)
+
+
+class NewRows:
+    """Gaussians born in this frame: every attribute free, rates of 3DGS."""
+
+    def __init__(self, born: Gaussians[torch.Tensor], lr_means: float) -> None:
+        """``lr_means``: scene units per iteration."""
+        self._leaves = {name: value.detach().clone().requires_grad_() for name, value in born.items()}
+        rates = {"means": lr_means, **BORN_RATES}
+        groups = [{"params": [self._leaves[name]], "lr": rates[name]} for name in ATTRIBUTES]
+        self._adam = torch.optim.Adam(groups, eps=ADAM_EPS, fused=True)
+
+    def __len__(self) -> int:
+        return len(self._leaves["means"])
+
+    def values(self) -> Gaussians[torch.Tensor]:
+        """The rows; differentiable."""
+        return Gaussians(**self._leaves)
+
+    def step(self) -> None:
+        self._adam.step()
+        self._adam.zero_grad(set_to_none=True)
+
+
+def concat(groups: list[Gaussians[torch.Tensor]]) -> Gaussians[torch.Tensor]:
+    """Rows of several groups, in order."""
+    if len(groups) == 1:
+        return groups[0]
+    return Gaussians(**{name: torch.cat([getattr(group, name) for group in groups]) for name in ATTRIBUTES})

@@ -1,0 +1,32 @@
+"""QUEEN keeps the contract of parts and of whole methods, with births and without."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+from gsstream_queen import plugin
+from gsstream_queen.method import Queen
+from gsstream_queen.settings import BirthSettings, QueenConfig
+
+from gsstream.testing import parametrize_with_checks
+from gsstream.testing.kit import run_method_checks
+
+#: The kit gives a frame one epoch: then something must be born after it.
+FERTILE = BirthSettings(every=1, after=0, until=1, gradient=1e-6, most=20)
+
+
+@parametrize_with_checks([Queen(), Queen(QueenConfig(births=FERTILE, rows="dynamic", dynamic=1e-5))])
+def test_contract(check) -> None:
+    check()
+
+
+@pytest.mark.parametrize("name", [spec.name for spec in plugin.gsstream_methods()])
+def test_its_methods(name: str) -> None:
+    assert [result for result in run_method_checks(name) if not result.ok] == []
+
+
+def test_declaring_imports_no_torch() -> None:
+    code = "import sys, gsstream_queen.plugin as p; p.gsstream_components(); sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,195 @@
+"""Gates, latents, births and change, against closed forms and independent walks."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from gsstream_queen.births import Statistics, densify, densify_epochs, turn
+from gsstream_queen.change import changed_tiles, gradient_difference
+from gsstream_queen.gates import BOUND, gates, initial_logits, open_probability
+from gsstream_queen.latents import cosines, decoder, rounded, weight_of
+from gsstream_queen.settings import BirthSettings, GateSettings, LatentPolicy, MaskSettings, QueenConfig
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from gsstream.testing import world
+from gsstream.testing.cases import RENDERER, scene
+
+GATE = GateSettings()
+EVERYONE = torch.ones(5, dtype=torch.bool)
+
+
+class TestGates:
+    def test_a_gate_is_open_with_the_published_confidence(self) -> None:
+        m = torch.tensor([0.0, 1.0, 2.0, 5.0, 20.0])
+        p = open_probability(initial_logits(m, EVERYONE, GATE), GATE)
+        expected = m / (m + 2.0)
+        torch.testing.assert_close(p[1:], expected[1:])
+        assert float(p[0]) < 2e-3, "what does not change is as closed as the bound allows"
+
+    @given(st.floats(-BOUND, BOUND), st.floats(0.05, 3), st.floats(-3, -0.01), st.floats(1.001, 4))
+    def test_more_likely_open_than_not_is_open(self, logit: float, t: float, gamma: float, eta: float) -> None:
+        """Without noise the gate is above 0 exactly where its logit exceeds the shift, i.e. P(open) > 1/2."""
+        settings = GateSettings(temperature=t, gamma=gamma, eta=eta)
+        value = torch.tensor([logit], dtype=torch.float64)
+        p, g = float(open_probability(value, settings)), float(gates(value, settings))
+        assert 0 <= g <= 1
+        if abs(p - 0.5) > 1e-9:
+            assert (g > 0) == (p > 0.5)
+
+    def test_ends_are_exact_and_flat(self) -> None:
+        logits = torch.tensor([-3.0, 0.5, 3.0], requires_grad=True)
+        value = gates(logits, GATE)
+        assert value[0] == 0
+        assert value[2] == 1
+        assert 0 < value[1] < 1
+        value.sum().backward()
+        assert logits.grad is not None
+        assert logits.grad[0] == logits.grad[2] == 0 < logits.grad[1]
+
+    def test_the_law_of_noisy_gates(self) -> None:
+        """P(gate > 0) of the hard concrete with logistic noise, counted: what L0 takes the closed form of."""
+        generator = torch.Generator().manual_seed(0)
+        u = torch.rand(200_000, generator=generator, dtype=torch.float64).clamp(1e-12, 1 - 1e-12)
+        for logit in (-1.0, 0.0, 0.7):
+            noisy = gates(torch.tensor(logit) + torch.log(u) - torch.log1p(-u), GATE)
+            counted = float((noisy > 0).double().mean())
+            assert abs(counted - float(open_probability(torch.tensor(logit), GATE))) < 4 * 0.5 / math.sqrt(len(u))
+
+    def test_nothing_unseen_and_a_median_of_zero(self) -> None:
+        assert bool((initial_logits(torch.zeros(5), EVERYONE, GATE) == -BOUND).all())
+        m = torch.tensor([0.0, 0.0, 0.0, 1e-30, 9.0])
+        assert initial_logits(m, EVERYONE, GATE).tolist() == pytest.approx([-BOUND] * 3 + [BOUND] * 2)
+        hidden = torch.tensor([True, True, True, True, False])
+        assert initial_logits(m, hidden, GATE)[4] == pytest.approx(-BOUND)
+        for size in (1e-38, 3e37):
+            assert bool(torch.isfinite(initial_logits(torch.arange(5.0) * size, EVERYONE, GATE)).all())
+
+
+class TestLatents:
+    @pytest.mark.parametrize("size", [1, 3, 8])
+    def test_the_basis_is_the_cosine_transform(self, size: int) -> None:
+        """Rows of the full square are orthogonal: it is a basis."""
+        square = cosines(size, size)
+        gram = square @ square.T
+        torch.testing.assert_close(gram, torch.diag(gram.diagonal()), atol=1e-5, rtol=0)
+        assert bool((square[0] == 1).all())
+
+    def test_a_sent_decoder_gives_its_weights_back(self) -> None:
+        for basis, shape in (("learned", (3, 2)), ("cosine", (1, 1))):
+            policy = LatentPolicy(latent=3, lr=0.1, decoder_lr=0, decoder_std=1, basis=basis)
+            weight = torch.randn(shape, generator=torch.Generator().manual_seed(1))
+            assert torch.equal(weight_of(decoder(weight, policy, 2), policy), weight)
+
+    def test_rounding_is_real_and_its_gradient_straight(self) -> None:
+        value = torch.tensor([0.4, 0.6, -1.5, 2.5, 7.0], requires_grad=True)
+        out = rounded(value)
+        assert out.tolist() == [0, 1, -2, 2, 7]
+        out.sum().backward()
+        assert value.grad is not None
+        assert value.grad.tolist() == [1] * 5
+
+
+class TestBirths:
+    def test_epochs(self) -> None:
+        published = BirthSettings()
+        assert sorted(densify_epochs(published, 10)) == [2, 4, 6, 8]
+        assert sorted(densify_epochs(published, 6)) == [2, 4]
+        assert densify_epochs(published, 1) == frozenset()
+        assert densify_epochs(BirthSettings(every=0), 10) == densify_epochs(BirthSettings(most=0), 10) == frozenset()
+
+    def grow(self, room: int = 100, may: list[bool] | None = None):
+        sizes = torch.tensor([0.001, 0.5, 0.001, 0.5])[:, None].expand(4, 3).log()
+        rows = scene(torch.arange(12.0).reshape(4, 3), scales=sizes)
+        pull = torch.tensor([0.5, 0.9, 1e-9, 0.7])
+        allowed = torch.tensor(may or [True] * 4)
+        settings, generator = BirthSettings(gradient=0.1), torch.Generator().manual_seed(0)
+        return rows, densify(rows, pull, allowed, room, 1.0, settings, generator)
+
+    def test_small_rows_are_cloned_and_large_ones_split(self) -> None:
+        rows, litter = self.grow()
+        assert litter.replaced.tolist() == [1, 3]
+        assert len(litter.gaussians) == 5
+        assert torch.equal(litter.gaussians.means[0], rows.means[0]), "a clone is where its parent is"
+        halves = litter.gaussians.scales[1:].exp()
+        torch.testing.assert_close(halves, torch.full_like(halves, 0.5 / 1.6))
+        assert bool((litter.gaussians.means[1:] != rows.means[[1, 1, 3, 3]]).all())
+
+    def test_the_strongest_pull_comes_first_when_there_is_little_room(self) -> None:
+        for room, replaced, number in ((0, [], 0), (1, [], 0), (2, [1], 2), (3, [1], 2), (4, [1, 3], 4)):
+            _, litter = self.grow(room)
+            assert (litter.replaced.tolist(), len(litter.gaussians)) == (replaced, number), room
+
+    def test_who_may_not_has_no_children(self) -> None:
+        _, litter = self.grow(may=[True, False, True, False])
+        assert (litter.replaced.tolist(), len(litter.gaussians)) == ([], 1)
+
+    def test_turning_is_the_rotation_matrix(self) -> None:
+        generator = torch.Generator().manual_seed(4)
+        quats, vectors = torch.randn(9, 4, generator=generator), torch.randn(9, 3, generator=generator)
+        for q, v, got in zip(quats, vectors, turn(quats, vectors), strict=True):
+            w, x, y, z = (q / q.norm()).tolist()
+            matrix = torch.tensor([
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ])  # fmt: skip
+            torch.testing.assert_close(got, matrix @ v, atol=1e-5, rtol=1e-5)
+
+    def test_means_count_only_the_iterations_that_hit(self) -> None:
+        statistics = Statistics.zeros(2).add(torch.tensor([[3.0, 4.0], [0, 0]])).add(torch.zeros(2, 2))
+        assert statistics.mean.tolist() == [5.0, 0.0]
+
+
+class TestChange:
+    def test_it_is_the_gradient_of_the_difference_of_two_distances(self) -> None:
+        case = world("moving")
+        found = gradient_difference(case)  # type: ignore[arg-type]
+        expected = torch.zeros(len(case.gaussians))
+        for view in range(len(case.cameras)):
+            shown = case.previous_render(view).requires_grad_()
+            truths = case.now[view], case.before[view]
+            now, before = ((shown - truth).square().sum(-1).add(1e-12).sqrt().mean() for truth in truths)
+            (upstream,) = torch.autograd.grad(now - before, shown)
+            half = torch.tensor([case.cameras.width / 2, case.cameras.height / 2])
+            expected += (case.screen_gradient(view, upstream).gradient * half).norm(dim=1)
+        torch.testing.assert_close(found.difference, expected, atol=1e-6, rtol=1e-4)
+        moved = found.difference[case.moved].mean()
+        assert moved > 3 * found.difference[~case.moved].mean(), "what moved feels more than what did not"
+
+    def test_still_images_change_nothing(self) -> None:
+        assert float(gradient_difference(world("moving").blended(0)).difference.max()) == 0  # type: ignore[arg-type]
+
+    def test_tiles_follow_the_dynamic_rows(self) -> None:
+        case = world("moving")
+        everyone = torch.ones(len(case.gaussians), dtype=torch.bool)
+        settings = MaskSettings(pixels=1, dilate=0)
+        masks = changed_tiles(case, everyone, RENDERER, settings)  # type: ignore[arg-type]
+        assert len(masks) == len(case.cameras)
+        for view, mask in enumerate(masks):
+            alpha = RENDERER.render(case.gaussians, case.cameras, view, (0.0, 0.0, 0.0)).alpha.detach().numpy() > 0.5
+            for row, column in np.ndindex(*mask.shape):
+                tile = alpha[row * 16 : row * 16 + 16, column * 16 : column * 16 + 16]
+                assert bool(mask[row, column]) == (tile.sum() >= tile.size / 256), (view, row, column)
+        wide = changed_tiles(case, everyone, RENDERER, MaskSettings(pixels=1, dilate=2))  # type: ignore[arg-type]
+        assert all(bool(mask.all()) for mask, small in zip(wide, masks, strict=True) if small.any())
+        none = changed_tiles(case, ~everyone, RENDERER, settings)  # type: ignore[arg-type]
+        assert not any(bool(mask.any()) for mask in none)
+
+
+def test_settings_that_contradict_themselves() -> None:
+    with pytest.raises(ValidationError, match=r"expected after <= until, got 0\.9 and 0\.8"):
+        QueenConfig(births=BirthSettings(after=0.9))
+    assert set(QueenConfig().latents()) == {"quats", "scales", "opacities", "sh0", "shN"}
+    policies = QueenConfig()
+    frozen = policies.model_copy(
+        update={
+            "sh0": policies.sh0.model_copy(update={"policy": "frozen"}),
+            "quats": policies.quats.model_copy(update={"lr": 0.0}),
+        }
+    )
+    assert set(frozen.latents()) == {"scales", "opacities", "shN"}

@@ -1,0 +1,164 @@
+"""Whole runs, tiny: births on the wire, the player's state, resuming, settings from the recipe."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gsstream_queen import frame as frame_module
+from gsstream_queen import method as method_module
+
+from gsstream.cli.main import run_command
+from gsstream.engine import session
+from gsstream.packet import PacketKind
+from gsstream.player.playback import Playback
+
+SOURCE = "synthetic:frames=5&views=3&width=64&height=48&supersample=1"
+SETTINGS = {
+    "first_frame.max_iterations": 40, "first_frame.fill_points": 100, "first_frame.max_points": 500, "stream.epochs": 3,
+    "whole.births.every": 1, "whole.births.gradient": 1e-4, "whole.births.most": 30, "whole.dynamic": 1e-4,
+}  # fmt: skip
+
+
+def encode(out: Path, *more: str, source: str = SOURCE, **changes: Any) -> bytes:
+    values = {**SETTINGS, **{key.replace("__", "."): value for key, value in changes.items()}}
+    sets = [item for key, value in values.items() for item in ("--set", f"{key}={value}")]
+    command = ["run", "--source", source, "--method", "queen", "--out", str(out), "--quiet", "--no-video", *sets, *more]
+    assert run_command(command) == 0
+    return (out / "stream.gss").read_bytes()
+
+
+def metrics(out: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def watched(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Any], list[Any]]:
+    """(folder, encoder state after every frame, (problem, result) of every optimised frame) of one run."""
+    out, states, solved = tmp_path_factory.mktemp("watched"), [], []
+    patch = pytest.MonkeyPatch()
+
+    def remember(step):
+        def call(*args: Any) -> Any:
+            outcome = step(*args)
+            states.append(outcome.state)
+            return outcome
+
+        return call
+
+    def solve(config, problem, generator):
+        run = frame_module.optimise(config, problem, generator)
+        solved.append((problem, run))
+        return run
+
+    patch.setattr(session, "begin_whole", remember(session.begin_whole))
+    patch.setattr(session, "step_whole", remember(session.step_whole))
+    patch.setattr(method_module, "optimise", solve)
+    encode(out)
+    patch.undo()
+    return out, states, solved
+
+
+def test_the_player_has_the_encoders_state_through_births_and_deaths(watched) -> None:
+    out, states, _ = watched
+    lines = metrics(out)
+    assert sum(line.get("births", 0) for line in lines) > 0, "a stream without births proves too little"
+    assert sum(line.get("deaths", 0) for line in lines) > 0
+    with Playback(out / "stream.gss") as playback:
+        assert len(playback.state_at(4)) != len(playback.state_at(0))
+        for number, state in enumerate(states):
+            theirs = playback.player_state(number)
+            for (name, ours), (_, value) in zip(state.player.gaussians.items(), theirs.gaussians.items(), strict=True):
+                assert ours.tobytes() == value.tobytes(), (number, name)
+            assert set(state.player.decoders) == set(theirs.decoders)
+            assert lines[number]["num_gaussians"] == len(theirs.gaussians)
+
+
+def test_what_was_trained_is_what_was_sent(watched) -> None:
+    """The rows of the last forward pass against the decoded packet: only half-float decoders lie between them."""
+    _, states, solved = watched
+    assert len(solved) == 4
+    for before, after, (problem, result) in zip(states, states[1:], solved, strict=False):
+        delta = after.player.delta
+        assert delta is not None
+        for name, table in result.solution.symbols.items():
+            if name in delta.symbols:
+                nodes = before.player.layout.node_of[problem.active.numpy()]
+                kept = ~result.gone[problem.active].numpy() & delta.gates[nodes].astype(bool)
+                np.testing.assert_array_equal(delta.symbols[name], table.numpy()[kept], err_msg=name)
+        for name, sent in delta.decoders.items():
+            np.testing.assert_allclose(sent, result.solution.decoders[name].numpy(), rtol=1e-3, atol=1e-6)
+        stay = np.delete(np.arange(len(before.player.gaussians)), delta.deaths)
+        moved = after.player.gaussians.means[: len(stay)] - before.player.gaussians.means[stay]
+        closed = delta.gates[before.player.layout.node_of[stay]] == 0
+        assert not moved[closed].any()
+
+
+def test_resumed_in_the_middle_it_gives_the_same_bytes(tmp_path: Path, watched) -> None:
+    once = (watched[0] / "stream.gss").read_bytes()
+    assert encode(tmp_path / "again") == once
+    with Playback(watched[0] / "stream.gss") as playback:
+        third = playback.entry(3)
+    for name, size in (("torn", third.offset + third.size // 2), ("whole", third.offset)):
+        out = tmp_path / name
+        encode(out, "--frames", "1")
+        (out / "stream.gss").write_bytes(once[:size])
+        assert encode(out, "--resume") == once, name
+        assert [line["frame"] for line in metrics(out)] == [0, 3, 4], "frames 1 and 2 were never measured here"
+
+
+def test_a_static_recording_costs_headers(tmp_path: Path) -> None:
+    encode(tmp_path, source=f"{SOURCE}&static=1")
+    with Playback(tmp_path / "stream.gss") as playback:
+        entries = [playback.entry(frame) for frame in playback.frames]
+    assert [entry.kind for entry in entries[1:]] == [PacketKind.EMPTY] * 4
+
+
+def test_policies_decide_what_is_sent(tmp_path: Path) -> None:
+    """Only sh0 may change: no other section is in any packet, and centres keep their bits."""
+    frozen = {f"whole__{name}__policy": "frozen" for name in ("means", "quats", "scales", "opacities", "shN")}
+    encode(tmp_path, whole__births__every=0, whole__sh0__lr=0.3, **frozen)
+    with Playback(tmp_path / "stream.gss") as playback:
+        first, last = playback.state_at(0), playback.state_at(4)
+    assert first.means.tobytes() == last.means.tobytes()
+    assert first.sh0.tobytes() != last.sh0.tobytes()
+    for line in metrics(tmp_path)[1:]:
+        assert set(line["bytes"]) <= {"gates", "decoders", "sh0", "header"}
+
+
+def test_gates_close_where_they_cost(tmp_path: Path) -> None:
+    """A heavy L0 leaves fewer centres moving than none."""
+    moving = []
+    for name, weight in (("free", 0.0), ("dear", 100.0)):
+        encode(tmp_path / name, "--frames", "3", whole__gate__l0=weight, stream__epochs=8, whole__births__every=0)
+        moving.append(sum(line["moved_gaussians"] for line in metrics(tmp_path / name)[1:]))
+    assert moving[1] < moving[0]
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("whole.sh0.latnt=3", "unknown key 'whole.params.sh0.latnt'; did you mean 'latent'?"),
+        ("whole.gate.gamma=0.5", "whole.params.gate.gamma: input should be less than 0, got 0.5"),
+        ("gate_training.warmup=0.5", "gate_training.warmup: the whole method 'queen' does not read it"),
+    ],
+)
+def test_wrong_settings_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], setting: str, message: str
+) -> None:
+    command = ["run", "--source", SOURCE, "--method", "queen", "--out", str(tmp_path / "o"), "--set", setting]
+    assert run_command(command) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_the_other_commands_know_it(tmp_path: Path, capsys: pytest.CaptureFixture[str], watched) -> None:
+    out = str(watched[0])
+    assert run_command(["info", out]) == 0
+    assert "births" in capsys.readouterr().out
+    assert run_command(["evaluate", out, "--source", SOURCE]) == 0
+    assert run_command(["play", out, "--out", str(tmp_path / "frames"), "--frames", "0:2"]) == 0
+    assert run_command(["methods", "show", "queen"]) == 0
+    assert "whole     queen" in capsys.readouterr().out

@@ -20,16 +20,16 @@ def gsstream_components() -> list[ComponentSpec]:
 
 @hookimpl
 def gsstream_methods() -> list[MethodSpec]:
-    """The published rates, and rates that suit short budgets."""
+    """The letter, and what it costs less to do."""
     return [
         MethodSpec(
             name="queen",
             recipe="gsstream_queen:recipes/queen.yaml",
-            summary="QUEEN: 10 epochs, measured rates",
+            summary="QUEEN: 10 epochs, training what changed",
         ),
         MethodSpec(
             name="queen-published",
             recipe="gsstream_queen:recipes/queen-published.yaml",
-            summary="QUEEN: 10 epochs, published rates",
+            summary="QUEEN: 10 epochs, training everything, as published",
         ),
     ]

@@ -100,6 +100,11 @@ def frame(
     if quick:
         overrides.insert(0, ("--quick", "stream.epochs=1"))
     recipe = resolve_recipe(method, catalog.recipe_path, (), overrides).recipe
+    if recipe.whole.name != "none":
+        raise InputError(
+            f"--method {method}: expected a method made of parts, got the whole method {recipe.whole.name!r}; time it "
+            "with gsstream run, which reports seconds per frame"
+        )
     from gsstream.trade.bench_frame import FramePlan, bench_frame
     from gsstream.trade.bench_tables import frame_table
 

@@ -11,7 +11,7 @@ import torch
 
 from gsstream.cli.main import run_command
 from gsstream.core.delta import Delta
-from gsstream.core.errors import ComponentError, InputError, RecipeError
+from gsstream.core.errors import ComponentError, RecipeError
 from gsstream.engine.assemble import assemble
 from gsstream.engine.exposure import Exposure
 from gsstream.method.base import StreamingMethod
@@ -175,13 +175,9 @@ def test_resuming_with_other_settings_is_refused(tmp_path: Path, capsys: pytest.
     assert "the stream was written with another recipe: seed differ" in capsys.readouterr().err
 
 
-def test_the_benchmark_of_the_parts_refuses_a_whole_method() -> None:
-    from gsstream.trade.bench_frame import FramePlan, bench_frame
-
-    recipe = Recipe.model_validate({"method": "hold", "whole": {"name": "hold"}})
-    plan = FramePlan(recipe, (0.5,), (10,), 5, 2, 32, 24, 1, 0)
-    with pytest.raises(InputError, match="'hold' is the whole method 'hold': time it with gsstream run"):
-        bench_frame(plan, load_catalog(), lambda _: None)
+def test_the_benchmark_of_the_parts_refuses_a_whole_method(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["bench", "frame", "--method", "hold", "--quick"]) == 2
+    assert "expected a method made of parts, got the whole method 'hold'" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")

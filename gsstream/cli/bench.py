@@ -91,6 +91,7 @@ def frame(
     moves. Three variants of the recipe: dense (every gate open, everything takes part), gated (its own gates), active
     (and only what changed beyond the noise takes part: stream.change_threshold, 4 where the recipe has none).
     """
+    from gsstream.core.errors import InputError
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
 

@@ -11,7 +11,7 @@ from gsstream.recipe.model import Recipe
 
 #: Keys that only the five-part path reads.
 PART_SLOTS = ("structure", "confidence", "propagation", "gate", "regularizer", "update")
-PART_SECTIONS = ("stream", "gate_training", "codec")
+PART_SECTIONS = ("stream", "gate_training", "codec", "insertion")
 #: Of those sections, what the session reads for every method.
 SESSION_KEYS = ("codec.fsync",)
 

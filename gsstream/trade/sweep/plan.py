@@ -19,7 +19,7 @@ from gsstream.trade.sweep.config import Axis, Range, Scene, SweepConfig, Variant
 #: Sections of a recipe that say nothing of frame 0; a section that nobody thought of counts as one that does.
 LATER_KEYS = (
     "schema_version", "method", "seed", "frames", "confidence", "propagation", "gate", "regularizer", "update",
-    "stream", "gate_training", "codec", "insertion",
+    "whole", "stream", "gate_training", "codec", "insertion",
 )  # fmt: skip
 
 

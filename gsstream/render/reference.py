@@ -47,6 +47,12 @@ class ReferenceRenderer(Renderer):
         # Visible does not depend on what the gradient happens to be: a still Gaussian in view has gradient 0.
         return ScreenGradient(gradient, footprint_in_image(fixed, cameras, view) | (gradient != 0).any(1))
 
+    def nudged(
+        self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, offsets: torch.Tensor
+    ) -> RenderOutput:
+        """Render on black with every 2-D mean moved by ``offsets`` [N, 2] pixels: what screen gradients are of."""
+        return self._render(gaussians, cameras, view, (0.0, 0.0, 0.0), offsets)
+
     def _render(
         self,
         gaussians: Gaussians[torch.Tensor],

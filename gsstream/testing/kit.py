@@ -9,12 +9,22 @@ from typing import Any, Literal
 
 from gsstream.core.part import Part
 from gsstream.method.base import StreamingMethod
-from gsstream.testing.checks import common, confidence, gate, method, packet, propagation, regularizer, structure
+from gsstream.testing.checks import (
+    common,
+    confidence,
+    gate,
+    method,
+    packet,
+    propagation,
+    regularizer,
+    renderer,
+    structure,
+)
 from gsstream.testing.registry import BEHAVED, CHECKS, Check, Skip, checks_for, kind_of
 
 Status = Literal["passed", "failed", "expected failure", "skipped"]
 #: Importing these modules fills the registry; the order is that of the reports.
-MODULES = (common, structure, confidence, propagation, gate, regularizer, method, packet)
+MODULES = (common, structure, confidence, propagation, gate, regularizer, renderer, method, packet)
 LEAST_REASON = 20
 
 
@@ -145,4 +155,4 @@ def summary(results: Sequence[CheckResult]) -> str:
 
 def behaviour_known(part: Part) -> bool:
     """Whether the kit checks more of this kind than settings, freezing and declaration."""
-    return kind_of(part) in (*BEHAVED, "whole")
+    return kind_of(part) in (*BEHAVED, "renderer", "whole")

@@ -30,7 +30,7 @@ CONTRACTS: dict[str, type[Part]] = {
     "loss": Loss,
     "optimiser": RowOptimiser,
 }
-#: The kinds whose behaviour the kit knows; of the others it checks settings, freezing and declaration.
+#: The kinds that all common checks are made on; of the others only settings, freezing and declaration.
 BEHAVED = ("structure", "confidence", "propagation", "gate", "regularizer")
 
 CheckFunction = TypeVar("CheckFunction", bound=Callable[..., None])

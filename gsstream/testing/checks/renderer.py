@@ -1,0 +1,171 @@
+"""What a renderer promises: pictures that agree with the reference, and sessions that agree with fresh renders."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from gsstream.core.cameras import Cameras
+from gsstream.render.base import Renderer, RenderOutput
+from gsstream.testing.cases import BLACK, RENDERER, SIZE, Scene, fingerprint, world
+from gsstream.testing.compare import EXACT, at_most, equal, finite
+from gsstream.testing.registry import check
+
+WORLDS = ("empty", "one", "two identical", "line", "cloud", "far", "thin", "unseen")
+GREY = (0.2, 0.5, 0.9)
+#: One alpha at the cut of 1/255 may fall on either side in another arithmetic; so may the last Gaussian of a pixel.
+CUT = 1e-2
+SUMS = "sums of float32 in another order"
+
+
+Color = tuple[float, float, float]
+
+
+def _draw(part: Renderer, scene: Scene, cameras: Cameras, view: int = 0, behind: Color = GREY) -> RenderOutput:
+    with torch.no_grad():
+        return part.render(scene, cameras, view, behind)
+
+
+def _next(scene: Scene, rows: torch.Tensor) -> Scene:
+    """The scene with every attribute of some rows changed, as the next frame may have it."""
+    shift = {"means": 0.07, "quats": 0.1, "scales": 0.3, "opacities": -0.8, "sh0": 0.4, "shN": 0.2}
+    add = torch.zeros(len(scene)).index_fill(0, rows, 1.0)
+    return type(scene)(**{n: v + shift[n] * add.reshape(-1, *[1] * (v.dim() - 1)) for n, v in scene.items()})
+
+
+@check("renderer")
+def check_renderer_range(part: Renderer) -> None:
+    """[H, W, 3] and [H, W], finite; a pixel lies between 0 and the brightest colour; nothing drawn is background."""
+    for name in WORLDS:
+        case = world(name)
+        got = _draw(part, case.gaussians, case.cameras)
+        shapes = (tuple(got.image.shape), tuple(got.alpha.shape))
+        assert shapes == ((SIZE, SIZE, 3), (SIZE, SIZE)), f"world {name!r}: expected [{SIZE}, {SIZE}, 3], got {shapes}"
+        finite(f"world {name!r}: image", got.image)
+        finite(f"world {name!r}: alpha", got.alpha)
+        # Degree 0: the colour of a Gaussian is 0.5 + 0.28... sh0 from everywhere.
+        colours = 0.5 + 0.28209479177387814 * case.gaussians.sh0.reshape(-1)
+        brightest = max(float(torch.cat([colours, torch.zeros(1)]).max()), max(GREY))
+        why = "a weighted mean of colours, each at least 0"
+        at_most(f"world {name!r}: image", got.image, brightest, 1e-5, why)
+        dark = _draw(part, case.gaussians, case.cameras, 0, BLACK).image
+        at_most(f"world {name!r}: image below 0", -dark, 0.0, 1e-5, why)
+        at_most(f"world {name!r}: alpha", got.alpha, 1.0, 1e-5, "1 - transmittance")
+        at_most(f"world {name!r}: alpha below 0", -got.alpha, 0.0, 1e-5, "1 - transmittance")
+    nothing = _draw(part, world("empty").gaussians, world("empty").cameras).image
+    equal("no Gaussians", nothing, torch.tensor(GREY).expand(SIZE, SIZE, 3), 1e-6, "the background alone")
+
+
+@check("renderer")
+def check_renderer_reference(part: Renderer) -> None:
+    """Image and alpha are those of the reference renderer, from every camera."""
+    for name in ("line", "cloud", "thin", "unseen"):
+        case = world(name)
+        for view in range(len(case.cameras)):
+            got, want = (_draw(each, case.gaussians, case.cameras, view) for each in (part, RENDERER))
+            for what, a, b in (("image", got.image, want.image), ("alpha", got.alpha, want.alpha)):
+                equal(f"world {name!r}, camera {view}: {what}", a, b, CUT, "an alpha at the cut of 1/255 may go over")
+                mean = (a - b).abs().mean()
+                at_most(f"world {name!r}, camera {view}: mean error of {what}", mean, 0.0, 1e-4, SUMS)
+
+
+@check("renderer")
+def check_renderer_repeatable(part: Renderer) -> None:
+    """The same scene gives the same image, bit for bit; scene and cameras come out as they went in."""
+    case = world("cloud")
+    scene = replace(case.gaussians, opacities=case.gaussians.opacities.clone())
+    scene.opacities[::3] = 9.0  # nearly opaque
+    before = fingerprint((scene, case.cameras))
+    first = _draw(part, scene, case.cameras).image.clone()
+    part.screen_gradient(scene, case.cameras, 0, torch.ones(SIZE, SIZE, 3))
+    assert fingerprint((scene, case.cameras)) == before, "the scene or the cameras were changed in place"
+    equal("second render of the same scene", _draw(part, scene, case.cameras).image, first)
+
+
+@check("renderer")
+def check_renderer_screen_gradient(part: Renderer) -> None:
+    """Agrees with finite differences of the reference, in pixels; who is not in view has none and is not visible."""
+    case = world("line")
+    weights = torch.randn(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(6))
+    got = part.screen_gradient(case.gaussians, case.cameras, 1, weights)
+    picked = torch.arange(0, len(case.gaussians), 3)
+    want, eps = torch.zeros(len(picked), 2, dtype=torch.float64), 1e-5
+    double = case.gaussians.map(torch.Tensor.double)
+    for place, row in enumerate(picked):
+        for axis in range(2):
+            ends = []
+            for sign in (1, -1):
+                nudge = torch.zeros(len(double), 2, dtype=torch.float64)
+                nudge[row, axis] = sign * eps
+                ends.append((RENDERER.nudged(double, case.cameras, 1, nudge).image * weights).sum())
+            want[place, axis] = (ends[0] - ends[1]) / (2 * eps)
+    scale = float(want.abs().max())
+    why = f"{SUMS}; relative to the largest"
+    equal("gradient of the 2-D means", got.gradient[picked] / scale, (want / scale).float(), 5e-3, why)
+
+    case = world("unseen")
+    got = part.screen_gradient(case.gaussians, case.cameras, 0, weights)
+    hidden = case.gaussians.means[:, 1] > 10
+    assert not bool(got.visible[hidden].any()), "Gaussians far outside the image are called visible"
+    at_most("gradient of what is not in view", got.gradient[hidden].abs(), 0.0, 0.0, EXACT)
+    moved = (got.gradient != 0).any(1)
+    assert not bool((moved & ~got.visible).any()), "a Gaussian has a gradient and is not called visible"
+
+
+@check("renderer")
+def check_renderer_session(part: Renderer) -> None:
+    """A session whose active rows changed shows what a fresh render of the whole shows, with the same gradients."""
+    case = world("cloud")
+    active = torch.arange(0, len(case.gaussians), 9)
+    changed = _next(case.gaussians, active)
+    weights = torch.randn(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(2))
+    for view in range(len(case.cameras)):
+        session = part.open(case.gaussians, None, case.cameras, GREY)
+        still = session.render(view, case.gaussians).image.detach().clone()
+        equal("wide session, nothing changed", still, _draw(part, case.gaussians, case.cameras, view).image, 1e-6, SUMS)
+        session.narrow(active)
+        rows = changed.rows(active).map(lambda v: v.detach().clone().requires_grad_())
+        whole = changed.map(lambda v: v.detach().clone().requires_grad_())
+        got, want = session.render(view, rows), part.render(whole, case.cameras, view, GREY)
+        equal(f"camera {view}: image", got.image.detach(), want.image.detach(), 1e-5, SUMS)
+        if got.tiles is not None:
+            tiles = got.tiles.repeat_interleave(16, 0).repeat_interleave(16, 1)[:SIZE, :SIZE]
+            equal(f"camera {view}: outside the tiles named", got.image.detach()[~tiles], still[~tiles], 1e-6, SUMS)
+        for output in (got, want):
+            (output.image * weights).sum().backward()  # type: ignore[no-untyped-call]
+        for (name, a), (_, b) in zip(rows.items(), whole.items(), strict=True):
+            if a.numel():
+                assert a.grad is not None and b.grad is not None, f"{name}: no gradient came back"
+                scale = float(b.grad.abs().max()) or 1.0
+                equal(f"camera {view}: gradient of {name}", a.grad / scale, b.grad[active] / scale, 1e-4, SUMS)
+
+
+@check("renderer")
+def check_renderer_commit(part: Renderer) -> None:
+    """After ``commit`` a session is, bit for bit, one opened anew with the next scene."""
+    case = world("cloud")
+    active = torch.arange(0, len(case.gaussians), 9)
+    later = _next(case.gaussians, active)
+    session = part.open(case.gaussians, None, case.cameras, GREY)
+    weights = torch.randn(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(2))
+    with torch.no_grad():
+        for view in range(len(case.cameras)):
+            session.screen_gradient(view, weights)
+        session.narrow(active)
+        for view in range(len(case.cameras)):
+            session.render(view, later.rows(active))
+    kept, fresh = session.commit(later, active), part.open(later, None, case.cameras, GREY)
+    others = torch.arange(4, len(later), 11)
+    last = _next(later, others)
+    for view in range(len(case.cameras)):
+        a, b = (each.screen_gradient(view, weights) for each in (kept, fresh))
+        # Sums of gradients may run in no fixed order; images may not differ.
+        scale = float(b.gradient.abs().max()) or 1.0
+        equal(f"camera {view}: screen gradient", a.gradient / scale, b.gradient / scale, 1e-5, SUMS)
+    for each in (kept, fresh):
+        each.narrow(others)
+    for view in range(len(case.cameras)):
+        with torch.no_grad():
+            a_image, b_image = (each.render(view, last.rows(others)).image for each in (kept, fresh))
+        equal(f"camera {view}: image", a_image, b_image)

@@ -17,10 +17,18 @@ ZOOMS = np.geomspace(0.7, 3.0, 60)
 
 @dataclass(frozen=True, slots=True)
 class Undistortion:
-    """``K`` [3, 3] of the pinhole pictures; ``places`` [H, W, 2] where each of their pixels lies in the raw picture."""
+    """How pinhole pictures are made of raw ones.
+
+    Arguments:
+        K: [3, 3] of the pinhole pictures.
+        places: [factor H, factor W, 2] where each sample lies in the raw picture, pixels.
+        factor: samples per pixel and axis. A pixel is the mean of its samples; one alone would skip raw pixels, which
+            flickers, where pictures are shrunk.
+    """
 
     K: FloatArray
     places: FloatArray
+    factor: int = 1
 
     def apply(self, image: FloatArray) -> FloatArray:
         """[H, W, 3] pinhole picture of a raw one, bilinear, in [0, 1]."""
@@ -29,6 +37,7 @@ class Undistortion:
         at = torch.from_numpy(self.places - 0.5).float()  # kornia counts from the centre of the first pixel
         planes = torch.from_numpy(image).permute(2, 0, 1)[None]
         out = remap(planes, at[None, ..., 0], at[None, ..., 1], mode="bilinear", align_corners=True)
+        out = torch.nn.functional.avg_pool2d(out, self.factor)
         return np.ascontiguousarray(out[0].permute(1, 2, 0).numpy())
 
 
@@ -42,6 +51,15 @@ def undistortion(lens: Lens, size: tuple[int, int], target: tuple[int, int]) -> 
     """
     scale = np.diag([target[0] / size[0], target[1] / size[1], 1.0])
     base = scale @ lens.K
+    K = _widest(lens, base, size, target) if lens.distorts else base
+    factor = -(-size[0] // target[0])
+    width, height = factor * target[0], factor * target[1]
+    x, y = np.meshgrid((np.arange(width) + 0.5) / factor, (np.arange(height) + 0.5) / factor)
+    rays = _rays(np.stack([x.ravel(), y.ravel()], axis=1), K)
+    return Undistortion(K, lens_places(lens, size, rays).reshape(height, width, 2), factor)
+
+
+def _widest(lens: Lens, base: FloatArray, size: tuple[int, int], target: tuple[int, int]) -> FloatArray:
     border = _border(*target)
     tried = [_rays(border, _zoomed(base, zoom)) for zoom in ZOOMS]
     places = lens_places(lens, size, np.concatenate(tried)).reshape(len(ZOOMS), -1, 2)
@@ -54,10 +72,7 @@ def undistortion(lens: Lens, size: tuple[int, int], target: tuple[int, int]) -> 
             f"undistortion: no pinhole is covered by a {lens.model} lens with {np.round(lens.params, 4).tolist()} and "
             f"pictures of {size[0]} x {size[1]}; expected a lens that sees straight ahead. Check the lens model"
         )
-    K = _zoomed(base, ZOOMS[first])
-    x, y = np.meshgrid(np.arange(target[0]) + 0.5, np.arange(target[1]) + 0.5)
-    rays = _rays(np.stack([x.ravel(), y.ravel()], axis=1), K)
-    return Undistortion(K, lens_places(lens, size, rays).reshape(target[1], target[0], 2))
+    return _zoomed(base, float(ZOOMS[first]))
 
 
 def _zoomed(K: FloatArray, zoom: float) -> FloatArray:

@@ -15,6 +15,7 @@ from gsstream.scene.prepare import PrepareOptions, prepare
 from gsstream.scene.raw import find_cameras
 from gsstream.source.open import open_source
 from tests.scene.bad_scenes import save
+from tests.source.scenes import write_video
 
 needs_pycolmap = pytest.mark.skipif(importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed")
 #: Structure from motion needs neighbours that are not far apart, and pixels.
@@ -87,6 +88,13 @@ def test_known_poses_are_kept_and_points_triangulated(tmp_path: Path) -> None:
     assert len(points) == len(made.points) > 50
     assert ((points.xyz >= made.bounds[0]) & (points.xyz <= made.bounds[1])).all()
     assert np.nanmax(made.mapping.camera_error) < 1
+    made = prepare(raw, tmp_path / "small", PrepareOptions(frames=1, width=80), quiet)
+    assert made.frames == 1
+    scaled = rig.train.scaled(80, 60)
+    assert np.allclose(open_source(str(tmp_path / "small")).info.train.Ks, scaled.Ks, rtol=1e-6)
+    blocks = open_source(str(tmp_path / "scene")).frame(0).images.reshape(-1, 60, 3, 80, 3, 3).mean((2, 4))
+    small = open_source(str(tmp_path / "small")).frame(0).images
+    assert np.abs(small - blocks).max() < 1 / 255, "shrunk pictures are means: no raw pixel is skipped"
 
 
 @pytest.mark.sfm
@@ -119,6 +127,46 @@ def test_undistorted_pixels_come_from_where_the_lens_shows_them(model: str) -> N
     image = np.concatenate([ramp, ramp[..., :1]], axis=-1).astype(np.float32)
     inner = (slice(2, -2), slice(2, -2), slice(2))
     assert np.abs(made.apply(image)[inner] - made.places[2:-2, 2:-2] / 120).max() < 1e-4
+
+
+def raw_videos(folder: Path, frames: int, world: str) -> dict[str, list[np.ndarray]]:
+    """A video without loss per camera; its frames as they were written, 8 bit."""
+    pytest.importorskip("av")
+    source, shown = open_source(world), {}
+    for split in ("train", "test"):
+        played = [source.frame(t, split) for t in range(frames)]
+        for i, name in enumerate(played[0].cameras.ids):
+            shown[name] = [np.round(frame.images[i] * 255).astype(np.uint8) for frame in played]
+            write_video(folder / f"{name}.mkv", np.stack(shown[name]))
+    return shown
+
+
+def test_videos_are_raw_cameras(tmp_path: Path) -> None:
+    shown = raw_videos(tmp_path / "raw", 2, WORLD)
+    cameras = find_cameras(tmp_path / "raw")
+    assert [camera.name for camera in cameras] == sorted(shown)
+    for camera in cameras:
+        assert camera.size == (240, 180)
+        frames = list(camera.frames(None))
+        assert np.array_equal(np.round(np.stack(frames) * 255), shown[camera.name])
+        assert len(list(camera.frames(1))) == 1
+    path = tmp_path / "raw" / "cam01.mkv"
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(SourceError, match=r"cam01.mkv: the video (cannot be decoded|holds no frame)"):
+        find_cameras(tmp_path / "raw")
+
+
+@pytest.mark.sfm
+@needs_pycolmap
+def test_videos_without_poses_become_a_small_scene(tmp_path: Path) -> None:
+    moving = LARGE.replace("frames=1&static=true", "frames=2&supersample=1")
+    shown = raw_videos(tmp_path / "raw", 2, moving)
+    command = ["scene", "prepare", str(tmp_path / "raw"), "--out", str(tmp_path / "scene"), "--lens", "pinhole"]
+    assert run_command([*command, "--test", "test", "--width", "160", "--quiet"]) == 0
+    scene = open_source(str(tmp_path / "scene"))
+    assert (scene.info.num_frames, scene.info.train.width, scene.info.train.height) == (2, 160, 120)
+    blocks = np.stack([shown[name][1] for name in scene.info.train.ids]).reshape(-1, 120, 2, 160, 2, 3).mean((2, 4))
+    assert np.abs(scene.frame(1).images * 255 - blocks).max() <= 1
 
 
 def test_what_cannot_be_prepared_is_said(tmp_path: Path) -> None:

@@ -65,7 +65,7 @@ class _StaleOpacities(Session):
         return drawn
 
     def commit(self, gaussians: Any, changed: torch.Tensor) -> RenderSession:
-        return _StaleOpacities(self._renderer, gaussians, None, self._cameras, self._background)  # type: ignore[no-any-return]
+        return _StaleOpacities(self._renderer, gaussians, None, self._cameras, self._background)
 
 
 @spoils("check_renderer_session")

@@ -90,6 +90,8 @@ def optimise(parts: Assembly, problem: Problem, generator: torch.Generator) -> S
             return run.solution(loss, (epoch + 1) * views)
         if stream.release_closed and epoch + 1 < epochs:
             run.release((epoch + 1) / epochs)
+            if len(run.active) == 0:
+                return run.solution(loss, (epoch + 1) * views)
     return run.solution(loss, epochs * views)
 
 

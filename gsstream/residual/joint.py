@@ -86,7 +86,8 @@ def joint_code(
 
 def join_features(code: JointCode, rows: Gaussians[torch.Tensor]) -> torch.Tensor:
     """[A, D] of the attributes that may change."""
-    parts = [getattr(rows, name).reshape(len(rows), -1) for name in code.feature]
+    # The width is said: no rows may be left, and then -1 could be anything.
+    parts = [getattr(rows, name).reshape(len(rows), at.stop - at.start) for name, at in code.feature.items()]
     return torch.cat(parts, 1) if parts else torch.zeros(len(rows), 0)
 
 

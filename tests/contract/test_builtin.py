@@ -10,6 +10,7 @@ from gsstream.confidence.uniform import Uniform
 from gsstream.gate.always_open import AlwaysOpen
 from gsstream.loss.photometric import ReferenceLoss
 from gsstream.method.hold import Hold
+from gsstream.optimiser.adam import ReferenceAdam
 from gsstream.propagation.group_max import GroupMax
 from gsstream.regularizer.none import NoRegularizer
 from gsstream.render.reference import ReferenceRenderer
@@ -26,7 +27,7 @@ from gsstream.testing.kit import all_checks, summary
 
 BUILTIN = [
     Flat(), Uniform(), Uniform(Uniform.Config(logit=-50)), GroupMax(), AlwaysOpen(), NoRegularizer(), Additive(),
-    ReferenceRenderer(), ReferenceLoss(), Hold(),
+    ReferenceRenderer(), ReferenceLoss(), ReferenceAdam(), Hold(),
 ]  # fmt: skip
 EXAMPLES = [ExampleStructure(), ExampleConfidence(), ExamplePropagation(), ExampleGate(), ExampleRegularizer()]
 EXAMPLES += [ExampleWhole()]

@@ -72,7 +72,7 @@ def test_a_native_abort_becomes_an_error(tmp_path: Path, monkeypatch: pytest.Mon
     aborting.chmod(0o755)
     monkeypatch.setattr(sys, "executable", os.fspath(aborting))
     with pytest.raises(InputError, match=r"was ended by signal 6: .*free\(\): invalid pointer"):
-        sfm._run(tmp_path, 30)
+        sfm.run_pycolmap("triangulate", tmp_path, 30)
 
 
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -342,6 +342,8 @@ def test_written_out_gradient_equals_autograd() -> None:
 
 def test_joint_table_of_attributes_that_do_not_change() -> None:
     base = make(4).map(torch.from_numpy)
+    none = joint_code(Additive().codes(), init_latents(Additive(), base.rows(torch.arange(0))), {}, base)
+    assert tuple(join_features(none, base.rows(torch.arange(0))).shape) == (0, none.trained.shape[1])
     code = joint_code(Additive().codes(), {}, {}, base)
     change = decode_joint(code, torch.zeros(4, 0), code.join_decoders({}), torch.ones(4))
     same = add_joint(code, base, join_features(code, base), change, torch.ones(4))

@@ -62,7 +62,8 @@ def _slot(
     slot: str, field: Schema, parts: Mapping[str, PartSchema], default: str | None, definitions: Schema
 ) -> Schema:
     """A bare name, or {name, params}; the name decides which settings are known."""
-    names = ["auto", *parts] if slot == "renderer" else list(parts)
+    # What a slot is without being asked need not be a part: "auto" of the renderer, "none" of a whole method.
+    names = list(dict.fromkeys([Recipe.model_fields[slot].default.name, *parts]))
     keys: set[str] = set()
     cases = []
     for name, part in parts.items():

@@ -26,7 +26,9 @@ ROOT = Path(__file__).parents[2]
 CATALOG = load_catalog()
 METHODS = [name for name in CATALOG.names("method") if isinstance(CATALOG.entry("method", name).spec, MethodSpec)]
 #: Files whose first key is a sweep's are no recipes.
-CONFIGS = [path for path in sorted((ROOT / "configs").rglob("*.yaml")) if "sweep" not in path.as_posix()]
+#: Folders of configs/ that hold no recipes.
+OTHERS = {"sweeps", "scenes"}
+CONFIGS = [p for p in sorted((ROOT / "configs").rglob("*.yaml")) if not OTHERS & {part.name for part in p.parents}]
 CONFIGS += [CATALOG.recipe_path(name) for name in METHODS]
 
 

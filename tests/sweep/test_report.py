@@ -35,7 +35,7 @@ def make_table(folder: Path, cells, paper=None, failed=(), cpu=1.0) -> Path:
         {"cell": f"c{i}", "scene": c[0], "variant": c[1], "axes": c[2], "seed": c[3]} for i, c in enumerate(cells)
     ]
     points += [{"cell": f"f{i}", "scene": "a", "variant": "bad", "axes": {}, "seed": i} for i, _ in enumerate(failed)]
-    config = {"name": "made up", "description": "Numbers < by hand", "scenes": [], "paper_table": paper}
+    config = {"name": "made up", "description": "Numbers < by hand", "scenes": [], "paper_tables": paper or {}}
     writer.append("plan", {"config": config, "points": points})
     facts = {"processor": "none", "processors_usable": 1, "gpu": None, "python": "3", "torch": "2", "code": "c",
              "distributions": {"gsstream": "0"}}  # fmt: skip
@@ -167,16 +167,24 @@ def test_one_seed_calls_nothing_a_tie(tmp_path):
 
 def test_the_papers_numbers_stand_beside_ours_and_are_labelled(tmp_path):
     cells = [("a", "full", BASE, 0, 30.0, 20.0, 1.0), ("a", "ft-0.50", BASE, 0, 29.0, 10.0, 1.0)]
-    data = read_sweep_data(make_table(tmp_path / "t", cells, paper="propagation"))
+    data = read_sweep_data(make_table(tmp_path / "t", cells, paper={"propagation": {}}))
     table = beside_ours(paper_table("propagation"), data.of("a"), "a")
     rows = [list(row) for row in table.rows]
     assert "ENeRF" in table.caption
     assert "RTX 4090" in table.caption
-    assert rows[1][:3] == ["full", "paper", "25.94"]
-    assert rows[2][:3] == ["", "ours, a", "31.00"]
-    assert rows[2][3] == "-", "LPIPS was not measured"
+    assert rows[1][:4] == ["full", "paper", "", "25.94"]
+    assert rows[2][:4] == ["", "ours, a", "1", "31.00"]
+    assert rows[2][4] == "-", "LPIPS was not measured"
+    assert rows[0][-2:] == [BY_KEY["psnr_moving"].title, BY_KEY["cpu_seconds"].title]
     assert [row[1] for row in rows[1:]].count("paper") == 5
     assert table in build_report(data, {})
+
+
+def test_a_row_of_the_paper_may_be_a_variant_of_another_name(tmp_path):
+    cells = [("a", "1-dense", BASE, 0, 30.0, 20.0, 1.0)]
+    data = read_sweep_data(make_table(tmp_path / "t", cells, paper={"structure-sparsity": {"neither": "1-dense"}}))
+    table = next(b for b in build_report(data, {}) if isinstance(b, Table) and "Structure" in b.caption)
+    assert [row[0] for row in table.rows[1:]] == ["neither", "", "sparsity", "structure", "both"]
 
 
 def test_the_papers_file_is_sound():

@@ -179,8 +179,12 @@ def test_the_sweeps_that_ship_are_sound(path):
     short = config.model_copy(update={"seeds": config.seeds[:1], "scenes": config.scenes[:1]})
     plan = make_plan(short, path.parent, load_catalog().recipe_path)
     assert len(plan.cells) == len(plan.points), "two points of a table are the same run"
-    if config.paper_table:
-        rows, names = set(paper_table(config.paper_table).rows), {variant.name for variant in config.variants}
+    names = {variant.name for variant in config.variants}
+    for table, renamed in config.paper_tables.items():
+        rows = set(paper_table(table).rows)
+        assert set(renamed) <= rows
+        if path.parent.name != "paper":
+            continue
         theirs = {"queen-l", "queen-s", "hicom", "3dgstream", "4dgc", "streamstgs", "recon-gs", "hierarchy"}
         assert rows - theirs <= names
 

@@ -86,8 +86,8 @@ def _scene(data: SweepData, scene: str) -> list[Block]:
     found = effects(groups, [*GOODS, *measured_costs(groups)])
     if found:
         blocks += [_knobs(found, groups), Text(_READING)]
-    if data.config.get("paper_table"):
-        blocks.append(beside_ours(paper_table(data.config["paper_table"]), groups, scene))
+    for name, rows in data.config.get("paper_tables", {}).items():
+        blocks.append(beside_ours(paper_table(name), groups, scene, rows))
     curves = curve_groups(groups)
     blocks.append(Picture(f"{scene}-frames.png", frame_curves(curves, f"{scene}, seed {curves[0].runs[0].seed}"),
                           f"Quality, bytes and seconds of every frame on {scene}"))  # fmt: skip

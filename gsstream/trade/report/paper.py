@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from ruamel.yaml import YAML
@@ -46,16 +47,23 @@ def paper_table(name: str) -> PaperTable:
     return PaperTable(name, table["title"], table["data"], machine, content["source"], columns, rows)
 
 
-def beside_ours(table: PaperTable, groups: Sequence[Group], scene: str) -> Table:
-    """The paper's rows, each followed by our run of the variant of that name, in the paper's columns."""
+def beside_ours(
+    table: PaperTable, groups: Sequence[Group], scene: str, variants: Mapping[str, str] = MappingProxyType({})
+) -> Table:
+    """The paper's rows, each followed by our run in the paper's columns, moving pixels and processor seconds.
+
+    Arguments:
+        variants: row -> our variant; by default the one of that name.
+    """
     ours = {group.variant: group for group in groups if not group.axes}
-    rows = [["", "whose", *(BY_KEY[key].title for key in table.columns)]]
+    more = [key for key in ("psnr_moving", "cpu_seconds") if any(math.isfinite(g.mean(key)) for g in ours.values())]
+    rows = [["", "whose", "seeds", *(BY_KEY[key].title for key in (*table.columns, *more))]]
     for name, values in table.rows.items():
-        rows.append([name, "paper", *(_printed(key, values[key]) for key in table.columns)])
-        if name in ours:
-            group = ours[name]
-            cells = [cell(key, group.mean(key), group.spread(key)) for key in table.columns]
-            rows.append(["", f"ours, {scene}", *cells])
+        rows.append([name, "paper", "", *(_printed(key, values[key]) for key in table.columns), *("-" for _ in more)])
+        group = ours.get(variants.get(name, name))
+        if group is not None:
+            cells = [cell(key, group.mean(key), group.spread(key)) for key in (*table.columns, *more)]
+            rows.append(["", f"ours, {scene}", str(len(group.runs)), *cells])
     caption = f"{table.title}: the paper on {table.data}, {table.machine} ({table.source})"
     return Table(f"{caption}; ours on {scene}, machine above", rows)
 

@@ -101,7 +101,10 @@ class SweepConfig(Section):
     schema_version: Literal["1.0"] = Field(default="1.0", description="version of this schema")
     name: str = Field(pattern=_NAME, description="name of the sweep")
     description: str = Field(default="", description="what it is to show; printed in the report")
-    paper_table: str | None = Field(default=None, description="table of the paper that the report puts beside it")
+    paper_tables: dict[str, dict[str, str]] = Field(
+        default_factory=dict,
+        description="tables of the paper that the report puts beside ours: row -> variant where their names differ",
+    )
     scenes: list[Scene] = Field(min_length=1, description="recordings")
     seeds: list[int] = Field(default=[0], min_length=1, description="seeds of every random stream")
     variants: list[Variant] = Field(min_length=1, description="named recipes")
@@ -136,6 +139,10 @@ class SweepConfig(Section):
                     f"base_seeds of {variant.name}: expected search 'each' and integers from 0 on besides the sweep's "
                     f"seeds {self.seeds}; got search {self.search!r} and {variant.base_seeds}"
                 )
+        names = [variant.name for variant in self.variants]
+        unknown = {name for rows in self.paper_tables.values() for name in rows.values()} - set(names)
+        if unknown:
+            raise ValueError(f"paper_tables names variants that are not there: {sorted(unknown)}; there are {names}")
         axes = [*self.axes.items(), *(item for variant in self.variants for item in variant.axes.items())]
         for key, axis in axes:
             if isinstance(axis, Range) and self.search != "random":

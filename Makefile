@@ -35,7 +35,7 @@ test: setup
 	for check in "ruff check ." "mypy" "lint-imports"; do \
 	  echo "== $$check"; $(BIN)/$$check || { echo "== FAILED: $$check"; status=1; }; \
 	done; \
-	echo "== pytest"; $(BIN)/python -m pytest || status=1; \
+	echo "== pytest"; $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile || status=1; \
 	exit $$status
 
 setup: $(BUILT)

@@ -35,6 +35,8 @@ from gsstream.recipe.save import save_resolved
 from gsstream.source.base import FrameSource, GrowingSource, SourceInfo
 from gsstream.source.prefetch import Prefetcher
 
+#: Sees every step of a run.
+Witness = Callable[[Step[Any]], None]
 STREAM, METRICS, RECIPE = "stream.gss", "metrics.jsonl", "recipe.yaml"
 
 
@@ -57,6 +59,7 @@ def run(
     measure: bool = True,
     first_frame: PlayerState | None = None,
     energy: EnergyMeter | None = None,
+    witness: Witness | None = None,
 ) -> RunResult:
     """Encode a recording into ``out`` (stream.gss, metrics.jsonl, recipe.yaml).
 
@@ -68,9 +71,10 @@ def run(
         first_frame: frame 0 of another stream (``engine.recording.read_first_frame``), taken over instead of being
             reconstructed again.
         energy: counters to read around every frame; their joules stand in its metrics.
+        witness: called with every step once its packet is written.
     """
     with _one_torch_thread():
-        return _Run(parts, source, out, quiet, measure, first_frame, energy).encode(resume)
+        return _Run(parts, source, out, quiet, measure, first_frame, energy, witness).encode(resume)
 
 
 class _Run:
@@ -78,10 +82,10 @@ class _Run:
 
     def __init__(
         self, parts: Assembly, source: FrameSource, out: Path, quiet: bool, measure: bool,
-        first_frame: PlayerState | None, energy: EnergyMeter | None,
+        first_frame: PlayerState | None, energy: EnergyMeter | None, witness: Witness | None,
     ) -> None:  # fmt: skip
         self.parts, self.source, self.out, self.first_frame = parts, source, out, first_frame
-        self.energy = energy
+        self.energy, self.witness = energy, witness
         self.rng = Rng(parts.recipe.seed)
         self.near = parts.recipe.near * source.info.train.extent
         self.total = _num_frames(source.info, parts.recipe.frames)
@@ -121,6 +125,8 @@ class _Run:
         if self.parts.whole is None:
             step = refresh(self.parts, step, train, self._meta, self.rng)
         writer.append(step.packet)
+        if self.witness is not None:
+            self.witness(step)
         total, cpu = time.perf_counter() - started, time.process_time() - worked
         metrics = {**self._metrics(step, train.index, test, total, waited), "cpu_seconds": cpu}
         if self.energy and joules:

@@ -39,7 +39,11 @@ def test_cases_repeat_and_cover_what_there_is() -> None:
 def test_drawn_settings_lie_in_their_ranges() -> None:
     """A part's settings are drawn from what its Config declares, so none is refused for its range."""
     rng = np.random.default_rng(0)
-    for kind, name in [("gate", "gumbel-sigmoid"), ("structure", "octree"), ("confidence", "view-gradient")]:
+    for kind, name in [
+        ("gate", "gumbel-sigmoid"),
+        ("regularizer", "expected-sparsity"),
+        ("confidence", "view-gradient"),
+    ]:
         config = CATALOG.resolve(kind, name).Config
         for key, info in config.model_fields.items():
             for _ in range(50):

@@ -179,11 +179,14 @@ class ScatterSession(RenderSession):
         if probe is not None:
             name = type(self._renderer).__name__
             raise NotImplementedError(f"{name} offers no gradient of the 2-D means in a session")
-        whole = rows
-        if self._active is not None:
-            base = dict(self._gaussians.items())
-            whole = Gaussians(**{n: base[n].index_copy(0, self._active, value) for n, value in rows.items()})
-        return self._renderer.render(whole, self._cameras, view, self._background)
+        return self._renderer.render(self._whole(rows), self._cameras, view, self._background)
+
+    def _whole(self, rows: Gaussians[torch.Tensor]) -> Gaussians[torch.Tensor]:
+        """The session's scene with the active rows put into their places."""
+        if self._active is None:
+            return rows
+        base = dict(self._gaussians.items())
+        return Gaussians(**{n: base[n].index_copy(0, self._active, value) for n, value in rows.items()})
 
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
         return self._renderer.screen_gradient(self._gaussians, self._cameras, view, image_gradient)

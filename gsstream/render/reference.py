@@ -15,7 +15,7 @@ from gsstream.core.context import ScreenGradient
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.part import PartConfig
 from gsstream.render.activations import SH0, activate_opacities, activate_scales, rotation_matrices
-from gsstream.render.base import Renderer, RenderOutput
+from gsstream.render.base import Renderer, RenderOutput, ScatterSession
 
 BLUR = 0.3
 ALPHA_CUT = 1 / 255
@@ -47,6 +47,15 @@ class ReferenceRenderer(Renderer):
         # Visible does not depend on what the gradient happens to be: a still Gaussian in view has gradient 0.
         return ScreenGradient(gradient, footprint_in_image(fixed, cameras, view) | (gradient != 0).any(1))
 
+    def open(
+        self,
+        gaussians: Gaussians[torch.Tensor],
+        active: torch.Tensor | None,
+        cameras: Cameras,
+        background: tuple[float, float, float],
+    ) -> ScatterSession:
+        return _ReferenceSession(self, gaussians, active, cameras, background)
+
     def nudged(
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, offsets: torch.Tensor
     ) -> RenderOutput:
@@ -75,6 +84,28 @@ class ReferenceRenderer(Renderer):
             images.append(image)
             alphas.append(alpha)
         return RenderOutput(torch.cat(images), torch.cat(alphas))
+
+
+class _ReferenceSession(ScatterSession):
+    """Renders everything, and knows the gradient of the 2-D means: frame 0 grows by it."""
+
+    _renderer: ReferenceRenderer
+
+    def render(
+        self,
+        view: int,
+        rows: Gaussians[torch.Tensor],
+        *,
+        probe: torch.Tensor | None = None,
+        tile_mask: torch.Tensor | None = None,
+    ) -> RenderOutput:
+        whole = self._whole(rows)
+        if probe is not None and self._active is not None:
+            probe = torch.zeros(len(whole), 2, dtype=probe.dtype).index_copy(0, self._active, probe)
+        return self._renderer._render(whole, self._cameras, view, self._background, probe)
+
+    def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> ScatterSession:
+        return self._renderer.open(gaussians, None, self._cameras, self._background)
 
 
 def project(

@@ -117,6 +117,21 @@ def test_gradient_equals_finite_differences(attribute: str) -> None:
     assert torch.autograd.gradcheck(loss, value, eps=1e-6, atol=1e-6, rtol=1e-5)
 
 
+def test_the_session_knows_the_gradient_of_the_2d_means() -> None:
+    """Of the rows that may change, on any background: frame 0 grows by it, and so do methods that add Gaussians."""
+    gaussians, cameras, active = random_scene(4), camera(), torch.tensor([1, 3])
+    session = ReferenceRenderer().open(gaussians, None, cameras, (0.2, 0.4, 0.6)).commit(gaussians, active)
+    session.narrow(active)
+    weights = torch.randn(H, W, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+
+    def loss(probe: torch.Tensor) -> torch.Tensor:
+        return (session.render(0, gaussians.rows(active), probe=probe).image * weights).sum()
+
+    probe = torch.zeros(2, 2, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(loss, probe, eps=1e-6, atol=1e-6, rtol=1e-5)
+    assert float(loss(probe.detach())) == float((session.render(0, gaussians.rows(active)).image * weights).sum())
+
+
 def test_screen_gradient_is_the_derivative_of_moving_the_projection() -> None:
     """Moving the principal point moves every projected centre by the same amount."""
     gaussians, cameras = random_scene(4), camera()

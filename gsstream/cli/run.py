@@ -29,6 +29,10 @@ def run(
         list[str] | None,
         typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change a value, e.g. gate.temperature=0.3; repeatable."),
     ] = None,
+    budget: Annotated[
+        str | None,
+        typer.Option("--budget", metavar="LIMITS", help="Any of time=1.0s,size=20KB,memory=2GB (howto/budget.md)."),
+    ] = None,
     frames: Annotated[int | None, typer.Option("--frames", help="Number of frames; all by default.")] = None,
     scale: Annotated[float | None, typer.Option("--scale", help="Shrink images by this factor in (0, 1].")] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of every random stream.")] = None,
@@ -49,9 +53,11 @@ def run(
     """
     from gsstream.engine.output import prepare_output
     from gsstream.plugins.catalog import load_catalog
+    from gsstream.recipe.budget import budget_overrides
     from gsstream.recipe.load import resolve_recipe
 
     overrides = [("--set", text) for text in settings or ()]
+    overrides += budget_overrides(budget) if budget is not None else []
     short = {"frames": frames, "scale": scale, "seed": seed, "renderer": renderer}
     overrides += [(f"--{key}", f"{key}={value}") for key, value in short.items() if value is not None]
     catalog = load_catalog()

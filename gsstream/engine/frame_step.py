@@ -9,6 +9,7 @@ import time
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,6 +23,10 @@ from gsstream.core.shapes import IntArray
 from gsstream.core.state import GateState
 from gsstream.engine.active_set import detect_change
 from gsstream.engine.assemble import Assembly
+from gsstream.engine.budget.controller import planned
+from gsstream.engine.budget.pace import Allowance
+from gsstream.engine.budget.spent import spent
+from gsstream.engine.budget.trim import Fitted, fit
 from gsstream.engine.context import StepContext
 from gsstream.engine.guard import check_output, guarded
 from gsstream.engine.insertion import with_insertions
@@ -30,18 +35,24 @@ from gsstream.engine.rows import follow
 from gsstream.engine.stream_state import Step, StreamState
 from gsstream.packet import EncodedPacket, PlayerState, decode_packet, encode_delta, encode_empty, quantise_decoders
 from gsstream.render.base import RenderCache, RenderSession
+from gsstream.residual.base import coarser
 from gsstream.residual.base import symbols as residual_symbols
 
 
-def frame_step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> Step:
+def frame_step(
+    parts: Assembly, state: StreamState, frame: Frame, rng: Rng, allowance: Allowance | None = None
+) -> Step:
     """Advance the stream by one frame. Pure: a failure leaves ``state`` as it was.
+
+    Arguments:
+        allowance: what the frame may spend; None: what the recipe says.
 
     Raises ComponentError when a part fails, unless the recipe says ``stream.on_error: repeat``: then the frame changes
     nothing, and its metrics and a warning say why.
     """
     started = time.perf_counter()
     try:
-        return _step(parts, state, frame, rng)
+        return _step(parts, state, frame, rng, allowance)
     except (ComponentError, ShapeError) as error:
         if parts.recipe.stream.on_error == "raise":
             raise
@@ -54,8 +65,10 @@ class RepeatedFrameWarning(UserWarning):
     """A part failed, and its frame was sent as "nothing changed"."""
 
 
-def _step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> Step:
-    clock = [time.perf_counter()]
+def _step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng, allowance: Allowance | None) -> Step:
+    clock, own = [time.perf_counter()], parts.recipe.stream
+    if allowance is not None:
+        parts = planned(parts, allowance.plan)
     if frame.effort == 0:
         return still_step(state, frame, 0.0)
     change = detect_change(state.previous, frame, parts.recipe.stream.change_threshold)
@@ -66,25 +79,45 @@ def _step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng) -> Step:
     gate, active = suspects(parts, state, context)
     clock.append(time.perf_counter())
 
-    problem = Problem(state, frame, active, context.gaussians.rows(active), gate, context.session_for(active))
+    session, base = context.session_for(active), context.gaussians.rows(active)
+    problem = Problem(state, frame, active, base, gate, session, allowance)
+    began = allowance.clock() if allowance else 0.0
     solution = optimise(parts, problem, rng.stream("frame", frame.index))
+    optimised = allowance.clock() - began if allowance else 0.0
     clock.append(time.perf_counter())
 
-    delta = with_insertions(parts, state, frame, harden(parts, problem, solution), rng)
-    packet = encode(delta, state, frame.index)
+    fitted = within(problem, solution, with_insertions(parts, state, frame, harden(parts, problem, solution), rng))
+    delta, packet = fitted.delta, fitted.packet
     player = decode_packet(state.player, packet.data)
     clock.append(time.perf_counter())
     with guarded("renderer", parts.renderer, frame.index):
-        session = committed(context.session, state, delta, player)
+        kept = committed(context.session, state, delta, player)
     clock.append(time.perf_counter())
     # A frame that changed nothing is not what the scene shows: the next one is compared with the last that did, so that
     # a change too slow to see from frame to frame adds up until it is seen.
     shown = state.previous if delta.is_empty else frame
-    after = follow(replace(state, previous=shown, gate_moments=solution.gate_moments, session=session), player)
+    after = follow(replace(state, previous=shown, gate_moments=solution.gate_moments, session=kept), player)
     metrics = step_metrics(delta, after, packet, solution, active)
     metrics["changed_tiles"] = 1.0 if change is None else change.share
     metrics["seconds"] = dict(zip(("confidence", "optimise", "code", "keep"), np.diff(clock).tolist(), strict=True))
+    if allowance is not None and solution.pace is not None:
+        metrics["budget"] = spent(
+            allowance, solution.pace, fitted, own, epochs=solution.iterations / len(frame.cameras),
+            before=began - allowance.started, optimise=optimised,
+        )  # fmt: skip
     return Step(after, packet, "empty" if delta.is_empty else "delta", metrics)
+
+
+def within(problem: Problem, solution: Solution, delta: Delta) -> Fitted:
+    """The delta and its packet, made to fit where the frame's allowance says a size."""
+    state, index, allowance = problem.state, problem.frame.index, problem.allowance
+    if allowance is None or allowance.plan.max_bytes is None:
+        packet = encode(delta, state, index)
+        return Fitted(delta, packet, len(packet.data))
+    layout, active = state.player.layout, solution.active.numpy()
+    sent = changed_rows(layout, delta.gates)
+    curvature = {n: _rows_of(solution.curvature[n].numpy(), active, sent) for n in delta.symbols}
+    return fit(delta, curvature, layout, lambda some: encode(some, state, index), allowance.plan.max_bytes)
 
 
 def committed(session: RenderSession, state: StreamState, delta: Delta, player: PlayerState) -> RenderSession | None:
@@ -145,7 +178,8 @@ def harden(parts: Assembly, problem: Problem, solution: Solution) -> Delta:
     check_output("gate", parts.gate, frame, "sample()", final, tuple(solution.gate.logits.shape), (0.0, 1.0))
     gates = torch.round(final * parts.gate.num_levels).numpy().astype(np.uint8)
     active = solution.active.numpy()
-    integers = {name: value.numpy() for name, value in residual_symbols(parts.update, solution.latents).items()}
+    codes = coarser(parts.update.codes(), problem.step_scale)
+    integers = {name: value.numpy() for name, value in residual_symbols(codes, solution.latents).items()}
     moving = np.zeros(len(active), bool)
     for value in integers.values():
         moving |= value.any(1)
@@ -156,14 +190,13 @@ def harden(parts: Assembly, problem: Problem, solution: Solution) -> Delta:
     table = {name: _rows_of(value, active, sent) for name, value in integers.items()}
     table = {name: value for name, value in table.items() if value.any()}
     decoders = {name: value.numpy() for name, value in solution.decoders.items() if name in table}
-    codes = parts.update.codes()
     steps = {name: codes[name].step for name in table}
     return Delta(gates, parts.gate.num_levels, table, steps, quantise_decoders(decoders))
 
 
-def _rows_of(values: IntArray, active: IntArray, wanted: IntArray) -> IntArray:
+def _rows_of(values: np.ndarray[Any, Any], active: IntArray, wanted: IntArray) -> np.ndarray[Any, Any]:
     """Rows ``wanted`` of a table whose rows belong to ``active``; rows that took no part are zero."""
-    out = np.zeros((len(wanted), values.shape[1]), np.int32)
+    out = np.zeros((len(wanted), values.shape[1]), values.dtype)
     place = np.searchsorted(active, wanted)
     known = (place < len(active)) & (active[np.minimum(place, max(0, len(active) - 1))] == wanted)
     out[known] = values[place[known]]

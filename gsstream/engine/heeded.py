@@ -11,9 +11,9 @@ from gsstream.recipe.model import Recipe
 
 #: Keys that only the five-part path reads.
 PART_SLOTS = ("structure", "confidence", "propagation", "gate", "regularizer", "update")
-PART_SECTIONS = ("stream", "gate_training", "codec", "insertion")
+PART_SECTIONS = ("stream", "gate_training", "codec", "insertion", "budget")
 #: Of those sections, what the session reads for every method.
-SESSION_KEYS = ("codec.fsync",)
+SESSION_KEYS = ("codec.fsync", "budget.memory")
 
 
 def unheeded(recipe: Recipe, whole: StreamingMethod[Any], parts: Mapping[str, Any]) -> Iterator[KeyPath]:

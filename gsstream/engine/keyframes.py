@@ -6,6 +6,7 @@ grids of a key packet and grouped anew, and the encoder goes on from it as any p
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -22,10 +23,17 @@ from gsstream.metrics import psnr
 from gsstream.packet import StreamMeta, quantise_key
 
 
-def refresh(parts: Assembly, step: Step, frame: Frame, meta: Callable[[Cameras], StreamMeta], rng: Rng) -> Step:
+def refresh(
+    parts: Assembly, step: Step, frame: Frame, meta: Callable[[Cameras], StreamMeta], rng: Rng,
+    refusal: Callable[[int], str | None] = lambda _: None, max_bytes: int | None = None,
+) -> Step:  # fmt: skip
     """``step``, or when the recipe asks for a key packet at this frame, the step that writes one instead of it.
 
-    ``meta`` says what a key packet tells about the run. Pure, like a frame step.
+    Arguments:
+        meta: what a key packet tells about the run.
+        refusal: number of Gaussians -> why a key packet cannot be paid for, or None. max_bytes: the largest allowed.
+
+    A key packet that is refused stays due: the next frame tries again. Pure, like a frame step.
     """
     if step.status == "key":
         return replace(step, state=with_key_quality(parts, step.state, frame))
@@ -33,11 +41,22 @@ def refresh(parts: Assembly, step: Step, frame: Frame, meta: Callable[[Cameras],
     reason = key_reason(parts, step, quality)
     if reason is None:
         return step
+    refused = refusal(len(step.state.gaussians))
+    if refused is not None:
+        return _postponed(step, reason, refused)
+    started = time.perf_counter()
     state, after = step.state, decoded_again(parts, step.state, frame, meta(frame.cameras), rng)
+    if max_bytes is not None and len(after.packet.data) > max_bytes:
+        return _postponed(step, reason, f"{len(after.packet.data)} bytes where {max_bytes} are allowed")
     # The scene goes on showing what it showed: a key packet after still frames is no new picture.
     after = replace(after, state=replace(after.state, previous=state.previous))
     metrics = {**step.metrics, **after.metrics, "key_reason": reason}
+    metrics["seconds"] = {**metrics["seconds"], "key": time.perf_counter() - started}
     return Step(with_key_quality(parts, after.state, frame), after.packet, "key", metrics)
+
+
+def _postponed(step: Step, reason: str, refused: str) -> Step:
+    return replace(step, metrics={**step.metrics, "key_postponed": f"{reason}: {refused}"})
 
 
 def key_reason(parts: Assembly, step: Step, quality: float | None) -> str | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 
@@ -14,13 +14,15 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.part import Part
 from gsstream.core.state import GateState
 from gsstream.engine.assemble import Assembly
+from gsstream.engine.budget.pace import Allowance, Pace, estimated_bytes
 from gsstream.engine.exposure import Exposure, backward_view
 from gsstream.engine.guard import check_terms, guarded
+from gsstream.engine.levels import current_level, level_schedule
 from gsstream.engine.row_table import RowTable
 from gsstream.engine.stopping import Gains, watch
 from gsstream.engine.stream_state import StreamState
 from gsstream.render.base import RenderSession
-from gsstream.residual.base import init_latents
+from gsstream.residual.base import coarser, init_latents
 from gsstream.residual.joint import add_joint, decode_joint, join_features, joint_code, pull_back_joint
 from gsstream.residual.rate import rate_gradient
 
@@ -37,6 +39,7 @@ class Problem:
         base: those rows of the decoded previous scene.
         gate: initial gate state [M].
         session: an open render session in which only ``active`` changes.
+        allowance: what the frame may spend; None: what the recipe says.
     """
 
     state: StreamState
@@ -45,6 +48,12 @@ class Problem:
     base: Gaussians[torch.Tensor]
     gate: GateState
     session: RenderSession
+    allowance: Allowance | None = None
+
+    @property
+    def step_scale(self) -> float:
+        """Factor on the update rule's quantisation steps."""
+        return 1.0 if self.allowance is None else self.allowance.plan.step_scale
 
 
 @dataclass(frozen=True)
@@ -56,6 +65,8 @@ class Solution:
         latents: attribute -> [A, L].
         loss: mean over the last pass, of the tiles that took part.
         iterations: views rendered.
+        curvature: attribute -> [A, L], mean squared gradient of the latents: what a latent is worth, up to a factor.
+        pace: what the passes were held to.
     """
 
     active: torch.Tensor
@@ -65,6 +76,8 @@ class Solution:
     gate_moments: Mapping[str, torch.Tensor]
     loss: float
     iterations: int
+    curvature: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    pace: Pace | None = None
 
 
 def optimise(parts: Assembly, problem: Problem, generator: torch.Generator) -> Solution:
@@ -76,30 +89,38 @@ def optimise(parts: Assembly, problem: Problem, generator: torch.Generator) -> S
     if len(problem.active) == 0:
         return Solution(problem.active, {}, {}, problem.gate, problem.state.gate_moments, 0.0, 0)
     views = len(problem.frame.cameras)
-    epochs = max(1, round(stream.epochs * problem.frame.effort))
-    run, gains = _FrameRun(parts, problem, generator), Gains(views)
-    loss = 0.0
-    for epoch in range(epochs):
-        losses = []
+    epochs, effort = max(1, round(stream.epochs * problem.frame.effort)), problem.frame.effort
+    pace = Pace(problem.allowance, epochs, stream.rate_weight, effort)
+    run, gains = _FrameRun(parts, problem, generator, pace), Gains(views)
+    loss, epoch = 0.0, 0
+    pace.begin(len(problem.active))
+    while epoch < pace.epochs:
+        losses: list[float] = []
         for place, view in enumerate(reversed(torch.randperm(views, generator=generator).tolist())):
             iteration = epoch * views + place
-            losses.append(run.step(view, iteration, iteration / (epochs * views)))
+            losses.append(run.step(view, iteration, iteration / (pace.epochs * views)))
             gains.note(view, losses[-1], run.judged_tiles)
+            if pace.is_over():
+                return run.solution(sum(losses) / len(losses), iteration + 1)
+        epoch += 1
         loss = sum(losses) / views
+        pace.end_epoch(epoch)
         if gains.end_epoch() < stream.min_gain:
-            return run.solution(loss, (epoch + 1) * views)
-        if stream.release_closed and epoch + 1 < epochs:
-            run.release((epoch + 1) / epochs)
+            break
+        if stream.release_closed and epoch < pace.epochs:
+            run.release(epoch / pace.epochs)
             if len(run.active) == 0:
-                return run.solution(loss, (epoch + 1) * views)
-    return run.solution(loss, epochs * views)
+                break
+        if pace.meets_size:
+            pace.meet_size(epoch, run.estimated_bytes())
+    return run.solution(loss, epoch * views)
 
 
 class _FrameRun:
     """The moving state of one frame's optimisation; lives only inside :func:`optimise`."""
 
-    def __init__(self, parts: Assembly, problem: Problem, generator: torch.Generator) -> None:
-        self.parts, self.problem, self.generator = parts, problem, generator
+    def __init__(self, parts: Assembly, problem: Problem, generator: torch.Generator, pace: Pace) -> None:
+        self.parts, self.problem, self.generator, self.pace = parts, problem, generator, pace
         state, layout = problem.state, problem.state.player.layout
         nodes, node_of = torch.unique(state.hierarchy.node_of[problem.active], return_inverse=True)
         if parts.recipe.gate_training.optimiser == "persistent":
@@ -114,7 +135,7 @@ class _FrameRun:
         self.schedule = level_schedule(parts, len(layout.cell_sizes))
         self.iteration = 0
         with self._guarded("update", parts.update):
-            codes = parts.update.codes()
+            codes = coarser(parts.update.codes(), problem.step_scale)
         latents = init_latents(parts.update, problem.base)
         self.decoder_names = {name: state.decoders[name] for name in latents if name in state.decoders}
         self.code = code = joint_code(codes, latents, self.decoder_names, problem.base)
@@ -131,7 +152,7 @@ class _FrameRun:
             self.targets = [parts.loss.prepare(torch.from_numpy(image)) for image in problem.frame.images]
         self.exposure: Exposure | None = state.exposure
         cameras = problem.frame.cameras
-        self.bit_weight = parts.recipe.stream.rate_weight / (cameras.width * cameras.height)
+        self.pixels = cameras.width * cameras.height
         self.watched: dict[int, torch.Tensor] = {}
         #: Tiles that the last view's loss is a sum over; 0: all.
         self.judged_tiles = 0
@@ -152,8 +173,9 @@ class _FrameRun:
         loss = self._render(view, rows)
         upstream = join_features(self.code, rows.map(_gradient))
         back = pull_back_joint(self.code, upstream, change, matrix, shut, self.units)
-        if self.bit_weight:
-            back.latents.add_(rate_gradient(latents, self.code.steps, shut, self.bit_weight))
+        if self.pace.rate_weight:
+            weight = self.pace.rate_weight / self.pixels
+            back.latents.add_(rate_gradient(latents, self.code.steps, shut, weight))
         self._step_gates(gate, gates, back.gates, learning=fraction >= parts.recipe.gate_training.warmup)
         self.latents.step({"latents": back.latents})
         self.decoders.step({"matrix": back.matrix})
@@ -237,6 +259,14 @@ class _FrameRun:
         with self._guarded("renderer", self.parts.renderer):
             self.session.narrow(self.active)
 
+    def estimated_bytes(self) -> float:
+        """What a packet would hold if this pass were the last: symbols behind open gates, and the gates."""
+        with self._guarded("gate", self.parts.gate):
+            gates = self.parts.gate.sample(GateState(self.gate["logits"].detach()), None)
+        opened = torch.round(gates * self.parts.gate.num_levels) > 0
+        latents = self.latents["latents"].detach()[opened[self.hierarchy.node_of]]
+        return estimated_bytes(torch.round(latents / self.code.steps)) + float(opened.sum())
+
     def _all_logits(self) -> torch.Tensor:
         """[M] logits of all gates; those that take part as they are now."""
         return self.logits.index_copy(0, self.nodes, self.gate["logits"].detach())
@@ -251,29 +281,11 @@ class _FrameRun:
             gate_moments=moments,
             loss=loss,
             iterations=iterations,
+            curvature=self.code.split(self.latents.moments("latents")["exp_avg_sq"]),
+            pace=self.pace,
         )
 
 
 def _gradient(value: torch.Tensor) -> torch.Tensor:
     """Gradient of a leaf; zeros where nothing reached it."""
     return torch.zeros_like(value) if value.grad is None else value.grad
-
-
-def level_schedule(parts: Assembly, num_levels: int) -> tuple[tuple[float, int], ...]:
-    """Progressive training (paper, supplement): (fraction of the frame until which, finest active level).
-
-    Starts at level floor(H / 2); each finer level's stage is omega times longer, N_{i+1} = omega N_i. Empty when the
-    recipe does not ask for it or there is nothing to hold back. The paper leaves omega and the treatment of inactive
-    levels open: here they keep their previous attributes (ours).
-    """
-    first = num_levels // 2
-    if not parts.recipe.stream.progressive or num_levels - first < 2:
-        return ()
-    weights = [parts.recipe.stream.progressive_omega**i for i in range(num_levels - first)]
-    ends = [sum(weights[: i + 1]) / sum(weights) for i in range(len(weights))]
-    return tuple((end, first + i) for i, end in enumerate(ends))
-
-
-def current_level(schedule: tuple[tuple[float, int], ...], fraction: float) -> int:
-    """Finest active level at this fraction [0, 1) of the frame's iterations."""
-    return next((level for end, level in schedule if fraction < end), schedule[-1][1])

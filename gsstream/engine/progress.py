@@ -10,6 +10,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from gsstream.engine.budget.report import violations
+
 
 class RunProgress:
     """Frame 0 as a bar over iterations, later frames as a bar over frames with PSNR, KB, seconds and active share."""
@@ -79,5 +81,6 @@ def frame_line(metrics: Mapping[str, Any], total: int | None) -> str:
     parts.append(f"{sum(metrics['seconds'].values()):.2f} s")
     if metrics["num_gaussians"]:
         parts.append(f"{100 * metrics['active_gaussians'] / metrics['num_gaussians']:.1f} % active")
+    parts += [f"OVER BUDGET: {text}" for text in violations(metrics)]
     last = "" if total is None else f"/{total - 1}"
     return f"frame {metrics['frame']}{last}: " + ", ".join(parts)

@@ -23,9 +23,12 @@ from gsstream.source.base import FrameSource, SourceInfo
 
 
 def resume_state(
-    parts: Assembly, path: Path, source: FrameSource, rng: Rng, near: float
+    parts: Assembly, path: Path, source: FrameSource, rng: Rng, near: float, last: int | None = None
 ) -> StreamState | None:
     """Encoder state after the last complete packet of a stream; None when not even frame 0 is complete.
+
+    Arguments:
+        last: go on after this frame, whatever the stream holds beyond it.
 
     Raises OutputError when the recipe or the recording is not the one the stream was written with, or when the recipe
     carries state that a stream does not hold (gate moments across frames).
@@ -36,10 +39,10 @@ def resume_state(
             "resumed; start it again with --overwrite"
         )
     # Before the replay: other parts would fail over a stream that is not theirs, and say something else.
-    if not check_stream(parts, path, source.info):
+    if not check_stream(parts, path, source.info) or (last is not None and last < 0):
         return None
     with StreamReader(path) as reader:
-        state = _replay(parts, reader, rng)
+        state = _replay(parts, reader, rng, last)
         shown = [e for e in reader.frames if e.kind != PacketKind.EMPTY and e.frame <= state.player.frame][-1]
         key = decode_packet(None, reader.read(reader.frames[state.key_frame - reader.frames[0].frame]))
 
@@ -82,11 +85,13 @@ def replay(reader: StreamReader) -> PlayerState:
     return player
 
 
-def _replay(parts: Assembly, reader: StreamReader, rng: Rng) -> StreamState:
+def _replay(parts: Assembly, reader: StreamReader, rng: Rng, last: int | None) -> StreamState:
     """Decode all packets; rebuild what the key packet implies at every key packet."""
     player: PlayerState | None = None
     state: StreamState | None = None
     for entry in reader.frames:
+        if last is not None and entry.frame > last:
+            break
         try:
             player = decode_packet(player, reader.read(entry), offset=entry.offset)
         except PacketError:

@@ -7,7 +7,7 @@ import json
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -21,6 +21,9 @@ from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
 from gsstream.engine.assemble import Assembly
 from gsstream.engine.begin import begin, begin_from
+from gsstream.engine.budget.controller import Controller
+from gsstream.engine.budget.memory import within_memory
+from gsstream.engine.budget.pace import CLOCKS, Allowance
 from gsstream.engine.frame_step import frame_step
 from gsstream.engine.keyframes import refresh
 from gsstream.engine.measure import HeldOut
@@ -73,6 +76,7 @@ def run(
         energy: counters to read around every frame; their joules stand in its metrics.
         witness: called with every step once its packet is written.
     """
+    parts = within_memory(parts, source.info)
     with _one_torch_thread():
         return _Run(parts, source, out, quiet, measure, first_frame, energy, witness).encode(resume)
 
@@ -87,6 +91,7 @@ class _Run:
         self.parts, self.source, self.out, self.first_frame = parts, source, out, first_frame
         self.energy, self.witness = energy, witness
         self.rng = Rng(parts.recipe.seed)
+        self.controller = Controller(parts.recipe.budget, parts.recipe.stream)
         self.near = parts.recipe.near * source.info.train.extent
         self.total = _num_frames(source.info, parts.recipe.frames)
         self.held_out = HeldOut(parts.renderer, parts.recipe.background) if measure else None
@@ -121,25 +126,36 @@ class _Run:
         train.validate()
         joules = self.energy.read() if self.energy else {}
         started, worked = time.perf_counter(), time.process_time()
-        step = self._first(train) if state is None else self._next(state, train)
+        clock = CLOCKS[self.parts.recipe.budget.clock]
+        began, allowance = clock(), None if state is None else self.controller.allow()
+        step = self._first(train) if state is None else self._next(state, train, allowance)
         if self.parts.whole is None:
-            step = refresh(self.parts, step, train, self._meta, self.rng)
+            step = self._refreshed(step, train, allowance)
         writer.append(step.packet)
+        total, cpu, counted = time.perf_counter() - started, time.process_time() - worked, clock() - began
         if self.witness is not None:
             self.witness(step)
-        total, cpu = time.perf_counter() - started, time.process_time() - worked
         metrics = {**self._metrics(step, train.index, test, total, waited), "cpu_seconds": cpu}
         if self.energy and joules:
             metrics["joules"] = {name: value - joules[name] for name, value in self.energy.read().items()}
+        metrics = self.controller.settle(metrics, counted)
         with (self.out / METRICS).open("a", encoding="utf-8") as log:
             log.write(json.dumps(metrics) + "\n")
         self.progress.frame(metrics)
         return step.state
 
-    def _next(self, state: Any, frame: Frame) -> Step[Any]:
+    def _next(self, state: Any, frame: Frame, allowance: Allowance | None) -> Step[Any]:
         if self.parts.whole is not None:
             return step_whole(self.parts.whole, self.tools, state, frame)
-        return frame_step(self.parts, state, frame, self.rng)
+        if allowance is None:
+            return frame_step(self.parts, state, frame, self.rng)
+        return frame_step(self.parts, state, frame, self.rng, allowance)
+
+    def _refreshed(self, step: Step[Any], frame: Frame, allowance: Allowance | None) -> Step[Any]:
+        size = None if allowance is None else allowance.plan.max_bytes
+        return refresh(
+            self.parts, step, frame, self._meta, self.rng, lambda n: self.controller.key_refusal(n, allowance), size
+        )
 
     def _first(self, frame: Frame) -> Step[Any]:
         if self.parts.whole is not None:
@@ -180,8 +196,13 @@ class _Run:
         return replace(frame, cameras=replace(frame.cameras, near=self.near))
 
     def _resume(self) -> MethodState | None:
-        state = self._last_state(self.out / STREAM)
-        _trim_metrics(self.out / METRICS, -1 if state is None else state.player.frame)
+        planned = self.controller.budget.limits_frames
+        # The controller plans by what it wrote down: frames that are not, are made again.
+        state = self._last_state(self.out / STREAM, _last_written(self.out / METRICS) if planned else None)
+        lines = _trim_metrics(self.out / METRICS, -1 if state is None else state.player.frame)
+        self.controller.remember(lines)
+        if state is None and planned:
+            (self.out / STREAM).unlink()
         if state is None:
             return None
         if self.held_out and len(self.source.info.test):
@@ -189,10 +210,10 @@ class _Run:
             self.held_out.remember(self.source.frame(0, "test"), second)
         return state
 
-    def _last_state(self, stream: Path) -> MethodState | None:
+    def _last_state(self, stream: Path, last: int | None) -> MethodState | None:
         if self.parts.whole is not None:
             return resume_whole(self.parts.whole, self.tools, stream)
-        return resume_state(self.parts, stream, self.source, self.rng, self.near)
+        return resume_state(self.parts, stream, self.source, self.rng, self.near, last)
 
 
 @contextmanager
@@ -247,16 +268,26 @@ def _stop_on_interrupt(say: Callable[[str], None], source: FrameSource) -> Itera
         signal.signal(signal.SIGINT, previous)
 
 
-def _trim_metrics(path: Path, last: int) -> None:
-    """Drop lines of frames that the stream does not hold (a kill can fall between packet and line)."""
-    if not path.exists():
-        return
-    kept: list[str] = []
-    for line in path.read_text(encoding="utf-8").splitlines():
+def _written(path: Path) -> list[dict[str, Any]]:
+    """The complete lines of a run's metrics."""
+    lines: list[dict[str, Any]] = []
+    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
         try:
-            entry: Mapping[str, Any] = json.loads(line)
+            lines.append(json.loads(line))
         except json.JSONDecodeError:
             continue
-        if int(entry["frame"]) <= last:
-            kept.append(line)
-    path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+    return lines
+
+
+def _last_written(path: Path) -> int:
+    """Last frame up to which no line is missing; -1: none."""
+    frames = {int(line["frame"]) for line in _written(path)}
+    return next(frame for frame in itertools.count(-1) if frame + 1 not in frames)
+
+
+def _trim_metrics(path: Path, last: int) -> list[dict[str, Any]]:
+    """Drop lines of frames that the stream does not hold (a kill can fall between packet and line); those that stay."""
+    kept = [line for line in _written(path) if int(line["frame"]) <= last]
+    if path.exists():
+        path.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
+    return kept

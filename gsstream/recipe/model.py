@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from gsstream.recipe.budget import Budget
 from gsstream.source.options import DataOptions
 
 SCHEMA_VERSION = "1.0"
@@ -196,6 +197,7 @@ class Recipe(Section):
     gate_training: GateTraining = Field(default=GateTraining(), description="optimisation of gates")
     insertion: Insertion = Field(default=Insertion(), description="Gaussians born while streaming")
     codec: Codec = Field(default=Codec(), description="packets")
+    budget: Budget = Field(default=Budget(), description="what a frame may cost; nothing given: no limits")
     data: DataOptions = Field(default=DataOptions(), description="the split, and disturbances for experiments")
     scale: float = Field(default=1.0, gt=0, le=1, description="images are downscaled by this factor on reading")
     frames: int | None = Field(default=None, ge=1, description="number of frames to process; all when absent")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -123,7 +123,11 @@ def apply_residual(
     return add_changes(base, decode_changes(rule, latents, decoders), gates, units)
 
 
-def symbols(rule: UpdateRule, latents: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+def coarser(codes: Mapping[str, AttributeCode], factor: float) -> Mapping[str, AttributeCode]:
+    """The same codes with steps ``factor`` times as large."""
+    return {name: replace(code, step=code.step * factor) for name, code in codes.items()} if factor != 1 else codes
+
+
+def symbols(codes: Mapping[str, AttributeCode], latents: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """[A, L] int32 symbols that the packet carries."""
-    codes = rule.codes()
     return {name: torch.round(value.detach() / codes[name].step).to(torch.int32) for name, value in latents.items()}

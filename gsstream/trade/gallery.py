@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from gsstream.engine.budget.report import budget_lines
 from gsstream.player.play import play
 from gsstream.player.playback import Playback
 from gsstream.source.base import FrameSource
 from gsstream.trade.contact_sheet import sheet_of_stream
 from gsstream.trade.plots import plot_runs
-from gsstream.trade.records import read_records
+from gsstream.trade.records import read_lines, read_records
 from gsstream.trade.summary import summarise, summary_table
 
 STREAM, METRICS = "stream.gss", "metrics.jsonl"
@@ -37,7 +38,10 @@ def write_gallery(out: Path, source: FrameSource, *, video: bool = True) -> list
     # Frame 0 alone, and no test camera to measure it: there is no curve to draw.
     if len(records) > 1 or records[0].psnr:
         written.append(plot_runs({method: records}, out / PLOTS, title=f"{method} on {source.info.name}"))
-    (out / SUMMARY).write_text(summary_table({method: summarise(records)}) + "\n", encoding="utf-8")
+    text = [summary_table({method: summarise(records)})]
+    budget = budget_lines(read_lines(out / METRICS))
+    text += ["", *budget] if budget else []
+    (out / SUMMARY).write_text("\n".join(text) + "\n", encoding="utf-8")
     written.append(out / SUMMARY)
     if video and len(frames) > 1 and importlib.util.find_spec("av") is not None:
         play(out / STREAM, out / VIDEO, camera=name)

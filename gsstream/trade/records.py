@@ -81,6 +81,18 @@ def read_records(path: str | os.PathLike[str]) -> list[FrameRecord]:
     return [found[frame] for frame in sorted(found)]
 
 
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """The lines of a ``metrics.jsonl`` that :func:`read_records` accepts, as they are; half a last line left out."""
+    found: dict[int, dict[str, Any]] = {}
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            data = json.loads(line)
+        except ValueError:
+            continue
+        found[int(data["frame"])] = data
+    return [found[frame] for frame in sorted(found)]
+
+
 def record_of(data: Mapping[str, Any]) -> FrameRecord:
     """A line of ``metrics.jsonl`` that has been read; raises ValueError, TypeError, KeyError or AttributeError."""
     memory = data.get("peak_memory_mb")

@@ -38,7 +38,7 @@ OPTIONS = {
     "gsstream run": [
         "--source", "--out", "--method", "--recipe", "--set", "--frames", "--scale", "--seed", "--renderer", "--resume",
         "--first-frame",
-        "--overwrite", "--no-video", "--quiet",
+        "--overwrite", "--no-video", "--quiet", "--budget",
     ],
     "gsstream play": ["STREAM", "--out", "--camera", "--frames"],
     "gsstream evaluate": ["STREAM", "--source", "--lpips-onnx", "--lpips-range"],
@@ -133,6 +133,11 @@ def run(capsys: pytest.CaptureFixture[str], *args: str) -> tuple[int, str, str]:
         ([*RUN, "--set", "lss.dssim=1"], "--set lss.dssim=1: unknown key 'lss'; did you mean 'loss'?"),
         ([*RUN, "--frames", "0"], "--frames frames=0: frames: input should be greater than or equal to 1, got 0"),
         ([*RUN, "--recipe", "absent.yaml"], "cannot read the recipe absent.yaml: "),
+        ([*RUN, "--budget", "siz=20KB"], "--budget siz=20KB: unknown key 'siz'; did you mean 'size'?"),
+        (
+            [*RUN, "--budget", "size=20kb"],
+            "--budget budget.size=20kb: budget.size: value error, no unit 'kb' here; did you mean 'KB'?, got '20kb'",
+        ),
         (["info", "absent.gss"], "no stream at absent.gss: expected a .gss file or the output folder of a run"),
         (["play", "absent.gss", "--out", "x", "--frames", "5:2"], "--frames 5:2: expected A:B with A < B, e.g. 0:30"),
         (["plugins", "show", "additiv"], "no part named 'additiv'; did you mean 'additive'?"),

@@ -236,7 +236,7 @@ def transmitted(
     trained = apply_residual(rule, base, gate, latents, decoders, units)
     delta = Delta(
         gates, levels,
-        {name: value.numpy() for name, value in symbols(rule, latents).items()},
+        {name: value.numpy() for name, value in symbols(rule.codes(), latents).items()},
         {name: code.step for name, code in rule.codes().items()},
         {name: value.numpy() for name, value in decoders.items()},
     )  # fmt: skip

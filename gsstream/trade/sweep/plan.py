@@ -181,6 +181,7 @@ def _first_frame(config: SweepConfig, scene: Scene, resolved: ResolvedRecipe, se
     seed = seed if config.first_frame.seed is None else config.first_frame.seed
     recipe = resolved.recipe.model_copy(update={"seed": seed, "frames": 1})
     values = recipe.model_dump(mode="json")
+    values["budget"] = {"memory": values["budget"]["memory"]}  # of a budget, frame 0 knows memory alone
     key = _hash([scene.uri, seed, {k: v for k, v in values.items() if k not in LATER_KEYS}])
     return FirstFrameRun(key, scene, seed, ResolvedRecipe(recipe, resolved.origins))
 

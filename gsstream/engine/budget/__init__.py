@@ -1,0 +1,1 @@
+"""Budgets: what a frame may cost, how it is planned, held and reported."""

@@ -1,0 +1,91 @@
+"""The controller of a run: a plan before every frame, and after it what it cost, what bound and what was given up.
+
+Its memory is the run's ``metrics.jsonl`` alone, so a resumed run plans as the first would have.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from gsstream.engine.assemble import Assembly
+from gsstream.engine.budget.pace import Allowance
+from gsstream.engine.budget.plan import WINDOW, FramePlan, Past, past_of, plan
+from gsstream.recipe.budget import Budget
+from gsstream.recipe.model import Stream
+
+
+class Controller:
+    """Plans frames of one run and writes down what became of the plans; does nothing where the budget is empty."""
+
+    def __init__(self, budget: Budget, stream: Stream) -> None:
+        self.budget, self._stream = budget, stream
+        self._history: tuple[Past, ...] = ()
+        self._key: tuple[float, float] | None = None
+
+    def remember(self, lines: Iterable[Mapping[str, Any]]) -> None:
+        """Go on after these lines of ``metrics.jsonl``."""
+        for line in lines:
+            self._note(line)
+
+    def allow(self) -> Allowance | None:
+        """What the frame that begins now may spend; None without a limit on frames."""
+        if not self.budget.limits_frames:
+            return None
+        return Allowance.start(self.budget, plan(self.budget, self._stream, self._history))
+
+    def key_refusal(self, num_gaussians: int, allowance: Allowance | None) -> str | None:
+        """Why a key packet that is due must wait, by what the last one cost; None: it may be tried."""
+        if allowance is None or self._key is None:
+            return None
+        size, seconds = (value * num_gaussians for value in self._key)
+        if self.budget.size is not None and 0.9 * size > self.budget.size:
+            return f"about {size:.0f} bytes where {self.budget.size} are allowed"
+        if self.budget.time is not None and allowance.clock() - allowance.started + seconds > self.budget.time:
+            return f"about {seconds:.2f} s where {self.budget.time:g} s are allowed for the frame"
+        return None
+
+    def settle(self, metrics: dict[str, Any], seconds: float) -> dict[str, Any]:
+        """``metrics`` of a finished frame with its entry ``budget``.
+
+        ``seconds``: of the whole frame, by the budget's clock.
+        """
+        if not self.budget.limits_anything:
+            return metrics
+        entry = dict(metrics.get("budget", {}))
+        size, first = sum(metrics["bytes"].values()), metrics["frame"] == 0
+        actual = {"time": seconds, "size": size, "memory": 1e6 * metrics["peak_memory_mb"]}
+        limits = {name: getattr(self.budget, name) for name in actual if getattr(self.budget, name) is not None}
+        if first:  # what everything starts from is no frame of a budget (docs/howto/budget.md)
+            limits = {name: limit for name, limit in limits.items() if name == "memory"}
+        entry["limits"] = limits
+        entry["actual"] = {name: actual[name] for name in limits}
+        entry["violated"] = [name for name, limit in limits.items() if actual[name] > limit]
+        if "spent" in entry:
+            entry["spent"] = {**entry["spent"], "seconds": seconds}
+            entry["bound"] = [name for name in entry.get("bound", []) if name in limits]
+        settled = {**metrics, "budget": entry}
+        # As it will be read back: a resumed run must plan with the same numbers.
+        self._note(json.loads(json.dumps(settled)))
+        return settled
+
+    def _note(self, metrics: Mapping[str, Any]) -> None:
+        if metrics["status"] == "key" and metrics["num_gaussians"]:
+            size = sum(metrics["bytes"].values())
+            seconds = metrics["seconds"].get("key", metrics["seconds"].get("code", 0.0))
+            self._key = size / metrics["num_gaussians"], seconds / metrics["num_gaussians"]
+        past = past_of(metrics)
+        if past is not None:
+            self._history = (*self._history, past)[-WINDOW:]
+
+
+def planned(parts: Assembly, frame_plan: FramePlan) -> Assembly:
+    """The parts with the recipe of one frame: the plan's passes, threshold and weight."""
+    changes = {
+        "epochs": frame_plan.epochs, "change_threshold": frame_plan.change_threshold,
+        "rate_weight": frame_plan.rate_weight,
+    }  # fmt: skip
+    recipe = parts.recipe
+    return replace(parts, recipe=recipe.model_copy(update={"stream": recipe.stream.model_copy(update=changes)}))

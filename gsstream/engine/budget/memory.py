@@ -1,0 +1,70 @@
+"""A memory budget before the run: what it needs at least, how many Gaussians and how large a cache fit. Ours.
+
+Constants, not what the process has now, so that a resumed run computes the same limits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from gsstream.core.errors import InputError
+from gsstream.engine.assemble import Assembly
+from gsstream.source.base import SourceInfo
+
+#: Interpreter, torch, the renderer and the engine with everything a run imports (measured, docs/results-budget.md).
+PROCESS = 330_000_000
+#: Copies of a training image, float32 RGB: two frames, two decoded ahead, the loss's target and its blurred moments.
+IMAGE_COPIES = 8
+#: A Gaussian with moments, gradients and the copies of a frame step.
+BYTES_PER_GAUSSIAN = 2_500
+#: Share of what images leave that goes to Gaussians; the rest is cache (about 250 bytes per camera and Gaussian).
+FOR_GAUSSIANS = 0.6
+#: Below this a scene is not worth the run.
+LEAST_GAUSSIANS = 1_000
+
+
+def memory_floor(info: SourceInfo) -> int:
+    """Bytes a run of this recording needs with the least number of Gaussians."""
+    return _fixed(info) + round(LEAST_GAUSSIANS * BYTES_PER_GAUSSIAN / FOR_GAUSSIANS)
+
+
+def within_memory(parts: Assembly, info: SourceInfo) -> Assembly:
+    """The parts with ``first_frame.max_gaussians`` and the renderer's ``cache_mb`` cut to what the budget holds.
+
+    Raises InputError when the budget is below what any run of this recording needs.
+    """
+    memory = parts.recipe.budget.memory
+    if memory is None:
+        return parts
+    if memory < memory_floor(info):
+        raise InputError(
+            f"budget.memory: {memory / 1e6:.0f} MB, but a run of this recording needs at least "
+            f"{memory_floor(info) / 1e6:.0f} MB ({PROCESS / 1e6:.0f} MB for the process, the rest for "
+            f"{len(info.train)} training cameras of {info.train.width} x {info.train.height} pixels and "
+            f"{LEAST_GAUSSIANS} Gaussians); give more, or lower --scale"
+        )
+    free, first = memory - _fixed(info), parts.recipe.first_frame
+    most = min(first.max_gaussians, round(FOR_GAUSSIANS * free) // BYTES_PER_GAUSSIAN)
+    recipe = parts.recipe.model_copy(update={"first_frame": first.model_copy(update={"max_gaussians": most})})
+    parts = replace(parts, recipe=recipe)
+    return _with_cache(parts, (free - most * BYTES_PER_GAUSSIAN) / 1e6)
+
+
+def _with_cache(parts: Assembly, megabytes: float) -> Assembly:
+    """The renderer with at most this much cache, where it has such a setting."""
+    config = parts.renderer.config
+    if "cache_mb" not in type(config).model_fields:
+        return parts
+    given = getattr(config, "cache_mb")  # noqa: B009  # a setting of some renderers alone
+    cache = round(megabytes if given is None else min(megabytes, given), 1)
+    config = type(config)(**{**config.model_dump(), "cache_mb": cache})
+    ref = parts.recipe.renderer.model_copy(update={"params": config.model_dump(mode="json")})
+    recipe = parts.recipe.model_copy(update={"renderer": ref})
+    return replace(parts, recipe=recipe, renderer=type(parts.renderer)(config))
+
+
+def _fixed(info: SourceInfo) -> int:
+    pixels = info.train.width * info.train.height
+    views = IMAGE_COPIES * len(info.train) + 4 * len(info.test)
+    return PROCESS + views * pixels * 12
+

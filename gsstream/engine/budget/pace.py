@@ -1,0 +1,123 @@
+"""Holding a plan inside the optimiser: how many passes the clock still allows, and what a residual may weigh. Ours."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+
+from gsstream.engine.budget.plan import LEAST_WEIGHT, MOST_WEIGHT, SIZE_AIM, FramePlan, each_with, epochs_within
+from gsstream.recipe.budget import Budget
+
+CLOCKS: Mapping[str, Callable[[], float]] = {"wall": time.perf_counter, "processor": time.process_time}
+#: Share of the passes before the size is looked at: residuals first have to grow to what they will be.
+SETTLE = 0.25
+
+
+@dataclass(frozen=True)
+class Allowance:
+    """A plan and the clock it runs against; ``started`` is the start of the frame by that clock."""
+
+    plan: FramePlan
+    started: float
+    clock: Callable[[], float]
+
+    @staticmethod
+    def start(budget: Budget, plan: FramePlan) -> Allowance:
+        """From now on."""
+        clock = CLOCKS[budget.clock]
+        return Allowance(plan, clock(), clock)
+
+
+class Pace:
+    """Passes and weight of one frame, corrected after every pass; lives inside one frame's optimisation.
+
+    Arguments:
+        epochs, rate_weight: of the plan or the recipe. effort: share of the passes that the frame is worth.
+
+    Without an allowance it is the recipe's number of passes and weight.
+    """
+
+    def __init__(self, allowance: Allowance | None, epochs: int, rate_weight: float, effort: float = 1.0) -> None:
+        plan = None if allowance is None else allowance.plan
+        timed = plan is not None and plan.seconds is not None
+        # With a time budget the plan's number is a prediction, and the clock may allow more.
+        self._most = max(epochs, round(effort * plan.most_epochs)) if plan is not None and timed else epochs
+        self.epochs, self.rate_weight = epochs, rate_weight
+        self.estimate = 0.0
+        self.stopped_by_clock = False
+        self._allowance = allowance
+        self._deadline: float | None = None
+        if allowance is not None and allowance.plan.seconds is not None:
+            self._deadline = allowance.started + allowance.plan.seconds - allowance.plan.after
+        self._now = allowance.clock if allowance is not None else None
+        self._epoch_began = self._iteration_began = self._slowest = 0.0
+
+    def begin(self, candidates: int) -> None:
+        """The first pass begins, with so many Gaussians."""
+        if self._now is None or self._allowance is None:
+            return
+        now, plan = self._now(), self._allowance.plan
+        self._epoch_began = self._iteration_began = now
+        if self._deadline is not None and plan.each is not None:
+            each = each_with(plan.each, plan.candidates, candidates)
+            self.epochs = epochs_within(self._deadline - now, each, self._most)
+
+    @property
+    def meets_size(self) -> bool:
+        """Whether a size is to be met, so that bytes are to be estimated after every pass."""
+        return self._allowance is not None and self._allowance.plan.max_bytes is not None
+
+    def is_over(self) -> bool:
+        """Called after every iteration: whether the time for another one is gone."""
+        if self._deadline is None or self._now is None:
+            return False
+        now = self._now()
+        self._slowest, self._iteration_began = max(self._slowest, now - self._iteration_began), now
+        self.stopped_by_clock = now + self._slowest > self._deadline
+        return self.stopped_by_clock
+
+    def end_epoch(self, done: int) -> None:
+        """Plan the passes that are left by what the last one took. ``done``: passes made."""
+        if self._deadline is None or self._now is None:
+            return
+        now = self._now()
+        each, self._epoch_began = now - self._epoch_began, now
+        left = self._deadline - now
+        self.epochs = done if left < 0.25 * each else done + epochs_within(left, each, max(1, self._most - done))
+        self.epochs = min(self.epochs, self._most)
+        self.stopped_by_clock = self.epochs == done < self._most
+
+    def meet_size(self, done: int, estimate: float) -> None:
+        """Move the weight of the rate by what a pass would have sent. ``estimate``: bytes, before the correction."""
+        assert self._allowance is not None
+        self.estimate = estimate
+        plan = self._allowance.plan
+        if plan.max_bytes is None or done < SETTLE * self.epochs:
+            return
+        self.rate_weight = next_weight(self.rate_weight, estimate * plan.correction, SIZE_AIM * plan.max_bytes)
+
+
+def next_weight(weight: float, expected: float, wanted: float) -> float:
+    """Weight of the rate after a pass that would send ``expected`` bytes where ``wanted`` are to be sent.
+
+    Bytes fall with about the square root of the weight (docs/results-stream.md), so the first power leads half of the
+    way to the goal; a factor of three a pass is the most that residuals can follow.
+    """
+    factor = min(max(expected / wanted, 1 / 3), 3.0)
+    return min(max(weight * factor, LEAST_WEIGHT), MOST_WEIGHT)
+
+
+def estimated_bytes(symbols: torch.Tensor) -> float:
+    """Bytes of a table of symbols [A, L]: the entropy of every channel's histogram, and its model."""
+    rows, channels = symbols.shape
+    if rows == 0 or channels == 0:
+        return 0.0
+    low = int(symbols.min())
+    width = int(symbols.max()) - low + 1
+    keys = (symbols - low).long() + width * torch.arange(channels)
+    counts = torch.bincount(keys.reshape(-1), minlength=width * channels).double()
+    used = counts[counts > 0]
+    return float((used * (rows / used).log2()).sum()) / 8 + 0.75 * len(used) + 8 * channels

@@ -1,0 +1,209 @@
+"""What one frame is to spend: a pure function of the budget, the recipe and what earlier frames cost. Ours.
+
+Order in which quality is given up. Size: weight of the rate, then coarser steps, then symbols and gates of the finished
+packet (:mod:`gsstream.engine.budget.trim`). Time: passes, then what counts as changed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import Any
+
+from gsstream.recipe.budget import Budget
+from gsstream.recipe.model import Stream
+
+#: Frames that are looked back on.
+WINDOW = 5
+#: Share of a time budget that is planned with; the rest is for what no plan sees coming.
+TIME_MARGIN = 0.93
+#: Share of a size budget that the optimiser aims at; the rest spares most packets from being trimmed.
+SIZE_AIM = 0.94
+#: Share of a time budget kept for coding while no frame has shown what it costs.
+UNKNOWN_RESERVE = 0.2
+#: Share of a pass's time that does not depend on the number of candidates.
+FIXED_SHARE = 0.3
+#: Fewer passes than this are worth less than fewer candidates.
+LEAST_EPOCHS = 4
+#: Weights of the rate that the controller may use; recipes ship 3e-4, which halves the bytes (docs/results-stream.md).
+LEAST_WEIGHT, USUAL_WEIGHT, MOST_WEIGHT = 3e-5, 3e-4, 3e-2
+#: Steps get at most this much coarser.
+MOST_STEP_SCALE = 4.0
+#: Thresholds of change rise at most to this many times the recipe's, from this one where the recipe has none.
+MOST_THRESHOLD, FIRST_THRESHOLD = 4.0, 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Past:
+    """What one frame cost that was optimised.
+
+    Arguments:
+        epochs: passes made. candidates: Gaussians that took part.
+        before, optimise, after: seconds of the frame until its passes begin, of the passes, and of what follows them.
+        weight, step_scale, threshold: what it was made with, at its end.
+        estimate: bytes expected after the last pass; 0: not estimated. untrimmed: bytes before trimming. size: bytes.
+    """
+
+    frame: int
+    epochs: float
+    candidates: int
+    before: float
+    optimise: float
+    after: float
+    weight: float
+    step_scale: float
+    threshold: float
+    estimate: float
+    untrimmed: int
+    size: int
+
+
+def past_of(metrics: Mapping[str, Any]) -> Past | None:
+    """A line of ``metrics.jsonl`` as the planner sees it; None for frames that were not optimised."""
+    spent = metrics.get("budget", {}).get("spent")
+    if spent is None:
+        return None
+    return Past(
+        frame=int(metrics["frame"]), epochs=float(spent["epochs"]), candidates=int(metrics["candidate_gaussians"]),
+        before=float(spent["before"]), optimise=float(spent["optimise"]),
+        after=float(spent["seconds"]) - float(spent["before"]) - float(spent["optimise"]),
+        weight=float(spent["rate_weight"]), step_scale=float(spent["step_scale"]),
+        threshold=float(spent["change_threshold"]), estimate=float(spent["estimate"]),
+        untrimmed=int(spent["untrimmed"]), size=sum(metrics["bytes"].values()),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class FramePlan:
+    """What a frame is to be made with.
+
+    Arguments:
+        epochs: passes over the cameras; with a time budget a prediction, corrected after every pass.
+        rate_weight: at the start; moved after every pass where a size is to be met.
+        most_epochs: passes that are not exceeded however much time is left.
+        step_scale: factor on all quantisation steps, >= 1.
+        max_bytes: the size that must not be exceeded, or None. correction: real bytes per estimated byte.
+        seconds: what may be planned with from the start of the frame, or None.
+        after: seconds of it to keep for coding.
+        each, candidates: seconds that a pass has taken, with so many Gaussians; None while nothing is known.
+        predicted_seconds, predicted_bytes: what the frame is expected to cost; None while nothing is known.
+    """
+
+    epochs: int
+    change_threshold: float
+    rate_weight: float
+    most_epochs: int = 0
+    step_scale: float = 1.0
+    max_bytes: int | None = None
+    correction: float = 1.0
+    seconds: float | None = None
+    after: float = 0.0
+    each: float | None = None
+    candidates: int = 0
+    predicted_seconds: float | None = None
+    predicted_bytes: float | None = None
+
+
+def plan(budget: Budget, stream: Stream, history: Sequence[Past]) -> FramePlan:
+    """What the next frame is to spend.
+
+    Arguments:
+        stream: the recipe's settings, from which the controller departs.
+        history: earlier frames that were optimised, oldest first.
+    """
+    recent = list(history)[-WINDOW:]
+    each, (before, after) = seconds_per_epoch(recent), _around(budget, recent)
+    epochs = _epochs(budget, stream, each, before + after)
+    size = budget.size
+    held = size is not None
+    seconds = None if budget.time is None else TIME_MARGIN * budget.time
+    known = [p.untrimmed for p in recent[-3:]]
+    expected = min(median(known), size or math.inf) if known else None
+    return FramePlan(
+        epochs=epochs,
+        change_threshold=_threshold(budget, stream, recent),
+        rate_weight=_weight(stream, recent) if held else stream.rate_weight,
+        most_epochs=max(stream.epochs, budget.most_epochs),
+        step_scale=_step_scale(recent) if held else 1.0,
+        max_bytes=size,
+        correction=_correction(recent),
+        seconds=seconds,
+        after=after,
+        each=each,
+        candidates=recent[-1].candidates if recent else 0,
+        predicted_seconds=None if each is None else before + each * epochs + after,
+        predicted_bytes=expected,
+    )
+
+
+def seconds_per_epoch(history: Sequence[Past]) -> float | None:
+    """Median of what a pass took in the last three frames; None while nothing is known."""
+    known = [p.optimise / p.epochs for p in list(history)[-3:] if p.epochs > 0]
+    return median(known) if known else None
+
+
+def epochs_within(seconds: float, each: float, most: int) -> int:
+    """Passes of ``each`` seconds that fit, at least 1 and at most ``most``."""
+    if each <= 0:
+        return most
+    return max(1, min(most, math.floor(min(seconds / each, most) + 1e-9)))
+
+
+def each_with(each: float, then: int, now: int) -> float:
+    """Seconds of a pass with ``now`` candidates where it took ``each`` with ``then``; a part of it does not scale."""
+    return each * (FIXED_SHARE + (1 - FIXED_SHARE) * now / then) if then > 0 else each
+
+
+def _epochs(budget: Budget, stream: Stream, each: float | None, around: float) -> int:
+    """Passes that fit beside ``around`` seconds of everything else."""
+    if budget.time is None:
+        return stream.epochs
+    most = max(stream.epochs, budget.most_epochs)
+    return most if each is None else epochs_within(TIME_MARGIN * budget.time - around, each, most)
+
+
+def _around(budget: Budget, recent: Sequence[Past]) -> tuple[float, float]:
+    """Seconds before and after the passes."""
+    if not recent:
+        return 0.0, UNKNOWN_RESERVE * (budget.time or 0.0)
+    # What follows cannot be cut short: the dearest of the last frames, unless it was a hiccup.
+    after = [p.after for p in recent]
+    return median(p.before for p in recent), min(max(after), 2 * median(after))
+
+
+def _threshold(budget: Budget, stream: Stream, recent: Sequence[Past]) -> float:
+    """Higher while too few passes fit into the time, else back towards the recipe's."""
+    usual = stream.change_threshold
+    if budget.time is None or not recent:
+        return usual
+    last, most = recent[-1], MOST_THRESHOLD * (usual or FIRST_THRESHOLD)
+    if last.epochs < min(LEAST_EPOCHS, stream.epochs):
+        return min(1.5 * last.threshold if last.threshold else FIRST_THRESHOLD, most)
+    if last.epochs >= 2 * LEAST_EPOCHS and last.threshold > usual:
+        lower = last.threshold / 1.25
+        return lower if lower > max(usual, 0.7 * FIRST_THRESHOLD) else usual
+    return last.threshold
+
+
+def _weight(stream: Stream, recent: Sequence[Past]) -> float:
+    """Where the last frame ended: neighbouring frames cost alike, and the passes correct the rest."""
+    start = recent[-1].weight if recent else stream.rate_weight or LEAST_WEIGHT
+    return min(max(start, LEAST_WEIGHT), MOST_WEIGHT)
+
+
+def _step_scale(recent: Sequence[Past]) -> float:
+    """Coarser steps while the weight of the rate has nothing left to give."""
+    if not recent:
+        return 1.0
+    last = recent[-1]
+    if last.weight >= 0.5 * MOST_WEIGHT and last.untrimmed > last.size:
+        return min(2 ** 0.5 * last.step_scale, MOST_STEP_SCALE)
+    return max(1.0, last.step_scale / 2 ** 0.5) if last.weight < 0.1 * MOST_WEIGHT else last.step_scale
+
+
+def _correction(recent: Sequence[Past]) -> float:
+    """Real over estimated bytes of the last frame that had both."""
+    known = [p.untrimmed / p.estimate for p in recent if p.estimate > 0]
+    return min(max(known[-1], 0.8), 3.0) if known else 1.1

@@ -1,0 +1,48 @@
+"""What one optimised frame spent of its allowance, in the words of ``metrics.jsonl``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gsstream.engine.budget.pace import Allowance, Pace
+from gsstream.engine.budget.trim import Fitted
+from gsstream.recipe.model import Stream
+
+
+def spent(
+    allowance: Allowance, pace: Pace, fitted: Fitted, stream: Stream, *, epochs: float, before: float, optimise: float
+) -> dict[str, Any]:
+    """The entry ``budget`` of a frame, before the session adds limits and what the whole frame cost.
+
+    Arguments:
+        stream: the recipe's own settings, from which the plan departed.
+        epochs: passes made. before, optimise: seconds until they began, and of them, by the frame's clock.
+    """
+    plan = allowance.plan
+    given_up: dict[str, Any] = {}
+    if plan.max_bytes is not None:
+        if pace.rate_weight > 1.05 * stream.rate_weight:
+            given_up["rate_weight"] = [stream.rate_weight, pace.rate_weight]
+        if plan.step_scale > 1:
+            given_up["step_scale"] = plan.step_scale
+        dropped = {"symbols": fitted.symbols, "gates": fitted.gates, "births": fitted.births}
+        given_up |= {name: number for name, number in dropped.items() if number}
+    bound = ["size"] if given_up else []
+    if plan.seconds is not None:
+        if epochs < stream.epochs and pace.stopped_by_clock:
+            given_up["epochs"] = stream.epochs - epochs
+        if plan.change_threshold > stream.change_threshold:
+            given_up["change_threshold"] = [stream.change_threshold, plan.change_threshold]
+        if pace.stopped_by_clock:
+            bound.append("time")
+    known = {"time": plan.predicted_seconds, "size": plan.predicted_bytes}
+    return {
+        "predicted": {name: value for name, value in known.items() if value is not None},
+        "bound": bound,
+        "given_up": given_up,
+        "spent": {
+            "epochs": epochs, "planned_epochs": plan.epochs, "rate_weight": pace.rate_weight,
+            "step_scale": plan.step_scale, "change_threshold": plan.change_threshold, "estimate": pace.estimate,
+            "untrimmed": fitted.untrimmed, "before": before, "optimise": optimise,
+        },
+    }  # fmt: skip

@@ -1,0 +1,193 @@
+"""Making a finished packet fit: symbols that explain little per bit go first, then whole gates, then everything. Ours.
+
+What a symbol is worth is read from the optimiser: the running mean of a latent's squared gradient stands for its
+curvature (empirical Fisher), so moving it by d costs about curvature * d^2 of loss, up to one factor for all. What it
+costs is its code length in its channel's histogram. Each symbol then takes the cheapest of itself, one step nearer to
+zero, and zero, at a price of loss per bit raised until the packet fits (rate-distortion optimised quantisation).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from gsstream.core.delta import Delta, Layout
+from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.packet import EncodedPacket
+
+BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
+#: Packets that are encoded at most on the way to one that fits, and the share of the limit that is good enough.
+TRIES, GOOD_ENOUGH = 8, 0.95
+#: Steps of the search for a price; bits of an open gate besides its rows.
+_BISECTIONS, _GATE_BITS = 24, 3.0
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A packet that fits, and what it gave up.
+
+    Arguments:
+        untrimmed: bytes before anything was given up.
+        symbols, gates, births: how many went, or moved nearer to zero.
+    """
+
+    delta: Delta
+    packet: EncodedPacket
+    untrimmed: int
+    symbols: int = 0
+    gates: int = 0
+    births: int = 0
+
+
+def fit(
+    delta: Delta, curvature: Mapping[str, FloatArray], layout: Layout, encode: Callable[[Delta], EncodedPacket],
+    max_bytes: int,
+) -> Fitted:  # fmt: skip
+    """The delta, with as little given up as makes its packet at most ``max_bytes``; unchanged when it fits.
+
+    Arguments:
+        curvature: attribute -> [A, L] >= 0, aligned with ``delta.symbols``.
+        encode: delta -> packet; a delta that changes nothing must give the smallest packet there is.
+        max_bytes: at least the size of an empty packet.
+
+    Raises AssertionError when not even the empty packet fits: a budget's least size forbids that.
+    """
+    packet = encode(delta)
+    untrimmed = len(packet.data)
+    if untrimmed <= max_bytes:
+        return Fitted(delta, packet, untrimmed)
+    found = _trimmed(delta, packet, curvature, layout, encode, max_bytes) if delta.symbols else None
+    if found is None and delta.edits_rows:
+        # What is born is fitted last and costs most per row: without it the rest may fit.
+        plain = fit(replace(delta, births=None, deaths=np.zeros(0, np.int64)), curvature, layout, encode, max_bytes)
+        return replace(plain, untrimmed=untrimmed, births=0 if delta.births is None else len(delta.births))
+    if found is None:
+        empty = Delta(np.zeros_like(delta.gates), delta.num_levels)
+        found = empty, encode(empty)
+    assert len(found[1].data) <= max_bytes, "an empty packet is above the budget"
+    return Fitted(*found, untrimmed, _changed(delta, found[0], layout), _open(delta) - _open(found[0]))
+
+
+def _trimmed(
+    delta: Delta, packet: EncodedPacket, curvature: Mapping[str, FloatArray], layout: Layout,
+    encode: Callable[[Delta], EncodedPacket], max_bytes: int,
+) -> tuple[Delta, EncodedPacket] | None:  # fmt: skip
+    """The largest packet found that fits, real bytes; None when none did."""
+    table = _Table(delta, curvature, layout)
+    best: tuple[Delta, EncodedPacket] | None = None
+    # Estimated bits and real bytes of a packet that fits and of one that does not; in between a straight line.
+    low, high = (0.0, 0.0), (table.bits, float(len(packet.data)))
+    for _ in range(TRIES):
+        share = (0.98 * max_bytes - low[1]) / (high[1] - low[1])
+        aim = low[0] + min(max(share, 0.05), 0.95) * (high[0] - low[0])
+        smaller = table.at_most(aim)
+        tried = encode(smaller)
+        size = len(tried.data)
+        if size > max_bytes:
+            high = aim, float(size)
+            continue
+        low = aim, float(size)
+        if not smaller.is_empty and (best is None or size > len(best[1].data)):
+            best = smaller, tried
+        if size >= GOOD_ENOUGH * max_bytes:
+            break
+    return best
+
+
+class _Table:
+    """Symbols of all attributes side by side with their worth and code lengths."""
+
+    def __init__(self, delta: Delta, curvature: Mapping[str, FloatArray], layout: Layout) -> None:
+        self.delta = delta
+        self.opened = np.flatnonzero((delta.gates > 0) & (np.asarray(layout.node_counts) > 0))
+        self.counts = np.asarray(layout.node_counts)[self.opened]
+        self.names = list(delta.symbols)
+        self.symbols = np.concatenate([delta.symbols[n] for n in self.names], 1).astype(np.int64)
+        steps = [np.full(delta.symbols[n].shape[1], delta.steps[n]) for n in self.names]
+        worth = np.concatenate([np.asarray(curvature[n], np.float64) for n in self.names], 1)
+        worth *= np.concatenate(steps)[None] ** 2
+        nearer = self.symbols - np.sign(self.symbols)
+        #: The three choices of every symbol: [3, A, L] values, what they lose and what they cost.
+        self.values = np.stack([self.symbols, nearer, np.zeros_like(self.symbols)])
+        self.losses = worth[None] * (self.values - self.symbols[None]) ** 2
+        codes = [_code_lengths(column) for column in self.symbols.T]
+        self.lengths = np.stack([[code(column) for code, column in zip(codes, v.T, strict=True)] for v in self.values])
+        self.lengths = self.lengths.transpose(0, 2, 1)
+        self.bits = float(self.lengths[0].sum()) + _GATE_BITS * len(self.opened)
+        #: A price at which nothing is worth its bits.
+        self.most = float(self.losses[2].sum()) + 1e-30
+
+    def at_most(self, bits: float) -> Delta:
+        """The delta at the lowest price at which it is estimated to take no more than ``bits``."""
+        low, high = self.most * 1e-14, self.most * 10
+        if self._choose(low)[2] <= bits:
+            return self._delta(*self._choose(low)[:2])
+        for _ in range(_BISECTIONS):
+            middle = float(np.sqrt(low * high))
+            low, high = (low, middle) if self._choose(middle)[2] <= bits else (middle, high)
+        return self._delta(*self._choose(high)[:2])
+
+    def _choose(self, price: float) -> tuple[IntArray, BoolArray, float]:
+        """(symbols [A, L], open [G] of the gates, bits) at a price of loss per bit."""
+        total = self.losses + price * self.lengths
+        choice = total.argmin(0)[None]
+        values, losses, lengths = (
+            np.take_along_axis(table, choice, 0)[0] for table in (self.values, self.losses, self.lengths)
+        )
+        starts = np.cumsum(self.counts) - self.counts
+        kept, length = _by_gate(losses.sum(1), starts), _by_gate(lengths.sum(1), starts) + _GATE_BITS
+        closed = _by_gate(self.losses[2].sum(1), starts)
+        opened = closed > kept + price * length
+        return values, opened, float(length[opened].sum())
+
+    def _delta(self, values: IntArray, opened: BoolArray) -> Delta:
+        # A gate behind which every symbol is zero is closed, as in hardening.
+        starts = np.cumsum(self.counts) - self.counts
+        opened = opened & (_by_gate(values.any(1).astype(np.float64), starts) > 0)
+        rows = np.repeat(opened, self.counts)
+        gates = self.delta.gates.copy()
+        gates[self.opened[~opened]] = 0
+        symbols, at = {}, 0
+        for name in self.names:
+            width = self.delta.symbols[name].shape[1]
+            part = values[rows, at : at + width].astype(np.int32)
+            at += width
+            if part.any():
+                symbols[name] = part
+        kept = {n: v for n, v in self.delta.decoders.items() if n in symbols}
+        return replace(
+            self.delta, gates=gates, symbols=symbols, steps={n: self.delta.steps[n] for n in symbols}, decoders=kept
+        )
+
+
+def _by_gate(rows: Any, starts: IntArray) -> FloatArray:
+    """[G] sums over the rows of each open gate, which are stored one after the other."""
+    return np.asarray(np.add.reduceat(rows, starts)) if len(starts) else np.zeros(0)
+
+
+def _code_lengths(column: IntArray) -> Callable[[IntArray], FloatArray]:
+    """Bits of symbols under the histogram of ``column``; what it lacks is as rare as half a symbol."""
+    low = min(int(column.min()), 0) - 1
+    counts = np.bincount(column - low, minlength=int(max(column.max(), 0)) - low + 2).astype(np.float64)
+    lengths = np.log2(len(column)) - np.log2(np.maximum(counts, 0.5))
+    return lambda values: np.asarray(lengths[values - low])
+
+
+def _open(delta: Delta) -> int:
+    return int(np.count_nonzero(delta.gates))
+
+
+def _changed(before: Delta, after: Delta, layout: Layout) -> int:
+    """Symbols that are not as they were; those of rows that are no longer sent count when they were not zero."""
+    opened = np.flatnonzero(before.gates)
+    kept = np.repeat(after.gates[opened] != 0, np.asarray(layout.node_counts)[opened])
+    changed = 0
+    for name, symbols in before.symbols.items():
+        now = np.zeros_like(symbols)
+        if name in after.symbols:
+            now[kept] = after.symbols[name]
+        changed += int((now != symbols).sum())
+    return changed

@@ -1,0 +1,102 @@
+"""What a frame may cost, as data: ``budget: {time: 1.0s, size: 20KB, memory: 2GB}``, any subset of it.
+
+Units are decimal (docs/conventions.md): 1 KB = 1,000 bytes. A number without a unit is seconds, or bytes.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+from gsstream.core.errors import RecipeError, suggest
+
+SECONDS = {"s": 1.0, "ms": 1e-3, "min": 60.0}
+BYTES = {"B": 1.0, "bytes": 1.0, "KB": 1e3, "MB": 1e6, "GB": 1e9}
+
+
+def read_quantity(text: str, units: dict[str, float]) -> float:
+    """``"1.5KB"`` as 1500.0. Raises ValueError that names the nearest unit."""
+    match = re.fullmatch(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([^\s\d.]\S*)?\s*", text)
+    if match is None:
+        example = "1.5s" if "s" in units else "20KB"
+        raise ValueError(f"expected a number and a unit ({', '.join(units)}), e.g. {example}")
+    unit = match[2]
+    if unit is not None and unit not in units:
+        near = next((f"; did you mean {name!r}?" for name in units if name.lower() == unit.lower()), None)
+        near = near or suggest(unit.replace("i", ""), units).replace("known:", "units here:")
+        raise ValueError(f"no unit {unit!r} here{near}")
+    value = float(match[1]) * (units[unit] if unit else 1.0)
+    if not math.isfinite(value):
+        raise ValueError("expected a finite quantity")
+    return value
+
+
+def _seconds(value: Any) -> Any:
+    return read_quantity(value, SECONDS) if isinstance(value, str) else value
+
+
+def _bytes(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, str | float | int):
+        return value
+    return math.floor(read_quantity(value, BYTES) if isinstance(value, str) else value)
+
+
+Seconds = Annotated[float, BeforeValidator(_seconds, json_schema_input_type=float | str)]
+Bytes = Annotated[int, BeforeValidator(_bytes, json_schema_input_type=float | str)]
+
+
+class Budget(BaseModel):
+    """Limits of every frame after the first, and of the process. The controller stays inside where it can and says
+    where it cannot (docs/howto/budget.md).
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+    time: Seconds | None = Field(
+        default=None, gt=0,
+        description="seconds from a frame's images in memory to its packet on disk, e.g. 1.0s, 800ms; the bytes then "
+        "depend on the clock",
+    )  # fmt: skip
+    size: Bytes | None = Field(
+        default=None, ge=16, description="bytes of a frame's packet, e.g. 20KB; an empty packet has 16"
+    )
+    memory: Bytes | None = Field(
+        default=None, gt=0, description="peak resident memory of the process, e.g. 2GB; limits Gaussians and caches"
+    )
+    clock: Literal["wall", "processor"] = Field(
+        default="wall", description="what time means: wall clock, or processor time of all threads of the process"
+    )
+    most_epochs: int = Field(
+        default=30, ge=1, description="with a time budget: most passes over the cameras that are spent on one frame"
+    )
+
+    @property
+    def limits_frames(self) -> bool:
+        """Whether a frame has a limit of its own."""
+        return self.time is not None or self.size is not None
+
+    @property
+    def limits_anything(self) -> bool:
+        """Whether there is any limit."""
+        return self.limits_frames or self.memory is not None
+
+
+def budget_overrides(text: str) -> list[tuple[str, str]]:
+    """``"time=1s,size=20KB"`` of the command line as overrides of recipe keys.
+
+    Raises RecipeError for a key that no budget has, or one given twice.
+    """
+    out: dict[str, str] = {}
+    for piece in text.split(","):
+        key, equals, value = (part.strip() for part in piece.partition("="))
+        if not equals or not key or not value:
+            raise RecipeError(f"--budget {text}: expected KEY=QUANTITY, e.g. time=1.0s,size=20KB,memory=2GB")
+        if key not in Budget.model_fields:
+            raise RecipeError(f"--budget {text}: unknown key {key!r}{suggest(key, Budget.model_fields)}")
+        if key in out:
+            raise RecipeError(f"--budget {text}: {key} is given twice")
+        out[key] = value
+    return [("--budget", f"budget.{key}={value}") for key, value in out.items()]

@@ -1,0 +1,160 @@
+"""Budgets on real runs, tiny: sizes hold in the file, resumed runs give the same bytes, what cannot be held is said."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from flow_runs import Witness, arguments, demo_copy, encode, metrics
+
+from gsstream.cli.main import run_command
+from gsstream.engine import session
+from gsstream.packet import StreamReader
+from gsstream.player.playback import Playback
+
+SIZE = 700
+TIGHT = ("--budget", f"size={SIZE}B")
+
+
+@pytest.fixture(scope="module")
+def held(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three frames of the demo recording at half size, in a size that binds."""
+    folder = tmp_path_factory.mktemp("held")
+    demo_copy(folder / "scene", frames=4)
+    encode(folder / "out", *TIGHT, "--scale", "0.5", source=str(folder / "scene"), method="s2gs-edge")
+    return folder
+
+
+def later_sizes(out: Path) -> list[int]:
+    with StreamReader(out / "stream.gss") as reader:
+        return [entry.size for entry in reader.frames][1:]
+
+
+def test_sizes_hold_in_the_file_and_are_reported(held: Path) -> None:
+    encode(held / "free", "--scale", "0.5", source=str(held / "scene"), method="s2gs-edge")
+    assert max(later_sizes(held / "free")) > 2 * SIZE, "a size that binds"
+    sizes, lines = later_sizes(held / "out"), metrics(held / "out")
+    assert max(sizes) <= SIZE
+    assert [sum(line["bytes"].values()) for line in lines[1:]] == sizes
+    for line in lines[1:]:
+        entry = line["budget"]
+        assert entry["limits"] == {"size": SIZE}
+        assert entry["violated"] == []
+        assert entry["bound"] == ["size"]
+        assert entry["given_up"]["rate_weight"][1] > entry["given_up"]["rate_weight"][0]
+        assert entry["spent"]["untrimmed"] >= sum(line["bytes"].values())
+    summary = (held / "out" / "summary.txt").read_text()
+    assert f"budget size {SIZE / 1000:.2f} KB: 3 of 3 frames inside" in summary
+    assert "given up: rate weight raised" in summary
+    assert "time: 1.0" not in (held / "out" / "recipe.yaml").read_text()
+    assert "size: 700" in (held / "out" / "recipe.yaml").read_text()
+
+
+def test_the_encoder_goes_on_from_what_it_trimmed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    witness = Witness(monkeypatch)
+    encode(tmp_path, "--budget", "size=300B", method="s2gs-edge")
+    assert any("symbols" in line["budget"]["given_up"] for line in metrics(tmp_path)[1:]), "something was trimmed"
+    with Playback(tmp_path / "stream.gss") as playback:
+        for index, state in enumerate(witness.states):
+            shown = playback.state_at(index)
+            for name, value in state.player.gaussians.items():
+                assert getattr(shown, name).tobytes() == value.tobytes(), (index, name)
+
+
+@pytest.mark.parametrize("lost", ["nothing", "a line", "all lines", "half a packet"])
+def test_a_size_budget_resumes_to_the_same_bytes(tmp_path: Path, monkeypatch, lost: str) -> None:
+    once = encode(tmp_path / "a", *TIGHT, method="s2gs-edge")
+    step = session.frame_step
+
+    def impatient(parts, state, frame, rng, *more):
+        if frame.index == 4:
+            raise KeyboardInterrupt
+        return step(parts, state, frame, rng, *more)
+
+    monkeypatch.setattr(session, "frame_step", impatient)
+    assert run_command(arguments(tmp_path / "b", *TIGHT, method="s2gs-edge")) == 130
+    monkeypatch.undo()
+    log = tmp_path / "b" / "metrics.jsonl"
+    lines = log.read_text().splitlines(keepends=True)
+    assert len(lines) == 4
+    if lost == "a line":  # a kill between packet and line
+        log.write_text("".join(lines[:-1]) + '{"fra')
+    if lost == "all lines":
+        log.unlink()
+    if lost == "half a packet":
+        with (tmp_path / "b" / "stream.gss").open("r+b") as file:
+            file.truncate((tmp_path / "b" / "stream.gss").stat().st_size - 9)
+    assert encode(tmp_path / "b", "--resume", *TIGHT, method="s2gs-edge") == once
+    assert [line["frame"] for line in metrics(tmp_path / "b")] == list(range(6))
+    ours, theirs = ([m["budget"]["spent"]["rate_weight"] for m in metrics(tmp_path / n)[1:]] for n in ("a", "b"))
+    assert ours == theirs
+
+
+def test_another_budget_is_not_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    encode(tmp_path, *TIGHT, "--frames", "2", method="s2gs-edge")
+    assert run_command(arguments(tmp_path, "--resume", "--budget", "size=2KB", method="s2gs-edge")) == 2
+    assert "another recipe: budget differ" in capsys.readouterr().err
+
+
+def test_a_time_that_cannot_be_held_is_said_frame_by_frame(tmp_path: Path) -> None:
+    """A millisecond is gone before the first view: one view is made, and every frame says that it is late."""
+    encode(tmp_path, "--budget", "time=1ms", method="s2gs-edge", stream__epochs=2)
+    lines = metrics(tmp_path)
+    assert [line["budget"]["violated"] for line in lines] == [[], *[["time"]] * 5]
+    assert all(line["iterations"] == 1 for line in lines[1:] if line["status"] == "delta")
+    assert all(line["budget"]["actual"]["time"] > 1e-3 for line in lines[1:])
+    summary = (tmp_path / "summary.txt").read_text()
+    assert "budget time 0.00 s: 0 of 5 frames inside" in summary
+    assert summary.count("  frame ") == 5
+    with Playback(tmp_path / "stream.gss") as playback:
+        assert list(playback.frames) == list(range(6))
+
+
+def test_plenty_of_time_makes_the_most_passes(tmp_path: Path) -> None:
+    encode(tmp_path, "--budget", "time=5min,most_epochs=4", "--frames", "3", method="s2gs-edge", stream__epochs=2)
+    assert [line["iterations"] for line in metrics(tmp_path)[1:]] == [12, 12]
+    encode(tmp_path / "p", "--budget", "time=5min,clock=processor", "--frames", "2", method="dense", stream__epochs=31)
+    assert metrics(tmp_path / "p")[1]["iterations"] == 31 * 3, "the recipe's own number is never the limit"
+
+
+def test_key_packets_wait_for_a_budget_that_has_room(tmp_path: Path) -> None:
+    encode(tmp_path / "small", *TIGHT, method="s2gs-edge", codec__key_every=2)
+    lines = metrics(tmp_path / "small")
+    assert [line["status"] for line in lines[1:]].count("key") == 0
+    assert ["key_postponed" in line for line in lines] == [False, False, True, True, True, True]
+    assert "bytes where 700 are allowed" in lines[2]["key_postponed"]
+    assert "a key packet was due and postponed in 4 frames (frames 2 to 5): period: about" in (
+        tmp_path / "small" / "summary.txt"
+    ).read_text()
+    encode(tmp_path / "large", "--budget", "size=1MB", method="s2gs-edge", codec__key_every=2)
+    assert [line["status"] for line in metrics(tmp_path / "large")][2::2] == ["key", "key"]
+
+
+def test_memory_limits_frame_0_or_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = arguments(tmp_path / "no", "--budget", "memory=100MB")
+    assert run_command(command) == 2
+    err = capsys.readouterr().err
+    assert "budget.memory: 100 MB, but a run of this recording needs at least 33" in err
+    assert "give more, or lower --scale" in err
+    assert not (tmp_path / "no" / "stream.gss").exists()
+    encode(tmp_path / "yes", "--budget", "memory=337MB", "--frames", "2")
+    recipe = metrics(tmp_path / "yes"), (tmp_path / "yes" / "recipe.yaml").read_text()
+    assert all("memory" in line["budget"]["limits"] for line in recipe[0])
+    with Playback(tmp_path / "yes" / "stream.gss") as playback:
+        limits = playback.meta.recipe["first_frame"]["max_gaussians"]
+    assert 1000 <= limits < 2000
+
+
+def test_a_whole_method_has_no_budget_of_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(arguments(tmp_path, "--budget", "size=1KB", method="hold")) == 2
+    assert "budget.size: the whole method 'hold' does not read it" in capsys.readouterr().err
+
+
+def test_a_budget_is_data(tmp_path: Path) -> None:
+    recipe = tmp_path / "mine.yaml"
+    recipe.write_text("base: s2gs-edge\nbudget: {size: 0.7KB}\n")
+    encode(tmp_path / "file", "--recipe", str(recipe), "--frames", "2", method="s2gs-edge")
+    encode(tmp_path / "option", *TIGHT, "--frames", "2", method="s2gs-edge")
+    ours, theirs = ((tmp_path / name / "stream.gss").read_bytes() for name in ("file", "option"))
+    assert ours == theirs
+    assert metrics(tmp_path / "file")[1]["budget"]["limits"] == {"size": 700}

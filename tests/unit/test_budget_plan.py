@@ -1,0 +1,259 @@
+"""Planning frames under a budget: units, the pure planner, the pace inside a frame, and what is reported."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from gsstream.core.errors import RecipeError
+from gsstream.engine.budget.controller import Controller
+from gsstream.engine.budget.pace import Allowance, Pace, estimated_bytes, next_weight
+from gsstream.engine.budget.plan import (
+    LEAST_WEIGHT,
+    MOST_WEIGHT,
+    TIME_MARGIN,
+    FramePlan,
+    Past,
+    epochs_within,
+    plan,
+)
+from gsstream.engine.budget.report import budget_lines
+from gsstream.recipe.budget import Budget, budget_overrides
+from gsstream.recipe.model import Stream
+
+SECONDS = st.floats(1e-3, 10)
+PASTS = st.builds(
+    Past, frame=st.just(1), epochs=st.floats(0.1, 30), candidates=st.integers(1, 10_000), before=SECONDS,
+    optimise=SECONDS, after=SECONDS, weight=st.floats(LEAST_WEIGHT, MOST_WEIGHT), step_scale=st.floats(1, 4),
+    threshold=st.floats(0, 24), estimate=st.floats(0, 1e5), untrimmed=st.integers(16, 100_000),
+    size=st.integers(16, 100_000),
+)  # fmt: skip
+HISTORIES = st.lists(PASTS, max_size=8)
+STREAMS = st.builds(Stream, epochs=st.integers(1, 30), change_threshold=st.sampled_from([0.0, 6.0]))
+USUAL = Past(1, 20.0, 1000, 0.1, 1.0, 0.1, 3e-4, 1.0, 6.0, 9000.0, 9900, 9500)
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("1.0s", 1.0), ("800ms", 0.8), ("2 min", 120.0), (".5s", 0.5), ("1e-1s", 0.1), (3, 3.0)]
+)
+def test_times(text: object, seconds: float) -> None:
+    assert Budget.model_validate({"time": text}).time == pytest.approx(seconds)
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("20KB", 20_000), ("1.5 MB", 1_500_000), ("500B", 500), ("999 bytes", 999), ("2GB", 2 * 10**9), (77, 77)],
+)
+def test_sizes_are_decimal(text: object, size: int) -> None:
+    assert Budget.model_validate({"size": text}).size == size
+
+
+@pytest.mark.parametrize(
+    ("given", "problem"),
+    [
+        ({"size": "20kb"}, "no unit 'kb' here; did you mean 'KB'"),
+        ({"size": "20KiB"}, "no unit 'KiB' here; did you mean 'KB'"),
+        ({"time": "1sec"}, "no unit 'sec' here; did you mean 's'"),
+        ({"time": "20KB"}, "no unit 'KB' here; units here: min, ms, s"),
+        ({"time": "soon"}, "expected a number and a unit (s, ms, min), e.g. 1.5s"),
+        ({"size": "3B"}, "greater than or equal to 16"),
+        ({"time": "0s"}, "greater than 0"),
+        ({"time": "-1s"}, "greater than 0"),
+        ({"time": "1e999s"}, "expected a finite quantity"),
+        ({"memory": True}, "valid integer"),
+        ({"clock": "cpu"}, "'wall' or 'processor'"),
+    ],
+)
+def test_nonsense_is_refused(given: dict[str, object], problem: str) -> None:
+    with pytest.raises(ValueError, match=r".") as caught:
+        Budget.model_validate(given, strict=True)
+    assert problem in str(caught.value)
+
+
+def test_command_line() -> None:
+    wanted = [("--budget", "budget.time=1.0s"), ("--budget", "budget.size=20KB")]
+    assert budget_overrides("time=1.0s, size=20KB") == wanted
+    with pytest.raises(RecipeError, match="unknown key 'siz'; did you mean 'size'"):
+        budget_overrides("siz=20KB")
+    with pytest.raises(RecipeError, match="time is given twice"):
+        budget_overrides("time=1s,time=2s")
+    for text in ("", "time", "time=", "=3s", "size=1KB,"):
+        with pytest.raises(RecipeError, match=r"expected KEY=QUANTITY, e\.g\."):
+            budget_overrides(text)
+
+
+@given(STREAMS, HISTORIES, st.floats(0.01, 100))
+def test_never_above_the_time_when_the_floor_fits(stream: Stream, history: list[Past], seconds: float) -> None:
+    found = plan(Budget(time=seconds), stream, history)
+    assert 1 <= found.epochs <= max(stream.epochs, 30)
+    if found.each is None:
+        assert not history
+        return
+    assert found.predicted_seconds is not None
+    around = found.predicted_seconds - found.epochs * found.each
+    assume(around + found.each <= TIME_MARGIN * seconds)
+    assert found.predicted_seconds <= seconds
+
+
+@given(STREAMS, HISTORIES, st.floats(0.01, 100), st.floats(1, 10))
+def test_more_time_is_never_fewer_passes(stream: Stream, history: list[Past], seconds: float, more: float) -> None:
+    less, greater = (plan(Budget(time=s), stream, history).epochs for s in (seconds, more * seconds))
+    assert greater >= less
+
+
+@given(STREAMS, HISTORIES, st.integers(16, 10**6))
+def test_a_size_plans_within_it_and_leaves_time_alone(stream: Stream, history: list[Past], size: int) -> None:
+    found = plan(Budget(size=size), stream, history)
+    assert found.max_bytes == size
+    assert found.predicted_bytes is None or found.predicted_bytes <= size
+    assert LEAST_WEIGHT <= found.rate_weight <= MOST_WEIGHT
+    assert 1 <= found.step_scale <= 4
+    assert found.epochs == stream.epochs, "bytes must not depend on what the clock said"
+    assert found.change_threshold == stream.change_threshold
+    slower = plan(Budget(size=size), stream, [replace(p, before=1.0, after=2.0, optimise=3.0) for p in history])
+    timeless = {"after": 0.0, "each": None, "predicted_seconds": None}
+    assert replace(found, **timeless) == replace(slower, **timeless)
+
+
+@given(STREAMS, HISTORIES)
+def test_without_limits_the_recipe_is_the_plan(stream: Stream, history: list[Past]) -> None:
+    found = plan(Budget(), stream, history)
+    assert (found.epochs, found.change_threshold, found.rate_weight) == (
+        stream.epochs, stream.change_threshold, stream.rate_weight
+    )  # fmt: skip
+    assert (found.step_scale, found.max_bytes, found.seconds) == (1.0, None, None)
+
+
+def test_too_few_passes_raise_the_threshold_and_plenty_lower_it_again() -> None:
+    stream, tight = Stream(change_threshold=6.0), Budget(time=1.0)
+    poor = replace(USUAL, epochs=2.0)
+    assert plan(tight, stream, [poor]).change_threshold == 9.0
+    assert plan(tight, stream, [replace(poor, threshold=20.0)]).change_threshold == 24.0
+    assert plan(tight, stream, [replace(USUAL, threshold=12.0)]).change_threshold == pytest.approx(9.6)
+    assert plan(tight, stream, [USUAL]).change_threshold == 6.0
+    assert plan(tight, Stream(), [replace(poor, threshold=0.0)]).change_threshold == 3.0
+
+
+def test_steps_get_coarser_only_when_the_weight_is_spent() -> None:
+    stream, small = Stream(rate_weight=3e-4), Budget(size=1000)
+    spent = replace(USUAL, weight=MOST_WEIGHT, untrimmed=3000, size=1000)
+    assert plan(small, stream, [spent]).step_scale == pytest.approx(math.sqrt(2))
+    assert plan(small, stream, [replace(spent, weight=1e-3)]).step_scale == 1.0
+    assert plan(small, stream, [replace(USUAL, step_scale=2.0)]).step_scale == pytest.approx(math.sqrt(2))
+
+
+@given(st.floats(0, 100), st.floats(1e-6, 10), st.integers(1, 40))
+def test_passes_fill_the_time(seconds: float, each: float, most: int) -> None:
+    epochs = epochs_within(seconds, each, most)
+    assert 1 <= epochs <= most
+    assert epochs == 1 or epochs * each <= seconds * (1 + 1e-6)
+    assert epochs == most or (epochs + 1) * each > seconds * (1 - 1e-6)
+
+
+class Clock:
+    """A clock that a test moves."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def paced(seconds: float, **known: float) -> tuple[Pace, Clock]:
+    clock = Clock()
+    found = FramePlan(20, 6.0, 3e-4, most_epochs=30, seconds=seconds, after=1.0, **known)  # type: ignore[arg-type]
+    return Pace(Allowance(found, clock.now, clock), 20, 3e-4), clock
+
+
+def test_the_clock_ends_a_frame_before_its_coding_has_no_time_left() -> None:
+    pace, clock = paced(5.0)
+    pace.begin(10)
+    done = 0
+    while True:
+        clock.now += 0.3
+        done += 1
+        if pace.is_over():
+            break
+    assert done == 13, "4 seconds are there beside coding, and 13 views of 0.3 s fit into them"
+    assert pace.stopped_by_clock
+
+
+def test_passes_follow_what_they_took() -> None:
+    pace, clock = paced(11.0)
+    pace.begin(10)
+    assert pace.epochs == 20
+    clock.now += 2.0
+    pace.end_epoch(1)
+    assert pace.epochs == 5, "10 s, 2 of them gone, 2 s a pass"
+    clock.now += 1.0
+    pace.end_epoch(2)
+    assert pace.epochs == 9, "the pass after that took half as long"
+    clock.now += 6.9
+    pace.end_epoch(3)
+    assert pace.epochs == 3
+    assert pace.stopped_by_clock
+
+
+def test_the_first_number_of_passes_scales_with_the_candidates() -> None:
+    few, many = (paced(11.0, each=1.0, candidates=100)[0] for _ in range(2))
+    few.begin(100)
+    many.begin(400)
+    assert (few.epochs, many.epochs) == (10, 3)
+
+
+def test_without_an_allowance_nothing_changes() -> None:
+    pace = Pace(None, 7, 3e-4)
+    pace.begin(10)
+    pace.end_epoch(1)
+    assert (pace.is_over(), pace.epochs, pace.rate_weight, pace.meets_size) == (False, 7, 3e-4, False)
+
+
+@given(st.floats(LEAST_WEIGHT, MOST_WEIGHT), st.floats(0, 1e6), st.floats(1, 1e6))
+def test_the_weight_moves_towards_the_size(weight: float, expected: float, wanted: float) -> None:
+    after = next_weight(weight, expected, wanted)
+    assert LEAST_WEIGHT <= after <= MOST_WEIGHT
+    assert after >= weight if expected > wanted else after <= weight
+
+
+def test_estimated_bytes() -> None:
+    torch.manual_seed(0)
+    assert estimated_bytes(torch.zeros(0, 5)) == 0.0
+    fair = torch.randint(0, 4, (8000, 3)).float()
+    assert estimated_bytes(fair) == pytest.approx(3 * 8000 * 2 / 8, rel=0.02)
+    assert estimated_bytes(torch.zeros(1000, 3)) < 40
+
+
+def line(frame: int, size: int, **more: object) -> dict[str, object]:
+    base = {"frame": frame, "status": "delta", "bytes": {"all": size}, "num_gaussians": 10, "peak_memory_mb": 100.0}
+    return {**base, "seconds": {"code": 1.0}, "candidate_gaussians": 5, **more}
+
+
+def test_violations_are_written_down_and_summed_up() -> None:
+    budget = Budget(size=1000, time=2.0)
+    controller = Controller(budget, Stream())
+    lines = [controller.settle(line(0, 99_000, status="key"), 90.0)]
+    lines += [controller.settle(line(t, 990 + 10 * t), 1.5 + 0.5 * (t == 3)) for t in range(1, 4)]
+    assert [entry["budget"]["violated"] for entry in lines] == [[], [], ["size"], ["size"]]
+    assert lines[0]["budget"]["limits"] == {}, "frame 0 is what a budget starts from"
+    text = "\n".join(budget_lines(lines))
+    assert "budget size 1.00 KB: 1 of 3 frames inside; median 1.01 KB, most 1.02 KB" in text
+    assert "budget time 2.00 s: 3 of 3 frames inside" in text
+    assert "outside the budget:\n  frame 2: size 1.01 KB of 1.00 KB\n  frame 3: size 1.02 KB of 1.00 KB" in text
+    assert budget_lines([{"frame": 0}]) == []
+
+
+def test_a_key_packet_waits_until_it_can_be_paid() -> None:
+    controller = Controller(Budget(size=1000), Stream())
+    assert controller.key_refusal(10, controller.allow()) is None, "nothing is known yet"
+    controller.settle(line(0, 5000, status="key"), 1.0)
+    assert controller.key_refusal(10, controller.allow()) == "about 5000 bytes where 1000 are allowed"
+    assert controller.key_refusal(1, controller.allow()) is None
+    slow = Controller(Budget(time=0.5), Stream())
+    slow.settle(line(0, 5000, status="key"), 1.0)
+    assert "where 0.5 s are allowed" in str(slow.key_refusal(10, slow.allow()))

@@ -27,6 +27,7 @@ from gsstream.cli import (
     scene,
     streams,
     sweep,
+    tune,
 )
 from gsstream.core.errors import GsstreamError, InputError
 
@@ -74,6 +75,7 @@ app.command(name="export")(deliver.export)
 app.command(name="manifest")(deliver.manifest)
 app.command(name="view")(deliver.view)
 app.command(name="sweep")(sweep.sweep)
+app.command(name="tune")(tune.tune)
 app.command(name="report")(report.report)
 app.command(name="check")(check.check)
 app.command(name="new-plugin")(scaffold.new_plugin)

@@ -44,8 +44,16 @@ def _bytes(value: Any) -> Any:
     return math.floor(read_quantity(value, BYTES) if isinstance(value, str) else value)
 
 
-Seconds = Annotated[float, BeforeValidator(_seconds, json_schema_input_type=float | str)]
-Bytes = Annotated[int, BeforeValidator(_bytes, json_schema_input_type=float | str)]
+def _text(units: dict[str, float]) -> Any:
+    """What a schema knows of the text: number and unit."""
+    return Annotated[str, Field(pattern=rf"^\s*\+?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?\s*({'|'.join(units)})?\s*$")]
+
+
+Seconds = Annotated[
+    float, BeforeValidator(_seconds, json_schema_input_type=Annotated[float, Field(gt=0)] | _text(SECONDS))
+]
+Packet = Annotated[int, BeforeValidator(_bytes, json_schema_input_type=Annotated[float, Field(ge=16)] | _text(BYTES))]
+Memory = Annotated[int, BeforeValidator(_bytes, json_schema_input_type=Annotated[float, Field(ge=1)] | _text(BYTES))]
 
 
 class Budget(BaseModel):
@@ -60,11 +68,11 @@ class Budget(BaseModel):
         description="seconds from a frame's images in memory to its packet on disk, e.g. 1.0s, 800ms; the bytes then "
         "depend on the clock",
     )  # fmt: skip
-    size: Bytes | None = Field(
+    size: Packet | None = Field(
         default=None, ge=16, description="bytes of a frame's packet, e.g. 20KB; an empty packet has 16"
     )
-    memory: Bytes | None = Field(
-        default=None, gt=0, description="peak resident memory of the process, e.g. 2GB; limits Gaussians and caches"
+    memory: Memory | None = Field(
+        default=None, ge=1, description="peak resident memory of the process, e.g. 2GB; limits Gaussians and caches"
     )
     clock: Literal["wall", "processor"] = Field(
         default="wall", description="what time means: wall clock, or processor time of all threads of the process"

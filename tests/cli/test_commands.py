@@ -27,6 +27,7 @@ CHEAP = [
     ["manifest", "--help"],
     ["view", "--help"],
     ["sweep", "--help"],
+    ["tune", "--help"],
     ["report", "--help"],
     ["recipe", "show", "dense"],
 ]
@@ -48,6 +49,10 @@ OPTIONS = {
     "gsstream view": ["STREAM", "--port", "--host"],
     "gsstream sweep": [
         "CONFIG", "--out", "--scenes", "--data", "--workers", "--threads", "--ray", "--dry-run", "--quiet",
+    ],
+    "gsstream tune": [
+        "--scene", "--budget", "--out", "--data", "--recipe", "--set", "--method", "--frames", "--scale", "--seed",
+        "--first-frame", "--workers", "--quiet",
     ],
     "gsstream report": ["FOLDER", "--out", "--data", "--sheets"],
     "gsstream check": ["NAME", "--quiet"],

@@ -1,0 +1,127 @@
+"""``gsstream tune``: a recipe that fits a budget, from a short pilot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from gsstream.cli.listing import plural
+from gsstream.cli.streams import stream_file
+
+if TYPE_CHECKING:
+    from gsstream.recipe.budget import Budget
+    from gsstream.trade.sweep.plan import Plan
+    from gsstream.trade.tune import Trial
+
+
+def tune(
+    scene: Annotated[str, typer.Option("--scene", help="The recording, as for 'gsstream run --source'.")],
+    budget: Annotated[
+        str,
+        typer.Option("--budget", metavar="LIMITS", help="Any of time=1.0s,size=20KB,memory=2GB (howto/budget.md)."),
+    ],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the pilot and of tuned.yaml; a pilot there goes on.")],
+    data: Annotated[
+        Path | None, typer.Option("--data", help="Folder in which a recording named by a relative path lies.")
+    ] = None,
+    recipe: Annotated[
+        Path | None, typer.Option("--recipe", help="YAML file with what the recording needs, for every candidate.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change a value in every candidate; repeatable."),
+    ] = None,
+    methods: Annotated[
+        list[str] | None,
+        typer.Option("--method", help="Method to try; repeatable; by default dense and the s2gs methods."),
+    ] = None,
+    frames: Annotated[int, typer.Option("--frames", min=2, help="Frames of the pilot, the first one included.")] = 5,
+    scale: Annotated[float | None, typer.Option("--scale", help="Shrink images by this factor in (0, 1].")] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of every random stream.")] = 0,
+    first_frame: Annotated[
+        Path | None, typer.Option("--first-frame", help="Take frame 0 over from this stream, do not reconstruct it.")
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option("--workers", min=1, help="Candidates at a time; default: one for each processor, 1 with a time."),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print only the table, warnings and errors.")] = False,
+) -> None:
+    """Try a few recipes on a few frames and write the best that fits a budget as tuned.yaml.
+
+    Candidates are the methods as they are, with one knob changed for what is limited, and with the controller of
+    'run --budget'. The best is the one with the highest PSNR on moving pixels of the test cameras. Nothing fits: the
+    table says what came nearest, nothing is written, and the exit code is 1.
+    """
+    from gsstream.plugins.catalog import load_catalog
+    from gsstream.recipe.budget import budget_overrides
+    from gsstream.recipe.load import resolve_recipe
+    from gsstream.trade.sweep.config import Scene
+    from gsstream.trade.sweep.plan import make_plan
+    from gsstream.trade.tune import METHODS, pilot
+
+    catalog = load_catalog()
+    limits = resolve_recipe(None, catalog.recipe_path, (), budget_overrides(budget)).recipe.budget
+    known = catalog.names("method")
+    tried = methods or [name for name in METHODS if name in known]
+    place = Scene(
+        name="scene", uri=scene, recipe=str(recipe.resolve()) if recipe else None, scale=scale, frames=frames,
+        set=_values(settings or ()),
+    )  # fmt: skip
+    plan = make_plan(pilot(place, tried, limits, seed), Path(), catalog.recipe_path)
+    trials = _run(plan, limits, out, data, first_frame, workers, quiet)
+    _tell(plan, trials, limits, out)
+
+
+def _values(settings: tuple[str, ...] | list[str]) -> dict[str, Any]:
+    from gsstream.recipe.document import read_override
+
+    found = [read_override(text) for text in settings]
+    return {".".join(path): leaf.value for path, leaf in found}
+
+
+def _run(
+    plan: Plan, limits: Budget, out: Path, data: Path | None, first: Path | None, workers: int | None, quiet: bool
+) -> list[Trial]:
+    from gsstream.trade.sweep.drive import run_sweep
+    from gsstream.trade.sweep.executor import LocalExecutor, usable_processors
+    from gsstream.trade.sweep.job import run_job
+    from gsstream.trade.sweep.table import read_table
+    from gsstream.trade.tune import give_first_frame, trial_of
+
+    if first is not None:
+        give_first_frame(plan, out, stream_file(first))
+    processors = usable_processors()
+    # Candidates beside each other would take each other's time.
+    workers = workers or (1 if limits.time is not None else processors)
+    executor = LocalExecutor(workers, max(1, processors // workers), run_job, ["gsstream.trade.sweep.warm"])
+    run_sweep(plan, out, executor, data=data, say=(lambda _: None) if quiet else typer.echo)
+    rows = read_table(out).cells
+    return [trial_of(point.variant, rows.get(point.id, {"status": "missing"}), limits) for point in plan.points]
+
+
+def _tell(plan: Plan, trials: list[Trial], limits: Budget, out: Path) -> None:
+    from gsstream.trade.tune import choose, nearest, tune_table, tuned_recipe
+
+    chosen = choose(trials)
+    typer.echo(tune_table(trials, chosen))
+    if chosen is not None:
+        resolved = next(point.resolved for point in plan.points if point.variant == chosen.name)
+        (out / "tuned.yaml").write_text(tuned_recipe(resolved), encoding="utf-8")
+        typer.echo(f"\nwrote {out / 'tuned.yaml'}: {chosen.name}; next: gsstream run --recipe {out / 'tuned.yaml'}")
+        return
+    close = nearest(trials)
+    if close is None:
+        typer.echo("\nno candidate could be run; the table says why", err=True)
+        raise typer.Exit(1)
+    worst = f"largest packet {max(close.sizes) / 1000:.2f} KB, longest frame {max(close.seconds):.2f} s"
+    wanted = limits.model_dump(include={"time", "size", "memory"}, exclude_none=True)
+    given = ", ".join(f"{name}={value:g}" for name, value in wanted.items())
+    typer.echo(
+        f"\nnothing fits {given} (seconds, bytes): nearest is {close.name} with {close.inside} of "
+        f"{plural(close.frames, 'frame')} inside ({worst}, peak {close.memory / 1e6:.0f} MB); give more",
+        err=True,
+    )
+    raise typer.Exit(1)

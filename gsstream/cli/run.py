@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -53,15 +54,11 @@ def run(
     """
     from gsstream.engine.output import prepare_output
     from gsstream.plugins.catalog import load_catalog
-    from gsstream.recipe.budget import budget_overrides
     from gsstream.recipe.load import resolve_recipe
 
-    overrides = [("--set", text) for text in settings or ()]
-    overrides += budget_overrides(budget) if budget is not None else []
     short = {"frames": frames, "scale": scale, "seed": seed, "renderer": renderer}
-    overrides += [(f"--{key}", f"{key}={value}") for key, value in short.items() if value is not None]
     catalog = load_catalog()
-    resolved = resolve_recipe(method, catalog.recipe_path, recipe or (), overrides)
+    resolved = resolve_recipe(method, catalog.recipe_path, recipe or (), _overrides(settings or (), budget, short))
     # The slow imports come last, so that a mistake on the command line is answered at once.
     from gsstream.engine.assemble import assemble
     from gsstream.engine.recording import open_recording, read_first_frame
@@ -80,6 +77,15 @@ def run(
         recording.close()
     if result.interrupted:
         raise typer.Exit(130)
+
+
+def _overrides(settings: Sequence[str], budget: str | None, short: Mapping[str, object]) -> list[tuple[str, str]]:
+    """What the command line changes in a recipe, the short options last."""
+    from gsstream.recipe.budget import budget_overrides
+
+    overrides = [("--set", text) for text in settings]
+    overrides += budget_overrides(budget) if budget is not None else []
+    return overrides + [(f"--{key}", f"{key}={value}") for key, value in short.items() if value is not None]
 
 
 def _pictures(result: RunResult, recording: FrameSource, *, video: bool, quiet: bool, warned: bool) -> None:

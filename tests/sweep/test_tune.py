@@ -12,6 +12,7 @@ from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError
 from gsstream.recipe.budget import Budget
 from gsstream.recipe.load import load_recipe
+from gsstream.trade.held import held_table, main
 from gsstream.trade.tune import Trial, candidates, choose, nearest, trial_of, tune_table
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "flow"))
@@ -112,3 +113,11 @@ def test_nonsense_is_refused_before_anything_runs(tmp_path: Path, capsys: pytest
     assert run_command([*command(tmp_path / "no", "size=3KB"), "--method", "s2gz"]) == 2
     assert "no method named 's2gz'" in capsys.readouterr().err
     assert not (tmp_path / "no").exists()
+
+
+def test_runs_are_held_against_a_budget_they_were_not_made_under(tmp_path: Path) -> None:
+    encode(tmp_path / "free", "--frames", "3", method="s2gs-edge")
+    sizes = [sum(line["bytes"].values()) for line in metrics(tmp_path / "free")][1:]
+    assert "| free   |    1/2 |" in held_table([tmp_path / "free"], f"size={min(sizes)}B")
+    assert "| free   |    1/1 |" in held_table([tmp_path / "free"], f"size={max(sizes)}B", frames=2)
+    assert main(["--budget", "size=3kb", str(tmp_path / "free")]) == 2

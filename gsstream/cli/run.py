@@ -39,8 +39,7 @@ def run(
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of every random stream.")] = None,
     renderer: Annotated[str | None, typer.Option("--renderer", help="Renderer: auto, cpu, reference, ...")] = None,
     first_frame: Annotated[
-        Path | None,
-        typer.Option("--first-frame", help="Take frame 0 over from this stream, do not reconstruct it."),
+        Path | None, typer.Option("--first-frame", help="Take frame 0 over from this stream, do not reconstruct it.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run that --out holds.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run that --out holds.")] = False,
@@ -57,9 +56,9 @@ def run(
     from gsstream.recipe.load import resolve_recipe
 
     short = {"frames": frames, "scale": scale, "seed": seed, "renderer": renderer}
-    catalog = load_catalog()
-    resolved = resolve_recipe(method, catalog.recipe_path, recipe or (), _overrides(settings or (), budget, short))
-    # The slow imports come last, so that a mistake on the command line is answered at once.
+    overrides, catalog = _overrides(settings or (), budget, short), load_catalog()
+    resolved = resolve_recipe(method, catalog.recipe_path, recipe or (), overrides)
+    # The slow imports come last: a mistake on the command line is answered at once.
     from gsstream.engine.assemble import assemble
     from gsstream.engine.recording import open_recording, read_first_frame
     from gsstream.engine.session import run as run_session

@@ -43,6 +43,10 @@ def run(
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run that --out holds.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run that --out holds.")] = False,
+    checks: Annotated[
+        str | None,
+        typer.Option("--checks", help="How closely to look at what parts return: off, frame (default) or step."),
+    ] = None,
     no_video: Annotated[bool, typer.Option("--no-video", help="Write no video, only still pictures.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print only warnings and errors.")] = False,
 ) -> None:
@@ -63,7 +67,7 @@ def run(
     from gsstream.engine.recording import open_recording, read_first_frame
     from gsstream.engine.session import run as run_session
 
-    assembly = assemble(resolved, catalog)
+    assembly = assemble(resolved, catalog, checks)
     # Read before the folder is touched: --overwrite must not delete a run for the sake of a faulty recording.
     first = None if first_frame is None else read_first_frame(stream_file(first_frame))
     recording = open_recording(source, assembly.recipe, catalog)

@@ -10,6 +10,7 @@ from typing import Any
 from gsstream.confidence.base import ConfidenceEstimator
 from gsstream.core.errors import PluginUnavailable, UnknownName
 from gsstream.core.part import Part
+from gsstream.engine.checks import Checks, wanted_checks
 from gsstream.engine.heeded import unheeded
 from gsstream.gate.base import GateSampler
 from gsstream.loss.base import Loss
@@ -46,6 +47,7 @@ class Assembly:
         whole: the whole method that runs in place of the parts; None: the parts are the method.
         origins: path -> origin of every value that is not a default (for ``recipe.save.save_resolved``).
         distributions: installed distributions that the parts come from.
+        checks: how closely the run looks at what parts return; nothing that is sent depends on it.
     """
 
     recipe: Recipe
@@ -61,6 +63,7 @@ class Assembly:
     whole: StreamingMethod[Any] | None = None
     origins: Mapping[KeyPath, Origin] = field(default_factory=dict)
     distributions: tuple[str, ...] = ()
+    checks: Checks = Checks.FRAME
 
     @property
     def resolved(self) -> ResolvedRecipe:
@@ -68,13 +71,18 @@ class Assembly:
         return ResolvedRecipe(self.recipe, self.origins)
 
 
-def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog) -> Assembly:
+def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | None = None) -> Assembly:
     """Import every named part, check its parameters against its own Config, and build it.
 
+    Arguments:
+        checks: off, frame or step; None: what the environment says (``engine.checks``).
+
     Raises:
+        InputError: ``checks`` is not a level.
         RecipeError: parameters that a part does not know or refuses, unknown parts; all of them together.
         PluginUnavailable: a part's plugin is in quarantine or the part is not what it claims to be.
     """
+    level = wanted_checks(checks)
     if isinstance(resolved, Recipe):
         resolved = ResolvedRecipe(resolved, {})
     problems: list[str] = []
@@ -105,7 +113,7 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog) -> Assembly:
     parts["optimiser"] = _optimiser(catalog)
     owners = sorted({catalog.entry(slot, ref.name).distribution for slot, ref in refs.items()})
     recipe = resolved.recipe.model_copy(update=refs)
-    return Assembly(recipe=recipe, origins=resolved.origins, distributions=tuple(owners), **parts)
+    return Assembly(recipe=recipe, origins=resolved.origins, distributions=tuple(owners), checks=level, **parts)
 
 
 def _build(

@@ -41,7 +41,9 @@ def begin(
         anchors = parts.structure.seed(points, frame.cameras)
     clock.append(time.perf_counter())
     start = initial_gaussians(anchors, parts.recipe.first_frame)
-    root = optimise_root(start, anchors.levels, frame, parts.recipe, parts.renderer, parts.loss, rng, progress)
+    root = optimise_root(
+        start, anchors.levels, frame, parts.recipe, parts.renderer, parts.loss, rng, progress, parts.checks
+    )
     clock.append(time.perf_counter())
     # Positions are float32 in the packet too, so the hierarchy of the decoded scene is the one built here.
     decoded = quantise_key(root.gaussians.map(lambda t: t.numpy())).map(torch.from_numpy)

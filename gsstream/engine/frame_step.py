@@ -27,8 +27,9 @@ from gsstream.engine.budget.controller import planned
 from gsstream.engine.budget.pace import Allowance
 from gsstream.engine.budget.spent import spent
 from gsstream.engine.budget.trim import Fitted, fit
+from gsstream.engine.checks import UNIT, VARIABLE, Checks, check_output, check_values
 from gsstream.engine.context import StepContext
-from gsstream.engine.guard import check_output, guarded
+from gsstream.engine.guard import guarded
 from gsstream.engine.insertion import with_insertions
 from gsstream.engine.optimise import Problem, Solution, optimise
 from gsstream.engine.rows import follow
@@ -37,6 +38,9 @@ from gsstream.packet import EncodedPacket, PlayerState, decode_packet, encode_de
 from gsstream.render.base import RenderCache, RenderSession
 from gsstream.residual.base import coarser
 from gsstream.residual.base import symbols as residual_symbols
+
+#: Largest symbol a residual may have; float32 rounds what lies between it and 2^31 up.
+MOST_SYMBOL = 2.0**31 - 256
 
 
 def frame_step(
@@ -84,6 +88,7 @@ def _step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng, allowance
     began = allowance.clock() if allowance else 0.0
     solution = optimise(parts, problem, rng.stream("frame", frame.index))
     optimised = allowance.clock() - began if allowance else 0.0
+    check_solution(parts, problem, solution)
     clock.append(time.perf_counter())
 
     fitted = within(problem, solution, with_insertions(parts, state, frame, harden(parts, problem, solution), rng))
@@ -149,21 +154,34 @@ def suspects(parts: Assembly, state: StreamState, context: StepContext) -> tuple
 
     What each part returns is looked at before the next one gets it.
     """
-    index, nodes = context.index, state.hierarchy.num_nodes
+    index, nodes, level = context.index, state.hierarchy.num_nodes, parts.checks
     with guarded("confidence", parts.confidence, index):
         logits = parts.confidence.estimate(context)
-    check_output("confidence", parts.confidence, index, "estimate()", logits, (state.hierarchy.num_gaussians,))
+    check_output(level, "confidence", parts.confidence, index, "estimate()", logits, (state.hierarchy.num_gaussians,))
     with guarded("propagation", parts.propagation, index):
         node_logits = parts.propagation.propagate(logits, state.hierarchy)
-    check_output("propagation", parts.propagation, index, "propagate()", node_logits, (nodes,))
+    check_output(level, "propagation", parts.propagation, index, "propagate()", node_logits, (nodes,))
     with guarded("gate", parts.gate, index):
         gate = parts.gate.init(node_logits)
         probability = parts.gate.open_probability(gate)
-    check_output("gate", parts.gate, index, "init().logits", gate.logits, (nodes,))
-    check_output("gate", parts.gate, index, "open_probability()", probability, (nodes,), (0.0, 1.0))
+    check_output(level, "gate", parts.gate, index, "init().logits", gate.logits, (nodes,))
+    check_output(level, "gate", parts.gate, index, "open_probability()", probability, (nodes,), UNIT)
     may_open = probability > parts.recipe.stream.active_threshold
     rows = may_open[state.hierarchy.node_of] & context.suspects(parts.recipe.stream.change_votes)
     return gate, rows.nonzero()[:, 0]
+
+
+def check_solution(parts: Assembly, problem: Problem, solution: Solution) -> None:
+    """Raise ComponentError unless what was learned can be sent: finite, and residuals within 32 bit symbols."""
+    if parts.checks is Checks.OFF:
+        return
+    codes, frame = coarser(parts.update.codes(), problem.step_scale), problem.frame.index
+    for name, value in solution.latents.items():
+        most = codes[name].step * MOST_SYMBOL
+        what = f"{name} after the last iteration ({VARIABLE}=step finds the first)"
+        check_values("update", parts.update, what, value, frame, limits=(-most, most), rows=solution.active)
+    for name, value in solution.decoders.items():
+        check_values("update", parts.update, f"decoder of {name}", value, frame)
 
 
 def harden(parts: Assembly, problem: Problem, solution: Solution) -> Delta:
@@ -175,7 +193,7 @@ def harden(parts: Assembly, problem: Problem, solution: Solution) -> Delta:
     frame = problem.frame.index
     with guarded("gate", parts.gate, frame):
         final = parts.gate.sample(solution.gate, None)
-    check_output("gate", parts.gate, frame, "sample()", final, tuple(solution.gate.logits.shape), (0.0, 1.0))
+    check_output(parts.checks, "gate", parts.gate, frame, "sample()", final, tuple(solution.gate.logits.shape), UNIT)
     gates = torch.round(final * parts.gate.num_levels).numpy().astype(np.uint8)
     active = solution.active.numpy()
     codes = coarser(parts.update.codes(), problem.step_scale)

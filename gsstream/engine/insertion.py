@@ -20,6 +20,7 @@ from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.engine.assemble import Assembly
+from gsstream.engine.checks import StepChecks
 from gsstream.engine.exposure import backward_view
 from gsstream.engine.parameters import AdamTable
 from gsstream.engine.stream_state import StreamState
@@ -102,11 +103,15 @@ def fit(
     table = AdamTable(dict(born.items()), rates)
     targets = [parts.loss.prepare(torch.from_numpy(image)) for image in frame.images]
     generator = rng.stream("insertion/order", frame.index)
+    look = StepChecks(parts.checks, frame.index)
     for _ in range(parts.recipe.insertion.epochs):
         for view in torch.randperm(views, generator=generator).tolist():
             output = session.render(view, Gaussians(**{name: table[name] for name in ATTRIBUTES}))
+            look("renderer", parts.renderer, f"image of view {view}, newborn Gaussians in it,", output.image)
             backward_view(output.image, view, state.exposure, parts.loss, targets[view], parts.recipe.loss.dssim)
             table.step()
+            look("insertion", table, "newborn Gaussians after the step,", table.leaves)
+            look.iteration += 1
     return Gaussians(**{name: table[name].detach() for name in ATTRIBUTES})
 
 

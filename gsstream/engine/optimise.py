@@ -15,8 +15,9 @@ from gsstream.core.part import Part
 from gsstream.core.state import GateState
 from gsstream.engine.assemble import Assembly
 from gsstream.engine.budget.pace import Allowance, Pace, estimated_bytes
+from gsstream.engine.checks import UNIT, StepChecks, check_terms
 from gsstream.engine.exposure import Exposure, backward_view
-from gsstream.engine.guard import check_terms, guarded
+from gsstream.engine.guard import guarded
 from gsstream.engine.levels import current_level, level_schedule
 from gsstream.engine.row_table import RowTable
 from gsstream.engine.stopping import Gains, watch
@@ -134,6 +135,7 @@ class _FrameRun:
         self.levels = torch.from_numpy(layout.octree_levels[active].astype("int64"))
         self.schedule = level_schedule(parts, len(layout.cell_sizes))
         self.iteration = 0
+        self.look = StepChecks(parts.checks, problem.frame.index)
         with self._guarded("update", parts.update):
             codes = coarser(parts.update.codes(), problem.step_scale)
         latents = init_latents(parts.update, problem.base)
@@ -162,35 +164,47 @@ class _FrameRun:
 
     def step(self, view: int, iteration: int, fraction: float) -> float:
         """One iteration on one view; returns the photometric loss."""
-        parts, self.iteration = self.parts, iteration
+        parts, look = self.parts, self.look
+        self.iteration = look.iteration = iteration
         gate = GateState(self.gate["logits"])
         gates = self._row_gates(gate, fraction)
         latents, matrix = self.latents["latents"].detach(), self.decoders["matrix"].detach()
         change = decode_joint(self.code, latents, matrix, self.units)
         shut = gates.detach()
         rows = add_joint(self.code, self.base, self.features, change, shut)
+        look("update", parts.update, "changed rows,", rows, rows=self.active)
         rows = rows.map(lambda value: value.detach().requires_grad_())
         loss = self._render(view, rows)
         upstream = join_features(self.code, rows.map(_gradient))
         back = pull_back_joint(self.code, upstream, change, matrix, shut, self.units)
+        look("update", parts.update, "gradient of latents", back.latents, rows=self.active)
+        look("update", parts.update, "gradient of decoders", back.matrix)
         if self.pace.rate_weight:
             weight = self.pace.rate_weight / self.pixels
             back.latents.add_(rate_gradient(latents, self.code.steps, shut, weight))
         self._step_gates(gate, gates, back.gates, learning=fraction >= parts.recipe.gate_training.warmup)
-        self.latents.step({"latents": back.latents})
-        self.decoders.step({"matrix": back.matrix})
+        with self._guarded("optimiser", parts.optimiser):
+            self.latents.step({"latents": back.latents})
+            self.decoders.step({"matrix": back.matrix})
+        look("optimiser", parts.optimiser, "latents", self.latents["latents"], rows=self.active)
+        look("optimiser", parts.optimiser, "decoders", self.decoders["matrix"])
         return loss
 
     def _render(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
         """Loss of one view; leaves its gradient on the rows."""
         with self._guarded("renderer", self.parts.renderer):
             output = self.session.render(view, rows)
+        self.look("renderer", self.parts.renderer, f"image of view {view}", output.image)
         weight, target, tiles = self.parts.recipe.loss.dssim, self.targets[view], output.tiles
         if tiles is not None and self.parts.recipe.stream.min_gain > 0:
             tiles = self.watched[view] = watch(self.watched.get(view), tiles)
         self.judged_tiles = 0 if tiles is None else int(tiles.sum())
         with self._guarded("loss", self.parts.loss):
-            return backward_view(output.image, view, self.exposure, self.parts.loss, target, weight, tiles)[0]
+            loss, gradient = backward_view(output.image, view, self.exposure, self.parts.loss, target, weight, tiles)
+        self.look.number("loss", self.parts.loss, f"loss of view {view}", loss)
+        self.look("loss", self.parts.loss, f"gradient of the image of view {view}", gradient)
+        self.look.gradients("renderer", self.parts.renderer, "gradient of rows,", rows, self.active)
+        return loss
 
     def _step_gates(self, gate: GateState, gates: torch.Tensor, upstream: torch.Tensor, *, learning: bool) -> None:
         """Move the logits by what the images and the penalty say, and keep them in their bounds."""
@@ -210,12 +224,15 @@ class _FrameRun:
             self.gate.step({})
             bounded = self.parts.gate.bound(GateState(self.gate["logits"].detach())).logits
             self.gate["logits"].data.copy_(bounded)
+        self.look("gate", self.parts.gate, "bound().logits", bounded)
 
     def _row_gates(self, gate: GateState, fraction: float) -> torch.Tensor:
         """[A] gate of every active row; rows of levels that are not yet active hold still."""
         with self._guarded("gate", self.parts.gate):
             noise = self.parts.gate.noise(self.hierarchy.num_nodes, self.generator)
-            per_row = self.parts.gate.sample(gate, noise)[self.hierarchy.node_of]
+            sample = self.parts.gate.sample(gate, noise)
+        self.look("gate", self.parts.gate, "sample()", sample, UNIT)
+        per_row = sample[self.hierarchy.node_of]
         if self.schedule:
             per_row = per_row * (self.levels <= current_level(self.schedule, fraction))
         return per_row
@@ -229,7 +246,7 @@ class _FrameRun:
         total, regularizer = self.problem.state.hierarchy.num_gaussians, self.parts.regularizer
         with self._guarded("regularizer", regularizer):
             terms = regularizer.penalty(probability, residual, self.hierarchy, total)
-            check_terms(regularizer, self.problem.frame.index, self.iteration, terms)
+            check_terms(self.parts.checks, regularizer, self.problem.frame.index, self.iteration, terms)
         return terms
 
     def release(self, fraction: float) -> None:

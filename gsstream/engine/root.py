@@ -17,6 +17,7 @@ from gsstream.core.frame import Frame
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.topology import TopologyEdit
+from gsstream.engine.checks import VARIABLE, Checks, StepChecks, check_values
 from gsstream.engine.densify import DensifyStatistics, grow_and_prune
 from gsstream.engine.exposure import Exposure, ExposureFit, backward_view
 from gsstream.engine.guard import guarded
@@ -79,6 +80,7 @@ def optimise_root(
     loss: Loss,
     rng: Rng,
     progress: Progress,
+    checks: Checks = Checks.FRAME,
 ) -> RootResult:
     """Fit frame 0 on its training images.
 
@@ -86,13 +88,19 @@ def optimise_root(
         start: [N] initial Gaussians; ``levels`` [N] their octree levels.
         frame: training images of frame 0.
         progress: called with (iteration, iterations, smoothed loss, number of Gaussians).
+        checks: how closely to look at what parts return.
     """
-    run = _RootRun(start, levels, frame, recipe, renderer, loss, rng)
+    run = _RootRun(start, levels, frame, recipe, renderer, loss, rng, StepChecks(checks, frame.index))
     for iteration in range(1, run.iterations + 1):
         value = run.step(iteration)
         progress(iteration, run.iterations, value, len(run.levels))
     exposure = run.exposure.centered().exposure if run.exposure else None
-    return RootResult(run.gaussians().map(torch.Tensor.detach), run.levels, exposure, run.iterations)
+    found = run.gaussians().map(torch.Tensor.detach)
+    for name, values in found.items():
+        if checks is not Checks.OFF:
+            what = f"{name} after the last iteration ({VARIABLE}=step finds the first)"
+            check_values("first frame", run.table, what, values, frame.index)
+    return RootResult(found, run.levels, exposure, run.iterations)
 
 
 class _RootRun:
@@ -100,10 +108,10 @@ class _RootRun:
 
     def __init__(
         self, start: Gaussians[torch.Tensor], levels: torch.Tensor, frame: Frame, recipe: Recipe,
-        renderer: Renderer, loss: Loss, rng: Rng,
+        renderer: Renderer, loss: Loss, rng: Rng, look: StepChecks,
     ) -> None:  # fmt: skip
         self.settings, self.recipe, self.frame = recipe.first_frame, recipe, frame
-        self.renderer, self.loss, self.levels = renderer, loss, levels
+        self.renderer, self.loss, self.levels, self.look = renderer, loss, levels, look
         self.views = len(frame.cameras)
         self.extent = frame.cameras.extent
         self.iterations = min(self.settings.epochs * self.views, self.settings.max_iterations)
@@ -125,18 +133,23 @@ class _RootRun:
 
     def step(self, iteration: int) -> float:
         s = self.settings
-        view = self._next_view()
+        view, look = self._next_view(), self.look
+        look.iteration = iteration
         densify = s.densify_from <= iteration + s.densify_every and iteration <= s.densify_until * self.iterations
         rows = self.gaussians()
         probe = torch.zeros(len(rows), 2, requires_grad=True) if densify else None
         with guarded("renderer", self.renderer, self.frame.index, iteration):
             session = self.renderer.open(rows, None, self.frame.cameras, self.recipe.background)
             output = session.render(view, rows, probe=probe)
+        look("renderer", self.renderer, f"image of view {view}", output.image)
         with guarded("loss", self.loss, self.frame.index, iteration):
             value = self._backward(view, output.image)
+        look.number("loss", self.loss, f"loss of view {view}", value)
+        look.gradients("renderer", self.renderer, "gradient of", rows)
         fraction = iteration / self.iterations
         self.table.set_lr("means", self.extent * _log_linear(s.lr_means, s.lr_means_final, fraction))
         self.table.step()
+        look("first frame", self.table, "parameters,", rows)
         if probe is not None and probe.grad is not None:
             size = torch.tensor([self.frame.cameras.width / 2, self.frame.cameras.height / 2])
             self.statistics = self.statistics.add(probe.grad * size)

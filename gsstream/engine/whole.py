@@ -18,6 +18,7 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.engine.assemble import Assembly
 from gsstream.engine.begin import begin, begin_from, exposure_from_meta
+from gsstream.engine.checks import StepChecks
 from gsstream.engine.context import StepContext
 from gsstream.engine.guard import fault, guarded
 from gsstream.engine.points import gather_points, with_test_views
@@ -88,13 +89,18 @@ class OpenFrame(StepContext):
         super().__init__(state, frame, parts.renderer, parts.recipe.background)
         self._loss, self._dssim = parts.loss, parts.recipe.loss.dssim
         self._targets: dict[int, Any] = {}
+        self._look = StepChecks(parts.checks, frame.index)
 
     def backward(self, view: int, image: torch.Tensor, tile_mask: torch.Tensor | None = None) -> float:
         if view not in self._targets:
             self._targets[view] = self._loss.prepare(self.image(view))
-        raw = image.detach()
+        raw, look = image.detach(), self._look
+        look.iteration += 1
+        look("renderer", self._renderer, f"image of view {view}", raw)
         shown = self._exposure.apply(view, raw) if self._exposure else raw
         value, gradient = self._loss.evaluate(shown, self._targets[view], self._dssim, tile_mask)
+        look.number("loss", self._loss, f"loss of view {view}", value)
+        look("loss", self._loss, f"gradient of the image of view {view}", gradient)
         if self._exposure:
             gradient = self._exposure.pull(view, gradient)
         torch.autograd.backward([image], [gradient])

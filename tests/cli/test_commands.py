@@ -38,7 +38,7 @@ OPTIONS = {
     "gsstream": ["--debug", "--version"],
     "gsstream run": [
         "--source", "--out", "--method", "--recipe", "--set", "--frames", "--scale", "--seed", "--renderer", "--resume",
-        "--first-frame",
+        "--first-frame", "--checks",
         "--overwrite", "--no-video", "--quiet", "--budget",
     ],
     "gsstream play": ["STREAM", "--out", "--camera", "--frames"],

@@ -1,0 +1,300 @@
+"""GSSTREAM_CHECKS: a part that is wrong in one number of one iteration is named, as precisely as the level promises."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from flow_runs import TINY, WORLD, finish
+
+from gsstream.core.errors import ComponentError, GsstreamError, InputError
+from gsstream.core.state import GateState
+from gsstream.engine import checks as checks_module
+from gsstream.engine.assemble import Assembly, assemble
+from gsstream.engine.checks import Checks, StepChecks, check_values, wanted_checks
+from gsstream.engine.recording import open_recording
+from gsstream.engine.session import run
+from gsstream.gate.always_open import AlwaysOpen
+from gsstream.gate.base import GateSampler
+from gsstream.loss.base import Loss
+from gsstream.optimiser.base import RowOptimiser
+from gsstream.plugins.catalog import load_catalog
+from gsstream.recipe.load import resolve_recipe
+from gsstream.render.base import Renderer, RenderOutput, ScatterSession
+from gsstream.render.reference import ReferenceRenderer
+
+CATALOG = load_catalog()
+SMALL = "synthetic:frames=3&views=3&width=24&height=16&supersample=1"
+NAN = float("nan")
+
+
+class Counter:
+    """Calls so far; parts have no state of their own."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def now(self, wanted: int) -> bool:
+        self.calls += 1
+        return self.calls == wanted + 1
+
+
+COUNTER = Counter()
+
+
+class WrongGate(GateSampler):
+    """Gate 5 is not a number in iteration 3 of the first frame that is trained."""
+
+    value = NAN
+
+    @property
+    def num_levels(self) -> int:
+        return 1
+
+    def init(self, logits: torch.Tensor) -> GateState:
+        return GateState(logits=torch.zeros_like(logits))
+
+    def noise(self, num_nodes: int, generator: torch.Generator) -> torch.Tensor | None:
+        return torch.zeros(num_nodes)
+
+    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
+        gates = torch.ones_like(state.logits)
+        if noise is not None and COUNTER.now(3):
+            gates[5] = self.value
+        return gates
+
+    def open_probability(self, state: GateState) -> torch.Tensor:
+        return torch.ones_like(state.logits)
+
+    def bound(self, state: GateState) -> GateState:
+        return state
+
+
+class TooOpen(WrongGate):
+    """Gate 5 is 1.25 in iteration 3."""
+
+    value = 1.25
+
+
+class Session(ScatterSession):
+    def render(self, view: int, rows: Any, **more: Any) -> RenderOutput:
+        output = super().render(view, rows)
+        image = output.image
+        if COUNTER.now(3):
+            image = image * torch.ones_like(image).index_put((torch.tensor(7), torch.tensor(9)), torch.tensor(NAN))
+        return replace(output, image=image)
+
+
+class WrongRenderer(Renderer):
+    """Pixel (7, 9) is not a number in iteration 3."""
+
+    def render(self, *arguments: Any) -> RenderOutput:
+        return ReferenceRenderer().render(*arguments)
+
+    def screen_gradient(self, *arguments: Any) -> Any:
+        return ReferenceRenderer().screen_gradient(*arguments)
+
+    def open(self, *arguments: Any) -> ScatterSession:
+        return Session(self, *arguments)
+
+
+class WrongLoss(Loss):
+    """Says infinity in iteration 3."""
+
+    def prepare(self, image: torch.Tensor) -> Any:
+        return image
+
+    def evaluate(self, image: torch.Tensor, target: Any, dssim: float, tiles: Any = None) -> tuple[float, torch.Tensor]:
+        difference = image - target
+        return float("inf") if COUNTER.now(3) else float(difference.square().mean()), difference / difference.numel()
+
+
+class WrongGradient(WrongLoss):
+    """Its value is fine; the gradient at one pixel is not, from iteration 3 on."""
+
+    def evaluate(self, image: torch.Tensor, target: Any, dssim: float, tiles: Any = None) -> tuple[float, torch.Tensor]:
+        COUNTER.calls += 1
+        gradient = (image - target) / image.numel()
+        gradient[7, 9] = NAN if COUNTER.calls > 3 else 0.0
+        return 1.0, gradient
+
+
+class WrongOptimiser(RowOptimiser):
+    """Moves nothing, and loses a number of Gaussian 4 in its fourth step of latents."""
+
+    def step(self, leaves: Any, gradients: Any, states: Any, lrs: Any) -> None:
+        if "latents" in leaves and COUNTER.now(3):
+            leaves["latents"].data[4, 0] = NAN
+
+
+def assembly(level: str | None, method: str = "dense", **parts: Any) -> Assembly:
+    keys = {**TINY, "first_frame.max_iterations": 0, "first_frame.max_points": 60, "stream.epochs": 3}
+    sets = [("--set", f"{key}={value}") for key, value in keys.items()]
+    return replace(assemble(resolve_recipe(method, CATALOG.recipe_path, (), sets), CATALOG, level), **parts)
+
+
+@pytest.fixture(autouse=True)
+def fresh() -> None:
+    COUNTER.calls = 0
+
+
+def encode(parts: Assembly, out: Path, source: str = SMALL) -> bytes:
+    out.mkdir(exist_ok=True)
+    recording = open_recording(source, parts.recipe, CATALOG)
+    try:
+        run(parts, recording, out, quiet=True, measure=False)
+    finally:
+        recording.close()
+    return (out / "stream.gss").read_bytes()
+
+
+def failure(parts: Assembly, out: Path) -> GsstreamError:
+    with pytest.raises(GsstreamError) as caught:
+        encode(parts, out)
+    return caught.value
+
+
+@pytest.mark.parametrize(("gate", "got"), [(WrongGate, "got nan"), (TooOpen, "got 1.25")])
+def test_step_names_part_frame_iteration_and_index(tmp_path: Path, gate: Callable[[], GateSampler], got: str) -> None:
+    error = failure(assembly("step", gate=gate()), tmp_path)
+    assert isinstance(error, ComponentError)
+    assert (error.slot, error.part, error.frame, error.iteration) == ("gate", gate.__name__, 1, 3)
+    assert f"sample(): expected finite values from 0 to 1, {got} at index [5] (1 of " in str(error)
+
+
+def test_step_names_a_pixel(tmp_path: Path) -> None:
+    """Frame 0 is not trained here: the fourth render is iteration 3 of frame 1."""
+    error = failure(assembly("step", renderer=WrongRenderer()), tmp_path)
+    assert isinstance(error, ComponentError)
+    assert (error.slot, error.part, error.frame, error.iteration) == ("renderer", "WrongRenderer", 1, 3)
+    assert "image of view " in str(error)
+    assert "got nan at index [7, 9, 0] (3 of 1152 values)" in str(error)
+
+
+def test_step_names_a_loss(tmp_path: Path) -> None:
+    error = failure(assembly("step", loss=WrongLoss()), tmp_path)
+    assert isinstance(error, ComponentError)
+    assert (error.slot, error.part, error.frame, error.iteration) == ("loss", "WrongLoss", 1, 3)
+    assert "got inf" in str(error)
+
+
+def test_step_looks_at_frame_0_and_at_whole_methods_too(tmp_path: Path) -> None:
+    parts = assembly("step", renderer=WrongRenderer())
+    first = parts.recipe.first_frame.model_copy(update={"max_iterations": 6})
+    error = failure(replace(parts, recipe=parts.recipe.model_copy(update={"first_frame": first})), tmp_path / "a")
+    assert isinstance(error, ComponentError)
+    assert (error.slot, error.frame, error.iteration) == ("renderer", 0, 4), "iterations of frame 0 count from 1"
+    COUNTER.calls = 0
+    error = failure(assembly("step", "queen", loss=WrongLoss()), tmp_path / "b")
+    assert isinstance(error, ComponentError)
+    # Nothing changed that QUEEN calls dynamic in frame 1.
+    assert (error.slot, error.part, error.frame, error.iteration) == ("loss", "WrongLoss", 2, 4)
+
+
+def test_frame_finds_at_the_end_of_the_frame_what_step_finds_at_once(tmp_path: Path) -> None:
+    """The default: what was learned is looked at before it is sent, so that no such stream exists."""
+    parts = assembly("frame", renderer=ReferenceRenderer(), optimiser=WrongOptimiser())
+    COUNTER.calls = -5  # the last of nine steps: the native loss refuses a picture that is not finite
+    error = failure(parts, tmp_path / "frame")
+    assert isinstance(error, ComponentError)
+    assert (error.slot, error.frame, error.iteration) == ("update", 1, None)
+    assert "GSSTREAM_CHECKS=step finds the first" in str(error)
+    assert "got nan at index [4, 0] (Gaussian 4)" in str(error)
+    COUNTER.calls = 0
+    error = failure(assembly("step", optimiser=WrongOptimiser()), tmp_path / "optimiser")
+    assert isinstance(error, ComponentError)
+    assert (error.slot, error.part, error.frame, error.iteration) == ("optimiser", "WrongOptimiser", 1, 3)
+    COUNTER.calls = 0
+    error = failure(assembly("step", loss=WrongGradient()), tmp_path / "step")
+    assert isinstance(error, ComponentError)
+    assert (error.slot, error.part, error.frame, error.iteration) == ("loss", "WrongGradient", 1, 3)
+    assert "got nan at index [7, 9, 0]" in str(error)
+
+
+def test_what_one_part_refuses_of_another_is_said_with_its_place(tmp_path: Path) -> None:
+    error = failure(assembly("frame", loss=WrongGradient()), tmp_path)
+    assert isinstance(error, ComponentError)
+    assert (error.slot, error.frame, error.iteration) == ("optimiser", 1, 3)
+    assert "got nan in row " in str(error)
+
+
+def test_a_residual_beyond_32_bits_is_refused(tmp_path: Path) -> None:
+    """Rounded to an integer it would wrap around; what was learned would not be what is sent."""
+    parts = assembly("frame")
+    huge = parts.update.config.means.model_copy(update={"step": 1e-12, "lr": 0.1})
+    update = type(parts.update)(parts.update.config.model_copy(update={"means": huge}))
+    error = failure(replace(parts, update=update), tmp_path)
+    assert "means after the last iteration" in str(error)
+    assert "expected finite values from -0.00214748 to 0.00214748" in str(error)
+
+
+def test_levels_do_not_change_what_is_sent_and_off_looks_at_no_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    streams = [encode(assembly(level, "s2gs-edge"), tmp_path / level) for level in ("step", "frame")]
+
+    def never(*_: Any, **__: Any) -> None:
+        raise AssertionError("looked at a number")
+
+    monkeypatch.setattr(checks_module, "check_values", never)
+    monkeypatch.setattr(checks_module.torch, "isfinite", never)
+    streams.append(encode(assembly("off", "s2gs-edge"), tmp_path / "off"))
+    assert streams[0] == streams[1] == streams[2]
+
+
+def test_off_still_looks_at_shapes(tmp_path: Path) -> None:
+    class Short(AlwaysOpen):  # type: ignore[misc]  # final, for everybody else
+        def open_probability(self, state: GateState) -> torch.Tensor:
+            return torch.ones(3)
+
+    assert "open_probability(): expected shape" in str(failure(assembly("off", gate=Short()), tmp_path))
+
+
+def test_where_the_level_comes_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("GSSTREAM_CHECKS", raising=False)
+    assert wanted_checks() is Checks.FRAME
+    assert assembly(None).checks is Checks.FRAME
+    monkeypatch.setenv("GSSTREAM_CHECKS", "step")
+    assert assembly(None).checks is Checks.STEP
+    assert assembly("off").checks is Checks.OFF, "the command line has the last word"
+    monkeypatch.setenv("GSSTREAM_CHECKS", "Steps")
+    with pytest.raises(InputError, match="GSSTREAM_CHECKS: expected one of off, frame, step, got 'Steps'"):
+        assembly(None)
+    with pytest.raises(InputError, match="--checks: expected one of off, frame, step, got ''"):
+        wanted_checks("")
+
+
+def test_a_wrong_level_ends_the_command_before_anything_is_written(tmp_path: Path) -> None:
+    command = ["run", "--source", WORLD, "--out", str(tmp_path / "o")]
+    for more, where, environment in (
+        ([], "GSSTREAM_CHECKS", {"GSSTREAM_CHECKS": "all"}),
+        (["--checks", "all"], "--checks", {}),
+    ):
+        code, _, err = finish(*command, *more, **environment)
+        assert (code, err) == (2, f"error: {where}: expected one of off, frame, step, got 'all'\n")
+    assert not (tmp_path / "o").exists()
+
+
+def test_the_first_wrong_number_is_named_with_its_gaussian() -> None:
+    values, rows = torch.zeros(4, 3), torch.tensor([10, 20, 30, 40])
+    check_values("gate", AlwaysOpen(), "x", values, 7, rows=rows)
+    values[2, 1], values[3, 0] = -float("inf"), NAN
+    with pytest.raises(ComponentError, match=r"got -inf at index \[2, 1\] \(Gaussian 30\) \(2 of 12 values\)"):
+        check_values("gate", AlwaysOpen(), "x", values, 7, 1, rows=rows)
+    check_values("gate", AlwaysOpen(), "nothing", torch.zeros(0, 3), 7)
+    check_values("gate", AlwaysOpen(), "edges", torch.tensor([0.0, 1.0]), 7, limits=(0, 1))
+    check_values("gate", AlwaysOpen(), "largest", torch.tensor([3.4028234e38, -3.4028234e38]), 7)
+    check_values("gate", AlwaysOpen(), "half", torch.zeros(3, dtype=torch.bfloat16), 7)
+
+
+def test_below_step_nothing_is_looked_at_in_an_iteration() -> None:
+    for level in (Checks.OFF, Checks.FRAME):
+        look = StepChecks(level, 0)
+        look("gate", AlwaysOpen(), "x", torch.tensor([NAN]))
+        look.number("loss", AlwaysOpen(), "y", NAN)
+    with pytest.raises(ComponentError, match="frame 0, iteration 0: y: expected finite values, got inf"):
+        StepChecks(Checks.STEP, 0).number("loss", AlwaysOpen(), "y", float("inf"))

@@ -31,7 +31,8 @@ from gsstream.engine.checks import UNIT, VARIABLE, Checks, check_output, check_v
 from gsstream.engine.context import StepContext
 from gsstream.engine.guard import guarded
 from gsstream.engine.insertion import with_insertions
-from gsstream.engine.optimise import Problem, Solution, optimise
+from gsstream.engine.optimise import optimise
+from gsstream.engine.problem import Problem, Solution
 from gsstream.engine.rows import follow
 from gsstream.engine.stream_state import Step, StreamState
 from gsstream.packet import EncodedPacket, PlayerState, decode_packet, encode_delta, encode_empty, quantise_decoders

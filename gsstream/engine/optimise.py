@@ -4,81 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
 
 import torch
 
-from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.part import Part
 from gsstream.core.state import GateState
 from gsstream.engine.assemble import Assembly
-from gsstream.engine.budget.pace import Allowance, Pace, estimated_bytes
+from gsstream.engine.budget.pace import Pace, estimated_bytes
 from gsstream.engine.checks import UNIT, StepChecks, check_terms
 from gsstream.engine.exposure import Exposure, backward_view
 from gsstream.engine.guard import guarded
 from gsstream.engine.levels import current_level, level_schedule
+from gsstream.engine.problem import Problem, Solution
 from gsstream.engine.row_table import RowTable
 from gsstream.engine.stopping import Gains, watch
-from gsstream.engine.stream_state import StreamState
-from gsstream.render.base import RenderSession
 from gsstream.residual.base import coarser, init_latents
 from gsstream.residual.joint import add_joint, decode_joint, join_features, joint_code, pull_back_joint
 from gsstream.residual.rate import rate_gradient
 
 #: Leaving costs a freeze of every view: at least a tenth of the rows must go.
 WORTH_LEAVING = 0.9
-
-
-@dataclass(frozen=True)
-class Problem:
-    """What one frame's optimisation is given.
-
-    Arguments:
-        active: [A] int64 rows that may change, ascending.
-        base: those rows of the decoded previous scene.
-        gate: initial gate state [M].
-        session: an open render session in which only ``active`` changes.
-        allowance: what the frame may spend; None: what the recipe says.
-    """
-
-    state: StreamState
-    frame: Frame
-    active: torch.Tensor
-    base: Gaussians[torch.Tensor]
-    gate: GateState
-    session: RenderSession
-    allowance: Allowance | None = None
-
-    @property
-    def step_scale(self) -> float:
-        """Factor on the update rule's quantisation steps."""
-        return 1.0 if self.allowance is None else self.allowance.plan.step_scale
-
-
-@dataclass(frozen=True)
-class Solution:
-    """What the optimisation found.
-
-    Arguments:
-        active: [A] int64 rows that stayed to the end, ascending; what other rows had is given up.
-        latents: attribute -> [A, L].
-        loss: mean over the last pass, of the tiles that took part.
-        iterations: views rendered.
-        curvature: attribute -> [A, L], mean squared gradient of the latents: what a latent is worth, up to a factor.
-        pace: what the passes were held to.
-    """
-
-    active: torch.Tensor
-    latents: Mapping[str, torch.Tensor]
-    decoders: Mapping[str, torch.Tensor]
-    gate: GateState
-    gate_moments: Mapping[str, torch.Tensor]
-    loss: float
-    iterations: int
-    curvature: Mapping[str, torch.Tensor] = field(default_factory=dict)
-    pace: Pace | None = None
 
 
 def optimise(parts: Assembly, problem: Problem, generator: torch.Generator) -> Solution:

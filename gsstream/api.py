@@ -5,6 +5,9 @@ Importing this module imports torch (the parts are torch code); ``gsstream.spec`
 
 from gsstream import API_VERSION as API_VERSION
 from gsstream.confidence.base import ConfidenceEstimator as ConfidenceEstimator
+from gsstream.core.auto import AutoRule as AutoRule
+from gsstream.core.auto import Choice as Choice
+from gsstream.core.auto import SceneFacts as SceneFacts
 from gsstream.core.births import Births as Births
 from gsstream.core.births import in_nodes as in_nodes
 from gsstream.core.births import own_nodes as own_nodes

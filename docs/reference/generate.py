@@ -144,6 +144,9 @@ def hooks() -> str:
                 about = (inspect.getdoc(function) or "").splitlines()
                 lines.append(f"- {how}`{_signature(name, function)}` ({must}){': ' + about[0] if about else ''}")
         lines.append("")
+    rules = inspect.getdoc(importlib.import_module("gsstream.core.auto").SceneFacts) or ""
+    lines += ["## Rules of `auto`", "", "`auto_rules = {SETTING: rule}`, `rule(facts, settings) -> Choice(value, why)`"]
+    lines += ["([how](../howto/auto.md)). What a rule is told:", "", "```", rules, "```", ""]
     lines += ["## Traits", "", "What a part claims, `traits = Traits(...)`; each claim calls for checks.", ""]
     lines += ["```", inspect.getdoc(Traits) or "", "```", ""]
     return "\n".join(lines)
@@ -186,6 +189,9 @@ def parts() -> str:
             lines += ["| setting | type | default | meaning |", "|---|---|---|---|"] if rows else ["No settings.", ""]
             lines += [f"| `{k}` | {_cell(t)} | `{d}` | {_cell(m)} |" for k, t, d, m in rows]
             lines += [""] if rows else []
+            if autos := getattr(catalog.resolve(kind, name), "auto_rules", {}):
+                keys = ", ".join(f"`{key}`" for key in autos)
+                lines += [f"[`auto`](../howto/auto.md), and the scene decides: {keys}.", ""]
     return "\n".join(lines)
 
 

@@ -90,9 +90,10 @@ def _part_schemas(catalog: Catalog) -> dict[str, dict[str, PartSchema]]:
     for slot in found:
         for name in catalog.names(slot):
             try:
-                config = catalog.resolve(slot, name).Config
+                part = catalog.resolve(slot, name)
+                config, autos = part.Config, tuple(part.auto_rules)
             except PluginUnavailable as error:
                 typer.echo(f"warning: {error}", err=True)
-                config = None
-            found[slot][name] = PartSchema(catalog.entry(slot, name).spec.summary, config)
+                config, autos = None, ()
+            found[slot][name] = PartSchema(catalog.entry(slot, name).spec.summary, config, autos)
     return found

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict
+
+from gsstream.core.auto import AutoRule
 
 
 class PartConfig(BaseModel):
@@ -58,10 +62,15 @@ class Part(ABC):
     """A swappable part. Subclasses are abstract or final and nest a ``Config``.
 
     State and noise are arguments and results, never attributes: after construction no attribute may be set.
+
+    ``auto_rules``: settings that a recipe may leave to the scene by saying ``auto``, and the rule that chooses each, in
+    the order in which they choose. A nested setting is written with dots. A part is never built with ``auto`` in its
+    settings: until the scene is known it has its defaults there.
     """
 
     Config: ClassVar[type[PartConfig]] = PartConfig
     traits: ClassVar[Traits] = Traits()
+    auto_rules: ClassVar[Mapping[str, AutoRule]] = MappingProxyType({})
     config: Any
 
     __slots__ = ("config",)

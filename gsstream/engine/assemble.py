@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from gsstream.confidence.base import ConfidenceEstimator
+from gsstream.core.auto import AUTO, Choice
 from gsstream.core.errors import PluginUnavailable, UnknownName
 from gsstream.core.part import Part
 from gsstream.engine.checks import Checks, wanted_checks
-from gsstream.engine.heeded import unheeded
+from gsstream.engine.heeded import PART_SLOTS, unheeded
 from gsstream.gate.base import GateSampler
 from gsstream.loss.base import Loss
 from gsstream.method.base import StreamingMethod
@@ -48,6 +50,8 @@ class Assembly:
         origins: path -> origin of every value that is not a default (for ``recipe.save.save_resolved``).
         distributions: installed distributions that the parts come from.
         checks: how closely the run looks at what parts return; nothing that is sent depends on it.
+        pending: paths of values that are still ``auto``; the parts have their defaults there (``engine.auto.settle``).
+        chosen: key -> what the scene decided.
     """
 
     recipe: Recipe
@@ -64,6 +68,8 @@ class Assembly:
     origins: Mapping[KeyPath, Origin] = field(default_factory=dict)
     distributions: tuple[str, ...] = ()
     checks: Checks = Checks.FRAME
+    pending: tuple[KeyPath, ...] = ()
+    chosen: Mapping[str, Choice] = field(default_factory=dict)
 
     @property
     def resolved(self) -> ResolvedRecipe:
@@ -88,6 +94,9 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
     problems: list[str] = []
     parts: dict[str, Any] = {}
     refs: dict[str, ComponentRef] = {}
+    pending: list[KeyPath] = []
+    if resolved.recipe.first_frame.sh_degree == AUTO:
+        pending.append(("first_frame", "sh_degree"))
     for slot in SLOTS:
         ref: ComponentRef = getattr(resolved.recipe, slot)
         if slot == "renderer" and ref.name == "auto":
@@ -98,22 +107,55 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
             built = _build(slot, ref, resolved, catalog, problems)
         if built is not None:
             parts[slot] = built
-            refs[slot] = ComponentRef(name=ref.name, params=built.config.model_dump(mode="json"))
+            refs[slot] = _written_out(slot, ref, built, pending)
     loss = _loss(resolved, catalog, problems)
     whole = _whole(resolved, catalog, problems)
     if whole is not None:
         parts["whole"] = whole
         name = resolved.recipe.whole.name
-        refs["whole"] = ComponentRef(name=name, params=whole.config.model_dump(mode="json"))
+        refs["whole"] = _written_out("whole", resolved.recipe.whole, whole, pending)
         hint = f"the whole method {name!r} does not read it; its own settings: gsstream plugins show whole/{name}"
-        paths = unheeded(resolved.recipe.model_copy(update=refs), whole, parts)
+        paths = [*unheeded(resolved.recipe.model_copy(update=refs), whole, parts)]
+        paths += [path for path in pending if path[0] in PART_SLOTS and path[0] not in whole.heeds]
         problems += [f"{resolved.near(path).where}: {'.'.join(path)}: {hint}" for path in paths]
     join_problems(problems)
     parts["loss"] = loss
     parts["optimiser"] = _optimiser(catalog)
     owners = sorted({catalog.entry(slot, ref.name).distribution for slot, ref in refs.items()})
     recipe = resolved.recipe.model_copy(update=refs)
-    return Assembly(recipe=recipe, origins=resolved.origins, distributions=tuple(owners), checks=level, **parts)
+    return Assembly(
+        recipe=recipe, origins=resolved.origins, distributions=tuple(owners), pending=tuple(pending), checks=level,
+        **parts,
+    )  # fmt: skip
+
+
+def _written_out(slot: str, ref: ComponentRef, part: Part, pending: list[KeyPath]) -> ComponentRef:
+    """The part with all its settings; what is left to the scene says ``auto`` and is added to ``pending``."""
+    left = [key for key in part.auto_rules if _at(ref.params, key) == AUTO]
+    pending += [(slot, "params", *key.split(".")) for key in left]
+    params = with_values(part.config.model_dump(mode="json"), dict.fromkeys(left, AUTO))
+    return ComponentRef(name=ref.name, params=params)
+
+
+def _at(params: Any, key: str) -> Any:
+    """The value under a dotted key; None where there is none."""
+    for name in key.split("."):
+        params = params.get(name) if isinstance(params, Mapping) else None
+    return params
+
+
+def with_values(params: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """``params`` with the values under dotted keys; None takes a key away."""
+    out: dict[str, Any] = copy.deepcopy(dict(params))
+    for key, value in values.items():
+        *above, name = key.split(".")
+        section = out
+        for step in above:
+            section = section.setdefault(step, {})
+        section[name] = value
+        if value is None:
+            del section[name]
+    return out
 
 
 def _build(
@@ -124,7 +166,11 @@ def _build(
     except UnknownName as error:
         problems.append(f"{resolved.near((slot, 'name')).where}: {slot}.name: {error}")
         return None
-    config = validate(cls.Config, ref.params, resolved.near, (slot, "params"), problems)
+    left = [key for key in cls.auto_rules if _at(ref.params, key) == AUTO]
+    fixed, found = with_values(ref.params, dict.fromkeys(left)), list[str]()
+    config = validate(cls.Config, fixed, resolved.near, (slot, "params"), found)
+    offered = f"; 'auto' is offered for {', '.join(cls.auto_rules)}" if cls.auto_rules else "; it offers no 'auto'"
+    problems += [text + offered if text.endswith("got 'auto'") else text for text in found]
     return None if config is None else _construct(slot, ref.name, cls, config, catalog)
 
 

@@ -18,6 +18,7 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.assemble import Assembly
+from gsstream.engine.auto import refuse_pending
 from gsstream.engine.exposure import Exposure
 from gsstream.engine.guard import guarded
 from gsstream.engine.root import Progress, initial_gaussians, optimise_root, sort_by_node
@@ -36,6 +37,7 @@ def begin(
         frame: training images of frame 0.
         meta: what the key packet says about the run; the exposure fit is added to it.
     """
+    refuse_pending(parts)
     clock = [time.perf_counter()]
     with guarded("structure", parts.structure, frame.index):
         anchors = parts.structure.seed(points, frame.cameras)
@@ -68,11 +70,12 @@ def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMe
 
     Raises InputError when the recipe asks for another degree of spherical harmonics than the stream has.
     """
+    refuse_pending(parts)
     started = time.perf_counter()
-    if first.gaussians.sh_degree != parts.recipe.first_frame.sh_degree:
+    if first.gaussians.sh_degree != parts.recipe.first_frame.degree:
         raise InputError(
             f"the first frame has spherical harmonics of degree {first.gaussians.sh_degree}, the recipe asks for "
-            f"{parts.recipe.first_frame.sh_degree}; set first_frame.sh_degree={first.gaussians.sh_degree}"
+            f"{parts.recipe.first_frame.degree}; set first_frame.sh_degree={first.gaussians.sh_degree}"
         )
     gaussians = first.gaussians.map(torch.from_numpy)
     anchors = own_anchors(parts, first, frame)
@@ -95,12 +98,17 @@ def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMe
 def own_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
     """The grid this method's structure would lay; each Gaussian gets the level of the nearest cell size."""
     theirs = decoded_anchors(first)
-    cloud = PointCloud(first.gaussians.means, np.full_like(first.gaussians.means, 0.5), "frame 0 of another stream")
     with guarded("structure", parts.structure, frame.index):
-        grid = parts.structure.seed(cloud, frame.cameras)
+        grid = parts.structure.seed(cloud_of(first), frame.cameras)
     sizes = theirs.cell_sizes[theirs.levels]
     levels = (sizes.log()[:, None] - grid.cell_sizes.log()[None]).abs().argmin(1)
     return replace(theirs, levels=levels, cell_sizes=grid.cell_sizes, origin=grid.origin)
+
+
+def cloud_of(first: PlayerState) -> PointCloud:
+    """The centres of a decoded scene; their colour is unknown, grey."""
+    means = first.gaussians.means
+    return PointCloud(means, np.full_like(means, 0.5), "frame 0 of another stream")
 
 
 def decoded_anchors(player: PlayerState) -> Anchors:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import signal
@@ -17,16 +18,19 @@ from typing import Any
 import torch
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.frame import Frame
+from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.rng import Rng
 from gsstream.engine.assemble import Assembly
-from gsstream.engine.begin import begin, begin_from
+from gsstream.engine.auto import lines, recall, record, settle, stream_extra, taken_over
+from gsstream.engine.begin import begin, begin_from, cloud_of
 from gsstream.engine.budget.controller import Controller
 from gsstream.engine.budget.memory import within_memory
 from gsstream.engine.budget.pace import CLOCKS, Allowance
+from gsstream.engine.facts import scene_facts
 from gsstream.engine.frame_step import frame_step
 from gsstream.engine.keyframes import refresh
 from gsstream.engine.measure import HeldOut
+from gsstream.engine.metrics_log import last_written, trim_metrics
 from gsstream.engine.points import gather_points, with_test_views
 from gsstream.engine.progress import RunProgress
 from gsstream.engine.resume import resume_state
@@ -158,14 +162,30 @@ class _Run:
         )
 
     def _first(self, frame: Frame) -> Step[Any]:
+        points = functools.cache(lambda: self._points(frame))
+        if self.parts.pending:
+            known = taken_over(self.first_frame) if self.first_frame else {}
+            self._settled(settle(self.parts, lambda: scene_facts(points(), frame), known))
+            save_resolved(self.out / RECIPE, self.parts.resolved)
+            for line in lines(self.parts):
+                self.progress.say(line)
         if self.parts.whole is not None:
             return begin_whole(self.parts.whole, self.tools, frame)
         if self.first_frame is not None:
             return begin_from(self.parts, self.first_frame, frame, self._meta(frame.cameras), self.rng)
+        return begin(self.parts, points(), frame, self._meta(frame.cameras), self.rng, self.progress.root)
+
+    def _points(self, frame: Frame) -> PointCloud:
+        """What frame 0 starts from: seeds, or the centres of the Gaussians that are taken over."""
+        if self.first_frame is not None:
+            return cloud_of(self.first_frame)
         recipe = self.parts.recipe
         seen = with_test_views(self.source, frame) if recipe.data.leak == "points" else frame
-        points = gather_points(self.source, seen, recipe.first_frame, self.rng)
-        return begin(self.parts, points, frame, self._meta(frame.cameras), self.rng, self.progress.root)
+        return gather_points(self.source, seen, recipe.first_frame, self.rng)
+
+    def _settled(self, parts: Assembly) -> None:
+        """Go on with the values that the scene decided."""
+        self.parts, self.tools = parts, replace(self.tools, parts=parts)
 
     def _metrics(self, step: Step[Any], index: int, test: Frame, total: float, waited: float) -> dict[str, Any]:
         metrics: dict[str, Any] = {"frame": index, "status": step.status, **step.metrics}
@@ -175,6 +195,8 @@ class _Run:
         if self.held_out and len(test.cameras):
             metrics |= self.held_out.measure(step.state, test)
         metrics["peak_memory_mb"] = peak_memory_mb()
+        if index == 0:
+            metrics |= record(self.parts)
         return metrics
 
     def _meta(self, train: Cameras) -> StreamMeta:
@@ -189,18 +211,19 @@ class _Run:
             fps=info.fps,
             background=recipe.background,
             plugins={name: version(name) for name in sorted(distributions)},
-            extra={"source_uri": info.uri, "licence": info.licence},
+            extra={"source_uri": info.uri, "licence": info.licence, **record(self.parts)},
         )
 
     def _with_near(self, frame: Frame) -> Frame:
         return replace(frame, cameras=replace(frame.cameras, near=self.near))
 
     def _resume(self) -> MethodState | None:
+        if (extra := stream_extra(self.out / STREAM)) is not None:
+            self._settled(recall(self.parts, extra))
         planned = self.controller.budget.limits_frames
         # The controller plans by what it wrote down: frames that are not, are made again.
-        state = self._last_state(self.out / STREAM, _last_written(self.out / METRICS) if planned else None)
-        lines = _trim_metrics(self.out / METRICS, -1 if state is None else state.player.frame)
-        self.controller.remember(lines)
+        state = self._last_state(self.out / STREAM, last_written(self.out / METRICS) if planned else None)
+        self.controller.remember(trim_metrics(self.out / METRICS, -1 if state is None else state.player.frame))
         if state is None and planned:
             (self.out / STREAM).unlink()
         if state is None:
@@ -266,28 +289,3 @@ def _stop_on_interrupt(say: Callable[[str], None], source: FrameSource) -> Itera
         yield stop
     finally:
         signal.signal(signal.SIGINT, previous)
-
-
-def _written(path: Path) -> list[dict[str, Any]]:
-    """The complete lines of a run's metrics."""
-    lines: list[dict[str, Any]] = []
-    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
-        try:
-            lines.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue
-    return lines
-
-
-def _last_written(path: Path) -> int:
-    """Last frame up to which no line is missing; -1: none."""
-    frames = {int(line["frame"]) for line in _written(path)}
-    return next(frame for frame in itertools.count(-1) if frame + 1 not in frames)
-
-
-def _trim_metrics(path: Path, last: int) -> list[dict[str, Any]]:
-    """Drop lines of frames that the stream does not hold (a kill can fall between packet and line); those that stay."""
-    kept = [line for line in _written(path) if int(line["frame"]) <= last]
-    if path.exists():
-        path.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
-    return kept

@@ -5,10 +5,11 @@ Defaults here are those of the dense baseline; methods ship their own recipe fil
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
+from gsstream.core.auto import AUTO
 from gsstream.recipe.budget import Budget
 from gsstream.source.options import DataOptions
 
@@ -28,12 +29,24 @@ class ComponentRef(Section):
     params: dict[str, Any] = Field(default_factory=dict, description="the part's own settings")
 
 
+def _degree(value: object) -> object:
+    """One message for both kinds of value."""
+    if value != AUTO and (isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 3):
+        raise ValueError("expected an integer from 0 to 3, or 'auto'")
+    return value
+
+
+Degree = Annotated[Annotated[int, Field(ge=0, le=3)] | Literal["auto"], BeforeValidator(_degree)]
+
+
 class FirstFrame(Section):
     """Seeding and root optimisation of frame 0."""
 
     epochs: int = Field(default=250, ge=0, description="passes over the training cameras (paper: 250)")
     max_iterations: int = Field(default=4000, ge=0, description="upper bound on epochs * cameras (released code: 4000)")
-    sh_degree: int = Field(default=2, ge=0, le=3, description="degree of the spherical harmonics (paper's code: 2)")
+    sh_degree: Degree = Field(
+        default=2, description="degree of the spherical harmonics (paper's code: 2); auto: the scene decides (ours)"
+    )
     points: Literal["auto", "recording", "sparse", "sfm", "sweep"] = Field(
         default="auto",
         description="auto: the recording's points, else sweep; sparse: the recording's thinned set; "
@@ -72,6 +85,12 @@ class FirstFrame(Section):
     exposure: bool = Field(
         default=False, description="fit an affine colour map per training camera while optimising frame 0 (ours)"
     )
+
+    @property
+    def degree(self) -> int:
+        """``sh_degree`` once it is a number; a run chooses before it looks."""
+        assert not isinstance(self.sh_degree, str), "first_frame.sh_degree is still 'auto'"
+        return self.sh_degree
 
 
 class Stream(Section):

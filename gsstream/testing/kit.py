@@ -10,6 +10,7 @@ from typing import Any, Literal
 from gsstream.core.part import Part
 from gsstream.method.base import StreamingMethod
 from gsstream.testing.checks import (
+    auto,
     common,
     confidence,
     gate,
@@ -24,7 +25,7 @@ from gsstream.testing.registry import BEHAVED, CHECKS, Check, Skip, checks_for, 
 
 Status = Literal["passed", "failed", "expected failure", "skipped"]
 #: Importing these modules fills the registry; the order is that of the reports.
-MODULES = (common, structure, confidence, propagation, gate, regularizer, renderer, method, packet)
+MODULES = (common, auto, structure, confidence, propagation, gate, regularizer, renderer, method, packet)
 LEAST_REASON = 20
 
 

@@ -22,6 +22,7 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.assemble import Assembly, assemble
+from gsstream.engine.auto import refuse_pending
 from gsstream.engine.begin import begin_from
 from gsstream.engine.frame_step import frame_step
 from gsstream.engine.stream_state import Step, StreamState
@@ -109,6 +110,8 @@ def bench_frame(plan: FramePlan, catalog: Catalog, progress: Progress) -> dict[s
     """Measure everything in the plan; plain JSON values."""
     machine = machine_facts()
     parts = {name: assemble(recipe, catalog) for name, recipe in variants(plan.recipe).items()}
+    for assembly in parts.values():
+        refuse_pending(assembly)
     results: list[dict[str, Any]] = []
     # One torch thread, as in a run: see engine.session.
     with torch_threads(1):
@@ -191,7 +194,7 @@ def _case(plan: FramePlan, parts: Assembly, static: int, ball: _Ball) -> _Case:
 
 
 def _scene(plan: FramePlan, static: int) -> Gaussians[FloatArray]:
-    degree = plan.recipe.first_frame.sh_degree
+    degree = plan.recipe.first_frame.degree
     still = make_gaussians(synthetic_points(static, plan.seed), static, plan.seed, degree=degree)
     moving = make_gaussians(object_points(plan.moving, plan.seed), plan.moving, plan.seed + 1, degree=degree)
     parts = dict(still.items())

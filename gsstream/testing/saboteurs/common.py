@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import Any, final
 
 import torch
 
+from gsstream.core.auto import Choice, SceneFacts
 from gsstream.core.state import GateState
 from gsstream.testing.examples.confidence import ExampleConfidence
 from gsstream.testing.examples.gate import ExampleGate
@@ -35,6 +37,17 @@ class Open(Gate):
 @final
 class Unsourced(Gate):
     """Threshold gates."""
+
+
+def _refused(facts: SceneFacts, _settings: Any) -> Choice:
+    return Choice(1.0 / facts.cameras - 1.0, "fewer cameras, harder gates")
+
+
+@spoils("check_auto_rules")
+class Overreacher(Gate):
+    """Its rule of auto chooses a temperature that its settings refuse."""
+
+    auto_rules = MappingProxyType({"temperature": _refused})
 
 
 @spoils("check_pure")

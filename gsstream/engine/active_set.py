@@ -20,6 +20,7 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame
 from gsstream.core.shapes import FloatArray
+from gsstream.core.storage import unpacked
 from gsstream.metrics.noise import MAD_TO_SIGMA, median_deviation
 from gsstream.render.base import TILE
 
@@ -82,7 +83,7 @@ def detect_change(previous: Frame, frame: Frame, threshold: float) -> Change | N
     """
     if threshold == 0:
         return None
-    tiles = [_changed(a, b, threshold) for a, b in zip(previous.images, frame.images, strict=True)]
+    tiles = [_changed(unpacked(a), b, threshold) for a, b in zip(previous.images, frame.images, strict=True)]
     return Change(torch.from_numpy(np.stack(tiles)), frame.cameras.height, frame.cameras.width)
 
 

@@ -9,6 +9,7 @@ from gsstream.core.context import ScreenGradient
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.storage import unpacked
 from gsstream.engine.active_set import Change
 from gsstream.engine.stream_state import StreamState
 from gsstream.metrics.noise import noise_sigma
@@ -63,7 +64,7 @@ class StepContext:
         return torch.from_numpy(self._frame.images[view])
 
     def previous_image(self, view: int) -> torch.Tensor:
-        return torch.from_numpy(self._state.previous.images[view])
+        return torch.from_numpy(unpacked(self._state.previous.images[view]))
 
     def previous_render(self, view: int) -> torch.Tensor:
         with torch.no_grad():
@@ -103,4 +104,4 @@ class StepContext:
         return touched
 
     def noise_sigma(self, view: int) -> float:
-        return noise_sigma(self._state.previous.images[view], self._frame.images[view])
+        return noise_sigma(unpacked(self._state.previous.images[view]), self._frame.images[view])

@@ -21,6 +21,7 @@ from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import IntArray
 from gsstream.core.state import GateState
+from gsstream.core.storage import packed
 from gsstream.engine.active_set import detect_change
 from gsstream.engine.assemble import Assembly
 from gsstream.engine.budget.controller import planned
@@ -101,7 +102,8 @@ def _step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng, allowance
     clock.append(time.perf_counter())
     # A frame that changed nothing is not what the scene shows: the next one is compared with the last that did, so that
     # a change too slow to see from frame to frame adds up until it is seen.
-    shown = state.previous if delta.is_empty else frame
+    images = packed(frame.images, parts.recipe.data.images)
+    shown = state.previous if delta.is_empty else replace(frame, images=images)
     after = follow(replace(state, previous=shown, gate_moments=solution.gate_moments, session=kept), player)
     metrics = step_metrics(delta, after, packet, solution, active)
     metrics["changed_tiles"] = 1.0 if change is None else change.share

@@ -19,6 +19,7 @@ from gsstream.core.frame import Frame
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.core.storage import unpacked
 from gsstream.engine.assemble import Assembly
 from gsstream.engine.checks import StepChecks
 from gsstream.engine.exposure import backward_view
@@ -62,7 +63,7 @@ def lacking(parts: Assembly, state: StreamState, scene: Gaussians[torch.Tensor],
             image = parts.renderer.render(scene, frame.cameras, view, parts.recipe.background).image
         image = state.exposure.apply(view, image) if state.exposure else image
         wrong = np.abs(image.numpy() - now).max(-1) > parts.recipe.insertion.error
-        changed = np.abs(state.previous.images[view] - now).max(-1) > parts.recipe.insertion.error
+        changed = np.abs(unpacked(state.previous.images[view]) - now).max(-1) > parts.recipe.insertion.error
         masks.append(wrong & changed)
     return np.stack(masks)
 

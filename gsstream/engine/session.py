@@ -117,7 +117,7 @@ class _Run:
             # Also when resuming finds no complete frame 0: what a kill left of it is cut off, and it starts again.
             StreamWriter.open(self.out / STREAM, resume=resume, last_frame=last, fsync=fsync) as writer,
             self.progress,
-            Prefetcher(self.source, indices) as frames,
+            Prefetcher(self.source, indices, storage=self.parts.recipe.data.images) as frames,
         ):
             for train, test, waited in _timed(frames):
                 state = self._advance(writer, state, self._with_near(train), self._with_near(test), waited)

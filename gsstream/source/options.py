@@ -6,6 +6,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from gsstream.core.storage import Storage
+
 Leak = Literal["none", "points", "training"]
 LostAs = Literal["hold", "black"]
 
@@ -52,6 +54,12 @@ class DataOptions(BaseModel):
     )
     lost_as: LostAs = Field(
         default="hold", description="a lost image is: hold: the camera's last one; black: a black one"
+    )
+
+    images: Storage = Field(
+        default="float32",
+        description="how training images wait in memory (decoded ahead, and those of the last frame); values are "
+        "rounded to it: float16 by at most 2^-12, uint8 by at most 1/510, and not at all for 8 bits read at scale 1",
     )
 
     @property

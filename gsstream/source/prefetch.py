@@ -6,10 +6,12 @@ import time
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from types import TracebackType
 
 from gsstream.core.errors import EndOfRecording, GsstreamError, InputError, SourceError
 from gsstream.core.frame import Frame
+from gsstream.core.storage import Storage, packed, unpacked
 from gsstream.source.base import FrameSource, GrowingSource
 
 FramePair = tuple[Frame, Frame]
@@ -28,12 +30,16 @@ class Prefetcher:
         indices: which frames, in which order.
         depth: pairs decoded ahead, at least 1.
         workers: decoding threads, at least 1.
+        storage: how training images wait; they are delivered as float32.
     """
 
-    def __init__(self, source: FrameSource, indices: Iterable[int], *, depth: int = 2, workers: int = 1) -> None:
+    def __init__(
+        self, source: FrameSource, indices: Iterable[int], *, depth: int = 2, workers: int = 1,
+        storage: Storage = "float32",
+    ) -> None:  # fmt: skip
         if depth < 1 or workers < 1:
             raise InputError(f"prefetcher: depth and workers must be at least 1, got depth {depth}, workers {workers}")
-        self._source = source
+        self._source, self._storage = source, storage
         self._todo = iter(indices)
         self._pending: deque[Future[tuple[FramePair, float]]] = deque()
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="gsstream-prefetch")
@@ -63,7 +69,7 @@ class Prefetcher:
             raise
         self._submit()
         self._decode_seconds.append(seconds)
-        return pair
+        return replace(pair[0], images=unpacked(pair[0].images)), pair[1]
 
     def __enter__(self) -> Prefetcher:
         return self
@@ -86,14 +92,15 @@ class Prefetcher:
     def _submit(self) -> None:
         # Taking one index at a time keeps the bound even for an endless stream of indices.
         for index in self._todo:
-            self._pending.append(self._pool.submit(_read_pair, self._source, index))
+            self._pending.append(self._pool.submit(_read_pair, self._source, index, self._storage))
             break
 
 
-def _read_pair(source: FrameSource, index: int) -> tuple[FramePair, float]:
+def _read_pair(source: FrameSource, index: int, storage: Storage) -> tuple[FramePair, float]:
     start = time.perf_counter()
     try:
-        pair = source.frame(index, "train"), source.frame(index, "test")
+        train = source.frame(index, "train")
+        pair = replace(train, images=packed(train.images, storage)), source.frame(index, "test")
     except GsstreamError:
         raise
     except Exception as error:  # a source may be a plugin's: its failure is reported with its name

@@ -11,6 +11,7 @@ from gsstream.core.errors import SourceError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
+from gsstream.core.storage import rounded
 from gsstream.source.base import (
     AttributedPoints,
     FrameSource,
@@ -51,7 +52,7 @@ class TransformedSource:
 
     Frame t of the run is frame ``start + t + offset`` of the recording for each camera, where ``start`` makes room for
     negative offsets; the run is shorter by the span of the offsets, so that no frame is shown twice.
-    Order: time offset, gain (all cameras), noise and losses (training cameras).
+    Order: time offset, gain (all cameras), noise, losses and the rounding of storage (training cameras).
     """
 
     def __init__(self, source: FrameSource, options: DataOptions, seed: int) -> None:
@@ -102,6 +103,8 @@ class TransformedSource:
         for row, name in enumerate(cameras.ids):
             shown = self._last_shown(name, index) if split == "train" else index
             images[row] = 0 if shown is None else self._image(name, shown, split, cache)
+        if split == "train":
+            images = rounded(images, self._options.images)
         return Frame(index, index / self._info.fps, images, cameras, effort)
 
     def points(self, kind: PointKind = "recording") -> PointCloud | None:

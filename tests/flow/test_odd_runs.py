@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from flow_runs import encode, metrics
+from flow_runs import Witness, encode, metrics
+
+from gsstream.packet import StreamReader
+from gsstream.player.playback import Playback
 
 TINY_WORLD = "synthetic:frames=3&views=3&width=16&height=12&supersample=1"
 GROWING = {"first_frame__densify_from": 4, "first_frame__densify_every": 4, "first_frame__max_iterations": 20}
@@ -18,3 +23,28 @@ def test_the_reference_renderer_can_grow_a_scene(tmp_path: Path, method: str) ->
     settings: dict[str, Any] = {**GROWING, "stream__epochs": 4, "first_frame__densify_gradient": 1e-6}
     encode(tmp_path, "--renderer", "reference", source=TINY_WORLD, method=method, **settings)
     assert [line["status"] for line in metrics(tmp_path)] == ["key", "delta", "delta"]
+
+
+@pytest.mark.parametrize("method", ["s2gs-edge", "queen"])
+def test_images_as_bytes_lose_nothing_of_8_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str) -> None:
+    """At full size the recording has 8 bits: every frame decodes to the same scene."""
+    witness = Witness(monkeypatch)
+    scenes = []
+    for storage in ("float32", "uint8"):
+        encode(tmp_path / storage, "--frames", "4", method=method, data__images=storage)
+        with Playback(tmp_path / storage / "stream.gss") as playback:
+            scenes.append([playback.state_at(frame).means.tobytes() for frame in playback.frames])
+    assert scenes[0] == scenes[1]
+    assert len(set(scenes[0])) > 1
+    if method == "s2gs-edge":
+        assert witness.states[-1].previous.images.dtype == np.uint8
+
+
+def test_a_run_on_half_float_images_resumes_to_the_same_bytes(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"method": "s2gs-edge", "scale": 0.5, "data__images": "float16"}
+    whole = encode(tmp_path / "whole", **options)
+    with StreamReader(tmp_path / "whole" / "stream.gss") as reader:
+        end = reader.frames[3].offset
+    shutil.copytree(tmp_path / "whole", tmp_path / "cut")
+    (tmp_path / "cut" / "stream.gss").write_bytes(whole[:end])
+    assert encode(tmp_path / "cut", "--resume", **options) == whole

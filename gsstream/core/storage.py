@@ -1,0 +1,43 @@
+"""How images wait in memory: as they are, as half floats, or as bytes. Values are always worked on as float32."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+
+from gsstream.core.errors import ShapeError
+from gsstream.core.shapes import FloatArray
+
+Storage = Literal["float32", "float16", "uint8"]
+
+
+def packed(images: FloatArray, storage: Storage) -> Any:
+    """Images [..., 3] float32 in [0, 1] -> an array of the kind ``storage`` of the same shape.
+
+    Largest error after :func:`unpacked`: 2^-12 (float16), 1/510 (uint8; none for recordings of 8 bits read at their
+    size). Doing it again changes nothing.
+
+    Raises ShapeError for values outside [0, 1] where bytes cannot hold them, NaN included.
+    """
+    if storage == "float32":
+        return images
+    if storage == "float16":
+        return images.astype(np.float16)
+    if images.size:
+        low, high = float(images.min()), float(images.max())
+        if not (low >= 0 and high <= 1):
+            raise ShapeError(f"images: expected values from 0 to 1 to store as uint8, got {low:g} to {high:g}")
+    return np.rint(images * np.float32(255)).astype(np.uint8)
+
+
+def unpacked(images: Any) -> FloatArray:
+    """Inverse of :func:`packed`: float32, whatever came; float32 itself is passed on as it is."""
+    if images.dtype == np.uint8:
+        return np.asarray(images, np.float32) / np.float32(255)
+    return np.asarray(images, np.float32)
+
+
+def rounded(images: FloatArray, storage: Storage) -> FloatArray:
+    """The values that are left after ``storage``."""
+    return images if storage == "float32" else unpacked(packed(images, storage))

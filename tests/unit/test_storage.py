@@ -1,0 +1,61 @@
+"""Images as bytes or half floats: what is lost, what is not, and that nothing is hidden."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from gsstream.core.errors import ShapeError
+from gsstream.core.storage import packed, rounded, unpacked
+from gsstream.source.options import DataOptions
+from gsstream.source.prefetch import Prefetcher
+from gsstream.source.synthetic import SyntheticSource
+from gsstream.source.transformed import transformed
+
+UNIT = arrays(np.float32, (5, 3), elements=st.floats(0, 1, width=32))
+ERROR = {"float32": 0.0, "float16": 2.0**-12, "uint8": 1 / 510 + 1e-7}
+
+
+@pytest.mark.parametrize("storage", ERROR)
+@given(images=UNIT)
+def test_the_error_is_bounded_and_twice_is_once(storage, images: np.ndarray) -> None:
+    once = rounded(images, storage)
+    assert once.dtype == np.float32
+    assert np.abs(once - images).max() <= ERROR[storage]
+    assert rounded(once, storage).tobytes() == once.tobytes()
+    assert packed(images, storage).itemsize == np.dtype(storage).itemsize
+
+
+def test_bytes_keep_what_was_recorded_in_8_bits() -> None:
+    levels = np.arange(256, dtype=np.float32) / np.float32(255)
+    assert rounded(levels, "uint8").tobytes() == levels.tobytes()
+
+
+@pytest.mark.parametrize("wrong", [float("nan"), float("inf"), -0.01, 1.01])
+def test_what_bytes_cannot_hold_is_refused(wrong: float) -> None:
+    images = np.full((1, 2, 2, 3), 0.5, np.float32)
+    images[0, 1, 0, 2] = wrong
+    with pytest.raises(ShapeError, match="expected values from 0 to 1 to store as uint8"):
+        packed(images, "uint8")
+    if not np.isfinite(wrong):
+        assert not np.isfinite(unpacked(packed(images, "float16"))).all(), "half floats pass it on to be found"
+
+
+@pytest.mark.parametrize("storage", ["float16", "uint8"])
+def test_frames_wait_packed_and_come_as_the_source_gives_them(storage) -> None:
+    """What is decoded ahead has the values that a resumed run reads; test images are not touched."""
+    recording = SyntheticSource.from_query("frames=5&views=2&width=24&height=16")
+    plain = transformed(recording, DataOptions(gain=0.9), 0)  # no longer 8 bits
+    source = transformed(recording, DataOptions(gain=0.9, images=storage), 0)
+    with Prefetcher(source, range(5), storage=storage) as frames:
+        waiting = frames._pending[0].result()[0]
+        assert waiting[0].images.dtype == np.dtype(storage)
+        for index, (train, test) in zip(itertools.count(), frames, strict=False):
+            assert train.images.tobytes() == source.frame(index).images.tobytes()
+            assert 0 < np.abs(train.images - plain.frame(index).images).max() <= ERROR[storage]
+            assert test.images.tobytes() == plain.frame(index, "test").images.tobytes()

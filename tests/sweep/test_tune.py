@@ -13,6 +13,7 @@ from gsstream.core.errors import InputError
 from gsstream.recipe.budget import Budget
 from gsstream.recipe.load import load_recipe
 from gsstream.trade.held import held_table, main
+from gsstream.trade.report.groups import read_sweep_data
 from gsstream.trade.tune import Trial, candidates, choose, nearest, trial_of, tune_table
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "flow"))
@@ -91,6 +92,7 @@ def test_a_pilot_writes_a_recipe_that_runs_inside_the_budget(
     assert out.count("<- chosen") == 1
     tuned = load_recipe(tmp_path / "pilot" / "tuned.yaml").recipe
     assert tuned.frames is None
+    assert len(read_sweep_data(tmp_path / "pilot").groups) == 4, "a pilot can be reported, its frame 0 was given"
     recipe = str(tmp_path / "pilot" / "tuned.yaml")
     again = ["run", "--source", WORLD, "--recipe", recipe, "--out", str(tmp_path / "run")]
     assert run_command([*again, "--frames", "3", "--quiet", "--no-video", *given]) == 0

@@ -16,6 +16,7 @@ from gsstream.engine.budget.pace import Allowance, Pace, estimated_bytes, next_w
 from gsstream.engine.budget.plan import (
     LEAST_WEIGHT,
     MOST_WEIGHT,
+    SIZE_AIM,
     TIME_MARGIN,
     FramePlan,
     Past,
@@ -257,3 +258,24 @@ def test_a_key_packet_waits_until_it_can_be_paid() -> None:
     slow = Controller(Budget(time=0.5), Stream())
     slow.settle(line(0, 5000, status="key"), 1.0)
     assert "where 0.5 s are allowed" in str(slow.key_refusal(10, slow.allow()))
+
+
+def test_a_frame_starts_with_the_weight_that_the_last_one_needed() -> None:
+    stream, size = Stream(rate_weight=3e-4), Budget(size=10_000)
+    assert plan(size, stream, []).rate_weight == 3e-4
+    known = replace(USUAL, weight=1e-3)
+    starts = [plan(size, stream, [replace(known, untrimmed=n)]).rate_weight for n in (3000, 9400, 13_000, 99_000)]
+    assert starts == sorted(starts)
+    assert starts[0] == 5e-4
+    assert starts[1] == pytest.approx(1e-3, rel=1e-3)
+    assert starts[3] == 2e-3
+
+
+def test_the_weight_of_a_frame_is_that_of_its_last_half() -> None:
+    clock = Clock()
+    pace = Pace(Allowance(FramePlan(4, 6.0, 1e-3, max_bytes=1000), clock.now, clock), 4, 1e-3)
+    for done in range(1, 5):
+        pace.end_epoch(done)
+        pace.meet_size(done, 10 * SIZE_AIM * 1000 / 1.0)
+    # Made with 1e-3 (its pass is a quarter of all: looked at), then three times as much after each pass.
+    assert pace.typical_weight == pytest.approx(math.sqrt(9e-3 * 27e-3))

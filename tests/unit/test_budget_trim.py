@@ -49,7 +49,7 @@ def encoder(layout: Layout):
 
 
 @given(st.integers(0, 10_000), st.floats(0.01, 1.5), st.sampled_from([0.05, 1.0, 20.0]), st.booleans())
-@settings(max_examples=60)
+@settings(max_examples=30)
 def test_a_packet_never_exceeds_a_feasible_size(seed: int, share: float, spread: float, births: bool) -> None:
     delta, curvature, layout = scene(seed, spread=spread, births=5 * births)
     encode = encoder(layout)

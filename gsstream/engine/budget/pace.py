@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -47,6 +48,7 @@ class Pace:
         self._most = max(epochs, round(effort * plan.most_epochs)) if plan is not None and timed else epochs
         self.epochs, self.rate_weight = epochs, rate_weight
         self.estimate = 0.0
+        self._weights: list[float] = []
         self.stopped_by_clock = False
         self._allowance = allowance
         self._deadline: float | None = None
@@ -64,6 +66,12 @@ class Pace:
         if self._deadline is not None and plan.each is not None:
             each = each_with(plan.each, plan.candidates, candidates)
             self.epochs = epochs_within(self._deadline - now, each, self._most)
+
+    @property
+    def typical_weight(self) -> float:
+        """Geometric mean over the last half of the passes: what the bytes of the frame answer to."""
+        last = self._weights[len(self._weights) // 2 :] or [self.rate_weight]
+        return math.exp(sum(map(math.log, last)) / len(last)) if min(last) > 0 else self.rate_weight
 
     @property
     def meets_size(self) -> bool:
@@ -94,6 +102,7 @@ class Pace:
         """Move the weight of the rate by what a pass would have sent. ``estimate``: bytes, before the correction."""
         assert self._allowance is not None
         self.estimate = estimate
+        self._weights.append(self.rate_weight)
         plan = self._allowance.plan
         if plan.max_bytes is None or done < SETTLE * self.epochs:
             return
@@ -104,9 +113,11 @@ def next_weight(weight: float, expected: float, wanted: float) -> float:
     """Weight of the rate after a pass that would send ``expected`` bytes where ``wanted`` are to be sent.
 
     Bytes fall with about the square root of the weight (docs/results-stream.md), so the first power leads half of the
-    way to the goal; a factor of three a pass is the most that residuals can follow.
+    way to the goal; a factor of three a pass is the most that residuals can follow. What was taken back comes slowly
+    again, so the way down is half as fast.
     """
-    factor = min(max(expected / wanted, 1 / 3), 3.0)
+    factor = min(max(expected / wanted, 1 / 9), 3.0)
+    factor = factor if factor > 1 else factor**0.5
     return min(max(weight * factor, LEAST_WEIGHT), MOST_WEIGHT)
 
 

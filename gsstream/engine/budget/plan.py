@@ -42,7 +42,7 @@ class Past:
     Arguments:
         epochs: passes made. candidates: Gaussians that took part.
         before, optimise, after: seconds of the frame until its passes begin, of the passes, and of what follows them.
-        weight, step_scale, threshold: what it was made with, at its end.
+        weight, step_scale, threshold: what it was made with; the weight as in the last half of the passes.
         estimate: bytes expected after the last pass; 0: not estimated. untrimmed: bytes before trimming. size: bytes.
     """
 
@@ -124,7 +124,7 @@ def plan(budget: Budget, stream: Stream, history: Sequence[Past]) -> FramePlan:
     return FramePlan(
         epochs=epochs,
         change_threshold=_threshold(budget, stream, recent),
-        rate_weight=_weight(stream, recent) if held else stream.rate_weight,
+        rate_weight=_weight(budget, stream, recent) if held else stream.rate_weight,
         most_epochs=max(stream.epochs, budget.most_epochs),
         step_scale=_step_scale(recent) if held else 1.0,
         max_bytes=size,
@@ -187,9 +187,12 @@ def _threshold(budget: Budget, stream: Stream, recent: Sequence[Past]) -> float:
     return last.threshold
 
 
-def _weight(stream: Stream, recent: Sequence[Past]) -> float:
-    """Where the last frame ended: neighbouring frames cost alike, and the passes correct the rest."""
-    start = recent[-1].weight if recent else stream.rate_weight or LEAST_WEIGHT
+def _weight(budget: Budget, stream: Stream, recent: Sequence[Past]) -> float:
+    """The last frame's, corrected by its bytes: neighbouring frames cost alike, and the passes do the rest."""
+    start = stream.rate_weight or LEAST_WEIGHT
+    if recent and budget.size is not None:
+        missed = recent[-1].untrimmed / (SIZE_AIM * budget.size)
+        start = recent[-1].weight * min(max(missed**1.5, 0.5), 2.0)
     return min(max(start, LEAST_WEIGHT), MOST_WEIGHT)
 
 

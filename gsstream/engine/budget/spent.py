@@ -21,8 +21,8 @@ def spent(
     plan = allowance.plan
     given_up: dict[str, Any] = {}
     if plan.max_bytes is not None:
-        if pace.rate_weight > 1.05 * stream.rate_weight:
-            given_up["rate_weight"] = [stream.rate_weight, pace.rate_weight]
+        if pace.typical_weight > 1.05 * stream.rate_weight:
+            given_up["rate_weight"] = [stream.rate_weight, pace.typical_weight]
         if plan.step_scale > 1:
             given_up["step_scale"] = plan.step_scale
         dropped = {"symbols": fitted.symbols, "gates": fitted.gates, "births": fitted.births}
@@ -41,7 +41,7 @@ def spent(
         "bound": bound,
         "given_up": given_up,
         "spent": {
-            "epochs": epochs, "planned_epochs": plan.epochs, "rate_weight": pace.rate_weight,
+            "epochs": epochs, "planned_epochs": plan.epochs, "rate_weight": pace.typical_weight,
             "step_scale": plan.step_scale, "change_threshold": plan.change_threshold, "estimate": pace.estimate,
             "untrimmed": fitted.untrimmed, "before": before, "optimise": optimise,
         },

@@ -111,9 +111,11 @@ def read_sweep_data(folder: Path) -> SweepData:
 
 
 def _first_seconds(row: Mapping[str, Any], table: TableData) -> float | None:
-    """Seconds of the frame 0 of a cell: of the run that made it, where it is shared."""
+    """Seconds of the frame 0 of a cell: of the run that made it, where it is shared; None: it was given (``tune``)."""
     made = row if row.get("first_frame") is None else table.first_frames.get(row["first_frame"])
-    return None if made is None or made["status"] != "done" else float(sum(made["frames"][0]["seconds"].values()))
+    if made is None or made["status"] != "done" or not made["frames"]:
+        return None
+    return float(sum(made["frames"][0]["seconds"].values()))
 
 
 def waited(groups: Sequence[Group]) -> bool:

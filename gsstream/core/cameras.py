@@ -61,9 +61,10 @@ class Cameras:
         return replace(self, Ks=factor @ self.Ks, width=width, height=height)
 
     def validate(self) -> None:
-        """Raise ShapeError for NaN poses, reflected or scaled rotations, non-invertible intrinsics, repeated names."""
+        """Raise ShapeError for NaN poses, reflected or scaled rotations, intrinsics that are not invertible or have
+        skew, last rows that are not those of a pinhole camera, repeated names."""
         c = len(self)
-        if not self.near > 0:
+        if not 0 < self.near < np.inf:
             raise ShapeError(f"near plane: expected a positive distance in scene units, got {self.near}")
         check_shape("viewmats", self.viewmats, (c, 4, 4))
         check_shape("Ks", self.Ks, (c, 3, 3))
@@ -78,6 +79,20 @@ class Cameras:
                     f"intrinsics (K) of camera {name!r} are not invertible: expected positive focal lengths in pixels, "
                     f"got fx = {self.Ks[i, 0, 0]:g}, fy = {self.Ks[i, 1, 1]:g}; check the calibration file"
                 )
+            _check_pinhole(name, self.viewmats[i], self.Ks[i])
+
+
+def _check_pinhole(name: str, viewmat: FloatArray, K: FloatArray) -> None:
+    """What renderers never read must be what they take it for."""
+    if K[0, 1] != 0 or K[1, 0] != 0:
+        raise ShapeError(
+            f"intrinsics (K) of camera {name!r}: expected no skew, got K[0, 1] = {K[0, 1]:g}, K[1, 0] = {K[1, 0]:g}; "
+            "undistort the images first"
+        )
+    if not np.allclose(K[2], [0, 0, 1], rtol=0, atol=1e-6):
+        raise ShapeError(f"intrinsics (K) of camera {name!r}: expected the last row 0 0 1, got {K[2].tolist()}")
+    if not np.allclose(viewmat[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
+        raise ShapeError(f"pose (w2c) of camera {name!r}: expected the last row 0 0 0 1, got {viewmat[3].tolist()}")
 
 
 def _check_rotation(name: str, rotation: FloatArray) -> None:

@@ -4,8 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from gsstream.core.cameras import Cameras
-from gsstream.core.shapes import FloatArray, check_finite, check_shape
+from gsstream.core.errors import ShapeError
+from gsstream.core.shapes import FloatArray, check_shape
+
+#: How far outside [0, 1] an image may be: what resampling in float32 leaves.
+ROUNDING = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,9 +34,23 @@ class Frame:
     effort: float = 1.0
 
     def validate(self) -> None:
-        """Raise ShapeError when images disagree with the cameras or hold a non-finite value."""
+        """Raise ShapeError when images disagree with the cameras, or naming camera, frame and first bad pixel when a
+        value is not finite or outside [0, 1]."""
         check_shape("images", self.images, (len(self.cameras), self.cameras.height, self.cameras.width, 3))
-        check_finite(f"images of frame {self.index}", self.images)
+        for camera, image in zip(self.cameras.ids, self.images, strict=True):
+            # Each is NaN when a pixel is, and a comparison with NaN is false.
+            if image.size and not (float(image.min()) >= -ROUNDING and float(image.max()) <= 1 + ROUNDING):
+                self._refuse(camera, image)
+
+    def _refuse(self, camera: str, image: FloatArray) -> None:
+        """Say where the first bad pixel of an image is."""
+        bad = np.argwhere(~((image >= -ROUNDING) & (image <= 1 + ROUNDING)))
+        row, column, channel = (int(i) for i in bad[0])
+        raise ShapeError(
+            f"images of frame {self.index}, camera {camera!r}: expected values in [0, 1], got "
+            f"{image[row, column, channel]} at row {row}, column {column}, channel {channel} ({len(bad)} of "
+            f"{image.size} values are bad); check the image file and the value that means white"
+        )
 
 
 @dataclass(frozen=True, slots=True)

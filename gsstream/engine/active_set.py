@@ -33,6 +33,12 @@ LEAST_BLOCKS = 2
 #: Least noise of a block's mean difference. Compressed video repeats still blocks exactly; without a floor the change
 #: of half a grey level by the encoder would count as motion.
 LEAST_SIGMA = 0.5 / 255
+#: Most noise of a block's mean difference that is believed. The estimate holds while fewer than half of the blocks
+#: move; a flash or a cut moves all of them, and then the change itself would pass for noise and nothing would be seen
+#: to change. Recordings have about 1 / 255.
+MOST_SIGMA = 4 / 255
+#: The same for the noise of one pixel of one image.
+MOST_PIXEL_SIGMA = 16 / 255
 
 
 @dataclass(frozen=True)
@@ -90,7 +96,7 @@ def detect_change(previous: Frame, frame: Frame, threshold: float) -> Change | N
 def _changed(before: FloatArray, after: FloatArray, threshold: float) -> BoolArray:
     """[rows, columns] bool of one view."""
     means = _block_means(after - before)
-    sigma = max(MAD_TO_SIGMA * float(median_deviation(means)), LEAST_SIGMA)
+    sigma = min(max(MAD_TO_SIGMA * float(median_deviation(means)), LEAST_SIGMA), MOST_SIGMA)
     moved = (np.abs(means) > threshold * sigma).any(-1)
     side = TILE // BLOCK
     rows, columns = -(-moved.shape[0] // side), -(-moved.shape[1] // side)

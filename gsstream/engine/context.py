@@ -10,7 +10,7 @@ from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.storage import unpacked
-from gsstream.engine.active_set import Change
+from gsstream.engine.active_set import MOST_PIXEL_SIGMA, Change
 from gsstream.engine.stream_state import StreamState
 from gsstream.metrics.noise import noise_sigma
 from gsstream.render.base import Renderer, RenderSession
@@ -104,4 +104,6 @@ class StepContext:
         return touched
 
     def noise_sigma(self, view: int) -> float:
-        return noise_sigma(unpacked(self._state.previous.images[view]), self._frame.images[view])
+        # Where everything moves, the estimate is the change itself; see MOST_SIGMA.
+        measured = noise_sigma(unpacked(self._state.previous.images[view]), self._frame.images[view])
+        return min(measured, MOST_PIXEL_SIGMA)

@@ -243,6 +243,7 @@ def step_metrics(
         "num_gaussians": len(after.player.gaussians),
         "active_gates": int((delta.gates != 0).sum()),
         "num_gates": len(delta.gates),
+        "dead_gates": solution.dead_gates,
         "births": 0 if delta.births is None else len(delta.births),
         "candidate_gaussians": len(active),
         "loss": solution.loss,

@@ -14,6 +14,7 @@ from gsstream.core.state import GateState
 from gsstream.engine.assemble import Assembly
 from gsstream.engine.budget.pace import Pace, estimated_bytes
 from gsstream.engine.checks import UNIT, StepChecks, check_terms
+from gsstream.engine.dead_gates import count_dead
 from gsstream.engine.exposure import Exposure, backward_view
 from gsstream.engine.guard import guarded
 from gsstream.engine.levels import current_level, level_schedule
@@ -236,6 +237,8 @@ class _FrameRun:
         return self.logits.index_copy(0, self.nodes, self.gate["logits"].detach())
 
     def solution(self, loss: float, iterations: int) -> Solution:
+        with self._guarded("gate", self.parts.gate):
+            dead = count_dead(self.parts.gate, self.gate["logits"])
         moments = self.gate.moments("logits") if self.parts.recipe.gate_training.optimiser == "persistent" else {}
         return Solution(
             active=self.active,
@@ -247,6 +250,7 @@ class _FrameRun:
             iterations=iterations,
             curvature=self.code.split(self.latents.moments("latents")["exp_avg_sq"]),
             pace=self.pace,
+            dead_gates=dead,
         )
 
 

@@ -52,6 +52,7 @@ class Solution:
         iterations: views rendered.
         curvature: attribute -> [A, L], mean squared gradient of the latents: what a latent is worth, up to a factor.
         pace: what the passes were held to.
+        dead_gates: gates of rows that stayed which ended where nothing moves them (:func:`count_dead`).
     """
 
     active: torch.Tensor
@@ -63,3 +64,4 @@ class Solution:
     iterations: int
     curvature: Mapping[str, torch.Tensor] = field(default_factory=dict)
     pace: Pace | None = None
+    dead_gates: int = 0

@@ -6,11 +6,13 @@ SSIM is the 3DGS variant: 11 x 11 Gaussian window, sigma 1.5, zero padding, mean
 
 from __future__ import annotations
 
+import math
 from typing import Any, final
 
 import torch
 from kornia.metrics import ssim
 
+from gsstream.core.errors import ShapeError
 from gsstream.loss.base import Loss
 
 TILE = 16
@@ -33,6 +35,9 @@ class ReferenceLoss(Loss):
             similarity = (ssim_map(leaf, prepared) * weight).mean()
             value = (1 - dssim) * absolute + dssim * (weight.mean() - similarity)
             (gradient,) = torch.autograd.grad(value, leaf)
+        if not math.isfinite(float(value.detach())):
+            # A NaN pixel, or an image so large that its square overflows.
+            raise ShapeError("image: expected finite values of ordinary size, got a loss that is not finite")
         return float(value.detach()), gradient if tile_mask is None else gradient * _pixel_weight(image, tile_mask)
 
 

@@ -12,6 +12,9 @@ from gsstream.core.part import Part
 
 ADAM_BETAS = (0.9, 0.999)
 ADAM_EPS = 1e-15  # released code and 3DGS: tiny gradients of tiny Gaussians must still move them
+#: Largest gradient that is taken. The square of a larger one leaves float32, its mean stays infinite, and the row would
+#: never move again without anybody being told.
+MAX_GRADIENT = 1e18
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,5 +60,6 @@ class RowOptimiser(Part):
             lrs: their learning rates, >= 0: one number, [d] by column of [n, d], or [n, 1] by row.
 
         Raises:
-            ShapeError: shapes that differ, a gradient that is not finite (that table is not changed then).
+            ShapeError: shapes that differ, a gradient that is not finite or beyond MAX_GRADIENT (that table is not
+                changed then).
         """

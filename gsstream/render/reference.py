@@ -12,8 +12,10 @@ from pydantic import Field
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.context import ScreenGradient
+from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.part import PartConfig
+from gsstream.core.shapes import check_finite
 from gsstream.render.activations import SH0, activate_opacities, activate_scales, rotation_matrices
 from gsstream.render.base import Renderer, RenderOutput, ScatterSession
 
@@ -21,6 +23,7 @@ BLUR = 0.3
 ALPHA_CUT = 1 / 255
 ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
+QUAT_NORMS = (1e-10, 1e10)
 
 
 @final
@@ -71,6 +74,8 @@ class ReferenceRenderer(Renderer):
         probe: torch.Tensor | None,
     ) -> RenderOutput:
         dtype = gaussians.means.dtype
+        for name, value in gaussians.items():
+            check_finite(name, value)
         means2d, conics, colors, depths, opacities = project(gaussians, cameras, view)
         if probe is not None:
             means2d = means2d + probe
@@ -129,12 +134,26 @@ def project(
     ty = safe * torch.clamp(points[:, 1] / safe, -cy / fy - margin_y, (height - cy) / fy + margin_y)
     zero = torch.zeros_like(safe)
     jacobian = torch.stack([fx / safe, zero, -fx * tx / safe**2, zero, fy / safe, -fy * ty / safe**2], -1)
+    _check_quats(gaussians.quats)
     axes = rotation_matrices(gaussians.quats) * activate_scales(gaussians.scales)[:, None, :]
     footprint = jacobian.reshape(-1, 2, 3) @ rotation @ axes  # [N, 2, 3]
     covariance = footprint @ footprint.transpose(1, 2) + BLUR * torch.eye(2, dtype=dtype)
+    check_finite("covariances on the screen (a size or a position overflows)", covariance)
     center = -(rotation.T @ translation)
     colors = evaluate_sh(gaussians.sh0, gaussians.shN, gaussians.means - center)
     return means2d, torch.linalg.inv(covariance), colors, depth, activate_opacities(gaussians.opacities)
+
+
+def _check_quats(quats: torch.Tensor) -> None:
+    """Raise ShapeError for a quaternion without direction; its rotation would be arbitrary."""
+    norms = quats.detach().double().norm(dim=1)
+    bad = ~((norms > QUAT_NORMS[0]) & (norms < QUAT_NORMS[1]))
+    if bool(bad.any()):
+        row = int(bad.nonzero()[0, 0])
+        raise ShapeError(
+            f"quats: expected norms between {QUAT_NORMS[0]:g} and {QUAT_NORMS[1]:g}, got {float(norms[row]):.3g} at "
+            f"row {row} ({int(bad.sum())} in all); give them a direction"
+        )
 
 
 def footprint_in_image(gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int) -> torch.Tensor:

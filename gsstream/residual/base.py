@@ -13,8 +13,12 @@ from typing import NamedTuple
 
 import torch
 
+from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.part import Part
+
+#: Largest magnitude of a symbol: the last up to which float32, in which symbols are decoded, tells neighbours apart.
+MAX_SYMBOL = 1 << 24
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,5 +133,21 @@ def coarser(codes: Mapping[str, AttributeCode], factor: float) -> Mapping[str, A
 
 
 def symbols(codes: Mapping[str, AttributeCode], latents: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """[A, L] int32 symbols that the packet carries."""
-    return {name: torch.round(value.detach() / codes[name].step).to(torch.int32) for name, value in latents.items()}
+    """[A, L] int32 symbols that the packet carries.
+
+    Raises ShapeError for latents that are not finite or beyond MAX_SYMBOL steps, whose integers would be arbitrary.
+    """
+    return {name: _integers(name, value.detach() / codes[name].step) for name, value in latents.items()}
+
+
+def _integers(name: str, scaled: torch.Tensor) -> torch.Tensor:
+    rounded = torch.round(scaled)
+    bad = ~(rounded.abs() <= MAX_SYMBOL)
+    if bool(bad.any()):
+        row, channel = bad.nonzero()[0].tolist()
+        raise ShapeError(
+            f"latents of {name}: expected at most {MAX_SYMBOL} quantisation steps, got {float(scaled[row, channel]):g} "
+            f"in row {row}, channel {channel} ({int(bad.sum())} of {bad.numel()} values); the optimisation has "
+            "diverged, lower its learning rate"
+        )
+    return rounded.to(torch.int32)

@@ -148,7 +148,7 @@ class TestCameras:
         with pytest.raises(ShapeError, match=r"images: expected shape \[2, 48, 64, 3\]"):
             Frame(3, 0.1, images[:, :47], rig()).validate()
         images[1, 5, 6, 0] = np.nan
-        with pytest.raises(ShapeError, match=r"images of frame 3: .* index \[1, 5, 6, 0\]"):
+        with pytest.raises(ShapeError, match=r"images of frame 3, camera 'cam1': .* nan at row 5, column 6, channel 0"):
             Frame(3, 0.1, images, rig()).validate()
 
 

@@ -26,7 +26,7 @@ class BinarySteGate(GateSampler):
 
     class Config(PartConfig):
         temperature: float = Field(
-            default=0.3, ge=0.01, le=10, description="tau, softness of the gradient, no unit, 0.01 to 10 (paper: 0.3)"
+            default=0.3, ge=0.01, le=100, description="tau, softness of the gradient, no unit, 0.01 to 100 (paper: 0.3)"
         )
         logit_bound: float = Field(
             default=math.log(1000.0), gt=0, le=50,
@@ -64,9 +64,10 @@ class BinarySteGate(GateSampler):
     def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
         """Gates [M], each exactly 0.0 or 1.0, dtype of the logits; a soft gate of exactly 1/2 is closed."""
         z = state.logits if noise is None else state.logits + noise.detach().to(state.logits.dtype)
-        soft = torch.sigmoid(z / self.config.temperature)
-        # soft - soft is exactly 0, so the value is exactly 0 or 1.
-        through = soft - soft.detach()
+        x = z.detach() / self.config.temperature
+        # The soft gate's slope; s (1 - s) would be exactly 0 from x = 17 on, and an open gate not feel the images.
+        # z - z is exactly 0, so the value is exactly 0 or 1.
+        through = (z - z.detach()) * (torch.sigmoid(x) * torch.sigmoid(-x) / self.config.temperature)
         if self.config.clamp_gradient:
             through = 0.0 * through
         return (z.detach() > 0).to(z.dtype) + through

@@ -8,6 +8,8 @@
 namespace gsstream_cpu::GSS_ISA {
 namespace {
 
+constexpr float MAX_GRADIENT = 1e18f;
+
 struct Factors {
   Floats beta1, rest1, beta2, rest2, eps, size, root2;  // size = lr / (1 - beta1^t), root2 = 1 / sqrt(1 - beta2^t)
 };
@@ -154,21 +156,18 @@ void update(const AdamJob& job, std::size_t begin, std::size_t end) {
   }
 }
 
-// x - x is 0 for finite x and NaN otherwise.
+// The first value that is not finite, or whose square leaves float32: its mean would stay infinite for good.
 std::size_t first_bad(const float* values, std::size_t count) {
   std::size_t i = 0;
   constexpr std::size_t block = 16 * LANES;
   for (; i + block <= count; i += block) {
-    Floats sum = {};
-    for (std::size_t k = 0; k < block; k += LANES) {
-      const Floats x = load(values + i + k);
-      sum += x - x;
-    }
-    constexpr uint32_t every = (1u << LANES) - 1u;
-    if (bits_of(greater_equal(sum, Floats{})) != every) break;
+    Ints largest{};
+    for (std::size_t k = 0; k < block; k += LANES) largest = largest_magnitude(largest, load(values + i + k));
+    // As integers, NaN and infinity are the largest magnitudes.
+    if (any(greater_equal(largest, (Ints)broadcast(MAX_GRADIENT) + 1))) break;
   }
   for (; i < count; ++i)
-    if (!(values[i] - values[i] == 0.0f)) return i;
+    if (!(std::fabs(values[i]) <= MAX_GRADIENT)) return i;
   return count;
 }
 

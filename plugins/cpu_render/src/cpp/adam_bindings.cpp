@@ -92,7 +92,8 @@ void bind_adam(nb::module_& module) {
              nb::arg("dense_step"), nb::arg("ids").noconvert().none(), nb::arg("mask").noconvert().none(), nb::arg("lr"),
              nb::arg("lr_columns").noconvert().none(), nb::arg("lr_rows").noconvert().none(), nb::arg("beta1"),
              nb::arg("beta2"), nb::arg("eps"), nb::arg("skip_zero_rows"), nb::arg("check_finite"),
-             "Adam in place. Returns -1, or the flat index of a non-finite gradient value (then nothing was changed).");
+             "Adam in place. Returns -1, or the flat index of a gradient value that is not finite or beyond 1e18 (then nothing "
+             "was changed).");
 }
 
 }  // namespace gsstream_cpu

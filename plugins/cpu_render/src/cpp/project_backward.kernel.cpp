@@ -44,7 +44,7 @@ GSS_INLINE void through_exponent(const Splats& s, const Floats* moments, SplatGr
                                  ChainGradients& chain) {
   const Floats g = moments[0], gx = moments[1], gy = moments[2], gxx = moments[3], gxy = moments[4], gyy = moments[5];
   const Floats qa = s.yy * s.inverse_det, qb = -s.xy * s.inverse_det, qc = s.xx * s.inverse_det;
-  out.opacity = g * (1.0f - s.opacity);  // d log(sigmoid)/d logit
+  out.opacity = g * s.transparency;  // d log(sigmoid)/d logit
   out.mean2d[0] = qa * gx + qb * gy;
   out.mean2d[1] = qb * gx + qc * gy;
   // dL/dQ = -1/2 [gxx gxy; gxy gyy] and dL/dCov = -Q (dL/dQ) Q

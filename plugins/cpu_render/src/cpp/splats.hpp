@@ -9,7 +9,8 @@
 namespace gsstream_cpu::GSS_ISA {
 
 struct Splats {
-  Floats mean[3], quat[4], scale[3], opacity;  // activated: unit quaternion, linear scale, opacity in (0,1)
+  Floats mean[3], quat[4], scale[3];  // activated: unit quaternion, linear scale
+  Floats opacity, transparency;       // in (0,1); 1 - opacity would be 0 from a logit of 17 on
   Floats quat_inverse_norm, quat_norm2;
   Ints largest;                                 // largest_magnitude of the raw geometry
   Floats view[3], inverse_z, x_slope, y_slope;  // camera space; slopes x/z, y/z limited as above
@@ -39,7 +40,9 @@ GSS_INLINE void load_and_activate(const GaussianArrays& in, const uint32_t* rows
   s.largest = largest_magnitude(Ints{}, s.opacity);
   for (int i = 0; i < 3; i++) s.largest = largest_magnitude(largest_magnitude(s.largest, s.mean[i]), s.scale[i]);
   for (const Floats& q : s.quat) s.largest = largest_magnitude(s.largest, q);
-  s.opacity = 1.0f / (1.0f + exp2(clamp(-LOG2_E * s.opacity, broadcast(-60.f), broadcast(60.f))));
+  const Floats odds = exp2(clamp(-LOG2_E * s.opacity, broadcast(-60.f), broadcast(60.f)));
+  s.opacity = 1.0f / (1.0f + odds);
+  s.transparency = odds * s.opacity;
   for (Floats& scale : s.scale)
     scale = exp2(clamp(scale * LOG2_E, broadcast(-LOG2_SCALE_LIMIT), broadcast(LOG2_SCALE_LIMIT)));
   s.quat_norm2 = s.quat[0] * s.quat[0] + s.quat[1] * s.quat[1] + s.quat[2] * s.quat[2] + s.quat[3] * s.quat[3];

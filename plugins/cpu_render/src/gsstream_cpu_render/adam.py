@@ -115,8 +115,8 @@ def _run(
     )  # fmt: skip
     if bad >= 0:
         row, column = divmod(bad, table.d)
-        refuse(f"grad: expected finite values, got {gradient[row, column]} in row {row}, column {column}; nothing was "
-               "changed. Look for the loss or the render that produced it")  # fmt: skip
+        refuse(f"grad: expected finite values up to 1e18, got {gradient[row, column]} in row {row}, column {column}; "
+               "nothing was changed. Look for the loss or the render that produced it")  # fmt: skip
 
 
 def _rows(rows: Any | None, n: int) -> tuple[NDArray[np.int64] | None, NDArray[np.uint8] | None]:

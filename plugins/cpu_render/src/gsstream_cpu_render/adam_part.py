@@ -50,7 +50,7 @@ def _step(name: str, value: torch.Tensor, gradient: torch.Tensor, state: AdamSta
     if bad >= 0:
         row, column = divmod(bad, table[1].shape[1])
         got = f"{table[1][row, column]} in row {row}, column {column}"
-        refuse(f"gradient of {name}: expected finite values, got {got}; its table was not changed")
+        refuse(f"gradient of {name}: expected finite values up to 1e18, got {got}; its table was not changed")
 
 
 def _rates(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsstream_cpu_render import _native
-from gsstream_cpu_render.checks import Float32, first_non_finite, native_array, refuse, refuse_value
+from gsstream_cpu_render.checks import Float32, first_non_finite, native_array, refuse
 
 SH_COEFFICIENTS = (1, 4, 9, 16)
 MASK_TILE = 16
@@ -113,20 +113,20 @@ def raise_on_faults(faults: int, splats: SplatArrays) -> None:
     Gaussians outside the view are never read and so not checked.
 
     Raises:
-        InputError: a NaN or infinity (array and index), a quaternion without direction (row), or finite values so
+        ShapeError: a NaN or infinity (array and index), a quaternion without direction (row), or finite values so
             large that they overflow float32.
     """
     if not faults:
         return
     for name, value in splats._asdict().items():
         if found := first_non_finite(name, value):
-            refuse_value(found)
+            refuse(found)
     norms = np.linalg.norm(splats.quats.astype(np.float64), axis=1)
     unusable = ~((norms > 1e-10) & (norms < 1e10))
     if faults & _native.FAULT_QUATERNION and unusable.any():
         row = int(np.argmax(unusable))
         got = f"{norms[row]:.3g} at row {row} ({int(unusable.sum())} in all)"
-        refuse_value(f"quats: expected norms between 1e-10 and 1e10, got {got}; give them a direction")
-    refuse_value(
+        refuse(f"quats: expected norms between 1e-10 and 1e10, got {got}; give them a direction")
+    refuse(
         "a product of finite parameters overflowed float32; expected values below about 1e15; rescale the scene"
     )

@@ -31,6 +31,8 @@ def as_array(name: str, value: Any) -> NDArray[Any]:
     if hasattr(value, "detach"):
         if value.device.type != "cpu":
             refuse(f"{name}: expected a tensor on the CPU, got one on {value.device}; call .cpu() first")
+        if str(value.dtype) == "torch.bfloat16":
+            refuse(f"{name}: expected float32, got bfloat16, which numpy does not know; convert it with .float()")
         value = value.detach().numpy()
     if not isinstance(value, np.ndarray):
         refuse(f"{name}: expected a numpy array or a torch tensor, got {type(value).__name__}")

@@ -64,6 +64,8 @@ class Lease:
 def lease(cameras: Rig, view: int, background: Background) -> Lease:
     """A rasteriser for camera ``view`` of a rig."""
     with _lock:
+        # An object keeps the kernels of the instruction set it was made for.
+        _idle[:] = [native for native in _idle if native.isa == _native.active_isa()]
         native = _idle.pop() if _idle else None
     pose = (cameras.viewmats[view], cameras.Ks[view])
     return Lease(NumpyRasterizer(*pose, cameras.width, cameras.height, background, cameras.near, native=native))

@@ -20,6 +20,8 @@ class GumbelSigmoid(GateSampler):
     """g = round_levels(sigmoid((alpha + n) / tau)), n ~ Logistic(0, 1) (paper, "Differentiable Gate Sampling").
 
     * alpha is the propagated confidence logit itself; nothing passes through a probability.
+    * The slope of the soft gate is sigmoid(x) sigmoid(-x), small but alive at either end. The usual g (1 - g) is
+      exactly 0 from x = 17 on in float32, so an open gate would no longer feel the images but still the price.
     * Rounding is to multiples of 1 / ``levels``: 10 is the paper's one decimal (multi-level STE), 1 its binary STE.
       The gradient is that of the soft gate (straight-through), alive also where the rounded gate is 0 or 1.
       Ties of the scaled value go to the even level, so a soft gate of exactly 0.5 / levels is closed.
@@ -34,7 +36,7 @@ class GumbelSigmoid(GateSampler):
 
     class Config(PartConfig):
         temperature: float = Field(
-            default=0.3, ge=0.01, le=10, description="tau, softness of the gate, no unit, 0.01 to 10 (paper: 0.3)"
+            default=0.3, ge=0.01, le=100, description="tau, softness of the gate, no unit, 0.01 to 100 (paper: 0.3)"
         )
         levels: int = Field(
             default=10, ge=1, le=255, description="non-zero gate values, 1 (binary) to 255; 10 is one decimal (paper)"
@@ -75,13 +77,13 @@ class GumbelSigmoid(GateSampler):
     def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
         """Gates [M] in {0, 1/levels, ..., 1}, dtype of the logits."""
         alpha = state.logits if noise is None else state.logits + noise.detach().to(state.logits.dtype)
-        soft = torch.sigmoid(alpha / self.config.temperature)
+        soft = torch.sigmoid(alpha.detach() / self.config.temperature)
         # Divided by a tensor, not by a number: some devices turn the latter into a product with 1/levels, which is not
         # the value the decoder computes.
         steps = soft.new_tensor(float(self.num_levels))
-        hard = torch.round(soft.detach() * steps) / steps
-        # soft - soft is exactly 0, so the value is exactly the level; soft + (hard - soft) would be an ulp off.
-        through = soft - soft.detach()
+        hard = torch.round(soft * steps) / steps
+        # alpha - alpha is exactly 0, so the value is exactly the level; soft + (hard - soft) would be an ulp off.
+        through = (alpha - alpha.detach()) * slope(alpha.detach() / self.config.temperature) / self.config.temperature
         if self.config.clamp_gradient:
             through = through * ((hard > 0) & (hard < 1))
         return hard + through
@@ -98,6 +100,11 @@ class GumbelSigmoid(GateSampler):
     def bound(self, state: GateState) -> GateState:
         """Project the logits into [-logit_bound, logit_bound]."""
         return GateState(logits=state.logits.clamp(-self.config.logit_bound, self.config.logit_bound))
+
+
+def slope(x: torch.Tensor) -> torch.Tensor:
+    """Derivative of the sigmoid; equally accurate at both ends, while s (1 - s) loses all digits at the upper one."""
+    return torch.sigmoid(x) * torch.sigmoid(-x)
 
 
 def logistic(uniform: torch.Tensor) -> torch.Tensor:

@@ -171,6 +171,8 @@ class StreamingOctree(Structure):
         # Coincident points have no extent of their own: the distance to the cameras is the only scale there is.
         extent = extent if extent > 0 else (far if far > 0 else 1.0)
         side = extent * (1 + 2 * self.config.padding)
+        if not side < torch.finfo(torch.float32).max:
+            raise InputError(f"points span {extent:g} scene units: its cube leaves float32; rescale the scene")
         origin = (low + high) / 2 - side / 2
         return origin.float().double(), float(np.float32(side))
 

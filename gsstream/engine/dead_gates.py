@@ -1,0 +1,28 @@
+"""Gates that nothing can move any more: counted, so that a setting which kills them is seen."""
+
+from __future__ import annotations
+
+import torch
+
+from gsstream.core.state import GateState
+from gsstream.gate.base import GateSampler
+
+#: Spacing of float32 below 1: a smaller slope changes no gate by a logit's step.
+RESOLUTION = 2.0**-24
+
+
+def count_dead(gate: GateSampler, logits: torch.Tensor) -> int:
+    """How many of the gates with these logits [M] neither the images nor the price can move.
+
+    Dead: the derivatives by the logit both of the deterministic gate (through which the images act) and of the open
+    probability (through which the price acts) are below RESOLUTION. Samplers that do not depend on their logits have
+    nothing to move and no dead gates.
+    """
+    leaf = logits.detach().clone().requires_grad_()
+    state = GateState(leaf)
+    with torch.enable_grad():
+        felt = [value for value in (gate.sample(state, None), gate.open_probability(state)) if value.requires_grad]
+        slopes = [torch.autograd.grad(value.sum(), leaf)[0].abs() for value in felt]
+    if not slopes:
+        return 0
+    return int((torch.stack(slopes).amax(0) < RESOLUTION).sum())

@@ -1,0 +1,130 @@
+"""Gates at the extremes: exact levels, gradients that stay alive, laws that hold, dead ones counted."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from gsstream_binary_ste.binary import BinarySteGate
+from gsstream_s2gs.gumbel_sigmoid import GumbelSigmoid, gumbel, logistic, slope
+from hypothesis import given
+from hypothesis import strategies as st
+from numeric_scenes import some
+
+from gsstream.core.state import GateState
+from gsstream.engine.dead_gates import count_dead
+from gsstream.gate.always_open import AlwaysOpen
+
+EXTREMES = torch.tensor([-1e4, -100.0, -17.5, -6.9, -1e-30, 0.0, 1e-30, 6.9, 17.5, 100.0, 1e4])
+
+
+def sampler(**settings: object) -> GumbelSigmoid:
+    return GumbelSigmoid(GumbelSigmoid.Config(**settings))
+
+
+def gradient(part: GumbelSigmoid | BinarySteGate, logits: torch.Tensor) -> torch.Tensor:
+    leaf = logits.clone().requires_grad_()
+    (found,) = torch.autograd.grad(part.sample(GateState(leaf), None).sum(), leaf)
+    return found
+
+
+@pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+@pytest.mark.parametrize("levels", [1, 2, 10, 100])
+@pytest.mark.parametrize("temperature", [0.01, 0.3, 100.0])
+def test_extreme_logits_give_levels_in_every_precision(temperature: float, levels: int, kind: torch.dtype) -> None:
+    part = sampler(temperature=temperature, levels=levels)
+    state = GateState(EXTREMES.to(kind))
+    for noise in (None, torch.full((11,), -17.4), torch.full((11,), 17.4)):
+        gates = part.sample(state, noise)
+        assert gates.dtype == kind
+        steps = gates.double() * levels
+        assert float((steps - steps.round()).abs().max()) <= levels * torch.finfo(kind).eps
+        assert 0 <= float(gates.min()) <= float(gates.max()) <= 1
+        probability = part.open_probability(state)
+        assert bool(torch.isfinite(probability).all())
+        assert 0 <= float(probability.min()) <= float(probability.max()) <= 1
+    ends = part.init(EXTREMES.float()).logits
+    assert float(ends.abs().max()) == pytest.approx(math.log(1000.0))
+
+
+@given(st.integers(1, 255), st.floats(0.01, 100), st.floats(-12, 12))
+@some(100)
+def test_the_decoder_has_the_sampled_value(levels: int, temperature: float, logit: float) -> None:
+    """float32: round(g * levels) as a byte, divided by levels again, is g; so is every level in between."""
+    part = sampler(levels=levels, temperature=temperature)
+    gate = part.sample(GateState(torch.tensor([logit, -logit, 0.0])), None)
+    byte = torch.round(gate * levels).to(torch.uint8)
+    assert torch.equal(byte.float() / torch.tensor(float(levels)), gate)
+
+
+@pytest.mark.parametrize("levels", [1, 3, 5, 255])
+def test_a_tie_between_two_levels_goes_to_the_even_one(levels: int) -> None:
+    """An odd number of levels has a tie at logit 0: levels / 2 is half-way."""
+    gate = sampler(levels=levels).sample(GateState(torch.zeros(1)), None)
+    assert float(gate * levels) == 2 * round(levels / 4)
+
+
+@pytest.mark.parametrize("part", [sampler(), BinarySteGate()], ids=["gumbel-sigmoid", "binary-ste"])
+def test_an_open_gate_feels_the_images_as_a_closed_one_does(part: GumbelSigmoid) -> None:
+    """s (1 - s) is exactly 0 from a logit of 17 temperatures on in float32: a gate at the upper bound (23) was pulled
+    by the price of openness alone, while one at the lower bound felt both."""
+    ends = torch.tensor([-math.log(1000.0), math.log(1000.0)])
+    down, up = gradient(part, ends).tolist()
+    assert up > 0
+    assert up == pytest.approx(down, rel=1e-6)
+    exact = 1 / (0.3 * (2 + 2 * math.cosh(math.log(1000.0) / 0.3)))
+    assert up == pytest.approx(exact, rel=1e-5)
+
+
+@given(st.floats(-87, 87, width=32))
+@some(60)
+def test_the_slope_is_even_and_never_dies_in_range(x: float) -> None:
+    at = torch.tensor([x, -x])
+    values = slope(at)
+    assert values[0] == values[1]
+    assert float(values[0]) > 0
+    assert float(values[0]) == pytest.approx(1 / (2 + 2 * math.cosh(x)), rel=1e-4)
+
+
+@pytest.mark.parametrize("uniform", [0.0, 2.0**-24, 0.5, 1 - 2.0**-24])
+def test_noise_is_finite_at_the_ends_of_the_generator(uniform: float) -> None:
+    u = torch.tensor([uniform])
+    assert abs(float(logistic(u))) < 17.5
+    assert -3 < float(gumbel(u)) < 17.5
+
+
+@pytest.mark.parametrize("temperature", [0.01, 0.3, 100.0])
+@pytest.mark.parametrize("levels", [1, 10, 255])
+def test_calibration_within_four_sigma_at_the_limits_of_the_settings(levels: int, temperature: float) -> None:
+    part, count = sampler(levels=levels, temperature=temperature, logit_bound=50.0), 20_000
+    for p in (0.01, 0.5, 0.99):
+        # The logit that opens with probability p, as far as the bound allows.
+        eta = 0.5 / levels
+        logit = math.log(p / (1 - p)) + temperature * math.log(eta / (1 - eta))
+        state = part.bound(GateState(torch.full((count,), logit)))
+        expected = float(part.open_probability(state)[0])
+        drawn = part.sample(state, part.noise(count, torch.Generator().manual_seed(levels)))
+        share = float((drawn > 0).double().mean())
+        assert abs(share - expected) <= 4 * math.sqrt(max(expected * (1 - expected), 1 / count) / count)
+
+
+def test_dead_gates_are_counted_and_there_are_none_by_default() -> None:
+    spread = torch.linspace(-50, 50, 101)
+    default = sampler()
+    assert count_dead(default, default.init(spread).logits) == 0
+    # With a bound of 50 and a cold gate the far logits are out of reach of images and price: float32 spacing at 1.
+    cold = sampler(logit_bound=50.0, temperature=0.01)
+    probability = 1 / (2 + 2 * torch.cosh(spread.double() - 0.01 * math.log(0.05 / 0.95)))
+    image = 1 / (0.01 * (2 + 2 * torch.cosh(spread.double() / 0.01)))
+    expected = int(((probability < 2.0**-24) & (image < 2.0**-24)).sum())
+    assert count_dead(cold, cold.init(spread).logits) == expected > 50
+    assert count_dead(AlwaysOpen(), spread) == 0
+    assert count_dead(default, torch.zeros(0)) == 0
+
+
+def test_double_precision_agrees_with_single() -> None:
+    logits = torch.linspace(-20, 20, 401)
+    for part in (sampler(), BinarySteGate()):
+        single, double = gradient(part, logits), gradient(part, logits.double())
+        torch.testing.assert_close(single.double(), double, rtol=3e-5, atol=0)

@@ -64,10 +64,11 @@ class BinarySteGate(GateSampler):
     def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
         """Gates [M], each exactly 0.0 or 1.0, dtype of the logits; a soft gate of exactly 1/2 is closed."""
         z = state.logits if noise is None else state.logits + noise.detach().to(state.logits.dtype)
-        x = z.detach() / self.config.temperature
+        tau: float = self.config.temperature
+        x = z.detach() / tau
         # The soft gate's slope; s (1 - s) would be exactly 0 from x = 17 on, and an open gate not feel the images.
         # z - z is exactly 0, so the value is exactly 0 or 1.
-        through = (z - z.detach()) * (torch.sigmoid(x) * torch.sigmoid(-x) / self.config.temperature)
+        through = (z - z.detach()) * (torch.sigmoid(x) * torch.sigmoid(-x) / tau)
         if self.config.clamp_gradient:
             through = 0.0 * through
         return (z.detach() > 0).to(z.dtype) + through

@@ -83,7 +83,8 @@ class GumbelSigmoid(GateSampler):
         steps = soft.new_tensor(float(self.num_levels))
         hard = torch.round(soft * steps) / steps
         # alpha - alpha is exactly 0, so the value is exactly the level; soft + (hard - soft) would be an ulp off.
-        through = (alpha - alpha.detach()) * slope(alpha.detach() / self.config.temperature) / self.config.temperature
+        tau: float = self.config.temperature
+        through = (alpha - alpha.detach()) * (slope(alpha.detach() / tau) / tau)
         if self.config.clamp_gradient:
             through = through * ((hard > 0) & (hard < 1))
         return hard + through

@@ -149,6 +149,25 @@ def test_a_change_of_the_whole_picture_is_seen(flash: str, threshold: float) -> 
     assert still.share < 0.05, "noise alone is still no change"
 
 
+@pytest.mark.parametrize("gain", [0.9, 0.95, 1.05, 1.1])
+def test_a_slow_change_of_the_light_is_no_noise(gain: float) -> None:
+    """A dimmer that turns by a few percent a frame widened the measured noise as fast as it changed the picture: seven
+    frames of a recording with a swinging gain were sent as "nothing changed"."""
+    _, _, frame = begun()
+    y, x = np.mgrid[:24, :32]
+    lit = (0.5 + 0.35 * np.sin(x / 15) * np.cos(y / 18))[None, :, :, None]
+
+    def exposed(index: int, gain: float) -> Frame:
+        draw = np.random.default_rng(index).normal(0, 0.006, frame.images.shape)
+        return shown(frame, index, lambda images: gain * lit + draw)
+
+    change, still = (detect_change(exposed(0, 1.0), exposed(1, g), 6.0) for g in (gain, 1.0))
+    assert change is not None
+    assert change.share > 0.5
+    assert still is not None
+    assert still.share == 0
+
+
 def test_an_alternating_flash_is_followed_both_ways() -> None:
     subject, state, frame = begun()
     bright, changed = FLASHES["half as bright again"], []

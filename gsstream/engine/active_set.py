@@ -120,7 +120,7 @@ def _rough(means: FloatArray) -> float:
     if not values.size:
         return np.inf
     # The variance of a - 2 b + c is six times that of each.
-    return MOST_OF_ROUGHNESS * MAD_TO_SIGMA * float(np.median(values)) / np.sqrt(6)
+    return float(MOST_OF_ROUGHNESS * MAD_TO_SIGMA * np.median(values) / np.sqrt(6))
 
 
 def _block_means(difference: FloatArray) -> FloatArray:

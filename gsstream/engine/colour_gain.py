@@ -11,8 +11,8 @@ from gsstream.init.geometry import inside, project
 from gsstream.render.activations import SH0
 from gsstream.render.reference import evaluate_sh
 
-#: Prior on every coefficient above degree 0, in observations: what few cameras say must not be believed at once.
-PRIOR = 1.0
+#: Prior on every coefficient above degree 0, in observations. Frame 0 holds them back, too: their rate is a twentieth.
+PRIOR = 10.0
 #: Samples further than this many median deviations from their seed's colour are of something in front of it.
 OUTLIER = 4.0
 LEAST_VIEWS = 4

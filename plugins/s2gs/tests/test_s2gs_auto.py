@@ -5,7 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from gsstream_s2gs.auto import BASES, PIXELS_PER_ANCHOR, anchors, log_base, max_levels, root_exponent
+from gsstream_s2gs.auto import (
+    BASES,
+    PIXELS_PER_ANCHOR,
+    anchors,
+    colour_channels,
+    colour_rate,
+    log_base,
+    max_levels,
+    root_exponent,
+)
+from gsstream_s2gs.latent import LatentResidual
 from gsstream_s2gs.octree import StreamingOctree
 from hypothesis import given
 from hypothesis import strategies as st
@@ -46,3 +56,16 @@ def test_the_base_meets_the_wanted_number_of_anchors_where_it_can() -> None:
 def test_levels_end_where_cells_are_too_small_to_see(width: float, levels: int) -> None:
     settings = SETTINGS.model_copy(update={"root_exponent": 8})
     assert max_levels(replace(FACTS, span_pixels=256 * width), settings).value == levels
+
+
+@given(gain=st.floats(-9, 9), more=st.floats(0, 9))
+def test_higher_colour_is_sent_where_it_depends_on_the_view(gain: float, more: float) -> None:
+    weak, strong = (replace(FACTS, colour_gain=(g, g, g)) for g in (gain, gain + more))
+    for rule in (colour_channels, colour_rate):
+        assert rule(weak, None).value <= rule(strong, None).value
+
+
+def test_a_frozen_colour_is_never_sent() -> None:
+    rate = colour_rate(replace(FACTS, colour_gain=(0.0, 0.0, 0.0)), None).value
+    update = LatentResidual(LatentResidual.Config.model_validate({"shN": {"lr": rate}}))
+    assert "shN" not in update.codes()

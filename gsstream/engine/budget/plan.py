@@ -19,8 +19,9 @@ from gsstream.recipe.model import Stream
 WINDOW = 5
 #: Share of a time budget that is planned with; the rest is for what no plan sees coming.
 TIME_MARGIN = 0.93
-#: Share of a size budget that the optimiser aims at; the rest spares most packets from being trimmed.
-SIZE_AIM = 0.94
+#: Below this share of a size budget the weight falls; above this multiple it rises. In between the packet is trimmed:
+#: that takes 43 % of the bytes for less than any weight does (docs/results-budget.md).
+SIZE_AIM, MOST_TRIMMED = 0.94, 2.0
 #: Share of a time budget kept for coding while no frame has shown what it costs.
 UNKNOWN_RESERVE = 0.2
 #: Share of a pass's time that does not depend on the number of candidates.
@@ -190,8 +191,8 @@ def _threshold(budget: Budget, stream: Stream, recent: Sequence[Past]) -> float:
 def _weight(budget: Budget, stream: Stream, recent: Sequence[Past]) -> float:
     """The recipe's, or less where the last frame left bytes over.
 
-    Never more: a residual that is taxed from the first pass on does not grow to what it should be. To let it grow, tax
-    it later and trim the packet gave 1 dB more on moving pixels at equal bytes (docs/results-budget.md).
+    Never more: a residual that is taxed from the first pass on does not grow to what it should be. To let it grow and
+    to trim the packet is better by far at equal bytes (docs/results-budget.md).
     """
     start = stream.rate_weight or LEAST_WEIGHT
     if recent and budget.size is not None:

@@ -5,9 +5,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 import importlib
 import inspect
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,7 +28,7 @@ def exported() -> dict[str, Any]:
 
 
 def api() -> str:
-    """One line per exported name, with its signature."""
+    """Every exported name: one line in a table, then its exact signature, fields and methods."""
     lines = [NOTE, "# gsstream.api", "", "Everything a plugin or a script may import.", ""]
     lines += ["| name | what it is | defined in |", "|---|---|---|"]
     for name, value in exported().items():
@@ -34,7 +36,55 @@ def api() -> str:
         text = (inspect.getdoc(value) or "").splitlines()[0] if described else f"constant, `{value!r}`"
         module = getattr(value, "__module__", "gsstream") if described else "-"
         lines.append(f"| `{name}` | {text.replace('|', chr(92) + '|')} | `{module}` |")
-    return "\n".join(lines) + "\n"
+    lines += ["", "## Signatures", ""]
+    for name, value in exported().items():
+        if inspect.isclass(value) or inspect.isroutine(value):
+            lines += [f"### {name}", "", "```python", *_declared(name, value), "```", ""]
+    return "\n".join(lines)
+
+
+def _declared(name: str, value: Any) -> Iterator[str]:
+    """A function's signature; of a class how it is made, its fields and its public methods, inherited ones too."""
+    if not inspect.isclass(value):
+        yield f"def {_signature(name, value)}"
+        return
+    bases = ", ".join(base.__name__ for base in value.__bases__ if base is not object)
+    yield f"class {name}({bases}):" if bases else f"class {name}:"
+    for field, kind in _fields(value):
+        yield f"    {field}: {kind}"
+    made = dataclasses.is_dataclass(value) or "__init__" in vars(value)
+    if made and not getattr(value, "_is_protocol", False):
+        yield f"    def {_signature('__init__', value.__init__)}"
+    for method, member in _members(value):
+        function = getattr(member, "fget", None) or getattr(member, "__func__", member)
+        if isinstance(member, property | staticmethod | classmethod):
+            yield f"    @{type(member).__name__}"
+        if getattr(member, "__isabstractmethod__", False):
+            yield "    @abstractmethod"
+        yield f"    def {_signature(method, function)}"
+
+
+def _fields(value: type) -> Iterator[tuple[str, str]]:
+    """Annotated names of a class that are no constructor arguments told anyway: those of parts, protocols, errors."""
+    if dataclasses.is_dataclass(value):
+        return
+    for field, kind in inspect.get_annotations(value).items():
+        if not field.startswith("_"):
+            # Named tuples keep annotations as forward references.
+            yield field, kind if isinstance(kind, str) else getattr(kind, "__forward_arg__", str(kind))
+
+
+def _members(value: type) -> Iterator[tuple[str, Any]]:
+    """Public functions and properties by name, in the order in which classes declare them, the nearest class first."""
+    seen: set[str] = set()
+    for cls in value.__mro__:
+        if not cls.__module__.startswith("gsstream"):
+            continue
+        for name, member in vars(cls).items():
+            known = isinstance(member, property | staticmethod | classmethod) or inspect.isfunction(member)
+            if known and not name.startswith("_") and name not in seen:
+                seen.add(name)
+                yield name, member
 
 
 def cli() -> str:
@@ -110,7 +160,27 @@ def checks() -> str:
                 meaning = entry.meaning.replace("|", chr(92) + "|")
                 lines.append(f"| `{entry.name}` | {meaning} | {claim} | {saboteur_of(entry.name)} |")
         lines.append("")
-    return "\n".join(lines)
+    lines += ["## Not checked here, and why", "", "| property | why not here |", "|---|---|"]
+    lines += [f"| {what} | {why} |" for what, why in ELSEWHERE.items()]
+    return "\n".join([*lines, ""])
+
+
+#: What a reader may miss among the checks.
+ELSEWHERE = {
+    "a structure's time grows with N, not faster": "no check judges by a clock, and shared machines have poor ones",
+    "memory returns after an estimate": "`check_confidence_leaves_no_trace` refuses what would hold it, a graph",
+    "outputs stay on a GPU": "checks run on the CPU, where every result can be compared bit by bit; a GPU renderer "
+    "brings its own suite (`plugins/gsplat_render/tests`)",
+    "a gate's noise at the ends of the generator's range": "a generator cannot be made to return them; 65,536 draws "
+    "must be finite (`check_gate_noise_is_data`)",
+    "no drift over many frames": "minutes, not seconds: `tests/flow/test_closed_loop.py`, and 300 frames in "
+    "docs/results-stream.md; the kit compares three frames bit by bit",
+    "resume in another process, after a kill": "`tests/flow/test_repeat_and_resume.py`; the kit resumes from the "
+    "stream alone, so a process has nothing to add",
+    "files cut, torn or lying about themselves": "`tests/packet`; the kit damages packets",
+    "quality and size within a stored band": "numbers belong to a machine and a date: docs/results.md",
+    "a metric": "metrics are functions, not parts; each is held against an independent implementation in `tests/unit`",
+}
 
 
 def hooks() -> str:
@@ -153,7 +223,8 @@ def hooks() -> str:
 
 
 def _signature(name: str, function: Any) -> str:
-    return f"{name}{inspect.signature(function)}".replace("'", "")
+    # Annotations are text already: their quotes say nothing, those of defaults do.
+    return name + re.sub(r"(: |-> )([\"'])(.*?)\2", r"\1\3", str(inspect.signature(function)))
 
 
 def _named(target: str) -> Any:

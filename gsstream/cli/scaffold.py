@@ -21,7 +21,20 @@ class PartKind(StrEnum):
     propagation = "propagation"
     gate = "gate"
     regularizer = "regularizer"
+    update = "update"
     whole = "whole"
+    renderer = "renderer"
+    loss = "loss"
+    source = "source"
+
+
+#: How a run uses a part of a kind that is no slot of its own name.
+USED_BY: Mapping[str, str] = {
+    "renderer": "--renderer <name> --source demo", "loss": "--set loss.backend=<name> --source demo",
+    "source": "--source <name>:",
+}  # fmt: skip
+#: What the contract test checks: a part, or of a source the recording that it opens.
+SUBJECTS: Mapping[str, str] = {"source": 'SourceUnderTest(<cls>, "<name>:")'}
 
 
 def new_plugin(
@@ -59,6 +72,10 @@ def files(name: str, kind: str) -> Mapping[str, str]:
     part = example.read_text(encoding="utf-8").replace(f"Example{kind.capitalize()}", cls)
     summary = part.splitlines()[0].strip('"')
     values = {"name": name, "kind": kind, "package": package, "cls": cls, "summary": summary, "module": kind}
+    values["use"] = _fill(USED_BY.get(kind, "--set <kind>=<name> --source demo"), values)
+    values["subject"] = _fill(SUBJECTS.get(kind, "<cls>()"), values)
+    values["kit"] = ", ".join([*(["SourceUnderTest"] if kind in SUBJECTS else []), "parametrize_with_checks"])
+    values["claims"] = CLAIMS.get(kind, CLAIMS[""])
     values["api"] = gsstream.API_VERSION  # stated, so that a later gsstream knows what it was written for
     texts = {path: _fill(text, values) for path, text in TEMPLATES.items()}
     return {
@@ -71,6 +88,11 @@ def _fill(text: str, values: Mapping[str, str]) -> str:
     return re.sub(r"<(\w+)>", lambda match: values[match[1]], text)
 
 
+#: What the README says about checks, by kind.
+CLAIMS: Mapping[str, str] = {
+    "": "A claim in `traits` is a promise that is checked;\nwhat is not claimed is skipped.",
+    "source": "Another recording:\n`gsstream check source/NAME --source NAME:PLACE`.",
+}
 TEMPLATES: Mapping[str, str] = {
     "pyproject.toml": """\
 [build-system]
@@ -105,12 +127,11 @@ One part for gsstream: the <kind> `<name>`.
 pip install -e .
 gsstream check <kind>/<name>
 gsstream plugins show <kind>/<name>
-gsstream run --method dense --set <kind>=<name> --source demo --out run/
+gsstream run --method dense <use> --out run/
 ```
 
 The part is in `src/<package>/<module>.py`. Change it and its docstring, and check again:
-`gsstream check <kind>/<name>`, or `pytest` for one test per check. A claim in `traits` is a promise that is checked;
-what is not claimed is skipped.
+`gsstream check <kind>/<name>`, or `pytest` for one test per check. <claims>
 """,
     "src/<package>/__init__.py": '"""<summary> Importing this package imports no torch."""\n',
     "src/<package>/plugin.py": '''\
@@ -138,10 +159,10 @@ def gsstream_components() -> list[ComponentSpec]:
 
 from <package>.<module> import <cls>
 
-from gsstream.testing import parametrize_with_checks
+from gsstream.testing import <kit>
 
 
-@parametrize_with_checks([<cls>()])
+@parametrize_with_checks([<subject>])
 def test_contract(check) -> None:
     check()
 ''',

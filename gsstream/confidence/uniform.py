@@ -20,7 +20,7 @@ class Uniform(ConfidenceEstimator):
         logit: float = Field(default=0.0, ge=-50, le=50, description="logit of the confidence, -50 to 50; 0 is p = 0.5")
 
     def claims(self) -> Traits:
-        return Traits(floor=self.config.logit)
+        return Traits(floor=self.config.logit, brightness=self.config.logit)
 
     def estimate(self, context: FrameContext) -> torch.Tensor:
         return torch.full((len(context.gaussians),), float(self.config.logit))

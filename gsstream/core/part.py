@@ -32,9 +32,12 @@ class Traits:
         needs_renderer: (confidence) asks the context for screen gradients.
         reduction: (regularizer) "mean" or "sum" over Gaussians.
         weights: (regularizer) settings that its terms are proportional to.
+        gate_terms: (regularizer) terms that price gates alone: no residual changes them.
         floor: (confidence) largest logit of a Gaussian that nobody sees, or of a scene that stands still.
         finds_motion: (confidence) ranks what moved above what did not.
         monotone_in_change: (confidence) a stronger change never makes what changed less suspect.
+        brightness: (confidence) largest mean logit of a still scene that becomes brighter by a fiftieth of full scale;
+            None: no promise.
         normalised: (propagation) keeps the scale: constants stay constant, the flat structure changes nothing.
         parent_bound: (propagation) no node is less suspect than its children.
         local: (structure) the members of a node lie within one root cell of each other, along every axis.
@@ -49,9 +52,11 @@ class Traits:
     needs_renderer: bool = False
     reduction: str = "mean"
     weights: tuple[str, ...] = ()
+    gate_terms: tuple[str, ...] = ()
     floor: float = 0.0
     finds_motion: bool = False
     monotone_in_change: bool = False
+    brightness: float | None = None
     normalised: bool = False
     parent_bound: bool = False
     local: bool = False

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsstream.core.cameras import Cameras
 from gsstream.core.delta import Layout
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
@@ -38,6 +39,7 @@ def begin(
         meta: what the key packet says about the run; the exposure fit is added to it.
     """
     refuse_pending(parts)
+    check_cameras(frame.cameras, 1, "a frame")
     clock = [time.perf_counter()]
     with guarded("structure", parts.structure, frame.index):
         anchors = parts.structure.seed(points, frame.cameras)
@@ -63,6 +65,15 @@ def begin(
         "seconds": dict(zip(("seed", "optimise", "code"), np.diff(clock).tolist(), strict=True)),
     }
     return Step(state, packet, "key", metrics)
+
+
+def check_cameras(cameras: Cameras, least: int, who: str) -> None:
+    """Raise InputError when there are fewer training cameras than somebody needs."""
+    if len(cameras) < least:
+        raise InputError(
+            f"{who} needs at least {least} training camera{'s'[: least != 1]}, got {len(cameras)}; record with "
+            "more, or choose another method"
+        )
 
 
 def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:

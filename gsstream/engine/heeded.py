@@ -12,8 +12,8 @@ from gsstream.recipe.model import Recipe
 #: Keys that only the five-part path reads.
 PART_SLOTS = ("structure", "confidence", "propagation", "gate", "regularizer", "update")
 PART_SECTIONS = ("stream", "gate_training", "codec", "insertion", "budget")
-#: Of those sections, what the session reads for every method.
-SESSION_KEYS = ("codec.fsync", "budget.memory")
+#: Of those sections, what the engine itself reads for every method.
+SESSION_KEYS = ("codec.fsync", "budget.memory", "stream.on_error")
 
 
 def unheeded(recipe: Recipe, whole: StreamingMethod[Any], parts: Mapping[str, Any]) -> Iterator[KeyPath]:

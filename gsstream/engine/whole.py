@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,14 +13,16 @@ import numpy as np
 import torch
 
 from gsstream.core.delta import row_gates
+from gsstream.core.errors import ComponentError, ShapeError
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.engine.assemble import Assembly
-from gsstream.engine.begin import begin, begin_from, exposure_from_meta
+from gsstream.engine.begin import begin, begin_from, check_cameras, exposure_from_meta
 from gsstream.engine.checks import StepChecks
 from gsstream.engine.context import StepContext
+from gsstream.engine.frame_step import RepeatedFrameWarning
 from gsstream.engine.guard import fault, guarded
 from gsstream.engine.points import gather_points, with_test_views
 from gsstream.engine.resume import check_stream, replay
@@ -108,13 +111,34 @@ class OpenFrame(StepContext):
 
 
 def begin_whole(method: StreamingMethod[Any], tools: WholeTools, frame: Frame) -> Step[Any]:
-    """Frame 0 of a whole method, held to its contract."""
+    """Frame 0 of a whole method, held to its contract. Raises InputError with fewer cameras than it needs."""
+    check_cameras(frame.cameras, method.least_cameras, f"the method {type(method).__name__!r}")
     with guarded("whole", method, frame.index):
         return _held(method, None, frame, lambda: method.begin(frame, tools))
 
 
 def step_whole(method: StreamingMethod[Any], tools: WholeTools, state: MethodState, frame: Frame) -> Step[Any]:
-    """A later frame of a whole method, held to its contract."""
+    """A later frame of a whole method, held to its contract.
+
+    Raises ComponentError when the method fails, unless the recipe says ``stream.on_error: repeat``: then the method is
+    asked for the same frame as one that is worth nothing, which it has to answer by an empty packet.
+    """
+    started = time.perf_counter()
+    try:
+        return _step(method, tools, state, frame)
+    except (ComponentError, ShapeError) as error:
+        if tools.parts.recipe.stream.on_error == "raise":
+            raise
+        lost = time.perf_counter() - started
+        step = _step(method, tools, state, replace(frame, effort=0.0))
+        if step.status != "empty":
+            raise  # it does not keep its contract: what it sends instead cannot be trusted either
+        warnings.warn(f"frame {frame.index} repeats the one before it: {error}", RepeatedFrameWarning, stacklevel=2)
+        seconds = {**step.metrics["seconds"], "failed": lost}
+        return replace(step, metrics={**step.metrics, "seconds": seconds, "error": str(error)})
+
+
+def _step(method: StreamingMethod[Any], tools: WholeTools, state: MethodState, frame: Frame) -> Step[Any]:
     with guarded("whole", method, frame.index):
         return _held(method, state.player, frame, lambda: method.step(state, frame, tools))
 

@@ -58,10 +58,12 @@ class StreamingMethod(Part, Generic[State]):
 
     ``heeds`` names the recipe keys that this method reads besides what the engine itself does (frame 0, loss, renderer,
     recording, packets), for example ``("stream.epochs",)``. A run that changes a key of the five parts or of later
-    frames that is not listed here is refused: no option falls through.
+    frames that is not listed here is refused: no option falls through. ``least_cameras`` is how many training
+    cameras it needs: a recording with fewer is refused before anything is reconstructed.
     """
 
     heeds: ClassVar[tuple[str, ...]] = ()
+    least_cameras: ClassVar[int] = 1
 
     @abstractmethod
     def begin(self, frame: Frame, tools: Tools) -> Step[State]:
@@ -75,7 +77,8 @@ class StreamingMethod(Part, Generic[State]):
 
         ``state.player`` of the result must be ``decoder()(before.player, packet.data)``, bit for bit: the method goes
         on from what it sent, not from what it trained. The engine decodes every packet and compares. A frame whose
-        ``effort`` is 0 is skipped: an empty packet, so that numbering and time go on.
+        ``effort`` is 0 is skipped: an empty packet, so that numbering and time go on; also one that failed, where the
+        recipe says ``stream.on_error: repeat``.
         """
 
     @abstractmethod

@@ -12,3 +12,4 @@ from gsstream.testing.cases import world as world
 from gsstream.testing.kit import CheckResult as CheckResult
 from gsstream.testing.kit import parametrize_with_checks as parametrize_with_checks
 from gsstream.testing.kit import run_checks as run_checks
+from gsstream.testing.recording import SourceUnderTest as SourceUnderTest

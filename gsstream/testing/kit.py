@@ -9,23 +9,32 @@ from typing import Any, Literal
 
 from gsstream.core.part import Part
 from gsstream.method.base import StreamingMethod
+from gsstream.testing import stepping
 from gsstream.testing.checks import (
     auto,
     common,
     confidence,
     gate,
+    loss,
     method,
+    optimiser,
     packet,
     propagation,
     regularizer,
     renderer,
+    source,
     structure,
+    update,
 )
-from gsstream.testing.registry import BEHAVED, CHECKS, Check, Skip, checks_for, kind_of
+from gsstream.testing.recording import SourceUnderTest
+from gsstream.testing.registry import CHECKS, Check, Skip, checks_for, kind_of
 
 Status = Literal["passed", "failed", "expected failure", "skipped"]
 #: Importing these modules fills the registry; the order is that of the reports.
-MODULES = (common, auto, structure, confidence, propagation, gate, regularizer, renderer, method, packet)
+MODULES = (
+    common, auto, structure, confidence, propagation, gate, regularizer, update, renderer, loss, optimiser, source,
+    method, packet,
+)  # fmt: skip
 LEAST_REASON = 20
 
 
@@ -47,10 +56,10 @@ class CheckResult:
 def run_check(entry: Check, subject: Any, expected: str | None = None) -> CheckResult:
     """Make one check; whatever the part raises is a failure with its name."""
     name = repr(subject)
-    if entry.trait is not None and not getattr(subject.claims(), entry.trait):
+    if entry.trait is not None and not claimed(subject, entry.trait):
         return CheckResult(entry.name, name, "skipped", f"not claimed: Traits.{entry.trait}")
     if entry.kind == "method" and isinstance(subject, StreamingMethod):
-        subject = method.around(subject)
+        subject = stepping.around(subject)
     try:
         entry.function(subject)
     except Skip as reason:
@@ -66,7 +75,13 @@ def run_check(entry: Check, subject: Any, expected: str | None = None) -> CheckR
     return CheckResult(entry.name, name, "passed")
 
 
-def run_checks(part: Part, expected_failures: Mapping[str, str] | None = None) -> list[CheckResult]:
+def claimed(subject: Any, trait: str) -> bool:
+    """Whether a part claims a trait; a claim may be a number, and that number 0."""
+    value = getattr(subject.claims(), trait)
+    return value is not None and value is not False and value != ()
+
+
+def run_checks(part: Part | SourceUnderTest, expected_failures: Mapping[str, str] | None = None) -> list[CheckResult]:
     """Make every check of the part's kind.
 
     Arguments:
@@ -84,7 +99,7 @@ def run_method_checks(name: str, expected_failures: Mapping[str, str] | None = N
 
     Raises RecipeError, UnknownName or PluginUnavailable when it cannot be assembled.
     """
-    return run_subject("method", method.MethodUnderTest(name), dict(expected_failures or {}))
+    return run_subject("method", stepping.MethodUnderTest(name), dict(expected_failures or {}))
 
 
 def run_packet_checks(codec: packet.PacketCodec | None = None) -> list[CheckResult]:
@@ -101,7 +116,7 @@ def run_subject(kind: str, subject: Any, expected: Mapping[str, str] | None = No
 
 
 def parametrize_with_checks(
-    parts: Sequence[Part], expected_failures: Mapping[str, str] | None = None
+    parts: Sequence[Part | SourceUnderTest], expected_failures: Mapping[str, str] | None = None
 ) -> Callable[[Callable[..., Any]], Any]:
     """Decorate ``def test_contract(check): check()`` to make every check on every part, one test each.
 
@@ -121,7 +136,7 @@ def parametrize_with_checks(
     return pytest.mark.parametrize("check", cases)
 
 
-def _as_test(entry: Check, part: Part, expected: str | None) -> None:
+def _as_test(entry: Check, part: Part | SourceUnderTest, expected: str | None) -> None:
     import pytest
 
     result = run_check(entry, part, expected)
@@ -153,7 +168,3 @@ def summary(results: Sequence[CheckResult]) -> str:
     counts = {status: sum(result.status == status for result in results) for status in order}
     return ", ".join(f"{number} {status}" for status, number in counts.items() if number)
 
-
-def behaviour_known(part: Part) -> bool:
-    """Whether the kit checks more of this kind than settings, freezing and declaration."""
-    return kind_of(part) in (*BEHAVED, "renderer", "whole")

@@ -17,6 +17,8 @@ from gsstream.regularizer.base import Regularizer
 from gsstream.render.base import Renderer
 from gsstream.residual.base import UpdateRule
 from gsstream.structure.base import Structure
+from gsstream.testing.recording import Skip as Skip
+from gsstream.testing.recording import SourceUnderTest
 
 CONTRACTS: dict[str, type[Part]] = {
     "structure": Structure,
@@ -36,17 +38,13 @@ BEHAVED = ("structure", "confidence", "propagation", "gate", "regularizer")
 CheckFunction = TypeVar("CheckFunction", bound=Callable[..., None])
 
 
-class Skip(Exception):
-    """Raised by a check that cannot be made here; the message says why. Skips are reported and counted."""
-
-
 @dataclass(frozen=True, slots=True)
 class Check:
     """One property.
 
     Arguments:
         name: name of the function; stable, because expected failures are given by it.
-        kind: "common", a kind of part, "method" or "packet".
+        kind: "common", a kind of part, "source", "method" or "packet".
         kinds: kinds of part it is made on.
         trait: the claim (a field of ``Traits``) that calls for it; None: every part of these kinds.
         function: raises AssertionError with numbers.
@@ -79,8 +77,10 @@ def check(kind: str, trait: str | None = None, kinds: tuple[str, ...] | None = N
     return register
 
 
-def kind_of(part: Part) -> str:
+def kind_of(part: Part | SourceUnderTest) -> str:
     """The kind whose abstract base class ``part`` implements. Raises TypeError when it is none of them."""
+    if isinstance(part, SourceUnderTest):
+        return "source"
     for kind, contract in CONTRACTS.items():
         if isinstance(part, contract):
             return kind

@@ -55,7 +55,7 @@ OPTIONS = {
         "--first-frame", "--workers", "--quiet",
     ],
     "gsstream report": ["FOLDER", "--out", "--data", "--sheets"],
-    "gsstream check": ["NAME", "--quiet"],
+    "gsstream check": ["NAME", "--quiet", "--source"],
     "gsstream new-plugin": ["NAME", "--kind", "--out"],
     "gsstream bench": [],
     "gsstream bench render": [

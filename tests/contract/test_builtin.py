@@ -15,13 +15,17 @@ from gsstream.propagation.group_max import GroupMax
 from gsstream.regularizer.none import NoRegularizer
 from gsstream.render.reference import ReferenceRenderer
 from gsstream.residual.additive import Additive
+from gsstream.source.open import open_source
 from gsstream.structure.flat import Flat
-from gsstream.testing import parametrize_with_checks, run_checks
+from gsstream.testing import SourceUnderTest, parametrize_with_checks, run_checks
 from gsstream.testing.examples.confidence import ExampleConfidence
 from gsstream.testing.examples.gate import ExampleGate
+from gsstream.testing.examples.loss import ExampleLoss
 from gsstream.testing.examples.propagation import ExamplePropagation
 from gsstream.testing.examples.regularizer import ExampleRegularizer
+from gsstream.testing.examples.source import ExampleSource
 from gsstream.testing.examples.structure import ExampleStructure
+from gsstream.testing.examples.update import ExampleUpdate
 from gsstream.testing.examples.whole import ExampleWhole
 from gsstream.testing.kit import all_checks, summary
 
@@ -30,10 +34,13 @@ BUILTIN = [
     ReferenceRenderer(), ReferenceLoss(), ReferenceAdam(), Hold(),
 ]  # fmt: skip
 EXAMPLES = [ExampleStructure(), ExampleConfidence(), ExamplePropagation(), ExampleGate(), ExampleRegularizer()]
-EXAMPLES += [ExampleWhole()]
+EXAMPLES += [ExampleWhole(), ExampleUpdate(), ExampleLoss()]
+TINY = "synthetic:frames=4&views=3&width=32&height=24&supersample=1"
+SOURCES = [SourceUnderTest(ExampleSource, "square:"), SourceUnderTest(open_source, "demo")]
+SOURCES += [SourceUnderTest(open_source, TINY)]
 
 
-@parametrize_with_checks([*BUILTIN, *EXAMPLES])
+@parametrize_with_checks([*BUILTIN, *EXAMPLES, *SOURCES])
 def test_contract(check) -> None:
     check()
 
@@ -47,7 +54,8 @@ def test_every_part_that_is_declared_is_checked_here() -> None:
 
 
 def test_examples_claim_enough_for_every_check_of_the_five_kinds_to_run() -> None:
-    skipped = {r.check: r.message for part in EXAMPLES for r in run_checks(part) if r.status == "skipped"}
+    results = [result for part in [*EXAMPLES, SOURCES[0]] for result in run_checks(part)]
+    skipped = {result.check: result.message for result in results if result.status == "skipped"}
     assert set(skipped) == {"check_cheap_spec"}, skipped
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from gsstream.testing.checks.method import MethodUnderTest
 from gsstream.testing.kit import CheckResult, all_checks, run_checks, run_method_checks, run_packet_checks, run_subject
 from gsstream.testing.saboteurs import INSTALLED, METHOD_SABOTEURS, PACKET_SABOTEURS, SABOTEURS, saboteur_of
+from gsstream.testing.stepping import MethodUnderTest
 
 
 def failed(results: list[CheckResult]) -> dict[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from gsstream.core.delta import Delta
 from gsstream.core.errors import ComponentError, RecipeError
 from gsstream.engine.assemble import assemble
 from gsstream.engine.exposure import Exposure
+from gsstream.engine.frame_step import RepeatedFrameWarning
 from gsstream.method.base import StreamingMethod
 from gsstream.method.hold import Hold, HoldState
 from gsstream.method.packets import send_delta
@@ -23,7 +25,10 @@ from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe
 from gsstream.source.open import open_source
-from gsstream.testing.checks.method import SOURCE, MethodUnderTest
+from gsstream.testing.examples.whole import ExampleWhole
+from gsstream.testing.stepping import SOURCE, MethodUnderTest
+
+Follow: Any = ExampleWhole  # final: only what is wrong on purpose may inherit from it
 
 RUN = [
     "run", "--source", SOURCE, "--method", "hold", "--quiet", "--no-video", "--set", "first_frame.max_iterations=5",
@@ -111,6 +116,79 @@ def test_what_a_method_raises_is_reported_with_its_name() -> None:
     start = subject.begin(open_source(SOURCE).frame(0))
     with pytest.raises(ComponentError, match=r"whole 'Wrong' .* failed at frame 1: RuntimeError: out of ideas"):
         subject.step(start.state, open_source(SOURCE).frame(1))
+
+
+def repeating(subject: MethodUnderTest) -> MethodUnderTest:
+    recipe = subject.parts.recipe
+    stream = recipe.stream.model_copy(update={"on_error": "repeat"})
+    subject.parts = replace(subject.parts, recipe=recipe.model_copy(update={"stream": stream}))
+    return subject
+
+
+class FailsAt1(Follow):  # type: ignore[misc]  # wrong on purpose
+    """Follows the light, and fails at frame 1 unless it is worth nothing."""
+
+    def step(self, state, frame, tools):
+        if frame.index == 1 and frame.effort > 0:
+            raise RuntimeError("out of ideas")
+        return super().step(state, frame, tools)
+
+
+def test_a_failed_frame_is_repeated_when_the_recipe_says_so() -> None:
+    subject = repeating(MethodUnderTest("dense", FailsAt1()))
+    source = open_source(SOURCE)
+    start = subject.begin(source.frame(0))
+    with pytest.warns(RepeatedFrameWarning, match=r"frame 1 repeats .* 'FailsAt1' .* RuntimeError: out of ideas"):
+        failed = subject.step(start.state, source.frame(1))
+    assert failed.status == "empty"
+    assert failed.packet.kind == PacketKind.EMPTY
+    assert "out of ideas" in failed.metrics["error"]
+    assert failed.metrics["seconds"]["failed"] > 0
+    for name, value in failed.state.player.gaussians.items():
+        assert np.array_equal(value, getattr(start.state.player.gaussians, name))
+    after = subject.step(failed.state, source.frame(2))
+    assert (after.packet.frame, after.status) == (2, "delta")
+    assert "error" not in after.metrics
+
+
+def test_a_method_that_cannot_skip_either_ends_the_run() -> None:
+    def busy(step):
+        raise RuntimeError("out of ideas")
+
+    subject = repeating(MethodUnderTest("dense", spoilt(busy)))
+    start = subject.begin(open_source(SOURCE).frame(0))
+    with pytest.raises(ComponentError, match="out of ideas"):
+        subject.step(start.state, open_source(SOURCE).frame(1))
+
+
+def test_what_is_sent_in_place_of_a_failed_frame_must_be_empty() -> None:
+    class Stubborn(Follow):
+        def step(self, state, frame, tools):
+            if frame.effort > 0:
+                raise RuntimeError("out of ideas")
+            return super().step(state, replace(frame, effort=1.0), tools)
+
+    subject = repeating(MethodUnderTest("dense", Stubborn()))
+    start = subject.begin(open_source(SOURCE).frame(0))
+    with pytest.raises(ComponentError, match="out of ideas"):
+        subject.step(start.state, open_source(SOURCE).frame(1))
+
+
+def test_a_run_repeats_failed_frames_of_a_whole_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hold = Hold.step
+
+    def fails(self, state, frame, tools):
+        if frame.index == 2 and frame.effort > 0:
+            raise RuntimeError("out of ideas")
+        return hold(self, state, frame, tools)
+
+    monkeypatch.setattr(Hold, "step", fails)
+    assert run_command([*RUN, "--out", str(tmp_path / "raise")]) == 1
+    assert run_command([*RUN, "--set", "stream.on_error=repeat", "--out", str(tmp_path / "repeat")]) == 0
+    lines = (tmp_path / "repeat" / "metrics.jsonl").read_text().splitlines()
+    assert ['"error"' in line for line in lines] == [False, False, True, False]
+    with Playback(tmp_path / "repeat" / "stream.gss") as playing:
+        assert list(playing.frames) == [0, 1, 2, 3]
 
 
 def refusal(*sets: str, method: str = "hold") -> list[str]:

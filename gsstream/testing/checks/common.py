@@ -24,6 +24,7 @@ from gsstream.core.part import Part
 from gsstream.testing.cases import fingerprint, world
 from gsstream.testing.compare import ROUNDING, all_equal, finite
 from gsstream.testing.drive import draw, outputs
+from gsstream.testing.recording import SourceUnderTest
 from gsstream.testing.registry import BEHAVED, CONTRACTS, Skip, check, kind_of
 
 ALL = tuple(CONTRACTS)
@@ -82,10 +83,10 @@ def check_docstring(part: Part) -> None:
     )
 
 
-@check("common", kinds=ALL)
-def check_cheap_spec(part: Part) -> None:
+@check("common", kinds=(*ALL, "source"))
+def check_cheap_spec(part: Part | SourceUnderTest) -> None:
     """The plugin that declares the part imports without torch, and its target is this class."""
-    cls = type(part)
+    cls: Any = part.target if isinstance(part, SourceUnderTest) else type(part)
     target = f"{cls.__module__}:{cls.__name__}"
     from gsstream.plugins.catalog import load_catalog
 

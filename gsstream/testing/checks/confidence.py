@@ -103,3 +103,19 @@ def check_confidence_extreme_images(part: ConfidenceEstimator) -> None:
     black, white = (tuple(torch.full_like(i, value) for i in case.now) for value in (0.0, 1.0))
     finite("black to white", part.estimate(replace(case, before=black, now=white)))
     finite("a change of 1e-6", part.estimate(case.blended(1e-6)))
+
+
+#: A fiftieth of full scale: five levels of 8 bits, what an automatic exposure does between two frames.
+EXPOSURE = 0.02
+
+
+@check("confidence", trait="brightness")
+def check_confidence_brightness(part: ConfidenceEstimator) -> None:
+    """When a still scene becomes brighter as a whole, the mean logit stays within the declared bound."""
+    case = world("static")
+    brighter = tuple((image + EXPOSURE).clamp(max=1.0) for image in case.before)
+    got = part.estimate(replace(case, now=brighter)).double().mean()
+    finite("brighter by a fiftieth", got)
+    bound = part.claims().brightness
+    assert bound is not None
+    at_most("mean logit of a scene that is brighter by a fiftieth", got, bound, 1e-4, "float32 of the declared bound")

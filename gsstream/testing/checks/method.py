@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 import tempfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,125 +10,18 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray, check_finite
-from gsstream.engine.assemble import Assembly, assemble
-from gsstream.engine.begin import begin, begin_from
-from gsstream.engine.frame_step import frame_step
-from gsstream.engine.points import gather_points
-from gsstream.engine.resume import resume_state
-from gsstream.engine.whole import WholeTools, begin_whole, resume_whole, step_whole
-from gsstream.method.base import Step, StreamingMethod
-from gsstream.packet import PlayerState, StreamMeta, StreamWriter, decode_packet, quantise_key
-from gsstream.plugins.catalog import load_catalog
-from gsstream.recipe.load import resolve_recipe
-from gsstream.recipe.model import ComponentRef
+from gsstream.method.base import Step
+from gsstream.packet import PlayerState, StreamWriter, quantise_key
 from gsstream.source.open import open_source
 from gsstream.testing.cases import fingerprint
 from gsstream.testing.registry import check
+from gsstream.testing.stepping import FRAMES, SOURCE, MethodUnderTest
 
-SOURCE = "synthetic:frames=4&views=3&width=32&height=24&supersample=1"
-TINY = (
-    "first_frame.max_iterations=8", "first_frame.max_points=200", "first_frame.fill_points=0", "stream.epochs=1",
-    "first_frame.points=recording",
-)  # fmt: skip
-FRAMES = 3
 CUT = 2
-
-
-class MethodUnderTest:
-    """A method, made of parts or whole, with a tiny budget; frames are stepped in memory. Saboteurs override one call.
-    """
-
-    def __init__(self, name: str, whole: StreamingMethod[Any] | None = None) -> None:
-        """Method ``name``; or a whole method under its recipe."""
-        self.name = name
-        catalog = load_catalog()
-        overrides = [("the contract kit", text) for text in TINY]
-        recipe = resolve_recipe(name, catalog.recipe_path, (), overrides).recipe
-        if recipe.whole.name != "none":
-            heeds = catalog.resolve("whole", recipe.whole.name).heeds
-            overrides = [item for item in overrides if not item[1].startswith("stream.") or _key(item[1]) in heeds]
-        self.parts: Assembly = assemble(resolve_recipe(name, catalog.recipe_path, (), overrides), catalog)
-        if whole is not None:
-            ref = ComponentRef(name="under-test", params=whole.config.model_dump(mode="json"))
-            self.parts = replace(self.parts, whole=whole, recipe=self.parts.recipe.model_copy(update={"whole": ref}))
-        self.seed = self.parts.recipe.seed
-
-    def __repr__(self) -> str:
-        return f"method {self.name}"
-
-    def tools(self, uri: str = SOURCE, first: PlayerState | None = None) -> WholeTools:
-        """What the engine lends a whole method."""
-        source = open_source(uri)
-        info, recipe = source.info, self.parts.recipe
-
-        def meta(frame: Frame) -> StreamMeta:
-            return StreamMeta(
-                recipe.method, info.name, recipe.model_dump(mode="json"), frame.cameras, info.test, info.fps,
-                recipe.background, {},
-            )  # fmt: skip
-
-        return WholeTools(self.parts, source, Rng(self.seed), info.train.near, meta, first)
-
-    def begin(self, frame: Frame, uri: str = SOURCE) -> Step[Any]:
-        """Frame 0."""
-        tools = self.tools(uri)
-        if self.parts.whole is not None:
-            return begin_whole(self.parts.whole, tools, frame)
-        points = gather_points(tools.source, frame, self.parts.recipe.first_frame, tools.rng)
-        return begin(self.parts, points, frame, tools.meta(frame), tools.rng, lambda *_: None)
-
-    def take_over(self, first: PlayerState, frame: Frame) -> Step[Any]:
-        """Frame 0 of another stream."""
-        tools = self.tools(first=first)
-        if self.parts.whole is not None:
-            return begin_whole(self.parts.whole, tools, frame)
-        return begin_from(self.parts, first, frame, tools.meta(frame), tools.rng)
-
-    def step(self, state: Any, frame: Frame) -> Step[Any]:
-        """A later frame."""
-        if self.parts.whole is not None:
-            return step_whole(self.parts.whole, self.tools(), state, frame)
-        return frame_step(self.parts, state, frame, Rng(self.seed))
-
-    def resume(self, stream: Path) -> Any:
-        """The encoder's state after the last packet of a stream."""
-        tools = self.tools()
-        if self.parts.whole is not None:
-            return resume_whole(self.parts.whole, tools, stream)
-        return resume_state(self.parts, stream, tools.source, tools.rng, tools.near)
-
-    def play(self, state: PlayerState | None, data: bytes) -> PlayerState:
-        """What a player does with a packet."""
-        return decode_packet(state, data)
-
-    def chain(self, uri: str = SOURCE, choose: Callable[[Frame], Frame] | None = None) -> list[Step[Any]]:
-        """All frames of a recording."""
-        source = open_source(uri)
-        frames = [source.frame(index) for index in range(FRAMES)]
-        frames = [choose(frame) for frame in frames] if choose else frames
-        steps = [self.begin(frames[0], uri)]
-        for frame in frames[1:]:
-            steps.append(self.step(steps[-1].state, frame))
-        return steps
-
-    @functools.cached_property
-    def steps(self) -> list[Step[Any]]:
-        """The chain that most checks look at, encoded once."""
-        return self.chain()
-
-
-@functools.lru_cache(maxsize=8)
-def around(whole: StreamingMethod[Any]) -> MethodUnderTest:
-    """A whole method as the subject of the checks of methods; its chain is encoded once."""
-    return MethodUnderTest("dense", whole)
-
-
-def _key(override: str) -> str:
-    return override.partition("=")[0]
 
 
 def _bytes(what: str, got: Step[Any], expected: Step[Any]) -> None:
@@ -208,14 +99,26 @@ def check_method_static_video(method: MethodUnderTest) -> None:
 
 @check("method", kinds=("method", "whole"))
 def check_method_one_camera(method: MethodUnderTest) -> None:
-    """One camera is enough to run, and everything stays finite."""
-
-    def first_camera(frame: Frame) -> Frame:
-        return replace(frame, images=frame.images[:1], cameras=frame.cameras.select([0]))
-
-    for step in method.chain(choose=first_camera):
+    """One camera, or as many as it says it needs, are enough to run, and everything stays finite."""
+    for step in method.chain(choose=lambda frame: _with_cameras(frame, method.least_cameras)):
         for name, value in step.state.player.gaussians.items():
             check_finite(f"frame {step.packet.frame}: {name}", value)
+
+
+def _with_cameras(frame: Frame, number: int) -> Frame:
+    return replace(frame, images=frame.images[:number], cameras=frame.cameras.select(range(number)))
+
+
+@check("method", kinds=("method", "whole"))
+def check_method_declared_needs(method: MethodUnderTest) -> None:
+    """With one camera fewer than it says it needs, frame 0 is refused by an InputError that says how many."""
+    frame = _with_cameras(open_source(SOURCE).frame(0), method.least_cameras - 1)
+    try:
+        method.begin(frame)
+    except InputError as error:
+        assert str(method.least_cameras) in str(error), f"the error does not say how many cameras are needed: {error}"
+        return
+    raise AssertionError(f"started with {len(frame.cameras)} cameras; it says it needs {method.least_cameras}")
 
 
 @check("method", kinds=("method", "whole"))

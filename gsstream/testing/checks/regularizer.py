@@ -146,3 +146,13 @@ def check_regularizer_empty(part: Regularizer) -> None:
     none_active = part.penalty(_opened(scene), scene.residual[:0], scene.hierarchy.rows(slice(0, 0)), len(scene.logits))
     total = _total(none_active)
     equal("no active rows", total, torch.zeros_like(total))
+
+
+@check("regularizer", trait="gate_terms")
+def check_regularizer_uses_what_it_says(part: Regularizer) -> None:
+    """Terms said to price gates alone (Traits.gate_terms) do not depend on the residual."""
+    case = world("cloud")
+    still, moving = (_terms(part, case, None, factor * case.residual) for factor in (0.0, 1.0))
+    for name in part.claims().gate_terms:
+        assert name in moving, f"Traits.gate_terms names {name!r}; the terms are {', '.join(moving)}"
+        equal(f"term {name!r}, with and without motion", moving[name], still[name])

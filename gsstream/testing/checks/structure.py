@@ -197,3 +197,20 @@ def check_structure_seed(part: Structure) -> None:
     except InputError:
         return
     raise AssertionError("no points were accepted; expected InputError saying what to do")
+
+
+@check("structure", trait="local")
+def check_structure_translation(part: Structure) -> None:
+    """Moved by whole root cells, along any axis, the Gaussians are grouped as before."""
+    case = world("cloud")
+    # Binary fractions: moving by a cell is exact, so nothing may fall on the other side of a border.
+    means = torch.round(case.gaussians.means * 1024) / 1024
+    anchors = replace(case.anchors, cell_sizes=torch.tensor([0.5, 0.25]), origin=torch.tensor([-2.0, -2.0, -2.0]))
+    want: list[int] | None = None
+    for cells in ((0, 0, 0), (2, 0, 0), (1, 3, 2)):
+        moved = means + 0.5 * torch.tensor(cells, dtype=torch.float32)
+        forest = part.build(replace(case.gaussians, means=moved), replace(anchors, positions=moved))
+        got = canonical(forest.node_of)
+        want = want or got
+        apart = [row for row, (a, b) in enumerate(zip(got, want, strict=True)) if a != b]
+        assert not apart, f"moved by {cells} root cells: {len(apart)} of {len(got)} rows are grouped differently"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import final
 
 import torch
@@ -24,7 +25,8 @@ class ExampleConfidence(ConfidenceEstimator):
     traits = Traits(needs_renderer=True, finds_motion=True, monotone_in_change=True)
 
     def claims(self) -> Traits:
-        return Traits(needs_renderer=True, finds_motion=True, monotone_in_change=True, floor=self.config.floor)
+        # A share of the largest pull: an even change of light makes a few Gaussians suspect, never half of them.
+        return replace(self.traits, floor=self.config.floor, brightness=0.0)
 
     def estimate(self, context: FrameContext) -> torch.Tensor:
         pull = torch.zeros(len(context.gaussians), dtype=torch.float64)

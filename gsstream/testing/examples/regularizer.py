@@ -19,7 +19,7 @@ class ExampleRegularizer(Regularizer):
         gates: float = Field(default=0.01, ge=0, le=1e6, description="price of an open gate, loss units per Gaussian")
         motion: float = Field(default=0.01, ge=0, le=1e6, description="price of motion, loss units per squared cell")
 
-    traits = Traits(differentiable=True, reduction="mean", weights=("gates", "motion"))
+    traits = Traits(differentiable=True, reduction="mean", weights=("gates", "motion"), gate_terms=("gates",))
 
     def penalty(
         self, open_probability: torch.Tensor, residual: torch.Tensor, hierarchy: Hierarchy, num_gaussians: int

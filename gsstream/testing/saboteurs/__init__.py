@@ -5,9 +5,11 @@ from __future__ import annotations
 from gsstream.testing.saboteurs import common as common
 from gsstream.testing.saboteurs import confidence as confidence
 from gsstream.testing.saboteurs import gate as gate
+from gsstream.testing.saboteurs import native as native
 from gsstream.testing.saboteurs import propagation as propagation
 from gsstream.testing.saboteurs import regularizer as regularizer
 from gsstream.testing.saboteurs import renderer as renderer
+from gsstream.testing.saboteurs import source as source
 from gsstream.testing.saboteurs import structure as structure
 from gsstream.testing.saboteurs.method import METHOD_SABOTEURS as METHOD_SABOTEURS
 from gsstream.testing.saboteurs.packet import PACKET_SABOTEURS as PACKET_SABOTEURS

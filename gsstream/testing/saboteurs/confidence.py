@@ -100,3 +100,16 @@ class Dazzled(Confidence):
     def estimate(self, context: Any) -> torch.Tensor:
         logits: torch.Tensor = super().estimate(context)
         return torch.full_like(logits, torch.nan) if _largest_change(context) == 1.0 else logits
+
+
+@spoils("check_confidence_brightness")
+class Startled(Confidence):
+    """Sure about everything once the light changes by the same amount everywhere."""
+
+    def estimate(self, context: Any) -> torch.Tensor:
+        logits: torch.Tensor = super().estimate(context)
+        if len(context.cameras) == 0:
+            return logits
+        change = context.image(0) - context.previous_image(0)
+        even = float(change.min()) > 0.01 and float(change.max()) < 0.5
+        return logits + 9.0 * even

@@ -13,8 +13,9 @@ import torch
 from gsstream.core.frame import Frame
 from gsstream.method.base import Step
 from gsstream.packet import KeyState, PlayerState, decode_packet, encode_key
+from gsstream.source.open import open_source
 from gsstream.testing.cases import fingerprint
-from gsstream.testing.checks.method import FRAMES, SOURCE, MethodUnderTest
+from gsstream.testing.stepping import FRAMES, SOURCE, MethodUnderTest
 
 METHOD_SABOTEURS: dict[str, type[MethodUnderTest]] = {}
 
@@ -115,6 +116,14 @@ class Stereo(Remembered):
         if len(frame.cameras) < 2:
             raise ValueError("expected at least two cameras")
         return super().step(state, frame)
+
+
+@_spoils("check_method_declared_needs")
+class Optimist(Remembered):
+    """Starts without a camera, from what it has seen before."""
+
+    def begin(self, frame: Frame, uri: str = SOURCE) -> Step[Any]:
+        return super().begin(frame, uri) if len(frame.cameras) else super().begin(open_source(uri).frame(0), uri)
 
 
 @_spoils("check_method_size_is_true")

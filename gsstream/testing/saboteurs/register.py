@@ -6,10 +6,11 @@ from collections.abc import Callable
 from typing import Any, TypeVar, final
 
 from gsstream.core.part import Part
+from gsstream.testing.recording import SourceUnderTest
 
 Saboteur = TypeVar("Saboteur", bound=type)
 
-SABOTEURS: dict[str, type[Part]] = {}
+SABOTEURS: dict[str, Callable[[], Part | SourceUnderTest]] = {}
 
 
 def spoils(check: str, *, leave: bool = False) -> Callable[[Any], Any]:

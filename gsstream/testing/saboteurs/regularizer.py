@@ -98,3 +98,12 @@ class NoRows(Regularizer):
         terms: Terms = super().penalty(open_probability, residual, hierarchy, n)
         lost = torch.nan if n > 0 and len(residual) == 0 else 0.0
         return {**terms, "gates": terms["gates"] + lost}
+
+
+@spoils("check_regularizer_uses_what_it_says")
+class Exchanged(Regularizer):
+    """Two terms under each other's name."""
+
+    def penalty(self, open_probability: torch.Tensor, residual: torch.Tensor, hierarchy: Hierarchy, n: int) -> Terms:
+        terms: Terms = super().penalty(open_probability, residual, hierarchy, n)
+        return {"gates": terms["motion"], "motion": terms["gates"]}

@@ -132,3 +132,15 @@ class Growing(Structure):
     def seed(self, points: Any, cameras: Any) -> Anchors:
         anchors: Anchors = super().seed(points, cameras)
         return replace(anchors, cell_sizes=torch.cat([anchors.cell_sizes, 2 * anchors.cell_sizes]))
+
+
+@spoils("check_structure_translation")
+class Floating(Structure):
+    """The grid begins at a third of the farthest coordinate."""
+
+    def build(self, gaussians: Any, anchors: Anchors) -> Hierarchy:
+        shift = 0.0
+        if len(gaussians) > 100 and bool((anchors.origin == -2.0).all()):
+            shift = 0.3 * float(gaussians.means.detach().abs().max())
+        forest: Hierarchy = super().build(gaussians, replace(anchors, origin=anchors.origin + shift))
+        return forest

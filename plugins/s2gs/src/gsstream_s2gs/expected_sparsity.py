@@ -40,7 +40,9 @@ class ExpectedSparsity(Regularizer):
             description="squared-norm: ||delta o||^2 (paper); half-mean: half the mean over the axes (released code)",
         )
 
-    traits = Traits(differentiable=True, reduction="mean", weights=("lambda1", "lambda2"))
+    traits = Traits(
+        differentiable=True, reduction="mean", weights=("lambda1", "lambda2"), gate_terms=("sparsity",)
+    )
 
     def claims(self) -> Traits:
         return replace(self.traits, reduction=self.config.reduction)

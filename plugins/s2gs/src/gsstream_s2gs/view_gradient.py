@@ -93,7 +93,9 @@ class ViewSpaceGradient(ConfidenceEstimator):
     def claims(self) -> Traits:
         # Normalised by its own statistics, a change may look weaker as all others grow: the default is checked to rise.
         rises = self.config.normalisation == "robust"
-        return replace(self.traits, floor=self.config.floor, monotone_in_change=rises)
+        return replace(
+            self.traits, floor=self.config.floor, monotone_in_change=rises, brightness=1.0 if rises else None
+        )
 
     def estimate(self, context: FrameContext) -> torch.Tensor:
         """Logits [N] float32 in [-limit, limit]. Raises ShapeError when a gradient is not finite."""

@@ -1,0 +1,77 @@
+"""What an implementation of the loss promises: the value and the gradient of the reference."""
+
+from __future__ import annotations
+
+import torch
+
+from gsstream.loss.base import Loss
+from gsstream.loss.photometric import ReferenceLoss
+from gsstream.testing.cases import fingerprint
+from gsstream.testing.compare import at_most, equal, finite
+from gsstream.testing.registry import check
+
+#: Three tiles by three, the last ones cut.
+HEIGHT, WIDTH = 40, 44
+WHY = "sums of float32 in another order; relative to the largest"
+
+
+def _pair() -> tuple[torch.Tensor, torch.Tensor]:
+    """Image and target [H, W, 3] in [0, 1]; some pixels agree, some are flat."""
+    g = torch.Generator().manual_seed(1)
+    target = torch.rand(HEIGHT, WIDTH, 3, generator=g)
+    target[:12, :12] = 0.5
+    image = (target + 0.2 * torch.randn(target.shape, generator=g)).clamp(0, 1)
+    image[20:, 30:] = target[20:, 30:]
+    return image, target
+
+
+def _judge(part: Loss, dssim: float, mask: torch.Tensor | None = None) -> tuple[float, torch.Tensor]:
+    image, target = _pair()
+    return part.evaluate(image, part.prepare(target), dssim, mask)
+
+
+def _agrees(part: Loss, dssim: float, mask: torch.Tensor | None) -> None:
+    (value, gradient), (want, slope) = _judge(part, dssim, mask), _judge(ReferenceLoss(), dssim, mask)
+    off = abs(value - want)
+    assert off <= 1e-5, f"dssim {dssim}: expected a loss of {want:.7f}, got {value:.7f} (tolerance 1e-5: float32)"
+    scale = float(slope.abs().max()) or 1.0
+    equal(f"dssim {dssim}: gradient", gradient / scale, slope / scale, 2e-3, WHY)
+
+
+@check("loss")
+def check_loss_reference(part: Loss) -> None:
+    """Value and gradient are those of (1 - w) L1 + w (1 - SSIM) at w = 0, 0.2 and 1."""
+    for dssim in (0.0, 0.2, 1.0):
+        _agrees(part, dssim, None)
+
+
+@check("loss")
+def check_loss_mask(part: Loss) -> None:
+    """With a mask of tiles the sum runs over them and those beside; a full mask equals no mask; none is 0."""
+    one = torch.zeros(3, 3, dtype=torch.bool)
+    one[0, 0] = True
+    _agrees(part, 0.2, one)
+    (value, gradient), (full, whole) = _judge(part, 0.2), _judge(part, 0.2, torch.ones(3, 3, dtype=torch.bool))
+    assert abs(value - full) <= 1e-6, f"a full mask: expected {value:.7f} as without, got {full:.7f}"
+    equal("gradient with a full mask", whole, gradient, 1e-6, WHY)
+    nothing, still = _judge(part, 0.2, torch.zeros(3, 3, dtype=torch.bool))
+    assert nothing == 0.0, f"an empty mask: expected a loss of exactly 0, got {nothing!r}"
+    at_most("gradient with an empty mask", still.abs(), 0.0, 0.0, "no tile is judged")
+
+
+@check("loss")
+def check_loss_pure(part: Loss) -> None:
+    """Images come out as they went in, a prepared target serves again, and nothing hangs on a graph."""
+    image, target = _pair()
+    before = fingerprint((image, target))
+    prepared = part.prepare(target)
+    leaf = image.clone().requires_grad_()
+    first, gradient = part.evaluate(leaf, prepared, 0.2)
+    kept = gradient.clone()
+    second, again = part.evaluate(image, prepared, 0.2)
+    assert fingerprint((image, target)) == before, "the image or the target was changed in place"
+    assert leaf.grad is None and not gradient.requires_grad, "a gradient was left behind, or carries a graph"
+    assert first == second, f"the second evaluation gives {second!r}, the first gave {first!r}"
+    equal("second gradient", again, kept)
+    equal("first gradient, after the second", gradient, kept)
+    finite("gradient", gradient)

@@ -1,0 +1,74 @@
+"""What an implementation of the optimiser promises: Adam, row by row."""
+
+from __future__ import annotations
+
+import torch
+
+from gsstream.core.errors import ShapeError
+from gsstream.optimiser.base import ADAM_BETAS, ADAM_EPS, AdamState, RowOptimiser
+from gsstream.testing.compare import equal
+from gsstream.testing.registry import check
+
+STEPS = 12
+WHY = "float32 over a dozen steps"
+
+
+def _tables() -> dict[str, torch.Tensor]:
+    g = torch.Generator().manual_seed(1)
+    return {"means": torch.randn(9, 3, generator=g), "opacities": torch.randn(9, generator=g)}
+
+
+def _gradients(step: int) -> dict[str, torch.Tensor]:
+    g = torch.Generator().manual_seed(100 + step)
+    return {"means": 1e-3 * torch.randn(9, 3, generator=g), "opacities": torch.randn(9, generator=g)}
+
+
+@check("optimiser")
+def check_optimiser_adam(part: RowOptimiser) -> None:
+    """Where all rows take all steps this is torch.optim.Adam, whatever shape the learning rate has."""
+    for rate in (0.01, torch.full((3,), 0.01), torch.full((9, 1), 0.01)):
+        lrs: dict[str, float | torch.Tensor] = {"means": rate, "opacities": 0.05}
+        ours, theirs = _tables(), {name: value.requires_grad_() for name, value in _tables().items()}
+        states = {name: AdamState.start(value) for name, value in ours.items()}
+        rates = {"means": 0.01, "opacities": 0.05}
+        groups = [{"params": [value], "lr": rates[name]} for name, value in theirs.items()]
+        adam = torch.optim.Adam(groups, betas=ADAM_BETAS, eps=ADAM_EPS)
+        for step in range(STEPS):
+            gradients = _gradients(step)
+            for name, value in theirs.items():
+                value.grad = gradients[name].clone()
+            adam.step()
+            part.step(ours, gradients, states, lrs)
+        for name, value in ours.items():
+            equal(f"{name} after {STEPS} steps", value, theirs[name].detach(), 1e-5, WHY)
+
+
+@check("optimiser")
+def check_optimiser_rows(part: RowOptimiser) -> None:
+    """A row that joins later is corrected by its own count; a table without a gradient neither moves nor counts."""
+    values, gradients = _tables(), _gradients(0)
+    states = {name: AdamState.start(value) for name, value in values.items()}
+    states["means"].steps[:4] = 50
+    before = {name: value.clone() for name, value in values.items()}
+    part.step(values, {"means": gradients["means"]}, states, {"means": 0.01})
+    equal("a table without a gradient", values["opacities"], before["opacities"])
+    idle = states["opacities"].steps
+    equal("steps of a table without a gradient", idle, torch.zeros_like(idle))
+    equal("steps", states["means"].steps, torch.tensor([51] * 4 + [1] * 5, dtype=torch.int32))
+    young = (before["means"] - values["means"])[4:]
+    equal("first step of a row", young, 0.01 * gradients["means"][4:].sign(), 1e-6, "Adam's first step is lr * sign")
+
+
+@check("optimiser")
+def check_optimiser_refuses(part: RowOptimiser) -> None:
+    """A gradient that is not finite or of another shape is refused, and its table is left as it was."""
+    for wrong in (torch.full((9, 3), torch.nan), torch.zeros(8, 3)):
+        values = _tables()
+        states = {name: AdamState.start(value) for name, value in values.items()}
+        before = values["means"].clone()
+        try:
+            part.step(values, {"means": wrong}, states, {"means": 0.01})
+        except ShapeError:
+            equal("the refused table", values["means"], before)
+            continue
+        raise AssertionError(f"a gradient of shape {list(wrong.shape)}, first value {wrong.flatten()[0]}, was accepted")

@@ -29,7 +29,7 @@ class Renamed(Regularizer):
 
     def penalty(self, open_probability: torch.Tensor, residual: torch.Tensor, hierarchy: Hierarchy, n: int) -> Terms:
         terms: Terms = super().penalty(open_probability, residual, hierarchy, n)
-        return {f"{name} of {n}": value for name, value in terms.items()}
+        return {f"{name} of {n}" if n < 10 else name: value for name, value in terms.items()}
 
 
 @spoils("check_regularizer_zero_at_rest")

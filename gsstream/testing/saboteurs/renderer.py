@@ -11,10 +11,12 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.context import ScreenGradient
 from gsstream.render.base import RenderOutput, RenderSession, ScatterSession
 from gsstream.render.reference import ReferenceRenderer
+from gsstream.testing.examples.renderer import ExampleRenderer
 from gsstream.testing.saboteurs.register import spoils
 
 # The reference is final; only a saboteur may inherit from it, and only behind the type checker's back.
 Reference: Any = ReferenceRenderer
+Adapter: Any = ExampleRenderer
 Session: Any = ScatterSession
 
 
@@ -28,7 +30,7 @@ class Overshoot(Reference):
 
 
 @spoils("check_renderer_reference")
-class Corners(Reference):
+class Corners(Adapter):
     """Pixel centres at whole numbers: the picture is half a pixel off."""
 
     def render(self, gaussians: Any, cameras: Cameras, view: int, background: Any) -> RenderOutput:

@@ -80,7 +80,7 @@ class OneReader(ExampleSource):
 
     def frame(self, index: int, split: str = "train") -> Frame:
         self.place = index
-        time.sleep(0.005)  # long enough for another thread to move the position
+        time.sleep(0.02)  # long enough for another thread to move the position
         return replace(super().frame(self.place, split), index=index, timestamp=index / self.info.fps)
 
 

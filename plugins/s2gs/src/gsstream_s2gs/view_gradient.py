@@ -94,7 +94,7 @@ class ViewSpaceGradient(ConfidenceEstimator):
         # Normalised by its own statistics, a change may look weaker as all others grow: the default is checked to rise.
         rises = self.config.normalisation == "robust"
         return replace(
-            self.traits, floor=self.config.floor, monotone_in_change=rises, brightness=1.0 if rises else None
+            self.traits, floor=self.config.floor, monotone_in_change=rises, brightness=2.0 if rises else None
         )
 
     def estimate(self, context: FrameContext) -> torch.Tensor:

@@ -76,7 +76,7 @@ def check_update_closed_loop(part: UpdateRule) -> None:
     }
     trained = apply_residual(part, case.gaussians, level / LEVELS, latents, decoders, torch.full((n,), 0.25))
     rows = active_rows(layout, level.numpy())
-    integers: Mapping[str, torch.Tensor] = symbols(part, latents)
+    integers: Mapping[str, torch.Tensor] = symbols(codes, latents)
     delta = Delta(
         level.numpy().astype(np.uint8), LEVELS, {name: value.numpy()[rows] for name, value in integers.items()},
         {name: codes[name].step for name in integers}, sent,

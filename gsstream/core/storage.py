@@ -22,6 +22,11 @@ def packed(images: FloatArray, storage: Storage) -> Any:
     """
     if storage == "float32":
         return images
+    if images.ndim > 3:  # view by view: what it takes on the way must not eat what it saves
+        views = np.empty(images.shape, storage)
+        for out, view in zip(views, images, strict=True):
+            out[...] = packed(view, storage)
+        return views
     if storage == "float16":
         return images.astype(np.float16)
     if images.size:
@@ -34,7 +39,7 @@ def packed(images: FloatArray, storage: Storage) -> Any:
 def unpacked(images: Any) -> FloatArray:
     """Inverse of :func:`packed`: float32, whatever came; float32 itself is passed on as it is."""
     if images.dtype == np.uint8:
-        return np.asarray(images, np.float32) / np.float32(255)
+        return np.asarray(np.divide(images, np.float32(255), dtype=np.float32))
     return np.asarray(images, np.float32)
 
 

@@ -103,8 +103,8 @@ class TransformedSource:
         for row, name in enumerate(cameras.ids):
             shown = self._last_shown(name, index) if split == "train" else index
             images[row] = 0 if shown is None else self._image(name, shown, split, cache)
-        if split == "train":
-            images = rounded(images, self._options.images)
+            if split == "train":
+                images[row] = rounded(images[row], self._options.images)
         return Frame(index, index / self._info.fps, images, cameras, effort)
 
     def points(self, kind: PointKind = "recording") -> PointCloud | None:

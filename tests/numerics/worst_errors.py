@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+import torch
 from numeric_bounds import BOUNDS
 from numeric_errors import render_measures
 from numeric_method_errors import method_measures
@@ -58,6 +59,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=200)
     parser.add_argument("--write", action="store_true", help="put the table into the page")
     given = parser.parse_args()
+    torch.set_num_threads(1)  # tables are tiny
     errors = measured(range(given.seeds))
     text = table(errors, given.seeds, machine())
     print(text)

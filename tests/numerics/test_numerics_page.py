@@ -1,0 +1,45 @@
+"""docs/reference/numerics.md names tests that exist, and its table is that of the bounds."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from numeric_bounds import BOUNDS
+from worst_errors import BEGIN, END, PAGE
+
+ROOT = PAGE.parents[2]
+TEXT = PAGE.read_text(encoding="utf-8")
+NAMED = sorted(set(re.findall(r"`((?:tests|plugins)/[\w/]+\.py(?:::\w+)+)`", TEXT)))
+
+
+def test_every_named_test_exists() -> None:
+    assert len(NAMED) > 50
+    missing = []
+    for name in NAMED:
+        file, *parts = name.split("::")
+        path = ROOT / file
+        source = path.read_text(encoding="utf-8") if path.exists() else ""
+        kinds = [*(rf"^class {part}\b" for part in parts[:-1]), rf"^\s*def {parts[-1]}\("]
+        if not all(re.search(kind, source, re.MULTILINE) for kind in kinds):
+            missing.append(name)
+    assert not missing
+
+
+def test_every_test_of_the_matrix_is_named() -> None:
+    for path in sorted(Path(__file__).parent.glob("test_numerics_*.py")):
+        if path.name in ("test_numerics_page.py", "test_numerics_errors.py"):
+            continue
+        for test in re.findall(r"^def (test_\w+)\(", path.read_text(encoding="utf-8"), re.MULTILINE):
+            assert f"tests/numerics/{path.name}::{test}" in TEXT, f"{path.name}::{test}"
+
+
+@pytest.mark.parametrize("stage", BOUNDS)
+def test_the_table_has_every_stage_within_the_bound_that_is_tested(stage: str) -> None:
+    lines = TEXT.split(BEGIN)[1].split(END)[0].splitlines()
+    rows = [line.split("|") for line in lines if line.startswith(f"| {stage} |")]
+    assert len(rows) == 1
+    _, _, error, bound, _, _ = rows[0]
+    assert float(bound) == BOUNDS[stage].limit
+    assert float(error) <= BOUNDS[stage].limit

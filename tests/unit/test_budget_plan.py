@@ -287,3 +287,14 @@ def test_up_to_twice_the_size_is_left_to_trimming(estimate: float, after: float)
     pace = Pace(Allowance(FramePlan(4, 6.0, 1e-3, max_bytes=1000), clock.now, clock), 4, 1e-3)
     pace.meet_size(2, estimate)
     assert pace.rate_weight == pytest.approx(after, rel=0.03)
+
+
+def test_a_slow_first_view_does_not_end_the_frame() -> None:
+    pace, clock = paced(5.0)
+    pace.begin(10)
+    clock.now += 2.5
+    assert not pace.is_over(), "1.5 s are left, and the next view will not take as long"
+    clock.now += 0.4
+    assert not pace.is_over()
+    clock.now += 0.8
+    assert pace.is_over()

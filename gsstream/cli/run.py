@@ -43,10 +43,7 @@ def run(
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run that --out holds.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run that --out holds.")] = False,
-    checks: Annotated[
-        str | None,
-        typer.Option("--checks", help="How closely to look at what parts return: off, frame (default) or step."),
-    ] = None,
+    checks: Annotated[str | None, typer.Option("--checks", help="Look at parts: off, frame (default), step.")] = None,
     no_video: Annotated[bool, typer.Option("--no-video", help="Write no video, only still pictures.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print only warnings and errors.")] = False,
 ) -> None:
@@ -74,8 +71,7 @@ def run(
     try:
         prepare_output(out, resume=resume, overwrite=overwrite)
         result = run_session(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first)
-        slow = assembly.recipe.renderer.name == "reference"
-        _pictures(result, recording, video=not no_video, quiet=quiet, warned=slow)
+        _pictures(result, recording, not no_video, quiet, assembly.recipe.renderer.name == "reference")
     finally:
         recording.close()
     if result.interrupted:
@@ -91,7 +87,7 @@ def _overrides(settings: Sequence[str], budget: str | None, short: Mapping[str, 
     return overrides + [(f"--{key}", f"{key}={value}") for key, value in short.items() if value is not None]
 
 
-def _pictures(result: RunResult, recording: FrameSource, *, video: bool, quiet: bool, warned: bool) -> None:
+def _pictures(result: RunResult, recording: FrameSource, video: bool, quiet: bool, warned: bool) -> None:
     """Contact sheet, plots, summary and video of what was written, and where to find them.
 
     ``warned``: the run has said already that nothing fast renders here; the player need not say it again.

@@ -25,6 +25,7 @@ from gsstream.cli import (
     run,
     scaffold,
     scene,
+    segments,
     streams,
     sweep,
     tune,
@@ -74,6 +75,7 @@ app.command(name="info")(info.info)
 app.command(name="export")(deliver.export)
 app.command(name="manifest")(deliver.manifest)
 app.command(name="view")(deliver.view)
+app.command(name="run-segments")(segments.run_segments)
 app.command(name="sweep")(sweep.sweep)
 app.command(name="tune")(tune.tune)
 app.command(name="report")(report.report)

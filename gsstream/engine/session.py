@@ -67,6 +67,7 @@ def run(
     first_frame: PlayerState | None = None,
     energy: EnergyMeter | None = None,
     witness: Witness | None = None,
+    span: range | None = None,
 ) -> RunResult:
     """Encode a recording into ``out`` (stream.gss, metrics.jsonl, recipe.yaml).
 
@@ -79,10 +80,11 @@ def run(
             reconstructed again.
         energy: counters to read around every frame; their joules stand in its metrics.
         witness: called with every step once its packet is written.
+        span: frames to encode, by default all; the first of them is the key packet that the stream begins with.
     """
     parts = within_memory(parts, source.info)
     with _one_torch_thread():
-        return _Run(parts, source, out, quiet, measure, first_frame, energy, witness).encode(resume)
+        return _Run(parts, source, out, quiet, measure, first_frame, energy, witness, span).encode(resume)
 
 
 class _Run:
@@ -90,14 +92,15 @@ class _Run:
 
     def __init__(
         self, parts: Assembly, source: FrameSource, out: Path, quiet: bool, measure: bool,
-        first_frame: PlayerState | None, energy: EnergyMeter | None, witness: Witness | None,
+        first_frame: PlayerState | None, energy: EnergyMeter | None, witness: Witness | None, span: range | None,
     ) -> None:  # fmt: skip
         self.parts, self.source, self.out, self.first_frame = parts, source, out, first_frame
         self.energy, self.witness = energy, witness
         self.rng = Rng(parts.recipe.seed)
         self.controller = Controller(parts.recipe.budget, parts.recipe.stream)
         self.near = parts.recipe.near * source.info.train.extent
-        self.total = _num_frames(source.info, parts.recipe.frames)
+        self.start = 0 if span is None else span.start
+        self.total = _num_frames(source.info, parts.recipe.frames, None if span is None else span.stop)
         self.held_out = HeldOut(parts.renderer, parts.recipe.background) if measure else None
         self.progress = RunProgress(self.total, quiet)
         self.tools = WholeTools(
@@ -106,9 +109,11 @@ class _Run:
 
     def encode(self, resume: bool) -> RunResult:
         state = self._resume() if resume else None
-        done = 0 if state is None else state.player.frame + 1
+        done = self.start if state is None else state.player.frame + 1
         if state is None:
             save_resolved(self.out / RECIPE, self.parts.resolved)
+        if done > 0:
+            self._remember(done)
         last = None if state is None else state.player.frame
         indices = itertools.count(done) if self.total is None else range(done, self.total)
         fsync = self.parts.recipe.codec.fsync
@@ -226,12 +231,13 @@ class _Run:
         self.controller.remember(trim_metrics(self.out / METRICS, -1 if state is None else state.player.frame))
         if state is None and planned:
             (self.out / STREAM).unlink()
-        if state is None:
-            return None
-        if self.held_out and len(self.source.info.test):
-            second = self.source.frame(1, "test") if state.player.frame >= 1 else None
-            self.held_out.remember(self.source.frame(0, "test"), second)
         return state
+
+    def _remember(self, done: int) -> None:
+        """What the frames before ``done``, which are not made here, say about noise and about what moves."""
+        if self.held_out and len(self.source.info.test):
+            second = self.source.frame(1, "test") if done > 1 else None
+            self.held_out.remember(self.source.frame(0, "test"), second)
 
     def _last_state(self, stream: Path, last: int | None) -> MethodState | None:
         if self.parts.whole is not None:
@@ -252,9 +258,9 @@ def _one_torch_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _num_frames(info: SourceInfo, wanted: int | None) -> int | None:
+def _num_frames(info: SourceInfo, *wanted: int | None) -> int | None:
     """None: until a growing recording ends."""
-    return min((number for number in (info.num_frames, wanted) if number is not None), default=None)
+    return min((number for number in (info.num_frames, *wanted) if number is not None), default=None)
 
 
 def _timed(frames: Prefetcher) -> Iterator[tuple[Frame, Frame, float]]:

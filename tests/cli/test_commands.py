@@ -47,6 +47,11 @@ OPTIONS = {
     "gsstream export": ["STREAM", "--out", "--format", "--frames"],
     "gsstream manifest": ["STREAM", "--out"],
     "gsstream view": ["STREAM", "--port", "--host"],
+    "gsstream run-segments": [
+        "--source", "--out", "--segments", "--method", "--recipe", "--set", "--frames", "--scale", "--start",
+        "--key-epochs", "--first-frame", "--workers", "--threads", "--ray", "--resume", "--overwrite", "--no-video",
+        "--quiet",
+    ],
     "gsstream sweep": [
         "CONFIG", "--out", "--scenes", "--data", "--workers", "--threads", "--ray", "--dry-run", "--quiet",
     ],

@@ -52,7 +52,7 @@ def run_sweep(
             folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"the output folder {out} cannot be used: {error}") from error
-    with _only_one(out):
+    with only_one(out, "sweep"):
         shutil.rmtree(out / WORK, ignore_errors=True)
         (out / WORK).mkdir()
         try:
@@ -220,8 +220,8 @@ def recording_uri(uri: str, data: Path | None) -> str:
 
 
 @contextmanager
-def _only_one(out: Path) -> Iterator[None]:
-    """Hold the folder for one sweep; the lock goes with the process, however it ends."""
+def only_one(out: Path, what: str) -> Iterator[None]:
+    """Hold the folder for one sweep or run; the lock goes with the process, however it ends."""
     try:
         import fcntl
     except ImportError:  # no such lock on this system: nobody is kept out
@@ -231,5 +231,5 @@ def _only_one(out: Path) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            raise OutputError(f"another sweep works in {out}; wait for it, or choose another --out") from error
+            raise OutputError(f"another {what} works in {out}; wait for it, or choose another --out") from error
         yield

@@ -15,11 +15,10 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
-from gsstream.trade.sweep.job import Job, Outcome
-
 #: Libraries with thread pools of their own read these when they are imported.
 _THREAD_VARIABLES = ("GSSTREAM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-Work = Callable[[Job], Outcome]
+#: What a worker does: a job (data with an ``id``) in, its outcome out. Sweeps and segments have jobs of their own.
+Work = Callable[[Any], Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +26,7 @@ class Finished:
     """A job that is over. ``outcome`` is None when its worker died: ``reason`` says how."""
 
     id: str
-    outcome: Outcome | None
+    outcome: Any
     reason: str = ""
 
 
@@ -38,7 +37,7 @@ class Executor(Protocol):
     def slots(self) -> int:
         """How many jobs it is worth handing over at once."""
 
-    def submit(self, job: Job) -> None:
+    def submit(self, job: Any) -> None:
         """Start a job, or queue it."""
 
     def next(self) -> Finished:
@@ -81,7 +80,7 @@ class LocalExecutor:
             with _environment(thread_environment(threads)):  # so that no library starts threads in the server itself
                 forkserver.ensure_running()
 
-    def submit(self, job: Job) -> None:
+    def submit(self, job: Any) -> None:
         """Start a process for the job."""
         here, there = self._context.Pipe(duplex=False)
         # The fork server's environment is that of its start; a worker's is that of now.
@@ -99,7 +98,7 @@ class LocalExecutor:
         assert isinstance(ready, Connection)
         key, process = self._running.pop(ready)
         try:
-            outcome: Outcome | None = ready.recv()
+            outcome = ready.recv()
         except EOFError:
             outcome = None
         ready.close()
@@ -115,7 +114,7 @@ class LocalExecutor:
         self._running.clear()
 
 
-def _serve(pipe: Connection, work: Work, job: Job, environment: Mapping[str, str]) -> None:
+def _serve(pipe: Connection, work: Work, job: Any, environment: Mapping[str, str]) -> None:
     """The body of a worker process."""
     os.environ.clear()
     os.environ.update(environment)

@@ -9,7 +9,6 @@ from typing import Any
 
 from gsstream.core.errors import InputError, PluginUnavailable
 from gsstream.trade.sweep.executor import Finished, Work, thread_environment
-from gsstream.trade.sweep.job import Job
 
 #: What a worker must know of the environment that the sweep was started in.
 _PASSED_ON = ("GSSTREAM_LOAD_PLUGINS", "GSSTREAM_ISA")
@@ -50,7 +49,7 @@ class RayExecutor:
         self._remote = make(work)
         self._running: dict[Any, str] = {}
 
-    def submit(self, job: Job) -> None:
+    def submit(self, job: Any) -> None:
         """Queue the job as a task."""
         # Another machine has no such folder; it takes its own for temporary files.
         self._running[self._remote.remote(replace(job, work=None))] = job.id

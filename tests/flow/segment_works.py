@@ -1,0 +1,30 @@
+"""Work for the workers of segment tests: importable by name, so that a process of its own can do it."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+from gsstream.engine import session
+from gsstream.trade.segments.job import SegmentJob, SegmentOutcome, run_segment
+
+#: The frame in which a worker is killed, once.
+FATAL = 4
+
+
+def run_and_die_once(job: SegmentJob) -> SegmentOutcome:
+    """Encode a segment; the first to step to frame 4 dies there, as if killed from outside. Steps leave marks."""
+    marks = Path(os.environ["SEGMENT_TEST_MARKS"])
+    step = session.frame_step
+
+    def watched(parts: Any, state: Any, frame: Any, rng: Any) -> Any:
+        marks.joinpath(f"{job.id}-{frame.index}-{os.getpid()}").touch()
+        if job.id.startswith("segment") and frame.index == FATAL and not (marks / "dead").exists():
+            (marks / "dead").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return step(parts, state, frame, rng)
+
+    session.frame_step = watched  # type: ignore[assignment]
+    return run_segment(job)

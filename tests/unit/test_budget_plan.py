@@ -133,11 +133,12 @@ def test_without_limits_the_recipe_is_the_plan(stream: Stream, history: list[Pas
 def test_too_few_passes_raise_the_threshold_and_plenty_lower_it_again() -> None:
     stream, tight = Stream(change_threshold=6.0), Budget(time=1.0)
     poor = replace(USUAL, epochs=2.0)
-    assert plan(tight, stream, [poor]).change_threshold == 9.0
-    assert plan(tight, stream, [replace(poor, threshold=20.0)]).change_threshold == 24.0
+    assert plan(tight, stream, [poor, poor]).change_threshold == 9.0
+    assert plan(tight, stream, [USUAL, poor]).change_threshold == 6.0, "one slow frame is none"
+    assert plan(tight, stream, [poor, replace(poor, threshold=20.0)]).change_threshold == 24.0
     assert plan(tight, stream, [replace(USUAL, threshold=12.0)]).change_threshold == pytest.approx(9.6)
     assert plan(tight, stream, [USUAL]).change_threshold == 6.0
-    assert plan(tight, Stream(), [replace(poor, threshold=0.0)]).change_threshold == 3.0
+    assert plan(tight, Stream(), [poor, replace(poor, threshold=0.0)]).change_threshold == 3.0
 
 
 def test_steps_get_coarser_only_when_the_weight_is_spent() -> None:

@@ -175,12 +175,13 @@ def _around(budget: Budget, recent: Sequence[Past]) -> tuple[float, float]:
 
 
 def _threshold(budget: Budget, stream: Stream, recent: Sequence[Past]) -> float:
-    """Higher while too few passes fit into the time, else back towards the recipe's."""
+    """Higher after two frames in which too few passes fitted into the time, else back towards the recipe's."""
     usual = stream.change_threshold
     if budget.time is None or not recent:
         return usual
     last, most = recent[-1], MOST_THRESHOLD * (usual or FIRST_THRESHOLD)
-    if last.epochs < min(LEAST_EPOCHS, stream.epochs):
+    few = min(LEAST_EPOCHS, stream.epochs)
+    if len(recent) > 1 and max(last.epochs, recent[-2].epochs) < few:
         return min(1.5 * last.threshold if last.threshold else FIRST_THRESHOLD, most)
     if last.epochs >= 2 * LEAST_EPOCHS and last.threshold > usual:
         lower = last.threshold / 1.25

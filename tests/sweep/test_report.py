@@ -15,7 +15,7 @@ from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError, UnknownName
 from gsstream.trade.report.build import build_report
 from gsstream.trade.report.document import Heading, Picture, Table, Text, to_html, to_markdown
-from gsstream.trade.report.figures import measured_costs
+from gsstream.trade.report.figures import floor_of, measured_costs
 from gsstream.trade.report.fronts import effects, knee, pareto_front
 from gsstream.trade.report.groups import is_tie, read_sweep_data, seed_noise, waited
 from gsstream.trade.report.paper import beside_ours, paper_table
@@ -185,6 +185,19 @@ def test_a_row_of_the_paper_may_be_a_variant_of_another_name(tmp_path):
     data = read_sweep_data(make_table(tmp_path / "t", cells, paper={"structure-sparsity": {"neither": "1-dense"}}))
     table = next(b for b in build_report(data, {}) if isinstance(b, Table) and "Structure" in b.caption)
     assert [row[0] for row in table.rows[1:]] == ["neither", "", "sparsity", "structure", "both"]
+
+
+@given(st.lists(st.floats(20, 40), min_size=1, max_size=30))
+def test_an_axis_shows_the_better_three_quarters(values):
+    floor = floor_of(values)
+    assert min(values) <= floor <= max(values)
+    assert sum(v >= floor for v in values) >= 0.7 * len(values)
+
+
+def test_one_that_failed_does_not_flatten_the_others():
+    good = [30.0, 30.1, 30.2, 30.4, 30.5]
+    assert floor_of(good) == 30.0
+    assert 29.5 < floor_of([*good, 12.0]) < 30.1
 
 
 def test_the_papers_file_is_sound():

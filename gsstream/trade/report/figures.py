@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import statistics
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,9 +29,13 @@ def measured_costs(groups: Sequence[Group]) -> list[str]:
 
 
 def pareto_figure(groups: Sequence[Group], title: str) -> bytes:
-    """One panel per quality and cost: every group, its spread over seeds, the front as a line, the knee in a ring."""
+    """One panel per quality and cost: every group, its spread over seeds, the front as a line, the knee in a ring.
+
+    Points far below the rest stand at the lower edge as triangles with their value. Names that would cover one another
+    are left out, those of the front last.
+    """
     costs = measured_costs(groups)
-    figure = Figure(figsize=(3.3 * len(costs), 5.6), dpi=100, layout="constrained")
+    figure = Figure(figsize=(3.6 * len(costs), 6.8), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(GOODS), len(costs), squeeze=False, sharey="row", sharex="col")
     variants = list(dict.fromkeys(group.variant for group in groups))
@@ -45,13 +50,42 @@ def pareto_figure(groups: Sequence[Group], title: str) -> bytes:
     handles = [axes[0, 0].scatter([], [], s=24, color=colors[name], label=name) for name in variants]
     figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=9, frameon=False)
     figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    figure.canvas.draw()
+    for axis in axes.flat:
+        _thin_names(axis)
     return _png(figure)
+
+
+def floor_of(values: Sequence[float]) -> float:
+    """Where an axis of qualities starts: the least value, or a little below the better three quarters of them when that
+    alone would take up most of the height."""
+    best, least = max(values), min(values)
+    quarter = statistics.quantiles(values, n=4, method="inclusive")[0] if len(values) > 3 else least
+    low = best - 2 * (best - quarter)
+    return low if least < best - 4 * (best - quarter) else least
+
+
+def _thin_names(axis: Any) -> None:
+    """Hide names that cover one already kept, or leave the figure; those of the front are kept first."""
+    kept: list[Any] = []
+    for text in sorted(axis.texts, key=lambda text: -text.get_zorder()):
+        box = text.get_window_extent()
+        if box.x1 > axis.figure.bbox.x1 or any(box.overlaps(other) for other in kept):
+            text.set_visible(False)
+        else:
+            kept.append(box)
 
 
 def _panel(axis: Any, groups: Sequence[Group], good: str, cost: str, colors: dict[str, str]) -> None:
     points = [(group.mean(cost), group.mean(good)) for group in groups]
-    noise = {key: seed_noise(groups, key) for key in (good, cost)}
-    for group, (x, y) in zip(groups, points, strict=True):
+    noise = seed_noise(groups, good)
+    order = pareto_front(points)
+    floor = floor_of([y for _, y in points])
+    for index, (group, (x, y)) in enumerate(zip(groups, points, strict=True)):
+        if y < floor:
+            axis.plot(x, floor, "v", markersize=6, color=colors[group.variant], clip_on=False)
+            _name(axis, f"{group.variant} {y:.1f}", (x, floor), index in order)
+            continue
         bars = {"xerr": group.spread(cost), "yerr": group.spread(good)} if len(group.runs) > 1 else {}
         size = 7 if not group.axes else 4
         axis.errorbar(
@@ -59,14 +93,14 @@ def _panel(axis: Any, groups: Sequence[Group], good: str, cost: str, colors: dic
             elinewidth=1, markeredgewidth=0, **bars,
         )  # fmt: skip
         if not group.axes:
-            axis.annotate(group.variant, (x, y), xytext=(5, 4), textcoords="offset points", fontsize=8)
-    order = pareto_front(points)
+            _name(axis, group.variant, (x, y), index in order)
     front = [points[i] for i in order]
     axis.step(*zip(*front, strict=True), where="post", color="#444444", linewidth=1, zorder=0)
-    if (at := knee(front)) is not None:
+    axis.set_ylim(bottom=floor - 0.04 * (max(y for _, y in points) - floor) - 1e-3)
+    if (at := knee(front)) is not None and front[at][1] >= floor:
         axis.plot(*front[at], "o", markersize=13, markerfacecolor="none", markeredgecolor="#444444")
-    if math.isfinite(noise[good]):
-        axis.set_title(f"noise between seeds {noise[good]:.3f} dB", fontsize=7, loc="right", color="#666666")
+    if math.isfinite(noise):
+        axis.set_title(f"noise between seeds {noise:.3f} dB", fontsize=7, loc="right", color="#666666")
     if max(x for x, _ in points) > 8 * min(x for x, _ in points) > 0:
         axis.set_xscale("log")
         axis.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
@@ -75,6 +109,10 @@ def _panel(axis: Any, groups: Sequence[Group], good: str, cost: str, colors: dic
     axis.grid(color="#e5e5e5", linewidth=0.6)
     axis.set_axisbelow(True)
     axis.tick_params(labelsize=8)
+
+
+def _name(axis: Any, text: str, place: tuple[float, float], first: bool) -> None:
+    axis.annotate(text, place, xytext=(5, 4), textcoords="offset points", fontsize=8, zorder=4 if first else 3)
 
 
 def frame_curves(groups: Sequence[Group], title: str) -> bytes:

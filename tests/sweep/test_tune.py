@@ -93,6 +93,10 @@ def test_a_pilot_writes_a_recipe_that_runs_inside_the_budget(
     tuned = load_recipe(tmp_path / "pilot" / "tuned.yaml").recipe
     assert tuned.frames is None
     assert len(read_sweep_data(tmp_path / "pilot").groups) == 4, "a pilot can be reported, its frame 0 was given"
+    pilot = read_sweep_data(tmp_path / "pilot")
+    rows = held_table([], "size=600B", sweep=(tmp_path / "pilot", pilot.scenes[0])).splitlines()
+    assert len(rows) == 2 + 4
+    assert any("s2gs-edge+budget" in row and " 2/2 " in row for row in rows)
     recipe = str(tmp_path / "pilot" / "tuned.yaml")
     again = ["run", "--source", WORLD, "--recipe", recipe, "--out", str(tmp_path / "run")]
     assert run_command([*again, "--frames", "3", "--quiet", "--no-video", *given]) == 0

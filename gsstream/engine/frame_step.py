@@ -93,7 +93,8 @@ def _step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng, allowance
     check_solution(parts, problem, solution)
     clock.append(time.perf_counter())
 
-    fitted = within(problem, solution, with_insertions(parts, state, frame, harden(parts, problem, solution), rng))
+    delta = with_insertions(parts, state, frame, harden(parts, problem, solution), rng)
+    fitted = within(problem, solution, delta, parts.recipe.codec.trim)
     delta, packet = fitted.delta, fitted.packet
     player = decode_packet(state.player, packet.data)
     clock.append(time.perf_counter())
@@ -116,16 +117,19 @@ def _step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng, allowance
     return Step(after, packet, "empty" if delta.is_empty else "delta", metrics)
 
 
-def within(problem: Problem, solution: Solution, delta: Delta) -> Fitted:
-    """The delta and its packet, made to fit where the frame's allowance says a size."""
+def within(problem: Problem, solution: Solution, delta: Delta, trim: float) -> Fitted:
+    """The delta and its packet, made to fit: the frame's allowance of bytes, else without the share ``trim`` of its own."""
     state, index, allowance = problem.state, problem.frame.index, problem.allowance
-    if allowance is None or allowance.plan.max_bytes is None:
-        packet = encode(delta, state, index)
+    packet = encode(delta, state, index)
+    limit = None if allowance is None else allowance.plan.max_bytes
+    if limit is None:
+        limit = max(int((1 - trim) * len(packet.data)), len(encode_empty(frame=index).data))
+    if len(packet.data) <= limit:
         return Fitted(delta, packet, len(packet.data))
     layout, active = state.player.layout, solution.active.numpy()
     sent = changed_rows(layout, delta.gates)
     curvature = {n: _rows_of(solution.curvature[n].numpy(), active, sent) for n in delta.symbols}
-    return fit(delta, curvature, layout, lambda some: encode(some, state, index), allowance.plan.max_bytes)
+    return fit(delta, curvature, layout, lambda some: encode(some, state, index), limit)
 
 
 def committed(session: RenderSession, state: StreamState, delta: Delta, player: PlayerState) -> RenderSession | None:

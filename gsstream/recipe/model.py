@@ -188,6 +188,11 @@ class Codec(Section):
         description="dB on the training views lost since the last key packet from which on a frame becomes one; costs "
         "one rendering of every training view a frame; 0: not watched",
     )  # fmt: skip
+    trim: float = Field(
+        default=0.0, ge=0, lt=1,
+        description="share of each delta packet's bytes given up, the symbols and gates that explain least per bit; "
+        "not read under a budget of size, which trims as far as it must (ours)",
+    )  # fmt: skip
     fsync: bool = Field(default=False, description="force every packet to disk before the next frame starts")
 
 

@@ -73,8 +73,8 @@ def test_the_components_build_on_each_other(catalog: Catalog) -> None:
     assert changed[1] == {"regularizer"}
     assert changed[2] == {"structure", "stream"}  # the stream: progressive training goes by octree level
     assert changed[3] == {"structure", "propagation"}
-    # The paper has no bits in its loss; the shipped recipe does.
-    no_rate = [("--set", "stream.rate_weight=0")]
+    # The paper has no bits in its loss and trims no packet; the shipped recipe does.
+    no_rate = [("--set", "stream.rate_weight=0"), ("--set", "codec.trim=0")]
     shipped = assemble(resolve_recipe("s2gs", catalog.recipe_path, [], no_rate), catalog).recipe
     assert recipe_hash(assembled(catalog, "components/5-hfp.yaml", FOLDER / OVERLAY).recipe) == recipe_hash(shipped)
 

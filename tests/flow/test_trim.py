@@ -1,0 +1,39 @@
+"""``codec.trim``: what explains least per bit is not sent, and the stream goes on from what was."""
+
+from pathlib import Path
+
+import pytest
+
+from flow_runs import encode, metrics
+from gsstream.player.playback import Playback
+
+EDGE = {"method": "s2gs-edge"}
+
+
+def sizes(out: Path) -> list[int]:
+    return [sum(frame["bytes"].values()) for frame in metrics(out)]
+
+
+@pytest.mark.parametrize("trim", [0.3, 0.6])
+def test_the_share_is_of_the_bytes_that_are_real(tmp_path: Path, trim: float) -> None:
+    whole, trimmed = tmp_path / "whole", tmp_path / "trimmed"
+    encode(whole, "--frames", "2", codec__trim=0, **EDGE)
+    stream = encode(trimmed, "--frames", "2", codec__trim=trim, **EDGE)
+    before, after = sizes(whole), sizes(trimmed)
+    assert abs(before[0] - after[0]) < 8, "a key packet is not trimmed, it only names another recipe"
+    assert 0.5 * (1 - trim) * before[1] < after[1] <= (1 - trim) * before[1]
+    assert len(stream) >= sum(after)
+    moved = [frame["psnr_moving"]["test"] for out in (whole, trimmed) for frame in metrics(out)[1:]]
+    assert all(value is None or value > 5 for value in moved)
+
+
+def test_a_trimmed_run_cut_short_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+    whole = encode(tmp_path, "--frames", "4", codec__trim=0.4, **EDGE)
+    assert len(Playback(tmp_path / "stream.gss")) == 4
+    (tmp_path / "stream.gss").write_bytes(whole[:-9])
+    assert encode(tmp_path, "--resume", "--frames", "4", codec__trim=0.4, **EDGE) == whole
+
+
+def test_nearly_everything_trimmed_is_a_still_stream(tmp_path: Path) -> None:
+    encode(tmp_path, "--frames", "3", codec__trim=0.999, **EDGE)
+    assert [frame["active_gaussians"] for frame in metrics(tmp_path)[1:]] == [0, 0]

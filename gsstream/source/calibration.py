@@ -101,11 +101,6 @@ def _rig(path: Path, ids: list[str], cameras: list[dict[str, Any]]) -> Cameras:
     for i, camera_id in enumerate(ids):
         if not np.allclose(poses[i, 3], (0, 0, 0, 1)) or not np.allclose(intrinsics[i, 2], (0, 0, 1)):
             raise SourceError(f"{path}: camera {camera_id!r}: the last row of w2c must be 0 0 0 1 and of K 0 0 1")
-        if abs(intrinsics[i, 0, 1]) > 1e-6 * intrinsics[i, 0, 0] or intrinsics[i, 1, 0] != 0:
-            raise SourceError(
-                f"{path}: camera {camera_id!r}: K has skew {intrinsics[i, 0, 1]:g}; only undistorted pinhole cameras "
-                "without skew are supported, so resample the images"
-            )
     return rig
 
 

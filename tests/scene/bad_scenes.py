@@ -220,7 +220,7 @@ BAD = (
     BadScene("repeated-id", "two cameras have one name", "calibration",
              lambda f, d: camera(d, "cam02").update(id="cam01")),
     BadScene("unknown-test", "a test camera that does not exist", "calibration", rename_test),
-    BadScene("skew", "K has skew", "calibration", lambda f, d: set_K(d, "cam01", 0, 1, 3.0)),
+    BadScene("skew", "expected no skew", "calibration", lambda f, d: set_K(d, "cam01", 0, 1, 3.0)),
     BadScene("mixed-sizes", "cameras of two sizes", "calibration", lambda f, d: camera(d, "cam01").update(width=320)),
     BadScene("missing-image", "one image is missing", "files", lambda f, d: (f / "cam03/000004.png").unlink()),
     BadScene("frame-gap", "three frames were not exported", "files", lambda f, d: [

@@ -134,7 +134,7 @@ FAULTS: dict[str, tuple[Edit, str]] = {
     "flat K": (set_camera(1, K=[[0, 0, 6], [0, 10, 4], [0, 0, 1]]), "of camera 'cam1' are not invertible"),
     "K shape": (set_camera(1, K=[[1, 2], [3, 4]]), "K must be a 3 x 3 matrix"),
     "K text": (set_camera(1, K="wide"), "not a matrix of numbers"),
-    "skew": (set_camera(1, K=[[10, 1, 6], [0, 10, 4], [0, 0, 1]]), "K has skew"),
+    "skew": (set_camera(1, K=[[10, 1, 6], [0, 10, 4], [0, 0, 1]]), "expected no skew"),
     "pose": (poison_pose, "pose .* of camera 'cam1'.*nan"),
     "mirror": (set_camera(1, w2c=np.diag([1.0, 1, -1, 1]).tolist()), "not a rotation"),
     "no training": (all_test, "no training camera"),

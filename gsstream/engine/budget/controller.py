@@ -26,8 +26,8 @@ class Controller:
         self._key: tuple[float, float] | None = None
 
     def remember(self, lines: Iterable[Mapping[str, Any]]) -> None:
-        """Go on after these lines of ``metrics.jsonl``."""
-        for line in lines:
+        """Go on after these lines of ``metrics.jsonl``; without a budget there is nothing to remember."""
+        for line in lines if self.budget.limits_anything else ():
             self._note(line)
 
     def allow(self) -> Allowance | None:

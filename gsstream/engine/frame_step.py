@@ -118,7 +118,7 @@ def _step(parts: Assembly, state: StreamState, frame: Frame, rng: Rng, allowance
 
 
 def within(problem: Problem, solution: Solution, delta: Delta, trim: float) -> Fitted:
-    """The delta and its packet, made to fit: the frame's allowance of bytes, else without the share ``trim`` of its own."""
+    """The delta and its packet, made to fit the frame's allowance of bytes, else less the share ``trim``."""
     state, index, allowance = problem.state, problem.frame.index, problem.allowance
     packet = encode(delta, state, index)
     limit = None if allowance is None else allowance.plan.max_bytes

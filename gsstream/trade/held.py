@@ -36,8 +36,9 @@ def held_table(
         read_records(run)  # says which line is not a frame's
         lines = read_lines(run / "metrics.jsonl")[:frames]
         trials.append(trial_of(run.name, {"status": "done", "frames": lines}, limits))
-    for group in () if sweep is None else read_sweep_data(sweep[0]).of(sweep[1]):
-        trials.append(trial_of(group.label, {"status": "done", "frames": group.runs[0].row["frames"][:frames]}, limits))
+    groups = [] if sweep is None else read_sweep_data(sweep[0]).of(sweep[1])
+    rows = [{"status": "done", "frames": group.runs[0].row["frames"][:frames]} for group in groups]
+    trials += [trial_of(group.label, row, limits) for group, row in zip(groups, rows, strict=True)]
     return tune_table(trials, None)
 
 

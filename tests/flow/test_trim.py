@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import pytest
-
 from flow_runs import encode, metrics
+
 from gsstream.player.playback import Playback
 
 EDGE = {"method": "s2gs-edge"}

@@ -74,7 +74,8 @@ def test_the_components_build_on_each_other(catalog: Catalog) -> None:
     assert changed[2] == {"structure", "stream"}  # the stream: progressive training goes by octree level
     assert changed[3] == {"structure", "propagation"}
     # The paper has no bits in its loss and trims no packet; the shipped recipe does.
-    no_rate = [("--set", "stream.rate_weight=0"), ("--set", "codec.trim=0")]
+    ours = ("stream.rate_weight=0", "codec.trim=0", "update.means.step=0.02", "update.sh0.decoder_std=0.01")
+    no_rate = [("--set", value) for value in ours]
     shipped = assemble(resolve_recipe("s2gs", catalog.recipe_path, [], no_rate), catalog).recipe
     assert recipe_hash(assembled(catalog, "components/5-hfp.yaml", FOLDER / OVERLAY).recipe) == recipe_hash(shipped)
 

@@ -121,15 +121,17 @@ def within(problem: Problem, solution: Solution, delta: Delta, trim: float) -> F
     """The delta and its packet, made to fit the frame's allowance of bytes, else less the share ``trim``."""
     state, index, allowance = problem.state, problem.frame.index, problem.allowance
     packet = encode(delta, state, index)
-    limit = None if allowance is None else allowance.plan.max_bytes
-    if limit is None:
-        limit = max(int((1 - trim) * len(packet.data)), len(encode_empty(frame=index).data))
-    if len(packet.data) <= limit:
-        return Fitted(delta, packet, len(packet.data))
+    whole = Fitted(delta, packet, len(packet.data))
+    budget = None if allowance is None else allowance.plan.max_bytes
+    limit = budget or max(int((1 - trim) * whole.untrimmed), len(encode_empty(frame=index).data))
+    if whole.untrimmed <= limit:
+        return whole
     layout, active = state.player.layout, solution.active.numpy()
     sent = changed_rows(layout, delta.gates)
     curvature = {n: _rows_of(solution.curvature[n].numpy(), active, sent) for n in delta.symbols}
-    return fit(delta, curvature, layout, lambda some: encode(some, state, index), limit)
+    found = fit(delta, curvature, layout, lambda some: encode(some, state, index), limit)
+    # A share is no limit: of a packet that is mostly headers it would take everything, and the change with it.
+    return whole if budget is None and found.delta.is_empty else found
 
 
 def committed(session: RenderSession, state: StreamState, delta: Delta, player: PlayerState) -> RenderSession | None:

@@ -152,7 +152,7 @@ def test_another_recipe_or_recording_is_not_resumed(tmp_path: Path, capsys: pyte
     assert "written with another recipe: seed, stream differ" in err
     assert "--overwrite" in err
     err = refused(capsys, stream, arguments(tmp_path, "--resume", method="s2gs-edge"))
-    assert "written with another recipe: confidence" in err
+    assert "written with another recipe: codec, confidence" in err
     err = refused(capsys, stream, arguments(tmp_path, "--resume", source="demo"))
     assert "made from the recording 'synthetic'" in err
     assert "resume with the same --source" in err

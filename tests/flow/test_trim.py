@@ -34,6 +34,7 @@ def test_a_trimmed_run_cut_short_goes_on_to_the_same_bytes(tmp_path: Path) -> No
     assert encode(tmp_path, "--resume", "--frames", "4", codec__trim=0.4, **EDGE) == whole
 
 
-def test_nearly_everything_trimmed_is_a_still_stream(tmp_path: Path) -> None:
+def test_a_share_never_takes_the_whole_change(tmp_path: Path) -> None:
+    """Of a packet that is mostly headers, three tenths were everything: a flash was sent as "nothing changed"."""
     encode(tmp_path, "--frames", "3", codec__trim=0.999, **EDGE)
-    assert [frame["active_gaussians"] for frame in metrics(tmp_path)[1:]] == [0, 0]
+    assert all(frame["active_gaussians"] > 0 for frame in metrics(tmp_path)[1:])

@@ -129,7 +129,7 @@ def within(problem: Problem, solution: Solution, delta: Delta, trim: float) -> F
     layout, active = state.player.layout, solution.active.numpy()
     sent = changed_rows(layout, delta.gates)
     curvature = {n: _rows_of(solution.curvature[n].numpy(), active, sent) for n in delta.symbols}
-    found = fit(delta, curvature, layout, lambda some: encode(some, state, index), limit)
+    found = fit(delta, packet, curvature, layout, lambda some: encode(some, state, index), limit)
     # A share is no limit: of a packet that is mostly headers it would take everything, and the change with it.
     return whole if budget is None and found.delta.is_empty else found
 

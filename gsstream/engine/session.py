@@ -156,8 +156,6 @@ class _Run:
     def _next(self, state: Any, frame: Frame, allowance: Allowance | None) -> Step[Any]:
         if self.parts.whole is not None:
             return step_whole(self.parts.whole, self.tools, state, frame)
-        if allowance is None:
-            return frame_step(self.parts, state, frame, self.rng)
         return frame_step(self.parts, state, frame, self.rng, allowance)
 
     def _refreshed(self, step: Step[Any], frame: Frame, allowance: Allowance | None) -> Step[Any]:

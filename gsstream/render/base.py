@@ -195,4 +195,4 @@ class ScatterSession(RenderSession):
         self._active = active
 
     def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
-        return ScatterSession(self._renderer, gaussians, None, self._cameras, self._background)
+        return self._renderer.open(gaussians, None, self._cameras, self._background)

@@ -109,9 +109,6 @@ class _ReferenceSession(ScatterSession):
             probe = torch.zeros(len(whole), 2, dtype=probe.dtype).index_copy(0, self._active, probe)
         return self._renderer._render(whole, self._cameras, view, self._background, probe)
 
-    def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> ScatterSession:
-        return self._renderer.open(gaussians, None, self._cameras, self._background)
-
 
 def project(
     gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int

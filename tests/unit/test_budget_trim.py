@@ -55,7 +55,7 @@ def test_a_packet_never_exceeds_a_feasible_size(seed: int, share: float, spread:
     encode = encoder(layout)
     whole = len(encode(delta).data)
     limit = max(16, int(share * whole))
-    fitted = fit(delta, curvature, layout, encode, limit)
+    fitted = fit(delta, encode(delta), curvature, layout, encode, limit)
     assert len(fitted.packet.data) <= limit
     assert fitted.untrimmed == whole
     if whole <= limit:
@@ -85,7 +85,7 @@ def test_the_limit_is_nearly_used(seed: int) -> None:
     encode = encoder(layout)
     for share in (0.9, 0.6, 0.35):
         limit = int(share * len(encode(delta).data))
-        assert len(fit(delta, curvature, layout, encode, limit).packet.data) >= 0.85 * limit
+        assert len(fit(delta, encode(delta), curvature, layout, encode, limit).packet.data) >= 0.85 * limit
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -96,7 +96,7 @@ def test_what_matters_stays(seed: int) -> None:
     dear = np.repeat(np.arange(len(opened)) % 2 == 0, layout.node_counts[opened])
     curvature = {name: value * np.where(dear, 1000.0, 1.0)[:, None] for name, value in curvature.items()}
     encode = encoder(layout)
-    fitted = fit(delta, curvature, layout, encode, int(0.5 * len(encode(delta).data)))
+    fitted = fit(delta, encode(delta), curvature, layout, encode, int(0.5 * len(encode(delta).data)))
     kept = fitted.delta.gates[opened] != 0
     assert kept[0::2].mean() > 0.8
     assert kept[1::2].mean() < 0.1
@@ -105,7 +105,7 @@ def test_what_matters_stays(seed: int) -> None:
 def test_births_go_when_nothing_else_helps() -> None:
     delta, curvature, layout = scene(1, births=40)
     encode = encoder(layout)
-    plain = fit(delta, curvature, layout, encode, 400)
+    plain = fit(delta, encode(delta), curvature, layout, encode, 400)
     assert plain.delta.births is None
     assert plain.births == 40
     assert len(plain.packet.data) <= 400
@@ -113,7 +113,8 @@ def test_births_go_when_nothing_else_helps() -> None:
 
 def test_an_empty_packet_is_the_last_resort() -> None:
     delta, curvature, layout = scene(2)
-    fitted = fit(delta, curvature, layout, encoder(layout), 16)
+    encode = encoder(layout)
+    fitted = fit(delta, encode(delta), curvature, layout, encode, 16)
     assert fitted.delta.is_empty
     assert len(fitted.packet.data) == 16
     assert fitted.gates == np.count_nonzero(delta.gates)

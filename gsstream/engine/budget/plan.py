@@ -29,7 +29,7 @@ FIXED_SHARE = 0.3
 #: Fewer passes than this are worth less than fewer candidates.
 LEAST_EPOCHS = 4
 #: Weights of the rate that the controller may use; recipes ship 3e-4, which halves the bytes (docs/results-stream.md).
-LEAST_WEIGHT, USUAL_WEIGHT, MOST_WEIGHT = 3e-5, 3e-4, 3e-2
+LEAST_WEIGHT, MOST_WEIGHT = 3e-5, 3e-2
 #: Steps get at most this much coarser.
 MOST_STEP_SCALE = 4.0
 #: Thresholds of change rise at most to this many times the recipe's, from this one where the recipe has none.
@@ -114,7 +114,7 @@ def plan(budget: Budget, stream: Stream, history: Sequence[Past]) -> FramePlan:
         stream: the recipe's settings, from which the controller departs.
         history: earlier frames that were optimised, oldest first.
     """
-    recent = list(history)[-WINDOW:]
+    recent = history[-WINDOW:]
     each, (before, after) = seconds_per_epoch(recent), _around(budget, recent)
     epochs = _epochs(budget, stream, each, before + after)
     size = budget.size
@@ -141,7 +141,7 @@ def plan(budget: Budget, stream: Stream, history: Sequence[Past]) -> FramePlan:
 
 def seconds_per_epoch(history: Sequence[Past]) -> float | None:
     """Median of what a pass took in the last three frames; None while nothing is known."""
-    known = [p.optimise / p.epochs for p in list(history)[-3:] if p.epochs > 0]
+    known = [p.optimise / p.epochs for p in history[-3:] if p.epochs > 0]
     return median(known) if known else None
 
 

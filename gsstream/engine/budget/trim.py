@@ -43,26 +43,27 @@ class Fitted:
 
 
 def fit(
-    delta: Delta, curvature: Mapping[str, FloatArray], layout: Layout, encode: Callable[[Delta], EncodedPacket],
-    max_bytes: int,
+    delta: Delta, packet: EncodedPacket, curvature: Mapping[str, FloatArray], layout: Layout,
+    encode: Callable[[Delta], EncodedPacket], max_bytes: int,
 ) -> Fitted:  # fmt: skip
     """The delta, with as little given up as makes its packet at most ``max_bytes``; unchanged when it fits.
 
     Arguments:
+        packet: the delta, encoded.
         curvature: attribute -> [A, L] >= 0, aligned with ``delta.symbols``.
         encode: delta -> packet; a delta that changes nothing must give the smallest packet there is.
         max_bytes: at least the size of an empty packet.
 
     Raises AssertionError when not even the empty packet fits: a budget's least size forbids that.
     """
-    packet = encode(delta)
     untrimmed = len(packet.data)
     if untrimmed <= max_bytes:
         return Fitted(delta, packet, untrimmed)
     found = _trimmed(delta, packet, curvature, layout, encode, max_bytes) if delta.symbols else None
     if found is None and delta.edits_rows:
         # What is born is fitted last and costs most per row: without it the rest may fit.
-        plain = fit(replace(delta, births=None, deaths=np.zeros(0, np.int64)), curvature, layout, encode, max_bytes)
+        rest = replace(delta, births=None, deaths=np.zeros(0, np.int64))
+        plain = fit(rest, encode(rest), curvature, layout, encode, max_bytes)
         return replace(plain, untrimmed=untrimmed, births=0 if delta.births is None else len(delta.births))
     if found is None:
         empty = Delta(np.zeros_like(delta.gates), delta.num_levels)

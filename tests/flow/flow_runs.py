@@ -7,9 +7,12 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from gsstream.cli.main import run_command
 from gsstream.engine.stream_state import StreamState
@@ -89,6 +92,23 @@ class Witness:
             return outcome
 
         return watched
+
+
+@contextmanager
+def broken_off_in(frame: int) -> Iterator[None]:
+    """Runs in this process are interrupted, as by Ctrl-C, when they are about to step to this frame."""
+    from gsstream.engine import session
+
+    step = session.frame_step
+
+    def impatient(parts: Any, state: Any, now: Any, *more: Any) -> Any:
+        if now.index == frame:
+            raise KeyboardInterrupt
+        return step(parts, state, now, *more)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(session, "frame_step", impatient)
+        yield
 
 
 def metrics(out: Path) -> list[dict[str, Any]]:

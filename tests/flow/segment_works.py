@@ -19,12 +19,12 @@ def run_and_die_once(job: SegmentJob) -> SegmentOutcome:
     marks = Path(os.environ["SEGMENT_TEST_MARKS"])
     step = session.frame_step
 
-    def watched(parts: Any, state: Any, frame: Any, rng: Any) -> Any:
+    def watched(parts: Any, state: Any, frame: Any, *more: Any) -> Any:
         marks.joinpath(f"{job.id}-{frame.index}-{os.getpid()}").touch()
         if job.id.startswith("segment") and frame.index == FATAL and not (marks / "dead").exists():
             (marks / "dead").touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        return step(parts, state, frame, rng)
+        return step(parts, state, frame, *more)
 
     session.frame_step = watched  # type: ignore[assignment]
     return run_segment(job)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from flow_runs import WORLD, arguments, encode, metrics
+from flow_runs import WORLD, arguments, broken_off_in, encode, metrics
 
 from gsstream.cli.main import run_command
 from gsstream.engine import session
@@ -58,20 +58,13 @@ def test_resume_takes_the_values_from_the_stream(
     tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, saved: bool
 ) -> None:
     """Bit-exact, and nothing is measured again; with the recipe that says auto, or with the one that was saved."""
-    step = session.frame_step
-
-    def impatient(parts, state, frame, rng):
-        if frame.index == 3:
-            raise KeyboardInterrupt
-        return step(parts, state, frame, rng)
 
     def never(*_: object) -> None:
         raise AssertionError("a resumed run measures the scene again")
 
-    monkeypatch.setattr(session, "frame_step", impatient)
     command = arguments(tmp_path / "o", method="s2gs-edge", codec__key_every=4, **AUTO)
-    assert run_command(command) == 130
-    monkeypatch.setattr(session, "frame_step", step)
+    with broken_off_in(3):
+        assert run_command(command) == 130
     monkeypatch.setattr(session, "scene_facts", never)
     if saved:
         recipe = (tmp_path / "o" / "recipe.yaml").rename(tmp_path / "recipe.yaml")
@@ -80,9 +73,7 @@ def test_resume_takes_the_values_from_the_stream(
     assert (tmp_path / "o" / "stream.gss").read_bytes() == (whole / "stream.gss").read_bytes()
 
 
-def test_resume_of_a_stream_with_given_values_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_resume_of_a_stream_with_given_values_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     encode(tmp_path, "--frames", "1", method="s2gs-edge", structure__root_exponent=4)
     command = arguments(tmp_path, "--resume", method="s2gs-edge", structure__root_exponent="auto")
     assert run_command(command) == 2

@@ -6,10 +6,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from flow_runs import Witness, arguments, demo_copy, encode, metrics
+from flow_runs import Witness, arguments, broken_off_in, demo_copy, encode, metrics
 
 from gsstream.cli.main import run_command
-from gsstream.engine import session
 from gsstream.packet import StreamReader
 from gsstream.player.playback import Playback
 
@@ -71,17 +70,9 @@ def tight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("lost", ["a line", "all lines", "half a packet"])
-def test_a_size_budget_resumes_to_the_same_bytes(tmp_path: Path, tight: Path, monkeypatch, lost: str) -> None:
-    step = session.frame_step
-
-    def impatient(parts, state, frame, rng, *more):
-        if frame.index == 4:
-            raise KeyboardInterrupt
-        return step(parts, state, frame, rng, *more)
-
-    monkeypatch.setattr(session, "frame_step", impatient)
-    assert run_command(arguments(tmp_path / "b", *TIGHT, method="s2gs-edge")) == 130
-    monkeypatch.undo()
+def test_a_size_budget_resumes_to_the_same_bytes(tmp_path: Path, tight: Path, lost: str) -> None:
+    with broken_off_in(4):
+        assert run_command(arguments(tmp_path / "b", *TIGHT, method="s2gs-edge")) == 130
     log = tmp_path / "b" / "metrics.jsonl"
     lines = log.read_text().splitlines(keepends=True)
     assert len(lines) == 4
@@ -131,9 +122,10 @@ def test_key_packets_wait_for_a_budget_that_has_room(tmp_path: Path) -> None:
     assert [line["status"] for line in lines[1:]].count("key") == 0
     assert ["key_postponed" in line for line in lines] == [False, False, True, True, True, True]
     assert "bytes where 700 are allowed" in lines[2]["key_postponed"]
-    assert "a key packet was due and postponed in 4 frames (frames 2 to 5): period: about" in (
-        tmp_path / "small" / "summary.txt"
-    ).read_text()
+    assert (
+        "a key packet was due and postponed in 4 frames (frames 2 to 5): period: about"
+        in (tmp_path / "small" / "summary.txt").read_text()
+    )
     encode(tmp_path / "large", "--budget", "size=1MB", method="s2gs-edge", codec__key_every=2)
     assert [line["status"] for line in metrics(tmp_path / "large")][2::2] == ["key", "key"]
 

@@ -5,17 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from flow_runs import arguments, encode, metrics
+from flow_runs import arguments, broken_off_in, encode, metrics
 
 from gsstream.cli.main import run_command
-from gsstream.engine import session
 from gsstream.source.open import open_source
 
 DISTURBED = {"data__gain_amplitude": 0.3, "data__noise_sigma": 8, "data__lost_share": 0.4, "data__train_views": 2}
 
 
 def test_a_disturbed_run_resumes_to_the_same_bytes_and_is_judged_on_what_it_saw(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     world = "synthetic:frames=5&views=3&width=64&height=48&supersample=1"
     name = open_source(world).info.test.ids[0]
@@ -23,15 +22,8 @@ def test_a_disturbed_run_resumes_to_the_same_bytes_and_is_judged_on_what_it_saw(
     once = encode(tmp_path / "whole", source=world, method="s2gs-edge", **options)
     assert len(metrics(tmp_path / "whole")) == 4  # the offset costs one frame
 
-    def impatient(parts, state, frame, rng):
-        if frame.index == 2:
-            raise KeyboardInterrupt
-        return step(parts, state, frame, rng)
-
-    step = session.frame_step
-    monkeypatch.setattr(session, "frame_step", impatient)
-    assert run_command(arguments(tmp_path / "halves", source=world, method="s2gs-edge", **options)) == 130
-    monkeypatch.undo()
+    with broken_off_in(2):
+        assert run_command(arguments(tmp_path / "halves", source=world, method="s2gs-edge", **options)) == 130
     assert encode(tmp_path / "halves", "--resume", source=world, method="s2gs-edge", **options) == once
     capsys.readouterr()
     assert run_command(["evaluate", str(tmp_path / "whole")]) == 0

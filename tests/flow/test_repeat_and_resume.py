@@ -11,10 +11,9 @@ import time
 from pathlib import Path
 
 import pytest
-from flow_runs import WORLD, arguments, encode, finish, metrics, start
+from flow_runs import WORLD, arguments, broken_off_in, encode, finish, metrics, start
 
 from gsstream.cli.main import run_command
-from gsstream.engine import session
 from gsstream.packet import StreamReader
 
 METHODS = ["dense", "s2gs-edge"]
@@ -44,25 +43,16 @@ def test_threads_change_no_byte(tmp_path: Path, whole: tuple[str, bytes]) -> Non
         assert (out / "stream.gss").read_bytes() == once
 
 
-def test_two_halves_equal_the_whole(
-    tmp_path: Path, whole: tuple[str, bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_halves_equal_the_whole(tmp_path: Path, whole: tuple[str, bytes]) -> None:
     """Frames 0 to 2 here, broken off in frame 3; the rest in a process of its own."""
     method, once = whole
 
-    def impatient(parts, state, frame, rng):
-        if frame.index == 3:
-            raise KeyboardInterrupt
-        return step(parts, state, frame, rng)
-
-    step = session.frame_step
-    monkeypatch.setattr(session, "frame_step", impatient)
-    assert run_command(arguments(tmp_path / "o", method=method)) == 130
+    with broken_off_in(3):
+        assert run_command(arguments(tmp_path / "o", method=method)) == 130
     first = metrics(tmp_path / "o")
     code, _, err = finish(*arguments(tmp_path / "o", "--resume", method=method))
     assert (code, err) == (0, "")
     assert (tmp_path / "o" / "stream.gss").read_bytes() == once
-    monkeypatch.undo()
     encode(tmp_path / "u", method=method)
     lines, undisturbed = metrics(tmp_path / "o"), metrics(tmp_path / "u")
     assert [line["frame"] for line in lines] == list(range(6))

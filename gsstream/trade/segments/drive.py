@@ -15,9 +15,8 @@ from gsstream.trade.segments.job import SegmentJob, SegmentOutcome
 from gsstream.trade.segments.join import Seam, join, read_lines, seams
 from gsstream.trade.segments.plan import STREAM, SegmentPlan, Task
 from gsstream.trade.sweep.executor import Executor, Finished
+from gsstream.trade.sweep.schedule import finished_tasks
 
-#: A worker that dies is given its task again this often; it goes on where the dead one stopped.
-RETRIES = 1
 KEY_STREAMS = "first.gss"
 
 
@@ -77,27 +76,20 @@ class _Drive:
         self.tasks = {task.id: task for task in (*plan.keys, *plan.segments)}
         self.keys = {task.id for task in plan.keys}
         self.have = {task.id for task in self.tasks.values() if task.done(out)}
-        self.deaths: dict[str, int] = {}
 
     def run(self) -> tuple[int, int]:
         kept = len(self.have)
         waiting = [task for task in self.tasks.values() if task.id not in self.have]
-        running: dict[str, Task] = {}
-        while waiting or running:
-            ready = [task for task in waiting if task.after in (None, "first") or task.after in self.have]
-            for task in ready[: max(0, self.executor.slots - len(running))]:
-                waiting.remove(task)
-                running[task.id] = task
-                self.executor.submit(self._job(task))
-            finished = self.executor.next()
-            task = running.pop(finished.id)
-            if finished.outcome is None and self.deaths.get(task.id, 0) < RETRIES:
-                self.deaths[task.id] = self.deaths.get(task.id, 0) + 1
-                self.say(f"{_label(task)}: {finished.reason}; goes on")
-                waiting.insert(0, task)
-                continue
+        for task, finished in finished_tasks(
+            waiting, self.executor, self.have, after=_after, job=self._job, lost=self._lost
+        ):
+            assert finished is not None, "a task that fails ends the run before others miss its result"
             self._finish(task, finished)
         return len(self.tasks) - kept, kept
+
+    def _lost(self, task: Task, reason: str) -> None:
+        """A task starts again; where workers see its folder, it goes on where the dead one stopped."""
+        self.say(f"{_label(task)}: {reason}; goes on")
 
     def _job(self, task: Task) -> SegmentJob:
         first = None
@@ -124,6 +116,11 @@ class _Drive:
             )
         self.have.add(task.id)
         self.say(f"[{len(self.have)}/{len(self.tasks)}] {_label(task)} done")
+
+
+def _after(task: Task) -> str | None:
+    """The task that one waits for; a given frame 0 is there from the start."""
+    return None if task.after == "first" else task.after
 
 
 def _label(task: Task) -> str:

@@ -18,11 +18,10 @@ from gsstream.trade.records import mean
 from gsstream.trade.sweep.executor import Executor, Finished
 from gsstream.trade.sweep.job import Job, Outcome
 from gsstream.trade.sweep.plan import Cell, FirstFrameRun, Plan
+from gsstream.trade.sweep.schedule import finished_tasks
 from gsstream.trade.sweep.table import FORMAT, TableWriter
 
 FIRST_FRAMES, CELLS, WORK, LOCK = "first_frames", "cells", "work", "sweep.lock"
-#: A worker that dies is given its job again this often.
-RETRIES = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +74,8 @@ class _Drive:
         self.cells = {key: cell for key, cell in cells.items() if key not in done}
         made = (key for key, row in self.table.data.first_frames.items() if row["status"] == "done")
         self.have = {key for key in made if first_frame_file(out, key).is_file()}
-        self.deaths: dict[str, int] = {}
         self.failed: dict[str, str] = {}
+        self.failed_firsts: dict[str, str] = {}
         self.made, self.started = 0, time.monotonic()
 
     def run(self) -> SweepResult:
@@ -84,27 +83,18 @@ class _Drive:
         needed = dict.fromkeys(cell.first for cell in self.cells.values() if cell.first and cell.first not in self.have)
         waiting: list[Cell | FirstFrameRun] = [self.plan.firsts[key] for key in needed]
         waiting += self.cells.values()
-        running: dict[str, Cell | FirstFrameRun] = {}
-        while waiting or running:
-            ready = [task for task in waiting if self._ready(task)]
-            for task in ready[: max(0, self.executor.slots - len(running))]:
-                waiting.remove(task)
-                running[task.id] = task
-                self.executor.submit(self._job(task))
-            finished = self.executor.next()
-            task = running.pop(finished.id)
-            if finished.outcome is None and self.deaths.get(task.id, 0) < RETRIES:
-                self.deaths[task.id] = self.deaths.get(task.id, 0) + 1
-                self.say(f"{task.label}: {finished.reason}; once more")
-                waiting.insert(0, task)
-            elif isinstance(task, FirstFrameRun):
-                waiting = self._after_first_frame(task, finished, waiting)
-            else:
+        for task, finished in finished_tasks(
+            waiting, self.executor, self.have, after=_first_of, job=self._job, lost=self._lost
+        ):
+            if isinstance(task, Cell):
                 self._after_cell(task, finished)
+            else:
+                assert finished is not None, "a frame 0 waits for nothing"
+                self._after_first_frame(task, finished)
         return SweepResult(self.made, len(self.kept), self.failed)
 
-    def _ready(self, task: Cell | FirstFrameRun) -> bool:
-        return isinstance(task, FirstFrameRun) or task.first is None or task.first in self.have
+    def _lost(self, task: Cell | FirstFrameRun, reason: str) -> None:
+        self.say(f"{task.label}: {reason}; once more")
 
     def _job(self, task: Cell | FirstFrameRun) -> Job:
         uri, work = recording_uri(task.scene.uri, self.data), str((self.out / WORK).resolve())
@@ -114,10 +104,7 @@ class _Drive:
         first = first_frame_file(self.out, task.first).read_bytes() if task.first else None
         return Job(task.id, uri, task.resolved, first, self.plan.config.measure, work, alone)
 
-    def _after_first_frame(
-        self, task: FirstFrameRun, finished: Finished, waiting: list[Cell | FirstFrameRun]
-    ) -> list[Cell | FirstFrameRun]:
-        """Record a frame 0; without it, the cells that wait for it fail with its reason."""
+    def _after_first_frame(self, task: FirstFrameRun, finished: Finished) -> None:
         outcome = finished.outcome or Outcome(task.id, error=finished.reason)
         if outcome.error is None:
             write_whole(first_frame_file(self.out, task.id), outcome.stream)
@@ -125,15 +112,16 @@ class _Drive:
         if outcome.error is None:
             self.have.add(task.id)
             self.say(f"{task.label}: {_seconds(outcome):.0f} s")
-            return waiting
-        self.say(f"{task.label}: FAILED: {outcome.error}")
-        lost = [t for t in waiting if isinstance(t, Cell) and t.first == task.id]
-        for cell in lost:
-            self._after_cell(cell, Finished(cell.id, Outcome(cell.id, error=f"frame 0: {outcome.error}")))
-        return [t for t in waiting if t not in lost]
+        else:
+            self.failed_firsts[task.id] = outcome.error
+            self.say(f"{task.label}: FAILED: {outcome.error}")
 
-    def _after_cell(self, cell: Cell, finished: Finished) -> None:
-        outcome = finished.outcome or Outcome(cell.id, error=finished.reason)
+    def _after_cell(self, cell: Cell, finished: Finished | None) -> None:
+        """Record a cell; one that could not start fails with the reason of its frame 0."""
+        if finished is None:
+            outcome = Outcome(cell.id, error=f"frame 0: {self.failed_firsts[cell.first or '']}")
+        else:
+            outcome = finished.outcome or Outcome(cell.id, error=finished.reason)
         if outcome.error is None:
             write_whole(cell_file(self.out, cell.id), outcome.stream)
         place = {"scene": cell.scene.name, "variant": cell.variant, "axes": dict(cell.axes), "seed": cell.seed}
@@ -170,6 +158,11 @@ class _Drive:
         known = self.table.data.plan
         if known is None or {**values, "record": "plan"} != known:
             self.table.append("plan", values)
+
+
+def _first_of(task: Cell | FirstFrameRun) -> str | None:
+    """The frame 0 that a task waits for."""
+    return task.first if isinstance(task, Cell) else None
 
 
 def stable_id(facts: Mapping[str, Any]) -> str:

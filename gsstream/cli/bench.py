@@ -9,6 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
+from gsstream.cli import options
+
 app = typer.Typer(help="Measure rendering or a frame step here.", rich_markup_mode=None, no_args_is_help=True)
 
 Out = Annotated[Path | None, typer.Option("--out", help="Write all measurements to this JSON file.")]
@@ -69,9 +71,7 @@ def render(
 @app.command()
 def frame(
     method: Annotated[str, typer.Option("--method", help="Method whose recipe is measured.")] = "s2gs-edge",
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change a recipe value; repeatable.")
-    ] = None,
+    settings: options.Settings = None,
     shares: Annotated[str, typer.Option("--shares", help="Shares of tiles that change, percent.")] = "100,25,5,2,0",
     static: Annotated[
         str, typer.Option("--static", help="Gaussians that stand still; shares are measured at the first number.")
@@ -97,10 +97,10 @@ def frame(
 
     _check(out)
     catalog = load_catalog()
-    overrides = [("--set", text) for text in settings or ()]
+    changes = options.overrides(settings)
     if quick:
-        overrides.insert(0, ("--quick", "stream.epochs=1"))
-    recipe = resolve_recipe(method, catalog.recipe_path, (), overrides).recipe
+        changes.insert(0, ("--quick", "stream.epochs=1"))
+    recipe = resolve_recipe(method, catalog.recipe_path, (), changes).recipe
     if recipe.whole.name != "none":
         raise InputError(
             f"--method {method}: expected a method made of parts, got the whole method {recipe.whole.name!r}; time it "

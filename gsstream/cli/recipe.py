@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from gsstream.cli import options
+
 if TYPE_CHECKING:
     from gsstream.plugins.catalog import Catalog
     from gsstream.recipe.schema import PartSchema
@@ -24,12 +26,8 @@ def _group() -> None:
 @app.command()
 def show(
     method: Annotated[str, typer.Argument(help="Name of a method.")],
-    recipe: Annotated[
-        list[Path] | None, typer.Option("--recipe", help="Recipe file laid over the method's; repeatable.")
-    ] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value; repeatable.")
-    ] = None,
+    recipe: options.Recipes = None,
+    settings: options.Settings = None,
     full: Annotated[
         bool, typer.Option("--full", help="Import the parts (slow): check their settings, show their defaults too.")
     ] = False,
@@ -39,9 +37,8 @@ def show(
     from gsstream.recipe.load import resolve_recipe
     from gsstream.recipe.save import to_yaml
 
-    overrides = [("--set", text) for text in settings or ()]
     catalog = load_catalog()
-    resolved = resolve_recipe(method, catalog.recipe_path, recipe or (), overrides)
+    resolved = resolve_recipe(method, catalog.recipe_path, recipe or (), options.overrides(settings))
     if full:
         from gsstream.engine.assemble import assemble
 

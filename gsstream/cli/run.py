@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from gsstream.cli import options
 from gsstream.cli.streams import stream_file
 
 if TYPE_CHECKING:
@@ -18,34 +17,21 @@ if TYPE_CHECKING:
 
 def run(
     source: Annotated[str, typer.Option("--source", help="demo, synthetic:K=V&..., watch:DIR, DIR, or LAYOUT:DIR.")],
-    out: Annotated[Path, typer.Option("--out", help="Output folder; must not hold another run.")],
-    method: Annotated[
-        str | None, typer.Option("--method", help="Method (see 'gsstream methods'); by default the recipe file's.")
-    ] = None,
-    recipe: Annotated[
-        list[Path] | None,
-        typer.Option("--recipe", help="YAML file with differences from the method's recipe; repeatable, last wins."),
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change a value, e.g. gate.temperature=0.3; repeatable."),
-    ] = None,
-    budget: Annotated[
-        str | None,
-        typer.Option("--budget", metavar="LIMITS", help="Any of time=1.0s,size=20KB,memory=2GB (howto/budget.md)."),
-    ] = None,
-    frames: Annotated[int | None, typer.Option("--frames", help="Number of frames; all by default.")] = None,
-    scale: Annotated[float | None, typer.Option("--scale", help="Shrink images by this factor in (0, 1].")] = None,
+    out: options.Out,
+    method: options.Method = None,
+    recipe: options.Recipes = None,
+    settings: options.Settings = None,
+    budget: Annotated[str | None, options.BUDGET] = None,
+    frames: options.Frames = None,
+    scale: options.Scale = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of every random stream.")] = None,
     renderer: Annotated[str | None, typer.Option("--renderer", help="Renderer: auto, cpu, reference, ...")] = None,
-    first_frame: Annotated[
-        Path | None, typer.Option("--first-frame", help="Take frame 0 over from this stream, do not reconstruct it.")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the run that --out holds.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run that --out holds.")] = False,
+    first_frame: options.FirstFrame = None,
+    resume: options.Resume = False,
+    overwrite: options.Overwrite = False,
     checks: Annotated[str | None, typer.Option("--checks", help="Look at parts: off, frame (default), step.")] = None,
-    no_video: Annotated[bool, typer.Option("--no-video", help="Write no video, only still pictures.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print only warnings and errors.")] = False,
+    no_video: options.NoVideo = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Encode a recording as a stream of 3D Gaussians.
 
@@ -56,9 +42,9 @@ def run(
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
 
-    short = {"frames": frames, "scale": scale, "seed": seed, "renderer": renderer}
-    overrides, catalog = _overrides(settings or (), budget, short), load_catalog()
-    resolved = resolve_recipe(method, catalog.recipe_path, recipe or (), overrides)
+    changes = options.overrides(settings, budget=budget, frames=frames, scale=scale, seed=seed, renderer=renderer)
+    catalog = load_catalog()
+    resolved = resolve_recipe(method, catalog.recipe_path, recipe or (), changes)
     # The slow imports come last: a mistake on the command line is answered at once.
     from gsstream.engine.assemble import assemble
     from gsstream.engine.recording import open_recording, read_first_frame
@@ -76,15 +62,6 @@ def run(
         recording.close()
     if result.interrupted:
         raise typer.Exit(130)
-
-
-def _overrides(settings: Sequence[str], budget: str | None, short: Mapping[str, object]) -> list[tuple[str, str]]:
-    """What the command line changes in a recipe, the short options last."""
-    from gsstream.recipe.budget import budget_overrides
-
-    overrides = [("--set", text) for text in settings]
-    overrides += budget_overrides(budget) if budget is not None else []
-    return overrides + [(f"--{key}", f"{key}={value}") for key, value in short.items() if value is not None]
 
 
 def _pictures(result: RunResult, recording: FrameSource, video: bool, quiet: bool, warned: bool) -> None:

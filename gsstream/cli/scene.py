@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from gsstream.cli import options
+
 app = typer.Typer(help="Prepare and validate scenes.", no_args_is_help=True, rich_markup_mode=None)
 
 
@@ -30,7 +32,7 @@ def prepare(
     width: Annotated[int | None, typer.Option("--width", help="Shrink pictures to this width.")] = None,
     max_points: Annotated[int, typer.Option("--max-points", help="Points to keep.")] = 50_000,
     fps: Annotated[float, typer.Option("--fps", help="Frames per second, where poses are not given.")] = 30.0,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print only warnings and errors.")] = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Make a validated scene from raw synchronised recordings: poses, pinhole pictures, points, a report.
 

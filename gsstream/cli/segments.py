@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
+from contextlib import closing
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
+from gsstream.cli import options
 from gsstream.cli.listing import plural, table
 from gsstream.cli.streams import stream_file
 
@@ -19,7 +21,6 @@ if TYPE_CHECKING:
     from gsstream.source.base import FrameSource
     from gsstream.trade.segments.drive import SegmentsResult, Setting
     from gsstream.trade.segments.plan import SegmentPlan
-    from gsstream.trade.sweep.executor import Executor
 
 
 class SegmentStart(StrEnum):
@@ -31,21 +32,13 @@ class SegmentStart(StrEnum):
 
 def run_segments(
     source: Annotated[str, typer.Option("--source", help="demo, synthetic:K=V&..., DIR, or LAYOUT:DIR.")],
-    out: Annotated[Path, typer.Option("--out", help="Output folder; must not hold another run.")],
+    out: options.Out,
     segments: Annotated[int, typer.Option("--segments", min=1, help="Number of segments, of nearly equal length.")],
-    method: Annotated[
-        str | None, typer.Option("--method", help="Method (see 'gsstream methods'); by default the recipe file's.")
-    ] = None,
-    recipe: Annotated[
-        list[Path] | None,
-        typer.Option("--recipe", help="YAML file with differences from the method's recipe; repeatable, last wins."),
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change a value, e.g. gate.temperature=0.3; repeatable."),
-    ] = None,
-    frames: Annotated[int | None, typer.Option("--frames", min=1, help="Number of frames; all by default.")] = None,
-    scale: Annotated[float | None, typer.Option("--scale", help="Shrink images by this factor in (0, 1].")] = None,
+    method: options.Method = None,
+    recipe: options.Recipes = None,
+    settings: options.Settings = None,
+    frames: options.Frames = None,
+    scale: options.Scale = None,
     start: Annotated[
         SegmentStart,
         typer.Option(
@@ -57,32 +50,23 @@ def run_segments(
     key_epochs: Annotated[
         int, typer.Option("--key-epochs", min=1, help="Epochs of the step that carries a scene from key to key frame.")
     ] = 20,
-    first_frame: Annotated[
-        Path | None,
-        typer.Option("--first-frame", help="Take frame 0 over from this stream, do not reconstruct it."),
-    ] = None,
-    workers: Annotated[
-        int | None, typer.Option("--workers", min=1, help="Segments at a time; default: one for each processor.")
-    ] = None,
-    threads: Annotated[int, typer.Option("--threads", min=1, help="Threads of each worker.")] = 1,
-    ray: Annotated[
-        str | None,
-        typer.Option("--ray", metavar="ADDRESS", help="Run on this Ray cluster (extra: ray); 'local' starts one here."),
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the run that --out holds.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run that --out holds.")] = False,
-    no_video: Annotated[bool, typer.Option("--no-video", help="Write no video, only still pictures.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print only warnings and errors.")] = False,
+    first_frame: options.FirstFrame = None,
+    workers: Annotated[int | None, options.workers("Segments")] = None,
+    threads: options.Threads = 1,
+    ray: options.Ray = None,
+    resume: options.Resume = False,
+    overwrite: options.Overwrite = False,
+    no_video: options.NoVideo = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Encode a recording in segments, several at a time, and join them into one stream.
 
     Each segment begins with a key packet, at which players can also join. A killed worker's segment goes on where it
     stopped; after Ctrl-C or a failure, --resume keeps what is finished.
     """
-    overrides = [("--set", text) for text in settings or ()]
-    overrides += [(f"--{key}", f"{key}={value}") for key, value in (("frames", frames), ("scale", scale)) if value]
+    changes = options.overrides(settings, frames=frames, scale=scale)
     wanted = Wanted(source, out, segments, start.value, key_epochs, first_frame, workers, threads, ray)
-    result = _encode(wanted, method, recipe or (), overrides, (resume, overwrite), (quiet, not no_video))
+    result = _encode(wanted, method, recipe or (), changes, (resume, overwrite), (quiet, not no_video))
     if not quiet:
         typer.echo(_seams(result))
 
@@ -102,7 +86,7 @@ class Wanted(NamedTuple):
 
 
 def _encode(
-    wanted: Wanted, method: str | None, recipe: Sequence[Path], overrides: Sequence[tuple[str, str]],
+    wanted: Wanted, method: str | None, recipe: Sequence[Path], changes: Sequence[tuple[str, str]],
     again: tuple[bool, bool], shown: tuple[bool, bool],
 ) -> SegmentsResult:  # fmt: skip
     """``again``: resume, overwrite; ``shown``: quiet, video."""
@@ -110,13 +94,15 @@ def _encode(
     from gsstream.recipe.load import resolve_recipe
 
     catalog = load_catalog()
-    resolved = resolve_recipe(method, catalog.recipe_path, recipe, overrides)
+    resolved = resolve_recipe(method, catalog.recipe_path, recipe, changes)
     from gsstream.engine.assemble import assemble
     from gsstream.engine.recording import open_recording
     from gsstream.trade.gallery import SUMMARY, write_gallery
     from gsstream.trade.segments.drive import run_segments as drive
+    from gsstream.trade.segments.job import run_segment
     from gsstream.trade.segments.join import first_frame_of
     from gsstream.trade.sweep.drive import only_one
+    from gsstream.trade.sweep.executor import make_executor
 
     assembly = assemble(resolved, catalog)
     first = None if wanted.first_frame is None else first_frame_of(stream_file(wanted.first_frame))
@@ -124,11 +110,13 @@ def _encode(
     out, (quiet, video) = wanted.out, shown
     try:
         work = _work(wanted, first, resolved, assembly, recording)
-        out.mkdir(parents=True, exist_ok=True)
-        with only_one(out, "run"):
-            _prepare(out, work.facts, first, resume=again[0], overwrite=again[1])
-            say = (lambda _: None) if quiet else typer.echo
-            result = drive(work.plan, work.setting, out, _executor(wanted), say=say)
+        say = (lambda _: None) if quiet else typer.echo
+        # Workers before the folder is touched: --overwrite must not delete a run for want of a cluster.
+        with closing(make_executor(run_segment, wanted.workers, wanted.threads, wanted.ray)) as executor:
+            out.mkdir(parents=True, exist_ok=True)
+            with only_one(out, "run"):
+                _prepare(out, work.facts, first, resume=again[0], overwrite=again[1])
+                result = drive(work.plan, work.setting, out, executor, say=say)
         written = write_gallery(out, recording, video=video)
     finally:
         recording.close()
@@ -206,18 +194,6 @@ def _prepare(
     write_plan(out, facts, resume=resume)
     if first is not None:
         (out / KEY_STREAMS).write_bytes(first)
-
-
-def _executor(wanted: Wanted) -> Executor:
-    from gsstream.trade.segments.job import run_segment
-    from gsstream.trade.sweep.executor import LocalExecutor, usable_processors
-
-    if wanted.ray is not None:
-        from gsstream.trade.sweep.ray_executor import RayExecutor
-
-        return RayExecutor(wanted.ray, wanted.workers, wanted.threads, run_segment)
-    count = wanted.workers or max(1, usable_processors() // wanted.threads)
-    return LocalExecutor(count, wanted.threads, run_segment, ["gsstream.trade.sweep.warm"])
 
 
 def _seams(result: SegmentsResult) -> str:

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from gsstream.cli import options
 from gsstream.cli.listing import plural, table
 
 if TYPE_CHECKING:
-    from gsstream.trade.sweep.executor import Executor
     from gsstream.trade.sweep.plan import Plan
 
 
@@ -23,14 +23,9 @@ def sweep(
     data: Annotated[
         Path | None, typer.Option("--data", help="Folder of the recordings that the file names by relative paths.")
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option("--workers", min=1, help="Cells at a time; default: one for each processor.")
-    ] = None,
-    threads: Annotated[int, typer.Option("--threads", min=1, help="Threads of each worker.")] = 1,
-    ray: Annotated[
-        str | None,
-        typer.Option("--ray", metavar="ADDRESS", help="Run on this Ray cluster (extra: ray); 'local' starts one here."),
-    ] = None,
+    workers: Annotated[int | None, options.workers("Cells")] = None,
+    threads: options.Threads = 1,
+    ray: options.Ray = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would run, and what is there already.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print only warnings, errors and failed cells.")] = False,
 ) -> None:
@@ -48,8 +43,10 @@ def sweep(
         typer.echo(_describe(plan, out))
         return
     from gsstream.trade.sweep.drive import run_sweep
+    from gsstream.trade.sweep.executor import make_executor
+    from gsstream.trade.sweep.job import run_job
 
-    executor = _executor(workers, threads, ray)
+    executor = make_executor(run_job, workers, threads, ray)
     result = run_sweep(plan, out, executor, data=data, say=(lambda _: None) if quiet else typer.echo)
     if not quiet:
         made = plural(result.made - len(result.failed), "cell")
@@ -59,18 +56,6 @@ def sweep(
         for key, reason in result.failed.items():
             typer.echo(f"  {plan.cells[key].label}: {reason}", err=True)
         raise typer.Exit(1)
-
-
-def _executor(workers: int | None, threads: int, ray: str | None) -> Executor:
-    from gsstream.trade.sweep.executor import LocalExecutor, usable_processors
-    from gsstream.trade.sweep.job import run_job
-
-    if ray is not None:
-        from gsstream.trade.sweep.ray_executor import RayExecutor
-
-        return RayExecutor(ray, workers, threads, run_job)
-    preload = ["gsstream.trade.sweep.warm"]
-    return LocalExecutor(workers or max(1, usable_processors() // threads), threads, run_job, preload)
 
 
 def _describe(plan: Plan, out: Path) -> str:

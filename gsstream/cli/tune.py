@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gsstream.cli import options
 from gsstream.cli.listing import plural
 from gsstream.cli.streams import stream_file
 
@@ -18,10 +19,7 @@ if TYPE_CHECKING:
 
 def tune(
     scene: Annotated[str, typer.Option("--scene", help="The recording, as for 'gsstream run --source'.")],
-    budget: Annotated[
-        str,
-        typer.Option("--budget", metavar="LIMITS", help="Any of time=1.0s,size=20KB,memory=2GB (howto/budget.md)."),
-    ],
+    budget: Annotated[str, options.BUDGET],
     out: Annotated[Path, typer.Option("--out", help="Folder of the pilot and of tuned.yaml; a pilot there goes on.")],
     data: Annotated[
         Path | None, typer.Option("--data", help="Folder in which a recording named by a relative path lies.")
@@ -38,14 +36,11 @@ def tune(
         typer.Option("--method", help="Method to try; repeatable; by default dense and the s2gs methods."),
     ] = None,
     frames: Annotated[int, typer.Option("--frames", min=2, help="Frames of the pilot, the first one included.")] = 5,
-    scale: Annotated[float | None, typer.Option("--scale", help="Shrink images by this factor in (0, 1].")] = None,
+    scale: options.Scale = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of every random stream.")] = 0,
-    first_frame: Annotated[
-        Path | None, typer.Option("--first-frame", help="Take frame 0 over from this stream, do not reconstruct it.")
-    ] = None,
+    first_frame: options.FirstFrame = None,
     workers: Annotated[
-        int | None,
-        typer.Option("--workers", min=1, help="Candidates at a time; default: one for each processor, 1 with a time."),
+        int | None, options.workers("Candidates", "one for each processor, 1 with a time")
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print only the table, warnings and errors.")] = False,
 ) -> None:
@@ -86,7 +81,7 @@ def _run(
     plan: Plan, limits: Budget, out: Path, data: Path | None, first: Path | None, workers: int | None, quiet: bool
 ) -> list[Trial]:
     from gsstream.trade.sweep.drive import run_sweep
-    from gsstream.trade.sweep.executor import LocalExecutor, usable_processors
+    from gsstream.trade.sweep.executor import make_executor, usable_processors
     from gsstream.trade.sweep.job import run_job
     from gsstream.trade.sweep.table import read_table
     from gsstream.trade.tune import give_first_frame, trial_of
@@ -96,7 +91,7 @@ def _run(
     processors = usable_processors()
     # Candidates beside each other would take each other's time.
     workers = workers or (1 if limits.time is not None else processors)
-    executor = LocalExecutor(workers, max(1, processors // workers), run_job, ["gsstream.trade.sweep.warm"])
+    executor = make_executor(run_job, workers, max(1, processors // workers))
     run_sweep(plan, out, executor, data=data, say=(lambda _: None) if quiet else typer.echo)
     rows = read_table(out).cells
     return [trial_of(point.variant, rows.get(point.id, {"status": "missing"}), limits) for point in plan.points]

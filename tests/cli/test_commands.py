@@ -33,6 +33,7 @@ CHEAP = [
 ]
 
 RUN = ["run", "--source", "demo", "--out", "OUT"]
+SEGMENTS = ["run-segments", *RUN[1:], "--segments", "2"]
 
 OPTIONS = {
     "gsstream": ["--debug", "--version"],
@@ -142,6 +143,8 @@ def run(capsys: pytest.CaptureFixture[str], *args: str) -> tuple[int, str, str]:
         ([*RUN, "--method", "dens"], "no method named 'dens'; did you mean 'dense'?"),
         ([*RUN, "--set", "lss.dssim=1"], "--set lss.dssim=1: unknown key 'lss'; did you mean 'loss'?"),
         ([*RUN, "--frames", "0"], "--frames frames=0: frames: input should be greater than or equal to 1, got 0"),
+        ([*SEGMENTS, "--frames", "0"], "--frames frames=0: frames: input should be greater than or equal to 1, got 0"),
+        ([*SEGMENTS, "--scale", "0"], "--scale scale=0.0: scale: input should be greater than 0, got 0.0"),
         ([*RUN, "--recipe", "absent.yaml"], "cannot read the recipe absent.yaml: "),
         ([*RUN, "--budget", "siz=20KB"], "--budget siz=20KB: unknown key 'siz'; did you mean 'size'?"),
         (

@@ -114,6 +114,22 @@ class LocalExecutor:
         self._running.clear()
 
 
+def make_executor(work: Work, workers: int | None, threads: int, ray: str | None = None) -> Executor:
+    """Processes on this machine, or tasks on the Ray cluster at ``ray``.
+
+    Arguments:
+        workers: jobs at a time; None: as many as the processors allow.
+
+    Raises what :class:`gsstream.trade.sweep.ray_executor.RayExecutor` raises.
+    """
+    if ray is not None:
+        from gsstream.trade.sweep.ray_executor import RayExecutor
+
+        return RayExecutor(ray, workers, threads, work)
+    workers = workers or max(1, usable_processors() // threads)
+    return LocalExecutor(workers, threads, work, ["gsstream.trade.sweep.warm"])
+
+
 def _serve(pipe: Connection, work: Work, job: Any, environment: Mapping[str, str]) -> None:
     """The body of a worker process."""
     os.environ.clear()

@@ -35,6 +35,11 @@ class Exposure:
         return (gradient.reshape(-1, 3) @ self.matrix[view]).reshape(gradient.shape)
 
 
+def load_backward() -> None:
+    """The first backward pass of a process imports for most of a second: to be paid before a frame is counted."""
+    torch.autograd.backward([torch.zeros(1, requires_grad=True)], [torch.zeros(1)])
+
+
 def backward_view(
     image: torch.Tensor,
     view: int,

@@ -39,7 +39,7 @@ def optimise(parts: Assembly, problem: Problem, generator: torch.Generator) -> S
         return Solution(problem.active, {}, {}, problem.gate, problem.state.gate_moments, 0.0, 0)
     views = len(problem.frame.cameras)
     epochs, effort = max(1, round(stream.epochs * problem.frame.effort)), problem.frame.effort
-    pace = Pace(problem.allowance, epochs, stream.rate_weight, effort)
+    pace = Pace(problem.allowance, epochs, stream.rate_weight, views, effort)
     run, gains = _FrameRun(parts, problem, generator, pace), Gains(views)
     loss, epoch = 0.0, 0
     pace.begin(len(problem.active))

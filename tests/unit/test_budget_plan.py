@@ -1,4 +1,4 @@
-"""Planning frames under a budget: units, the pure planner, the pace inside a frame, and what is reported."""
+"""Planning frames under a budget: units, the pure planner, and what is reported."""
 
 from __future__ import annotations
 
@@ -12,13 +12,11 @@ from hypothesis import strategies as st
 
 from gsstream.core.errors import RecipeError
 from gsstream.engine.budget.controller import Controller
-from gsstream.engine.budget.pace import Allowance, Pace, estimated_bytes, next_weight
+from gsstream.engine.budget.pace import estimated_bytes, next_weight
 from gsstream.engine.budget.plan import (
     LEAST_WEIGHT,
-    MOST_TRIMMED,
     MOST_WEIGHT,
     TIME_MARGIN,
-    FramePlan,
     Past,
     epochs_within,
     plan,
@@ -157,65 +155,6 @@ def test_passes_fill_the_time(seconds: float, each: float, most: int) -> None:
     assert epochs == most or (epochs + 1) * each > seconds * (1 - 1e-6)
 
 
-class Clock:
-    """A clock that a test moves."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
-def paced(seconds: float, **known: float) -> tuple[Pace, Clock]:
-    clock = Clock()
-    found = FramePlan(20, 6.0, 3e-4, most_epochs=30, seconds=seconds, after=1.0, **known)  # type: ignore[arg-type]
-    return Pace(Allowance(found, clock.now, clock), 20, 3e-4), clock
-
-
-def test_the_clock_ends_a_frame_before_its_coding_has_no_time_left() -> None:
-    pace, clock = paced(5.0)
-    pace.begin(10)
-    done = 0
-    while True:
-        clock.now += 0.3
-        done += 1
-        if pace.is_over():
-            break
-    assert done == 13, "4 seconds are there beside coding, and 13 views of 0.3 s fit into them"
-    assert pace.stopped_by_clock
-
-
-def test_passes_follow_what_they_took() -> None:
-    pace, clock = paced(11.0)
-    pace.begin(10)
-    assert pace.epochs == 20
-    clock.now += 2.0
-    pace.end_epoch(1)
-    assert pace.epochs == 5, "10 s, 2 of them gone, 2 s a pass"
-    clock.now += 1.0
-    pace.end_epoch(2)
-    assert pace.epochs == 9, "the pass after that took half as long"
-    clock.now += 6.9
-    pace.end_epoch(3)
-    assert pace.epochs == 3
-    assert pace.stopped_by_clock
-
-
-def test_the_first_number_of_passes_scales_with_the_candidates() -> None:
-    few, many = (paced(11.0, each=1.0, candidates=100)[0] for _ in range(2))
-    few.begin(100)
-    many.begin(400)
-    assert (few.epochs, many.epochs) == (10, 3)
-
-
-def test_without_an_allowance_nothing_changes() -> None:
-    pace = Pace(None, 7, 3e-4)
-    pace.begin(10)
-    pace.end_epoch(1)
-    assert (pace.is_over(), pace.epochs, pace.rate_weight, pace.meets_size) == (False, 7, 3e-4, False)
-
-
 @given(st.floats(LEAST_WEIGHT, MOST_WEIGHT), st.floats(0, 1e6), st.floats(1, 1e6))
 def test_the_weight_moves_towards_the_size(weight: float, expected: float, wanted: float) -> None:
     after = next_weight(weight, expected, wanted)
@@ -270,32 +209,3 @@ def test_a_frame_starts_with_the_recipes_weight_or_less_where_bytes_were_left() 
     assert starts[0] == 1e-4
     assert starts[1] == pytest.approx(2e-4, rel=1e-3)
     assert starts[2:] == [3e-4, 3e-4]
-
-
-def test_the_weight_of_a_frame_is_that_of_its_last_half() -> None:
-    clock = Clock()
-    pace = Pace(Allowance(FramePlan(4, 6.0, 1e-3, max_bytes=1000), clock.now, clock), 4, 1e-3)
-    for done in range(1, 5):
-        pace.end_epoch(done)
-        pace.meet_size(done, 10 * MOST_TRIMMED * 1000)
-    # Made with 1e-3 (its pass is a quarter of all: looked at), then three times as much after each pass.
-    assert pace.typical_weight == pytest.approx(math.sqrt(9e-3 * 27e-3))
-
-
-@pytest.mark.parametrize(("estimate", "after"), [(900, 1e-3), (1000, 1e-3), (1999, 1e-3), (4000, 2e-3), (235, 5e-4)])
-def test_up_to_twice_the_size_is_left_to_trimming(estimate: float, after: float) -> None:
-    clock = Clock()
-    pace = Pace(Allowance(FramePlan(4, 6.0, 1e-3, max_bytes=1000), clock.now, clock), 4, 1e-3)
-    pace.meet_size(2, estimate)
-    assert pace.rate_weight == pytest.approx(after, rel=0.03)
-
-
-def test_a_slow_first_view_does_not_end_the_frame() -> None:
-    pace, clock = paced(5.0)
-    pace.begin(10)
-    clock.now += 2.5
-    assert not pace.is_over(), "1.5 s are left, and the next view will not take as long"
-    clock.now += 0.4
-    assert not pace.is_over()
-    clock.now += 0.8
-    assert pace.is_over()

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gsstream.core.births import own_nodes
 from gsstream.core.delta import Delta, Layout, active_rows
 from gsstream.core.gaussians import Gaussians
-from gsstream.engine.budget.trim import fit
+from gsstream.engine.budget.trim import _GATE_BITS, _Table, fit
 from gsstream.packet import EncodedPacket, encode_delta, encode_empty, quantise_decoders
 from gsstream.packet.delta import decode_delta
 
@@ -118,3 +118,31 @@ def test_an_empty_packet_is_the_last_resort() -> None:
     assert fitted.delta.is_empty
     assert len(fitted.packet.data) == 16
     assert fitted.gates == np.count_nonzero(delta.gates)
+
+
+@given(st.integers(0, 10_000), st.sampled_from([0.05, 1.0, 20.0]), st.floats(1e-6, 1e3))
+@settings(max_examples=10)
+def test_leaving_zeros_out_of_the_choice_changes_nothing(seed: int, spread: float, price: float) -> None:
+    """Against all symbols of all rows weighed one by one."""
+    delta, curvature, layout = scene(seed, spread=spread)
+    assume(delta.symbols)
+    table = _Table(delta, curvature, layout)
+    values, opened, bits = table._choose(price)
+    kept = np.zeros_like(table.symbols)
+    kept[table.place] = values
+    wanted, lost, code, shut = np.zeros_like(kept), *np.zeros((3, *kept.shape))
+    worth = np.concatenate([curvature[n] * delta.steps[n] ** 2 for n in delta.symbols], 1)
+    for channel, column in enumerate(table.symbols.T):
+        for row, symbol in enumerate(column):
+            choices = []
+            for value in (symbol, symbol - np.sign(symbol), 0):
+                length = np.log2(len(column) / max(np.sum(column == value), 0.5))
+                choices.append((worth[row, channel] * (value - symbol) ** 2, length, value))
+            best = min(choices, key=lambda c: c[0] + price * c[1])
+            lost[row, channel], code[row, channel], wanted[row, channel] = best
+            shut[row, channel] = choices[2][0]
+    np.testing.assert_array_equal(kept, wanted)
+    gate = np.repeat(np.arange(len(table.counts)), table.counts)
+    cost, length, closed = (np.bincount(gate, part.sum(1), len(opened)) for part in (lost, code, shut))
+    np.testing.assert_array_equal(opened, closed > cost + price * (length + _GATE_BITS))
+    assert bits == pytest.approx((length + _GATE_BITS)[opened].sum())

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from statistics import mean
 
 import torch
 
@@ -14,6 +15,7 @@ from gsstream.engine.budget.plan import (
     MOST_TRIMMED,
     MOST_WEIGHT,
     SIZE_AIM,
+    UNKNOWN_RESERVE,
     FramePlan,
     each_with,
     epochs_within,
@@ -41,40 +43,53 @@ class Allowance:
 
 
 class Pace:
-    """Passes and weight of one frame, corrected after every pass; lives inside one frame's optimisation.
+    """Passes and weight of one frame, corrected by what its own passes take; lives inside one frame's optimisation.
 
     Arguments:
-        epochs, rate_weight: of the plan or the recipe. effort: share of the passes that the frame is worth.
+        epochs, rate_weight: of the plan or the recipe. views: iterations of a pass.
+        effort: share of the passes that the frame is worth.
 
     Without an allowance it is the recipe's number of passes and weight.
     """
 
-    def __init__(self, allowance: Allowance | None, epochs: int, rate_weight: float, effort: float = 1.0) -> None:
+    def __init__(
+        self, allowance: Allowance | None, epochs: int, rate_weight: float, views: int, effort: float = 1.0
+    ) -> None:
         plan = None if allowance is None else allowance.plan
-        timed = plan is not None and plan.seconds is not None
+        self._timed = allowance if plan is not None and plan.seconds is not None else None
         # With a time budget the plan's number is a prediction, and the clock may allow more.
-        self._most = max(epochs, round(effort * plan.most_epochs)) if plan is not None and timed else epochs
+        self._most = max(epochs, round(effort * plan.most_epochs)) if plan is not None and self._timed else epochs
         self.epochs, self.rate_weight = epochs, rate_weight
         self.estimate = 0.0
         self._weights: list[float] = []
         self.stopped_by_clock = False
-        self._allowance = allowance
-        self._deadline: float | None = None
-        if allowance is not None and allowance.plan.seconds is not None:
-            self._deadline = allowance.started + allowance.plan.seconds - allowance.plan.after
-        self._now = allowance.clock if allowance is not None else None
-        self._epoch_began = self._iteration_began = 0.0
+        self._allowance, self._views = allowance, views
+        #: Seconds a pass is expected to take.
+        self._each = 0.0
+        self._iteration_began = 0.0
         self._iterations: list[float] = []
 
     def begin(self, candidates: int) -> None:
         """The first pass begins, with so many Gaussians."""
-        if self._now is None or self._allowance is None:
+        if self._timed is None:
             return
-        now, plan = self._now(), self._allowance.plan
-        self._epoch_began = self._iteration_began = now
-        if self._deadline is not None and plan.each is not None:
-            each = each_with(plan.each, plan.candidates, candidates)
-            self.epochs = epochs_within(self._deadline - now, each, self._most)
+        now, plan = self._timed.clock(), self._timed.plan
+        self._iteration_began = now
+        # What came before took every view once, forwards and backwards: without a past it stands for a pass.
+        before = now - self._timed.started
+        self._each = before if plan.each is None else each_with(plan.each, plan.candidates, candidates)
+        self.epochs = epochs_within(self._left(now), self._each, self._most)
+
+    def _left(self, now: float) -> float:
+        """Seconds for passes from now on.
+
+        What follows them is not known before a frame has shown it: until then it is taken for one more pass.
+        """
+        assert self._timed is not None
+        assert self._timed.plan.seconds is not None
+        seconds, after = self._timed.plan.seconds, self._timed.plan.after
+        kept = min(self._each, UNKNOWN_RESERVE * seconds) if after is None else after
+        return self._timed.started + seconds - kept - now
 
     @property
     def typical_weight(self) -> float:
@@ -89,26 +104,36 @@ class Pace:
 
     def is_over(self) -> bool:
         """Called after every iteration: whether the time for another one is gone."""
-        if self._deadline is None or self._now is None:
+        if self._timed is None:
             return False
-        now = self._now()
+        now = self._timed.clock()
         self._iterations.append(now - self._iteration_began)
         self._iteration_began = now
-        # The first view pays for what is made ready once: taken as typical it would end the frame there.
-        last = self._iterations[1:][-3:]
-        self.stopped_by_clock = now + (max(last) if last else 0.0) > self._deadline
+        usual = self._usual()
+        if usual and self._timed.plan.each is None and len(self._iterations) < self._views:
+            self._each = self._views * mean(usual)
+            made = len(self._iterations) / self._views
+            self.epochs = epochs_within(self._left(now) + made * self._each, self._each, self._most)
+        self.stopped_by_clock = max(usual[-3:], default=0.0) > self._left(now)
         return self.stopped_by_clock
 
     def end_epoch(self, done: int) -> None:
         """Plan the passes that are left by what the last one took. ``done``: passes made."""
-        if self._deadline is None or self._now is None:
+        if self._timed is None:
             return
-        now = self._now()
-        each, self._epoch_began = now - self._epoch_began, now
-        left = self._deadline - now
-        self.epochs = done if left < 0.25 * each else done + epochs_within(left, each, max(1, self._most - done))
-        self.epochs = min(self.epochs, self._most)
+        now = self._timed.clock()
+        self._each = self._views * mean(self._usual() or self._iterations)
+        left = self._left(now)
+        more = 0 if left < 0.25 * self._each else epochs_within(left, self._each, max(1, self._most - done))
+        self.epochs = min(done + more, self._most)
         self.stopped_by_clock = self.epochs == done < self._most
+
+    def _usual(self) -> list[float]:
+        """Seconds of the iterations of the last pass.
+
+        Without the frame's first, which pays for what is made ready once: as typical it would end the frame there.
+        """
+        return self._iterations[1:][-self._views :]
 
     def meet_size(self, done: int, estimate: float) -> None:
         """Move the weight of the rate by what a pass would have sent. ``estimate``: bytes, before the correction."""

@@ -22,7 +22,7 @@ TIME_MARGIN = 0.93
 #: Below this share of a size budget the weight falls; above this multiple it rises. In between the packet is trimmed:
 #: that takes 43 % of the bytes for less than any weight does (docs/results-budget.md).
 SIZE_AIM, MOST_TRIMMED = 0.94, 2.0
-#: Share of a time budget kept for coding while no frame has shown what it costs.
+#: Share of a time that is kept at most for what follows the passes while no frame has shown what it costs.
 UNKNOWN_RESERVE = 0.2
 #: Share of a pass's time that does not depend on the number of candidates.
 FIXED_SHARE = 0.3
@@ -87,7 +87,7 @@ class FramePlan:
         step_scale: factor on all quantisation steps, >= 1.
         max_bytes: the size that must not be exceeded, or None. correction: real bytes per estimated byte.
         seconds: what may be planned with from the start of the frame, or None.
-        after: seconds of it to keep for coding.
+        after: seconds of it to keep for what follows the passes; None: unknown, the frame's own passes will tell.
         each, candidates: seconds that a pass has taken, with so many Gaussians; None while nothing is known.
         predicted_seconds, predicted_bytes: what the frame is expected to cost; None while nothing is known.
     """
@@ -100,7 +100,7 @@ class FramePlan:
     max_bytes: int | None = None
     correction: float = 1.0
     seconds: float | None = None
-    after: float = 0.0
+    after: float | None = None
     each: float | None = None
     candidates: int = 0
     predicted_seconds: float | None = None
@@ -115,7 +115,7 @@ def plan(budget: Budget, stream: Stream, history: Sequence[Past]) -> FramePlan:
         history: earlier frames that were optimised, oldest first.
     """
     recent = history[-WINDOW:]
-    each, (before, after) = seconds_per_epoch(recent), _around(budget, recent)
+    each, (before, after) = seconds_per_epoch(recent), _around(recent)
     epochs = _epochs(budget, stream, each, before + after)
     size = budget.size
     held = size is not None
@@ -131,7 +131,7 @@ def plan(budget: Budget, stream: Stream, history: Sequence[Past]) -> FramePlan:
         max_bytes=size,
         correction=_correction(recent),
         seconds=seconds,
-        after=after,
+        after=after if recent else None,
         each=each,
         candidates=recent[-1].candidates if recent else 0,
         predicted_seconds=None if each is None else before + each * epochs + after,
@@ -165,10 +165,10 @@ def _epochs(budget: Budget, stream: Stream, each: float | None, around: float) -
     return most if each is None else epochs_within(TIME_MARGIN * budget.time - around, each, most)
 
 
-def _around(budget: Budget, recent: Sequence[Past]) -> tuple[float, float]:
+def _around(recent: Sequence[Past]) -> tuple[float, float]:
     """Seconds before and after the passes."""
     if not recent:
-        return 0.0, UNKNOWN_RESERVE * (budget.time or 0.0)
+        return 0.0, 0.0
     # What follows cannot be cut short: the dearest of the last frames, unless it was a hiccup.
     after = [p.after for p in recent]
     return median(p.before for p in recent), min(max(after), 2 * median(after))

@@ -99,25 +99,37 @@ def _trimmed(
 
 
 class _Table:
-    """Symbols of all attributes side by side with their worth and code lengths."""
+    """Symbols of all attributes side by side with their worth and code lengths.
+
+    A zero has no choice, and most symbols are zeros: only the K others are weighed against a price.
+    """
 
     def __init__(self, delta: Delta, curvature: Mapping[str, FloatArray], layout: Layout) -> None:
         self.delta = delta
         self.opened = np.flatnonzero((delta.gates > 0) & (np.asarray(layout.node_counts) > 0))
         self.counts = np.asarray(layout.node_counts)[self.opened]
         self.names = list(delta.symbols)
-        self.symbols = np.concatenate([delta.symbols[n] for n in self.names], 1).astype(np.int64)
+        self.symbols = symbols = np.concatenate([delta.symbols[n] for n in self.names], 1).astype(np.int64)
+        codes = [_code_lengths(column) for column in symbols.T]
+        self.place = rows, columns = symbols.nonzero()
+        gate = np.repeat(np.arange(len(self.opened)), self.counts)
+        zeros = np.where(symbols == 0, [code(np.zeros(1, np.int64))[0] for code in codes], 0.0).sum(1)
+        #: What the zeros behind each open gate cost, and the gate itself: [G].
+        self.fixed = np.bincount(gate, zeros, len(self.opened)) + _GATE_BITS
+        self.gate = gate[rows]
         steps = [np.full(delta.symbols[n].shape[1], delta.steps[n]) for n in self.names]
-        worth = np.concatenate([np.asarray(curvature[n], np.float64) for n in self.names], 1)
-        worth *= np.concatenate(steps)[None] ** 2
-        nearer = self.symbols - np.sign(self.symbols)
-        #: The three choices of every symbol: [3, A, L] values, what they lose and what they cost.
-        self.values = np.stack([self.symbols, nearer, np.zeros_like(self.symbols)])
-        self.losses = worth[None] * (self.values - self.symbols[None]) ** 2
-        codes = [_code_lengths(column) for column in self.symbols.T]
-        self.lengths = np.stack([[code(column) for code, column in zip(codes, v.T, strict=True)] for v in self.values])
-        self.lengths = self.lengths.transpose(0, 2, 1)
-        self.bits = float(self.lengths[0].sum()) + _GATE_BITS * len(self.opened)
+        worth = np.concatenate([np.asarray(curvature[n], np.float64) for n in self.names], 1)[rows, columns]
+        worth *= np.concatenate(steps)[columns] ** 2
+        kept = symbols[rows, columns]
+        #: The three choices of every symbol that is not zero: [3, K] values, what they lose and what they cost.
+        self.values = np.stack([kept, kept - np.sign(kept), np.zeros_like(kept)])
+        self.losses = worth[None] * (self.values - kept[None]) ** 2
+        self.lengths = np.zeros(self.values.shape)
+        for channel, code in enumerate(codes):
+            of = np.flatnonzero(columns == channel)
+            self.lengths[:, of] = code(self.values[:, of])
+        self.closed = self._by_gate(self.losses[2])
+        self.bits = float(self.lengths[0].sum() + self.fixed.sum())
         #: A price at which nothing is worth its bits.
         self.most = float(self.losses[2].sum()) + 1e-30
 
@@ -132,41 +144,35 @@ class _Table:
         return self._delta(*self._choose(high)[:2])
 
     def _choose(self, price: float) -> tuple[IntArray, BoolArray, float]:
-        """(symbols [A, L], open [G] of the gates, bits) at a price of loss per bit."""
-        total = self.losses + price * self.lengths
-        choice = total.argmin(0)[None]
-        values, losses, lengths = (
-            np.take_along_axis(table, choice, 0)[0] for table in (self.values, self.losses, self.lengths)
-        )
-        starts = np.cumsum(self.counts) - self.counts
-        kept, length = _by_gate(losses.sum(1), starts), _by_gate(lengths.sum(1), starts) + _GATE_BITS
-        closed = _by_gate(self.losses[2].sum(1), starts)
-        opened = closed > kept + price * length
-        return values, opened, float(length[opened].sum())
+        """(symbols [K], open [G] of the gates, bits) at a price of loss per bit."""
+        choice = (self.losses + price * self.lengths).argmin(0), np.arange(len(self.gate))
+        length = self._by_gate(self.lengths[choice]) + self.fixed
+        opened = self.closed > self._by_gate(self.losses[choice]) + price * length
+        return self.values[choice], opened, float(length[opened].sum())
+
+    def _by_gate(self, values: FloatArray) -> FloatArray:
+        """[G] sums over the symbols behind each open gate."""
+        return np.asarray(np.bincount(self.gate, values, len(self.opened)), np.float64)
 
     def _delta(self, values: IntArray, opened: BoolArray) -> Delta:
         # A gate behind which every symbol is zero is closed, as in hardening.
-        starts = np.cumsum(self.counts) - self.counts
-        opened = opened & (_by_gate(values.any(1).astype(np.float64), starts) > 0)
+        opened = opened & (self._by_gate((values != 0).astype(np.float64)) > 0)
         rows = np.repeat(opened, self.counts)
         gates = self.delta.gates.copy()
         gates[self.opened[~opened]] = 0
+        kept = np.zeros_like(self.symbols)
+        kept[self.place] = values
         symbols, at = {}, 0
         for name in self.names:
             width = self.delta.symbols[name].shape[1]
-            part = values[rows, at : at + width].astype(np.int32)
+            part = kept[rows, at : at + width].astype(np.int32)
             at += width
             if part.any():
                 symbols[name] = part
-        kept = {n: v for n, v in self.delta.decoders.items() if n in symbols}
+        decoders = {n: v for n, v in self.delta.decoders.items() if n in symbols}
         return replace(
-            self.delta, gates=gates, symbols=symbols, steps={n: self.delta.steps[n] for n in symbols}, decoders=kept
+            self.delta, gates=gates, symbols=symbols, steps={n: self.delta.steps[n] for n in symbols}, decoders=decoders
         )
-
-
-def _by_gate(rows: Any, starts: IntArray) -> FloatArray:
-    """[G] sums over the rows of each open gate, which are stored one after the other."""
-    return np.asarray(np.add.reduceat(rows, starts)) if len(starts) else np.zeros(0)
 
 
 def _code_lengths(column: IntArray) -> Callable[[IntArray], FloatArray]:

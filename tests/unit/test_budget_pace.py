@@ -1,0 +1,225 @@
+"""The pace inside a frame, on a clock that the test moves: passes follow what passes take, and nothing is late."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from dataclasses import dataclass
+
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from gsstream.engine.budget.pace import Allowance, Pace
+from gsstream.engine.budget.plan import MOST_TRIMMED, TIME_MARGIN, UNKNOWN_RESERVE, FramePlan, Past, plan
+from gsstream.recipe.budget import Budget
+from gsstream.recipe.model import Stream
+
+
+class Clock:
+    """A clock that a test moves."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def paced(seconds: float, **known: float) -> tuple[Pace, Clock]:
+    clock = Clock()
+    values = {"after": 1.0, "each": 0.55, **known}
+    found = FramePlan(20, 6.0, 3e-4, most_epochs=30, seconds=seconds, **values)  # type: ignore[arg-type]
+    return Pace(Allowance(found, clock.now, clock), 20, 3e-4, 5), clock
+
+
+def test_the_clock_ends_a_frame_before_its_coding_has_no_time_left() -> None:
+    pace, clock = paced(5.0)
+    pace.begin(10)
+    done = 0
+    while True:
+        clock.now += 0.3
+        done += 1
+        if pace.is_over():
+            break
+    assert done == 13, "4 seconds are there beside coding, and 13 views of 0.3 s fit into them"
+    assert pace.stopped_by_clock
+
+
+def test_passes_follow_what_they_took() -> None:
+    pace, clock = paced(11.0)
+    pace.begin(10)
+    assert pace.epochs == 18, "10 s, 0.55 s a pass in the frames before"
+    for done, seconds, planned in ((1, 2.0, 5), (2, 1.0, 9), (3, 6.8, 3)):
+        for _ in range(5):
+            clock.now += seconds / 5
+            pace.is_over()
+        pace.end_epoch(done)
+        assert pace.epochs == planned, "what is left, at what the last pass took"
+    assert pace.stopped_by_clock
+
+
+def test_the_first_number_of_passes_scales_with_the_candidates() -> None:
+    few, many = (paced(11.0, each=1.0, candidates=100)[0] for _ in range(2))
+    few.begin(100)
+    many.begin(400)
+    assert (few.epochs, many.epochs) == (10, 3)
+
+
+def test_without_an_allowance_nothing_changes() -> None:
+    pace = Pace(None, 7, 3e-4, 5)
+    pace.begin(10)
+    pace.end_epoch(1)
+    assert (pace.is_over(), pace.epochs, pace.rate_weight, pace.meets_size) == (False, 7, 3e-4, False)
+
+
+def test_the_weight_of_a_frame_is_that_of_its_last_half() -> None:
+    clock = Clock()
+    pace = Pace(Allowance(FramePlan(4, 6.0, 1e-3, max_bytes=1000), clock.now, clock), 4, 1e-3, 5)
+    for done in range(1, 5):
+        pace.end_epoch(done)
+        pace.meet_size(done, 10 * MOST_TRIMMED * 1000)
+    # Made with 1e-3 (its pass is a quarter of all: looked at), then three times as much after each pass.
+    assert pace.typical_weight == pytest.approx(math.sqrt(9e-3 * 27e-3))
+
+
+@pytest.mark.parametrize(("estimate", "after"), [(900, 1e-3), (1000, 1e-3), (1999, 1e-3), (4000, 2e-3), (235, 5e-4)])
+def test_up_to_twice_the_size_is_left_to_trimming(estimate: float, after: float) -> None:
+    clock = Clock()
+    pace = Pace(Allowance(FramePlan(4, 6.0, 1e-3, max_bytes=1000), clock.now, clock), 4, 1e-3, 5)
+    pace.meet_size(2, estimate)
+    assert pace.rate_weight == pytest.approx(after, rel=0.03)
+
+
+def test_a_slow_first_view_does_not_end_the_frame() -> None:
+    pace, clock = paced(5.0)
+    pace.begin(10)
+    clock.now += 2.5
+    assert not pace.is_over(), "1.5 s are left, and the next view will not take as long"
+    clock.now += 0.4
+    assert not pace.is_over()
+    clock.now += 0.8
+    assert pace.is_over()
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What a frame's parts take, in seconds: before its passes, its first view besides, a view, and what follows."""
+
+    before: float
+    first: float
+    view: float
+    after: float
+    views: int
+
+    @property
+    def each(self) -> float:
+        return self.view * self.views
+
+
+@dataclass(frozen=True)
+class Made:
+    """A frame as it went: seconds in all and of its passes, passes, and the number planned after every iteration."""
+
+    seconds: float
+    optimise: float
+    epochs: float
+    planned: tuple[int, ...]
+
+
+def made(found: FramePlan, costs: Costs, slower: float = 1.0) -> Made:
+    """A frame whose passes take what they take, as ``optimise`` goes through them."""
+    clock = Clock()
+    began = clock.now
+    pace = Pace(Allowance(found, began, clock), found.epochs, 3e-4, costs.views)
+    clock.now += costs.before
+    pace.begin(100)
+    epoch, planned = 0, [pace.epochs]
+    iterations = 0
+    while epoch < pace.epochs:
+        for _ in range(costs.views):
+            clock.now += costs.view * slower**epoch + (costs.first if iterations == 0 else 0.0)
+            iterations += 1
+            if pace.is_over():
+                break
+            planned.append(pace.epochs)
+        else:
+            epoch += 1
+            pace.end_epoch(epoch)
+            continue
+        break
+    optimised = clock.now - began - costs.before
+    return Made(clock.now - began + costs.after, optimised, iterations / costs.views, tuple(planned))
+
+
+def past(frame: Made, costs: Costs) -> Past:
+    """What the planner knows of a frame."""
+    return Past(
+        1, frame.epochs, 100, costs.before, frame.optimise, costs.after, 3e-4, 1.0, 6.0, 0.0, 9000, 9000
+    )  # fmt: skip
+
+
+COSTS = st.builds(
+    Costs, before=st.floats(0.01, 2), first=st.floats(0, 0.5), view=st.floats(0.01, 0.5), after=st.floats(0, 2),
+    views=st.integers(1, 30),
+)  # fmt: skip
+
+
+@given(COSTS, st.floats(0.1, 60), st.floats(0.7, 1.0))
+def test_no_frame_is_late_that_costs_what_its_passes_say(costs: Costs, seconds: float, slower: float) -> None:
+    """Also the first, of which nothing is known: what follows the passes is kept for, if it takes no more than one.
+
+    Passes get cheaper from one to the next, as rows leave: the reserve follows the last, which still covers it.
+    """
+    budget, stream = Budget(time=seconds), Stream()
+    limit = TIME_MARGIN * seconds
+    # One view is always made; two, for the first says nothing about the next.
+    least = costs.before + costs.first + 2 * costs.view + costs.after
+    last_pass = costs.each * slower**30
+    assume(least <= limit and costs.after <= min(last_pass, UNKNOWN_RESERVE * limit))
+    frame = made(plan(budget, stream, []), costs, slower)
+    assert frame.seconds <= seconds
+    second = made(plan(budget, stream, [past(frame, costs)]), costs, slower)
+    assert second.seconds <= seconds
+
+
+@given(COSTS, st.floats(0.1, 60))
+def test_time_that_is_given_is_used(costs: Costs, seconds: float) -> None:
+    """Passes of constant cost: less than a pass and the margin is left, in the first frame two passes at most."""
+    budget, stream = Budget(time=seconds), Stream()
+    first, most = plan(budget, stream, []), 30
+    frame = made(first, costs)
+    left = TIME_MARGIN * seconds - frame.seconds
+    unsure = max(0.0, min(costs.each, UNKNOWN_RESERVE * TIME_MARGIN * seconds) - costs.after)
+    assert frame.epochs >= most or left <= unsure + 0.25 * costs.each + costs.view + costs.first + 1e-9
+    second = made(plan(budget, stream, [past(frame, costs)]), costs)
+    assert second.epochs >= most or TIME_MARGIN * seconds - second.seconds <= 0.25 * costs.each + costs.view + 1e-9
+    if frame.epochs >= 6:
+        assert frame.epochs >= most or frame.seconds >= 0.7 * seconds
+        assert second.epochs >= most or second.seconds >= 0.85 * seconds
+
+
+@given(COSTS, st.floats(0.1, 60))
+def test_the_first_frame_knows_its_passes_after_two_views(costs: Costs, seconds: float) -> None:
+    """Before that it knows what came before them; a schedule over 30 passes of which 4 are made would never end."""
+    assume(costs.views >= 4)
+    frame = made(plan(Budget(time=seconds), Stream(), []), costs)
+    assert frame.planned[0] <= max(1.0, TIME_MARGIN * seconds / costs.before) + 1e-6
+    assert all(abs(planned - frame.epochs) <= 1.5 for planned in frame.planned[2:])
+
+
+def test_what_the_first_backward_pass_imports_is_loaded_before_a_frame() -> None:
+    """In a process of its own: here it is imported long since. Most of a second would count as the first view's."""
+    program = """
+import sys
+import torch
+from gsstream.engine.exposure import load_backward
+load_backward()
+before = set(sys.modules)
+value = torch.zeros(3, requires_grad=True)
+torch.autograd.backward([value * 2], [torch.ones(3)])
+late = sorted(set(sys.modules) - before)
+assert not late, late
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)

@@ -199,7 +199,7 @@ def _prepare(
 def _seams(result: SegmentsResult) -> str:
     """The seams as a table."""
     rows = [
-        [str(s.frame), f"{s.key_bytes / 1000:.1f}", f"{s.delta_bytes / 1000:.1f}", *map(_db, (s.before, s.at, s.after))]
+        [str(s.frame), _kb(s.key_bytes), _kb(s.delta_bytes), *map(_db, (s.before, s.at, s.after))]
         for s in result.seams
     ]
     made = f"{plural(result.made, 'task')} made, {result.kept} kept"
@@ -207,6 +207,10 @@ def _seams(result: SegmentsResult) -> str:
         return made
     heading = ("SEAM", "KEY KB", "DELTA KB", "PSNR BEFORE", "AT", "AFTER")
     return f"{table(heading, rows)}\n{made}"
+
+
+def _kb(size: float | None) -> str:
+    return "-" if size is None else f"{size / 1000:.1f}"
 
 
 def _db(value: float | None) -> str:

@@ -1,22 +1,38 @@
-"""metrics.jsonl of a run that goes on: what was written down, up to where, and what of it stays."""
+"""metrics.jsonl of a run, one JSON object per frame: read, and what of it stays when the run goes on."""
 
 from __future__ import annotations
 
 import itertools
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from gsstream.core.errors import InputError
 
-def _written(path: Path) -> list[dict[str, Any]]:
-    """The complete lines of a run's metrics."""
-    lines: list[dict[str, Any]] = []
-    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
-        try:
-            lines.append(json.loads(line))
-        except json.JSONDecodeError:
+
+def read_metrics(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+    """(line number, line) of every frame's record, in the order of the file; empty lines are passed over.
+
+    A last line that is no JSON is left out: a run that is being written, or was killed, ends in half of one. Raises
+    InputError naming file and line for anything else that is not a JSON object with a frame, and when there is no file.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read {path}: {error}; expected the metrics.jsonl of a run") from error
+    for number, text in enumerate(lines, 1):
+        if not text.strip():
             continue
-    return lines
+        try:
+            line = json.loads(text)
+        except ValueError as error:
+            if number == len(lines):
+                return
+            raise InputError(f"{path}:{number}: not a frame record: {error}; mend or remove the line") from error
+        if not isinstance(line, dict) or not isinstance(line.get("frame"), int):
+            raise InputError(f"{path}:{number}: not a frame record: expected an object with a frame, got {text[:60]!r}")
+        yield number, line
 
 
 def last_written(path: Path) -> int:
@@ -31,3 +47,8 @@ def trim_metrics(path: Path, last: int) -> list[dict[str, Any]]:
     if path.exists():
         path.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
     return kept
+
+
+def _written(path: Path) -> list[dict[str, Any]]:
+    """The lines of a run that goes on; without a file, none has been written."""
+    return [line for _, line in read_metrics(path)] if path.exists() else []

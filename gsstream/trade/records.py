@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Iterable, Mapping
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gsstream.core.errors import InputError
+from gsstream.engine.metrics_log import read_metrics
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,23 +57,16 @@ def mean(values: Iterable[float]) -> float:
 def read_records(path: str | os.PathLike[str]) -> list[FrameRecord]:
     """Read ``metrics.jsonl`` (or the folder that holds it), in the order of frames; the last entry of a frame counts.
 
-    Unknown entries are passed over, so that a newer writer can be summarised. Raises InputError naming file and line.
+    Unknown entries are passed over, so that a newer writer can be summarised. Raises InputError naming file and line
+    (``engine.metrics_log.read_metrics``), and when there is no frame.
     """
     path = Path(path)
     path = path / "metrics.jsonl" if path.is_dir() else path
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}; expected the metrics.jsonl of a run") from error
     found: dict[int, FrameRecord] = {}
-    for number, line in enumerate(lines, 1):
-        if not line.strip():
-            continue
+    for number, line in read_metrics(path):
         try:
-            record = record_of(json.loads(line))
+            record = record_of(line)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
-            if number == len(lines):
-                break  # a run that is being written, or was killed, ends in half a line
             raise InputError(f"{path}:{number}: not a frame record: {error!r}") from error
         found[record.frame] = record
     if not found:
@@ -82,14 +75,11 @@ def read_records(path: str | os.PathLike[str]) -> list[FrameRecord]:
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
-    """The lines of a ``metrics.jsonl`` that :func:`read_records` accepts, as they are; half a last line left out."""
-    found: dict[int, dict[str, Any]] = {}
-    for line in path.read_text(encoding="utf-8").splitlines():
-        try:
-            data = json.loads(line)
-        except ValueError:
-            continue
-        found[int(data["frame"])] = data
+    """The lines of a ``metrics.jsonl`` as they are, in the order of frames; the last entry of a frame counts.
+
+    Raises InputError as ``engine.metrics_log.read_metrics``.
+    """
+    found = {line["frame"]: line for _, line in read_metrics(path)}
     return [found[frame] for frame in sorted(found)]
 
 

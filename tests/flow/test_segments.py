@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsstream.cli.main import run_command
+from gsstream.cli.segments import _seams
 from gsstream.core.errors import GsstreamError, InputError, PacketError
 from gsstream.packet import PacketKind, StreamReader
 from gsstream.player.playback import Playback
@@ -182,6 +184,27 @@ def test_a_killed_run_resumes_and_keeps_what_is_finished(tmp_path: Path) -> None
     assert " kept" in said
     assert " 0 kept" not in said
     assert "SEAM" in said
+
+
+@pytest.mark.parametrize("lost", ["half a line", "the key frame's line"])
+def test_metrics_that_a_kill_cut_short_lose_a_line_and_no_more(
+    whole: tuple[str, Path, bytes], tmp_path: Path, lost: str
+) -> None:
+    """The packet is on disk before its line: a stream can be whole where its metrics are not."""
+    start, made_once, once = whole
+    shutil.copytree(made_once, tmp_path, dirs_exist_ok=True)
+    log = tmp_path / "segment-001" / "metrics.jsonl"
+    lines = log.read_text().splitlines(keepends=True)
+    log.write_text(lines[0] + lines[1][:-9] if lost == "half a line" else lines[1])
+    plan = make_plan(6, 3, start, first_given=False)
+    result = run_segments(plan, setting(), tmp_path, Here(1), say=lambda _: None)
+    assert (result.made, (tmp_path / "stream.gss").read_bytes()) == (0, once)
+    missing = 3 if lost == "half a line" else 2
+    assert [line["frame"] for line in metrics(tmp_path)] == [frame for frame in range(6) if frame != missing]
+    first, second = result.seams
+    assert (first.frame, first.key_bytes is None) == (2, lost != "half a line")
+    assert (first.at is None, second.before is None) == (lost != "half a line", lost == "half a line")
+    assert "-" in _seams(result)
 
 
 def test_a_segment_that_fails_says_which_and_keeps_the_others(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from gsstream.core.delta import Delta, Layout
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
+from gsstream.engine.metrics_log import last_written, trim_metrics
 from gsstream.packet import KeyState, StreamMeta, StreamWriter, encode_delta, encode_empty, encode_key
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, render
@@ -22,7 +23,7 @@ from gsstream.source.base import SourceInfo
 from gsstream.trade.contact_sheet import contact_sheet, sheet_of_stream
 from gsstream.trade.evaluate import evaluate
 from gsstream.trade.plots import plot_runs
-from gsstream.trade.records import FrameRecord, read_records
+from gsstream.trade.records import FrameRecord, read_lines, read_records
 from gsstream.trade.summary import summarise, summary_table
 
 NUMPY = PlayerRenderer("numpy", render_numpy)
@@ -179,13 +180,41 @@ def test_records_round_trip_and_survive_a_killed_run(tmp_path):
     assert math.isnan(read[1].peak_memory_mb)
 
 
+def test_a_file_cut_anywhere_loses_its_last_line_alone_for_every_reader(tmp_path):
+    path, lines = tmp_path / "metrics.jsonl", [{"frame": f, "psnr": {"x": 30.0 + f}} for f in range(3)]
+    whole = "".join(json.dumps(line) + "\n" for line in lines)
+    first = len(json.dumps(lines[0]))
+    for end in range(first, len(whole) + 1):
+        path.write_text(whole[:end])
+        kept = [line for line in lines if whole.index(json.dumps(line)) + len(json.dumps(line)) <= end]
+        assert read_lines(path) == kept
+        assert [r.psnr["x"] for r in read_records(path)] == [line["psnr"]["x"] for line in kept]
+        assert last_written(path) == len(kept) - 1
+        assert trim_metrics(path, 1) == kept[:2]
+        assert path.read_text() == "".join(json.dumps(line) + "\n" for line in kept[:2])
+    assert last_written(tmp_path / "elsewhere") == -1
+    assert trim_metrics(tmp_path / "elsewhere", 5) == []
+
+
+def test_a_damaged_line_is_not_dropped_when_a_run_goes_on(tmp_path):
+    path, text = tmp_path / "metrics.jsonl", '{"frame": 0}\n{"fr\n{"frame": 2}\n'
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"metrics.jsonl:2: .*mend or remove the line"):
+        trim_metrics(path, 2)
+    assert path.read_text() == text
+
+
 def test_a_frame_written_again_after_resuming_counts_once(tmp_path):
     path = tmp_path / "metrics.jsonl"
     path.write_text("\n".join(json.dumps({"frame": f, "num_gates": n}) for f, n in ((0, 1), (1, 1), (1, 5))))
     assert [(r.frame, r.num_gates) for r in read_records(path)] == [(0, 1), (1, 5)]
 
 
-BAD = [("", "no frame"), ('{"psnr": {}}\n{"frame": 1}', ":1:"), ("[]\n{}", ":1:")]
+BAD = [
+    ("", "no frame"), ('{"psnr": {}}\n{"frame": 1}', ":1:"), ("[]\n{}", ":1:"),
+    ('{"frame": 0}\n{"fra\n{"frame": 1}', ":2:"),
+    ('{"frame": 0}\n[1]', ":2:"), ('{"frame": 0}\n{"frame": "1"}', ":2:"), ('{"frame": 0, "bytes": 3}', ":1:"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("text", "message"), BAD)

@@ -11,8 +11,9 @@ from pathlib import Path
 from gsstream.core.errors import GsstreamError
 from gsstream.engine.session import METRICS, RECIPE
 from gsstream.recipe.load import ResolvedRecipe
+from gsstream.trade.records import read_lines
 from gsstream.trade.segments.job import SegmentJob, SegmentOutcome
-from gsstream.trade.segments.join import Seam, join, read_lines, seams
+from gsstream.trade.segments.join import Seam, join, seams
 from gsstream.trade.segments.plan import STREAM, SegmentPlan, Task
 from gsstream.trade.sweep.executor import Executor, Finished
 from gsstream.trade.sweep.schedule import finished_tasks
@@ -60,7 +61,7 @@ def run_segments(
         executor.close()
     folders = [out / task.id for task in plan.segments]
     join([folder / STREAM for folder in folders], out / STREAM)
-    frames = list(read_lines([folder / METRICS for folder in folders]))
+    frames = [line for folder in folders for line in read_lines(folder / METRICS)]
     (out / METRICS).write_text("".join(json.dumps(frame) + "\n" for frame in frames), encoding="utf-8")
     shutil.copyfile(folders[0] / RECIPE, out / RECIPE)
     return SegmentsResult(len(frames), made, kept, seams(plan.seams, frames))

@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gsstream.core.errors import PacketError
 from gsstream.core.frame import Frame, PointCloud
-from gsstream.packet import PlayerState, StreamReader, decode_packet
+from gsstream.packet import PlayerState
+from gsstream.player.playback import Playback
 from gsstream.recipe.load import ResolvedRecipe
 from gsstream.source.base import FrameSource, PointKind, SourceInfo, Split
 from gsstream.trade.segments.plan import STREAM
@@ -76,9 +76,9 @@ def _encode(job: SegmentJob, folder: Path) -> None:
 
     catalog = load_catalog()
     parts = assemble(job.resolved, catalog)
+    first = None if job.first is None else _last_frame(job.first, folder)
     recording = open_recording(job.uri, parts.recipe, catalog)
     source = recording if job.shown is None else Carried(recording, job.frames.start, job.shown)
-    first = None if job.first is None else _last_frame(job.first, folder)
     try:
         run(
             parts, source, folder, resume=(folder / STREAM).exists(), quiet=True, measure=job.measure,
@@ -93,13 +93,8 @@ def _last_frame(stream: bytes, folder: Path) -> PlayerState:
     path = folder / "first.gss"
     path.write_bytes(stream)
     try:
-        with StreamReader(path) as reader:
-            player: PlayerState | None = None
-            for entry in reader.frames:
-                player = decode_packet(player, reader.read(entry), offset=entry.offset)
-            if player is None:
-                raise reader.damage or PacketError("the stream to start from holds no complete packet", reader.end)
-            return player
+        with Playback(path) as playback:
+            return playback.player_state(playback.frames[-1])
     finally:
         path.unlink()
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,12 +20,12 @@ class Seam:
     Arguments:
         frame: the key packet's.
         key_bytes: its size. What a delta packet would have cost in its place is not known; ``delta_bytes`` is the mean
-            of the frames around it.
+            of the frames around it. None where a worker was killed between the packet and its line in the metrics.
         before, at, after: PSNR of the frame before, of the key frame and of the one after.
     """
 
     frame: int
-    key_bytes: int
+    key_bytes: int | None
     delta_bytes: float
     before: float | None
     at: float | None
@@ -65,13 +64,6 @@ def join(streams: Sequence[Path], out: Path) -> None:
         raise OutputError(f"cannot write {out}: {error.strerror}") from error
 
 
-def read_lines(paths: Sequence[Path]) -> Iterator[dict[str, Any]]:
-    """The metrics of every frame, segment after segment."""
-    for path in paths:
-        for line in path.read_text(encoding="utf-8").splitlines():
-            yield json.loads(line)
-
-
 def seams(starts: Sequence[int], frames: Sequence[dict[str, Any]]) -> list[Seam]:
     """What each seam shows in the metrics of the joined frames."""
     found = []
@@ -79,7 +71,8 @@ def seams(starts: Sequence[int], frames: Sequence[dict[str, Any]]) -> list[Seam]
         deltas = [_size(frame) for frame in frames if frame["status"] != "key" and abs(frame["frame"] - start) <= 3]
         place = {frame["frame"]: frame for frame in frames}
         before, at, after = (_psnr(place[index]) if index in place else None for index in (start - 1, start, start + 1))
-        found.append(Seam(start, _size(place[start]), mean(deltas) if deltas else 0.0, before, at, after))
+        size = _size(place[start]) if start in place else None
+        found.append(Seam(start, size, mean(deltas) if deltas else 0.0, before, at, after))
     return found
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import math
 import os
 import statistics
@@ -86,6 +85,7 @@ def run_job(job: Job) -> Outcome:
 
 def _run(job: Job, folder: Path) -> Outcome:
     from gsstream.engine.assemble import assemble
+    from gsstream.engine.metrics_log import read_metrics
     from gsstream.engine.recording import open_recording, read_first_frame
     from gsstream.engine.session import METRICS, STREAM, run
     from gsstream.metrics import EnergyMeter
@@ -106,8 +106,7 @@ def _run(job: Job, folder: Path) -> Outcome:
             result = run(parts, recording, folder, quiet=True, measure=False, first_frame=first, energy=energy)
         if result.interrupted:
             raise InterruptedError("the run was interrupted; the sweep's next start makes this cell again")
-        lines = (folder / METRICS).read_text(encoding="utf-8").splitlines()
-        frames = [json.loads(line) for line in lines]
+        frames = [line for _, line in read_metrics(folder / METRICS)]
         facts: dict[str, Any] = {}
         if job.measure is not None:
             facts = _measure(job.measure, folder / STREAM, recording, frames)

@@ -53,10 +53,15 @@ class SceneFacts:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A value, and in one line why this one."""
+    """A value, and in one line why this one.
+
+    ``ladder``: values worth trying instead, in an order along which a scene is expected to get better up to a point and
+    worse from there; ``value`` is one of them. Empty: what a short fit of frame 0 cannot tell (``engine.trials``).
+    """
 
     value: Any
     why: str
+    ladder: tuple[Any, ...] = ()
 
 
 #: (facts, the part's settings so far) -> value. A pure function; the settings are the part's ``Config``, in which rules

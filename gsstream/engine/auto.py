@@ -34,7 +34,8 @@ def sh_degree(facts: SceneFacts) -> Choice:
         if gain - (0.0 if degree == 0 else facts.colour_gain[degree - 1]) >= WORTHWHILE:
             degree = higher
     gains = ", ".join(f"{gain:+.2f}" for gain in facts.colour_gain)
-    return Choice(degree, f"degrees 1 to 3 predict a left-out camera's colours by {gains} dB better than degree 0")
+    why = f"degrees 1 to 3 predict a left-out camera's colours by {gains} dB better than degree 0"
+    return Choice(degree, why, tuple(range(4)))
 
 
 def settle(parts: Assembly, facts: Callable[[], SceneFacts], known: Mapping[str, Choice]) -> Assembly:
@@ -46,7 +47,6 @@ def settle(parts: Assembly, facts: Callable[[], SceneFacts], known: Mapping[str,
 
     Raises ComponentError when a rule fails, or chooses what its part does not accept.
     """
-    chosen: dict[str, Choice] = {}
     measured: list[SceneFacts] = []
     for path in parts.pending:
         key = ".".join(path)
@@ -55,9 +55,8 @@ def settle(parts: Assembly, facts: Callable[[], SceneFacts], known: Mapping[str,
         else:
             measured = measured or [facts()]
             choice = _choose(parts, path, measured[0])
-        parts = _put(parts, path, choice)
-        chosen[key] = choice
-    return replace(parts, pending=(), chosen=chosen)
+        parts = put(parts, path, choice)
+    return replace(parts, pending=())
 
 
 def stream_extra(path: Path) -> Mapping[str, Any] | None:
@@ -138,9 +137,14 @@ def _part(parts: Assembly, slot: str) -> Part:
     return part
 
 
-def _put(parts: Assembly, path: KeyPath, choice: Choice) -> Assembly:
-    """The assembly with one value in its place: in the part, in the recipe, and with its provenance."""
-    key, origins = ".".join(path), {**parts.origins, path: Origin(f"auto: {choice.why}", f"auto, {'.'.join(path)}")}
+def put(parts: Assembly, path: KeyPath, choice: Choice) -> Assembly:
+    """The assembly with one value in its place: in the part, in the recipe, and with its provenance.
+
+    Raises ComponentError for a value that the part does not accept.
+    """
+    key = ".".join(path)
+    origins = {**parts.origins, path: Origin(f"auto: {choice.why}", f"auto, {key}")}
+    parts = replace(parts, chosen={**parts.chosen, key: choice})
     if key == DEGREE:
         first = parts.recipe.first_frame.model_copy(update={"sh_degree": choice.value})
         return replace(parts, recipe=parts.recipe.model_copy(update={"first_frame": first}), origins=origins)

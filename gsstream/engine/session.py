@@ -35,6 +35,7 @@ from gsstream.engine.metrics_log import last_written, trim_metrics
 from gsstream.engine.points import gather_points, with_test_views
 from gsstream.engine.progress import RunProgress
 from gsstream.engine.resume import resume_state
+from gsstream.engine.trials import FirstFrameTrials, left_out, try_out
 from gsstream.engine.whole import WholeTools, begin_whole, resume_whole, step_whole
 from gsstream.method.base import MethodState, Step
 from gsstream.metrics import EnergyMeter, peak_memory_mb
@@ -169,8 +170,7 @@ class _Run:
     def _first(self, frame: Frame) -> Step[Any]:
         points = functools.cache(lambda: self._points(frame))
         if self.parts.pending:
-            known = taken_over(self.first_frame) if self.first_frame else {}
-            self._settled(settle(self.parts, lambda: scene_facts(points(), frame), known))
+            self._settled(self._chosen(points, frame))
             save_resolved(self.out / RECIPE, self.parts.resolved)
             for line in lines(self.parts):
                 self.progress.say(line)
@@ -179,6 +179,16 @@ class _Run:
         if self.first_frame is not None:
             return begin_from(self.parts, self.first_frame, frame, self._meta(frame.cameras), self.rng)
         return begin(self.parts, points(), frame, self._meta(frame.cameras), self.rng, self.progress.root)
+
+    def _chosen(self, points: Callable[[], PointCloud], frame: Frame) -> Assembly:
+        """The values that this scene decides: by rules, and where frame 0 is made here, by trials."""
+        known = taken_over(self.first_frame) if self.first_frame else {}
+        parts = settle(self.parts, lambda: scene_facts(points(), frame), known)
+        judges = left_out(len(frame.cameras), parts.recipe.first_frame.trial_cameras)
+        if self.first_frame is not None or parts.whole is not None or not judges:
+            return parts
+        trials = FirstFrameTrials(points(), frame, self._meta(frame.cameras), parts.recipe.seed, judges)
+        return try_out(parts, trials, self.progress.say)
 
     def _points(self, frame: Frame) -> PointCloud:
         """What frame 0 starts from: seeds, or the centres of the Gaussians that are taken over."""

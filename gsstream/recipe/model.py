@@ -85,6 +85,15 @@ class FirstFrame(Section):
     exposure: bool = Field(
         default=False, description="fit an affine colour map per training camera while optimising frame 0 (ours)"
     )
+    trials: int = Field(
+        default=16, ge=0, le=1000,
+        description="where the recipe says auto: most short fits of frame 0, judged on training cameras that are left "
+        "out of them, by which values are compared; 0: rules alone (ours)",
+    )  # fmt: skip
+    trial_epochs: int = Field(default=30, ge=1, description="passes over the cameras of such a short fit")
+    trial_cameras: float = Field(
+        default=0.25, gt=0, lt=1, description="share of the training cameras that a short fit leaves out, as its judges"
+    )
 
     @property
     def degree(self) -> int:

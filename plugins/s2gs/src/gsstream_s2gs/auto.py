@@ -18,6 +18,10 @@ PIXELS_PER_ANCHOR = 14.0
 #: Side of the finest cell at the median distance, pixels.
 FINEST_CELL = 0.05
 MOST_LEVELS = 10
+#: Numbers of levels worth trying.
+LEVELS = (1, 2, 3, 4, 6, 8, MOST_LEVELS)
+#: Least and largest exponent of the root grid chosen, and how far from the rule's trials look.
+EXPONENTS, EXPONENT_REACH = (2, 12), 2
 #: What harmonics must gain for a left-out camera, dB, before their residuals are worth bytes.
 STRONG_GAIN = 1.0
 
@@ -27,9 +31,11 @@ def root_exponent(facts: SceneFacts, _config: Any) -> Choice:
 
     Wider cells merge seeds, and what is merged is missing in frame 0; narrower ones group no two Gaussians.
     """
-    k = _between(2, _rounded(math.log2(max(facts.span_spacings, 1.0))), 12)
+    low, high = EXPONENTS
+    k = _between(low, _rounded(math.log2(max(facts.span_spacings, 1.0))), high)
     cells = 2**k / facts.span_spacings if facts.span_spacings > 0 else math.inf
-    return Choice(k, f"neighbouring seeds are {cells:.2g} root cells apart")
+    ladder = tuple(range(max(low, k - EXPONENT_REACH), min(high, k + EXPONENT_REACH) + 1))
+    return Choice(k, f"neighbouring seeds are {cells:.2g} root cells apart", ladder)
 
 
 def log_base(facts: SceneFacts, config: Any) -> Choice:
@@ -37,7 +43,7 @@ def log_base(facts: SceneFacts, config: Any) -> Choice:
     wanted = max(1.0, facts.pixels / PIXELS_PER_ANCHOR)
     expected = {base: anchors(facts, base, config.max_levels) for base in BASES}
     base = min(BASES, key=lambda b: (abs(math.log(expected[b] / wanted)), -b))
-    return Choice(base, f"about {expected[base]:,.0f} anchors for {facts.pixels:,} training pixels")
+    return Choice(base, f"about {expected[base]:,.0f} anchors for {facts.pixels:,} training pixels", BASES)
 
 
 def anchors(facts: SceneFacts, base: float, max_levels: int) -> float:
@@ -50,7 +56,8 @@ def max_levels(facts: SceneFacts, config: Any) -> Choice:
     """As many levels as it takes from the root cell down to cells of FINEST_CELL pixels."""
     width = max(facts.span_pixels, 1e-9) / 2**config.root_exponent
     levels = _between(1, 1 + _rounded(math.log2(width / FINEST_CELL)), MOST_LEVELS)
-    return Choice(levels, f"a root cell is {width:.2g} pixels wide at the median distance of the seeds")
+    why = f"a root cell is {width:.2g} pixels wide at the median distance of the seeds"
+    return Choice(levels, why, tuple(sorted({levels, *LEVELS})))
 
 
 def two_channels(_facts: SceneFacts, _config: Any) -> Choice:

@@ -24,6 +24,8 @@ from gsstream.recipe.model import ComponentRef
 
 #: A degree more must gain at least this for a camera that was left out, dB: its coefficients are most of a key packet.
 WORTHWHILE = 0.1
+#: Degree 3 has nearly twice the coefficients of 2; trials go there only when the rule does.
+HIGHEST_TRIED = 2
 DEGREE = "first_frame.sh_degree"
 
 
@@ -35,7 +37,7 @@ def sh_degree(facts: SceneFacts) -> Choice:
             degree = higher
     gains = ", ".join(f"{gain:+.2f}" for gain in facts.colour_gain)
     why = f"degrees 1 to 3 predict a left-out camera's colours by {gains} dB better than degree 0"
-    return Choice(degree, why, tuple(range(4)))
+    return Choice(degree, why, tuple(range(max(degree, HIGHEST_TRIED) + 1)))
 
 
 def settle(parts: Assembly, facts: Callable[[], SceneFacts], known: Mapping[str, Choice]) -> Assembly:

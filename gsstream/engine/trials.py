@@ -7,6 +7,7 @@ it gets better. A trial is frame 0 as a run makes it, packet and all, with fewer
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -28,8 +29,9 @@ from gsstream.metrics import psnr
 from gsstream.packet import StreamMeta
 from gsstream.recipe.document import KeyPath
 
-#: Of trials this close to the best, in dB, the one with the smallest packet is taken.
-TIE = 0.02
+#: What a key packet of half the size is worth, dB. Little, for short fits show only a part of what more coefficients
+#: gain in long ones: it decides between choices that are as good.
+HALVED = 0.1
 #: Training cameras below which none can be spared.
 LEAST_CAMERAS = 4
 
@@ -42,6 +44,11 @@ class Trial:
     psnr: float
     gaussians: int
     size: int
+
+    @property
+    def score(self) -> float:
+        """PSNR less the price of the bytes, dB: what trials are compared by."""
+        return self.psnr - HALVED * math.log2(self.size)
 
 
 def left_out(count: int, share: float) -> list[int]:
@@ -108,8 +115,7 @@ def try_out(parts: Assembly, trial: Callable[[Assembly], Trial], say: Callable[[
     """The assembly with the choices that have a ladder moved to where short fits are best.
 
     One key after the other, in the order in which the rules chose, a value goes up its ladder, or else down, while the
-    left-out cameras get better; again from the first key until nothing moves or ``first_frame.trials`` are made. Of
-    all that was tried, the smallest packet within ``TIE`` of the best is taken.
+    score of the trials gets better; again from the first key until nothing moves or ``first_frame.trials`` are made.
 
     Arguments:
         parts: settled by the rules (``engine.auto.settle``).
@@ -148,16 +154,13 @@ class _Climb:
         return self._best is not before and len(self._made) < self._most
 
     def verdict(self) -> Assembly:
-        """The smallest of the best, with the reason behind every value that was tried."""
-        near = [t for t in self._made if t.trial.psnr >= self._best.trial.psnr - TIE]
-        taken, first = min(near, key=lambda t: t.trial.size), self._made[0]
-        parts = taken.parts
+        """The best, with the reason behind every value that was tried."""
+        parts, found, first = self._best.parts, self._best.trial.psnr, self._made[0].trial.psnr
         for key, choice in self._rules.items():
             if choice.ladder:
-                value, why = parts.chosen[key].value, f"best of {len(self._made)} trials, {_said(taken.trial)}"
-                if taken.trial is not first.trial:
-                    why += f"; the rules came to {_said(first.trial)}"
-                parts = put(parts, _path(key), Choice(value, f"{why}; by rule {choice.value}: {choice.why}"))
+                why = f"best of {len(self._made)} trials ({found:.2f} dB on left-out cameras, by rules {first:.2f}); "
+                why += f"by rule {choice.value}: {choice.why}"
+                parts = put(parts, _path(key), Choice(parts.chosen[key].value, why))
         return parts
 
     def _walk(self, key: str, ladder: tuple[Any, ...], step: int) -> bool:
@@ -170,7 +173,7 @@ class _Climb:
             found = None if parts is None else self._try(parts, f"{key} = {value}")
             if found is None or found.trial is best.trial:
                 continue  # not possible together with the other values, or the same scene to start from: look further
-            if found.trial.psnr <= best.trial.psnr:
+            if found.trial.score <= best.trial.score:
                 break
             best = found
         self._best = best
@@ -196,4 +199,4 @@ def _path(key: str) -> KeyPath:
 
 
 def _said(trial: Trial) -> str:
-    return f"{trial.psnr:.2f} dB on left-out cameras with {trial.gaussians:,} Gaussians"
+    return f"{trial.psnr:.2f} dB on left-out cameras, {trial.gaussians:,} Gaussians, {trial.size / 1000:.0f} KB"

@@ -63,6 +63,10 @@ class Choice:
     why: str
     ladder: tuple[Any, ...] = ()
 
+    def __post_init__(self) -> None:
+        if self.ladder and self.value not in self.ladder:
+            raise ValueError(f"a choice stands on its own ladder; got {self.value!r}, which is not in {self.ladder}")
+
 
 #: (facts, the part's settings so far) -> value. A pure function; the settings are the part's ``Config``, in which rules
 #: that stand earlier in the table have already put their values.

@@ -21,13 +21,12 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.rng import Rng
 from gsstream.engine.assemble import Assembly
-from gsstream.engine.auto import lines, recall, record, settle, stream_extra, taken_over
+from gsstream.engine.auto import lines, recall, record, stream_extra
 from gsstream.engine.begin import begin, begin_from, cloud_of
 from gsstream.engine.budget.controller import Controller
 from gsstream.engine.budget.memory import within_memory
 from gsstream.engine.budget.pace import CLOCKS, Allowance
 from gsstream.engine.exposure import load_backward
-from gsstream.engine.facts import scene_facts
 from gsstream.engine.frame_step import frame_step
 from gsstream.engine.keyframes import refresh
 from gsstream.engine.measure import HeldOut
@@ -35,7 +34,7 @@ from gsstream.engine.metrics_log import last_written, trim_metrics
 from gsstream.engine.points import gather_points, with_test_views
 from gsstream.engine.progress import RunProgress
 from gsstream.engine.resume import resume_state
-from gsstream.engine.trials import FirstFrameTrials, left_out, try_out
+from gsstream.engine.trials import choose
 from gsstream.engine.whole import WholeTools, begin_whole, resume_whole, step_whole
 from gsstream.method.base import MethodState, Step
 from gsstream.metrics import EnergyMeter, peak_memory_mb
@@ -170,7 +169,8 @@ class _Run:
     def _first(self, frame: Frame) -> Step[Any]:
         points = functools.cache(lambda: self._points(frame))
         if self.parts.pending:
-            self._settled(self._chosen(points, frame))
+            meta, say = self._meta(frame.cameras), self.progress.say
+            self._settled(choose(self.parts, points, frame, meta, self.first_frame, say))
             save_resolved(self.out / RECIPE, self.parts.resolved)
             for line in lines(self.parts):
                 self.progress.say(line)
@@ -179,16 +179,6 @@ class _Run:
         if self.first_frame is not None:
             return begin_from(self.parts, self.first_frame, frame, self._meta(frame.cameras), self.rng)
         return begin(self.parts, points(), frame, self._meta(frame.cameras), self.rng, self.progress.root)
-
-    def _chosen(self, points: Callable[[], PointCloud], frame: Frame) -> Assembly:
-        """The values that this scene decides: by rules, and where frame 0 is made here, by trials."""
-        known = taken_over(self.first_frame) if self.first_frame else {}
-        parts = settle(self.parts, lambda: scene_facts(points(), frame), known)
-        judges = left_out(len(frame.cameras), parts.recipe.first_frame.trial_cameras)
-        if self.first_frame is not None or parts.whole is not None or not judges:
-            return parts
-        trials = FirstFrameTrials(points(), frame, self._meta(frame.cameras), parts.recipe.seed, judges)
-        return try_out(parts, trials, self.progress.say)
 
     def _points(self, frame: Frame) -> PointCloud:
         """What frame 0 starts from: seeds, or the centres of the Gaussians that are taken over."""

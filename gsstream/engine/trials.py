@@ -22,11 +22,12 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.assemble import Assembly
-from gsstream.engine.auto import put
+from gsstream.engine.auto import put, settle, taken_over
 from gsstream.engine.begin import begin
+from gsstream.engine.facts import scene_facts
 from gsstream.engine.guard import guarded
 from gsstream.metrics import psnr
-from gsstream.packet import StreamMeta
+from gsstream.packet import PlayerState, StreamMeta
 from gsstream.recipe.document import KeyPath
 
 #: What a key packet of half the size is worth, dB. Little, for short fits show only a part of what more coefficients
@@ -51,6 +52,32 @@ class Trial:
         return self.psnr - HALVED * math.log2(self.size)
 
 
+def choose(
+    parts: Assembly,
+    points: Callable[[], PointCloud],
+    frame: Frame,
+    meta: StreamMeta,
+    first: PlayerState | None,
+    say: Callable[[str], None],
+) -> Assembly:
+    """The assembly with every ``auto`` replaced by what this scene decides.
+
+    Rules choose first; where frame 0 is made here and training cameras can be spared, trials go on from there.
+
+    Arguments:
+        points: the seeds, made when they are asked for.
+        frame: training images of frame 0.
+        first: the frame 0 of another stream that is taken over, whose choices stand.
+        say: told of every trial.
+    """
+    known = taken_over(first) if first else {}
+    parts = settle(parts, lambda: scene_facts(points(), frame), known)
+    judges = left_out(len(frame.cameras), parts.recipe.first_frame.trial_cameras)
+    if first is not None or parts.whole is not None or not judges:
+        return parts
+    return try_out(parts, FirstFrameTrials(points(), frame, meta, parts.recipe.seed, judges), say)
+
+
 def left_out(count: int, share: float) -> list[int]:
     """Which of ``count`` training cameras trials do without: about that share, evenly spread, never none; empty when
     there are too few to spare one."""
@@ -68,11 +95,6 @@ class FirstFrameTrials:
         self._fitted = _views(frame, [i for i in range(len(frame.cameras)) if i not in judges])
         self._judges = _views(frame, judges)
         self._known: dict[tuple[int, bytes], Trial] = {}
-
-    @property
-    def made(self) -> int:
-        """Fits so far."""
-        return len(self._known)
 
     def __call__(self, parts: Assembly) -> Trial:
         """The trial of these settings; made anew only when nothing with the same start was."""

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
-from flow_runs import WORLD, arguments, broken_off_in, encode, metrics
+from flow_runs import WORLD, arguments, broken_off_in, demo_copy, encode, metrics, without_test_cameras
 
 from gsstream.cli.main import run_command
-from gsstream.engine import session
+from gsstream.engine import session, trials
 from gsstream.packet import StreamReader, decode_packet
 from gsstream.recipe.load import load_recipe
 
 AUTO = {"structure__root_exponent": "auto", "structure__log_base": "auto", "first_frame__sh_degree": "auto"}
+SIX = "synthetic:frames=2&views=6&width=64&height=48&supersample=1"
+BRIEF: dict[str, Any] = {"first_frame__trials": 6, "first_frame__trial_epochs": 1}
 KEYS = {"structure.params.root_exponent", "structure.params.log_base", "first_frame.sh_degree"}
 
 
@@ -65,7 +68,7 @@ def test_resume_takes_the_values_from_the_stream(
     command = arguments(tmp_path / "o", method="s2gs-edge", codec__key_every=4, **AUTO)
     with broken_off_in(3):
         assert run_command(command) == 130
-    monkeypatch.setattr(session, "scene_facts", never)
+    monkeypatch.setattr(session, "choose", never)
     if saved:
         recipe = (tmp_path / "o" / "recipe.yaml").rename(tmp_path / "recipe.yaml")
         command = ["run", "--source", WORLD, "--recipe", str(recipe), "--out", str(tmp_path / "o"), "--no-video"]
@@ -84,7 +87,8 @@ def test_a_frame_0_that_is_taken_over_brings_its_choices(
     tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     taken = ("--first-frame", str(whole / "stream.gss"), "--frames", "2")
-    monkeypatch.setattr(session, "scene_facts", None)
+    for name in ("scene_facts", "try_out"):
+        monkeypatch.setattr(trials, name, None)
     encode(tmp_path / "same", *taken, method="s2gs-edge", **AUTO)
     assert metrics(tmp_path / "same")[0]["auto"] == metrics(whole)[0]["auto"]
 
@@ -96,3 +100,41 @@ def test_a_frame_0_with_given_values_brings_its_degree(tmp_path: Path) -> None:
     said = metrics(tmp_path / "taken")[0]["auto"]
     assert said["first_frame.sh_degree"]["value"] == 1
     assert set(said) == KEYS
+
+
+@pytest.fixture(scope="module")
+def tried(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose training cameras are enough to leave some out."""
+    out = tmp_path_factory.mktemp("tried")
+    encode(out, source=SIX, method="s2gs-edge", **BRIEF, **AUTO)
+    return out
+
+
+def test_a_run_tries_choices_out(tried: Path) -> None:
+    recorded = metrics(tried)[0]["auto"]
+    made = {re.match(r"best of (\d+) trials \(\d+\.\d\d dB", entry["why"]).group(1) for entry in recorded.values()}
+    assert len(made) == 1
+    assert 3 <= int(made.pop()) <= BRIEF["first_frame__trials"]
+    assert dict(key_packet(tried).extra["auto"]) == recorded
+
+
+def test_trials_leave_no_trace_but_the_values(tmp_path: Path, tried: Path) -> None:
+    recorded = metrics(tried)[0]["auto"]
+    values = {key.replace(".params", "").replace(".", "__"): entry["value"] for key, entry in recorded.items()}
+    encode(tmp_path, source=SIX, method="s2gs-edge", **BRIEF, **values)
+    with StreamReader(tmp_path / "stream.gss") as one, StreamReader(tried / "stream.gss") as other:
+        assert one.read(one.frames[1]) == other.read(other.frames[1])
+        first, second = (decode_packet(None, r.read(r.frames[0])) for r in (one, other))
+    for name, ours in first.gaussians.items():
+        assert ours.tobytes() == dict(second.gaussians.items())[name].tobytes(), name
+
+
+def test_test_cameras_have_no_say(tmp_path: Path) -> None:
+    said = []
+    for name, edit in (("with", lambda _: None), ("without", without_test_cameras)):
+        folder = demo_copy(tmp_path / name, train=5, frames=1, edit=edit)
+        settings = {**BRIEF, "scale": 0.25, "first_frame__points": "sweep", **AUTO}
+        encode(tmp_path / f"{name}-run", source=str(folder), method="s2gs-edge", **settings)
+        said.append(metrics(tmp_path / f"{name}-run")[0]["auto"])
+    assert said[0] == said[1]
+    assert all(entry["why"].startswith("best of ") for entry in said[0].values())

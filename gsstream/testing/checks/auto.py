@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -25,7 +26,7 @@ def extreme_scenes() -> list[SceneFacts]:
 
 @check("common", kinds=tuple(CONTRACTS))
 def check_auto_rules(part: Part) -> None:
-    """Each rule of ``auto`` gives a value that the settings accept, with a reason, and the same when asked again."""
+    """Each rule of ``auto`` gives a value, and others to try, that the settings accept; a reason; the same each time."""
     if not part.auto_rules:
         raise Skip("offers no 'auto'")
     for facts, (key, rule) in itertools.product(extreme_scenes(), part.auto_rules.items()):
@@ -34,14 +35,19 @@ def check_auto_rules(part: Part) -> None:
         assert choice.why.strip(), f"rule for {key}: expected a reason, got {choice.why!r}"
         again = rule(facts, part.config)
         assert again == choice, f"rule for {key}: the same scene gave {choice.value!r}, then {again.value!r}"
-        values = part.config.model_dump()
-        *above, name = key.split(".")
-        section = values
-        for step in above:
-            section = section[step]
-        section[name] = choice.value
-        try:
-            part.Config.model_validate(values)
-        except ValidationError as error:
-            reason = error.errors(include_url=False)[0]["msg"]
-            raise AssertionError(f"rule for {key} chose {choice.value!r} for {facts}: {reason}") from error
+        for value in {choice.value, *choice.ladder}:
+            _check_accepted(part, key, value, facts)
+
+
+def _check_accepted(part: Part, key: str, value: Any, facts: SceneFacts) -> None:
+    values = part.config.model_dump()
+    *above, name = key.split(".")
+    section = values
+    for step in above:
+        section = section[step]
+    section[name] = value
+    try:
+        part.Config.model_validate(values)
+    except ValidationError as error:
+        reason = error.errors(include_url=False)[0]["msg"]
+        raise AssertionError(f"rule for {key} chose or would try {value!r} for {facts}: {reason}") from error

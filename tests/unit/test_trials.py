@@ -1,0 +1,178 @@
+"""Choices tried out in short frames 0: where a search goes, what it is judged by, and that it ends."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any, final
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gsstream.core.auto import Choice
+from gsstream.engine.assemble import Assembly, assemble
+from gsstream.engine.auto import settle
+from gsstream.engine.trials import Trial, colour_matched, left_out, try_out
+from gsstream.plugins.catalog import load_catalog
+from gsstream.recipe.load import resolve_recipe
+from gsstream.structure.flat import Flat
+from gsstream.testing.checks.auto import extreme_scenes
+
+FACTS = extreme_scenes()[0]
+LADDER = tuple(range(10))
+
+
+@final
+class Asking(Flat):  # type: ignore[misc]  # a test may inherit
+    """Flat with two settings that a search can move, and one that no trial can judge (ours)."""
+
+    class Config(Flat.Config):
+        wide: int = 0
+        deep: int = 0
+        late: int = 0
+
+    auto_rules = MappingProxyType({
+        "wide": lambda facts, config: Choice(5, "the middle", LADDER),
+        "deep": lambda facts, config: Choice(2, "near the end", LADDER),
+        "late": lambda facts, config: Choice(7, "only time will tell"),
+    })  # fmt: skip
+
+
+def settled(trials: int = 100) -> Assembly:
+    """All three chosen by their rules."""
+    parts = assemble(resolve_recipe("dense", load_catalog().recipe_path).recipe, load_catalog())
+    params = dict.fromkeys(Asking.auto_rules, "auto")
+    first = parts.recipe.first_frame.model_copy(update={"trials": trials})
+    structure = parts.recipe.structure.model_copy(update={"params": params})
+    recipe = parts.recipe.model_copy(update={"structure": structure, "first_frame": first})
+    pending = tuple(("structure", "params", key) for key in params)
+    return settle(replace(parts, structure=Asking(), recipe=recipe, pending=pending), lambda: FACTS, {})
+
+
+class Hill:
+    """A trial with one best place, equal scenes on every second step of ``wide``, and nothing else to find."""
+
+    def __init__(self, wide: int, deep: int, size: int = 1000, flat: bool = False) -> None:
+        self.top, self.size, self.flat = (wide, deep), size, flat
+        self.asked: list[tuple[int, int, int]] = []
+        self.known: dict[tuple[int, int], Trial] = {}
+
+    def __call__(self, parts: Assembly) -> Trial:
+        config = parts.structure.config
+        self.asked.append((config.wide, config.deep, config.late))
+        wide = config.wide // 2 * 2 if self.flat else config.wide
+        distance = abs(wide - self.top[0]) + abs(config.deep - self.top[1])
+        return self.known.setdefault((wide, config.deep), Trial(30.0 - distance, 1000, self.size))
+
+
+places = st.sampled_from(LADDER)
+
+
+@given(wide=places, deep=places)
+def test_a_search_climbs_to_the_top_and_says_where_it_was(wide: int, deep: int) -> None:
+    hill, said = Hill(wide, deep), []
+    done = try_out(settled(), hill, said.append)
+    assert (done.structure.config.wide, done.structure.config.deep) == (wide, deep)
+    assert done.recipe.structure.params == {"wide": wide, "deep": deep, "late": 7}
+    assert len(said) == len(hill.known)
+    why = done.chosen["structure.params.wide"].why
+    assert why.startswith(f"best of {len(said)} trials (30.00 dB on left-out cameras, by rules ")
+    assert why.endswith("by rule 5: the middle")
+    assert done.chosen["structure.params.late"] == Choice(7, "only time will tell")
+    assert {late for _, _, late in hill.asked} == {7}
+
+
+@given(wide=st.sampled_from(LADDER[::2]), deep=places)
+def test_settings_that_start_alike_do_not_end_a_walk(wide: int, deep: int) -> None:
+    hill = Hill(wide, deep, flat=True)
+    done = try_out(settled(), hill, lambda _: None)
+    assert done.structure.config.wide // 2 * 2 == wide
+    assert done.structure.config.deep == deep
+
+
+@given(wide=places, deep=places, most=st.integers(1, 12))
+def test_a_search_makes_no_more_trials_than_it_may_and_never_ends_below_the_rules(
+    wide: int, deep: int, most: int
+) -> None:
+    hill = Hill(wide, deep)
+    done = try_out(settled(most), hill, lambda _: None)
+    assert len(hill.known) <= most
+    end = done.structure.config
+    assert hill.known[end.wide, end.deep].psnr >= hill.known[5, 2].psnr
+
+
+def test_no_trials_are_no_search() -> None:
+    def never(parts: Assembly) -> Trial:
+        raise AssertionError("tried")
+
+    parts = settled(0)
+    assert try_out(parts, never, lambda _: None) is parts
+
+
+def test_equal_quality_goes_to_the_smaller_packet_and_little_quality_does_not_buy_a_large_one() -> None:
+    def trial(parts: Assembly) -> Trial:
+        wide = parts.structure.config.wide
+        return Trial(30.0 + 0.01 * wide, 1, 1000 * 2**wide)
+
+    assert try_out(settled(), trial, lambda _: None).structure.config.wide == 0
+
+
+@final
+class Picky(Flat):  # type: ignore[misc]  # a test may inherit
+    """Refuses a value that its rule would try: the search looks behind it (ours)."""
+
+    class Config(Asking.Config):
+        def model_post_init(self, _: Any) -> None:
+            if self.wide == 6:
+                raise ValueError("not six")
+
+    auto_rules = Asking.auto_rules
+
+
+def test_a_search_steps_over_what_the_part_refuses() -> None:
+    parts = settled()
+    parts = replace(parts, structure=Picky(Picky.Config(**parts.structure.config.model_dump())))
+    assert try_out(parts, Hill(8, 2), lambda _: None).structure.config.wide == 8
+
+
+def test_a_choice_off_its_own_ladder_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"got 3, which is not in \(1, 2\)"):
+        Choice(3, "why not", (1, 2))
+
+
+@given(count=st.integers(0, 500), share=st.floats(0.001, 0.999))
+def test_who_is_left_out(count: int, share: float) -> None:
+    judges = left_out(count, share)
+    if count < 4:
+        assert judges == []
+        return
+    assert judges == sorted(set(judges))
+    assert len(judges) == min(max(1, round(share * count)), count // 2)
+    assert judges[0] >= 0
+    assert judges[-1] < count
+    gaps = np.diff(judges)
+    assert gaps.size == 0 or gaps.max() - gaps.min() <= 1
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 1000))
+def test_a_camera_of_its_own_colours_is_matched(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    image = draw.uniform(0.2, 0.8, (9, 7, 3)).astype(np.float32)
+    matrix = np.eye(3) * 0.7 + draw.uniform(-0.05, 0.05, (3, 3))
+    seen = (image @ matrix + 0.1).astype(np.float32)
+    np.testing.assert_allclose(colour_matched(image, seen), seen, atol=2e-6)
+    noisy = (seen + draw.normal(0, 0.05, seen.shape)).astype(np.float32)
+    best = np.square(colour_matched(image, noisy) - noisy).mean()
+    for other in (image, image * 1.01, (image @ matrix + 0.1)):
+        assert best <= np.square(other - noisy).mean() + 1e-9
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
+def test_an_image_of_one_colour_is_matched_to_the_mean(value: float) -> None:
+    image = np.full((4, 5, 3), value, np.float32)
+    seen = np.random.default_rng(0).random((4, 5, 3)).astype(np.float32)
+    matched = colour_matched(image, seen)
+    np.testing.assert_allclose(matched, np.broadcast_to(seen.reshape(-1, 3).mean(0), seen.shape), atol=1e-5)

@@ -26,7 +26,7 @@ def extreme_scenes() -> list[SceneFacts]:
 
 @check("common", kinds=tuple(CONTRACTS))
 def check_auto_rules(part: Part) -> None:
-    """Each rule of ``auto`` gives a value, and others to try, that the settings accept; a reason; the same each time."""
+    """Each rule of ``auto`` gives a value that the settings accept, others to try, a reason, and the same each time."""
     if not part.auto_rules:
         raise Skip("offers no 'auto'")
     for facts, (key, rule) in itertools.product(extreme_scenes(), part.auto_rules.items()):

@@ -215,7 +215,8 @@ def hooks() -> str:
                 lines.append(f"- {how}`{_signature(name, function)}` ({must}){': ' + about[0] if about else ''}")
         lines.append("")
     rules = inspect.getdoc(importlib.import_module("gsstream.core.auto").SceneFacts) or ""
-    lines += ["## Rules of `auto`", "", "`auto_rules = {SETTING: rule}`, `rule(facts, settings) -> Choice(value, why, ladder=())`"]
+    signature = "`auto_rules = {SETTING: rule}`, `rule(facts, settings) -> Choice(value, why, ladder=())`"
+    lines += ["## Rules of `auto`", "", signature]
     lines += ["([how](../howto/auto.md)). What a rule is told:", "", "```", rules, "```", ""]
     lines += ["## Traits", "", "What a part claims, `traits = Traits(...)`; each claim calls for checks.", ""]
     lines += ["```", inspect.getdoc(Traits) or "", "```", ""]

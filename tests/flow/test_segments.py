@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
 import shutil
+import sys
 import time
 from pathlib import Path
 
@@ -24,7 +26,7 @@ from gsstream.trade.segments.drive import Setting, run_segments
 from gsstream.trade.segments.job import SegmentOutcome, run_segment
 from gsstream.trade.segments.join import join
 from gsstream.trade.segments.plan import make_plan
-from gsstream.trade.sweep.executor import Finished, LocalExecutor
+from gsstream.trade.sweep.executor import Finished, LocalExecutor, make_executor
 
 
 class Here:
@@ -160,6 +162,43 @@ def test_a_worker_killed_in_a_segment_goes_on_where_it_stopped(
     assert [line for line in said if "killed by SIGKILL" in line and "goes on" in line]
     steps = [path.name.split("-")[2] for path in marks.glob("segment-001-*")]
     assert sorted(steps) == ["4", "4", "5"], "frame 3, the key packet, was kept; frame 4 was made again"
+
+
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs Ray (extra: ray)")
+@pytest.mark.slow
+def test_on_ray_a_killed_worker_s_segment_begins_again_to_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cluster of two workers that share no folder with the run; frame 0 is given, one worker fewer to wait for."""
+    marks, once, out = tmp_path / "marks", tmp_path / "once", tmp_path / "o"
+    marks.mkdir()
+    out.mkdir()
+    wanted = made(once, Here(1), segments=2)
+    monkeypatch.setenv("SEGMENT_TEST_MARKS", str(marks))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    shutil.copyfile(once / "key-000" / "stream.gss", out / "first.gss")
+    said: list[str] = []
+    executor = make_executor(segment_works.run_and_die_once, 2, 1, "local")
+    result = run_segments(
+        make_plan(6, 2, "warm", first_given=True), setting(local=False), out, executor, say=said.append
+    )
+    assert (result.made, (out / "stream.gss").read_bytes()) == (3, wanted)
+    assert sum("Ray worker was lost" in line and "goes on" in line for line in said) == 1
+    steps = [path.name.split("-")[2] for path in marks.glob("segment-001-*")]
+    assert sorted(steps) == ["4", "4", "5"]
+
+
+def test_without_ray_nothing_is_touched(
+    whole: tuple[str, Path, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(whole[1], tmp_path, dirs_exist_ok=True)
+    (tmp_path / "segments.json").write_text("{}")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    monkeypatch.setitem(sys.modules, "ray", None)
+    command = ["run-segments", "--method", "dense", "--source", WORLD, "--segments", "3", "--ray", "local"]
+    assert run_command([*command, "--overwrite", "--out", str(tmp_path)]) == 1
+    assert "gsstream[ray]" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
 def test_a_killed_run_resumes_and_keeps_what_is_finished(tmp_path: Path) -> None:

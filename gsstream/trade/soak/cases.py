@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
+from gsstream.core.auto import AUTO
 from gsstream.core.errors import PluginUnavailable
 from gsstream.core.rng import Rng
 from gsstream.engine.heeded import PART_SECTIONS, SESSION_KEYS
@@ -112,7 +113,17 @@ SOMETIMES: Mapping[str, Draw] = MappingProxyType({
     "data.gain_amplitude": _of(0.0, 0.3, 0.9), "data.gain_pattern": _of("sine", "random"),
     "data.gain_period": _of(2.0, 60.0), "data.noise_sigma": _of(0.0, 5.0, 60.0, 255.0),
     "data.noise_frames": _of(1, 3, 99), "data.lost_share": _of(0.0, 0.2, 0.9), "data.lost_as": _of("hold", "black"),
-    "data.leak": _of("none", "points", "training"),
+    "data.leak": _of("none", "points", "training"), "data.images": _of("float16", "uint8"),
+})  # fmt: skip
+#: Drawn with the others where the six parts are the method.
+OF_PARTS: Mapping[str, Draw] = MappingProxyType({
+    "codec.trim": _of(0.0, 0.3, 0.9, 0.999), "budget.size": _of(16, 200, 1500, 20_000), "budget.time": _logs(1e-3, 2),
+    "budget.clock": _of("processor", "wall"), "first_frame.sh_degree": _of("auto"),
+})  # fmt: skip
+#: What keeps a choice of ``auto`` short.
+TRIALS: Mapping[str, Draw] = MappingProxyType({
+    "first_frame.trials": _of(0, 2, 4), "first_frame.trial_epochs": _of(1, 2),
+    "first_frame.trial_cameras": _logs(0.01, 0.9),
 })  # fmt: skip
 
 
@@ -147,7 +158,9 @@ def draw_case(seed: int, index: int, catalog: Catalog) -> Case:
         settings = {k: v for k, v in settings.items() if k in read or k.partition(".")[0] not in PART_SECTIONS}
         settings |= dict(_settings_of(catalog, "whole", whole, rng, share))
     else:
+        settings |= {key: draw(rng) for key, draw in OF_PARTS.items() if rng.random() < share}
         settings |= _parts(catalog, rng, share)
+        settings |= {key: draw(rng) for key, draw in TRIALS.items()} if AUTO in settings.values() else {}
     return Case(seed, index, source, method, tuple(settings.items()))
 
 
@@ -185,7 +198,10 @@ def usable(catalog: Catalog, slot: str) -> list[str]:
 
 
 def _settings_of(catalog: Catalog, slot: str, name: str, rng: Generator, share: float) -> Iterator[tuple[str, Any]]:
-    yield from _fields(catalog.resolve(slot, name).Config(), f"{slot}.params", rng, share)
+    part = catalog.resolve(slot, name)
+    yield from _fields(part.Config(), f"{slot}.params", rng, share)
+    if rng.random() < share:
+        yield from ((f"{slot}.params.{key}", AUTO) for key in part.auto_rules)
 
 
 def _fields(config: BaseModel, path: str, rng: Generator, share: float) -> Iterator[tuple[str, Any]]:

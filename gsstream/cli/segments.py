@@ -27,6 +27,7 @@ class SegmentStart(StrEnum):
     """Where the first frame of a later segment comes from."""
 
     warm = "warm"
+    open = "open"
     anew = "anew"
 
 
@@ -44,7 +45,7 @@ def run_segments(
         typer.Option(
             "--start",
             help="First frame of a later segment; warm: the scene of the segment before, carried over in one step; "
-            "anew: reconstructed like frame 0.",
+            "open: so, too, with every gate open; anew: reconstructed like frame 0.",
         ),
     ] = SegmentStart.warm,
     key_epochs: Annotated[
@@ -77,7 +78,7 @@ class Wanted(NamedTuple):
     source: str
     out: Path
     segments: int
-    start: Literal["warm", "anew"]
+    start: Literal["warm", "open", "anew"]
     key_epochs: int
     first_frame: Path | None
     workers: int | None
@@ -149,7 +150,7 @@ def _work(
     total = min(number, assembly.recipe.frames or number)
     plan = make_plan(total, wanted.segments, wanted.start, first_given=first is not None)
     uri = recording_uri(wanted.source, None)
-    setting = Setting(uri, resolved, _carrying(resolved, assembly, wanted.key_epochs), wanted.ray is None)
+    setting = Setting(uri, resolved, _carrying(resolved, assembly, wanted), wanted.ray is None)
     facts = {
         "source": uri, "segments": wanted.segments, "frames": total, "start": wanted.start,
         "key_epochs": wanted.key_epochs, "recipe": recipe_hash(assembly.recipe),
@@ -158,14 +159,19 @@ def _work(
     return SegmentWork(plan, setting, facts)
 
 
-def _carrying(resolved: ResolvedRecipe, assembly: Assembly, epochs: int) -> ResolvedRecipe:
-    """The recipe with the epochs of a leap, where the method reads them."""
-    from gsstream.recipe.load import ResolvedRecipe
+def _carrying(resolved: ResolvedRecipe, assembly: Assembly, wanted: Wanted) -> ResolvedRecipe:
+    """The recipe of a leap. Raises InputError where there are no gates to open."""
+    from gsstream.core.errors import InputError
+    from gsstream.trade.segments.carry import leap_recipe, open_leap_recipe
 
-    if assembly.whole is not None and "stream.epochs" not in assembly.whole.heeds:
-        return resolved
-    stream = resolved.recipe.stream.model_copy(update={"epochs": epochs})
-    return ResolvedRecipe(resolved.recipe.model_copy(update={"stream": stream}), resolved.origins)
+    if wanted.start != "open":
+        return leap_recipe(resolved, wanted.key_epochs, assembly.whole)
+    if assembly.whole is not None:
+        raise InputError(
+            f"--start open: expected a method made of parts, got the whole method {resolved.recipe.whole.name!r}, "
+            "which has no gates; use warm or anew"
+        )
+    return open_leap_recipe(resolved, wanted.key_epochs)
 
 
 def _prepare(

@@ -22,6 +22,7 @@ from gsstream.packet import PacketKind, StreamReader
 from gsstream.player.playback import Playback
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
+from gsstream.trade.segments.carry import open_leap_recipe
 from gsstream.trade.segments.drive import Setting, run_segments
 from gsstream.trade.segments.job import SegmentOutcome, run_segment
 from gsstream.trade.segments.join import join
@@ -136,6 +137,27 @@ def test_moving_pixels_are_those_of_a_run_from_the_start(whole: tuple[str, Path,
         assert moving[0] == moving[1], ours["frame"]
     first = metrics(whole[1])[0]
     assert first["psnr"] == alone[0]["psnr"], "segment 0 begins as the run does"
+
+
+def test_an_open_leap_frees_every_gaussian_and_the_segment_is_the_method_s_own(tmp_path: Path) -> None:
+    overrides = [("--set", f"{key}={value}") for key, value in TINY.items()]
+    overrides += [("--set", "budget.size=400"), ("--set", "budget.memory=8GB"), ("--set", "scale=0.5")]
+    resolved = resolve_recipe("s2gs-edge", load_catalog().recipe_path, (), overrides)
+    leap = open_leap_recipe(resolved, 2)
+    plan = make_plan(6, 2, "open", first_given=False)
+    run_segments(plan, Setting(WORLD, resolved, leap), tmp_path, Here(1), say=lambda _: None)
+    changed = metrics(tmp_path / "key-001")[1]
+    assert (changed["active_gaussians"], changed["status"]) == (changed["num_gaussians"], "delta")
+    assert sum(changed["bytes"].values()) > 400, "the budget of a frame does not bind what is not sent"
+    assert (leap.recipe.budget.memory, leap.recipe.scale) == (8e9, 0.5)
+    assert leap.recipe.structure == resolved.recipe.structure
+    with Playback(tmp_path / "stream.gss") as playback:
+        first, later = playback.player_state(0), playback.player_state(3)
+        for state in (first, later):
+            assert state.meta.recipe == first.meta.recipe
+            assert state.meta.recipe["gate"]["name"] == "gumbel-sigmoid"
+        levels = [np.sort(state.layout.octree_levels) for state in (first, later)]
+    assert np.array_equal(*levels), "what a Gaussian's residuals are measured in goes on"
 
 
 def test_a_whole_method_in_segments(tmp_path: Path) -> None:
@@ -303,3 +325,5 @@ def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str], whole: tup
     assert "was begun with other settings" in err
     assert "segments" in err
     assert "already holds a run in segments" in refused(*world, "--segments", "2", "--out", str(out))
+    err = refused(*world, "--segments", "2", "--out", str(tmp_path / "b"), "--method", "hold", "--start", "open")
+    assert "--start open: expected a method made of parts, got the whole method 'hold'" in err

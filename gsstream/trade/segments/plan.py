@@ -11,7 +11,7 @@ from typing import Any, Literal
 from gsstream.core.errors import InputError, OutputError
 from gsstream.packet import StreamReader
 
-Start = Literal["warm", "anew"]
+Start = Literal["warm", "open", "anew"]
 PLAN = "segments.json"
 STREAM = "stream.gss"
 #: The shortest segment: a key packet and one frame that goes on from it.
@@ -62,7 +62,7 @@ def make_plan(frames: int, segments: int, start: Start, *, first_given: bool) ->
 
     Arguments:
         start: "warm": the scene of a segment's first frame is that of the segment before, carried over in one step;
-            "anew": it is reconstructed.
+            "open": so, too (the two differ in the recipe of that step, ``carry``); "anew": it is reconstructed.
         first_given: frame 0 is taken over from another stream.
 
     Raises InputError when segments would be shorter than two frames.

@@ -24,6 +24,7 @@ from gsstream.engine.exposure import Exposure
 from gsstream.engine.guard import guarded
 from gsstream.engine.root import Progress, initial_gaussians, optimise_root, sort_by_node
 from gsstream.engine.stream_state import Step, StreamState
+from gsstream.init.thinning import thin_points
 from gsstream.packet import EncodedPacket, KeyState, PlayerState, StreamMeta, decode_packet, encode_key, quantise_key
 from gsstream.structure.base import Anchors
 
@@ -41,8 +42,7 @@ def begin(
     refuse_pending(parts)
     check_cameras(frame.cameras, 1, "a frame")
     clock = [time.perf_counter()]
-    with guarded("structure", parts.structure, frame.index):
-        anchors = parts.structure.seed(points, frame.cameras)
+    anchors = seeded(parts, points, frame)
     clock.append(time.perf_counter())
     start = initial_gaussians(anchors, parts.recipe.first_frame)
     root = optimise_root(
@@ -65,6 +65,20 @@ def begin(
         "seconds": dict(zip(("seed", "optimise", "code"), np.diff(clock).tolist(), strict=True)),
     }
     return Step(state, packet, "key", metrics)
+
+
+def seeded(parts: Assembly, points: PointCloud, frame: Frame) -> Anchors:
+    """Anchors, at most ``first_frame.max_gaussians`` of them.
+
+    A structure places one or more for each point, so where there are too many it is given fewer points.
+    """
+    most = parts.recipe.first_frame.max_gaussians
+    while True:
+        with guarded("structure", parts.structure, frame.index):
+            anchors = parts.structure.seed(points, frame.cameras)
+        if len(anchors.positions) <= most or len(points) == 1:
+            return anchors
+        points = thin_points(points, max(1, int(0.95 * len(points) * most / len(anchors.positions))))
 
 
 def check_cameras(cameras: Cameras, least: int, who: str) -> None:

@@ -60,9 +60,10 @@ def initial_gaussians(anchors: Anchors, settings: FirstFrame) -> Gaussians[torch
     )
 
 
-def neighbour_distance(positions: torch.Tensor, block: int = 2048) -> torch.Tensor:
-    """[N] root mean squared distance to the three nearest other points, blockwise."""
+def neighbour_distance(positions: torch.Tensor, most: int = 2**22) -> torch.Tensor:
+    """[N] root mean squared distance to the three nearest other points; ``most``: distances in memory at a time."""
     count = len(positions)
+    block = max(1, min(2048, most // max(1, count)))
     k = min(4, count)
     if k < 2:
         return torch.full((count,), 0.01)

@@ -143,6 +143,13 @@ def test_memory_limits_frame_0_or_refuses(tmp_path: Path, capsys: pytest.Capture
     with Playback(tmp_path / "yes" / "stream.gss") as playback:
         limits = playback.meta.recipe["first_frame"]["max_gaussians"]
     assert 1000 <= limits < 2000
+    assert all(0 < line["num_gaussians"] <= limits for line in recipe[0]), "also the seeds, not only what grows"
+
+
+def test_seeds_are_limited_as_well_as_growth(tmp_path: Path) -> None:
+    """A structure places several anchors for a point; a recording once began with half as many again as allowed."""
+    encode(tmp_path, "--frames", "2", method="s2gs-edge", first_frame__max_gaussians=90)
+    assert all(0 < line["num_gaussians"] <= 90 for line in metrics(tmp_path))
 
 
 def test_a_whole_method_has_no_budget_of_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

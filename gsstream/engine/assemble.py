@@ -131,13 +131,13 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
 
 def _written_out(slot: str, ref: ComponentRef, part: Part, pending: list[KeyPath]) -> ComponentRef:
     """The part with all its settings; what is left to the scene says ``auto`` and is added to ``pending``."""
-    left = [key for key in part.auto_rules if _at(ref.params, key) == AUTO]
+    left = [key for key in part.auto_rules if value_at(ref.params, key) == AUTO]
     pending += [(slot, "params", *key.split(".")) for key in left]
     params = with_values(part.config.model_dump(mode="json"), dict.fromkeys(left, AUTO))
     return ComponentRef(name=ref.name, params=params)
 
 
-def _at(params: Any, key: str) -> Any:
+def value_at(params: Any, key: str) -> Any:
     """The value under a dotted key; None where there is none."""
     for name in key.split("."):
         params = params.get(name) if isinstance(params, Mapping) else None
@@ -166,7 +166,7 @@ def _build(
     except UnknownName as error:
         problems.append(f"{resolved.near((slot, 'name')).where}: {slot}.name: {error}")
         return None
-    left = [key for key in cls.auto_rules if _at(ref.params, key) == AUTO]
+    left = [key for key in cls.auto_rules if value_at(ref.params, key) == AUTO]
     fixed, found = with_values(ref.params, dict.fromkeys(left)), list[str]()
     config = validate(cls.Config, fixed, resolved.near, (slot, "params"), found)
     offered = f"; 'auto' is offered for {', '.join(cls.auto_rules)}" if cls.auto_rules else "; it offers no 'auto'"

@@ -8,7 +8,7 @@ it gets better. A trial is frame 0 as a run makes it, packet and all, with fewer
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,14 +21,15 @@ from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
-from gsstream.engine.assemble import Assembly
-from gsstream.engine.auto import put, settle, taken_over
+from gsstream.engine.assemble import Assembly, value_at
+from gsstream.engine.auto import DEGREE, put, settle, taken_over
 from gsstream.engine.begin import begin
 from gsstream.engine.facts import scene_facts
 from gsstream.engine.guard import guarded
 from gsstream.metrics import psnr
 from gsstream.packet import PlayerState, StreamMeta
 from gsstream.recipe.document import KeyPath
+from gsstream.recipe.model import FirstFrame
 
 #: What a key packet of half the size is worth, dB. Little, for short fits show only a part of what more coefficients
 #: gain in long ones: it decides between choices that are as good.
@@ -70,12 +71,22 @@ def choose(
         first: the frame 0 of another stream that is taken over, whose choices stand.
         say: told of every trial.
     """
-    known = taken_over(first) if first else {}
-    parts = settle(parts, lambda: scene_facts(points(), frame), known)
+    usual = usual_values(parts)
+    parts = settle(parts, lambda: scene_facts(points(), frame), taken_over(first) if first else {})
     judges = left_out(len(frame.cameras), parts.recipe.first_frame.trial_cameras)
     if first is not None or parts.whole is not None or not judges:
         return parts
-    return try_out(parts, FirstFrameTrials(points(), frame, meta, parts.recipe.seed, judges), say)
+    return try_out(parts, usual, FirstFrameTrials(points(), frame, meta, parts.recipe.seed, judges), say)
+
+
+def usual_values(parts: Assembly) -> dict[str, Any]:
+    """What stands in the parts where the recipe says ``auto``, by key: the defaults."""
+    usual: dict[str, Any] = {DEGREE: FirstFrame.model_fields["sh_degree"].default}
+    for slot, *inner in parts.pending:
+        if slot != "first_frame":
+            config = getattr(parts, slot).config.model_dump()
+            usual[".".join((slot, *inner))] = value_at(config, ".".join(inner[1:]))
+    return usual
 
 
 def left_out(count: int, share: float) -> list[int]:
@@ -133,20 +144,25 @@ def _views(frame: Frame, views: list[int]) -> Frame:
     return replace(frame, images=frame.images[views], cameras=frame.cameras.select(views))
 
 
-def try_out(parts: Assembly, trial: Callable[[Assembly], Trial], say: Callable[[str], None]) -> Assembly:
+def try_out(
+    parts: Assembly, usual: Mapping[str, Any], trial: Callable[[Assembly], Trial], say: Callable[[str], None]
+) -> Assembly:
     """The assembly with the choices that have a ladder moved to where short fits are best.
 
-    One key after the other, in the order in which the rules chose, a value goes up its ladder, or else down, while the
-    score of the trials gets better; again from the first key until nothing moves or ``first_frame.trials`` are made.
+    It starts from the rules' choice or from the usual values, whichever is better. One key after the other, in the order
+    in which the rules chose, a value goes up its ladder, or else down, while the score of the trials gets better; again
+    from the first key until nothing moves or ``first_frame.trials`` are made.
 
     Arguments:
         parts: settled by the rules (``engine.auto.settle``).
+        usual: key -> what it is where nobody says ``auto``.
         trial: what settings come to (``FirstFrameTrials``).
         say: told of every trial.
     """
     if not any(choice.ladder for choice in parts.chosen.values()) or parts.recipe.first_frame.trials == 0:
         return parts
     climb = _Climb(parts, trial, say)
+    climb.begin_with(usual)
     while climb.round():
         pass
     return climb.verdict()
@@ -166,6 +182,18 @@ class _Climb:
         self._most = parts.recipe.first_frame.trials
         self._made: list[_Tried] = []
         self._best = self._try(parts, "the rules' choice")
+
+    def begin_with(self, values: Mapping[str, Any]) -> None:
+        """Start from these values instead, where they are on their ladders and better than the rules' choice."""
+        parts: Assembly | None = self._best.parts
+        for key, choice in self._rules.items():
+            if choice.ladder and values[key] in choice.ladder and parts is not None:
+                parts = _accepted(parts, key, values[key])
+        if parts is None or len(self._made) >= self._most:
+            return
+        found = self._try(parts, "the usual values")
+        if found.trial.score > self._best.trial.score:
+            self._best = found
 
     def round(self) -> bool:
         """Walk along every ladder once; whether anything got better and trials are left."""

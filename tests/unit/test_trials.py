@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from gsstream.core.auto import Choice
 from gsstream.engine.assemble import Assembly, assemble
 from gsstream.engine.auto import settle
-from gsstream.engine.trials import Trial, colour_matched, left_out, try_out
+from gsstream.engine.trials import Trial, colour_matched, left_out, try_out, usual_values
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.structure.flat import Flat
@@ -22,6 +22,8 @@ from gsstream.testing.checks.auto import extreme_scenes
 
 FACTS = extreme_scenes()[0]
 LADDER = tuple(range(10))
+#: The usual values, where they are those of the rules.
+RULES = {"structure.params.wide": 5, "structure.params.deep": 2}
 
 
 @final
@@ -73,7 +75,7 @@ places = st.sampled_from(LADDER)
 @given(wide=places, deep=places)
 def test_a_search_climbs_to_the_top_and_says_where_it_was(wide: int, deep: int) -> None:
     hill, said = Hill(wide, deep), []
-    done = try_out(settled(), hill, said.append)
+    done = try_out(settled(), RULES, hill, said.append)
     assert (done.structure.config.wide, done.structure.config.deep) == (wide, deep)
     assert done.recipe.structure.params == {"wide": wide, "deep": deep, "late": 7}
     assert len(said) == len(hill.known)
@@ -87,7 +89,7 @@ def test_a_search_climbs_to_the_top_and_says_where_it_was(wide: int, deep: int) 
 @given(wide=st.sampled_from(LADDER[::2]), deep=places)
 def test_settings_that_start_alike_do_not_end_a_walk(wide: int, deep: int) -> None:
     hill = Hill(wide, deep, flat=True)
-    done = try_out(settled(), hill, lambda _: None)
+    done = try_out(settled(), RULES, hill, lambda _: None)
     assert done.structure.config.wide // 2 * 2 == wide
     assert done.structure.config.deep == deep
 
@@ -97,10 +99,38 @@ def test_a_search_makes_no_more_trials_than_it_may_and_never_ends_below_the_rule
     wide: int, deep: int, most: int
 ) -> None:
     hill = Hill(wide, deep)
-    done = try_out(settled(most), hill, lambda _: None)
+    done = try_out(settled(most), RULES, hill, lambda _: None)
     assert len(hill.known) <= most
     end = done.structure.config
     assert hill.known[end.wide, end.deep].psnr >= hill.known[5, 2].psnr
+
+
+@given(wide=places, deep=places)
+def test_a_search_starts_where_it_is_better(wide: int, deep: int) -> None:
+    usual = {"structure.params.wide": wide, "structure.params.deep": deep}
+    hill, said = Hill(wide, deep), []
+    done = try_out(settled(2), usual, hill, said.append)
+    assert (done.structure.config.wide, done.structure.config.deep) == (wide, deep)
+    if (wide, deep) != (5, 2):
+        assert said[1].startswith("auto: trial 2, the usual values: 30.00 dB")
+    worse = {"structure.params.wide": 9 - wide, "structure.params.deep": 9 - deep}
+    assert try_out(settled(1), worse, Hill(5, 2), lambda _: None).structure.config.wide == 5
+    off = {"structure.params.wide": 77, "structure.params.deep": deep}
+    assert try_out(settled(2), off, Hill(5, deep), lambda _: None).structure.config == Asking.Config(
+        wide=5, deep=deep, late=7
+    )
+
+
+def test_usual_values_are_the_defaults() -> None:
+    catalog = load_catalog()
+    keys = ("first_frame.sh_degree", "structure.log_base", "update.sh0.latent")
+    recipe = resolve_recipe("s2gs-edge", catalog.recipe_path, (), [("--set", f"{key}=auto") for key in keys])
+    fixed = assemble(resolve_recipe("s2gs-edge", catalog.recipe_path), catalog).recipe
+    assert usual_values(assemble(recipe, catalog)) == {
+        "first_frame.sh_degree": fixed.first_frame.sh_degree,
+        "structure.params.log_base": fixed.structure.params["log_base"],
+        "update.params.sh0.latent": fixed.update.params["sh0"]["latent"],
+    }
 
 
 def test_no_trials_are_no_search() -> None:
@@ -108,7 +138,7 @@ def test_no_trials_are_no_search() -> None:
         raise AssertionError("tried")
 
     parts = settled(0)
-    assert try_out(parts, never, lambda _: None) is parts
+    assert try_out(parts, RULES, never, lambda _: None) is parts
 
 
 def test_equal_quality_goes_to_the_smaller_packet_and_little_quality_does_not_buy_a_large_one() -> None:
@@ -116,7 +146,7 @@ def test_equal_quality_goes_to_the_smaller_packet_and_little_quality_does_not_bu
         wide = parts.structure.config.wide
         return Trial(30.0 + 0.01 * wide, 1, 1000 * 2**wide)
 
-    assert try_out(settled(), trial, lambda _: None).structure.config.wide == 0
+    assert try_out(settled(), RULES, trial, lambda _: None).structure.config.wide == 0
 
 
 @final
@@ -134,7 +164,7 @@ class Picky(Flat):  # type: ignore[misc]  # a test may inherit
 def test_a_search_steps_over_what_the_part_refuses() -> None:
     parts = settled()
     parts = replace(parts, structure=Picky(Picky.Config(**parts.structure.config.model_dump())))
-    assert try_out(parts, Hill(8, 2), lambda _: None).structure.config.wide == 8
+    assert try_out(parts, RULES, Hill(8, 2), lambda _: None).structure.config.wide == 8
 
 
 def test_a_choice_off_its_own_ladder_is_refused() -> None:

@@ -20,8 +20,8 @@ FINEST_CELL = 0.05
 MOST_LEVELS = 10
 #: Numbers of levels worth trying.
 LEVELS = (1, 2, 3, 4, 6, 8, MOST_LEVELS)
-#: Least and largest exponent of the root grid chosen, and how far from the rule's trials look.
-EXPONENTS, EXPONENT_REACH = (2, 12), 2
+#: Exponents of the root grid chosen from.
+EXPONENTS = tuple(range(2, 13))
 #: What harmonics must gain for a left-out camera, dB, before their residuals are worth bytes.
 STRONG_GAIN = 1.0
 
@@ -31,11 +31,9 @@ def root_exponent(facts: SceneFacts, _config: Any) -> Choice:
 
     Wider cells merge seeds, and what is merged is missing in frame 0; narrower ones group no two Gaussians.
     """
-    low, high = EXPONENTS
-    k = _between(low, _rounded(math.log2(max(facts.span_spacings, 1.0))), high)
+    k = _between(EXPONENTS[0], _rounded(math.log2(max(facts.span_spacings, 1.0))), EXPONENTS[-1])
     cells = 2**k / facts.span_spacings if facts.span_spacings > 0 else math.inf
-    ladder = tuple(range(max(low, k - EXPONENT_REACH), min(high, k + EXPONENT_REACH) + 1))
-    return Choice(k, f"neighbouring seeds are {cells:.2g} root cells apart", ladder)
+    return Choice(k, f"neighbouring seeds are {cells:.2g} root cells apart", EXPONENTS)
 
 
 def log_base(facts: SceneFacts, config: Any) -> Choice:

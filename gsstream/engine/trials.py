@@ -149,9 +149,9 @@ def try_out(
 ) -> Assembly:
     """The assembly with the choices that have a ladder moved to where short fits are best.
 
-    It starts from the rules' choice or from the usual values, whichever is better. One key after the other, in the order
-    in which the rules chose, a value goes up its ladder, or else down, while the score of the trials gets better; again
-    from the first key until nothing moves or ``first_frame.trials`` are made.
+    It starts from the rules' choice or from the usual values, whichever is better. One key after the other, in the
+    rules' order, a value goes up its ladder, or else down, while the score of the trials gets better; again from the
+    first key until nothing moves or ``first_frame.trials`` are made.
 
     Arguments:
         parts: settled by the rules (``engine.auto.settle``).

@@ -12,7 +12,7 @@ from gsstream.engine.assemble import Assembly
 from gsstream.source.base import SourceInfo
 
 #: Interpreter, torch, the renderer and the engine with everything a run imports (measured, docs/results-budget.md).
-PROCESS = 330_000_000
+PROCESS = 352_000_000
 #: Copies of a training image, float32 RGB: two frames, two decoded ahead, the loss's target and its blurred moments.
 IMAGE_COPIES = 8
 #: A Gaussian with moments, gradients and the copies of a frame step.

@@ -24,20 +24,26 @@ from gsstream.recipe.model import ComponentRef
 
 #: A degree more must gain at least this for a camera that was left out, dB: its coefficients are most of a key packet.
 WORTHWHILE = 0.1
-#: Degree 3 has nearly twice the coefficients of 2; trials go there only when the rule does.
+#: The usual degree. 3 has nearly twice the coefficients; trials go there only when the rule does.
 HIGHEST_TRIED = 2
 DEGREE = "first_frame.sh_degree"
 
 
 def sh_degree(facts: SceneFacts) -> Choice:
-    """The least degree of harmonics after which no further one helps a camera that was left out (ours)."""
+    """The least degree of harmonics after which no further one helps a camera that was left out (ours).
+
+    With too few cameras to judge the usual degree, that one.
+    """
+    ladder, usual = tuple(range(HIGHEST_TRIED + 1)), HIGHEST_TRIED
+    if facts.cameras <= (usual + 1) ** 2:
+        return Choice(usual, f"{facts.cameras} cameras are too few to judge; this is the usual degree", ladder)
     degree = 0
     for higher, gain in enumerate(facts.colour_gain, 1):
         if gain - (0.0 if degree == 0 else facts.colour_gain[degree - 1]) >= WORTHWHILE:
             degree = higher
     gains = ", ".join(f"{gain:+.2f}" for gain in facts.colour_gain)
     why = f"degrees 1 to 3 predict a left-out camera's colours by {gains} dB better than degree 0"
-    return Choice(degree, why, tuple(range(max(degree, HIGHEST_TRIED) + 1)))
+    return Choice(degree, why, ladder if degree in ladder else (*ladder, degree))
 
 
 def settle(parts: Assembly, facts: Callable[[], SceneFacts], known: Mapping[str, Choice]) -> Assembly:

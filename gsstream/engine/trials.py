@@ -34,6 +34,8 @@ from gsstream.recipe.model import FirstFrame
 #: What a key packet of half the size is worth, dB. Little, for short fits show only a part of what more coefficients
 #: gain in long ones: it decides between choices that are as good.
 HALVED = 0.1
+#: What a step must gain, dB: left-out cameras of one short fit do not tell less apart.
+MARGIN = 0.05
 #: Training cameras below which none can be spared.
 LEAST_CAMERAS = 4
 
@@ -149,9 +151,10 @@ def try_out(
 ) -> Assembly:
     """The assembly with the choices that have a ladder moved to where short fits are best.
 
-    It starts from the rules' choice or from the usual values, whichever is better. One key after the other, in the
-    rules' order, a value goes up its ladder, or else down, while the score of the trials gets better; again from the
-    first key until nothing moves or ``first_frame.trials`` are made.
+    It starts from the rules' choice or from the usual values, whichever is better. One key after the other, those
+    that were chosen last first (they correct what the others left), a value goes up its ladder, or else down, while
+    each step gains more than ``MARGIN``; again from the first key until nothing moves or ``first_frame.trials`` are
+    made.
 
     Arguments:
         parts: settled by the rules (``engine.auto.settle``).
@@ -198,7 +201,7 @@ class _Climb:
     def round(self) -> bool:
         """Walk along every ladder once; whether anything got better and trials are left."""
         before = self._best
-        for key, choice in self._rules.items():
+        for key, choice in reversed(self._rules.items()):
             if choice.ladder and not self._walk(key, choice.ladder, 1):
                 self._walk(key, choice.ladder, -1)
         return self._best is not before and len(self._made) < self._most
@@ -223,7 +226,7 @@ class _Climb:
             found = None if parts is None else self._try(parts, f"{key} = {value}")
             if found is None or found.trial is best.trial:
                 continue  # not possible together with the other values, or the same scene to start from: look further
-            if found.trial.score <= best.trial.score:
+            if found.trial.score <= best.trial.score + MARGIN:
                 break
             best = found
         self._best = best

@@ -154,6 +154,11 @@ def test_the_degree_never_falls_when_the_highest_gains_more(gains: tuple[float, 
     assert sh_degree(replace(FACTS, colour_gain=tuple(-abs(g) for g in gains))).value == 0
 
 
+@given(cameras=st.integers(1, 9), gain=st.floats(-9, 9))
+def test_few_cameras_keep_the_usual_degree(cameras: int, gain: float) -> None:
+    assert sh_degree(replace(FACTS, cameras=cameras, colour_gain=(gain, 0.0, 0.0))).value == 2
+
+
 def _three(facts: SceneFacts, config: Any) -> Choice:
     return Choice(facts.cameras, "as many as there are cameras")
 

@@ -201,7 +201,7 @@ class _Climb:
     def round(self) -> bool:
         """Walk along every ladder once; whether anything got better and trials are left."""
         before = self._best
-        for key, choice in reversed(self._rules.items()):
+        for key, choice in reversed(list(self._rules.items())):
             if choice.ladder and not self._walk(key, choice.ladder, 1):
                 self._walk(key, choice.ladder, -1)
         return self._best is not before and len(self._made) < self._most

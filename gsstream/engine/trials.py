@@ -36,6 +36,8 @@ from gsstream.recipe.model import FirstFrame
 HALVED = 0.1
 #: What a step must gain, dB: left-out cameras of one short fit do not tell less apart.
 MARGIN = 0.05
+#: Steps without that before a walk turns back: one bad value does not hide a good one behind it.
+PATIENCE = 1
 #: Training cameras below which none can be spared.
 LEAST_CAMERAS = 4
 
@@ -153,7 +155,7 @@ def try_out(
 
     It starts from the rules' choice or from the usual values, whichever is better. One key after the other, those
     that were chosen last first (they correct what the others left), a value goes up its ladder, or else down, while
-    each step gains more than ``MARGIN``; again from the first key until nothing moves or ``first_frame.trials`` are
+    it gains more than ``MARGIN`` within two steps; again from the first key until nothing moves or ``first_frame.trials`` are
     made.
 
     Arguments:
@@ -218,7 +220,7 @@ class _Climb:
 
     def _walk(self, key: str, ladder: tuple[Any, ...], step: int) -> bool:
         """Go one way along a ladder while it gets better; whether it did."""
-        before, best = self._best, self._best
+        before, best, misses = self._best, self._best, 0
         at = ladder.index(before.parts.chosen[key].value) + step
         while 0 <= at < len(ladder) and len(self._made) < self._most:
             value, at = ladder[at], at + step
@@ -227,8 +229,11 @@ class _Climb:
             if found is None or found.trial is best.trial:
                 continue  # not possible together with the other values, or the same scene to start from: look further
             if found.trial.score <= best.trial.score + MARGIN:
-                break
-            best = found
+                misses += 1
+                if misses > PATIENCE:
+                    break
+            else:
+                best, misses = found, 0
         self._best = best
         return best is not before
 

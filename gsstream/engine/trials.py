@@ -155,8 +155,8 @@ def try_out(
 
     It starts from the rules' choice or from the usual values, whichever is better. One key after the other, those
     that were chosen last first (they correct what the others left), a value goes up its ladder, or else down, while
-    it gains more than ``MARGIN`` within two steps; again from the first key until nothing moves or ``first_frame.trials`` are
-    made.
+    it gains more than ``MARGIN`` within two steps; again from the first key until nothing moves or
+    ``first_frame.trials`` are made.
 
     Arguments:
         parts: settled by the rules (``engine.auto.settle``).

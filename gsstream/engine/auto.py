@@ -16,16 +16,17 @@ from gsstream.core.auto import Choice, SceneFacts
 from gsstream.core.errors import OutputError, RecipeError
 from gsstream.core.part import Part
 from gsstream.engine.assemble import Assembly, with_values
+from gsstream.engine.colour_gain import can_judge
 from gsstream.engine.guard import fault, guarded
 from gsstream.packet import PacketKind, PlayerState, StreamReader, decode_packet
 from gsstream.packet.base import FILE_HEADER
 from gsstream.recipe.document import KeyPath, Origin
-from gsstream.recipe.model import ComponentRef
+from gsstream.recipe.model import ComponentRef, FirstFrame
 
 #: A degree more must gain at least this for a camera that was left out, dB: its coefficients are most of a key packet.
 WORTHWHILE = 0.1
-#: The usual degree. 3 has nearly twice the coefficients; trials go there only when the rule does.
-HIGHEST_TRIED = 2
+#: 3 has nearly twice the coefficients: trials go beyond the usual degree only when the rule does.
+USUAL_DEGREE: int = FirstFrame.model_fields["sh_degree"].default
 DEGREE = "first_frame.sh_degree"
 
 
@@ -34,9 +35,9 @@ def sh_degree(facts: SceneFacts) -> Choice:
 
     With too few cameras to judge the usual degree, that one.
     """
-    ladder, usual = tuple(range(HIGHEST_TRIED + 1)), HIGHEST_TRIED
-    if facts.cameras <= (usual + 1) ** 2:
-        return Choice(usual, f"{facts.cameras} cameras are too few to judge; this is the usual degree", ladder)
+    ladder = tuple(range(USUAL_DEGREE + 1))
+    if not can_judge(USUAL_DEGREE, facts.cameras):
+        return Choice(USUAL_DEGREE, f"{facts.cameras} cameras are too few to judge; this is the usual degree", ladder)
     degree = 0
     for higher, gain in enumerate(facts.colour_gain, 1):
         if gain - (0.0 if degree == 0 else facts.colour_gain[degree - 1]) >= WORTHWHILE:

@@ -42,9 +42,14 @@ def colour_gain(images: FloatArray, cameras: Cameras, xyz: FloatArray) -> tuple[
     seen = _without_occluders(colours, seen)
     basis = _harmonics(xyz, cameras.centers)
     errors = [_left_out_error(colours, seen, basis[..., : (degree + 1) ** 2]) for degree in range(4)]
-    judged = [(degree + 1) ** 2 < len(cameras) and min(errors[0], errors[degree]) > LEAST for degree in range(4)]
+    judged = [can_judge(degree, len(cameras)) and min(errors[0], errors[degree]) > LEAST for degree in range(4)]
     gains = [10 * float(np.log10(errors[0] / errors[d])) if judged[d] else 0.0 for d in (1, 2, 3)]
     return gains[0], gains[1], gains[2]
+
+
+def can_judge(degree: int, cameras: int) -> bool:
+    """Whether a degree has fewer coefficients than there are cameras: with one left out, the others still fix them."""
+    return (degree + 1) ** 2 < cameras
 
 
 def _samples(images: FloatArray, cameras: Cameras, xyz: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -22,14 +22,13 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.assemble import Assembly, value_at
-from gsstream.engine.auto import DEGREE, put, settle, taken_over
-from gsstream.engine.begin import begin
+from gsstream.engine.auto import DEGREE, USUAL_DEGREE, put, settle, taken_over
+from gsstream.engine.begin import begin, seeded
 from gsstream.engine.facts import scene_facts
 from gsstream.engine.guard import guarded
 from gsstream.metrics import psnr
 from gsstream.packet import PlayerState, StreamMeta
 from gsstream.recipe.document import KeyPath
-from gsstream.recipe.model import FirstFrame
 
 #: What a key packet of half the size is worth, dB. Little, for short fits show only a part of what more coefficients
 #: gain in long ones: it decides between choices that are as good.
@@ -85,7 +84,7 @@ def choose(
 
 def usual_values(parts: Assembly) -> dict[str, Any]:
     """What stands in the parts where the recipe says ``auto``, by key: the defaults."""
-    usual: dict[str, Any] = {DEGREE: FirstFrame.model_fields["sh_degree"].default}
+    usual: dict[str, Any] = {DEGREE: USUAL_DEGREE}
     for slot, *inner in parts.pending:
         if slot != "first_frame":
             config = getattr(parts, slot).config.model_dump()
@@ -113,8 +112,7 @@ class FirstFrameTrials:
 
     def __call__(self, parts: Assembly) -> Trial:
         """The trial of these settings; made anew only when nothing with the same start was."""
-        with guarded("structure", parts.structure, self._fitted.index):
-            anchors = parts.structure.seed(self._points, self._fitted.cameras)
+        anchors = seeded(parts, self._points, self._fitted)
         key = (parts.recipe.first_frame.degree, anchors.positions.numpy().tobytes())
         if key not in self._known:
             self._known[key] = self._fit(parts)

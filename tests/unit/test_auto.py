@@ -10,6 +10,7 @@ from typing import Any, final
 
 import numpy as np
 import pytest
+from auto_parts import asking
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -18,7 +19,7 @@ from gsstream.core.auto import Choice, SceneFacts
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ComponentError, InputError, OutputError, RecipeError
 from gsstream.core.frame import Frame, PointCloud
-from gsstream.engine.assemble import Assembly, assemble
+from gsstream.engine.assemble import assemble
 from gsstream.engine.auto import recall, record, refuse_pending, settle, sh_degree
 from gsstream.engine.colour_gain import colour_gain
 from gsstream.engine.facts import scene_facts
@@ -183,26 +184,14 @@ class Asking(Flat):  # type: ignore[misc]  # a test may inherit
     auto_rules = MappingProxyType({"first": _three, "second": _same_again, "third": _bad})
 
 
-def asking(**params: Any) -> Assembly:
-    """An assembly whose structure offers auto."""
-    recipe = resolve_recipe("dense", load_catalog().recipe_path).recipe
-    parts = assemble(recipe, load_catalog())
-    structure = parts.recipe.structure.model_copy(update={"params": params})
-    pending = tuple(("structure", "params", key) for key in Asking.auto_rules if params.get(key) == "auto")
-    return replace(
-        parts, structure=Asking(Asking.Config(**{k: v for k, v in params.items() if v != "auto"})),
-        recipe=parts.recipe.model_copy(update={"structure": structure}), pending=pending,
-    )  # fmt: skip
-
-
 def test_later_rules_see_what_earlier_ones_chose() -> None:
-    done = settle(asking(first="auto", second="auto", third=7), lambda: FACTS, {})
+    done = settle(asking(Asking, first="auto", second="auto", third=7), lambda: FACTS, {})
     assert done.structure.config == Asking.Config(first=12, second=13, third=7)
     assert done.recipe.structure.params == {"first": 12, "second": 13, "third": 7}
     assert done.pending == ()
     assert list(done.chosen) == ["structure.params.first", "structure.params.second"]
     assert done.resolved.origin(("structure", "params", "first")).label == "auto: as many as there are cameras"
-    fixed = settle(asking(first=5, second="auto"), lambda: FACTS, {})
+    fixed = settle(asking(Asking, first=5, second="auto"), lambda: FACTS, {})
     assert fixed.structure.config.second == 6
 
 
@@ -211,29 +200,29 @@ def test_known_choices_are_taken_and_nothing_is_measured() -> None:
         raise AssertionError("measured")
 
     known = {"structure.params.first": Choice(3, "said so")}
-    assert settle(asking(first="auto"), never, known).structure.config.first == 3
+    assert settle(asking(Asking, first="auto"), never, known).structure.config.first == 3
 
 
 def test_what_was_chosen_comes_back_from_a_stream() -> None:
-    done = settle(asking(first="auto", second="auto"), lambda: FACTS, {})
-    again = recall(asking(first="auto", second="auto"), record(done))
+    done = settle(asking(Asking, first="auto", second="auto"), lambda: FACTS, {})
+    again = recall(asking(Asking, first="auto", second="auto"), record(done))
     assert again.structure == done.structure
     assert again.recipe == done.recipe
     assert again.chosen == done.chosen
-    written_out = recall(asking(first=12, second=13), record(done))
+    written_out = recall(asking(Asking, first=12, second=13), record(done))
     assert written_out.chosen == done.chosen
     with pytest.raises(OutputError, match=r"'auto' for structure.params.second, but .* --overwrite"):
-        recall(asking(second="auto"), {"auto": {}})
+        recall(asking(Asking, second="auto"), {"auto": {}})
 
 
 def test_a_rule_that_chooses_what_its_part_refuses_is_the_parts_fault() -> None:
     with pytest.raises(ComponentError, match=r"'Asking' .* rule for third chose 'plenty'"):
-        settle(asking(third="auto"), lambda: FACTS, {})
+        settle(asking(Asking, third="auto"), lambda: FACTS, {})
 
 
 def test_only_a_run_chooses() -> None:
     with pytest.raises(RecipeError, match=r"structure.params.first: 'auto' is chosen by 'gsstream run'"):
-        refuse_pending(asking(first="auto"))
+        refuse_pending(asking(Asking, first="auto"))
 
 
 @pytest.mark.parametrize(

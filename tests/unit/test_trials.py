@@ -8,6 +8,7 @@ from typing import Any, final
 
 import numpy as np
 import pytest
+from auto_parts import asking
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -44,13 +45,9 @@ class Asking(Flat):  # type: ignore[misc]  # a test may inherit
 
 def settled(trials: int = 100) -> Assembly:
     """All three chosen by their rules."""
-    parts = assemble(resolve_recipe("dense", load_catalog().recipe_path).recipe, load_catalog())
-    params = dict.fromkeys(Asking.auto_rules, "auto")
+    parts = asking(Asking, **dict.fromkeys(Asking.auto_rules, "auto"))
     first = parts.recipe.first_frame.model_copy(update={"trials": trials})
-    structure = parts.recipe.structure.model_copy(update={"params": params})
-    recipe = parts.recipe.model_copy(update={"structure": structure, "first_frame": first})
-    pending = tuple(("structure", "params", key) for key in params)
-    return settle(replace(parts, structure=Asking(), recipe=recipe, pending=pending), lambda: FACTS, {})
+    return settle(replace(parts, recipe=parts.recipe.model_copy(update={"first_frame": first})), lambda: FACTS, {})
 
 
 class Hill:

@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from gsstream.core.auto import Choice, SceneFacts
 from gsstream.core.part import Part
+from gsstream.engine.assemble import with_values
 from gsstream.testing.registry import CONTRACTS, Skip, check
 
 
@@ -40,12 +41,7 @@ def check_auto_rules(part: Part) -> None:
 
 
 def _check_accepted(part: Part, key: str, value: Any, facts: SceneFacts) -> None:
-    values = part.config.model_dump()
-    *above, name = key.split(".")
-    section = values
-    for step in above:
-        section = section[step]
-    section[name] = value
+    values = with_values(part.config.model_dump(), {key: value})
     try:
         part.Config.model_validate(values)
     except ValidationError as error:

@@ -23,6 +23,7 @@ from gsstream.core.storage import unpacked
 from gsstream.engine.assemble import Assembly
 from gsstream.engine.checks import StepChecks
 from gsstream.engine.exposure import backward_view
+from gsstream.engine.nearest import nearest_rows
 from gsstream.engine.parameters import AdamTable
 from gsstream.engine.stream_state import StreamState
 from gsstream.init.hull import Hull, hull_points, one_per_cell
@@ -128,12 +129,3 @@ def place(born: Gaussians[FloatArray], means: FloatArray, layout: Layout) -> Bir
         Gaussians(**joined), np.concatenate([inside.nodes, apart.nodes]),
         np.concatenate([inside.octree_levels, apart.octree_levels]), apart.parents,
     )  # fmt: skip
-
-
-def nearest_rows(points: FloatArray, means: FloatArray) -> tuple[FloatArray, IntArray]:
-    """[B] distance to the nearest centre, and its row; infinitely far when there is none."""
-    if not len(means):
-        return np.full(len(points), np.inf), np.zeros(len(points), np.int64)
-    distances = torch.cdist(torch.from_numpy(points), torch.from_numpy(means)).numpy()
-    rows = distances.argmin(1)
-    return distances[np.arange(len(points)), rows], rows

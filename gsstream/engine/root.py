@@ -21,6 +21,7 @@ from gsstream.engine.checks import VARIABLE, Checks, StepChecks, check_values
 from gsstream.engine.densify import DensifyStatistics, grow_and_prune
 from gsstream.engine.exposure import Exposure, ExposureFit, backward_view
 from gsstream.engine.guard import guarded
+from gsstream.engine.nearest import neighbour_distance
 from gsstream.engine.parameters import AdamTable
 from gsstream.loss.base import Loss
 from gsstream.recipe.model import FirstFrame, Recipe
@@ -58,18 +59,6 @@ def initial_gaussians(anchors: Anchors, settings: FirstFrame) -> Gaussians[torch
         sh0=rgb_to_sh0(anchors.colors.float()),
         shN=torch.zeros(count, (settings.degree + 1) ** 2 - 1, 3),
     )
-
-
-def neighbour_distance(positions: torch.Tensor, most: int = 2**22) -> torch.Tensor:
-    """[N] root mean squared distance to the three nearest other points; ``most``: distances in memory at a time."""
-    count = len(positions)
-    block = max(1, min(2048, most // max(1, count)))
-    k = min(4, count)
-    if k < 2:
-        return torch.full((count,), 0.01)
-    blocks = torch.split(positions, block)
-    parts = [torch.cdist(rows, positions).topk(k, largest=False).values[:, 1:] for rows in blocks]
-    return torch.cat(parts).square().mean(1).sqrt()
 
 
 def optimise_root(

@@ -9,7 +9,7 @@ import pytest
 import torch
 from cpu_scenes import BACKGROUND, HEIGHT, WIDTH
 from gsstream_cpu_render.arrays import SplatArrays
-from gsstream_cpu_render.pool import lease
+from gsstream_cpu_render.pool import lease, release_idle_memory
 from gsstream_cpu_render.renderer import CpuRenderer
 from gsstream_cpu_render.threads import num_threads, set_num_threads
 from test_cpu_renderer import N, grads, leaves, pull, replaced, rig, scene, upstream
@@ -78,6 +78,7 @@ def assert_alike(subject: RenderSession, whole: Scene, seed: int, renderer: Rend
         want_image = fresh.render(view, want_rows, tile_mask=tiles)
         assert torch.equal(got_image.image, want_image.image)
         assert torch.equal(got_image.alpha, want_image.alpha)
+        assert torch.equal(got_image.tiles, want_image.tiles)
         pull(got_image, seed)
         pull(want_image, seed)
         assert all(torch.equal(a, b) for a, b in zip(grads(got_rows), grads(want_rows), strict=True))
@@ -153,7 +154,7 @@ def test_backward_after_the_commit_is_refused() -> None:
         pull(output)
 
 
-@pytest.mark.parametrize("megabytes", [0.0, 0.2])
+@pytest.mark.parametrize("megabytes", [0.0, 0.2, 1.0])
 def test_the_same_bits_beyond_the_budget(megabytes: float) -> None:
     whole, limited = scene(5), CpuRenderer(CpuRenderer.Config(cache_mb=megabytes))
     session = limited.open(whole, None, rig(), BACKGROUND)
@@ -163,7 +164,49 @@ def test_the_same_bits_beyond_the_budget(megabytes: float) -> None:
         assert session.cache_bytes().total <= megabytes * 1e6
         whole = moved(whole, ids, frame)
         session = session.commit(whole, ids)
-    assert len(session.cache_bytes().per_view) == (0 if megabytes == 0 else 1)
+    assert len(session.cache_bytes().per_view) == {0.0: 0, 0.2: 1, 1.0: 2}[megabytes]
+
+
+def test_what_fits_does_not_depend_on_what_the_process_did_before() -> None:
+    """A rasteriser lent by the pool brings the memory of former owners, far beyond what a small view needs."""
+
+    def kept() -> dict[int, int]:
+        session = CpuRenderer(CpuRenderer.Config(cache_mb=0.25)).open(scene(5), None, rig(), BACKGROUND)
+        for view in (0, 1):
+            session.screen_gradient(view, upstream()[0])
+        return dict(session.cache_bytes().per_view)
+
+    release_idle_memory()
+    before = kept()
+    large = lease(rig(), 0, BACKGROUND)
+    many = scene(5).rows(torch.arange(N).repeat(200))
+    large.rasterizer.forward(SplatArrays(*(value.numpy() for _, value in many.items())))
+    del large
+    assert set(before) == {0, 1}
+    assert kept() == before
+
+
+def test_a_view_that_outgrows_the_budget_goes_and_leaves_the_pool_small() -> None:
+    release_idle_memory()
+    whole = scene(5)
+    idle = CpuRenderer().open(whole, None, rig(), BACKGROUND)
+    for view in (0, 1):
+        idle.screen_gradient(view, upstream()[0])
+    budget = idle.cache_bytes().total + 2_000  # both views as they come, nothing to work in
+    session = CpuRenderer(CpuRenderer.Config(cache_mb=budget / 1e6)).open(whole, None, rig(), BACKGROUND)
+    for view in (0, 1):
+        session.screen_gradient(view, upstream()[0])
+    assert set(session.cache_bytes().per_view) == {0, 1}
+    ids = some_rows(100, 1)
+    session.narrow(ids)
+    for view in (0, 1, 0, 1):
+        pull(session.render(view, leaves(whole.rows(ids))))
+    assert len(session.cache_bytes().per_view) == 1
+    assert session.cache_bytes().total <= budget
+    del idle
+    release_idle_memory()
+    del session
+    assert release_idle_memory() == 0
 
 
 def test_cache_bytes_follow_views_and_gaussians() -> None:

@@ -49,26 +49,31 @@ class Passes(ABC):
 
 
 class Lease:
-    """A rasteriser for one owner; its memory returns to the pool when the last reference to the lease goes."""
+    """A rasteriser for one owner; its memory returns to the pool when the last reference to the lease goes.
 
-    def __init__(self, rasterizer: NumpyRasterizer) -> None:
-        self.rasterizer = rasterizer
+    With ``own`` it came from the system and goes back there.
+    """
+
+    def __init__(self, rasterizer: NumpyRasterizer, own: bool) -> None:
+        self.rasterizer, self._own = rasterizer, own
 
     def __del__(self) -> None:
+        if self._own:
+            return
         native = self.rasterizer.release()
         with _lock:
             if len(_idle) < MOST_IDLE and native.isa == _native.active_isa():
                 _idle.append(native)
 
 
-def lease(cameras: Rig, view: int, background: Background) -> Lease:
-    """A rasteriser for camera ``view`` of a rig."""
+def lease(cameras: Rig, view: int, background: Background, own: bool = False) -> Lease:
+    """A rasteriser for camera ``view`` of a rig; ``own``: with memory that nobody had before or gets after."""
     with _lock:
         # An object keeps the kernels of the instruction set it was made for.
         _idle[:] = [native for native in _idle if native.isa == _native.active_isa()]
-        native = _idle.pop() if _idle else None
+        native = _idle.pop() if _idle and not own else None
     pose = (cameras.viewmats[view], cameras.Ks[view])
-    return Lease(NumpyRasterizer(*pose, cameras.width, cameras.height, background, cameras.near, native=native))
+    return Lease(NumpyRasterizer(*pose, cameras.width, cameras.height, background, cameras.near, native=native), own)
 
 
 def release_idle_memory() -> int:

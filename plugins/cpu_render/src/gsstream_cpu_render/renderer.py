@@ -34,8 +34,8 @@ class CpuRenderer(Renderer):
         cache_mb: float | None = Field(
             default=None,
             ge=0,
-            description="megabytes that the caches of a session's cameras may take together; cameras beyond are drawn "
-            "as a whole each time (slower, same bits); None: no limit",
+            description="megabytes that the caches of a session's cameras may take together; cameras beyond fill "
+            "theirs anew each time (slower, same bits); None: no limit",
         )
 
     def __init__(self, config: PartConfig | None = None) -> None:

@@ -23,7 +23,7 @@ Ids = NDArray[np.uint32]
 class CpuSession(RenderSession):
     """Keeps one rasteriser and one render per view that was asked for, while the budget lasts.
 
-    A view beyond the budget is drawn as a whole each time: same bits, but its cost grows with the scene.
+    A view beyond the budget fills its cache anew for each call: same bits, but its cost grows with the scene.
 
     Arguments:
         gaussians: the scene; rows outside `active` are read once per view.
@@ -56,11 +56,8 @@ class CpuSession(RenderSession):
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
         upstream = as_array("image_gradient", image_gradient.contiguous())
         splats = splats_of(self._gaussians)
-        cached = self._view(view)
-        held = self._lease(view) if cached is None else cached.held
-        if cached is None:
-            held.rasterizer.forward(splats)
-        gradient, visible = held.rasterizer.backward_cached(splats, upstream)
+        cached = self._view(view)  # its owner while the native call runs
+        gradient, visible = cached.rasterizer.backward_cached(splats, upstream)
         return ScreenGradient(torch.from_numpy(gradient), torch.from_numpy(visible))
 
     def render(
@@ -77,11 +74,7 @@ class CpuSession(RenderSession):
         if self._order is not None:
             rows = rows.rows(self._order)
             probe = None if probe is None else probe[self._order]
-        cached = self._view(view)
-        if cached is None:
-            whole = _UncachedPass(self._lease(view), splats_of(self._gaussians), self._ids, mask)
-            return differentiable(whole, rows, probe)
-        active = _ActivePass(cached, self._ids, mask)
+        active = _ActivePass(self._view(view), self._ids, mask)
         output = differentiable(active, rows, probe)
         return replace(output, tiles=torch.from_numpy(active.tiles))
 
@@ -107,20 +100,24 @@ class CpuSession(RenderSession):
     def cache_bytes(self) -> RenderCache:
         return RenderCache({index: view.bytes() for index, view in self._views.items()}, len(self._gaussians))
 
-    def _lease(self, view: int) -> Lease:
-        return lease(self._cameras, view, self._background)
+    def _lease(self, view: int, own: bool = False) -> Lease:
+        return lease(self._cameras, view, self._background, own)
 
-    def _view(self, view: int) -> _CachedView | None:
-        """The cache of a view, filled if that is not done yet; None if it does not fit into the budget."""
-        if view in self._refused:
-            return None
-        if view not in self._views:
-            opened = _CachedView(self._lease(view), splats_of(self._gaussians))
-            if self._budget is not None and opened.bytes() + self.cache_bytes().total > self._budget:
-                self._refused.add(view)
-                return None
-            self._views[view] = opened
-        return self._views[view]
+    def _view(self, view: int) -> _CachedView:
+        """A view with its cache filled, kept for the next call unless the caches together are beyond the budget."""
+        cached = self._views.get(view)
+        if cached is None:
+            kept = view not in self._refused
+            # Memory of its own where memory counts: what the pool lends is as large as its former owners needed.
+            held = self._lease(view, own=kept and self._budget is not None)
+            cached = _CachedView(held, splats_of(self._gaussians))
+            if kept:
+                self._views[view] = cached
+        # What passes work in grows with them, so a view that fitted when it came may have to go later.
+        if self._budget is not None and view in self._views and self.cache_bytes().total > self._budget:
+            self._refused.add(view)
+            del self._views[view]
+        return cached
 
 
 def _ascending(rows: torch.Tensor) -> tuple[Ids, torch.Tensor | None]:
@@ -203,25 +200,3 @@ class _ActivePass(Passes):
         if self._view.rasterizer.passes != self._pass:
             self.forward(splats)  # the view was rendered again since; the same inputs give the same bits
         return self._view.rasterizer.backward_active(v_image, v_alpha)
-
-
-class _UncachedPass(Passes):
-    """The active rows put back into the whole scene, which is drawn anew."""
-
-    def __init__(self, held: Lease, scene: SplatArrays, ids: Ids, mask: Any) -> None:
-        self._held, self._scene, self._ids, self._mask = held, scene, ids, mask
-        self._whole: SplatArrays | None = None
-
-    def forward(self, splats: SplatArrays) -> tuple[Float32, Float32]:
-        rasterizer = self._held.rasterizer
-        image = transmittance = None
-        if self._mask is not None:
-            image, transmittance = rasterizer.forward(self._scene)  # what lies outside of the mask
-        self._whole = SplatArrays(*(part.copy() for part in self._scene))
-        for part, rows in zip(self._whole, splats, strict=True):
-            part[self._ids] = rows
-        return rasterizer.forward(self._whole, tile_mask=self._mask, image=image, transmittance=transmittance)
-
-    def backward(self, splats: SplatArrays, v_image: Float32, v_alpha: Float32 | None) -> tuple[Float32, ...]:
-        gradients = self._held.rasterizer.backward(v_image, v_alpha)
-        return tuple(gradient[self._ids] for gradient in gradients)

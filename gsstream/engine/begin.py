@@ -45,9 +45,7 @@ def begin(
     anchors = seeded(parts, points, frame)
     clock.append(time.perf_counter())
     start = initial_gaussians(anchors, parts.recipe.first_frame)
-    root = optimise_root(
-        start, anchors.levels, frame, parts.recipe, parts.renderer, parts.loss, rng, progress, parts.checks
-    )
+    root = optimise_root(start, anchors.levels, frame, parts, rng, progress)
     clock.append(time.perf_counter())
     # Positions are float32 in the packet too, so the hierarchy of the decoded scene is the one built here.
     decoded = quantise_key(root.gaussians.map(lambda t: t.numpy())).map(torch.from_numpy)

@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 
+from gsstream.engine.backward import pull_back
 from gsstream.loss.base import Loss
 
 
@@ -35,11 +36,6 @@ class Exposure:
         return (gradient.reshape(-1, 3) @ self.matrix[view]).reshape(gradient.shape)
 
 
-def load_backward() -> None:
-    """The first backward pass of a process imports for most of a second: to be paid before a frame is counted."""
-    torch.autograd.backward([torch.zeros(1, requires_grad=True)], [torch.zeros(1)])
-
-
 def backward_view(
     image: torch.Tensor,
     view: int,
@@ -60,7 +56,7 @@ def backward_view(
     """
     raw = image.detach()
     value, gradient = loss.evaluate(exposure.apply(view, raw) if exposure else raw, target, dssim, tiles)
-    torch.autograd.backward([image], [exposure.pull(view, gradient) if exposure else gradient])
+    pull_back([image], [exposure.pull(view, gradient) if exposure else gradient])
     return value, gradient
 
 

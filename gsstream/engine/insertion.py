@@ -24,7 +24,7 @@ from gsstream.engine.assemble import Assembly
 from gsstream.engine.checks import StepChecks
 from gsstream.engine.exposure import backward_view
 from gsstream.engine.nearest import nearest_rows
-from gsstream.engine.parameters import AdamTable
+from gsstream.engine.row_table import RowTable
 from gsstream.engine.stream_state import StreamState
 from gsstream.init.hull import Hull, hull_points, one_per_cell
 from gsstream.render.activations import logit, rgb_to_sh0
@@ -102,7 +102,7 @@ def fit(
     session.narrow(torch.arange(len(scene), len(whole)))
     rates = {"means": first.lr_means * frame.cameras.extent, "quats": first.lr_quats, "scales": first.lr_scales}
     rates |= {"opacities": first.lr_opacities, "sh0": first.lr_sh0, "shN": first.lr_shN}
-    table = AdamTable(dict(born.items()), rates)
+    table = RowTable(dict(born.items()), rates, parts.optimiser)
     targets = [parts.loss.prepare(torch.from_numpy(image)) for image in frame.images]
     generator = rng.stream("insertion/order", frame.index)
     look = StepChecks(parts.checks, frame.index)

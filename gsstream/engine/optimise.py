@@ -12,6 +12,7 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.part import Part
 from gsstream.core.state import GateState
 from gsstream.engine.assemble import Assembly
+from gsstream.engine.backward import pull_back
 from gsstream.engine.budget.pace import Pace, estimated_bytes
 from gsstream.engine.checks import UNIT, StepChecks, check_terms
 from gsstream.engine.dead_gates import count_dead
@@ -168,8 +169,8 @@ class _FrameRun:
         if not roots:
             return
         with self._guarded("gate", self.parts.gate):
-            torch.autograd.backward(roots, gradients)
-            self.gate.step({})
+            pull_back(roots, gradients)
+            self.gate.step()
             bounded = self.parts.gate.bound(GateState(self.gate["logits"].detach())).logits
             self.gate["logits"].data.copy_(bounded)
         self.look("gate", self.parts.gate, "bound().logits", bounded)

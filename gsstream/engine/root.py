@@ -17,16 +17,15 @@ from gsstream.core.frame import Frame
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.topology import TopologyEdit
+from gsstream.engine.assemble import Assembly
 from gsstream.engine.checks import VARIABLE, Checks, StepChecks, check_values
 from gsstream.engine.densify import DensifyStatistics, grow_and_prune
 from gsstream.engine.exposure import Exposure, ExposureFit, backward_view
 from gsstream.engine.guard import guarded
 from gsstream.engine.nearest import neighbour_distance
-from gsstream.engine.parameters import AdamTable
-from gsstream.loss.base import Loss
-from gsstream.recipe.model import FirstFrame, Recipe
+from gsstream.engine.row_table import RowTable
+from gsstream.recipe.model import FirstFrame
 from gsstream.render.activations import logit, rgb_to_sh0
-from gsstream.render.base import Renderer
 from gsstream.structure.base import Anchors
 
 CENTER_EVERY = 50
@@ -65,12 +64,9 @@ def optimise_root(
     start: Gaussians[torch.Tensor],
     levels: torch.Tensor,
     frame: Frame,
-    recipe: Recipe,
-    renderer: Renderer,
-    loss: Loss,
+    parts: Assembly,
     rng: Rng,
     progress: Progress,
-    checks: Checks = Checks.FRAME,
 ) -> RootResult:
     """Fit frame 0 on its training images.
 
@@ -78,16 +74,15 @@ def optimise_root(
         start: [N] initial Gaussians; ``levels`` [N] their octree levels.
         frame: training images of frame 0.
         progress: called with (iteration, iterations, smoothed loss, number of Gaussians).
-        checks: how closely to look at what parts return.
     """
-    run = _RootRun(start, levels, frame, recipe, renderer, loss, rng, StepChecks(checks, frame.index))
+    run = _RootRun(start, levels, frame, parts, rng)
     for iteration in range(1, run.iterations + 1):
         value = run.step(iteration)
         progress(iteration, run.iterations, value, len(run.levels))
     exposure = run.exposure.centered().exposure if run.exposure else None
     found = run.gaussians().map(torch.Tensor.detach)
     for name, values in found.items():
-        if checks is not Checks.OFF:
+        if parts.checks is not Checks.OFF:
             what = f"{name} after the last iteration ({VARIABLE}=step finds the first)"
             check_values("first frame", run.table, what, values, frame.index)
     return RootResult(found, run.levels, exposure, run.iterations)
@@ -97,17 +92,17 @@ class _RootRun:
     """The moving state of one root optimisation; lives only inside :func:`optimise_root`."""
 
     def __init__(
-        self, start: Gaussians[torch.Tensor], levels: torch.Tensor, frame: Frame, recipe: Recipe,
-        renderer: Renderer, loss: Loss, rng: Rng, look: StepChecks,
-    ) -> None:  # fmt: skip
-        self.settings, self.recipe, self.frame = recipe.first_frame, recipe, frame
-        self.renderer, self.loss, self.levels, self.look = renderer, loss, levels, look
+        self, start: Gaussians[torch.Tensor], levels: torch.Tensor, frame: Frame, parts: Assembly, rng: Rng
+    ) -> None:
+        self.settings, self.recipe, self.frame = parts.recipe.first_frame, parts.recipe, frame
+        self.renderer, self.loss, self.levels = parts.renderer, parts.loss, levels
+        self.look = StepChecks(parts.checks, frame.index)
         self.views = len(frame.cameras)
         self.extent = frame.cameras.extent
         self.iterations = min(self.settings.epochs * self.views, self.settings.max_iterations)
         self.generator = rng.stream("root", frame.index)
-        self.table = AdamTable(dict(start.items()), self._rates())
-        self.targets = [loss.prepare(torch.from_numpy(image)) for image in frame.images]
+        self.table = RowTable(dict(start.items()), self._rates(), parts.optimiser)
+        self.targets = [self.loss.prepare(torch.from_numpy(image)) for image in frame.images]
         self.exposure = ExposureFit.start(self.views) if self.settings.exposure else None
         self.statistics = DensifyStatistics.zeros(len(start))
         self.order: list[int] = []

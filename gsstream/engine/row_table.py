@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 
 import torch
 
+from gsstream.core.topology import TopologyEdit
 from gsstream.optimiser.base import AdamState, RowOptimiser
+
+EMPTY: Mapping[str, torch.Tensor] = MappingProxyType({})
 
 
 class RowTable:
@@ -22,7 +26,7 @@ class RowTable:
     def __getitem__(self, name: str) -> torch.Tensor:
         return self.leaves[name]
 
-    def step(self, gradients: Mapping[str, torch.Tensor]) -> None:
+    def step(self, gradients: Mapping[str, torch.Tensor] = EMPTY) -> None:
         """One Adam step from ``gradients`` and whatever waits on the leaves, which is then dropped."""
         total = dict(gradients)
         for name, leaf in self.leaves.items():
@@ -34,10 +38,23 @@ class RowTable:
     def keep(self, rows: torch.Tensor) -> None:
         """Go on with these rows [K] of every leaf, and with the steps they have taken."""
         self.leaves = {name: leaf.detach()[rows].requires_grad_() for name, leaf in self.leaves.items()}
-        self._states = {
-            name: AdamState(state.exp_avg[rows], state.exp_avg_sq[rows], state.steps[rows])
-            for name, state in self._states.items()
-        }
+        self._states = {name: _rows(state, rows) for name, state in self._states.items()}
+
+    def set_lr(self, name: str, lr: float) -> None:
+        """Change one learning rate."""
+        self._lrs[name] = lr
+
+    def edit(self, edit: TopologyEdit, values: Mapping[str, torch.Tensor] | None = None) -> None:
+        """Apply a topology edit to every leaf and its moments; ``values`` replaces the edited leaves' contents.
+
+        A fresh row has no moments, and the count of the row it came of.
+        """
+        self.keep(edit.source)
+        for state in self._states.values():
+            state.exp_avg[edit.fresh] = 0
+            state.exp_avg_sq[edit.fresh] = 0
+        if values is not None:
+            self.leaves = {name: values[name].clone().requires_grad_() for name in self.leaves}
 
     def moments(self, name: str) -> dict[str, torch.Tensor]:
         """Adam state of one leaf, row by row."""
@@ -48,3 +65,7 @@ class RowTable:
         """Continue from moments saved by :meth:`moments`; an empty mapping starts fresh."""
         if moments:
             self._states[name] = AdamState(**{key: value.clone() for key, value in moments.items()})
+
+
+def _rows(state: AdamState, rows: torch.Tensor) -> AdamState:
+    return AdamState(state.exp_avg[rows], state.exp_avg_sq[rows], state.steps[rows])

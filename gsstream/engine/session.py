@@ -26,7 +26,6 @@ from gsstream.engine.begin import begin, begin_from, cloud_of
 from gsstream.engine.budget.controller import Controller
 from gsstream.engine.budget.memory import within_memory
 from gsstream.engine.budget.pace import CLOCKS, Allowance
-from gsstream.engine.exposure import load_backward
 from gsstream.engine.frame_step import frame_step
 from gsstream.engine.keyframes import refresh
 from gsstream.engine.measure import HeldOut
@@ -85,7 +84,6 @@ def run(
     """
     parts = within_memory(parts, source.info)
     with _one_torch_thread():
-        load_backward()
         return _Run(parts, source, out, quiet, measure, first_frame, energy, witness, span).encode(resume)
 
 

@@ -19,6 +19,7 @@ from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.engine.assemble import Assembly
+from gsstream.engine.backward import pull_back
 from gsstream.engine.begin import begin, begin_from, check_cameras, exposure_from_meta
 from gsstream.engine.checks import StepChecks
 from gsstream.engine.context import StepContext
@@ -106,7 +107,7 @@ class OpenFrame(StepContext):
         look("loss", self._loss, f"gradient of the image of view {view}", gradient)
         if self._exposure:
             gradient = self._exposure.pull(view, gradient)
-        torch.autograd.backward([image], [gradient])
+        pull_back([image], [gradient])
         return value
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from dataclasses import dataclass, replace
 
 import pytest
@@ -208,19 +206,3 @@ def test_the_first_frame_knows_its_passes_after_two_views(costs: Costs, seconds:
     frame = made(plan(Budget(time=seconds), Stream(), []), costs)
     assert frame.planned[0] <= max(1.0, TIME_MARGIN * seconds / costs.before) + 1e-6
     assert all(abs(planned - frame.epochs) <= 1.5 for planned in frame.planned[2:])
-
-
-def test_what_the_first_backward_pass_imports_is_loaded_before_a_frame() -> None:
-    """In a process of its own: here it is imported long since. Most of a second would count as the first view's."""
-    program = """
-import sys
-import torch
-from gsstream.engine.exposure import load_backward
-load_backward()
-before = set(sys.modules)
-value = torch.zeros(3, requires_grad=True)
-torch.autograd.backward([value * 2], [torch.ones(3)])
-late = sorted(set(sys.modules) - before)
-assert not late, late
-"""
-    subprocess.run([sys.executable, "-c", program], check=True)

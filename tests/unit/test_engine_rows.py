@@ -10,9 +10,10 @@ from gsstream.core.births import Births, gather_rows, in_nodes, own_nodes
 from gsstream.core.delta import Delta, Layout
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.engine.parameters import AdamTable
+from gsstream.engine.row_table import RowTable
 from gsstream.engine.rows import edit_of, follow
 from gsstream.engine.stream_state import StreamState
+from gsstream.optimiser.adam import ReferenceAdam
 from gsstream.packet import decode_packet, encode_delta, encode_key
 from gsstream.testing.checks.packet import tiny_key
 
@@ -80,7 +81,7 @@ def test_a_packet_without_births_leaves_the_forest_alone(state):
 
 def test_per_gaussian_moments_follow_the_edit(state):
     layout = state.player.layout
-    table = AdamTable({"x": torch.arange(40.0)[:, None]}, {"x": 0.0})
+    table = RowTable({"x": torch.arange(40.0)[:, None]}, {"x": 0.0}, ReferenceAdam())
     table.step({"x": torch.arange(40.0)[:, None] + 1})
     delta = delta_of(layout, in_nodes(scene(3), [int(layout.node_of[0]), 5, 11], [0, 0, 0]), [0, 20, 39])
     edit = edit_of(layout, delta)

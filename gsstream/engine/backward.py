@@ -1,0 +1,29 @@
+"""Backward passes from gradients that are already known, as every frame makes them. Ours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+
+def pull_back(roots: Sequence[torch.Tensor], gradients: Sequence[torch.Tensor]) -> None:
+    """Add to every leaf what ``gradients``, one like each root, make of it: ``torch.autograd.backward``, bit for bit.
+
+    That function imports a library of symbols when it is handed gradients: 0.6 s and 36 MB of every process.
+    """
+    _Known.apply(tuple(gradients), *roots).backward()  # type: ignore[no-untyped-call]
+
+
+class _Known(torch.autograd.Function):
+    """A number whose derivative by each root is the gradient given for it."""
+
+    @staticmethod
+    def forward(ctx: Any, gradients: tuple[torch.Tensor, ...], *_roots: torch.Tensor) -> torch.Tensor:
+        ctx.gradients = gradients
+        return torch.zeros(())
+
+    @staticmethod
+    def backward(ctx: Any, *_upstream: Any) -> Any:
+        return (None, *ctx.gradients)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.nearest import nearest_rows, neighbour_distance
 
-KINDS = ("ball", "plane", "line", "grid", "pairs", "far")
+KINDS = ("ball", "plane", "line", "grid", "pairs", "aside", "far")
 
 
 def cloud(kind: str, count: int, seed: int) -> FloatArray:
@@ -28,6 +28,8 @@ def cloud(kind: str, count: int, seed: int) -> FloatArray:
         xyz = xyz.round()
     elif kind == "pairs":
         xyz[1::2] = xyz[: count // 2 * 2 : 2]
+    elif kind == "aside":
+        xyz = xyz * 0.1 + 100  # where a table made by a product of matrices has no distances left
     elif kind == "far":
         xyz = xyz * 100 + 1e7
     return xyz.astype(np.float32)

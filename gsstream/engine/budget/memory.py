@@ -13,8 +13,8 @@ from gsstream.source.base import SourceInfo
 
 #: Interpreter, torch, the renderer and the engine with everything a run imports (measured, docs/results-budget.md).
 PROCESS = 280_000_000
-#: Copies of a training image, float32 RGB: two frames, two decoded ahead, the loss's target and its blurred moments, and
-#: what change is looked for in (measured on two recordings).
+#: Copies of a training image, float32 RGB: two frames, two decoded ahead, the loss's target and its blurred moments,
+#: and what change is looked for in (measured on two recordings).
 IMAGE_COPIES = 12
 #: A Gaussian with its gradients and moments in frame 0, and the copies of a frame step.
 BYTES_PER_GAUSSIAN = 1_700
@@ -68,4 +68,3 @@ def _fixed(info: SourceInfo) -> int:
     pixels = info.train.width * info.train.height
     views = IMAGE_COPIES * len(info.train) + 4 * len(info.test)
     return PROCESS + views * pixels * 12
-

@@ -94,6 +94,10 @@ class FirstFrame(Section):
     trial_cameras: float = Field(
         default=0.25, gt=0, lt=1, description="share of the training cameras that a short fit leaves out, as its judges"
     )
+    trial_folds: int = Field(
+        default=2, ge=1, le=8,
+        description="short fits behind each trial, every one without other cameras; as many as there are cameras for",
+    )  # fmt: skip
 
     @property
     def degree(self) -> int:

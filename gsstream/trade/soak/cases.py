@@ -123,7 +123,7 @@ OF_PARTS: Mapping[str, Draw] = MappingProxyType({
 #: What keeps a choice of ``auto`` short.
 TRIALS: Mapping[str, Draw] = MappingProxyType({
     "first_frame.trials": _of(0, 2, 4), "first_frame.trial_epochs": _of(1, 2),
-    "first_frame.trial_cameras": _logs(0.01, 0.9),
+    "first_frame.trial_cameras": _logs(0.01, 0.9), "first_frame.trial_folds": _of(1, 2, 3),
 })  # fmt: skip
 
 

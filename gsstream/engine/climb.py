@@ -118,7 +118,9 @@ class _Climb:
         tried = _Tried(parts, self._trial(parts, best))
         if all(tried.trial is not one.trial for one in self._made):
             self._made.append(tried)
-            self._say(f"auto: trial {len(self._made)}, {what}: {_said(tried.trial)}")
+            folds, of = len(tried.trial.folds), len(self._made[0].trial.folds)
+            early = f" (given up, {folds} of {of} folds)" if folds < of else ""
+            self._say(f"auto: trial {len(self._made)}, {what}: {_said(tried.trial)}{early}")
         return tried
 
 

@@ -202,4 +202,7 @@ def test_the_mean_of_the_folds_decides(wide: list[float], most: int) -> None:
 def test_a_trial_that_was_given_up_is_never_chosen() -> None:
     """Its one fold may be better than that fold of a best that only the other folds made the best."""
     assert chosen({5: (30.0, 31.0), 6: (30.9,)}) == 5
+    said: list[str] = []
+    try_out(settled(), RULES, by_wide({5: (30.0, 31.0), 6: (30.9,)}), said.append)
+    assert [line.endswith("KB (given up, 1 of 2 folds)") for line in said] == ["wide = 6" in line for line in said]
     assert chosen({5: (30.0, 31.0), 6: (30.9, 30.9)}) == 6

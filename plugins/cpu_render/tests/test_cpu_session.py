@@ -169,7 +169,8 @@ def through_three_frames(session: RenderSession, budget: float) -> RenderSession
 @pytest.mark.parametrize(("views", "kept"), [(0.0, 0), (1.3, 1), (3.0, 2)])
 def test_the_same_bits_beyond_the_budget(views: float, kept: int) -> None:
     """``views``: what the budget has room for; how large a view gets depends on the instruction set."""
-    free = through_three_frames(CpuRenderer().open(scene(5), None, rig(), BACKGROUND), np.inf)
+    roomy = CpuRenderer(CpuRenderer.Config(cache_mb=100))  # without a limit views borrow memory of any size
+    free = through_three_frames(roomy.open(scene(5), None, rig(), BACKGROUND), np.inf)
     megabytes = views * max(free.cache_bytes().per_view.values()) / 1e6
     limited = CpuRenderer(CpuRenderer.Config(cache_mb=megabytes)).open(scene(5), None, rig(), BACKGROUND)
     assert len(through_three_frames(limited, megabytes * 1e6).cache_bytes().per_view) == kept
@@ -197,10 +198,10 @@ def test_what_fits_does_not_depend_on_what_the_process_did_before() -> None:
 def test_a_view_that_outgrows_the_budget_goes_and_leaves_the_pool_small() -> None:
     release_idle_memory()
     whole = scene(5)
-    idle = CpuRenderer().open(whole, None, rig(), BACKGROUND)
+    roomy = CpuRenderer(CpuRenderer.Config(cache_mb=100)).open(whole, None, rig(), BACKGROUND)
     for view in (0, 1):
-        idle.screen_gradient(view, upstream()[0])
-    budget = idle.cache_bytes().total + 2_000  # both views as they come, nothing to work in
+        roomy.screen_gradient(view, upstream()[0])
+    budget = roomy.cache_bytes().total + 2_000  # both views as they come, nothing to work in
     session = CpuRenderer(CpuRenderer.Config(cache_mb=budget / 1e6)).open(whole, None, rig(), BACKGROUND)
     for view in (0, 1):
         session.screen_gradient(view, upstream()[0])
@@ -211,10 +212,8 @@ def test_a_view_that_outgrows_the_budget_goes_and_leaves_the_pool_small() -> Non
         pull(session.render(view, leaves(whole.rows(ids))))
     assert len(session.cache_bytes().per_view) == 1
     assert session.cache_bytes().total <= budget
-    del idle
-    release_idle_memory()
     del session
-    assert release_idle_memory() == 0
+    assert release_idle_memory() < budget, "at most the one view that was drawn without a cache"
 
 
 def test_cache_bytes_follow_views_and_gaussians() -> None:

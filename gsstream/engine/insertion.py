@@ -24,6 +24,7 @@ from gsstream.engine.assemble import Assembly
 from gsstream.engine.checks import StepChecks
 from gsstream.engine.exposure import backward_view
 from gsstream.engine.nearest import nearest_rows
+from gsstream.engine.root import first_rates
 from gsstream.engine.row_table import RowTable
 from gsstream.engine.stream_state import StreamState
 from gsstream.init.hull import Hull, hull_points, one_per_cell
@@ -96,12 +97,11 @@ def fit(
     rng: Rng,
 ) -> Gaussians[torch.Tensor]:  # fmt: skip
     """Optimise the newborn alone, everything else held still, with the rates of frame 0."""
-    first, views = parts.recipe.first_frame, len(frame.cameras)
+    views = len(frame.cameras)
     whole = Gaussians(**{name: torch.cat([getattr(scene, name), value]) for name, value in born.items()})
     session = parts.renderer.open(whole, None, frame.cameras, parts.recipe.background)
     session.narrow(torch.arange(len(scene), len(whole)))
-    rates = {"means": first.lr_means * frame.cameras.extent, "quats": first.lr_quats, "scales": first.lr_scales}
-    rates |= {"opacities": first.lr_opacities, "sh0": first.lr_sh0, "shN": first.lr_shN}
+    rates = first_rates(parts.recipe.first_frame, frame.cameras.extent)
     table = RowTable(dict(born.items()), rates, parts.optimiser)
     targets = [parts.loss.prepare(torch.from_numpy(image)) for image in frame.images]
     generator = rng.stream("insertion/order", frame.index)

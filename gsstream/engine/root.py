@@ -60,6 +60,13 @@ def initial_gaussians(anchors: Anchors, settings: FirstFrame) -> Gaussians[torch
     )
 
 
+def first_rates(settings: FirstFrame, extent: float) -> dict[str, float]:
+    """Learning rate of every attribute at the start of frame 0; ``extent``: of the cameras, scene units."""
+    s = settings
+    rates = {"means": s.lr_means * extent, "quats": s.lr_quats, "scales": s.lr_scales}
+    return {**rates, "opacities": s.lr_opacities, "sh0": s.lr_sh0, "shN": s.lr_shN}
+
+
 def optimise_root(
     start: Gaussians[torch.Tensor],
     levels: torch.Tensor,
@@ -101,17 +108,12 @@ class _RootRun:
         self.extent = frame.cameras.extent
         self.iterations = min(self.settings.epochs * self.views, self.settings.max_iterations)
         self.generator = rng.stream("root", frame.index)
-        self.table = RowTable(dict(start.items()), self._rates(), parts.optimiser)
+        self.table = RowTable(dict(start.items()), first_rates(self.settings, self.extent), parts.optimiser)
         self.targets = [self.loss.prepare(torch.from_numpy(image)) for image in frame.images]
         self.exposure = ExposureFit.start(self.views) if self.settings.exposure else None
         self.statistics = DensifyStatistics.zeros(len(start))
         self.order: list[int] = []
         self.smooth = math.nan
-
-    def _rates(self) -> dict[str, float]:
-        s = self.settings
-        rates = {"means": s.lr_means * self.extent, "quats": s.lr_quats, "scales": s.lr_scales}
-        return {**rates, "opacities": s.lr_opacities, "sh0": s.lr_sh0, "shN": s.lr_shN}
 
     def gaussians(self) -> Gaussians[torch.Tensor]:
         return Gaussians(**{name: self.table[name] for name in ATTRIBUTES})

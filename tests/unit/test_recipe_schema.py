@@ -132,7 +132,7 @@ def test_schema_and_loader_agree(dense, dense_file, path: tuple[str, ...], value
         refused = str(error)
     if path == ("loss", "backend") or "key_every" in refused or "data" in path:
         return  # which backends work here, and what the encoder does not do yet, is no matter of a schema
-    if path[0] == "budget" and "greater than" in refused:
+    if path[0] == "budget" and isinstance(value, str) and "greater than" in refused:
         return  # a schema knows the form of a quantity with a unit, not how much it is: the loader finds "1" too small
     assert bool(dense.problems(file)) == bool(refused), (file, refused, dense.problems(file))
 

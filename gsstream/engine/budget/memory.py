@@ -61,7 +61,7 @@ def _with_cache(parts: Assembly, megabytes: float) -> Assembly:
     config = type(config)(**{**config.model_dump(), "cache_mb": cache})
     ref = parts.recipe.renderer.model_copy(update={"params": config.model_dump(mode="json")})
     recipe = parts.recipe.model_copy(update={"renderer": ref})
-    return replace(parts, recipe=recipe, renderer=type(parts.renderer)(config))
+    return replace(parts, recipe=recipe, renderer=type(parts.part("renderer"))(config))
 
 
 def _fixed(info: SourceInfo) -> int:

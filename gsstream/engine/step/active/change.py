@@ -1,13 +1,4 @@
-"""What may change in a frame: cost follows change.
-
-A tile has changed when enough of its pixels differ from the last frame beyond the camera's measured noise. A Gaussian
-takes part when it is visible in a changed tile of some training view, its centre lies in or beside changed tiles in
-enough of the views that it projects into, and its gate may open. Everything else is frozen: it is neither projected nor
-optimised nor sent.
-
-The vote is what keeps many cameras from making everything suspect: a wall is behind a moving person in some view, but
-only what moves is in changed tiles in most of them (the idea of a visual hull).
-"""
+"""Which tiles of which views changed since the last frame, beyond the measured noise of their camera."""
 
 from __future__ import annotations
 

@@ -174,6 +174,33 @@ def test_what_leaves_a_trace_is_visible() -> None:
     assert int(visible.sum()) <= int(traces.sum()) + 10
 
 
+def test_visible_is_whose_colour_matters_in_the_marked_tiles() -> None:
+    """Held against painting each row another colour: only who is drawn changes a pixel."""
+    wide = dataclasses.replace(camera(), width=40, height=24)
+    g = torch.Generator().manual_seed(7)
+    spread = torch.rand(40, 3, generator=g, dtype=torch.float64) * torch.tensor([3.0, 2.5, 3.0])
+    base = random_scene(40, seed=8)
+    gaussians = dataclasses.replace(base, means=spread + torch.tensor([-0.5, -0.5, 0.5]), scales=base.scales - 1)
+    gaussians = dataclasses.replace(gaussians, opacities=gaussians.opacities + 4)
+    session = ReferenceRenderer().open(gaussians, None, wide, BLACK)
+    still = ReferenceRenderer().render(gaussians, wide, 0, BLACK).image
+    changes = []
+    for row in range(40):
+        sh0 = gaussians.sh0.clone()
+        sh0[row] += 5.0
+        painted = ReferenceRenderer().render(dataclasses.replace(gaussians, sh0=sh0), wide, 0, BLACK).image
+        changes.append((painted != still).any(2))
+    counts = []
+    for tile in range(6):
+        tiles = (torch.arange(6) == tile).reshape(2, 3)
+        y, x = 16 * (tile // 3), 16 * (tile % 3)
+        expected = torch.stack([change[y : y + 16, x : x + 16].any() for change in changes])
+        assert session.visible(0, tiles).tolist() == expected.tolist()
+        counts.append(int(expected.sum()))
+    assert max(counts) > 3
+    assert min(counts) < 40
+
+
 def test_the_nearer_one_covers_whatever_the_order_of_rows() -> None:
     near, far = [0, 0, 1.5], [0, 0, 3.0]
     red, blue = [1.0, 0, 0], [0, 0, 1.0]

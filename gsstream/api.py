@@ -40,9 +40,6 @@ from gsstream.core.part import Traits as Traits
 from gsstream.core.rng import Rng as Rng
 from gsstream.core.shapes import check_finite as check_finite
 from gsstream.core.shapes import check_shape as check_shape
-from gsstream.core.state import GateState as GateState
-from gsstream.core.state import rows as rows
-from gsstream.core.topology import TopologyEdit as TopologyEdit
 from gsstream.gate.base import GateSampler as GateSampler
 from gsstream.loss.base import Loss as Loss
 from gsstream.method.base import MethodState as MethodState

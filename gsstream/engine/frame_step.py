@@ -20,7 +20,6 @@ from gsstream.core.errors import ComponentError, ShapeError
 from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import IntArray
-from gsstream.core.state import GateState
 from gsstream.core.storage import packed
 from gsstream.engine.active_set import detect_change
 from gsstream.engine.assemble import Assembly
@@ -151,15 +150,15 @@ def still_step(state: StreamState, frame: Frame, seconds: float) -> Step:
     packet = encode_empty(frame=frame.index)
     after = replace(state, player=decode_packet(state.player, packet.data))
     gates = np.zeros(len(state.player.layout.node_counts), np.uint8)
-    solution = Solution(torch.zeros(0), {}, {}, GateState(torch.zeros(0)), {}, 0.0, 0)
+    solution = Solution(torch.zeros(0), {}, {}, torch.zeros(0), {}, 0.0, 0)
     metrics = step_metrics(Delta(gates, 1), after, packet, solution, torch.zeros(0))
     metrics["changed_tiles"] = 0.0
     metrics["seconds"] = {"confidence": seconds, "optimise": 0.0, "code": time.perf_counter() - started, "keep": 0.0}
     return Step(after, packet, "empty", metrics)
 
 
-def suspects(parts: Assembly, state: StreamState, context: StepContext) -> tuple[GateState, torch.Tensor]:
-    """Initial gates [M], and the rows [A] that may change: suspect to the cameras and behind a gate that may open.
+def suspects(parts: Assembly, state: StreamState, context: StepContext) -> tuple[torch.Tensor, torch.Tensor]:
+    """Initial gate logits [M], and the rows [A] that may change: suspect to the cameras, behind a gate that may open.
 
     What each part returns is looked at before the next one gets it.
     """
@@ -173,7 +172,7 @@ def suspects(parts: Assembly, state: StreamState, context: StepContext) -> tuple
     with guarded("gate", parts.gate, index):
         gate = parts.gate.init(node_logits)
         probability = parts.gate.open_probability(gate)
-    check_output(level, "gate", parts.gate, index, "init().logits", gate.logits, (nodes,))
+    check_output(level, "gate", parts.gate, index, "init()", gate, (nodes,))
     check_output(level, "gate", parts.gate, index, "open_probability()", probability, (nodes,), UNIT)
     may_open = probability > parts.recipe.stream.active_threshold
     rows = may_open[state.hierarchy.node_of] & context.suspects(parts.recipe.stream.change_votes)
@@ -202,7 +201,7 @@ def harden(parts: Assembly, problem: Problem, solution: Solution) -> Delta:
     frame = problem.frame.index
     with guarded("gate", parts.gate, frame):
         final = parts.gate.sample(solution.gate, None)
-    check_output(parts.checks, "gate", parts.gate, frame, "sample()", final, tuple(solution.gate.logits.shape), UNIT)
+    check_output(parts.checks, "gate", parts.gate, frame, "sample()", final, tuple(solution.gate.shape), UNIT)
     gates = torch.round(final * parts.gate.num_levels).numpy().astype(np.uint8)
     active = solution.active.numpy()
     codes = coarser(parts.update.codes(), problem.step_scale)

@@ -10,7 +10,6 @@ import torch
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.part import Part
-from gsstream.core.state import GateState
 from gsstream.engine.assemble import Assembly
 from gsstream.engine.backward import pull_back
 from gsstream.engine.budget.pace import Pace, estimated_bytes
@@ -77,7 +76,7 @@ class _FrameRun:
             nodes, node_of = torch.arange(state.hierarchy.num_nodes), state.hierarchy.node_of[problem.active]
         # Only gates with active rows behind them are sampled and trained; parents matter to no gate.
         self.nodes = nodes
-        self.logits, self.active, self.base = problem.gate.logits, problem.active, problem.base
+        self.logits, self.active, self.base = problem.gate, problem.active, problem.base
         self.hierarchy = Hierarchy(node_of, torch.arange(len(nodes)), torch.zeros_like(nodes))
         active = problem.active.numpy()
         self.units = torch.from_numpy(layout.units[active])
@@ -96,7 +95,7 @@ class _FrameRun:
         matrix = code.join_decoders(self.decoder_names)
         self.decoders = RowTable({"matrix": matrix}, {"matrix": code.decoder_lrs}, parts.optimiser)
         rates = {"logits": parts.recipe.gate_training.lr}
-        self.gate = RowTable({"logits": problem.gate.logits[nodes]}, rates, parts.optimiser)
+        self.gate = RowTable({"logits": problem.gate[nodes]}, rates, parts.optimiser)
         self.gate.load_moments("logits", state.gate_moments)
         self.session = problem.session
         with self._guarded("loss", parts.loss):
@@ -115,7 +114,7 @@ class _FrameRun:
         """One iteration on one view; returns the photometric loss."""
         parts, look = self.parts, self.look
         self.iteration = look.iteration = iteration
-        gate = GateState(self.gate["logits"])
+        gate = self.gate["logits"]
         gates = self._row_gates(gate, fraction)
         latents, matrix = self.latents["latents"].detach(), self.decoders["matrix"].detach()
         change = decode_joint(self.code, latents, matrix, self.units)
@@ -155,7 +154,7 @@ class _FrameRun:
         self.look.gradients("renderer", self.parts.renderer, "gradient of rows,", rows, self.active)
         return loss
 
-    def _step_gates(self, gate: GateState, gates: torch.Tensor, upstream: torch.Tensor, *, learning: bool) -> None:
+    def _step_gates(self, gate: torch.Tensor, gates: torch.Tensor, upstream: torch.Tensor, *, learning: bool) -> None:
         """Move the logits by what the images and the penalty say, and keep them in their bounds."""
         if not learning:
             return
@@ -171,11 +170,11 @@ class _FrameRun:
         with self._guarded("gate", self.parts.gate):
             pull_back(roots, gradients)
             self.gate.step()
-            bounded = self.parts.gate.bound(GateState(self.gate["logits"].detach())).logits
+            bounded = self.parts.gate.bound(self.gate["logits"].detach())
             self.gate["logits"].data.copy_(bounded)
-        self.look("gate", self.parts.gate, "bound().logits", bounded)
+        self.look("gate", self.parts.gate, "bound()", bounded)
 
-    def _row_gates(self, gate: GateState, fraction: float) -> torch.Tensor:
+    def _row_gates(self, gate: torch.Tensor, fraction: float) -> torch.Tensor:
         """[A] gate of every active row; rows of levels that are not yet active hold still."""
         with self._guarded("gate", self.parts.gate):
             noise = self.parts.gate.noise(self.hierarchy.num_nodes, self.generator)
@@ -186,7 +185,7 @@ class _FrameRun:
             per_row = per_row * (self.levels <= current_level(self.schedule, fraction))
         return per_row
 
-    def _penalty(self, gate: GateState) -> Mapping[str, torch.Tensor]:
+    def _penalty(self, gate: torch.Tensor) -> Mapping[str, torch.Tensor]:
         columns = self.code.latent.get("means")
         # The motion term also pulls on the residual itself; that gradient waits on the leaf for the latents' step.
         residual = torch.zeros(len(self.base), 3) if columns is None else self.latents["latents"][:, columns]
@@ -207,7 +206,7 @@ class _FrameRun:
         if self.parts.recipe.gate_training.optimiser == "persistent":
             return
         with self._guarded("gate", self.parts.gate):
-            gates = self.parts.gate.sample(GateState(self.gate["logits"].detach()), None)
+            gates = self.parts.gate.sample(self.gate["logits"].detach(), None)
         keep = (torch.round(gates * self.parts.gate.num_levels) > 0)[self.hierarchy.node_of]
         if self.schedule:
             keep |= self.levels > current_level(self.schedule, fraction)
@@ -228,7 +227,7 @@ class _FrameRun:
     def estimated_bytes(self) -> float:
         """What a packet would hold if this pass were the last: symbols behind open gates, and the gates."""
         with self._guarded("gate", self.parts.gate):
-            gates = self.parts.gate.sample(GateState(self.gate["logits"].detach()), None)
+            gates = self.parts.gate.sample(self.gate["logits"].detach(), None)
         opened = torch.round(gates * self.parts.gate.num_levels) > 0
         latents = self.latents["latents"].detach()[opened[self.hierarchy.node_of]]
         return estimated_bytes(torch.round(latents / self.code.steps)) + float(opened.sum())
@@ -245,7 +244,7 @@ class _FrameRun:
             active=self.active,
             latents=self.code.split(self.latents["latents"].detach()),
             decoders=self.code.split_decoders(self.decoders["matrix"].detach(), self.decoder_names),
-            gate=GateState(self._all_logits()),
+            gate=self._all_logits(),
             gate_moments=moments,
             loss=loss,
             iterations=iterations,

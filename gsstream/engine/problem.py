@@ -9,7 +9,6 @@ import torch
 
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.state import GateState
 from gsstream.engine.budget.pace import Allowance, Pace
 from gsstream.engine.stream_state import StreamState
 from gsstream.render.base import RenderSession
@@ -22,7 +21,7 @@ class Problem:
     Arguments:
         active: [A] int64 rows that may change, ascending.
         base: those rows of the decoded previous scene.
-        gate: initial gate state [M].
+        gate: initial gate logits [M].
         session: an open render session in which only ``active`` changes.
         allowance: what the frame may spend; None: what the recipe says.
     """
@@ -31,7 +30,7 @@ class Problem:
     frame: Frame
     active: torch.Tensor
     base: Gaussians[torch.Tensor]
-    gate: GateState
+    gate: torch.Tensor
     session: RenderSession
     allowance: Allowance | None = None
 
@@ -49,6 +48,7 @@ class Solution:
         active: [A] int64 rows that stayed to the end, ascending; what other rows had is given up.
         latents: attribute -> [A, L].
         loss: mean over the last pass, of the tiles that took part.
+        gate: gate logits [M] at the end.
         iterations: views rendered.
         curvature: attribute -> [A, L], mean squared gradient of the latents: what a latent is worth, up to a factor.
         pace: what the passes were held to.
@@ -58,7 +58,7 @@ class Solution:
     active: torch.Tensor
     latents: Mapping[str, torch.Tensor]
     decoders: Mapping[str, torch.Tensor]
-    gate: GateState
+    gate: torch.Tensor
     gate_moments: Mapping[str, torch.Tensor]
     loss: float
     iterations: int

@@ -7,10 +7,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gsstream.core.births import gather_rows
 from gsstream.core.delta import Delta, Layout
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.core.topology import TopologyEdit
 from gsstream.engine.stream_state import StreamState
 from gsstream.packet import PlayerState
 
@@ -44,16 +42,3 @@ def next_hierarchy(hierarchy: Hierarchy, delta: Delta, layout: Layout) -> Hierar
 def next_moments(value: torch.Tensor, num_nodes: int) -> torch.Tensor:
     """One Adam moment, or the steps taken, of every gate: zero for new nodes."""
     return torch.cat([value, value.new_zeros(num_nodes - len(value), *value.shape[1:])])
-
-
-def edit_of(layout: Layout, delta: Delta) -> TopologyEdit:
-    """The delta's births and deaths as an edit of per-Gaussian state; ``layout`` is that before it.
-
-    A birth has no old row: it is fresh and points at the row that stays before it (else the first), and the caller
-    replaces its values. The scene before must have a row.
-    """
-    source = gather_rows(layout.node_of, delta.births, delta.deaths)
-    fresh = source >= len(layout.octree_levels)
-    place = np.maximum.accumulate(np.where(fresh, 0, np.arange(len(source))))
-    rows = np.where(fresh, np.where(fresh[place], 0, source[place]), source)
-    return TopologyEdit(torch.from_numpy(rows), torch.from_numpy(fresh))

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.core.state import rows
 from gsstream.engine.exposure import Exposure
 from gsstream.method.base import Step as MethodStep
 from gsstream.packet import PlayerState
@@ -36,14 +35,14 @@ class StreamState:
     """
 
     player: PlayerState
-    hierarchy: Hierarchy = rows("gaussian")
-    previous: Frame = rows(None)
-    decoders: Mapping[str, torch.Tensor] = rows(None, default_factory=dict)
-    exposure: Exposure | None = rows(None, default=None)
-    key_frame: int = rows(None, default=0)
-    key_quality: float | None = rows(None, default=None)
-    gate_moments: Mapping[str, torch.Tensor] = rows("node", default_factory=dict)
-    session: RenderSession | None = rows(None, default=None, compare=False, repr=False)
+    hierarchy: Hierarchy
+    previous: Frame
+    decoders: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    exposure: Exposure | None = None
+    key_frame: int = 0
+    key_quality: float | None = None
+    gate_moments: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    session: RenderSession | None = field(default=None, compare=False, repr=False)
 
     @property
     def gaussians(self) -> Gaussians[torch.Tensor]:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Literal
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.delta import Delta
+from gsstream.core.changes import Delta
 from gsstream.core.errors import InputError, PacketError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray

@@ -15,7 +15,7 @@ from gsstream.engine.frame0.begin import begin, begin_from
 from gsstream.engine.step.frame_step import frame_step
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.keys.resume import resume_state
-from gsstream.engine.whole import WholeTools, begin_whole, resume_whole, step_whole
+from gsstream.engine.run.held import WholeTools, begin_whole, resume_whole, step_whole
 from gsstream.method.base import Step, StreamingMethod
 from gsstream.packet import PlayerState, StreamMeta, decode_packet
 from gsstream.plugins.catalog import load_catalog

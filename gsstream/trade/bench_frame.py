@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.delta import Layout
+from gsstream.core.changes import Layout
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng

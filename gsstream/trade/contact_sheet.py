@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from gsstream.core.delta import row_gates
+from gsstream.core.changes import row_gates
 from gsstream.core.errors import InputError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray

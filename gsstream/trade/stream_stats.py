@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import zstandard
 
-from gsstream.core.births import gather_rows
-from gsstream.core.delta import active_rows
+from gsstream.core.changes import gather_rows
+from gsstream.core.changes import active_rows
 from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.shapes import FloatArray, IntArray

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from packet_scenes import decode_all, make_births, make_edit, make_key, make_packets, make_scene, replaced, same_bits
 
-from gsstream.core.births import Births, in_nodes, own_nodes
-from gsstream.core.delta import Delta, Layout, apply_delta, next_layout, row_gates
+from gsstream.core.changes import Births, in_nodes, own_nodes
+from gsstream.core.changes import Delta, Layout, apply_delta, next_layout, row_gates
 from gsstream.core.errors import OutputError, PacketError, ShapeError
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.packet import (

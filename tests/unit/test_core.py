@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.delta import Delta, Layout, active_rows, apply_delta
+from gsstream.core.changes import Delta, Layout, active_rows, apply_delta
 from gsstream.core.errors import (
     ComponentError,
     GsstreamError,
@@ -30,8 +30,6 @@ from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.hierarchy import Hierarchy, tree_max, tree_roots
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import check_finite, check_shape
-from gsstream.core.state import GateState, edit_state, rows
-from gsstream.core.topology import TopologyEdit
 
 
 def make(n: int, bases: int = 4, seed: int = 0) -> Gaussians[np.ndarray]:
@@ -234,57 +232,6 @@ class TestHierarchy:
             tree_roots(parent)
 
 
-@st.composite
-def edits(draw: st.DrawFn, n: int) -> TopologyEdit:
-    source = draw(st.lists(st.integers(0, n - 1), min_size=1, max_size=8))
-    fresh = draw(st.lists(st.booleans(), min_size=len(source), max_size=len(source)))
-    return TopologyEdit(torch.tensor(source), torch.tensor(fresh))
-
-
-@dataclasses.dataclass(frozen=True)
-class Moments:
-    first: torch.Tensor = rows("gaussian")
-    gate: torch.Tensor = rows("node")
-    shared: torch.Tensor = rows(None)
-    absent: torch.Tensor | None = rows("gaussian", default=None)
-
-
-class TestTopology:
-    @given(st.data())
-    @settings(max_examples=50, deadline=None)
-    def test_composition_is_associative_and_equals_doing_both(self, data: st.DataObject) -> None:
-        a = data.draw(edits(6))
-        b = data.draw(edits(len(a.source)))
-        c = data.draw(edits(len(b.source)))
-        values = torch.arange(6)
-        assert torch.equal(values[a.then(b).source], values[a.source][b.source])
-        left, right = a.then(b).then(c), a.then(b.then(c))
-        assert torch.equal(left.source, right.source)
-        assert torch.equal(left.fresh, right.fresh)
-
-    def test_freshness_survives_later_edits(self) -> None:
-        born = TopologyEdit(torch.tensor([0, 1, 1]), torch.tensor([False, False, True]))
-        moved = born.then(TopologyEdit.permute(torch.tensor([2, 0, 1])))
-        assert moved.fresh.tolist() == [True, False, False]
-        assert moved.source.tolist() == [1, 0, 1]
-
-    def test_keep(self) -> None:
-        edit = TopologyEdit.keep(torch.tensor([True, False, True]))
-        assert edit.source.tolist() == [0, 2]
-        assert edit.fresh.tolist() == [False, False]
-        assert TopologyEdit.keep(torch.zeros(3, dtype=torch.bool)).source.shape == (0,)
-
-    def test_only_declared_rows_are_edited(self) -> None:
-        state = Moments(torch.arange(3.0), torch.arange(3.0), torch.arange(3.0))
-        edited = edit_state(state, TopologyEdit.permute(torch.tensor([2, 2, 0])))
-        assert edited.first.tolist() == [2.0, 2.0, 0.0]
-        assert edited.gate.tolist() == [0.0, 1.0, 2.0]  # same length as the Gaussians, still not theirs
-        assert edited.shared.tolist() == [0.0, 1.0, 2.0]
-        assert edited.absent is None
-        gates = GateState(torch.zeros(3))
-        assert edit_state(gates, TopologyEdit.keep(torch.tensor([True]))).logits.shape == (3,)
-
-
 def numpy_state() -> bytes:
     return np.random.get_state()[1].tobytes()  # noqa: NPY002 - the legacy global state is what must not move
 
@@ -414,8 +361,8 @@ class TestErrors:
 
 def test_core_imports_no_torch() -> None:
     code = (
-        "import sys, gsstream.spec, gsstream.core.gaussians, gsstream.core.delta, gsstream.core.hierarchy, "
-        "gsstream.core.state, gsstream.core.rng, gsstream.core.topology, gsstream.core.part; "
+        "import sys, gsstream.spec, gsstream.core.gaussians, gsstream.core.changes, gsstream.core.hierarchy, "
+        "gsstream.core.rng, gsstream.core.topology, gsstream.core.part; "
         "sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsstream.core.delta import Delta, decode_residual
+from gsstream.core.changes import Delta, decode_residual
 from gsstream.core.errors import InputError
 from gsstream.packet import StreamWriter, decode_packet, encode_delta, encode_key, quantise_decoders
 from gsstream.player.decoders import decoder_model, export_decoders, quantise_output, run_decoder

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from gsstream.core.births import Births, gather_rows, in_nodes, own_nodes
-from gsstream.core.delta import Delta, Layout
+from gsstream.core.changes import Births, own_nodes
+from gsstream.core.changes import Delta, Layout
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.topology import TopologyEdit
 from gsstream.engine.fit.row_table import RowTable
-from gsstream.engine.state.rows import edit_of, follow
+from gsstream.engine.state.follow import follow
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.optimiser.adam import ReferenceAdam
 from gsstream.packet import decode_packet, encode_delta, encode_key
@@ -79,19 +80,14 @@ def test_a_packet_without_births_leaves_the_forest_alone(state):
     assert torch.equal(after.decoders["sh0"], torch.ones(2, 3))
 
 
-def test_per_gaussian_moments_follow_the_edit(state):
-    layout = state.player.layout
+def test_per_gaussian_moments_follow_the_edit():
+    """Row 1 is copied as a fresh row, row 0 goes: what stays keeps its moment, what is fresh starts at zero."""
     table = RowTable({"x": torch.arange(40.0)[:, None]}, {"x": 0.0}, ReferenceAdam())
     table.step({"x": torch.arange(40.0)[:, None] + 1})
-    delta = delta_of(layout, in_nodes(scene(3), [int(layout.node_of[0]), 5, 11], [0, 0, 0]), [0, 20, 39])
-    edit = edit_of(layout, delta)
-    source = gather_rows(layout.node_of, delta.births, delta.deaths)
-    assert torch.equal(edit.fresh, torch.from_numpy(source >= 40))
-    assert int(edit.fresh.sum()) == 3
-    assert int(edit.source.max()) < 40
-    table.edit(edit)
+    source = torch.cat([torch.arange(1, 40), torch.tensor([1])])
+    fresh = torch.arange(40) == 39
+    table.edit(TopologyEdit(source, fresh))
     moments = table.moments("x")["exp_avg"][:, 0]
-    assert moments[edit.fresh].tolist() == [0, 0, 0]
-    kept = ~edit.fresh
-    torch.testing.assert_close(moments[kept], 0.1 * (torch.from_numpy(source)[kept] + 1.0))
-    assert table["x"][kept, 0].tolist() == source[kept.numpy()].tolist()
+    torch.testing.assert_close(moments[:39], 0.1 * (source[:39] + 1.0))
+    assert moments[39] == 0
+    assert table["x"][:, 0].tolist() == source.tolist()

@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.delta import Delta, Layout
+from gsstream.core.changes import Delta, Layout
 from gsstream.core.errors import InputError, ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.packet import KeyState, StreamMeta, StreamWriter, encode_delta, encode_empty, encode_key

@@ -11,7 +11,7 @@ import zstandard
 from test_player import make_stream
 
 from gsstream.cli.main import run_command
-from gsstream.core.delta import Delta, Layout
+from gsstream.core.changes import Delta, Layout
 from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import Gaussians
 from gsstream.packet import KeyState, StreamReader, StreamWriter, encode_delta, encode_empty, encode_key

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.delta import Delta, Layout
+from gsstream.core.changes import Delta, Layout
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from gsstream.cli.main import run_command
-from gsstream.core.delta import Delta
+from gsstream.core.changes import Delta
 from gsstream.core.errors import ComponentError, RecipeError
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.fit.exposure import Exposure

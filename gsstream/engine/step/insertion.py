@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gsstream.core.births import Births, in_nodes, own_nodes
-from gsstream.core.delta import Delta, Layout, apply_delta
+from gsstream.core.changes import Births, in_nodes, own_nodes
+from gsstream.core.changes import Delta, Layout, apply_delta
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.rng import Rng

@@ -25,8 +25,8 @@ from gsstream import API_VERSION
 
 ENTRY_POINT_GROUP = "gsstream"
 Kind = Literal[
-    "structure", "confidence", "propagation", "gate", "motion", "update", "growth", "regularizer", "stepper", "renderer",
-    "loss", "optimiser", "source",
+    "structure", "confidence", "propagation", "gate", "motion", "update", "growth", "regularizer", "stepper",
+    "renderer", "loss", "optimiser", "source",
 ]  # fmt: skip
 #: Of whatever has a name: kinds of parts, and named methods (recipes).
 KINDS: tuple[str, ...] = (*get_args(Kind), "method")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from gsstream.core.hierarchy import Hierarchy
 
@@ -62,6 +62,10 @@ class FrameWork(FrameContext, Protocol):
 
     Colour maps of the cameras are applied and pulled through where they belong; a part need not know them.
     """
+
+    @property
+    def optimiser(self) -> Any:
+        """The optimiser of the run (``gsstream.api.RowOptimiser``), for rows that a part fits on its own."""
 
     def changed_rows(self, least_votes: float) -> torch.Tensor:
         """Return [N] bool: Gaussians that are seen in a tile that changed.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from abc import abstractmethod
 
 from gsstream.core.changes import Motion, Scene
-from gsstream.core.part import Part
 from gsstream.core.context import FrameWork
+from gsstream.core.part import Part
 
 
 class MotionPart(Part):

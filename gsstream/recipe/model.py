@@ -178,13 +178,13 @@ class Recipe(Section):
     confidence: ComponentRef = Field(default=ComponentRef(name="uniform"), description="which Gaussians changed")
     propagation: ComponentRef = Field(default=ComponentRef(name="group-max"), description="how belief spreads to nodes")
     gate: ComponentRef = Field(default=ComponentRef(name="always-open"), description="which nodes may move")
-    motion: ComponentRef = Field(default=ComponentRef(name="still"), description="what is carried along before the residual")
+    motion: ComponentRef = Field(default=ComponentRef(name="still"), description="what moves before the residual")
     regularizer: ComponentRef = Field(default=ComponentRef(name="none"), description="what openness costs")
     update: ComponentRef = Field(default=ComponentRef(name="additive"), description="how a gated change is applied")
     growth: ComponentRef = Field(default=ComponentRef(name="none"), description="which Gaussians are born and leave")
     stepper: ComponentRef = Field(
         default=ComponentRef(name="parts"),
-        description="what goes from frame to frame; parts: the slots above; a method that is built otherwise names itself",
+        description="what goes from frame to frame; parts: the slots above; other methods bring their own",
     )
     renderer: ComponentRef = Field(
         default=ComponentRef(name="auto"), description="auto: the fastest that works here, else the reference"

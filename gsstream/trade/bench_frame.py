@@ -24,8 +24,8 @@ from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.auto.rules import refuse_pending
 from gsstream.engine.frame0.begin import begin_from
-from gsstream.engine.step.frame_step import frame_step
 from gsstream.engine.state.stream_state import Step, StreamState
+from gsstream.engine.step.frame_step import frame_step
 from gsstream.metrics import peak_memory_mb, psnr
 from gsstream.packet import KeyState, PlayerState, StreamMeta, decode_packet, encode_key
 from gsstream.plugins.catalog import Catalog

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import zstandard
 
-from gsstream.core.changes import gather_rows
-from gsstream.core.changes import active_rows
+from gsstream.core.changes import active_rows, gather_rows
 from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.shapes import FloatArray, IntArray

@@ -13,12 +13,12 @@ from typing import Any
 from pydantic import ValidationError
 
 from gsstream.core.auto import Choice, SceneFacts
-from gsstream.core.errors import OutputError, RecipeError
+from gsstream.core.errors import OutputError
 from gsstream.core.part import Part
 from gsstream.engine.assembly.assemble import Assembly, with_values
-from gsstream.engine.auto.colour_gain import can_judge
 from gsstream.engine.assembly.fault import fault
 from gsstream.engine.assembly.guard import blaming
+from gsstream.engine.auto.colour_gain import can_judge
 from gsstream.packet import PacketKind, PlayerState, StreamReader, decode_packet
 from gsstream.packet.base import FILE_HEADER
 from gsstream.recipe.document import KeyPath, Origin

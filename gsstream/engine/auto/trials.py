@@ -12,9 +12,9 @@ from typing import Any
 
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.engine.assembly.assemble import Assembly, value_at
-from gsstream.engine.auto.rules import DEGREE, USUAL_DEGREE, settle, taken_over
 from gsstream.engine.auto.climb import try_out
 from gsstream.engine.auto.facts import scene_facts
+from gsstream.engine.auto.rules import DEGREE, USUAL_DEGREE, settle, taken_over
 from gsstream.engine.auto.short_fits import FirstFrameTrials, left_out
 from gsstream.packet import PlayerState, StreamMeta
 

@@ -8,8 +8,8 @@ held-out ones) sees the scene as it is.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-import torch
 
+import torch
 
 
 @dataclass(frozen=True)

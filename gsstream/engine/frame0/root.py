@@ -19,10 +19,10 @@ from gsstream.core.rng import Rng
 from gsstream.core.topology import TopologyEdit
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import VARIABLE, Look
-from gsstream.engine.frame0.densify import DensifyStatistics, grow_and_prune
+from gsstream.engine.fit.densify import DensifyStatistics, grow_and_prune
 from gsstream.engine.fit.exposure import Exposure, ExposureFit
 from gsstream.engine.fit.judge import Judge
-from gsstream.engine.frame0.nearest import neighbour_distance
+from gsstream.engine.fit.nearest import neighbour_distance
 from gsstream.engine.fit.row_table import RowTable
 from gsstream.recipe.model import FirstFrame
 from gsstream.render.activations import logit, rgb_to_sh0

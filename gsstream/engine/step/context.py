@@ -16,6 +16,7 @@ from gsstream.engine.fit.judge import Judge, shown
 from gsstream.engine.step.active.candidates import changed_rows
 from gsstream.engine.step.active.change import MOST_PIXEL_SIGMA, Change
 from gsstream.metrics.noise import noise_sigma
+from gsstream.optimiser.base import RowOptimiser
 from gsstream.render.base import RenderSession
 
 
@@ -98,6 +99,10 @@ class FrameView:
         # Where everything moves, the estimate is the change itself; see MOST_SIGMA.
         measured = noise_sigma(unpacked(self._previous.images[view]), self._frame.images[view])
         return min(measured, MOST_PIXEL_SIGMA)
+
+    @property
+    def optimiser(self) -> RowOptimiser:
+        return self._parts.optimiser
 
     def changed_rows(self, least_votes: float) -> torch.Tensor:
         return changed_rows(self._change, self._gaussians.means, self.cameras, self.session, least_votes)

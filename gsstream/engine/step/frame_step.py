@@ -78,8 +78,7 @@ def frame_step(
         solution = optimise(parts, problem, rng.stream("frame", frame.index))
         residual = harden(parts, problem, solution)
     with clock.phase("growth"):
-        changes = motions if residual is None else (*motions, residual)
-        delta = grown(parts, state, Delta(changes), view, rng)
+        delta = grown(parts, state, Delta(motions).with_residual(residual), view, rng)
     with clock.phase("code"):
         fitted = encode_frame(delta, state.player, problem, solution, parts.recipe.codec.trim)
         player = decode_packet(state.player, fitted.packet.data)

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import torch
 
-from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.pace import Pace, estimated_bytes

@@ -10,7 +10,7 @@ import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame
-from gsstream.core.shapes import FloatArray
+from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.core.storage import unpacked
 from gsstream.metrics.noise import MAD_TO_SIGMA, median_deviation
 from gsstream.render.base import TILE
@@ -92,16 +92,26 @@ def _changed(before: FloatArray, after: FloatArray, threshold: float) -> BoolArr
     """[rows, columns] bool of one view."""
     means = _block_means(after - before)
     sigma = min(max(min(MAD_TO_SIGMA * float(median_deviation(means)), _rough(means)), LEAST_SIGMA), MOST_SIGMA)
-    moved = (np.abs(means) > threshold * sigma).any(-1)
-    side = TILE // BLOCK
-    rows, columns = -(-moved.shape[0] // side), -(-moved.shape[1] // side)
-    padded = np.zeros((rows * side, columns * side), bool)
-    padded[: moved.shape[0], : moved.shape[1]] = moved
-    # A tile cut off by the border has fewer blocks to show a change with.
-    inside = np.zeros_like(padded)
-    inside[: moved.shape[0], : moved.shape[1]] = True
-    count, blocks = (x.reshape(rows, side, columns, side).sum((1, 3)) for x in (padded, inside))
+    moved: BoolArray = np.asarray((np.abs(means) > threshold * sigma).any(-1))
+    count, blocks = marked_per_tile(moved, TILE // BLOCK)
     return np.asarray(count >= np.minimum(LEAST_BLOCKS, blocks))
+
+
+def marked_per_tile(marked: BoolArray, side: int = TILE) -> tuple[IntArray, IntArray]:
+    """Count what is marked in each tile: ([rows, columns] how many are, and how many there are).
+
+    A tile cut off by the border has fewer to show a change with.
+
+    Arguments:
+        marked: [H, W] bool, pixels or blocks of them. side: of a tile, in these.
+    """
+    rows, columns = -(-marked.shape[0] // side), -(-marked.shape[1] // side)
+    padded = np.zeros((rows * side, columns * side), bool)
+    padded[: marked.shape[0], : marked.shape[1]] = marked
+    inside = np.zeros_like(padded)
+    inside[: marked.shape[0], : marked.shape[1]] = True
+    count, number = (x.reshape(rows, side, columns, side).sum((1, 3)) for x in (padded, inside))
+    return count, number
 
 
 def _rough(means: FloatArray) -> float:

@@ -58,11 +58,23 @@ def grow_and_prune(
     kept = keep.nonzero()[:, 0]
     source = torch.cat([kept, hot])
     fresh = torch.cat([split[kept], torch.ones(len(hot), dtype=torch.bool)])
-    values = {name: value[source].clone() for name, value in gaussians.items()}
-    halves = split[source]
-    if bool(halves.any()):
-        spread = torch.randn(int(halves.sum()), 3, generator=generator) * activate_scales(values["scales"][halves])
-        turned = (rotation_matrices(values["quats"][halves]) @ spread[..., None])[..., 0]
-        values["means"][halves] += turned
-        values["scales"][halves] -= float(torch.tensor(SPLIT_SHRINK).log())
+    values = dict(children(gaussians, source, split[source], generator).items())
     return TopologyEdit(source, fresh), values
+
+
+def children(
+    gaussians: Gaussians[torch.Tensor], parents: torch.Tensor, halves: torch.Tensor, generator: torch.Generator
+) -> Gaussians[torch.Tensor]:
+    """Return copies of Gaussians, those that are halves of a split drawn from their parent and made smaller (3DGS).
+
+    Arguments:
+        parents: [P] rows that are copied.
+        halves: [P] bool, copies that are one half of a split parent; the others are as their parent is.
+    """
+    born = gaussians.rows(parents).map(torch.clone)
+    if bool(halves.any()):
+        spread = torch.randn(int(halves.sum()), 3, generator=generator) * activate_scales(born.scales[halves])
+        turned = (rotation_matrices(born.quats[halves]) @ spread[..., None])[..., 0]
+        born.means[halves] += turned
+        born.scales[halves] -= float(torch.tensor(SPLIT_SHRINK).log())
+    return born

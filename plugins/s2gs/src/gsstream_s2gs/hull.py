@@ -1,4 +1,4 @@
-"""Points that several cameras agree on where the scene lacks something: a small visual hull with colours. Ours."""
+"""Points that several cameras agree on where the scene lacks something: a small visual hull with colours."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsstream.core.cameras import Cameras
-from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.api import Cameras, FloatArray, IntArray
 
 #: Depths tried along a ray; neighbours differ by about four percent of the range's logarithm.
 DEPTHS = 48

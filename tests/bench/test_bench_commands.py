@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from gsstream.cli.main import run_command
-from gsstream.trade.bench_native import LOOKS, find_native, measure_peaks
+from gsstream.trade.bench.native import LOOKS, find_native, measure_peaks
 
 RENDER_KEYS = {
     "renderer", "level", "gaussians", "width", "height", "share", "tiles", "path", "rows", "drawn", "live_pairs",

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from gsstream.core.errors import InputError
 from gsstream.core.gaussians import Gaussians
 from gsstream.render.reference import ALPHA_CUT, ALPHA_MAX, TRANSMITTANCE_MIN, project
-from gsstream.trade.bench_floor import (
+from gsstream.trade.bench.floor import (
     FLOPS_PER_PAIR,
     FLOPS_PER_VISIBLE,
     Peak,
@@ -24,8 +24,7 @@ from gsstream.trade.bench_floor import (
     live_pairs,
     pixels_of,
 )
-from gsstream.trade.bench_report import Steps, interleaved
-from gsstream.trade.bench_scene import (
+from gsstream.trade.bench.scene import (
     OBJECT_ROOM,
     Points,
     bench_camera,
@@ -36,6 +35,7 @@ from gsstream.trade.bench_scene import (
     read_points,
     synthetic_points,
 )
+from gsstream.trade.bench.timing import Steps, interleaved
 
 
 def scene(count: int = 300, seed: int = 0) -> Gaussians[np.ndarray]:

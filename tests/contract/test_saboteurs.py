@@ -38,7 +38,7 @@ PAGE = read_page()
 
 
 def test_the_page_shows_every_saboteur() -> None:
-    """When it is stale: python docs/reference/generate.py --saboteurs"""
+    """When it is stale: python -m tools.reference --saboteurs"""
     assert set(PAGE) == {*SABOTEURS, *PACKET_SABOTEURS, *METHOD_SABOTEURS}
     for check in PAGE:
         assert f"for `{check}`: {saboteur_of(check)}" in TEXT

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from flow_runs import TINY, WORLD, encode
 
-from gsstream.trade import checks_cost, precision
+from tools import checks_cost, precision
 
 
 def table(text: str) -> dict[tuple[str, str], list[float]]:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from gsstream.plugins.catalog import load_catalog
-from gsstream.trade.soak import __main__ as soak
-from gsstream.trade.soak import drive
-from gsstream.trade.soak.cases import SOMETIMES, Case, draw_case, draw_value
-from gsstream.trade.soak.drive import run_case
-from gsstream.trade.soak.summary import summarise
+from tools.soak import __main__ as soak
+from tools.soak import drive
+from tools.soak.cases import SOMETIMES, Case, draw_case, draw_value
+from tools.soak.drive import run_case
+from tools.soak.summary import summarise
 
 CATALOG = load_catalog()
 SMALL = (("frames", 3), ("first_frame.max_iterations", 5), ("first_frame.max_points", 100), ("stream.epochs", 1))

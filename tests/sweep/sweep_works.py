@@ -73,9 +73,9 @@ if __name__ == "__main__":
     import sweep_works
 
     from gsstream.plugins.catalog import load_catalog
+    from gsstream.trade.jobs.executor import LocalExecutor
     from gsstream.trade.sweep.config import read_sweep
     from gsstream.trade.sweep.drive import run_sweep
-    from gsstream.trade.sweep.executor import LocalExecutor
     from gsstream.trade.sweep.plan import make_plan
 
     config = Path(sys.argv[1])

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsstream.trade.sweep.executor import Finished
-from gsstream.trade.sweep.schedule import RETRIES, finished_tasks
+from gsstream.trade.jobs.base import Finished
+from gsstream.trade.jobs.schedule import RETRIES, finished_tasks
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ import sweep_works
 from sweep_works import TWO_SEEDS
 
 from gsstream.core.errors import InputError, OutputError
+from gsstream.trade.jobs.executor import LocalExecutor
 from gsstream.trade.sweep.drive import cell_file, run_sweep
-from gsstream.trade.sweep.executor import LocalExecutor
 from gsstream.trade.sweep.table import TableWriter, read_table
 
 

@@ -15,9 +15,9 @@ import sweep_works
 from sweep_works import TWO_SEEDS
 
 from gsstream.core.errors import PluginUnavailable
+from gsstream.trade.jobs.ray_executor import RayExecutor
 from gsstream.trade.sweep.drive import run_sweep
 from gsstream.trade.sweep.job import run_job
-from gsstream.trade.sweep.ray_executor import RayExecutor
 from gsstream.trade.sweep.table import read_table
 
 HAVE_RAY = importlib.util.find_spec("ray") is not None
@@ -75,7 +75,7 @@ def test_ray_workers_killed_in_a_cell_are_replaced(plan_of, tmp_path, marks):
 @needs_ray
 @pytest.mark.slow
 def test_ray_makes_the_very_streams_that_local_workers_make(plan_of, tmp_path, monkeypatch, marks):
-    from gsstream.trade.sweep.executor import LocalExecutor
+    from gsstream.trade.jobs.executor import LocalExecutor
 
     monkeypatch.setenv("GSSTREAM_LOAD_PLUGINS", "gsstream-cpu-render")
     plan = plan_of(REAL)

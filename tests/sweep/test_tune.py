@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+import shlex
 import sys
 from pathlib import Path
 
@@ -12,9 +14,10 @@ from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError
 from gsstream.recipe.budget import Budget
 from gsstream.recipe.load import load_recipe
-from gsstream.trade.held import held_table, main
+from gsstream.recipe.model import Recipe
 from gsstream.trade.report.groups import read_sweep_data
-from gsstream.trade.tune import Trial, candidates, choose, nearest, trial_of, tune_table
+from gsstream.trade.sweep.tune import Trial, candidates, choose, nearest, trial_of, tune_table
+from tools.held import held_table, main
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "flow"))
 from flow_runs import WORLD, encode, metrics
@@ -67,8 +70,12 @@ def test_the_best_that_fits_is_chosen() -> None:
     assert choose([large]) is None
     assert nearest([large, trial("far", 31.0, 100, inside=0), Trial("broken", error="x")]) is large
     assert nearest([Trial("broken", error="x")]) is None
-    with pytest.raises(InputError, match="no test cameras"):
+    with pytest.raises(InputError, match="no test cameras") as refused:
         choose([trial("blind", math.nan, 100)])
+    hint = re.search(r"--set '(\w+)\.(\w+)=", str(refused.value))
+    assert hint, "the message says what to do"
+    section = Recipe.model_fields[hint[1]].annotation
+    assert hint[2] in section.model_fields, "the key that the message names is one of a recipe"  # type: ignore[union-attr]
     table = tune_table([large, good, Trial("broken", error="it broke")], good).splitlines()
     assert "<- chosen" in table[2]
     assert "| good" in table[2]
@@ -97,10 +104,10 @@ def test_a_pilot_writes_a_recipe_that_runs_inside_the_budget(
     rows = held_table([], "size=600B", sweep=(tmp_path / "pilot", pilot.scenes[0])).splitlines()
     assert len(rows) == 2 + 4
     assert any("s2gs-edge+budget" in row and " 2/2 " in row for row in rows)
-    recipe = str(tmp_path / "pilot" / "tuned.yaml")
-    again = ["run", "--source", WORLD, "--recipe", recipe, "--out", str(tmp_path / "run")]
-    assert run_command([*again, "--frames", "3", "--quiet", "--no-video", *given]) == 0
-    assert all(sum(line["bytes"].values()) <= 600 for line in metrics(tmp_path / "run")[1:])
+    program, *said = shlex.split(out.rpartition("next: ")[2])
+    assert program == "gsstream"
+    assert run_command([*said, "--frames", "3", "--quiet", "--no-video", *given]) == 0
+    assert all(sum(line["bytes"].values()) <= 600 for line in metrics(tmp_path / "pilot" / "run")[1:])
     # Nothing fits: said so, with the nearest; the pilot's other candidates are there already.
     (tmp_path / "pilot" / "tuned.yaml").unlink()
     assert run_command(command(tmp_path / "pilot", "time=1ms", *given)) == 1

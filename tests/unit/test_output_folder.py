@@ -8,7 +8,7 @@ import pytest
 
 from gsstream.core.errors import OutputError
 from gsstream.engine.output import MADE_FILES, RUN_FILES, prepare_output
-from gsstream.trade import gallery
+from gsstream.trade.show import gallery
 
 
 def test_a_new_folder_is_created(tmp_path: Path) -> None:

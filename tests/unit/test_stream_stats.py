@@ -16,7 +16,7 @@ from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import Gaussians
 from gsstream.packet import KeyState, StreamReader, StreamWriter, encode_delta, encode_empty, encode_key
 from gsstream.player.playback import Playback
-from gsstream.trade.stream_stats import entropy_bits, stream_stats
+from gsstream.trade.measure.stream_stats import entropy_bits, stream_stats
 
 
 def entropy_by_hand(values) -> float:

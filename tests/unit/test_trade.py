@@ -20,11 +20,11 @@ from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, render
 from gsstream.player.software import render_numpy
 from gsstream.source.base import SourceInfo
-from gsstream.trade.contact_sheet import contact_sheet, sheet_of_stream
-from gsstream.trade.evaluate import evaluate
-from gsstream.trade.plots import plot_runs
-from gsstream.trade.records import FrameRecord, read_lines, read_records
-from gsstream.trade.summary import summarise, summary_table
+from gsstream.trade.measure.evaluate import evaluate
+from gsstream.trade.measure.records import FrameRecord, read_lines, read_records
+from gsstream.trade.measure.summary import summarise, summary_table
+from gsstream.trade.show.contact_sheet import contact_sheet, sheet_of_stream
+from gsstream.trade.show.plots import plot_runs
 
 NUMPY = PlayerRenderer("numpy", render_numpy)
 

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from gsstream.core.errors import OutputError
-from gsstream.trade.drift import Drift, main, there_and_back
+from tools.drift import Drift, main, there_and_back
 
 
 def test_the_loop_never_jumps():

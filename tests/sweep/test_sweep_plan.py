@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sweep_works import TWO_SEEDS
 
-from gsstream.core.errors import RecipeError, UnknownName
+from gsstream.core.errors import GsstreamError, RecipeError, UnknownName
 from gsstream.plugins.catalog import load_catalog
 from gsstream.trade.sweep.config import Range, SweepConfig, flat_settings, read_sweep
 from gsstream.trade.sweep.plan import combinations, make_plan
@@ -163,6 +163,59 @@ def test_an_unknown_method_is_named(plan_of):
         plan_of(f"name: x\n{SCENE}variants: [{{name: v, method: dens}}]\n")
 
 
+OTHER = f"""
+name: other
+{SCENE}set: {{near: 0.5}}
+variants:
+  - name: a
+    recipe: recipes/one.yaml
+    set: {{stream: {{epochs: 3, change_threshold: 4}}, loss.dssim: 0.5, gate: {{name: always-open}}}}
+  - {{name: b, base: other.yaml#a}}
+  - {{name: d, base: more.yaml}}
+  - {{name: c, method: dense, axes: {{near: [1, 2]}}}}
+  - {{name: loop, base: "sweep.yaml#v"}}
+"""
+
+
+def based(folder, plan_of, variant: str):
+    (folder / "tables" / "recipes").mkdir(parents=True, exist_ok=True)
+    (folder / "tables" / "recipes" / "one.yaml").write_text("base: dense\nfirst_frame: {max_points: 77}\n")
+    for name in ("tables/other.yaml", "tables/more.yaml"):
+        (folder / name).write_text(OTHER.replace("sweep.yaml", "../sweep.yaml"))
+    return plan_of(f"name: s\n{SCENE}variants: [{{{variant}}}]\n")
+
+
+def test_a_variant_starts_from_one_of_another_file(tmp_path, plan_of):
+    plan = based(tmp_path, plan_of, "name: a, base: tables/other.yaml")
+    recipe = plan.points[0].resolved.recipe
+    assert (recipe.stream.epochs, recipe.stream.change_threshold, recipe.loss.dssim) == (3, 4, 0.5)
+    assert (recipe.first_frame.max_points, recipe.near) == (77, 0.01), "its recipe file, not what its file sets for all"
+    assert plan.config.variants[0].base is None
+    for base in ("other.yaml#a", "more.yaml#b"):
+        renamed = based(tmp_path, plan_of, f"name: v, base: tables/{base}")
+        assert renamed.points[0].id == plan.points[0].id
+    changed = based(tmp_path, plan_of, "name: a, base: tables/other.yaml, set: {stream.epochs: 5, loss: {dssim: 0.1}}")
+    recipe = changed.points[0].resolved.recipe
+    assert (recipe.stream.epochs, recipe.stream.change_threshold, recipe.loss.dssim) == (5, 4, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("variant", "problem"),
+    [
+        ("name: z, base: tables/other.yaml", "known: a, b, c, d, loop"),
+        ("name: a, base: tables/none.yaml", "cannot read"),
+        ("name: c, base: tables/other.yaml", "has axes"),
+        ("name: a, base: tables/other.yaml, method: dense", "leave them out"),
+        ("name: a, base: tables/other.yaml#", "base"),
+        ("name: d, base: tables/other.yaml", "goes in a circle"),
+        ("name: v, base: tables/other.yaml#loop", "goes in a circle"),
+    ],
+)
+def test_a_base_that_cannot_be_is_refused(tmp_path, plan_of, variant, problem):
+    with pytest.raises(GsstreamError, match=problem):
+        based(tmp_path, plan_of, variant)
+
+
 def test_settings_flatten():
     assert flat_settings({"a.b": 1, "c": {"d.e": {"f": [1]}}}, "x") == {("a", "b"): 1, ("c", "d", "e", "f"): [1]}
 
@@ -170,7 +223,10 @@ def test_settings_flatten():
 ROOT = Path(__file__).parents[2] / "configs"
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "sweeps").rglob("*.yaml")), ids=lambda p: p.stem)
+TABLES = [path for path in (ROOT / "paper").glob("*.yaml") if path.name not in ("full.yaml", "candidates.yaml")]
+
+
+@pytest.mark.parametrize("path", sorted([*(ROOT / "sweeps").rglob("*.yaml"), *TABLES]), ids=lambda p: p.stem)
 def test_the_sweeps_that_ship_are_sound(path):
     """Their keys, methods and files exist; a sweep of a table has a variant for each row that is ours to run."""
     from gsstream.trade.report.paper import paper_table
@@ -190,8 +246,8 @@ def test_the_sweeps_that_ship_are_sound(path):
 
 
 def test_scenes_from_a_file_bring_their_recipes_along():
-    path = ROOT / "sweeps" / "paper" / "discretisation.yaml"
-    moved = read_sweep(path, ROOT / "scenes" / "at_hand.yaml")
+    path = ROOT / "paper" / "discretisation.yaml"
+    moved = read_sweep(path, ROOT / "recordings" / "at_hand.yaml")
     assert [scene.name for scene in moved.scenes] == ["pickblocks", "basketball"]
     one = moved.model_copy(update={"seeds": [0], "variants": moved.variants[:1]})
     recipes = [point.resolved.recipe for point in make_plan(one, path.parent, load_catalog().recipe_path).points]

@@ -25,10 +25,8 @@ jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not install
 ROOT = Path(__file__).parents[2]
 CATALOG = load_catalog()
 METHODS = [name for name in CATALOG.names("method") if isinstance(CATALOG.entry("method", name).spec, MethodSpec)]
-#: Files whose first key is a sweep's are no recipes.
-#: Folders of configs/ that hold no recipes.
-OTHERS = {"sweeps", "scenes"}
-CONFIGS = [p for p in sorted((ROOT / "configs").rglob("*.yaml")) if not OTHERS & {part.name for part in p.parents}]
+#: Sweeps and lists of recordings have this key, recipes do not.
+CONFIGS = [p for p in sorted((ROOT / "configs").rglob("*.yaml")) if "\nscenes:" not in p.read_text(encoding="utf-8")]
 CONFIGS += [CATALOG.recipe_path(name) for name in METHODS]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -138,6 +139,57 @@ def test_every_setting_is_described(monkeypatch: pytest.MonkeyPatch) -> None:
         assert model.model_config.get("frozen"), f"{name} can be changed after it was checked"
         for key, field in settings(model, name):
             assert field.description, f"{key} has no description"
+
+
+#: Written by people: not the pages made from the code, nor the reports of sweeps.
+PROSE = [
+    path
+    for path in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
+    if path.name != "report.md" and not path.read_text(encoding="utf-8").startswith("<!-- Made by")
+]
+MAX_PROSE = 125
+
+
+def prose_of(text: str) -> Iterator[tuple[int, str]]:
+    """Numbered lines of a page that are neither tables, nor code, nor pictures."""
+    fenced = False
+    for number, line in enumerate(text.splitlines(), 1):
+        fence = line.lstrip().startswith("```")
+        fenced ^= fence
+        if not (fence or fenced or line.startswith(("|", "    ", "!["))):
+            yield number, line
+
+
+def test_lines_of_prose_are_short() -> None:
+    """A sentence begins on a line of its own where a paragraph would be too wide: a change then shows what changed."""
+    assert len(PROSE) > 50, "the pages were not found"
+    lines = [(path, number, line) for path in PROSE for number, line in prose_of(path.read_text(encoding="utf-8"))]
+    assert [f"{p.relative_to(ROOT)}:{n}: {len(line)}" for p, n, line in lines if len(line) > MAX_PROSE] == []
+
+
+def test_decisions_have_one_form() -> None:
+    pages = sorted((ROOT / "docs" / "adr").glob("[0-9]*.md"))
+    index = (ROOT / "docs" / "adr" / "README.md").read_text(encoding="utf-8")
+    for page in pages:
+        text = page.read_text(encoding="utf-8")
+        title, status = text.splitlines()[0], text.splitlines()[2]
+        assert re.fullmatch(rf"# {page.name[:4]} .*[^.]", title), f"{page.name}: no title '# NUMBER Title': {title!r}"
+        assert status.startswith("Status: "), f"{page.name}: the third line says the status"
+        sections = re.findall(r"^## (.*)$", text, re.MULTILINE)
+        assert sections == ["Situation", "Decision", "Why", "What follows"], f"{page.name}: {sections}"
+        assert f"({page.name})" in index, f"docs/adr/README.md does not list {page.name}"
+    assert len(pages) > 20
+
+
+LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)\s]*)?\)")
+
+
+def test_links_of_the_docs_lead_somewhere() -> None:
+    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "configs").rglob("*.md")]
+    pages += (ROOT / "plugins").glob("*/README.md")
+    links = [(page, target) for page in pages for target in LINK.findall(page.read_text(encoding="utf-8"))]
+    assert len(links) > 100
+    assert [f"{p.relative_to(ROOT)}: {t}" for p, t in links if ":" not in t and not (p.parent / t).exists()] == []
 
 
 def test_the_requirements_cover_every_distribution_of_this_repository() -> None:

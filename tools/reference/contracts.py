@@ -51,7 +51,8 @@ ELSEWHERE = {
     "stream alone, so a process has nothing to add",
     "files cut, torn or lying about themselves": "`tests/packet`; the kit damages packets",
     "quality and size within a stored band": "numbers belong to a machine and a date: docs/results/index.md",
-    "a metric": "metrics are functions, not parts; each is held against an independent implementation in `tests/unit`",
+    "a metric": "metrics are functions, not parts; each is held against an independent implementation in "
+    "`tests/metrics`",
 }
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import re
 import shlex
-import sys
 from pathlib import Path
 
 import pytest
+from flow_runs import WORLD, encode, metrics
 
 from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError
@@ -18,9 +18,6 @@ from gsstream.recipe.model import Recipe
 from gsstream.trade.report.groups import read_sweep_data
 from gsstream.trade.sweep.tune import Trial, candidates, choose, nearest, trial_of, tune_table
 from tools.held import held_table, main
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "flow"))
-from flow_runs import WORLD, encode, metrics
 
 TINY = ["first_frame.max_iterations=20", "first_frame.fill_points=100", "first_frame.max_points=400", "stream.epochs=2"]
 

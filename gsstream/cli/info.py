@@ -11,7 +11,7 @@ from gsstream.cli.streams import Stream, progress_on, stream_file
 
 if TYPE_CHECKING:
     from gsstream.player.playback import Playback
-    from gsstream.trade.stream_stats import StreamStats
+    from gsstream.trade.measure.stream_stats import StreamStats
 
 
 def info(
@@ -21,7 +21,7 @@ def info(
     """Say what a stream holds: method, cameras, packets, their sizes and what they could cost at best."""
     file = stream_file(stream)
     from gsstream.player.playback import Playback
-    from gsstream.trade.stream_stats import stream_stats
+    from gsstream.trade.measure.stream_stats import stream_stats
 
     with Playback(file) as playback:
         if not as_json:

@@ -70,7 +70,7 @@ def _pictures(result: RunResult, recording: FrameSource, video: bool, quiet: boo
     ``warned``: the run has said already that nothing fast renders here; the player need not say it again.
     """
     from gsstream.player.render import SlowRendererWarning
-    from gsstream.trade.gallery import SUMMARY, write_gallery
+    from gsstream.trade.show.gallery import SUMMARY, write_gallery
 
     if result.frames == 0:
         return

@@ -68,7 +68,7 @@ def evaluate(
     from gsstream.metrics import OnnxLpips
     from gsstream.player.playback import Playback
     from gsstream.plugins.catalog import load_catalog
-    from gsstream.trade.evaluate import evaluate as evaluate_stream
+    from gsstream.trade.measure.evaluate import evaluate as evaluate_stream
 
     if lpips_range is not None and lpips_onnx is None:
         raise InputError(f"--lpips-range {lpips_range}: without --lpips-onnx there is no LPIPS to give it to")

@@ -27,7 +27,7 @@ from gsstream.packet.births import HEAD_PARTS, most_births
 from gsstream.packet.bits import BitWriter, pack_blobs, unpack_blobs
 from gsstream.packet.gates import encode_gates
 from gsstream.packet.symbols import encode_symbols
-from gsstream.trade.stream_stats import stream_stats
+from gsstream.trade.measure.stream_stats import stream_stats
 
 SEEDS = st.integers(0, 2**32 - 1)
 NONE = np.zeros(0, np.int64)

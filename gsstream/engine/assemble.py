@@ -11,9 +11,10 @@ from typing import Any
 from gsstream.confidence.base import ConfidenceEstimator
 from gsstream.core.auto import AUTO, Choice
 from gsstream.core.errors import PluginUnavailable, UnknownName
+from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.core.part import Part
 from gsstream.engine.checks import Checks, wanted_checks
-from gsstream.engine.heeded import PART_SLOTS, unheeded
+from gsstream.engine.heeded import unheeded
 from gsstream.gate.base import GateSampler
 from gsstream.loss.base import Loss
 from gsstream.method.base import StreamingMethod
@@ -29,7 +30,7 @@ from gsstream.render.base import Renderer
 from gsstream.residual.base import UpdateRule
 from gsstream.structure.base import Structure
 
-SLOTS = ("structure", "confidence", "propagation", "gate", "regularizer", "update", "renderer")
+SLOTS = (*METHOD_SLOTS, "renderer")
 #: What "auto" tries, fastest first, before it falls back to the reference.
 AUTO_RENDERERS = ("cpu",)
 AUTO_LOSSES = ("cpu", "reference")
@@ -116,7 +117,7 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
         refs["whole"] = _written_out("whole", resolved.recipe.whole, whole, pending)
         hint = f"the whole method {name!r} does not read it; its own settings: gsstream plugins show whole/{name}"
         paths = [*unheeded(resolved.recipe.model_copy(update=refs), whole, parts)]
-        paths += [path for path in pending if path[0] in PART_SLOTS and path[0] not in whole.heeds]
+        paths += [path for path in pending if path[0] in METHOD_SLOTS and path[0] not in whole.heeds]
         problems += [f"{resolved.near(path).where}: {'.'.join(path)}: {hint}" for path in paths]
     join_problems(problems)
     parts["loss"] = loss

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.method.base import StreamingMethod
 from gsstream.recipe.document import KeyPath
 from gsstream.recipe.model import Recipe
 
-#: Keys that only the five-part path reads.
-PART_SLOTS = ("structure", "confidence", "propagation", "gate", "regularizer", "update")
+#: Sections that, beside the slots of parts, only a method made of parts reads.
 PART_SECTIONS = ("stream", "gate_training", "codec", "insertion", "budget")
 #: Of those sections, what the engine itself reads for every method.
 SESSION_KEYS = ("codec.fsync", "budget.memory", "stream.on_error")
@@ -24,7 +24,7 @@ def unheeded(recipe: Recipe, whole: StreamingMethod[Any], parts: Mapping[str, An
         parts: slot -> live part.
     """
     default = Recipe()
-    for slot in PART_SLOTS:
+    for slot in METHOD_SLOTS:
         if slot not in parts or slot in whole.heeds:
             continue
         if getattr(recipe, slot).name != getattr(default, slot).name:

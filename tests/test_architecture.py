@@ -127,7 +127,8 @@ def settings(model: type[BaseModel], name: str):
 
 
 def test_every_setting_is_described(monkeypatch: pytest.MonkeyPatch) -> None:
-    from gsstream.plugins.catalog import CONTRACTS, load_catalog
+    from gsstream.core.kinds import CONTRACTS
+    from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.model import Recipe
 
     monkeypatch.setenv("GSSTREAM_LOAD_PLUGINS", "")

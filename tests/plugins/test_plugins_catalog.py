@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 
 from gsstream.core.errors import PluginUnavailable, UnknownName
+from gsstream.core.kinds import CONTRACTS
 from gsstream.core.versions import version_problem
-from gsstream.plugins.catalog import CONTRACTS, load_catalog
+from gsstream.plugins.catalog import load_catalog
 from gsstream.plugins.discovery import Discovered, PluginFault, discover
 from gsstream.spec import ComponentSpec, MethodSpec
 

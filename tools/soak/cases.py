@@ -19,13 +19,13 @@ from pydantic.fields import FieldInfo
 
 from gsstream.core.auto import AUTO
 from gsstream.core.errors import PluginUnavailable
+from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.heeded import PART_SECTIONS, SESSION_KEYS
 from gsstream.plugins.catalog import Catalog
 
 Generator = np.random.Generator
 Draw = Callable[[Generator], Any]
-PART_SLOTS = ("structure", "confidence", "propagation", "gate", "regularizer", "update")
 #: Width, height: below, at and above one tile, long ones, and sizes that no tile divides.
 SIZES = ((8, 8), (9, 8), (8, 40), (48, 8), (17, 13), (33, 25), (40, 30), (64, 48), (65, 49), (96, 72), (120, 90))
 #: Up to this many pixels a case may take the reference renderer, which is hundreds of times slower.
@@ -176,7 +176,7 @@ def _parts(catalog: Catalog, rng: Generator, share: float) -> dict[str, Any]:
     """Other parts in some of the slots, and settings of theirs."""
     settings: dict[str, Any] = {}
     swap = _of(0.0, 0.3, 1.0)(rng)
-    for slot in PART_SLOTS:
+    for slot in METHOD_SLOTS:
         if rng.random() >= swap:
             continue
         name = _of(*usable(catalog, slot))(rng)

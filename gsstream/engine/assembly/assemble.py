@@ -11,6 +11,7 @@ from typing import Any
 from gsstream.confidence.base import ConfidenceEstimator
 from gsstream.core.auto import AUTO, Choice
 from gsstream.core.errors import PluginUnavailable, UnknownName
+from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.core.part import Part
 from gsstream.engine.assembly.checks import Checks, wanted_checks
 from gsstream.engine.assembly.guard import guard, plain
@@ -33,9 +34,7 @@ from gsstream.render.base import Renderer
 from gsstream.residual.base import UpdateRule
 from gsstream.structure.base import Structure
 
-SLOTS = (
-    "structure", "confidence", "propagation", "gate", "motion", "update", "growth", "regularizer", "stepper", "renderer",
-)  # fmt: skip
+SLOTS = (*METHOD_SLOTS, "stepper", "renderer")
 #: Everything that is called behind a guard.
 GUARDED = (*SLOTS, "loss", "optimiser")
 #: What "auto" tries, fastest first, before it falls back to the reference.

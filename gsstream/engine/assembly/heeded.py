@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.method.base import StreamingMethod
 from gsstream.recipe.document import KeyPath
 from gsstream.recipe.model import Recipe
 
-#: Keys that a method made of parts reads.
-PART_SLOTS = ("structure", "confidence", "propagation", "gate", "motion", "update", "growth", "regularizer")
+#: Sections that, beside the slots of parts, only a method made of parts reads.
 PART_SECTIONS = ("stream", "gate_training", "codec", "budget")
 #: Of those sections, what the engine itself reads for every method.
 SESSION_KEYS = ("codec.fsync", "budget.memory", "stream.on_error")
@@ -27,7 +27,7 @@ def unheeded(
         pending: paths of keys that the scene is to decide.
     """
     default = Recipe()
-    for slot in PART_SLOTS:
+    for slot in METHOD_SLOTS:
         if slot not in parts or method.reads(slot):
             continue
         if getattr(recipe, slot).name != getattr(default, slot).name:
@@ -40,4 +40,4 @@ def unheeded(
             path = f"{section}.{key}"
             if getattr(now, key) != getattr(usual, key) and path not in SESSION_KEYS and not method.reads(path):
                 yield section, key
-    yield from (path for path in pending if path[0] in PART_SLOTS and not method.reads(path[0]))
+    yield from (path for path in pending if path[0] in METHOD_SLOTS and not method.reads(path[0]))

@@ -101,7 +101,9 @@ def stream_file(path: Path) -> Path:
 
 def _one_of_many(out: Path, camera: str) -> Path:
     """Several cameras make one file or folder each, named after the camera."""
-    return out.with_name(f"{out.stem}-{camera}{out.suffix}") if out.suffix else out / camera
+    from gsstream.core.names import child
+
+    return child(out.parent, f"{out.stem}-{camera}{out.suffix}") if out.suffix else child(out, camera)
 
 
 def _cameras(playback: Playback, wanted: str | None) -> list[str | None]:

@@ -13,6 +13,7 @@ import numpy as np
 from gsstream import __version__
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import PacketError, ShapeError
+from gsstream.core.names import check_camera_ids
 
 #: Conventions every value of a stream of this format follows.
 CONVENTIONS: Mapping[str, str] = {
@@ -102,6 +103,7 @@ def meta_from_json(data: bytes) -> StreamMeta:
 
 
 def _rig(cameras: Cameras) -> dict[str, Any]:
+    check_camera_ids(cameras.ids)
     return {
         "ids": list(cameras.ids), "width": cameras.width, "height": cameras.height, "near": cameras.near,
         "viewmats": np.asarray(cameras.viewmats, np.float64).reshape(-1, 16).tolist(),
@@ -111,6 +113,7 @@ def _rig(cameras: Cameras) -> dict[str, Any]:
 
 def _cameras(value: Any) -> Cameras:
     ids = tuple(_text(name) for name in value["ids"])
+    check_camera_ids(ids)
     viewmats = np.asarray(value["viewmats"], np.float64).reshape(len(ids), 4, 4)
     Ks = np.asarray(value["Ks"], np.float64).reshape(len(ids), 3, 3)
     cameras = Cameras(ids, viewmats, Ks, int(value["width"]), int(value["height"]), float(value["near"]))

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsstream.core.errors import SourceError
+from gsstream.core.errors import ShapeError, SourceError
+from gsstream.core.names import check_camera_ids
 from gsstream.core.shapes import FloatArray
 from gsstream.source.calibration import CALIBRATION_FILE, frame_path, read_calibration
 from gsstream.source.images import read_image
@@ -60,6 +61,10 @@ def find_cameras(folder: Path) -> list[RawCamera]:
             f"{folder}: cameras found: {len(found)}; expected at least two: a folder of pictures per camera, "
             f"a video per camera, or a picture per camera ({', '.join(PICTURES + VIDEOS)})"
         )
+    try:
+        check_camera_ids(found)
+    except ShapeError as error:
+        raise SourceError(f"{folder}: {error}") from error
     return [RawCamera(name, files, _size(files[0])) for name, files in found.items()]
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from gsstream.cli.listing import plural
-from gsstream.cli.streams import Frames, Stream, chosen_frames, frame_range, progress_on, stream_file
+from gsstream.cli.streams import Frames, Stream, fail_with, frame_range, progress_on, stream_file
 
 
 def export(
@@ -28,13 +28,14 @@ def export(
     from gsstream.player.playback import Playback
 
     with Playback(file) as playback:
-        chosen = chosen_frames(playback, first, last)
+        chosen, damage = playback.sound(first, last)
     if kind == "onnx":
         written = export_decoders(file, out, frames=chosen)
     else:
         written = export_stream(file, out, kind, frames=chosen, progress=progress_on("frame"))
     size = sum(path.stat().st_size for path in written)
     typer.echo(f"{out}: {plural(len(written), 'file')}, {size / 1e6:.1f} MB")
+    fail_with(damage)
 
 
 def manifest(

@@ -13,6 +13,7 @@ import typer
 from gsstream.cli.listing import plural
 
 if TYPE_CHECKING:
+    from gsstream.core.errors import PacketError
     from gsstream.player.playback import Playback
 
 Stream = Annotated[Path, typer.Argument(help="A stream (.gss), or the output folder of a run.")]
@@ -38,11 +39,12 @@ def play(
 
     with Playback(file) as playback:
         cameras = _cameras(playback, camera)
-        chosen = chosen_frames(playback, first, last)
+        chosen, damage = playback.sound(first, last)
     for name in cameras:
         target = out if len(cameras) == 1 else _one_of_many(out, name or "")
         played = play_stream(file, target, camera=name, frames=chosen, progress=progress_on(name or "camera"))
         typer.echo(f"{played.path}: {plural(played.frames, 'picture')}")
+    fail_with(damage)
 
 
 def evaluate(
@@ -75,15 +77,17 @@ def evaluate(
     lpips = None if lpips_onnx is None else OnnxLpips(lpips_onnx, lpips_range)
     with Playback(file) as playback:
         meta = playback.meta
+        frames, damage = playback.sound()
     uri = source or meta.extra.get("source_uri")
     if not uri:
         raise InputError(f"{file} does not say which recording it was made from; name it with --source")
     recording = reopen_recording(str(uri), meta.recipe, load_catalog())
     try:
-        evaluation = evaluate_stream(file, recording, lpips=lpips, progress=progress_on("frame"))
+        evaluation = evaluate_stream(file, recording, frames=frames, lpips=lpips, progress=progress_on("frame"))
     finally:
         recording.close()
     typer.echo(evaluation.table())
+    fail_with(damage)
 
 
 def stream_file(path: Path) -> Path:
@@ -120,13 +124,10 @@ def _cameras(playback: Playback, wanted: str | None) -> list[str | None]:
     return list(found)
 
 
-def chosen_frames(playback: Playback, first: int | None, last: int | None) -> list[int]:
-    """Frame indices from ``first`` to ``last`` - 1, by default all. Raises InputError outside the stream."""
-    start = playback.frames[0] if first is None else first
-    stop = playback.frames[-1] + 1 if last is None else last
-    for edge in (start, stop - 1):
-        playback.entry(edge)  # says which frames there are when this one is not
-    return list(range(start, stop))
+def fail_with(damage: PacketError | None) -> None:
+    """Raise what ended a stream early, once the frames before it are done: exit code 1 and the byte of the damage."""
+    if damage is not None:
+        raise damage
 
 
 def frame_range(text: str | None) -> tuple[int | None, int | None]:

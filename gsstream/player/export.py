@@ -29,9 +29,10 @@ def export(
     Arguments:
         kind: ``ply``; ``spz`` (through splat-transform, an npm package); ``sequence``: PLYs and ``sequence.json`` with
             frame indices, times and the cameras.
-        frames: frame indices; default: all.
+        frames: frame indices; default: all up to the first damaged packet.
 
-    Raises InputError for an unknown format or frame, PacketError for a damaged stream, OutputError when the folder
+    Raises InputError for an unknown format or frame, PacketError for a damaged stream (without ``frames``: once the
+    files before the damage are written), OutputError when the folder
     cannot be written or the converter is missing or fails.
     """
     if kind not in FORMATS:
@@ -39,7 +40,8 @@ def export(
     converter = find_converter() if kind == "spz" else ""
     folder, written = Path(out), []
     with Playback(stream) as playback:
-        chosen = list(playback.frames if frames is None else frames)
+        sound, damage = playback.sound() if frames is None else (frames, None)
+        chosen = list(sound)
         for frame in chosen:
             playback.entry(frame)
         try:
@@ -57,6 +59,8 @@ def export(
                 (folder / "sequence.json").write_text(_description(playback, chosen), encoding="utf-8")
         except OSError as error:
             raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
+    if damage is not None:
+        raise damage
     return written
 
 

@@ -44,15 +44,16 @@ def play(
         out: ``.mp4`` needs PyAV, and becomes a folder of PNGs (with a warning) where it is missing; ``.webp`` and
             ``.gif`` are animated pictures; anything else is a folder.
         camera: id of a train or test camera, "orbit" or "spiral"; default: the first test, else the first train camera.
-        frames: frame indices in the order to be shown; default: all.
+        frames: frame indices in the order to be shown; default: all up to the first damaged packet.
         fps: pictures per second; default: that of the recording.
         progress: called with (done, total) after every picture.
 
-    Raises InputError for an unknown camera or frame, PacketError for a damaged stream, OutputError when ``out`` cannot
-    be written.
+    Raises InputError for an unknown camera or frame, PacketError for a damaged stream (without ``frames``: once the
+    pictures before the damage are written), OutputError when ``out`` cannot be written.
     """
     with Playback(stream) as playback:
-        chosen = list(playback.frames if frames is None else frames)
+        sound, damage = playback.sound() if frames is None else (frames, None)
+        chosen = list(sound)
         if not chosen:
             raise InputError("no frames to play: expected at least one frame index")
         cameras = choose_cameras(playback, camera, len(chosen))
@@ -61,9 +62,12 @@ def play(
         images = _images(playback, chosen, cameras, renderer, progress)
         rate = playback.meta.fps if fps is None else fps
         try:
-            return _write(Path(out), images, chosen, rate)
+            played = _write(Path(out), images, chosen, rate)
         except OSError as error:
             raise OutputError(f"cannot write {out}: {error.strerror or error}") from error
+    if damage is not None:
+        raise damage
+    return played
 
 
 def choose_cameras(playback: Playback, camera: str | None, number: int) -> Cameras:

@@ -30,7 +30,11 @@ from gsstream.cli import (
     sweep,
     tune,
 )
+from gsstream.cli.listing import printable
 from gsstream.core.errors import GsstreamError, InputError
+
+#: Messages may have several lines; nothing else in them that a terminal would obey is printed.
+_LINE = "\n"
 
 
 @dataclass
@@ -109,7 +113,7 @@ def run_command(argv: Sequence[str]) -> int:
             if options.debug:
                 traceback.print_exc()
             else:
-                typer.echo(f"error: {error}", err=True)
+                typer.echo(f"error: {printable(error, keep=_LINE)}", err=True)
             return 2 if isinstance(error, InputError) else 1
     if code == 130:
         return _interrupted()
@@ -122,4 +126,4 @@ def _interrupted() -> int:
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    typer.echo(f"warning: {message}", err=True)
+    typer.echo(f"warning: {printable(message, keep=_LINE)}", err=True)

@@ -21,6 +21,11 @@ Frames = Annotated[
     str | None, typer.Option("--frames", metavar="A:B", help="Frames A to B - 1; either may be left out.")
 ]
 
+MaxMemory = Annotated[
+    str | None,
+    typer.Option("--max-memory", metavar="SIZE", help="Refuse what would take more, e.g. 500MB; default: no limit."),
+]
+
 
 def play(
     stream: Stream,
@@ -30,19 +35,23 @@ def play(
         typer.Option("--camera", help="Camera id, orbit, spiral, or train, test, all; default: the first test camera."),
     ] = None,
     frames: Frames = None,
+    max_memory: MaxMemory = None,
 ) -> None:
     """Decode a stream and render it, without torch or the recording."""
     first, last = frame_range(frames)
+    most = size_of(max_memory)
     file = stream_file(stream)
     from gsstream.player.play import play as play_stream
     from gsstream.player.playback import Playback
 
-    with Playback(file) as playback:
+    with Playback(file, max_memory=most) as playback:
         cameras = _cameras(playback, camera)
         chosen, damage = playback.sound(first, last)
     for name in cameras:
         target = out if len(cameras) == 1 else _one_of_many(out, name or "")
-        played = play_stream(file, target, camera=name, frames=chosen, progress=progress_on(name or "camera"))
+        played = play_stream(
+            file, target, camera=name, frames=chosen, progress=progress_on(name or "camera"), max_memory=most
+        )
         typer.echo(f"{played.path}: {plural(played.frames, 'picture')}")
     fail_with(damage)
 
@@ -62,8 +71,10 @@ def evaluate(
             "--lpips-range", metavar="-1|0", help="Lower end of the range that file is given; default: its metadata."
         ),
     ] = None,
+    max_memory: MaxMemory = None,
 ) -> None:
     """Render the decoded frames and compare them with the recording's test cameras."""
+    most = size_of(max_memory)
     file = stream_file(stream)
     from gsstream.core.errors import InputError
     from gsstream.engine.recording import reopen_recording
@@ -75,9 +86,13 @@ def evaluate(
     if lpips_range is not None and lpips_onnx is None:
         raise InputError(f"--lpips-range {lpips_range}: without --lpips-onnx there is no LPIPS to give it to")
     lpips = None if lpips_onnx is None else OnnxLpips(lpips_onnx, lpips_range)
-    with Playback(file) as playback:
+    with Playback(file, max_memory=most) as playback:
         meta = playback.meta
         frames, damage = playback.sound()
+        if playback.limit is not None:
+            playback.limit.check_pictures(meta.test.width, meta.test.height, len(meta.test))
+            for frame in frames:
+                playback.state_at(frame)
     uri = source or meta.extra.get("source_uri")
     if not uri:
         raise InputError(f"{file} does not say which recording it was made from; name it with --source")
@@ -139,6 +154,22 @@ def frame_range(text: str | None) -> tuple[int | None, int | None]:
     if last is not None and last <= (first or 0):
         raise InputError(f"--frames {text}: expected A:B with A < B, e.g. 0:30, or A: for all frames from A on")
     return first, last
+
+
+def size_of(text: str | None) -> int | None:
+    """Bytes meant by ``--max-memory``; None: no limit."""
+    from gsstream.core.errors import InputError
+    from gsstream.recipe.budget import BYTES, read_quantity
+
+    if text is None:
+        return None
+    try:
+        size = read_quantity(text, BYTES)
+    except ValueError as error:
+        raise InputError(f"--max-memory {text}: {error}") from error
+    if size < 1:
+        raise InputError(f"--max-memory {text}: expected a positive size, e.g. 500MB")
+    return int(size)
 
 
 def progress_on(what: str) -> Callable[[int, int], None] | None:

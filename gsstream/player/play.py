@@ -36,7 +36,7 @@ class Played:
 def play(
     stream: str | os.PathLike[str], out: str | os.PathLike[str], *, camera: str | None = None,
     frames: Sequence[int] | None = None, fps: float | None = None, renderer: PlayerRenderer | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None, max_memory: int | None = None,
 ) -> Played:  # fmt: skip
     """Render a stream from one camera.
 
@@ -47,11 +47,12 @@ def play(
         frames: frame indices in the order to be shown; default: all up to the first damaged packet.
         fps: pictures per second; default: that of the recording.
         progress: called with (done, total) after every picture.
+        max_memory: bytes that decoding and drawing may take at most; default: what the format allows.
 
-    Raises InputError for an unknown camera or frame, PacketError for a damaged stream (without ``frames``: once the
-    pictures before the damage are written), OutputError when ``out`` cannot be written.
+    Raises InputError for an unknown camera or frame and beyond ``max_memory``, PacketError for a damaged stream
+    (without ``frames``: once the pictures before the damage are written), OutputError when ``out`` cannot be written.
     """
-    with Playback(stream) as playback:
+    with Playback(stream, max_memory=max_memory) as playback:
         sound, damage = playback.sound() if frames is None else (frames, None)
         chosen = list(sound)
         if not chosen:
@@ -59,6 +60,9 @@ def play(
         cameras = choose_cameras(playback, camera, len(chosen))
         for frame in chosen:
             playback.entry(frame)
+        if playback.limit is not None:
+            kept = len(chosen) if Path(out).suffix.lower() in _ANIMATED else 1
+            playback.limit.check_pictures(cameras.width, cameras.height, kept)
         images = _images(playback, chosen, cameras, renderer, progress)
         rate = playback.meta.fps if fps is None else fps
         try:

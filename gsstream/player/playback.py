@@ -14,6 +14,7 @@ from gsstream.core.errors import InputError, PacketError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
 from gsstream.packet import Entry, PacketKind, PlayerState, StreamMeta, StreamReader, decode_packet
+from gsstream.player.memory import MemoryLimit
 
 
 class UnfinishedStreamWarning(UserWarning):
@@ -23,15 +24,23 @@ class UnfinishedStreamWarning(UserWarning):
 class Playback:
     """A stream seen as scenes by frame index. Stepping forward decodes one packet; seeking starts at a key packet."""
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        """Open a stream. Raises SourceError when there is none, PacketError when its first packet is not readable."""
+    def __init__(self, path: str | os.PathLike[str], *, max_memory: int | None = None) -> None:
+        """Open a stream.
+
+        Arguments:
+            max_memory: bytes that decoding a frame may take at most; None: only the limits of the format hold.
+
+        Raises SourceError when there is no stream, PacketError when its first packet is not readable, InputError when
+        it would take more memory than allowed; so do all methods that decode.
+        """
         self.reader = StreamReader(path)
+        self.limit = None if max_memory is None else MemoryLimit(max_memory)
         try:
             if not self.reader.frames:
                 raise self.reader.damage or PacketError("the stream holds no complete packet yet", self.reader.end)
             self._entries = self.reader.frames
-            self._state = self._decode(None, self._entries[0])
-        except PacketError:
+            self._state: PlayerState = self._decode(None, self._entries[0])
+        except (PacketError, InputError):
             self.reader.close()
             raise
 
@@ -91,6 +100,8 @@ class Playback:
             self.entry(stop - 1)
         for entry in self._entries[self._key_before(start) - first : None if stop is None else max(0, stop - first)]:
             try:
+                if self.limit is not None:
+                    self.limit.check_packet(entry.size, entry.frame)
                 self.reader.read(entry)
             except PacketError as error:
                 if entry.frame <= start:
@@ -144,4 +155,9 @@ class Playback:
         return keys[bisect_right(keys, frame) - 1]
 
     def _decode(self, state: PlayerState | None, entry: Entry) -> PlayerState:
-        return decode_packet(state, self.reader.read(entry), offset=entry.offset)
+        if self.limit is None:
+            return decode_packet(state, self.reader.read(entry), offset=entry.offset)
+        self.limit.check_packet(entry.size, entry.frame)
+        data = self.reader.read(entry)
+        self.limit.check_decoding(data, state, entry.offset)
+        return decode_packet(state, data, offset=entry.offset)

@@ -42,10 +42,10 @@ OPTIONS = {
         "--first-frame", "--checks",
         "--overwrite", "--no-video", "--quiet", "--budget",
     ],
-    "gsstream play": ["STREAM", "--out", "--camera", "--frames"],
-    "gsstream evaluate": ["STREAM", "--source", "--lpips-onnx", "--lpips-range"],
+    "gsstream play": ["STREAM", "--out", "--camera", "--frames", "--max-memory"],
+    "gsstream evaluate": ["STREAM", "--source", "--lpips-onnx", "--lpips-range", "--max-memory"],
     "gsstream info": ["STREAM", "--json"],
-    "gsstream export": ["STREAM", "--out", "--format", "--frames"],
+    "gsstream export": ["STREAM", "--out", "--format", "--frames", "--max-memory"],
     "gsstream manifest": ["STREAM", "--out"],
     "gsstream view": ["STREAM", "--port", "--host"],
     "gsstream run-segments": [

@@ -33,6 +33,8 @@ from gsstream.cli import (
 from gsstream.cli.listing import printable
 from gsstream.core.errors import GsstreamError, InputError
 
+#: Exit codes of runs that a service ended: 128 plus the number of the signal.
+_SIGNALS = {129: "SIGHUP", 143: "SIGTERM"}
 #: Messages may have several lines; nothing else in them that a terminal would obey is printed.
 _LINE = "\n"
 
@@ -93,7 +95,8 @@ app.add_typer(scene.app, name="scene")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run one command and exit: 0 done, 2 something given is wrong, 130 interrupted, 1 everything else."""
+    """Run one command and exit: 0 done, 2 something given is wrong, 130 interrupted, 129 and 143 ended by a signal,
+    1 everything else."""
     sys.exit(run_command(sys.argv[1:] if argv is None else argv))
 
 
@@ -117,6 +120,8 @@ def run_command(argv: Sequence[str]) -> int:
             return 2 if isinstance(error, InputError) else 1
     if code == 130:
         return _interrupted()
+    if code in _SIGNALS:
+        typer.echo(f"ended by {_SIGNALS[code]}", err=True)
     return code if isinstance(code, int) else 0
 
 

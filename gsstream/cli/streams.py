@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,7 +14,9 @@ from gsstream.cli.listing import plural
 
 if TYPE_CHECKING:
     from gsstream.core.errors import PacketError
+    from gsstream.packet import StreamMeta
     from gsstream.player.playback import Playback
+    from gsstream.plugins.catalog import Catalog
 
 Stream = Annotated[Path, typer.Argument(help="A stream (.gss), or the output folder of a run.")]
 Frames = Annotated[
@@ -32,17 +34,32 @@ def play(
     out: Annotated[Path, typer.Option("--out", help="Folder for pictures, or a file: .mp4, .webp or .gif.")],
     camera: Annotated[
         str | None,
-        typer.Option("--camera", help="Camera id, orbit, spiral, or train, test, all; default: the first test camera."),
+        typer.Option(
+            "--camera",
+            help="Camera id, orbit, spiral, train, test, all, or FILE.json with a path; default: first test camera.",
+        ),
     ] = None,
     frames: Frames = None,
+    size: Annotated[
+        str | None, typer.Option("--size", metavar="WxH", help="Pixels of the pictures; default: those of the camera.")
+    ] = None,
+    renderer: Annotated[
+        str | None,
+        typer.Option("--renderer", help="numpy, or one that a plugin offers; default: the first of those that works."),
+    ] = None,
     max_memory: MaxMemory = None,
 ) -> None:
     """Decode a stream and render it, without torch or the recording."""
     first, last = frame_range(frames)
-    most = size_of(max_memory)
+    most, pixels = size_of(max_memory), picture_size(size)
     file = stream_file(stream)
+    from gsstream.player.play import check_target
     from gsstream.player.play import play as play_stream
     from gsstream.player.playback import Playback
+    from gsstream.player.render import named_renderer
+
+    chosen_renderer = None if renderer is None else named_renderer(renderer)
+    check_target(out)
 
     with Playback(file, max_memory=most) as playback:
         cameras = _cameras(playback, camera)
@@ -50,8 +67,9 @@ def play(
     for name in cameras:
         target = out if len(cameras) == 1 else _one_of_many(out, name or "")
         played = play_stream(
-            file, target, camera=name, frames=chosen, progress=progress_on(name or "camera"), max_memory=most
-        )
+            file, target, camera=name, frames=chosen, progress=progress_on(name or "camera"), max_memory=most,
+            size=pixels, renderer=chosen_renderer,
+        )  # fmt: skip
         typer.echo(f"{played.path}: {plural(played.frames, 'picture')}")
     fail_with(damage)
 
@@ -71,6 +89,7 @@ def evaluate(
             "--lpips-range", metavar="-1|0", help="Lower end of the range that file is given; default: its metadata."
         ),
     ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Every view of every frame as JSON, for scripts.")] = False,
     max_memory: MaxMemory = None,
 ) -> None:
     """Render the decoded frames and compare them with the recording's test cameras."""
@@ -93,15 +112,15 @@ def evaluate(
             playback.limit.check_pictures(meta.test.width, meta.test.height, len(meta.test))
             for frame in frames:
                 playback.state_at(frame)
-    uri = source or meta.extra.get("source_uri")
-    if not uri:
-        raise InputError(f"{file} does not say which recording it was made from; name it with --source")
-    recording = reopen_recording(str(uri), meta.recipe, load_catalog())
+    catalog = load_catalog()
+    uri = source or named_recording(file, meta, catalog)
+    check_recipe(file, meta.recipe)
+    recording = reopen_recording(uri, meta.recipe, catalog)
     try:
         evaluation = evaluate_stream(file, recording, frames=frames, lpips=lpips, progress=progress_on("frame"))
     finally:
         recording.close()
-    typer.echo(evaluation.table())
+    typer.echo(evaluation.to_json() if as_json else evaluation.table())
     fail_with(damage)
 
 
@@ -139,6 +158,38 @@ def _cameras(playback: Playback, wanted: str | None) -> list[str | None]:
     return list(found)
 
 
+def named_recording(file: Path, meta: StreamMeta, catalog: Catalog) -> str:
+    """The recording that a stream says it was made from, as far as it may be opened because a file says so.
+
+    Folders, the demo and synthetic scenes are read as they are. What waits (watch:) or is opened by a plugin is only
+    opened when the user names it. Raises InputError.
+    """
+    from gsstream.core.errors import InputError
+
+    uri = str(meta.extra.get("source_uri", ""))
+    if not uri:
+        raise InputError(f"{file} does not say which recording it was made from; name it with --source")
+    for scheme in uri.split(":")[:-1]:
+        entry = catalog.entries.get(("source", scheme))
+        if scheme == "watch" or (entry is not None and entry.plugin != "builtin"):
+            raise InputError(
+                f"{file} says that it was made from {uri[:200]!r}, which is not opened because a file says so; if you "
+                "trust it, name it yourself with --source"
+            )
+    return uri
+
+
+def check_recipe(file: Path, recipe: Mapping[str, Any]) -> None:
+    """Refuse a recipe in a stream whose scale or seed no run can have had. Raises InputError."""
+    from gsstream.core.errors import InputError
+
+    scale, seed = recipe.get("scale", 1.0), recipe.get("seed", 0)
+    if isinstance(scale, bool) or not isinstance(scale, int | float) or not 0 < scale <= 1:
+        raise InputError(f"{file}: its recipe says scale = {str(scale)[:40]!r}; expected a factor in (0, 1]")
+    if type(seed) is not int:
+        raise InputError(f"{file}: its recipe says seed = {str(seed)[:40]!r}; expected a whole number")
+
+
 def fail_with(damage: PacketError | None) -> None:
     """Raise what ended a stream early, once the frames before it are done: exit code 1 and the byte of the damage."""
     if damage is not None:
@@ -154,6 +205,19 @@ def frame_range(text: str | None) -> tuple[int | None, int | None]:
     if last is not None and last <= (first or 0):
         raise InputError(f"--frames {text}: expected A:B with A < B, e.g. 0:30, or A: for all frames from A on")
     return first, last
+
+
+def picture_size(text: str | None) -> tuple[int, int] | None:
+    """(width, height) meant by ``--size``; None: that of the camera. Raises InputError."""
+    from gsstream.core.errors import InputError
+
+    if text is None:
+        return None
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    width, height = (int(side) for side in match.groups()) if match else (0, 0)
+    if not (0 < width <= 1 << 16 and 0 < height <= 1 << 16):
+        raise InputError(f"--size {text}: expected WIDTHxHEIGHT in pixels, each 1 to 65536, e.g. 1280x720")
+    return width, height
 
 
 def size_of(text: str | None) -> int | None:

@@ -81,6 +81,12 @@ def test_evaluate_measures_what_is_sound_and_fails(tmp_path, capsys) -> None:
     quick = ["--set", "first_frame.max_iterations=5"]
     assert run_command([*arguments, "--out", str(out), "--quiet", *quick]) == 0
     capsys.readouterr()
+    assert run_command(["evaluate", str(out), "--json", "--max-memory", "100MB"]) == 0
+    views = json.loads(capsys.readouterr().out)["views"]
+    assert [view["frame"] for view in views] == [0, 1, 2, 3]
+    assert all(5 < view["psnr"] < 60 for view in views)
+    assert run_command(["evaluate", str(out), "--max-memory", "100KB"]) == 2
+    assert "the limit is 0.1 MB" in capsys.readouterr().err
     stream = out / "stream.gss"
     with StreamReader(stream) as reader:
         at = reader.frames[2].offset

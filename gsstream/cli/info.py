@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsstream.cli.listing import plural, table
+from gsstream.cli.listing import plural, printable, table
 from gsstream.cli.streams import Stream, progress_on, stream_file
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def _describe(playback: Playback) -> str:
     ]
     if reader.unfinished is not None:
         rows.append(("unfinished", f"{reader.unfinished.size} bytes from byte {reader.unfinished.offset}"))
-    lines = [plural(len(frames), "frame"), *(f"  {key:<11}{value}" for key, value in rows), ""]
+    lines = [plural(len(frames), "frame"), *(f"  {key:<11}{printable(value)}" for key, value in rows), ""]
     sizes: dict[str, list[int]] = {}
     for entry in reader.frames:
         sizes.setdefault(entry.kind.name.lower(), []).append(entry.size)

@@ -26,7 +26,7 @@ from gsstream.testing.examples.regularizer import ExampleRegularizer
 from gsstream.testing.examples.source import ExampleSource
 from gsstream.testing.examples.structure import ExampleStructure
 from gsstream.testing.examples.update import ExampleUpdate
-from gsstream.testing.examples.whole import ExampleWhole
+from gsstream.testing.examples.stepper import ExampleStepper
 from gsstream.testing.kit import all_checks, summary
 
 BUILTIN = [
@@ -34,7 +34,7 @@ BUILTIN = [
     ReferenceRenderer(), ReferenceLoss(), ReferenceAdam(), Hold(),
 ]  # fmt: skip
 EXAMPLES = [ExampleStructure(), ExampleConfidence(), ExamplePropagation(), ExampleGate(), ExampleRegularizer()]
-EXAMPLES += [ExampleWhole(), ExampleUpdate(), ExampleLoss()]
+EXAMPLES += [ExampleStepper(), ExampleUpdate(), ExampleLoss()]
 TINY = "synthetic:frames=4&views=3&width=32&height=24&supersample=1"
 SOURCES = [SourceUnderTest(ExampleSource, "square:"), SourceUnderTest(open_source, "demo")]
 SOURCES += [SourceUnderTest(open_source, TINY)]

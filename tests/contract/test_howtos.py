@@ -53,7 +53,7 @@ def test_the_example_passes_every_check_of_its_kind(kind: str, monkeypatch: pyte
 
 
 def test_there_is_a_page_for_every_kind_with_a_contract() -> None:
-    internal = {"loss", "optimiser", "whole"}  # whole methods have a page of their own
+    internal = {"loss", "optimiser", "stepper"}  # whole methods have a page of their own
     assert {*PAGES, *internal} >= set(CONTRACTS)
 
 

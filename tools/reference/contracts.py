@@ -59,9 +59,9 @@ ELSEWHERE = {
 def hooks() -> str:
     """Every hook, what it returns, and what a part of each kind has to implement, with exact signatures."""
     from gsstream.cli.plugins import setting_rows
+    from gsstream.core.kinds import CONTRACTS
     from gsstream.core.part import Traits
     from gsstream.plugins import hookspecs
-    from gsstream.plugins.catalog import CONTRACTS
     from gsstream.source.base import FrameSource
     from gsstream.spec import KINDS, ComponentSpec, MethodSpec
 

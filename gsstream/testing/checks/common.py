@@ -73,7 +73,7 @@ def check_frozen_and_final(part: Part) -> None:
         assert twin == part, f"{how} gives another part: expected {part!r}, got {twin!r}"
 
 
-@check("common", kinds=(*BEHAVED, "update", "whole"))
+@check("common", kinds=(*BEHAVED, "update", "stepper"))
 def check_docstring(part: Part) -> None:
     """The class says what it is and where the idea is from (paper, released code, ours)."""
     text = inspect.cleandoc(vars(type(part)).get("__doc__") or "")

@@ -1,4 +1,4 @@
-"""A whole method that follows the light: one colour shift a frame for the whole scene."""
+"""A method that follows the light: one colour shift a frame for the whole scene."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from gsstream.api import Delta, Frame, PartConfig, PlayerState, Step, StreamingMethod, Tools, send_delta, send_key
+from gsstream.api import Delta, Frame, PartConfig, PlayerState, Residual, Step, StreamingMethod, Tools, send_delta, send_key
 
 #: Colour of one unit of the degree-0 spherical-harmonic coefficient.
 SH0 = 0.2820948
@@ -23,7 +23,7 @@ class Carried:
 
 
 @final
-class ExampleWhole(StreamingMethod[Carried]):
+class ExampleStepper(StreamingMethod[Carried]):
     """Adds the mean colour difference between the cameras and the scene to every Gaussian (ours)."""
 
     class Config(PartConfig):
@@ -42,11 +42,11 @@ class ExampleWhole(StreamingMethod[Carried]):
         shift = torch.stack([(work.image(v) - work.previous_render(v)).mean((0, 1)) for v in views]).mean(0) / SH0
         symbols = torch.round(shift / self.config.step).to(torch.int32).numpy()
         if frame.effort == 0 or not symbols.any():
-            packet, player = send_delta(state.player, Delta(np.zeros(1, np.uint8), 1))
+            packet, player = send_delta(state.player, Delta())
             return Step(Carried(player), packet, "empty")
         rows = np.tile(symbols, (len(state.player.gaussians), 1))
-        delta = Delta(np.ones(1, np.uint8), 1, {"sh0": rows}, {"sh0": self.config.step})
-        packet, player = send_delta(state.player, delta)
+        residual = Residual(np.ones(1, np.uint8), 1, {"sh0": rows}, {"sh0": self.config.step})
+        packet, player = send_delta(state.player, Delta((residual,)))
         return Step(Carried(player), packet, "delta")
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> Carried:

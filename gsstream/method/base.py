@@ -1,7 +1,7 @@
 """StreamingMethod: the one interface to a method, three calls. What it sends is played by every player.
 
 A method is given a frame and what the engine can do (``Tools``), and returns a packet and the state it goes on from. The
-engine keeps the rest: recordings, recipes, the stream on disk, metrics, resume. ``engine.step.method.PartsMethod`` is
+engine keeps the rest: recordings, recipes, the stream on disk, metrics, resume. ``engine.method.parts.PartsMethod`` is
 the method made of parts; QUEEN is another one, built differently.
 """
 

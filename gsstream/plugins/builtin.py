@@ -20,7 +20,7 @@ def gsstream_components() -> list[ComponentSpec]:
         _part("update", "additive", "residual.additive:Additive", "gated change added to raw attributes"),
         _part("motion", "still", "motion.still:Still", "nothing is carried along"),
         _part("growth", "none", "growth.none:NoGrowth", "nothing is born and nothing leaves"),
-        _part("stepper", "parts", "engine.step.method:PartsMethod", "the slots of the recipe, one after the other"),
+        _part("stepper", "parts", "engine.method.parts:PartsMethod", "the slots of the recipe, one after the other"),
         _part("stepper", "hold", "method.hold:Hold", "frame 0 and nothing after it"),
         _part("renderer", "reference", "render.reference:ReferenceRenderer", "pure torch, slow, defines the truth"),
         _part("loss", "reference", "loss.photometric:ReferenceLoss", "L1 + D-SSIM in torch, slow, defines the truth"),

@@ -17,7 +17,7 @@ import numpy as np
 
 from gsstream.core.errors import ComponentError, InputError, PluginUnavailable, ShapeError
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.engine.run.held import RepeatedFrameWarning
+from gsstream.engine.method.held import RepeatedFrameWarning
 from gsstream.engine.run.recording import open_recording
 from gsstream.engine.run.session import METRICS, STREAM, run
 from gsstream.method.base import Step

@@ -22,7 +22,7 @@ from gsstream.engine.frame0.begin import cloud_of
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.frame0.root import Progress
 from gsstream.engine.keys.resume import check_stream, ended, since_key
-from gsstream.engine.run.held import begin_held, step_held
+from gsstream.engine.method.held import begin_held, step_held
 from gsstream.engine.run.threads import one_torch_thread
 from gsstream.engine.step.tools import RunTools
 from gsstream.method.base import Step

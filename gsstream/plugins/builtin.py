@@ -19,6 +19,8 @@ def gsstream_components() -> list[ComponentSpec]:
         _part("regularizer", "none", "regularizer.none:NoRegularizer", "nothing costs anything"),
         _part("update", "additive", "residual.additive:Additive", "gated change added to raw attributes"),
         _part("motion", "still", "motion.still:Still", "nothing is carried along"),
+        _part("motion", "coasting", "motion.coasting:Coasting", "what moved goes on moving"),
+        _part("motion", "rigid", "motion.rigid:Rigid", "one fitted rigid motion per group"),
         _part("growth", "none", "growth.none:NoGrowth", "nothing is born and nothing leaves"),
         _part("stepper", "parts", "engine.method.parts:PartsMethod", "the slots of the recipe, one after the other"),
         _part("stepper", "hold", "method.hold:Hold", "frame 0 and nothing after it"),

@@ -1,4 +1,4 @@
-"""Displacement: how far rows were moved by the last frame. Both ends compute it, so a motion can be predicted from it."""
+"""Displacement: how far rows were moved by the last frame. Both ends compute it, to predict motions from it."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Motion: groups of rows move rigidly, positions and orientations, as predicted from the last frame and corrected.
 
-A residual that is learned from zero in every frame cannot travel as far as a body does, so Gaussians are left behind and
-the body is repainted with what happens to stand there. A motion carries them along: it costs a bit or so per group where
-the prediction holds, and six small integers where it does not.
+A residual that is learned from zero in every frame cannot travel as far as a body does, so Gaussians are left behind
+and the body is repainted with what happens to stand there. A motion carries them along: it costs a bit or so per group
+where the prediction holds, and six small integers where it does not.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Groups:
     count: int
 
     def gathered(self, source: IntArray) -> Groups:
-        """Return the groups of the rows after births and deaths; a birth joins the group of the row stored before it."""
+        """Return the groups after births and deaths; a birth joins the group of the row stored before it."""
         number = len(self.group_of)
         if number == 0 or len(source) == 0:
             return replace(self, group_of=np.zeros(len(source), np.int32))

@@ -54,8 +54,8 @@ class Listeners:
 class Encoder:
     """Encodes the frames of one recording with one method, in memory.
 
-    :meth:`encode` takes the frames in order and returns a :class:`gsstream.method.base.Step` for each: its ``packet`` is
-    what a player reads, its ``metrics`` say what the frame cost. A frame that fails leaves the encoder as it was.
+    :meth:`encode` takes the frames in order and returns a :class:`gsstream.method.base.Step` for each: its ``packet``
+    is what a player reads, its ``metrics`` say what the frame cost. A frame that fails leaves the encoder as it was.
 
     Arguments:
         parts: the live parts of a recipe (``engine.assembly.assemble``).

@@ -24,7 +24,7 @@ _MAX_SHIFT = 1e18
 
 
 def encode_motions(motions: tuple[Motion, ...]) -> list[tuple[str, bytes]]:
-    """Return the section that holds the motions of a frame; none without any. Raises ShapeError for what is no motion."""
+    """Return the section that holds the motions of a frame; none without any. Raises ShapeError for a bad one."""
     if not motions:
         return []
     if len(motions) > MAX_MOTIONS:

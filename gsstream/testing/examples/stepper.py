@@ -9,7 +9,18 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from gsstream.api import Delta, Frame, PartConfig, PlayerState, Residual, Step, StreamingMethod, Tools, send_delta, send_key
+from gsstream.api import (
+    Delta,
+    Frame,
+    PartConfig,
+    PlayerState,
+    Residual,
+    Step,
+    StreamingMethod,
+    Tools,
+    send_delta,
+    send_key,
+)
 
 #: Colour of one unit of the degree-0 spherical-harmonic coefficient.
 SH0 = 0.2820948

@@ -20,7 +20,7 @@ from gsstream_cpu_render.arrays import (
     require_splats,
 )
 from gsstream_cpu_render.checks import Float32, native_array, refuse
-from gsstream_cpu_render.native import NativeRasterizer
+from gsstream_cpu_render.native import NativeRasterizer, native_scene
 from gsstream_cpu_render.view import NEAR, Background
 
 
@@ -82,7 +82,7 @@ class NumpyRasterizer(NativeRasterizer):
         splats = require_splats(splats)
         mask = require_mask(tile_mask, self.width, self.height)
         target = self._target(image, transmittance)
-        faults = self._call("forward", *splats, *self._view, mask, *target)
+        faults = self._call("forward", native_scene(splats), *self._view, mask, *target)
         raise_on_faults(faults, splats)
         self._coefficients, self._scene_rows = splats.shN.shape[1] + 1, len(splats.means)
         return target
@@ -109,16 +109,6 @@ class NumpyRasterizer(NativeRasterizer):
         gradients = self._gradients(rows, out)
         self._call("backward", *self._upstream(v_image, v_alpha), *gradients, compact)
         return gradients
-
-    def backward_screen(self, v_image: Float32) -> Float32:
-        """Gradient of sum(v_image * image) with respect to the 2-D means of all Gaussians: [N, 2], pixels.
-
-        Raises:
-            InputError: wrong dtype, shape or layout, or no matching forward.
-        """
-        v_means2d = np.empty((self._scene_rows, 2), np.float32)
-        self._call("backward_screen", self._upstream(v_image, None)[0], v_means2d)
-        return v_means2d
 
     def visible_rows(self) -> NDArray[np.uint32]:
         """Ascending rows that touch a wanted tile in the last pass (after an active pass: indices into active_ids)."""
@@ -176,7 +166,8 @@ class NumpyRasterizer(NativeRasterizer):
         """
         rows = require_splats(rows, self._native.active_count)
         target = self._target(image, transmittance)
-        raise_on_faults(self._call("forward_active", *rows, self._view.background, *target, touched_only), rows)
+        faults = self._call("forward_active", native_scene(rows), self._view.background, *target, touched_only)
+        raise_on_faults(faults, rows)
         self._coefficients = rows.shN.shape[1] + 1
         return target
 
@@ -210,13 +201,13 @@ class NumpyRasterizer(NativeRasterizer):
         changed = native_array("changed", changed, np.uint32, ("A",))
         rows = require_splats(rows, len(changed))
         target = self._target(image, transmittance)
-        raise_on_faults(self._call("update", changed, *rows, self._view.background, *target), rows)
+        raise_on_faults(self._call("update", changed, native_scene(rows), self._view.background, *target), rows)
 
     def backward_cached(self, splats: SplatArrays, v_image: Float32) -> tuple[Float32, NDArray[np.bool_]]:
         """Gradient of sum(v_image * image) of the cached scene by its 2-D means [N, 2], and who is visible [N] bool.
 
         Nothing is rendered, and work follows the pixels at which ``v_image`` [H, W, 3] is not zero. Same bits as
-        `backward_screen` of a full forward. A backward of an active pass may still follow.
+        `backward` of a full forward gives. A backward of an active pass may still follow.
 
         Arguments:
             splats: the values the cache was made of (`forward`, then every `update`).
@@ -226,7 +217,7 @@ class NumpyRasterizer(NativeRasterizer):
         """
         splats = require_splats(splats)
         v_means2d, visible = np.empty((len(splats.means), 2), np.float32), np.empty(len(splats.means), np.uint8)
-        self._call("backward_cached", *splats, self._upstream(v_image, None)[0], v_means2d)
+        self._call("backward_cached", native_scene(splats), self._upstream(v_image, None)[0], v_means2d)
         self._call("visible_in_cache", visible)
         return v_means2d, visible.view(np.bool_)
 

@@ -80,6 +80,13 @@ class NativeRasterizer:
 
     # ---- checks
 
+    def _expect(self, operation: str) -> None:
+        """Raise InputError unless this operation may follow now: before its arguments are held against the last pass."""
+        try:
+            self._native.expect(operation)
+        except ValueError as error:
+            refuse_value(str(error))
+
     def _call(self, name: str, *arguments: object) -> int:
         try:
             return getattr(self._native, name)(*arguments) or 0

@@ -105,6 +105,7 @@ class NumpyRasterizer(NativeRasterizer):
         Raises:
             InputError: wrong dtype, shape or layout, or no matching forward.
         """
+        self._expect("backward")
         rows = self._native.visible_count if compact else self._scene_rows
         gradients = self._gradients(rows, out)
         self._call("backward", *self._upstream(v_image, v_alpha), *gradients, compact)
@@ -143,6 +144,7 @@ class NumpyRasterizer(NativeRasterizer):
         if not isinstance(active_ids, np.ndarray) or active_ids.dtype != np.uint32 or active_ids.ndim != 1:
             got = f"{getattr(active_ids, 'dtype', type(active_ids).__name__)} {list(np.shape(active_ids))}"
             refuse(f"active_ids: expected uint32 [A], got {got}; convert with ids.astype(np.uint32)")
+        self._expect("freeze")
         self._call("freeze", require_mask(tile_mask, self.width, self.height), np.ascontiguousarray(active_ids))
 
     def forward_active(
@@ -164,6 +166,7 @@ class NumpyRasterizer(NativeRasterizer):
         Raises:
             InputError: wrong dtype, shape or layout, values that are not finite, no `freeze` since the last forward.
         """
+        self._expect("forward_active")
         rows = require_splats(rows, self._native.active_count)
         target = self._target(image, transmittance)
         faults = self._call("forward_active", native_scene(rows), self._view.background, *target, touched_only)
@@ -179,6 +182,7 @@ class NumpyRasterizer(NativeRasterizer):
         Raises:
             InputError: wrong dtype, shape or layout, or no matching forward_active.
         """
+        self._expect("backward_active")
         gradients = self._gradients(self._native.active_count, out)
         self._call("backward_active", *self._upstream(v_image, v_alpha), *gradients)
         return gradients
@@ -233,6 +237,7 @@ class NumpyRasterizer(NativeRasterizer):
         Raises:
             InputError: wrong dtype or shape, no full forward yet, tiles that are not cached.
         """
+        self._expect("drawn_in_cache")
         drawn = np.empty(self._native.scene_count, np.uint8)
         self._call("drawn_in_cache", require_mask(tile_mask, self.width, self.height), drawn)
         return drawn.view(np.bool_)
@@ -249,6 +254,7 @@ class NumpyRasterizer(NativeRasterizer):
         Raises:
             InputError: no full forward yet, or tiles that are not cached.
         """
+        self._expect("forward_cached")
         target = self._target(image, transmittance)
         self._call("forward_cached", self._view.background, require_mask(tile_mask, self.width, self.height), *target)
         return target

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cstring>
+#include <iterator>
 #include <stdexcept>
 #include <string>
 
@@ -24,28 +25,21 @@ Rasterizer::Rasterizer()
       composite_kernels_(composite_kernels()) {}
 Rasterizer::~Rasterizer() = default;
 
-void Rasterizer::expect(State needed, const char* operation) const {
+void Rasterizer::expect(const std::string& operation) const {
+  const auto named = [&](const Rule& rule) { return operation == rule.operation; };
+  const Rule* rule = std::find_if(std::begin(RULES), std::end(RULES), named);
+  if (rule == std::end(RULES)) throw std::invalid_argument("expect: no operation is called '" + operation + "'.");
+  const bool frozen = state_ == State::frozen || state_ == State::active_passed;
   const char* missing = nullptr;
-  switch (needed) {
-    case State::empty:
-      break;
-    case State::cached:
-      if (state_ == State::empty)
-        missing = "expected a forward pass of the whole scene before, got none. Call forward first.";
-      break;
-    case State::passed:
-      if (state_ != State::passed) missing = "expected a forward pass before, got none (or another pass since).";
-      break;
-    case State::frozen:
-      if (state_ != State::frozen && state_ != State::active_passed)
-        missing = "expected freeze(tile_mask, active_ids) before, got none since the last forward or update.";
-      break;
-    case State::active_passed:
-      if (state_ != State::active_passed)
-        missing = "expected a forward_active pass before, got none (or another pass since).";
-      break;
-  }
-  if (missing) throw std::invalid_argument(std::string(operation) + ": " + missing);
+  if (rule->needs == State::cached && state_ == State::empty)
+    missing = "a forward pass of the whole scene before, got none. Call forward first.";
+  if (rule->needs == State::passed && state_ != State::passed)
+    missing = "a forward pass before, got none (or another pass since).";
+  if (rule->needs == State::frozen && !frozen)
+    missing = "freeze(tile_mask, active_ids) before, got none since the last forward or update.";
+  if (rule->needs == State::active_passed && state_ != State::active_passed)
+    missing = "a forward_active pass before, got none (or another pass since).";
+  if (missing) throw std::invalid_argument(operation + ": expected " + missing);
 }
 
 void Rasterizer::drop_pass() {
@@ -54,7 +48,7 @@ void Rasterizer::drop_pass() {
 }
 
 TileSelection Rasterizer::cached_tiles(const uint8_t* mask, const char* operation) const {
-  expect(State::cached, operation);
+  expect(operation);
   TileSelection wanted;
   wanted.build(camera_.width, camera_.height, mask);
   if (!cached_selection_.contains(wanted))
@@ -199,7 +193,7 @@ uint32_t Rasterizer::list_active(const Scene& rows, const TileSelection& selecti
 
 uint32_t Rasterizer::forward_active(const Scene& rows, const Target& target, bool touched_only) {
   const Claim claim(busy_);
-  expect(State::frozen, "forward_active");
+  expect("forward_active");
   drop_pass();
   passes_++;
   const uint32_t faults = list_active(rows, selection_);
@@ -260,13 +254,13 @@ void Rasterizer::differentiate(const float* image_gradient, const float* alpha_g
 void Rasterizer::backward(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out,
                           bool compact) {
   const Claim claim(busy_);
-  expect(State::passed, "backward");
+  expect("backward");
   differentiate(image_gradient, alpha_gradient, out, compact);
 }
 
 void Rasterizer::backward_active(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out) {
   const Claim claim(busy_);
-  expect(State::active_passed, "backward_active");
+  expect("backward_active");
   differentiate(image_gradient, alpha_gradient, out, false);
 }
 

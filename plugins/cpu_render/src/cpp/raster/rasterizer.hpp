@@ -12,6 +12,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <memory>
+#include <string>
 #include <vector>
 
 #include "runtime/buffer.hpp"
@@ -47,6 +48,32 @@ struct PixelTrace {
 
 class Rasterizer {
  public:
+  // What there is to work with. `passed` (a forward whose backward may follow) offers what `cached` does, `frozen` too,
+  // and `active_passed` (a forward_active whose backward may follow) what `frozen` does.
+  enum class State { empty, cached, passed, frozen, active_passed };
+  // What each operation needs and leaves behind. When it fails, forward leaves `empty` and forward_active `frozen`; on
+  // `empty`, forget and shed_scratch do nothing.
+  struct Rule {
+    const char* operation;
+    State needs;
+    const char* leaves;
+  };
+  static constexpr Rule RULES[] = {
+      {"forward", State::empty, "passed"},
+      {"backward", State::passed, "the same"},
+      {"freeze", State::cached, "frozen"},
+      {"forward_active", State::frozen, "active_passed"},
+      {"backward_active", State::active_passed, "the same"},
+      {"update", State::cached, "cached"},
+      {"backward_cached", State::cached, "the same"},
+      {"drawn_in_cache", State::cached, "the same"},
+      {"forward_cached", State::cached, "cached or frozen, without its pass"},
+      {"forget", State::empty, "cached or frozen, without its pass"},
+      {"shed_scratch", State::empty, "cached"},
+  };
+  // Throws std::invalid_argument unless the state offers what the operation needs.
+  void expect(const std::string& operation) const;
+
   Rasterizer();
   ~Rasterizer();
 
@@ -100,25 +127,8 @@ class Rasterizer {
   std::size_t cache_bytes() const;
 
  private:
-  // What there is to work with, and what each operation needs (at least) and leaves behind:
-  //
-  //   operation                                        needs           leaves
-  //   forward                                          -               passed; empty when it fails
-  //   backward                                         passed          the same
-  //   freeze                                           cached          frozen
-  //   forward_active                                   frozen          active_passed; frozen when it fails
-  //   backward_active                                  active_passed   the same
-  //   update, shed_scratch                             cached          cached
-  //   forward_cached, forget                           cached          without its pass: cached or frozen
-  //   backward_cached, drawn_in_cache                  cached          the same
-  //
-  // `passed` offers what `cached` does, `active_passed` what `frozen` does, and both of these what `cached` does.
-  // On `empty`, shed_scratch and forget do nothing; all others refuse.
-  enum class State { empty, cached, passed, frozen, active_passed };
   class Claim;
 
-  // Throws std::invalid_argument unless the state offers what `operation` needs.
-  void expect(State needed, const char* operation) const;
   // No backward may follow.
   void drop_pass();
   // The selection of the caller's mask. Throws std::invalid_argument where the cache does not cover it.

@@ -197,6 +197,8 @@ void bind_rasterizer(nb::module_& module) {
   nb::class_<PyRasterizer>(module, "Rasterizer",
                            "Rasteriser of one camera; see gsstream_cpu_render.rasterizer for the checked interface.")
       .def(nb::init<>())
+      .def("expect", [](const PyRasterizer& r, const std::string& operation) { r.rasterizer().expect(operation); },
+           nb::arg("operation"), "Raises ValueError unless this operation may follow now; see rasterizer.hpp.")
       .def("forward", &PyRasterizer::forward, nb::arg("scene"), strict("viewmat"), strict("K"), nb::arg("width"),
            nb::arg("height"), nb::arg("near"), strict("background"), strict("tile_mask").none(), GSS_TARGET,
            "Returns FAULT_* bits; 0 means rendered.")

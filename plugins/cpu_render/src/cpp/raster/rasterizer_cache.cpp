@@ -11,7 +11,7 @@ namespace gsstream_cpu {
 
 uint32_t Rasterizer::update(const uint32_t* changed, const Scene& rows, const Target& target) {
   const Claim claim(busy_);
-  expect(State::cached, "update");
+  expect("update");
   set_active(changed, rows.count, "update: changed");
   passes_++;
   const uint32_t faults = list_active(rows, cached_selection_);
@@ -61,7 +61,7 @@ void Rasterizer::replace_tiles(const std::vector<uint32_t>& changed_tiles) {
 
 void Rasterizer::backward_cached(const Scene& scene, const float* image_gradient, float* means2d_gradient) {
   const Claim claim(busy_);
-  expect(State::cached, "backward_cached");
+  expect("backward_cached");
   if (scene.count != scene_count_)
     throw std::invalid_argument("backward_cached: expected the scene of the cached forward pass with " +
                                 std::to_string(scene_count_) + " rows, got " + std::to_string(scene.count) + ".");

@@ -41,7 +41,7 @@ def _step(name: str, value: torch.Tensor, gradient: torch.Tensor, state: AdamSta
     moments = [part.numpy().reshape(rows, -1) for part in (state.exp_avg, state.exp_avg_sq)]
     try:
         bad = _native.adam_update(
-            *table, *moments, state.steps.numpy(), 1, None, None, *rates, *ADAM_BETAS, ADAM_EPS, False, True
+            *table, *moments, state.steps.numpy(), None, None, *rates, *ADAM_BETAS, ADAM_EPS, True
         )
     except (TypeError, ValueError) as error:
         for label, tensor in (("values", value), ("gradient", gradient), ("exp_avg", state.exp_avg)):

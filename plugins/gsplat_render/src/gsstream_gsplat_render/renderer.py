@@ -48,11 +48,6 @@ class GsplatRenderer(Renderer):
             view, gaussians
         )
 
-    def screen_gradient(
-        self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, image_gradient: torch.Tensor
-    ) -> ScreenGradient:
-        return screen_gradient(self._kernels, self.config.device, gaussians, cameras, view, image_gradient)
-
     def open(
         self,
         gaussians: Gaussians[torch.Tensor],

@@ -1,4 +1,4 @@
-"""Recipes of the leap from key frame to key frame: what a method would send, or everything that helps."""
+"""Recipes of the step from one key frame to the next: the method's own, or one with every gate open."""
 
 from __future__ import annotations
 

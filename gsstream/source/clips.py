@@ -13,6 +13,8 @@ from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
 from gsstream.source.images import PICTURE_FORMATS, read_image
 
+#: What to do about cameras of different sizes, for messages.
+PREPARE = "'gsstream scene prepare' brings pictures to one size"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 

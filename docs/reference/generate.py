@@ -217,8 +217,11 @@ def hooks() -> str:
     signature = "`auto_rules = {SETTING: rule}`, `rule(facts, settings) -> Choice(value, why, ladder=())`"
     lines += ["## Rules of `auto`", "", signature]
     lines += ["([how](../howto/auto.md)). What a rule is told:", "", "```", rules, "```", ""]
-    lines += ["## Traits", "", "What a part claims, `traits = Traits(...)`; each claim calls for checks.", ""]
-    lines += ["```", inspect.getdoc(Traits) or "", "```", ""]
+    lines += ["## Traits", "", "What a part claims, `traits = GateTraits(...)`; each claim calls for checks.", ""]
+    for kind in CONTRACTS:
+        record = type(_named(CONTRACTS[kind]).traits)
+        if record is not Traits:
+            lines += [f"### {record.__name__}", "", "```", inspect.getdoc(record) or "", "```", ""]
     return "\n".join(lines)
 
 

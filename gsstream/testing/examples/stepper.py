@@ -35,7 +35,9 @@ class Carried:
 
 @final
 class ExampleStepper(StreamingMethod[Carried]):
-    """Adds the mean colour difference between the cameras and the scene to every Gaussian (ours)."""
+    """Adds the mean colour difference between the cameras and the scene to every Gaussian."""
+
+    source = "gsstream"
 
     class Config(PartConfig):
         step: float = Field(default=0.02, gt=0, le=1, description="quantisation step of the shift, sh0 units, to 1")

@@ -18,6 +18,8 @@ from gsstream_cpu_render.checks import native_array, refuse, refuse_value
 class CpuAdam(RowOptimiser):
     """Native and fused: one call per table, threaded where a table is large."""
 
+    source = "Adam (Kingma and Ba 2015)"
+
     def step(
         self,
         values: Mapping[str, torch.Tensor],

@@ -26,6 +26,8 @@ class CpuRenderer(Renderer):
     the same bits as a render of the whole scene.
     """
 
+    source = "3DGS (Kerbl et al. 2023)"
+
     class Config(PartConfig):
         """Threads: gsstream_cpu_render.threads; instruction set: environment GSSTREAM_ISA."""
 

@@ -34,6 +34,8 @@ class GsplatRenderer(Renderer):
     Raises PluginUnavailable on construction when there is no GPU, no gsplat, or no compiled kernels.
     """
 
+    source = "gsplat (Ye et al. 2024)"
+
     class Config(PartConfig):
         device: str = Field(default="cuda", pattern=r"^cuda(:\d+)?$", description="the GPU, e.g. cuda or cuda:1")
 

@@ -52,6 +52,8 @@ class Queen(StreamingMethod[QueenState]):
     from what is published, and why: README of this plugin.
     """
 
+    source = "QUEEN (Girish et al. 2024)"
+
     Config = QueenConfig
     heeds = ("stream.epochs",)
 

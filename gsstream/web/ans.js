@@ -1,7 +1,6 @@
 // The entropy decoder: the stack coder of constriction 0.5 (64-bit state, 32-bit words) with 24-bit categorical models.
 //
-// The state is kept as two 32-bit halves in ordinary numbers: no product below exceeds 2^45, so all of it is exact
-// without BigInt.
+// The state is kept as two halves of 32 bits; no product below exceeds 2^49, so all of it is exact without BigInt.
 
 import { PacketError } from "./errors.js";
 
@@ -67,15 +66,15 @@ export class AnsDecoder {
 
   _word() {
     this.left -= 1;
-    return this.view.getUint32(4 * this.left, true);
+    return this.view.getInt32(4 * this.left, true);
   }
 
-  /** Fill `out[start], out[start + stride], ...` with `number` symbols of a model given by `quantiseCounts`. */
-  decode(model, out, start, stride, number) {
+  /** Fill `out` with the next symbols of a model given by `quantiseCounts`, plus `low`. */
+  decode(model, shift, out) {
     const guide = searchGuide(model);
     const { view } = this;
     let { low, high, left } = this;
-    for (let i = 0, at = start; i < number; i += 1, at += stride) {
+    for (let i = 0; i < out.length; i += 1) {
       const quantile = low & (TOTAL - 1);
       let symbol = guide[quantile >>> GUIDE_SHIFT];
       let last = guide[(quantile >>> GUIDE_SHIFT) + 1];
@@ -86,19 +85,18 @@ export class AnsDecoder {
       }
       const begin = model[symbol];
       const width = model[symbol + 1] - begin;
-      // state = (state >> 24) * width + (quantile - begin), in two pieces of 20 bits.
-      const upper = high >>> 12;
-      const lower = ((high & 0xfff) << 8) | (low >>> 24);
-      const small = lower * width + (quantile - begin);
-      const big = upper * width + Math.floor(small / 1048576);
-      high = Math.floor(big / 4096);
-      low = (big % 4096) * 1048576 + (small % 1048576);
+      // state = (state >> 24) * width + rest: the low half by integer products, the high half in exact pieces.
+      const rest = quantile - begin;
+      const small = (high & 0xffff) * width * 256 + ((low >>> 24) * width + rest);
+      const big = (high >>> 16) * width + Math.floor(small / 16777216);
+      low = (Math.imul((high << 8) | (low >>> 24), width) + rest) | 0;
+      high = Math.floor(big / 256) | 0;
       if (high === 0 && left > 0) {
         left -= 1;
         high = low;
-        low = view.getUint32(4 * left, true);
+        low = view.getInt32(4 * left, true);
       }
-      out[at] = symbol;
+      out[i] = symbol + shift;
     }
     this.low = low;
     this.high = high;

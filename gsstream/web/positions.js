@@ -9,7 +9,7 @@ const MAX_EXPONENT = 60;
 const MAX_CELL = 2 ** 29;
 const LOG2E = 1512775;
 
-/** Decode [N, 3] positions into a Float32Array. `scales`: [N, 3] integer codes with `bits` fractional bits. */
+/** Decode [N, 3] positions into a Float32Array. `scales`: integer codes of three channels with `bits` fractional bits. */
 export function decodePositions(data, scales, bits, number) {
   if (number === 0) {
     if (data.length) throw new PacketError(`${data.length} bytes for no positions`);
@@ -25,7 +25,7 @@ export function decodePositions(data, scales, bits, number) {
   const depths = new Uint8Array(number);
   let total = 0;
   for (let i = 0; i < number; i += 1) {
-    const smallest = Math.min(scales[3 * i], scales[3 * i + 1], scales[3 * i + 2]);
+    const smallest = Math.min(scales[i], scales[number + i], scales[2 * number + i]);
     const exponent = Math.max(floor, Math.floor((smallest * LOG2E) / 2 ** (20 + bits)) - fineness);
     depths[i] = Math.max(0, cell - exponent);
     total += 3 * depths[i];
@@ -35,12 +35,16 @@ export function decodePositions(data, scales, bits, number) {
   return place(cells, depths, fields, 2 ** cell);
 }
 
-/** Running sums of the moves, as exact float64 integers. */
+/** Running sums of the moves, as exact float64 integers, row by row. */
 function checkCells(moves, number) {
   const cells = new Float64Array(3 * number);
-  for (let i = 0; i < 3 * number; i += 1) {
-    cells[i] = moves[i] + (i < 3 ? 0 : cells[i - 3]);
-    if (Math.abs(cells[i]) > MAX_CELL) throw new PacketError("means: a cell is out of range");
+  for (let axis = 0; axis < 3; axis += 1) {
+    let cell = 0;
+    for (let i = 0; i < number; i += 1) {
+      cell += moves[axis * number + i];
+      if (cell > MAX_CELL || cell < -MAX_CELL) throw new PacketError("means: a cell is out of range");
+      cells[3 * i + axis] = cell;
+    }
   }
   return cells;
 }
@@ -58,6 +62,7 @@ function checkFields(fields, total) {
 function place(cells, depths, fields, side) {
   const out = new Float32Array(cells.length);
   let at = 0;
+  const steps = Float64Array.from({ length: MAX_DEPTH + 1 }, (_, depth) => 2 ** -depth);
   for (let i = 0; i < cells.length; i += 1) {
     const depth = depths[(i / 3) | 0];
     let field = 0;
@@ -69,7 +74,7 @@ function place(cells, depths, fields, side) {
       at += taken;
       left -= taken;
     }
-    out[i] = (cells[i] + field * 2 ** -depth) * side;
+    out[i] = (cells[i] + field * steps[depth]) * side;
   }
   return out;
 }

@@ -7,7 +7,11 @@ import { MAX_BINS } from "./limits.js";
 
 const INT32 = 2 ** 31;
 
-/** Decode [rows, channels] symbols into an Int32Array. Throws PacketError when the bytes are not such a table. */
+/**
+ * Decode symbols of `rows` rows into an Int32Array, channel after channel: symbol (row, c) is at c * rows + row.
+ *
+ * Throws PacketError when the bytes are not such a table.
+ */
 export function decodeSymbols(data, rows, channels) {
   if (rows * channels === 0) {
     if (data.length) throw new PacketError(`${data.length} bytes for an empty table`);
@@ -24,30 +28,31 @@ export function decodeSymbols(data, rows, channels) {
   const out = new Int32Array(rows * channels);
   for (let channel = 0; channel < channels; channel += 1) {
     const model = models[channel];
-    if (model.counts.length > 1) {
+    const column = out.subarray(channel * rows, (channel + 1) * rows);
+    if (model.counts.length === 1) {
+      column.fill(model.low);
+    } else {
       model.cumulative ??= quantiseCounts(model.counts);
-      coder.decode(model.cumulative, out, channel, channels, rows);
+      coder.decode(model.cumulative, model.low, column);
     }
-    toValues(out, channel, channels, model, head);
+    if (model.escapes) readEscaped(column, model, head);
   }
   head.finish();
   if (!coder.isEmpty) throw new PacketError("entropy-coded words are left over after the last symbol");
   return out;
 }
 
-/** Bins into values, in place; escaped ones are read from the head. */
-function toValues(out, start, stride, model, head) {
-  const { low, bins, escapes } = model;
-  for (let at = start; at < out.length; at += stride) {
-    if (escapes && out[at] === bins) {
-      const below = head.bits(1);
-      const distance = head.gamma();
-      const value = below ? low - 1 - distance : low + bins + distance;
-      if (value < -INT32 || value >= INT32) throw new PacketError(`escaped symbol ${value} does not fit 32 bits`);
-      out[at] = value;
-    } else {
-      out[at] += low;
-    }
+/** Values that left the histogram stand in its last bin; they are read from the head. */
+function readEscaped(column, { low, bins }, head) {
+  // As 32 bits: the bin of a histogram that ends at 2^31 - 1 wraps around, in `column` as here.
+  const mark = (low + bins) | 0;
+  for (let i = 0; i < column.length; i += 1) {
+    if (column[i] !== mark) continue;
+    const below = head.bits(1);
+    const distance = head.gamma();
+    const value = below ? low - 1 - distance : low + bins + distance;
+    if (value < -INT32 || value >= INT32) throw new PacketError(`escaped symbol ${value} does not fit 32 bits`);
+    column[i] = value;
   }
 }
 

@@ -52,21 +52,32 @@ export function applyResidual(state, residual) {
   }
 }
 
-function addPart(values, rows, gate, { symbols, channels, step, decoder, width }) {
-  const { fround } = Math;
-  const latent = new Float32Array(channels);
-  for (let i = 0; i < rows.length; i += 1) {
-    for (let c = 0; c < channels; c += 1) latent[c] = fround(symbols[i * channels + c]) * step;
+function addPart(values, rows, gate, part) {
+  const { symbols, channels, step, width } = part;
+  const latents = new Float32Array(symbols.length);
+  for (let i = 0; i < symbols.length; i += 1) latents[i] = Math.fround(symbols[i]) * step;
+  if (part.decoder) addDecoded(values, rows, gate, latents, part.decoder.values, channels, width);
+  else addDirect(values, rows, gate, latents, width);
+}
+
+function addDirect(values, rows, gate, latents, width) {
+  const number = rows.length;
+  for (let i = 0; i < number; i += 1) {
+    const start = rows[i] * width;
+    for (let d = 0; d < width; d += 1) values[start + d] += Math.fround(latents[d * number + i] * gate[i]);
+  }
+}
+
+function addDecoded(values, rows, gate, latents, weights, channels, width) {
+  const number = rows.length;
+  for (let i = 0; i < number; i += 1) {
     const start = rows[i] * width;
     for (let d = 0; d < width; d += 1) {
-      let change = latent[d];
-      if (decoder) {
-        change = fround(latent[0] * decoder.values[d]);
-        for (let c = 1; c < channels; c += 1) {
-          change = fround(change + fround(latent[c] * decoder.values[c * width + d]));
-        }
+      let change = Math.fround(latents[i] * weights[d]);
+      for (let c = 1; c < channels; c += 1) {
+        change = Math.fround(change + Math.fround(latents[c * number + i] * weights[c * width + d]));
       }
-      values[start + d] += fround(change * gate[i]);
+      values[start + d] += Math.fround(change * gate[i]);
     }
   }
 }

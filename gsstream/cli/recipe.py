@@ -40,7 +40,7 @@ def show(
     catalog = load_catalog()
     resolved = resolve_recipe(method, catalog.recipe_path, recipe or (), options.overrides(settings))
     if full:
-        from gsstream.engine.assemble import assemble
+        from gsstream.engine.assembly.assemble import assemble
 
         resolved = assemble(resolved, catalog).resolved
     typer.echo(to_yaml(resolved), nl=False)

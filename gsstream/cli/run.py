@@ -11,7 +11,7 @@ from gsstream.cli import options
 from gsstream.cli.streams import stream_file
 
 if TYPE_CHECKING:
-    from gsstream.engine.session import RunResult
+    from gsstream.engine.run.session import RunResult
     from gsstream.source.base import FrameSource
 
 
@@ -38,7 +38,7 @@ def run(
     The recipe of the run is the method's, changed by --recipe FILE, then by --set and the short options. Ctrl-C ends
     after the current frame with a valid stream (exit code 130); --resume continues it to the same bytes.
     """
-    from gsstream.engine.output import prepare_output
+    from gsstream.engine.run.output import prepare_output
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
 
@@ -46,9 +46,9 @@ def run(
     catalog = load_catalog()
     resolved = resolve_recipe(method, catalog.recipe_path, recipe or (), changes)
     # The slow imports come last: a mistake on the command line is answered at once.
-    from gsstream.engine.assemble import assemble
-    from gsstream.engine.recording import open_recording, read_first_frame
-    from gsstream.engine.session import run as run_session
+    from gsstream.engine.assembly.assemble import assemble
+    from gsstream.engine.run.recording import open_recording, read_first_frame
+    from gsstream.engine.run.session import run as run_session
 
     assembly = assemble(resolved, catalog, checks)
     # Read before the folder is touched: --overwrite must not delete a run for the sake of a faulty recording.

@@ -74,7 +74,7 @@ def validate(
 ) -> None:
     """Say what is wrong with a scene, and what to do. Exit code 2 when a run would be wasted on it."""
     from gsstream.core.errors import InputError
-    from gsstream.engine.recording import open_recording
+    from gsstream.engine.run.recording import open_recording
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.model import Recipe
     from gsstream.scene.findings import CHECKS

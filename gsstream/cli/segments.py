@@ -16,7 +16,7 @@ from gsstream.cli.listing import plural, table
 from gsstream.cli.streams import stream_file
 
 if TYPE_CHECKING:
-    from gsstream.engine.assemble import Assembly
+    from gsstream.engine.assembly.assemble import Assembly
     from gsstream.recipe.load import ResolvedRecipe
     from gsstream.source.base import FrameSource
     from gsstream.trade.segments.drive import SegmentsResult, Setting
@@ -96,8 +96,8 @@ def _encode(
 
     catalog = load_catalog()
     resolved = resolve_recipe(method, catalog.recipe_path, recipe, changes)
-    from gsstream.engine.assemble import assemble
-    from gsstream.engine.recording import open_recording
+    from gsstream.engine.assembly.assemble import assemble
+    from gsstream.engine.run.recording import open_recording
     from gsstream.trade.gallery import SUMMARY, write_gallery
     from gsstream.trade.segments.drive import run_segments as drive
     from gsstream.trade.segments.job import run_segment
@@ -179,7 +179,7 @@ def _prepare(
 ) -> None:
     """Make sure that ``out`` holds nothing else, or exactly this run; overwriting removes what such a run writes."""
     from gsstream.core.errors import OutputError
-    from gsstream.engine.output import RUN_FILES, prepare_output
+    from gsstream.engine.run.output import RUN_FILES, prepare_output
     from gsstream.trade.segments.drive import KEY_STREAMS
     from gsstream.trade.segments.plan import PLAN, write_plan
 

@@ -64,7 +64,7 @@ def evaluate(
     """Render the decoded frames and compare them with the recording's test cameras."""
     file = stream_file(stream)
     from gsstream.core.errors import InputError
-    from gsstream.engine.recording import reopen_recording
+    from gsstream.engine.run.recording import reopen_recording
     from gsstream.metrics import OnnxLpips
     from gsstream.player.playback import Playback
     from gsstream.plugins.catalog import load_catalog

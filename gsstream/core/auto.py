@@ -56,7 +56,7 @@ class Choice:
     """A value, and in one line why this one.
 
     ``ladder``: values worth trying instead, in an order along which a scene is expected to get better up to a point and
-    worse from there; ``value`` is one of them. Empty: what a short fit of frame 0 cannot tell (``engine.trials``).
+    worse from there; ``value`` is one of them. Empty: what a short fit of frame 0 cannot tell (``engine.auto.trials``).
     """
 
     value: Any

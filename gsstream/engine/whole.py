@@ -18,17 +18,17 @@ from gsstream.core.frame import Frame
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
-from gsstream.engine.assemble import Assembly
-from gsstream.engine.backward import pull_back
-from gsstream.engine.begin import begin, begin_from, check_cameras, exposure_from_meta
-from gsstream.engine.checks import StepChecks
-from gsstream.engine.context import StepContext
-from gsstream.engine.frame_step import RepeatedFrameWarning
-from gsstream.engine.guard import fault, guarded
-from gsstream.engine.points import gather_points, with_test_views
-from gsstream.engine.resume import check_stream, replay
-from gsstream.engine.root import Progress
-from gsstream.engine.stream_state import StreamState
+from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.fit.backward import pull_back
+from gsstream.engine.frame0.begin import begin, begin_from, check_cameras, exposure_from_meta
+from gsstream.engine.assembly.checks import StepChecks
+from gsstream.engine.step.context import StepContext
+from gsstream.engine.step.frame_step import RepeatedFrameWarning
+from gsstream.engine.assembly.guard import fault, guarded
+from gsstream.engine.frame0.points import gather_points, with_test_views
+from gsstream.engine.keys.resume import check_stream, replay
+from gsstream.engine.frame0.root import Progress
+from gsstream.engine.state.stream_state import StreamState
 from gsstream.method.base import MethodState, Step, StreamingMethod
 from gsstream.method.tools import FirstFrame
 from gsstream.packet import PacketKind, PlayerState, StreamMeta, StreamReader, decode_packet

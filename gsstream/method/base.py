@@ -1,6 +1,6 @@
 """StreamingMethod: a whole method behind three calls. What it sends is played by every player.
 
-The five-part path (``engine.frame_step``) asks a method for its parts. A method that is built differently implements
+The five-part path (``engine.step.frame_step``) asks a method for its parts. A method that is built differently implements
 this contract instead: it is given a frame and what the engine can do (``Tools``), and returns a packet and the state it
 goes on from. The engine keeps the rest: recordings, recipes, the stream on disk, metrics, resume.
 """

@@ -7,12 +7,12 @@
 from gsstream.packet.base import FORMAT_VERSION as FORMAT_VERSION
 from gsstream.packet.base import EncodedPacket as EncodedPacket
 from gsstream.packet.base import PacketKind as PacketKind
+from gsstream.packet.changes.residual import quantise_decoders as quantise_decoders
 from gsstream.packet.delta import decode_delta as decode_delta
 from gsstream.packet.delta import decode_empty as decode_empty
 from gsstream.packet.delta import encode_delta as encode_delta
 from gsstream.packet.delta import encode_empty as encode_empty
 from gsstream.packet.delta import next_decoders as next_decoders
-from gsstream.packet.delta import quantise_decoders as quantise_decoders
 from gsstream.packet.key import KeyState as KeyState
 from gsstream.packet.key import decode_key as decode_key
 from gsstream.packet.key import encode_key as encode_key

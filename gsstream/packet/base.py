@@ -13,7 +13,7 @@ from typing import NamedTuple
 from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import ATTRIBUTES
 
-FORMAT_MAJOR, FORMAT_MINOR = 1, 1
+FORMAT_MAJOR, FORMAT_MINOR = 2, 0
 FORMAT_VERSION = f"{FORMAT_MAJOR}.{FORMAT_MINOR}"
 #: First byte not ASCII, a CR LF and a lone LF: text-mode transfers and terminals are noticed, as in PNG.
 MAGIC = b"\x89GSS\r\n\x1a\n"
@@ -29,7 +29,7 @@ MAX_GAUSSIANS_PER_BYTE = 64
 MAX_BODY = 1 << 30
 MAX_SECTIONS = 16
 MAX_META = 16 << 20
-MAX_LEVELS = 64
+MAX_UNITS = 64
 MAX_CHANNELS = 64
 WIDTHS: Mapping[str, tuple[int, ...]] = {
     "means": (3,), "quats": (4,), "scales": (3,), "opacities": (1,), "sh0": (3,), "shN": (0, 9, 24, 45)
@@ -47,6 +47,7 @@ class PacketKind(IntEnum):
 
 SECTION_NAMES: Mapping[int, str] = {
     1: "meta", 2: "layout", 3: "gates", 4: "decoders", 5: "index", 6: "deaths", 7: "births",
+    8: "motion",
     **{16 + i: name for i, name in enumerate(ATTRIBUTES)}
 }  # fmt: skip
 SECTION_IDS: Mapping[str, int] = {name: number for number, name in SECTION_NAMES.items()}
@@ -176,7 +177,8 @@ def parse_packet(data: bytes, offset: int = 0) -> tuple[PacketHeader, dict[str, 
         number, length = SECTION_HEADER.unpack_from(body, at)
         name = SECTION_NAMES.get(number)
         if name is None or name in found:
-            raise PacketError(f"section {number} is unknown or repeated", where)
+            why = "is unknown; upgrade gsstream" if name is None else "is repeated"
+            raise PacketError(f"section {number} {why}", where)
         at += SECTION_HEADER.size
         if length > len(body) - at:
             raise PacketError(f"section {name}: {length} bytes announced, {len(body) - at} left in the packet", where)

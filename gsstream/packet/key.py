@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsstream.core.delta import Layout
+from gsstream.core.changes import Layout
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.shapes import FloatArray
@@ -15,7 +15,7 @@ from gsstream.packet.base import (
     FREE_GAUSSIANS,
     MAX_GAUSSIANS,
     MAX_GAUSSIANS_PER_BYTE,
-    MAX_LEVELS,
+    MAX_UNITS,
     MAX_META,
     EncodedPacket,
     PacketKind,
@@ -82,53 +82,53 @@ def decode_key(data: bytes, *, offset: int = 0) -> KeyState:
         meta = meta_from_json(decompress(sections["meta"].data, MAX_META))
     with located(sections["layout"].offset):
         layout = _decode_layout(sections["layout"].data, most_gaussians(len(data)))
-    number = len(layout.octree_levels)
+    number = len(layout.unit_of)
     gaussians = decode_rows({name: sections[name] for name in ATTRIBUTES}, number)
     return KeyState(gaussians, layout, meta)
 
 
 def _check_layout(gaussians: Gaussians[FloatArray], layout: Layout) -> None:
-    number, levels = len(gaussians), layout.octree_levels
+    number, unit_of = len(gaussians), layout.unit_of
     if number > MAX_GAUSSIANS:
         raise ShapeError(f"expected at most {MAX_GAUSSIANS} Gaussians, got {number}")
-    if len(levels) != number or int(np.sum(layout.node_counts)) != number or np.any(np.asarray(layout.node_counts) < 0):
+    if len(unit_of) != number or int(np.sum(layout.node_counts)) != number or np.any(np.asarray(layout.node_counts) < 0):
         nodes = int(np.sum(layout.node_counts))
-        raise ShapeError(f"layout: expected {number} Gaussians, got nodes holding {nodes} and {len(levels)} levels")
-    if len(layout.node_counts) > MAX_GAUSSIANS or len(layout.cell_sizes) > MAX_LEVELS:
-        raise ShapeError(f"layout: at most {MAX_GAUSSIANS} nodes and {MAX_LEVELS} levels")
-    if number and int(np.max(levels)) >= len(layout.cell_sizes):
-        raise ShapeError(f"layout: level {int(np.max(levels))} has no cell size (there are {len(layout.cell_sizes)})")
+        raise ShapeError(f"layout: expected {number} Gaussians, got nodes holding {nodes} and {len(unit_of)} units")
+    if len(layout.node_counts) > MAX_GAUSSIANS or len(layout.units) > MAX_UNITS:
+        raise ShapeError(f"layout: at most {MAX_GAUSSIANS} nodes and {MAX_UNITS} units")
+    if number and int(np.max(unit_of)) >= len(layout.units):
+        raise ShapeError(f"layout: expected units 0 to {len(layout.units) - 1}, got {int(np.max(unit_of))}")
 
 
 def _encode_layout(layout: Layout) -> bytes:
-    head = _LAYOUT.pack(len(layout.octree_levels), len(layout.node_counts), len(layout.cell_sizes))
-    cells = np.asarray(layout.cell_sizes, "<f4").tobytes()
+    head = _LAYOUT.pack(len(layout.unit_of), len(layout.node_counts), len(layout.units))
+    units = np.asarray(layout.units, "<f4").tobytes()
     counts = encode_symbols(np.asarray(layout.node_counts, np.int32)[:, None])
-    return head + cells + pack_blobs([counts, encode_symbols(layout.octree_levels.astype(np.int32)[:, None])])
+    return head + units + pack_blobs([counts, encode_symbols(layout.unit_of.astype(np.int32)[:, None])])
 
 
 def _decode_layout(data: bytes, most: int) -> Layout:
     if len(data) < _LAYOUT.size:
         raise PacketError("layout cut short")
-    number, nodes, levels = _LAYOUT.unpack_from(data)
-    if number > most or nodes > most or levels > MAX_LEVELS:
+    number, nodes, number_of_units = _LAYOUT.unpack_from(data)
+    if number > most or nodes > most or number_of_units > MAX_UNITS:
         raise PacketError(
-            f"layout of {number} Gaussians, {nodes} nodes, {levels} levels is beyond the limits: at most {most} "
-            f"Gaussians and nodes in a packet of this size, {MAX_LEVELS} levels"
+            f"layout of {number} Gaussians, {nodes} nodes, {number_of_units} units is beyond the limits: at most {most} "
+            f"Gaussians and nodes in a packet of this size, {MAX_UNITS} units"
         )
     rest = data[_LAYOUT.size :]
-    if len(rest) < 4 * levels:
-        raise PacketError("cell sizes cut short")
-    cells = np.frombuffer(rest[: 4 * levels], "<f4").astype(np.float32)
-    counts_blob, levels_blob = unpack_blobs(rest[4 * levels :], 2)
+    if len(rest) < 4 * number_of_units:
+        raise PacketError("units cut short")
+    units = np.frombuffer(rest[: 4 * number_of_units], "<f4").astype(np.float32)
+    counts_blob, units_blob = unpack_blobs(rest[4 * number_of_units :], 2)
     counts = decode_symbols(counts_blob, nodes, 1)[:, 0]
     if nodes and (int(counts.min()) < 0 or int(counts.sum(dtype=np.int64)) != number):
         raise PacketError(f"layout: nodes hold {int(counts.sum(dtype=np.int64))} Gaussians, {number} were announced")
-    octree = decode_symbols(levels_blob, number, 1)[:, 0]
-    if number and not 0 <= int(octree.min()) <= int(octree.max()) < levels:
-        raise PacketError(f"layout: levels {int(octree.min())} to {int(octree.max())} need cell sizes, {levels} given")
+    unit_of = decode_symbols(units_blob, number, 1)[:, 0]
+    if number and not 0 <= int(unit_of.min()) <= int(unit_of.max()) < number_of_units:
+        raise PacketError(f"layout: units {int(unit_of.min())} to {int(unit_of.max())}, {number_of_units} are given")
     if number and not nodes:
         raise PacketError(f"layout: {number} Gaussians in no node")
-    if not (np.isfinite(cells).all() and (cells > 0).all()):
-        raise PacketError("layout: cell sizes must be finite and positive")
-    return Layout(np.ascontiguousarray(counts), octree.astype(np.uint8), cells)
+    if not (np.isfinite(units).all() and (units > 0).all()):
+        raise PacketError("layout: units must be finite and positive")
+    return Layout(np.ascontiguousarray(counts), unit_of.astype(np.uint8), units)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
-from gsstream.core.delta import Delta, Layout, apply_delta, next_layout
+from gsstream.core.changes import Delta, Layout, Scene, apply_delta
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
@@ -21,24 +21,33 @@ class PlayerState:
 
     Arguments:
         frame: frame index.
-        gaussians: the scene of that frame.
-        layout: how the scene is stored. meta: that of the last key packet.
+        scene: the scene of that frame, and what of the frames before it the next packet may refer to.
+        meta: that of the last key packet.
         decoders: the decoders last sent since then.
         delta: what the packet of this frame changed; None after a key or an empty packet.
         before: the layout that ``delta`` refers to, that of the frame before; None without a delta.
     """
 
     frame: int
-    gaussians: Gaussians[FloatArray]
-    layout: Layout
+    scene: Scene
     meta: StreamMeta
-    decoders: Mapping[str, FloatArray]
+    decoders: Mapping[str, FloatArray] = field(default_factory=dict)
     delta: Delta | None = None
     before: Layout | None = None
 
+    @property
+    def gaussians(self) -> Gaussians[FloatArray]:
+        """The Gaussians of this frame."""
+        return self.scene.gaussians
+
+    @property
+    def layout(self) -> Layout:
+        """How they are stored."""
+        return self.scene.layout
+
 
 def decode_packet(state: PlayerState | None, data: bytes, *, offset: int = 0) -> PlayerState:
-    """The state after one complete packet.
+    """Return the state after one complete packet.
 
     ``state`` is that of the frame before (a key packet needs none); ``offset`` is the packet's place in the file.
     Raises PacketError with the byte offset.
@@ -46,18 +55,16 @@ def decode_packet(state: PlayerState | None, data: bytes, *, offset: int = 0) ->
     header = parse_header(data, offset)
     if header.kind == PacketKind.KEY:
         key = decode_key(data, offset=offset)
-        return PlayerState(header.frame, key.gaussians, key.layout, key.meta, {})
+        return PlayerState(header.frame, Scene(key.gaussians, key.layout), key.meta)
     if state is None or header.frame != state.frame + 1:
         had = "none" if state is None else f"frame {state.frame}"
         raise PacketError(f"frame {header.frame} needs the state of the frame before it, got {had}", offset)
     if header.kind == PacketKind.EMPTY:
         decode_empty(data, offset=offset)
-        return PlayerState(header.frame, state.gaussians, state.layout, state.meta, state.decoders)
-    delta = decode_delta(data, state.layout, state.decoders, offset=offset)
+        return PlayerState(header.frame, replace(state.scene, moved=None), state.meta, state.decoders)
+    delta = decode_delta(data, state.scene, state.decoders, offset=offset)
     try:
-        gaussians = apply_delta(state.gaussians, state.layout, delta)
-        layout = next_layout(state.layout, delta)
+        scene = apply_delta(state.scene, delta)
     except ShapeError as error:
         raise PacketError(str(error), offset) from error
-    decoders = next_decoders(state.decoders, delta)
-    return PlayerState(header.frame, gaussians, layout, state.meta, decoders, delta, state.layout)
+    return PlayerState(header.frame, scene, state.meta, next_decoders(state.decoders, delta), delta, state.layout)

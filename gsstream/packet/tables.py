@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsstream.core.delta import Layout
+from gsstream.core.changes import Layout
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.shapes import IntArray
 from gsstream.packet.base import MAX_GAUSSIANS, PacketKind, Section
-from gsstream.packet.births import HEAD_PARTS, decode_births
+from gsstream.packet.changes.rows import HEAD_PARTS, decode_births
 from gsstream.packet.bits import unpack_blobs
 from gsstream.packet.gates import decode_gates, run_tokens
 from gsstream.packet.symbols import decode_symbols
@@ -52,8 +52,8 @@ def _entropy(values: IntArray) -> float:
 
 
 def _key_tables(data: Mapping[str, bytes], layout: Layout) -> Iterator[Table]:
-    number, nodes = len(layout.octree_levels), len(layout.node_counts)
-    parts = unpack_blobs(data["layout"][_LAYOUT_HEAD + 4 * len(layout.cell_sizes) :], 2)
+    number, nodes = len(layout.unit_of), len(layout.node_counts)
+    parts = unpack_blobs(data["layout"][_LAYOUT_HEAD + 4 * len(layout.units) :], 2)
     for part, rows in zip(parts, (nodes, number), strict=True):
         yield _table("layout", part, rows, 1)
     yield from _row_tables(data, number)
@@ -72,6 +72,19 @@ def _row_tables(data: Mapping[str, bytes], number: int) -> Iterator[Table]:
 
 
 def _delta_tables(data: Mapping[str, bytes], layout: Layout) -> Iterator[Table]:
+    if "motion" in data:
+        # Its tables depend on the groups of the whole scene; it counts as if it could not be smaller.
+        yield Table("motion", len(data["motion"]), 8.0 * len(data["motion"]))
+    if "gates" in data:
+        yield from _residual_tables(data, layout)
+    if "deaths" in data:
+        gone, _ = decode_gates(data["deaths"], len(layout.unit_of))
+        yield _runs_table("deaths", data["deaths"], gone)
+    if "births" in data:
+        yield from _birth_tables(data["births"], layout)
+
+
+def _residual_tables(data: Mapping[str, bytes], layout: Layout) -> Iterator[Table]:
     gates, num_levels = decode_gates(data["gates"], len(layout.node_counts))
     rows = int(np.asarray(layout.node_counts)[gates != 0].sum())
     tokens, plain_bits = run_tokens(gates)
@@ -84,13 +97,6 @@ def _delta_tables(data: Mapping[str, bytes], layout: Layout) -> Iterator[Table]:
             yield _table(name, data[name][_DELTA_HEAD:], rows, data[name][1])
 
 
-    if "deaths" in data:
-        gone, _ = decode_gates(data["deaths"], len(layout.octree_levels))
-        yield _runs_table("deaths", data["deaths"], gone)
-    if "births" in data:
-        yield from _birth_tables(data["births"], layout)
-
-
 def _runs_table(name: str, data: bytes, marks: IntArray) -> Table:
     """Marks coded as runs without levels."""
     tokens, plain_bits = run_tokens(marks)
@@ -100,7 +106,7 @@ def _runs_table(name: str, data: bytes, marks: IntArray) -> Table:
 
 def _birth_tables(data: bytes, layout: Layout) -> Iterator[Table]:
     nodes = len(layout.node_counts)
-    births = decode_births(Section(data, 0), nodes, len(layout.cell_sizes), MAX_GAUSSIANS)
+    births = decode_births(Section(data, 0), nodes, len(layout.units), MAX_GAUSSIANS)
     blobs = unpack_blobs(data, HEAD_PARTS + len(ATTRIBUTES))
     used, _ = decode_gates(blobs[2], nodes + len(births.parents))
     yield _table("births", blobs[1], len(births.parents), 1)

@@ -10,11 +10,11 @@ from typing import Any
 
 from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
-from gsstream.engine.assemble import Assembly, assemble
-from gsstream.engine.begin import begin, begin_from
-from gsstream.engine.frame_step import frame_step
-from gsstream.engine.points import gather_points
-from gsstream.engine.resume import resume_state
+from gsstream.engine.assembly.assemble import Assembly, assemble
+from gsstream.engine.frame0.begin import begin, begin_from
+from gsstream.engine.step.frame_step import frame_step
+from gsstream.engine.frame0.points import gather_points
+from gsstream.engine.keys.resume import resume_state
 from gsstream.engine.whole import WholeTools, begin_whole, resume_whole, step_whole
 from gsstream.method.base import Step, StreamingMethod
 from gsstream.packet import PlayerState, StreamMeta, decode_packet

@@ -21,11 +21,11 @@ from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
-from gsstream.engine.assemble import Assembly, assemble
-from gsstream.engine.auto import refuse_pending
-from gsstream.engine.begin import begin_from
-from gsstream.engine.frame_step import frame_step
-from gsstream.engine.stream_state import Step, StreamState
+from gsstream.engine.assembly.assemble import Assembly, assemble
+from gsstream.engine.auto.rules import refuse_pending
+from gsstream.engine.frame0.begin import begin_from
+from gsstream.engine.step.frame_step import frame_step
+from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.metrics import peak_memory_mb, psnr
 from gsstream.packet import KeyState, PlayerState, StreamMeta, decode_packet, encode_key
 from gsstream.plugins.catalog import Catalog

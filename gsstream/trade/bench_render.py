@@ -14,7 +14,7 @@ from gsstream.core.errors import GsstreamError
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray, IntArray
-from gsstream.engine.backward import pull_back
+from gsstream.engine.fit.backward import pull_back
 from gsstream.plugins.catalog import Catalog
 from gsstream.render.base import Renderer, RenderOutput
 from gsstream.trade.bench_floor import (

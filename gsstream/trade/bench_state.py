@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import torch
 
-from gsstream.engine.assemble import Assembly
-from gsstream.engine.stream_state import Step, StreamState
+from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.state.stream_state import Step, StreamState
 
 
 def under_way(parts: Assembly, state: StreamState, last: Step | None) -> StreamState:

@@ -18,12 +18,12 @@ from statistics import median
 from typing import Any
 
 from gsstream.core.rng import Rng
-from gsstream.engine.assemble import Assembly, assemble
-from gsstream.engine.begin import begin, begin_from
-from gsstream.engine.checks import Checks
-from gsstream.engine.frame_step import frame_step
-from gsstream.engine.points import gather_points
-from gsstream.engine.recording import open_recording, read_first_frame
+from gsstream.engine.assembly.assemble import Assembly, assemble
+from gsstream.engine.frame0.begin import begin, begin_from
+from gsstream.engine.assembly.checks import Checks
+from gsstream.engine.step.frame_step import frame_step
+from gsstream.engine.frame0.points import gather_points
+from gsstream.engine.run.recording import open_recording, read_first_frame
 from gsstream.packet import PlayerState, StreamMeta
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe

@@ -24,14 +24,14 @@ from gsstream.core.errors import OutputError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
-from gsstream.engine.assemble import Assembly, assemble
-from gsstream.engine.begin import begin
-from gsstream.engine.frame_step import frame_step
-from gsstream.engine.keyframes import refresh
-from gsstream.engine.measure import HeldOut
-from gsstream.engine.points import gather_points
-from gsstream.engine.recording import open_recording
-from gsstream.engine.stream_state import StreamState
+from gsstream.engine.assembly.assemble import Assembly, assemble
+from gsstream.engine.frame0.begin import begin
+from gsstream.engine.step.frame_step import frame_step
+from gsstream.engine.keys.keyframes import refresh
+from gsstream.engine.run.measure import HeldOut
+from gsstream.engine.frame0.points import gather_points
+from gsstream.engine.run.recording import open_recording
+from gsstream.engine.state.stream_state import StreamState
 from gsstream.metrics.trend import slope_per_100
 from gsstream.packet import StreamMeta, StreamWriter
 from gsstream.player.playback import Playback

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gsstream.core.errors import InputError
-from gsstream.engine.metrics_log import read_metrics
+from gsstream.engine.run.metrics_log import read_metrics
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ def read_records(path: str | os.PathLike[str]) -> list[FrameRecord]:
     """Read ``metrics.jsonl`` (or the folder that holds it), in the order of frames; the last entry of a frame counts.
 
     Unknown entries are passed over, so that a newer writer can be summarised. Raises InputError naming file and line
-    (``engine.metrics_log.read_metrics``), and when there is no frame.
+    (``engine.run.metrics_log.read_metrics``), and when there is no frame.
     """
     path = Path(path)
     path = path / "metrics.jsonl" if path.is_dir() else path
@@ -77,7 +77,7 @@ def read_records(path: str | os.PathLike[str]) -> list[FrameRecord]:
 def read_lines(path: Path) -> list[dict[str, Any]]:
     """The lines of a ``metrics.jsonl`` as they are, in the order of frames; the last entry of a frame counts.
 
-    Raises InputError as ``engine.metrics_log.read_metrics``.
+    Raises InputError as ``engine.run.metrics_log.read_metrics``.
     """
     found = {line["frame"]: line for _, line in read_metrics(path)}
     return [found[frame] for frame in sorted(found)]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gsstream.core.part import Part
-from gsstream.engine.recording import open_recording
+from gsstream.engine.run.recording import open_recording
 from gsstream.plugins.catalog import CONTRACTS, load_catalog
 from gsstream.plugins.discovery import Discovered
 from gsstream.recipe.model import Recipe

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from gsstream.cli.main import run_command
-from gsstream.engine.stream_state import StreamState
+from gsstream.engine.state.stream_state import StreamState
 from gsstream.source.open import DEMO_FOLDER
 
 #: Six frames of an analytic scene, three training cameras, one test camera.
@@ -79,7 +79,7 @@ class Witness:
     """Remembers the encoder's state after every frame of runs in this process; changes nothing."""
 
     def __init__(self, monkeypatch: Any) -> None:
-        from gsstream.engine import session
+        from gsstream.engine.run import session
 
         self.states: list[StreamState] = []
         for name in ("begin", "begin_from", "frame_step"):
@@ -97,7 +97,7 @@ class Witness:
 @contextmanager
 def broken_off_in(frame: int) -> Iterator[None]:
     """Runs in this process are interrupted, as by Ctrl-C, when they are about to step to this frame."""
-    from gsstream.engine import session
+    from gsstream.engine.run import session
 
     step = session.frame_step
 

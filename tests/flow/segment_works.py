@@ -7,7 +7,7 @@ import signal
 from pathlib import Path
 from typing import Any
 
-from gsstream.engine import session
+from gsstream.engine.run import session
 from gsstream.trade.segments.job import SegmentJob, SegmentOutcome, run_segment
 
 #: The frame in which a worker is killed, once.

@@ -13,11 +13,11 @@ from flow_runs import TINY, WORLD, finish
 
 from gsstream.core.errors import ComponentError, GsstreamError, InputError
 from gsstream.core.state import GateState
-from gsstream.engine import checks as checks_module
-from gsstream.engine.assemble import Assembly, assemble
-from gsstream.engine.checks import Checks, StepChecks, check_values, wanted_checks
-from gsstream.engine.recording import open_recording
-from gsstream.engine.session import run
+from gsstream.engine.assembly import checks as checks_module
+from gsstream.engine.assembly.assemble import Assembly, assemble
+from gsstream.engine.assembly.checks import Checks, StepChecks, check_values, wanted_checks
+from gsstream.engine.run.recording import open_recording
+from gsstream.engine.run.session import run
 from gsstream.gate.always_open import AlwaysOpen
 from gsstream.gate.base import GateSampler
 from gsstream.loss.base import Loss

@@ -14,7 +14,7 @@ from flow_runs import WORLD, Witness, demo_copy, encode, metrics, without_test_c
 from gsstream.cli.main import run_command
 from gsstream.core.delta import Layout, apply_delta
 from gsstream.core.gaussians import ATTRIBUTES
-from gsstream.engine import frame_step as step_module
+from gsstream.engine.step import frame_step as step_module
 from gsstream.packet import PacketKind
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, find_renderer, render

@@ -11,7 +11,7 @@ from flow_runs import Witness, demo_copy, encode, metrics
 from gsstream_cpu_render.renderer import CpuRenderer
 from gsstream_cpu_render.session import CpuSession
 
-from gsstream.engine import frame_step as step_module
+from gsstream.engine.step import frame_step as step_module
 from gsstream.packet import StreamReader
 from gsstream.render.base import ScatterSession
 

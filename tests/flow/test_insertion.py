@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw
 from gsstream.cli.main import run_command
 from gsstream.core.delta import Layout
 from gsstream.core.gaussians import Gaussians
-from gsstream.engine.insertion import place
+from gsstream.engine.step.insertion import place
 from gsstream.packet import StreamReader
 from gsstream.player.playback import Playback
 

@@ -13,7 +13,7 @@ import pytest
 from flow_runs import Witness, arguments, encode, finish, metrics, start
 
 from gsstream.cli.main import run_command
-from gsstream.engine import session
+from gsstream.engine.run import session
 from gsstream.packet import PacketKind, StreamReader, quantise_key
 from gsstream.packet.base import FILE_HEADER
 from gsstream.player.manifest import manifest

@@ -10,7 +10,7 @@ import pytest
 import torch
 from flow_runs import demo_copy
 
-from gsstream.engine.backward import pull_back
+from gsstream.engine.fit.backward import pull_back
 
 #: Seconds and tens of megabytes each; nothing of them is ever used.
 UNWANTED = ("torch._dynamo", "torch._inductor", "sympy", "torch.fx.experimental.symbolic_shapes")

@@ -9,7 +9,7 @@ import pytest
 from flow_runs import metrics
 
 from gsstream.cli.main import run_command
-from gsstream.engine.assemble import Assembly, assemble
+from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.plugins.catalog import Catalog, load_catalog
 from gsstream.recipe.load import recipe_hash, resolve_recipe
 

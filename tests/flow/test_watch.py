@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from gsstream.cli.main import run_command
-from gsstream.engine.assemble import assemble
-from gsstream.engine.session import STREAM, run
+from gsstream.engine.assembly.assemble import assemble
+from gsstream.engine.run.session import STREAM, run
 from gsstream.packet import StreamReader
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe

@@ -13,7 +13,7 @@ from numeric_scenes import some
 
 from gsstream.core.errors import ComponentError
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.engine.checks import Checks, check_terms
+from gsstream.engine.assembly.checks import Checks, check_terms
 
 
 def flat(nodes: int, rows: int) -> Hierarchy:

@@ -20,9 +20,9 @@ from numeric_scenes import some
 from gsstream.core.errors import ComponentError, ShapeError
 from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
-from gsstream.engine.active_set import detect_change
-from gsstream.engine.frame_step import frame_step
-from gsstream.engine.optimise import _FrameRun
+from gsstream.engine.step.active.change import detect_change
+from gsstream.engine.step.frame_step import frame_step
+from gsstream.engine.step.optimise import _FrameRun
 from gsstream.metrics import psnr
 from gsstream.optimiser.adam import ReferenceAdam
 from gsstream.optimiser.base import MAX_GRADIENT, AdamState, RowOptimiser

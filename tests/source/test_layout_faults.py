@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scenes import LAYOUTS, SIZE, World, make_world, write_colmap, write_frames, write_n3dv, write_ply, write_png
 
 from gsstream.core.errors import SourceError
-from gsstream.engine.recording import open_recording
+from gsstream.engine.run.recording import open_recording
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.source.open import open_source

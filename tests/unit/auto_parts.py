@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from gsstream.core.part import Part
-from gsstream.engine.assemble import Assembly, assemble
+from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 

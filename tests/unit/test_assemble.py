@@ -7,7 +7,7 @@ import warnings
 import pytest
 
 from gsstream.core.errors import PluginUnavailable, RecipeError
-from gsstream.engine.assemble import SLOTS, Assembly, SlowRendererWarning, assemble
+from gsstream.engine.assembly.assemble import SLOTS, Assembly, SlowRendererWarning, assemble
 from gsstream.plugins.catalog import Catalog, load_catalog
 from gsstream.plugins.discovery import Discovered
 from gsstream.recipe.load import ResolvedRecipe, resolve_recipe

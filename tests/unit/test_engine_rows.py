@@ -10,9 +10,9 @@ from gsstream.core.births import Births, gather_rows, in_nodes, own_nodes
 from gsstream.core.delta import Delta, Layout
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.engine.row_table import RowTable
-from gsstream.engine.rows import edit_of, follow
-from gsstream.engine.stream_state import StreamState
+from gsstream.engine.fit.row_table import RowTable
+from gsstream.engine.state.rows import edit_of, follow
+from gsstream.engine.state.stream_state import StreamState
 from gsstream.optimiser.adam import ReferenceAdam
 from gsstream.packet import decode_packet, encode_delta, encode_key
 from gsstream.testing.checks.packet import tiny_key

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsstream.core.shapes import FloatArray
-from gsstream.engine.nearest import nearest_rows, neighbour_distance
+from gsstream.engine.frame0.nearest import nearest_rows, neighbour_distance
 
 KINDS = ("ball", "plane", "line", "grid", "pairs", "aside", "far")
 
@@ -77,7 +77,7 @@ def test_memory_follows_the_cloud_and_not_its_square() -> None:
     """A table of all distances, block by block, once left every block on the heap: 12 GB for 60,000 points."""
     code = """
 import resource, torch
-from gsstream.engine.nearest import neighbour_distance
+from gsstream.engine.frame0.nearest import neighbour_distance
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 neighbour_distance(torch.rand(100, 3))
 before = peak()

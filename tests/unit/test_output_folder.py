@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gsstream.core.errors import OutputError
-from gsstream.engine.output import MADE_FILES, RUN_FILES, prepare_output
+from gsstream.engine.run.output import MADE_FILES, RUN_FILES, prepare_output
 from gsstream.trade import gallery
 
 

@@ -14,7 +14,7 @@ from ruamel.yaml import YAML
 
 from gsstream.cli.main import run_command
 from gsstream.core.errors import GsstreamError
-from gsstream.engine.assemble import assemble
+from gsstream.engine.assembly.assemble import assemble
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.save import to_yaml

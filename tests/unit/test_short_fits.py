@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from gsstream.core.auto import Choice
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame, PointCloud
-from gsstream.engine.assemble import Assembly
-from gsstream.engine.auto import settle
-from gsstream.engine.short_fits import HALVED, HOPELESS, FirstFrameTrials, Trial, colour_matched, left_out
+from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.auto.rules import settle
+from gsstream.engine.auto.short_fits import HALVED, HOPELESS, FirstFrameTrials, Trial, colour_matched, left_out
 from gsstream.packet import StreamMeta
 from gsstream.structure.base import Anchors
 from gsstream.structure.flat import Flat

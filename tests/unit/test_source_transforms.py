@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from gsstream.core.errors import RecipeError, SourceError
 from gsstream.core.rng import Rng
-from gsstream.engine.recording import reopen_recording
+from gsstream.engine.run.recording import reopen_recording
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.source.open import open_source

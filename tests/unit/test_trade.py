@@ -14,7 +14,7 @@ from gsstream.core.delta import Delta, Layout
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
-from gsstream.engine.metrics_log import last_written, trim_metrics
+from gsstream.engine.run.metrics_log import last_written, trim_metrics
 from gsstream.packet import KeyState, StreamMeta, StreamWriter, encode_delta, encode_empty, encode_key
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, render

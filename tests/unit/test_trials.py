@@ -14,11 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsstream.core.auto import Choice
-from gsstream.engine.assemble import Assembly, assemble
-from gsstream.engine.auto import settle
-from gsstream.engine.climb import MARGIN, try_out
-from gsstream.engine.short_fits import Trial
-from gsstream.engine.trials import usual_values
+from gsstream.engine.assembly.assemble import Assembly, assemble
+from gsstream.engine.auto.rules import settle
+from gsstream.engine.auto.climb import MARGIN, try_out
+from gsstream.engine.auto.short_fits import Trial
+from gsstream.engine.auto.trials import usual_values
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.structure.flat import Flat

@@ -13,9 +13,9 @@ import torch
 from gsstream.cli.main import run_command
 from gsstream.core.delta import Delta
 from gsstream.core.errors import ComponentError, RecipeError
-from gsstream.engine.assemble import assemble
-from gsstream.engine.exposure import Exposure
-from gsstream.engine.frame_step import RepeatedFrameWarning
+from gsstream.engine.assembly.assemble import assemble
+from gsstream.engine.fit.exposure import Exposure
+from gsstream.engine.step.frame_step import RepeatedFrameWarning
 from gsstream.method.base import StreamingMethod
 from gsstream.method.hold import Hold, HoldState
 from gsstream.method.packets import send_delta

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from gsstream.engine.assemble import Assembly
+from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.pace import Allowance
 from gsstream.engine.budget.plan import WINDOW, FramePlan, Past, past_of, plan
 from gsstream.recipe.budget import Budget

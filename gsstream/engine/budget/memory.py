@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gsstream.core.errors import InputError
-from gsstream.engine.assemble import Assembly
+from gsstream.engine.assembly.assemble import Assembly
 from gsstream.source.base import SourceInfo
 
 #: Interpreter, torch, the renderer and the engine with everything a run imports (measured, docs/results-budget.md).

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from gsstream.core.auto import Choice, SceneFacts
 from gsstream.core.part import Part
-from gsstream.engine.assemble import with_values
+from gsstream.engine.assembly.assemble import with_values
 from gsstream.testing.registry import CONTRACTS, Skip, check
 
 

@@ -168,7 +168,7 @@ def write_sheets(folder: Path, data: SweepData, scenes: Sequence[str], recording
     """A contact sheet of the first variant of each scene. Raises InputError when a recording cannot be found."""
     import tempfile
 
-    from gsstream.engine.recording import reopen_recording
+    from gsstream.engine.run.recording import reopen_recording
     from gsstream.plugins.catalog import load_catalog
     from gsstream.trade.contact_sheet import sheet_of_stream
     from gsstream.trade.sweep.drive import cell_file, recording_uri

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from gsstream.core.errors import GsstreamError
-from gsstream.engine.session import METRICS, RECIPE
+from gsstream.engine.run.session import METRICS, RECIPE
 from gsstream.recipe.load import ResolvedRecipe
 from gsstream.trade.records import read_lines
 from gsstream.trade.segments.job import SegmentJob, SegmentOutcome

@@ -69,9 +69,9 @@ def _folder(work: str | None) -> Iterator[Path]:
 
 
 def _encode(job: SegmentJob, folder: Path) -> None:
-    from gsstream.engine.assemble import assemble
-    from gsstream.engine.recording import open_recording
-    from gsstream.engine.session import run
+    from gsstream.engine.assembly.assemble import assemble
+    from gsstream.engine.run.recording import open_recording
+    from gsstream.engine.run.session import run
     from gsstream.plugins.catalog import load_catalog
 
     catalog = load_catalog()

@@ -20,7 +20,7 @@ from pydantic.fields import FieldInfo
 from gsstream.core.auto import AUTO
 from gsstream.core.errors import PluginUnavailable
 from gsstream.core.rng import Rng
-from gsstream.engine.heeded import PART_SECTIONS, SESSION_KEYS
+from gsstream.engine.assembly.heeded import PART_SECTIONS, SESSION_KEYS
 from gsstream.plugins.catalog import Catalog
 
 Generator = np.random.Generator

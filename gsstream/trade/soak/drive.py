@@ -16,10 +16,10 @@ from typing import Any, Literal
 import numpy as np
 
 from gsstream.core.errors import ComponentError, InputError, PluginUnavailable, ShapeError
-from gsstream.engine.assemble import Assembly, assemble
-from gsstream.engine.frame_step import RepeatedFrameWarning
-from gsstream.engine.recording import open_recording
-from gsstream.engine.session import METRICS, STREAM, run
+from gsstream.engine.assembly.assemble import Assembly, assemble
+from gsstream.engine.step.frame_step import RepeatedFrameWarning
+from gsstream.engine.run.recording import open_recording
+from gsstream.engine.run.session import METRICS, STREAM, run
 from gsstream.method.base import Step
 from gsstream.packet import PlayerState
 from gsstream.player.playback import Playback

@@ -20,7 +20,7 @@ from gsstream.recipe.load import ResolvedRecipe
 from gsstream.trade.sweep.config import Measure
 
 if TYPE_CHECKING:
-    from gsstream.engine.assemble import Assembly
+    from gsstream.engine.assembly.assemble import Assembly
     from gsstream.source.base import FrameSource
     from gsstream.trade.evaluate import Evaluation
 
@@ -84,10 +84,10 @@ def run_job(job: Job) -> Outcome:
 
 
 def _run(job: Job, folder: Path) -> Outcome:
-    from gsstream.engine.assemble import assemble
-    from gsstream.engine.metrics_log import read_metrics
-    from gsstream.engine.recording import open_recording, read_first_frame
-    from gsstream.engine.session import METRICS, STREAM, run
+    from gsstream.engine.assembly.assemble import assemble
+    from gsstream.engine.run.metrics_log import read_metrics
+    from gsstream.engine.run.recording import open_recording, read_first_frame
+    from gsstream.engine.run.session import METRICS, STREAM, run
     from gsstream.metrics import EnergyMeter
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import recipe_hash

@@ -12,7 +12,7 @@ from gsstream_queen import frame as frame_module
 from gsstream_queen import method as method_module
 
 from gsstream.cli.main import run_command
-from gsstream.engine import session
+from gsstream.engine.run import session
 from gsstream.packet import PacketKind
 from gsstream.player.playback import Playback
 

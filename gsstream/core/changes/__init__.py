@@ -1,0 +1,28 @@
+"""What a frame may say: an ordered list of changes, each a frozen record and one numpy function that applies it.
+
+The list of kinds is short and closed, so that every player can play every stream: encoder and player call the same
+functions, and a stream never needs a plugin. The arithmetic is +, -, x, / and square root in a stated order and
+precision, so that another implementation can agree bit by bit (docs/reference/packet-format.md).
+"""
+
+from gsstream.core.changes.delta import Change as Change
+from gsstream.core.changes.delta import Delta as Delta
+from gsstream.core.changes.delta import apply_delta as apply_delta
+from gsstream.core.changes.delta import row_gates as row_gates
+from gsstream.core.changes.history import Displacement as Displacement
+from gsstream.core.changes.motion import Groups as Groups
+from gsstream.core.changes.motion import Motion as Motion
+from gsstream.core.changes.motion import apply_motion as apply_motion
+from gsstream.core.changes.motion import groups_for as groups_for
+from gsstream.core.changes.residual import Residual as Residual
+from gsstream.core.changes.residual import apply_residual as apply_residual
+from gsstream.core.changes.residual import decode_residual as decode_residual
+from gsstream.core.changes.residual import sent_rows as sent_rows
+from gsstream.core.changes.rows import Births as Births
+from gsstream.core.changes.rows import Rows as Rows
+from gsstream.core.changes.rows import apply_rows as apply_rows
+from gsstream.core.changes.rows import gather_rows as gather_rows
+from gsstream.core.changes.rows import in_nodes as in_nodes
+from gsstream.core.changes.rows import own_nodes as own_nodes
+from gsstream.core.changes.scene import Layout as Layout
+from gsstream.core.changes.scene import Scene as Scene

@@ -1,0 +1,120 @@
+"""Delta: what one frame changes, as the integers that are transmitted, and the one function that applies it.
+
+Encoder and player call the same :func:`apply_delta` on numpy arrays, so the state they reach is equal by construction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from gsstream.core.changes.history import displacement
+from gsstream.core.changes.motion import Motion, apply_motion
+from gsstream.core.changes.residual import Residual, apply_residual, sent_rows
+from gsstream.core.changes.rows import Births, Rows, apply_rows, gather_rows, join_rows
+from gsstream.core.changes.scene import Layout, Scene
+from gsstream.core.errors import ShapeError
+from gsstream.core.shapes import FloatArray, IntArray
+
+Change: TypeAlias = Motion | Residual | Rows
+#: The order in which kinds of changes stand in a delta; only motions may stand there more than once.
+ORDER: tuple[type[Motion] | type[Residual] | type[Rows], ...] = (Motion, Residual, Rows)
+
+
+@dataclass(frozen=True, slots=True)
+class Delta:
+    """One frame's changes, applied one after the other: motions, then at most one residual, then at most one of rows.
+
+    Raises ShapeError for another order.
+    """
+
+    changes: tuple[Change, ...] = ()
+
+    def __post_init__(self) -> None:
+        ranks = [ORDER.index(type(change)) for change in self.changes]
+        if ranks != sorted(ranks) or ranks.count(1) > 1 or ranks.count(2) > 1:
+            names = ", ".join(type(change).__name__ for change in self.changes)
+            raise ShapeError(f"delta: expected motions, then one residual, then one change of rows; got {names}")
+
+    @property
+    def motions(self) -> tuple[Motion, ...]:
+        """The motions, in order."""
+        return tuple(change for change in self.changes if isinstance(change, Motion))
+
+    @property
+    def residual(self) -> Residual | None:
+        """The residual, if there is one."""
+        return next((change for change in self.changes if isinstance(change, Residual)), None)
+
+    @property
+    def rows(self) -> Rows | None:
+        """The change of rows, if there is one."""
+        return next((change for change in self.changes if isinstance(change, Rows)), None)
+
+    @property
+    def births(self) -> Births | None:
+        """Gaussians that are added, or None."""
+        return None if self.rows is None else self.rows.births
+
+    @property
+    def deaths(self) -> IntArray:
+        """[D] rows that are removed."""
+        return np.zeros(0, np.int64) if self.rows is None else self.rows.deaths
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing changes."""
+        return all(change.is_empty for change in self.changes)
+
+    @property
+    def edits_rows(self) -> bool:
+        """Whether Gaussians are added or removed."""
+        return self.rows is not None and not self.rows.is_empty
+
+    def gates(self, layout: Layout) -> IntArray:
+        """Return the gates [M] of the residual; all closed without one."""
+        residual = self.residual
+        return np.zeros(len(layout.node_counts), np.uint8) if residual is None else residual.gates
+
+    def with_residual(self, residual: Residual | None) -> Delta:
+        """Return the same delta with another residual, or with none."""
+        others = [change for change in self.changes if not isinstance(change, Residual)]
+        if residual is not None:
+            others.insert(len(self.motions), residual)
+        return Delta(tuple(others))
+
+    def with_rows(self, rows: Rows | None) -> Delta:
+        """Return the same delta with another change of rows, or with none."""
+        others = tuple(change for change in self.changes if not isinstance(change, Rows))
+        return Delta(others if rows is None or rows.is_empty else (*others, rows))
+
+
+def apply_delta(scene: Scene, delta: Delta) -> Scene:
+    """Return the next frame's scene, and what moved in it.
+
+    Rows that no change touches keep their bits. Raises ShapeError when the delta does not fit the scene.
+    """
+    after, touched = scene, np.zeros(0, np.int64)
+    for motion in delta.motions:
+        after, rows = apply_motion(after, motion)
+        touched = np.union1d(touched, rows)
+    if delta.residual is not None:
+        after = replace(after, gaussians=apply_residual(after.gaussians, after.layout, delta.residual))
+        touched = np.union1d(touched, sent_rows(after.layout, delta.residual.gates))
+    after = replace(after, moved=displacement(scene.gaussians, after.gaussians, touched))
+    return after if delta.rows is None else apply_rows(after, delta.rows)
+
+
+def row_gates(layout: Layout, delta: Delta) -> FloatArray:
+    """Return the gate, 0 to 1, [N'] float32 of every row after the delta; ``layout`` is that before it. Births are open."""
+    residual = delta.residual
+    if residual is None:
+        gates = np.zeros(len(layout.unit_of), np.float32)
+    else:
+        gates = np.repeat(residual.gates, layout.node_counts).astype(np.float32) / np.float32(residual.num_levels)
+    if not delta.edits_rows:
+        return np.asarray(gates)
+    born = None if delta.births is None else np.ones(len(delta.births), np.float32)
+    return join_rows(gates, born, gather_rows(layout.node_of, delta.births, delta.deaths))

@@ -1,0 +1,60 @@
+"""Displacement: how far rows were moved by the last frame. Both ends compute it, so a motion can be predicted from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.shapes import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Displacement:
+    """Rows that the last frame displaced; a row that is not listed stood still.
+
+    Arguments:
+        rows: [A] int64, ascending.
+        shift: [A, 3] float32 displacement of the centre, scene units per frame.
+        turn: [A, 3] float32 rotation as axis * tan(angle / 2), per frame.
+    """
+
+    rows: IntArray
+    shift: FloatArray
+    turn: FloatArray
+
+    def gathered(self, source: IntArray) -> Displacement:
+        """Return the displacement of the rows after births and deaths; ``source`` is :func:`gather_rows`' result."""
+        kept = np.flatnonzero(np.isin(source, self.rows))
+        place = np.searchsorted(self.rows, source[kept])
+        return Displacement(kept, self.shift[place], self.turn[place])
+
+
+def displacement(
+    before: Gaussians[FloatArray], after: Gaussians[FloatArray], rows: IntArray
+) -> Displacement | None:
+    """Measure what a frame did to ``rows`` [A], ascending, all that it may have touched; None when nothing moved."""
+    shift = after.means[rows] - before.means[rows]
+    turn = turn_between(before.quats[rows], after.quats[rows])
+    some = (shift != 0).any(1) | (turn != 0).any(1)
+    return Displacement(rows[some], shift[some], turn[some]) if bool(some.any()) else None
+
+
+def turn_between(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Return the rotation [A, 3] that leads from one row of quaternions [A, 4] to the other: axis * tan(angle / 2).
+
+    float64, each sum from left to right, rounded to float32 at the end. A turn of more than 120 degrees counts as none:
+    it is a Gaussian that was painted anew, not one that turned.
+    """
+    w0, x0, y0, z0 = before.astype(np.float64).T
+    w1, x1, y1, z1 = after.astype(np.float64).T
+    w = w1 * w0 + x1 * x0 + y1 * y0 + z1 * z0
+    x = x1 * w0 - w1 * x0 - y1 * z0 + z1 * y0
+    y = y1 * w0 - w1 * y0 + x1 * z0 - z1 * x0
+    z = z1 * w0 - w1 * z0 - x1 * y0 + y1 * x0
+    size = (w0 * w0 + x0 * x0 + y0 * y0 + z0 * z0) * (w1 * w1 + x1 * x1 + y1 * y1 + z1 * z1)
+    known = (w != 0) & (4 * (w * w) >= size)
+    scale = np.where(known, w, 1.0)
+    turn = np.stack([x / scale, y / scale, z / scale], 1)
+    return np.where(known[:, None], turn, 0.0).astype(np.float32)

@@ -1,0 +1,217 @@
+"""Motion: groups of rows move rigidly, positions and orientations, as predicted from the last frame and corrected.
+
+A residual that is learned from zero in every frame cannot travel as far as a body does, so Gaussians are left behind and
+the body is repainted with what happens to stand there. A motion carries them along: it costs a bit or so per group where
+the prediction holds, and six small integers where it does not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from gsstream.core.changes.scene import Scene
+from gsstream.core.errors import ShapeError
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.shapes import FloatArray, IntArray
+
+#: Cells are counted from -HALF_GRID to HALF_GRID - 1 along each axis; what lies beyond belongs to the outermost one.
+HALF_GRID = 1 << 15
+MAX_SHADES = 16
+#: Value of the spherical harmonic of degree 0: colour = 0.5 + SH0 * sh0.
+SH0 = 0.28209479177387814
+
+
+@dataclass(frozen=True, slots=True)
+class Groups:
+    """Which group each row belongs to.
+
+    Arguments:
+        cell: side of a cell, scene units; rows of one cell and one shade are a group.
+        shades: number of classes of brightness, 1 to 16.
+        group_of: [N] int32 group of each row.
+        count: G, the number of groups; some may have lost all their rows since.
+    """
+
+    cell: float
+    shades: int
+    group_of: IntArray
+    count: int
+
+    def gathered(self, source: IntArray) -> Groups:
+        """Return the groups of the rows after births and deaths; a birth joins the group of the row stored before it."""
+        number = len(self.group_of)
+        if number == 0 or len(source) == 0:
+            return replace(self, group_of=np.zeros(len(source), np.int32))
+        old = source < number
+        before = np.maximum.accumulate(np.where(old, np.arange(len(source)), -1))
+        before[before < 0] = int(np.argmax(old))
+        known = np.where(old, source, 0)[before]
+        return replace(self, group_of=self.group_of[known])
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Rigid transforms of groups of rows.
+
+    Arguments:
+        cell, shades: what makes a group (:class:`Groups`); ``cell`` is a float32 above 0.
+        moving: [G] uint8, 1 for the K groups that move.
+        symbols: [K, 6] int32 corrections of the prediction: shift x, y, z and turn x, y, z.
+        shift_step: scene units per symbol of the shift.
+        turn_step: tan(angle / 2) per symbol of the turn.
+        predicted: whether a group starts from the mean displacement of its rows in the last frame, else from rest.
+        regroup: whether the groups are formed anew from where rows are now, even if they are known.
+    """
+
+    cell: float
+    shades: int
+    moving: IntArray
+    symbols: IntArray = field(repr=False)
+    shift_step: float = 1.0
+    turn_step: float = 1.0
+    predicted: bool = True
+    regroup: bool = False
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no group moves."""
+        return not bool(np.any(self.moving))
+
+
+class Moves(NamedTuple):
+    """The rows of moving groups, and the transform of each group: x' = R (x - centre) + centre + shift.
+
+    ``rows`` [A] ascending, ``place`` [A] which of the K moving groups each is in, ``centre``, ``shift``, ``turn``
+    [K, 3] float64 (turn: axis * tan(angle / 2)).
+    """
+
+    rows: IntArray
+    place: IntArray
+    centre: FloatArray
+    shift: FloatArray
+    turn: FloatArray
+
+
+def groups_for(scene: Scene, cell: float, shades: int, regroup: bool = False) -> Groups:
+    """Return the groups of a motion: those the scene knows, unless they are others or are to be formed anew.
+
+    Rows are of one group when their centres lie in one cell of a regular grid and their colours in one class of
+    brightness. Groups are numbered by cell (x, then y, then z), then brightness.
+    """
+    known = scene.groups
+    if known is not None and not regroup and known.cell == cell and known.shades == shades:
+        return known
+    index = np.floor(scene.gaussians.means.astype(np.float64) / float(cell))
+    x, y, z = np.clip(index, -HALF_GRID, HALF_GRID - 1).astype(np.int64).T + HALF_GRID
+    red, green, blue = scene.gaussians.sh0[:, 0].astype(np.float64).T
+    bright = 0.5 + SH0 * (0.25 * red + 0.5 * green + 0.25 * blue)
+    shade = np.clip(np.floor(bright * shades), 0, shades - 1).astype(np.int64)
+    keys = ((x * (2 * HALF_GRID) + y) * (2 * HALF_GRID) + z) * MAX_SHADES + shade
+    names, group_of = np.unique(keys, return_inverse=True)
+    return Groups(cell, shades, group_of.astype(np.int32), len(names))
+
+
+def moves_of(scene: Scene, groups: Groups, moving: IntArray, predicted: bool) -> Moves:
+    """Return the moving rows and the predicted transform of their groups, before any correction.
+
+    Means over rows are float64 sums in the order of rows, divided by their number.
+    """
+    which = np.flatnonzero(moving)
+    rank = np.full(groups.count, -1, np.int64)
+    rank[which] = np.arange(len(which))
+    place = rank[groups.group_of]
+    rows = np.flatnonzero(place >= 0)
+    place = place[rows]
+    centre = _means(scene.gaussians.means[rows], place, len(which))
+    shift, turn = np.zeros((len(which), 3)), np.zeros((len(which), 3))
+    if predicted and scene.moved is not None:
+        past = rank[groups.group_of[scene.moved.rows]]
+        here = past >= 0
+        shift = _means(scene.moved.shift[here], past[here], len(which))
+        turn = _means(scene.moved.turn[here], past[here], len(which))
+    return Moves(rows, place, centre, shift, turn)
+
+
+def apply_motion(scene: Scene, motion: Motion) -> tuple[Scene, IntArray]:
+    """Return the scene after a motion, and the rows [A] of the groups that moved. What ``moved`` says stays.
+
+    All arithmetic is float64 in a fixed order; centres and quaternions are rounded to float32 at the end.
+
+    Raises:
+        ShapeError: the motion's groups do not fit the scene, or lead out of the range of float32.
+    """
+    groups = groups_for(scene, motion.cell, motion.shades, motion.regroup)
+    if motion.moving.shape != (groups.count,):
+        raise ShapeError(
+            f"motion: expected a mark for each of {groups.count} groups, got shape {list(motion.moving.shape)}; "
+            "the packet belongs to another scene"
+        )
+    moves = moves_of(scene, groups, motion.moving, motion.predicted)
+    if motion.symbols.shape != (len(moves.centre), 6):
+        raise ShapeError(
+            f"motion: expected 6 symbols for each of {len(moves.centre)} moving groups, got shape "
+            f"{list(motion.symbols.shape)}"
+        )
+    shift = moves.shift + motion.symbols[:, :3].astype(np.float64) * float(motion.shift_step)
+    turn = moves.turn + motion.symbols[:, 3:].astype(np.float64) * float(motion.turn_step)
+    gaussians = transformed(scene.gaussians, moves._replace(shift=shift, turn=turn))
+    return replace(scene, gaussians=gaussians, groups=groups), moves.rows
+
+
+def transformed(gaussians: Gaussians[FloatArray], moves: Moves) -> Gaussians[FloatArray]:
+    """Return the Gaussians with the rows of moving groups transformed. Raises ShapeError beyond float32."""
+    if len(moves.rows) == 0:
+        return gaussians
+    rows, place = moves.rows, moves.place
+    quats = quats_of(moves.turn)
+    matrix, centre = matrices_of(quats)[place], moves.centre[place]
+    offset = gaussians.means[rows].astype(np.float64) - centre
+    x, y, z = offset.T
+    turned = np.stack([matrix[:, i, 0] * x + matrix[:, i, 1] * y + matrix[:, i, 2] * z for i in range(3)], 1)
+    means, turns = gaussians.means.copy(), gaussians.quats.copy()
+    with np.errstate(over="ignore"):
+        means[rows] = (turned + centre + moves.shift[place]).astype(np.float32)
+    if not bool(np.isfinite(means[rows]).all()):
+        raise ShapeError("motion: it leads to positions beyond the range of float32")
+    turns[rows] = multiply(quats[place], gaussians.quats[rows].astype(np.float64)).astype(np.float32)
+    return replace(gaussians, means=means, quats=turns)
+
+
+def quats_of(turn: FloatArray) -> FloatArray:
+    """Return unit quaternions [K, 4] wxyz, float64, of rotations [K, 3] given as axis * tan(angle / 2)."""
+    x, y, z = turn.T
+    scale = 1.0 / np.sqrt(1.0 + x * x + y * y + z * z)
+    return np.stack([scale, x * scale, y * scale, z * scale], 1)
+
+
+def matrices_of(quats: FloatArray) -> FloatArray:
+    """Return rotation matrices [K, 3, 3] of unit quaternions [K, 4] wxyz."""
+    w, x, y, z = quats.T
+    rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, 1) for row in rows], 1)
+
+
+def multiply(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the quaternion products a b [A, 4] wxyz: first the rotation b, then a."""
+    w0, x0, y0, z0 = a.T
+    w1, x1, y1, z1 = b.T
+    return np.stack([
+        w0 * w1 - x0 * x1 - y0 * y1 - z0 * z1,
+        w0 * x1 + x0 * w1 + y0 * z1 - z0 * y1,
+        w0 * y1 - x0 * z1 + y0 * w1 + z0 * x1,
+        w0 * z1 + x0 * y1 - y0 * x1 + z0 * w1,
+    ], 1)  # fmt: skip
+
+
+def _means(values: FloatArray, place: IntArray, number: int) -> FloatArray:
+    """[K, 3] float64 mean of the rows in each of ``number`` places; 0 where there are none."""
+    counts = np.maximum(np.bincount(place, minlength=number), 1)
+    columns = [np.bincount(place, values[:, i].astype(np.float64), number) / counts for i in range(3)]
+    return np.stack(columns, 1)

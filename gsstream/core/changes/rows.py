@@ -1,0 +1,147 @@
+"""Rows: Gaussians that a frame adds and removes, and what becomes of rows and layout then.
+
+Rows stay stored node by node: a Gaussian is born behind the last row of its node. Old rows keep their order, and nodes
+keep their numbers: a node may become empty, a new one comes behind the old ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+
+from gsstream.core.changes.scene import Layout, Scene
+from gsstream.core.errors import ShapeError
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.shapes import FloatArray, IntArray
+
+Rows = TypeVar("Rows", FloatArray, IntArray)
+
+
+@dataclass(frozen=True, slots=True)
+class Births:
+    """B Gaussians that one frame adds, and K nodes that come with them.
+
+    Arguments:
+        gaussians: B rows, raw values.
+        nodes: [B] int64 node of each, ascending; M to M + K - 1 are the new ones.
+        unit_of: [B] uint8, which of the layout's units each Gaussian has.
+        parents: [K] int64 parent of each new node, a node with a smaller number; its own number: a root.
+    """
+
+    gaussians: Gaussians[FloatArray]
+    nodes: IntArray
+    unit_of: IntArray
+    parents: IntArray
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Rows that leave, then rows that join.
+
+    Arguments:
+        births: Gaussians added, or None.
+        deaths: [D] int64 rows removed (of the scene before the births), ascending.
+    """
+
+    births: Births | None = None
+    deaths: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no row leaves and none joins."""
+        return self.births is None and len(self.deaths) == 0
+
+
+def apply_rows(scene: Scene, rows: Rows) -> Scene:
+    """Return the scene without the rows that leave and with those that join. Raises ShapeError when they do not fit.
+
+    A birth belongs to the group of the row stored before it, so that it moves with its neighbours.
+    """
+    layout, born = scene.layout, rows.births
+    check_deaths(rows.deaths, len(layout.unit_of))
+    if rows.is_empty:
+        return scene
+    if born is not None:
+        widths = [(name, int(np.prod(value.shape[1:]))) for name, value in scene.gaussians.items()]
+        check_births(born, len(layout.node_counts), len(layout.units), widths)
+    source = gather_rows(layout.node_of, born, rows.deaths)
+    gaussians = Gaussians(**{
+        name: join_rows(value, None if born is None else getattr(born.gaussians, name), source)
+        for name, value in scene.gaussians.items()
+    })
+    units = join_rows(layout.unit_of, None if born is None else born.unit_of, source).astype(np.uint8)
+    counts = next_counts(layout.node_counts, layout.node_of, born, rows.deaths)
+    moved = None if scene.moved is None else scene.moved.gathered(source)
+    groups = None if scene.groups is None else scene.groups.gathered(source)
+    return Scene(gaussians, Layout(counts, units, layout.units), moved, groups)
+
+
+def own_nodes(gaussians: Gaussians[FloatArray], unit_of: IntArray, num_nodes: int) -> Births:
+    """Births that each bring a root node of their own (no grouping); ``num_nodes`` is M before them."""
+    nodes = num_nodes + np.arange(len(gaussians), dtype=np.int64)
+    return Births(gaussians, nodes, np.asarray(unit_of, np.uint8), nodes)
+
+
+def in_nodes(gaussians: Gaussians[FloatArray], nodes: IntArray, unit_of: IntArray) -> Births:
+    """Births into existing nodes, given in any order: copies stay in the node of what they were copied from."""
+    order = np.argsort(nodes, kind="stable")
+    units = np.asarray(unit_of, np.uint8)[order]
+    return Births(gaussians.rows(order), np.asarray(nodes, np.int64)[order], units, np.zeros(0, np.int64))
+
+
+def gather_rows(node_of: IntArray, births: Births | None, deaths: IntArray) -> IntArray:
+    """[N'] int64: which row (of ``node_of``) each row of the scene afterwards was before; N + j is birth j."""
+    kept = np.delete(np.arange(len(node_of), dtype=np.int64), deaths)
+    if births is None or not len(births):
+        return kept
+    places = np.searchsorted(node_of[kept], births.nodes, side="right")
+    return np.asarray(np.insert(kept, places, len(node_of) + np.arange(len(births))))
+
+
+def next_counts(node_counts: IntArray, node_of: IntArray, births: Births | None, deaths: IntArray) -> IntArray:
+    """[M + K] int32 Gaussians of each node after births and deaths."""
+    counts = np.asarray(node_counts, np.int64) - np.bincount(node_of[deaths], minlength=len(node_counts))
+    if births is not None:
+        counts = np.concatenate([counts, np.zeros(len(births.parents), np.int64)])
+        counts += np.bincount(births.nodes, minlength=len(counts))
+    return counts.astype(np.int32)
+
+
+def join_rows(old: Rows, born: Rows | None, source: IntArray) -> Rows:
+    """Rows of an attribute after births and deaths; ``source`` is :func:`gather_rows`."""
+    joined: Rows = (old if born is None else np.concatenate([old, born]))[source]
+    return joined
+
+
+def check_births(births: Births, num_nodes: int, num_units: int, shapes: Sequence[tuple[str, int]]) -> None:
+    """Raise ShapeError unless the births fit a scene of M nodes and H units; ``shapes`` name attributes and widths."""
+    number, new = len(births.nodes), len(births.parents)
+    if len(births.gaussians) != number or len(births.unit_of) != number:
+        raise ShapeError(
+            f"births: expected {number} Gaussians and units like nodes, got {len(births.gaussians)} and "
+            f"{len(births.unit_of)}"
+        )
+    nodes = np.asarray(births.nodes)
+    if number and (int(nodes[0]) < 0 or int(nodes[-1]) >= num_nodes + new or np.any(np.diff(nodes) < 0)):
+        raise ShapeError(f"births: expected nodes from 0 to {num_nodes + new - 1}, ascending")
+    own = num_nodes + np.arange(new)
+    if np.any(births.parents < 0) or np.any(births.parents > own):
+        raise ShapeError("births: expected for every new node a parent with a smaller number, or its own (a root)")
+    if number and int(np.max(births.unit_of)) >= num_units:
+        raise ShapeError(f"births: expected units 0 to {num_units - 1}, got {int(np.max(births.unit_of))}")
+    for name, width in shapes:
+        got = int(np.prod(getattr(births.gaussians, name).shape[1:]))
+        if got != width:
+            raise ShapeError(f"births: expected {width} values of {name} like the scene, got {got}")
+
+
+def check_deaths(deaths: IntArray, number: int) -> None:
+    """Raise ShapeError unless ``deaths`` are rows of N Gaussians, ascending, none twice."""
+    if len(deaths) and (int(deaths[0]) < 0 or int(deaths[-1]) >= number or np.any(np.diff(deaths) <= 0)):
+        raise ShapeError(f"deaths: expected rows from 0 to {number - 1}, ascending and none twice")

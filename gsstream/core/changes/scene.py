@@ -1,0 +1,56 @@
+"""Scene: what the changes of a frame apply to, and all that a player remembers of the frames before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.shapes import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from gsstream.core.changes.history import Displacement
+    from gsstream.core.changes.motion import Groups
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How Gaussians are stored, known to both ends; between two key packets only births and deaths change it.
+
+    Arguments:
+        node_counts: [M] int32, number of Gaussians of each node; Gaussians are stored node by node.
+        unit_of: [N] uint8, which of ``units`` each Gaussian has.
+        units: [H] float32 > 0, scene units; a position residual is measured in the unit of its Gaussian.
+    """
+
+    node_counts: IntArray
+    unit_of: IntArray
+    units: FloatArray
+
+    def units_of(self, rows: IntArray) -> FloatArray:
+        """Return the unit [A] float32 of each of the Gaussians ``rows`` [A]."""
+        return np.asarray(self.units, np.float32).take(self.unit_of.take(rows))
+
+    @property
+    def node_of(self) -> IntArray:
+        """[N] int64 node of each Gaussian."""
+        return np.repeat(np.arange(len(self.node_counts), dtype=np.int64), self.node_counts)
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """The state that a delta turns into the next one.
+
+    Arguments:
+        gaussians: N rows, raw values, float32.
+        layout: nodes and units of the rows.
+        moved: how far rows were displaced by the last frame; None: nothing moved, or a key packet came last.
+        groups: the groups that the last motion was said of; None until a motion names some after a key packet.
+    """
+
+    gaussians: Gaussians[FloatArray]
+    layout: Layout
+    moved: Displacement | None = None
+    groups: Groups | None = None

@@ -1,0 +1,1 @@
+"""From a recipe and the catalogue to live parts, each guarded once."""

@@ -1,0 +1,247 @@
+"""Recipe + catalogue -> live parts. Every part's settings are checked here; all problems come in one error."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from gsstream.confidence.base import ConfidenceEstimator
+from gsstream.core.auto import AUTO, Choice
+from gsstream.core.errors import PluginUnavailable, UnknownName
+from gsstream.core.part import Part
+from gsstream.engine.assembly.checks import Checks, wanted_checks
+from gsstream.engine.assembly.heeded import PART_SLOTS, unheeded
+from gsstream.gate.base import GateSampler
+from gsstream.loss.base import Loss
+from gsstream.method.base import StreamingMethod
+from gsstream.optimiser.base import RowOptimiser
+from gsstream.plugins.catalog import Catalog
+from gsstream.propagation.base import Propagation
+from gsstream.recipe.check import join_problems, validate
+from gsstream.recipe.document import KeyPath, Origin
+from gsstream.recipe.load import ResolvedRecipe
+from gsstream.recipe.model import ComponentRef, Recipe
+from gsstream.regularizer.base import Regularizer
+from gsstream.render.base import Renderer
+from gsstream.residual.base import UpdateRule
+from gsstream.structure.base import Structure
+
+SLOTS = ("structure", "confidence", "propagation", "gate", "regularizer", "update", "renderer")
+#: What "auto" tries, fastest first, before it falls back to the reference.
+AUTO_RENDERERS = ("cpu",)
+AUTO_LOSSES = ("cpu", "reference")
+AUTO_OPTIMISERS = ("cpu", "reference")
+
+
+class SlowRendererWarning(UserWarning):
+    """The reference renderer is used because no fast one works here."""
+
+
+@dataclass(frozen=True, slots=True)
+class Assembly:
+    """The live parts of a run.
+
+    Arguments:
+        recipe: the recipe with every part's parameters written out and the renderer that was chosen.
+        whole: the whole method that runs in place of the parts; None: the parts are the method.
+        origins: path -> origin of every value that is not a default (for ``recipe.save.save_resolved``).
+        distributions: installed distributions that the parts come from.
+        checks: how closely the run looks at what parts return; nothing that is sent depends on it.
+        pending: paths of values that are still ``auto``; the parts have their defaults there (``engine.auto.rules.settle``).
+        chosen: key -> what the scene decided.
+    """
+
+    recipe: Recipe
+    structure: Structure
+    confidence: ConfidenceEstimator
+    propagation: Propagation
+    gate: GateSampler
+    regularizer: Regularizer
+    update: UpdateRule
+    renderer: Renderer
+    loss: Loss
+    optimiser: RowOptimiser
+    whole: StreamingMethod[Any] | None = None
+    origins: Mapping[KeyPath, Origin] = field(default_factory=dict)
+    distributions: tuple[str, ...] = ()
+    checks: Checks = Checks.FRAME
+    pending: tuple[KeyPath, ...] = ()
+    chosen: Mapping[str, Choice] = field(default_factory=dict)
+
+    @property
+    def resolved(self) -> ResolvedRecipe:
+        """Recipe and provenance together."""
+        return ResolvedRecipe(self.recipe, self.origins)
+
+
+def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | None = None) -> Assembly:
+    """Import every named part, check its parameters against its own Config, and build it.
+
+    Arguments:
+        checks: off, frame or step; None: what the environment says (``engine.assembly.checks``).
+
+    Raises:
+        InputError: ``checks`` is not a level.
+        RecipeError: parameters that a part does not know or refuses, unknown parts; all of them together.
+        PluginUnavailable: a part's plugin is in quarantine or the part is not what it claims to be.
+    """
+    level = wanted_checks(checks)
+    if isinstance(resolved, Recipe):
+        resolved = ResolvedRecipe(resolved, {})
+    problems: list[str] = []
+    parts: dict[str, Any] = {}
+    refs: dict[str, ComponentRef] = {}
+    pending: list[KeyPath] = []
+    if resolved.recipe.first_frame.sh_degree == AUTO:
+        pending.append(("first_frame", "sh_degree"))
+    for slot in SLOTS:
+        ref: ComponentRef = getattr(resolved.recipe, slot)
+        if slot == "renderer" and ref.name == "auto":
+            part = _auto_renderer(ref, resolved, catalog, problems)
+            ref = ComponentRef(name=part[0]) if part else ref
+            built = part[1] if part else None
+        else:
+            built = _build(slot, ref, resolved, catalog, problems)
+        if built is not None:
+            parts[slot] = built
+            refs[slot] = _written_out(slot, ref, built, pending)
+    loss = _loss(resolved, catalog, problems)
+    whole = _whole(resolved, catalog, problems)
+    if whole is not None:
+        parts["whole"] = whole
+        name = resolved.recipe.whole.name
+        refs["whole"] = _written_out("whole", resolved.recipe.whole, whole, pending)
+        hint = f"the whole method {name!r} does not read it; its own settings: gsstream plugins show whole/{name}"
+        paths = [*unheeded(resolved.recipe.model_copy(update=refs), whole, parts)]
+        paths += [path for path in pending if path[0] in PART_SLOTS and path[0] not in whole.heeds]
+        problems += [f"{resolved.near(path).where}: {'.'.join(path)}: {hint}" for path in paths]
+    join_problems(problems)
+    parts["loss"] = loss
+    parts["optimiser"] = _optimiser(catalog)
+    owners = sorted({catalog.entry(slot, ref.name).distribution for slot, ref in refs.items()})
+    recipe = resolved.recipe.model_copy(update=refs)
+    return Assembly(
+        recipe=recipe, origins=resolved.origins, distributions=tuple(owners), pending=tuple(pending), checks=level,
+        **parts,
+    )  # fmt: skip
+
+
+def _written_out(slot: str, ref: ComponentRef, part: Part, pending: list[KeyPath]) -> ComponentRef:
+    """The part with all its settings; what is left to the scene says ``auto`` and is added to ``pending``."""
+    left = [key for key in part.auto_rules if value_at(ref.params, key) == AUTO]
+    pending += [(slot, "params", *key.split(".")) for key in left]
+    params = with_values(part.config.model_dump(mode="json"), dict.fromkeys(left, AUTO))
+    return ComponentRef(name=ref.name, params=params)
+
+
+def value_at(params: Any, key: str) -> Any:
+    """The value under a dotted key; None where there is none."""
+    for name in key.split("."):
+        params = params.get(name) if isinstance(params, Mapping) else None
+    return params
+
+
+def with_values(params: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """``params`` with the values under dotted keys; None takes a key away."""
+    out: dict[str, Any] = copy.deepcopy(dict(params))
+    for key, value in values.items():
+        *above, name = key.split(".")
+        section = out
+        for step in above:
+            section = section.setdefault(step, {})
+        section[name] = value
+        if value is None:
+            del section[name]
+    return out
+
+
+def _build(
+    slot: str, ref: ComponentRef, resolved: ResolvedRecipe, catalog: Catalog, problems: list[str]
+) -> Part | None:
+    try:
+        cls = catalog.resolve(slot, ref.name)
+    except UnknownName as error:
+        problems.append(f"{resolved.near((slot, 'name')).where}: {slot}.name: {error}")
+        return None
+    left = [key for key in cls.auto_rules if value_at(ref.params, key) == AUTO]
+    fixed, found = with_values(ref.params, dict.fromkeys(left)), list[str]()
+    config = validate(cls.Config, fixed, resolved.near, (slot, "params"), found)
+    offered = f"; 'auto' is offered for {', '.join(cls.auto_rules)}" if cls.auto_rules else "; it offers no 'auto'"
+    problems += [text + offered if text.endswith("got 'auto'") else text for text in found]
+    return None if config is None else _construct(slot, ref.name, cls, config, catalog)
+
+
+def _construct(slot: str, name: str, cls: type[Any], config: Any, catalog: Catalog) -> Part:
+    try:
+        part: Part = cls(config)
+    except Exception as error:  # third-party constructor: reported with its owner's name
+        origin = catalog.entry(slot, name).origin
+        raise PluginUnavailable(f"{slot} {name!r} (from {origin}) could not be built: {error}") from error
+    return part
+
+
+def _whole(resolved: ResolvedRecipe, catalog: Catalog, problems: list[str]) -> StreamingMethod[Any] | None:
+    """The whole method the recipe names, if it names one."""
+    ref = resolved.recipe.whole
+    if ref.name != "none":
+        part = _build("whole", ref, resolved, catalog, problems)
+        return part if isinstance(part, StreamingMethod) else None
+    if ref.params:
+        where = resolved.near(("whole", "params", next(iter(ref.params)))).where
+        problems.append(f"{where}: whole.params needs a named whole method, but whole.name is 'none'")
+    return None
+
+
+def _loss(resolved: ResolvedRecipe, catalog: Catalog, problems: list[str]) -> Part | None:
+    """The loss implementation the recipe names, or the fastest that works here (they agree to 1e-6)."""
+    wanted = resolved.recipe.loss.backend
+    for name in AUTO_LOSSES if wanted == "auto" else (wanted,):
+        try:
+            cls = catalog.resolve("loss", name)
+            return _construct("loss", name, cls, cls.Config(), catalog)
+        except (UnknownName, PluginUnavailable) as error:
+            if wanted != "auto":
+                problems.append(f"{resolved.near(('loss', 'backend')).where}: loss.backend: {error}")
+    return None
+
+
+def _optimiser(catalog: Catalog) -> Part:
+    """The fastest optimiser that works here; they agree to 1e-6, so a recipe does not choose."""
+    for name in AUTO_OPTIMISERS[:-1]:
+        try:
+            cls = catalog.resolve("optimiser", name)
+            return _construct("optimiser", name, cls, cls.Config(), catalog)
+        except (UnknownName, PluginUnavailable):
+            continue  # what keeps a plugin from working is shown where its renderer is chosen
+    cls = catalog.resolve("optimiser", AUTO_OPTIMISERS[-1])
+    return _construct("optimiser", AUTO_OPTIMISERS[-1], cls, cls.Config(), catalog)
+
+
+def _auto_renderer(
+    ref: ComponentRef, resolved: ResolvedRecipe, catalog: Catalog, problems: list[str]
+) -> tuple[str, Part] | None:
+    """(name, renderer) of the fastest renderer that works here, else the reference with one warning."""
+    if ref.params:
+        where = resolved.near(("renderer", "params", next(iter(ref.params)))).where
+        problems.append(f"{where}: renderer.params needs a named renderer, but renderer.name is 'auto'")
+        return None
+    reasons = []
+    for name in AUTO_RENDERERS:
+        try:
+            cls = catalog.resolve("renderer", name)
+            return name, _construct("renderer", name, cls, cls.Config(), catalog)
+        except (UnknownName, PluginUnavailable) as error:
+            reasons.append(str(error))
+    warnings.warn(
+        "no fast renderer works here, so the reference renderer is used: about 500 times slower. To mend it, install a "
+        f"C++ compiler and run 'pip install ./plugins/cpu_render'. Reason: {'; '.join(reasons)}",
+        SlowRendererWarning,
+        stacklevel=3,
+    )
+    cls = catalog.resolve("renderer", "reference")
+    return "reference", _construct("renderer", "reference", cls, cls.Config(), catalog)
+
+

@@ -1,0 +1,1 @@
+"""Values that the scene decides before frame 0."""

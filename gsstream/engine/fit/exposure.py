@@ -1,0 +1,110 @@
+"""Exposure: an affine colour map per training camera, fitted while frame 0 is optimised (ours).
+
+Rigs are rarely colour-matched. Without this the Gaussians explain the differences between cameras with floaters and
+view-dependent colour, and held-out views pay. The mean map is held at identity, so a camera nobody fitted (the
+held-out ones) sees the scene as it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+
+from gsstream.engine.fit.backward import pull_back
+from gsstream.loss.base import Loss
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Colour maps of C cameras: image' = image @ matrix.T + offset. ``matrix`` [C, 3, 3], ``offset`` [C, 3]."""
+
+    matrix: torch.Tensor
+    offset: torch.Tensor
+
+    @staticmethod
+    def identity(num_cameras: int) -> Exposure:
+        return Exposure(torch.eye(3).repeat(num_cameras, 1, 1), torch.zeros(num_cameras, 3))
+
+    def apply(self, view: int, image: torch.Tensor) -> torch.Tensor:
+        """[H, W, 3] scene colours -> colours as camera ``view`` records them."""
+        return torch.addmm(self.offset[view], image.reshape(-1, 3), self.matrix[view].T).reshape(image.shape)
+
+    def pull(self, view: int, gradient: torch.Tensor) -> torch.Tensor:
+        """Gradient with respect to recorded colours -> gradient with respect to scene colours."""
+        return (gradient.reshape(-1, 3) @ self.matrix[view]).reshape(gradient.shape)
+
+
+def backward_view(
+    image: torch.Tensor,
+    view: int,
+    exposure: Exposure | None,
+    loss: Loss,
+    target: Any,
+    dssim: float,
+    tiles: torch.Tensor | None = None,
+) -> tuple[float, torch.Tensor]:
+    """Judge a rendered view as its camera records it, and pull the loss back into whatever ``image`` was rendered from.
+
+    Arguments:
+        image: [H, W, 3] scene colours, with a graph.
+        target: what ``loss.prepare`` made of the recorded image.
+        tiles: the only tiles that what is optimised can change (``RenderOutput.tiles``).
+
+    Returns the loss, and its gradient [H, W, 3] with respect to the recorded colours.
+    """
+    raw = image.detach()
+    value, gradient = loss.evaluate(exposure.apply(view, raw) if exposure else raw, target, dssim, tiles)
+    pull_back([image], [exposure.pull(view, gradient) if exposure else gradient])
+    return value, gradient
+
+
+@dataclass(frozen=True)
+class ExposureFit:
+    """Adam state of an exposure fit, per camera. Rows: the 9 + 3 coefficients."""
+
+    exposure: Exposure
+    first: torch.Tensor  # [C, 12]
+    second: torch.Tensor  # [C, 12]
+    steps: tuple[int, ...]
+
+    @staticmethod
+    def start(num_cameras: int) -> ExposureFit:
+        zeros = torch.zeros(num_cameras, 12)
+        return ExposureFit(Exposure.identity(num_cameras), zeros, zeros, (0,) * num_cameras)
+
+    def step(self, view: int, image: torch.Tensor, gradient: torch.Tensor, lr: float, pull: float) -> ExposureFit:
+        """One Adam step of camera ``view``.
+
+        Arguments:
+            image, gradient: [H, W, 3] uncorrected render, and the loss gradient with respect to the corrected one.
+            lr: learning rate of the matrix entries; offsets use 0.4 of it.
+            pull: weight of the quadratic pull towards identity.
+        """
+        matrix, offset = self.exposure.matrix[view], self.exposure.offset[view]
+        pixels, upstream = image.reshape(-1, 3), gradient.reshape(-1, 3)
+        slope = torch.cat([(upstream.T @ pixels).flatten(), upstream.sum(0)])
+        slope = slope + pull * torch.cat([(matrix - torch.eye(3)).flatten(), offset])
+        count = self.steps[view] + 1
+        first = 0.9 * self.first[view] + 0.1 * slope
+        second = 0.999 * self.second[view] + 0.001 * slope.square()
+        change = lr * (first / (1 - 0.9**count)) / ((second / (1 - 0.999**count)).sqrt() + 1e-10)
+        steps = (*self.steps[:view], count, *self.steps[view + 1 :])
+        exposure = Exposure(
+            _put(self.exposure.matrix, view, matrix - change[:9].reshape(3, 3)),
+            _put(self.exposure.offset, view, offset - 0.4 * change[9:]),
+        )
+        return ExposureFit(exposure, _put(self.first, view, first), _put(self.second, view, second), steps)
+
+    def centered(self) -> ExposureFit:
+        """Shift all maps so that their mean is identity: the gauge that held-out cameras are judged in."""
+        matrix, offset = self.exposure.matrix, self.exposure.offset
+        centered = Exposure(matrix - matrix.mean(0) + torch.eye(3), offset - offset.mean(0))
+        return replace(self, exposure=centered)
+
+
+def _put(values: torch.Tensor, row: int, value: torch.Tensor) -> torch.Tensor:
+    out = values.clone()
+    out[row] = value
+    return out

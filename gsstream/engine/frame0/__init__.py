@@ -1,0 +1,1 @@
+"""The first frame: seeds, anchors, Gaussians, key packet."""

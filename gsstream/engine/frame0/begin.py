@@ -1,0 +1,207 @@
+"""Frame 0: points -> anchors -> optimised Gaussians -> key packet -> the state every later frame starts from."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.delta import Layout
+from gsstream.core.errors import InputError
+from gsstream.core.frame import Frame, PointCloud
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.rng import Rng
+from gsstream.core.shapes import FloatArray
+from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.auto.rules import refuse_pending
+from gsstream.engine.fit.exposure import Exposure
+from gsstream.engine.assembly.guard import guarded
+from gsstream.engine.frame0.root import Progress, initial_gaussians, optimise_root, sort_by_node
+from gsstream.engine.state.stream_state import Step, StreamState
+from gsstream.init.thinning import thin_points
+from gsstream.packet import EncodedPacket, KeyState, PlayerState, StreamMeta, decode_packet, encode_key, quantise_key
+from gsstream.structure.base import Anchors
+
+
+def begin(
+    parts: Assembly, points: PointCloud, frame: Frame, meta: StreamMeta, rng: Rng, progress: Progress
+) -> Step:
+    """Reconstruct frame 0 and write it as a key packet.
+
+    Arguments:
+        points: seeds (never derived from test cameras).
+        frame: training images of frame 0.
+        meta: what the key packet says about the run; the exposure fit is added to it.
+    """
+    refuse_pending(parts)
+    check_cameras(frame.cameras, 1, "a frame")
+    clock = [time.perf_counter()]
+    anchors = seeded(parts, points, frame)
+    clock.append(time.perf_counter())
+    start = initial_gaussians(anchors, parts.recipe.first_frame)
+    root = optimise_root(start, anchors.levels, frame, parts, rng, progress)
+    clock.append(time.perf_counter())
+    # Positions are float32 in the packet too, so the hierarchy of the decoded scene is the one built here.
+    decoded = quantise_key(root.gaussians.map(lambda t: t.numpy())).map(torch.from_numpy)
+    hierarchy, levels, decoded = arrange(parts, decoded, root.levels, anchors)
+    layout = make_layout(hierarchy, levels, anchors)
+    state, packet = key_state(parts, decoded, layout, hierarchy, frame, meta, root.exposure, anchors.origin, rng)
+    clock.append(time.perf_counter())
+    metrics: dict[str, Any] = {
+        "bytes": dict(packet.sizes),
+        "num_gaussians": len(decoded),
+        "active_gaussians": len(decoded),
+        "num_gates": len(layout.node_counts),
+        "active_gates": 0,
+        "iterations": root.iterations,
+        "seconds": dict(zip(("seed", "optimise", "code"), np.diff(clock).tolist(), strict=True)),
+    }
+    return Step(state, packet, "key", metrics)
+
+
+def seeded(parts: Assembly, points: PointCloud, frame: Frame) -> Anchors:
+    """Anchors, at most ``first_frame.max_gaussians`` of them.
+
+    A structure places one or more for each point, so where there are too many it is given fewer points.
+    """
+    most = parts.recipe.first_frame.max_gaussians
+    while True:
+        with guarded("structure", parts.structure, frame.index):
+            anchors = parts.structure.seed(points, frame.cameras)
+        if len(anchors.positions) <= most or len(points) == 1:
+            return anchors
+        points = thin_points(points, max(1, int(0.95 * len(points) * most / len(anchors.positions))))
+
+
+def check_cameras(cameras: Cameras, least: int, who: str) -> None:
+    """Raise InputError when there are fewer training cameras than somebody needs."""
+    if len(cameras) < least:
+        raise InputError(
+            f"{who} needs at least {least} training camera{'s'[: least != 1]}, got {len(cameras)}; record with "
+            "more, or choose another method"
+        )
+
+
+def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
+    """Start from the decoded frame 0 of another stream, grouped by this method: methods compare on the same scene.
+
+    Raises InputError when the recipe asks for another degree of spherical harmonics than the stream has.
+    """
+    refuse_pending(parts)
+    started = time.perf_counter()
+    if first.gaussians.sh_degree != parts.recipe.first_frame.degree:
+        raise InputError(
+            f"the first frame has spherical harmonics of degree {first.gaussians.sh_degree}, the recipe asks for "
+            f"{parts.recipe.first_frame.degree}; set first_frame.sh_degree={first.gaussians.sh_degree}"
+        )
+    gaussians = first.gaussians.map(torch.from_numpy)
+    anchors = own_anchors(parts, first, frame)
+    hierarchy, levels, gaussians = arrange(parts, gaussians, anchors.levels, anchors)
+    layout = make_layout(hierarchy, levels, anchors)
+    exposure = exposure_from_meta(first.meta)
+    state, packet = key_state(parts, gaussians, layout, hierarchy, frame, meta, exposure, anchors.origin, rng)
+    metrics = {
+        "bytes": dict(packet.sizes),
+        "num_gaussians": len(gaussians),
+        "active_gaussians": len(gaussians),
+        "num_gates": len(layout.node_counts),
+        "active_gates": 0,
+        "iterations": 0,
+        "seconds": {"code": time.perf_counter() - started},
+    }
+    return Step(state, packet, "key", metrics)
+
+
+def own_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
+    """The grid this method's structure would lay; each Gaussian gets the level of the nearest cell size."""
+    theirs = decoded_anchors(first)
+    with guarded("structure", parts.structure, frame.index):
+        grid = parts.structure.seed(cloud_of(first), frame.cameras)
+    sizes = theirs.cell_sizes[theirs.levels]
+    levels = (sizes.log()[:, None] - grid.cell_sizes.log()[None]).abs().argmin(1)
+    return replace(theirs, levels=levels, cell_sizes=grid.cell_sizes, origin=grid.origin)
+
+
+def cloud_of(first: PlayerState) -> PointCloud:
+    """The centres of a decoded scene; their colour is unknown, grey."""
+    means = first.gaussians.means
+    return PointCloud(means, np.full_like(means, 0.5), "frame 0 of another stream")
+
+
+def decoded_anchors(player: PlayerState) -> Anchors:
+    """What a structure needs to group a decoded scene again."""
+    gaussians = player.gaussians.map(torch.from_numpy)
+    return Anchors(
+        positions=gaussians.means,
+        colors=torch.zeros_like(gaussians.means),
+        levels=torch.from_numpy(player.layout.octree_levels.astype(np.int64)),
+        cell_sizes=torch.from_numpy(np.asarray(player.layout.cell_sizes)),
+        origin=torch.tensor(player.meta.extra["origin"], dtype=torch.float32),
+    )
+
+
+def arrange(
+    parts: Assembly, gaussians: Gaussians[torch.Tensor], levels: torch.Tensor, anchors: Anchors
+) -> tuple[Hierarchy, torch.Tensor, Gaussians[torch.Tensor]]:
+    """Group the Gaussians and store them node by node: (hierarchy, levels, Gaussians), all in the new order."""
+    with guarded("structure", parts.structure, 0):
+        hierarchy = parts.structure.build(gaussians, anchors)
+        hierarchy.validate()
+    edit = sort_by_node(hierarchy.node_of)
+    return hierarchy.rows(edit.source), levels[edit.source], gaussians.rows(edit.source)
+
+
+def make_layout(hierarchy: Hierarchy, levels: torch.Tensor, anchors: Anchors) -> Layout:
+    """What both ends know until the next key packet; ``hierarchy.node_of`` must be sorted."""
+    counts = torch.bincount(hierarchy.node_of, minlength=hierarchy.num_nodes)
+    return Layout(
+        node_counts=counts.numpy().astype(np.int32),
+        octree_levels=levels.numpy().astype(np.uint8),
+        cell_sizes=anchors.cell_sizes.numpy().astype(np.float32),
+    )
+
+
+def key_state(
+    parts: Assembly,
+    gaussians: Gaussians[torch.Tensor],
+    layout: Layout,
+    hierarchy: Hierarchy,
+    frame: Frame,
+    meta: StreamMeta,
+    exposure: Exposure | None,
+    origin: torch.Tensor,
+    rng: Rng,
+) -> tuple[StreamState, EncodedPacket]:
+    """Encode a key packet and continue from its decoded bytes."""
+    extra: Mapping[str, Any] = {**meta.extra, **exposure_to_meta(exposure), "origin": origin.tolist()}
+    arrays: Gaussians[FloatArray] = gaussians.map(lambda t: np.ascontiguousarray(t.numpy()))
+    packet = encode_key(KeyState(arrays, layout, replace(meta, extra=extra)), frame=frame.index)
+    player = decode_packet(None, packet.data)
+    with guarded("update", parts.update, frame.index):
+        decoders = parts.update.init_decoders(gaussians, rng.stream("decoders", frame.index))
+    state = StreamState(
+        player=player, hierarchy=hierarchy, previous=frame, decoders=decoders,
+        exposure=exposure_from_meta(player.meta), key_frame=player.frame,
+    )  # fmt: skip
+    return state, packet
+
+
+def exposure_to_meta(exposure: Exposure | None) -> dict[str, Any]:
+    """The colour maps of the training cameras as plain values: what a camera recorded can be shown from the stream."""
+    if exposure is None:
+        return {}
+    return {"exposure": {"matrix": exposure.matrix.tolist(), "offset": exposure.offset.tolist()}}
+
+
+def exposure_from_meta(meta: StreamMeta) -> Exposure | None:
+    """Inverse of :func:`exposure_to_meta`; encoder and resumed encoder both continue from the packet's values."""
+    stored = meta.extra.get("exposure")
+    if stored is None:
+        return None
+    return Exposure(torch.tensor(stored["matrix"]), torch.tensor(stored["offset"]))

@@ -1,0 +1,191 @@
+"""The first frame: from anchors to Gaussians that a stream can start from.
+
+The schedule is 3DGS's (Kerbl et al. 2023) with gradient-driven densification and opacity pruning; the exposure fit, the
+opacity and scale penalties and the near plane are ours, and held-out quality is why they are there (docs/results.md).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from gsstream.core.errors import InputError
+from gsstream.core.frame import Frame
+from gsstream.core.gaussians import ATTRIBUTES, Gaussians
+from gsstream.core.rng import Rng
+from gsstream.core.topology import TopologyEdit
+from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.assembly.checks import VARIABLE, Checks, StepChecks, check_values
+from gsstream.engine.frame0.densify import DensifyStatistics, grow_and_prune
+from gsstream.engine.fit.exposure import Exposure, ExposureFit, backward_view
+from gsstream.engine.assembly.guard import guarded
+from gsstream.engine.frame0.nearest import neighbour_distance
+from gsstream.engine.fit.row_table import RowTable
+from gsstream.recipe.model import FirstFrame
+from gsstream.render.activations import logit, rgb_to_sh0
+from gsstream.structure.base import Anchors
+
+CENTER_EVERY = 50
+Progress = Callable[[int, int, float, int], None]
+
+
+@dataclass(frozen=True)
+class RootResult:
+    """Optimised frame 0. ``levels`` [N] is aligned with the Gaussians."""
+
+    gaussians: Gaussians[torch.Tensor]
+    levels: torch.Tensor
+    exposure: Exposure | None
+    iterations: int
+
+
+def initial_gaussians(anchors: Anchors, settings: FirstFrame) -> Gaussians[torch.Tensor]:
+    """One isotropic Gaussian per anchor, as wide as the distance to its three nearest neighbours (3DGS)."""
+    count = len(anchors.positions)
+    if count == 0:
+        raise InputError("the structure placed no anchors: expected at least 1 Gaussian to start from, got 0")
+    spacing = neighbour_distance(anchors.positions).clamp(1e-6, 1e6)
+    quats = torch.zeros(count, 4)
+    quats[:, 0] = 1
+    return Gaussians(
+        means=anchors.positions.float().clone(),
+        quats=quats,
+        scales=spacing.log()[:, None].repeat(1, 3),
+        opacities=torch.full((count,), logit(settings.opacity)),
+        sh0=rgb_to_sh0(anchors.colors.float()),
+        shN=torch.zeros(count, (settings.degree + 1) ** 2 - 1, 3),
+    )
+
+
+def first_rates(settings: FirstFrame, extent: float) -> dict[str, float]:
+    """Learning rate of every attribute at the start of frame 0; ``extent``: of the cameras, scene units."""
+    s = settings
+    rates = {"means": s.lr_means * extent, "quats": s.lr_quats, "scales": s.lr_scales}
+    return {**rates, "opacities": s.lr_opacities, "sh0": s.lr_sh0, "shN": s.lr_shN}
+
+
+def optimise_root(
+    start: Gaussians[torch.Tensor],
+    levels: torch.Tensor,
+    frame: Frame,
+    parts: Assembly,
+    rng: Rng,
+    progress: Progress,
+) -> RootResult:
+    """Fit frame 0 on its training images.
+
+    Arguments:
+        start: [N] initial Gaussians; ``levels`` [N] their octree levels.
+        frame: training images of frame 0.
+        progress: called with (iteration, iterations, smoothed loss, number of Gaussians).
+    """
+    run = _RootRun(start, levels, frame, parts, rng)
+    for iteration in range(1, run.iterations + 1):
+        value = run.step(iteration)
+        progress(iteration, run.iterations, value, len(run.levels))
+    exposure = run.exposure.centered().exposure if run.exposure else None
+    found = run.gaussians().map(torch.Tensor.detach)
+    for name, values in found.items():
+        if parts.checks is not Checks.OFF:
+            what = f"{name} after the last iteration ({VARIABLE}=step finds the first)"
+            check_values("first frame", run.table, what, values, frame.index)
+    return RootResult(found, run.levels, exposure, run.iterations)
+
+
+class _RootRun:
+    """The moving state of one root optimisation; lives only inside :func:`optimise_root`."""
+
+    def __init__(
+        self, start: Gaussians[torch.Tensor], levels: torch.Tensor, frame: Frame, parts: Assembly, rng: Rng
+    ) -> None:
+        self.settings, self.recipe, self.frame = parts.recipe.first_frame, parts.recipe, frame
+        self.renderer, self.loss, self.levels = parts.renderer, parts.loss, levels
+        self.look = StepChecks(parts.checks, frame.index)
+        self.views = len(frame.cameras)
+        self.extent = frame.cameras.extent
+        self.iterations = min(self.settings.epochs * self.views, self.settings.max_iterations)
+        self.generator = rng.stream("root", frame.index)
+        self.table = RowTable(dict(start.items()), first_rates(self.settings, self.extent), parts.optimiser)
+        self.targets = [self.loss.prepare(torch.from_numpy(image)) for image in frame.images]
+        self.exposure = ExposureFit.start(self.views) if self.settings.exposure else None
+        self.statistics = DensifyStatistics.zeros(len(start))
+        self.order: list[int] = []
+        self.smooth = math.nan
+
+    def gaussians(self) -> Gaussians[torch.Tensor]:
+        return Gaussians(**{name: self.table[name] for name in ATTRIBUTES})
+
+    def step(self, iteration: int) -> float:
+        s = self.settings
+        view, look = self._next_view(), self.look
+        look.iteration = iteration
+        densify = s.densify_from <= iteration + s.densify_every and iteration <= s.densify_until * self.iterations
+        rows = self.gaussians()
+        probe = torch.zeros(len(rows), 2, requires_grad=True) if densify else None
+        with guarded("renderer", self.renderer, self.frame.index, iteration):
+            session = self.renderer.open(rows, None, self.frame.cameras, self.recipe.background)
+            output = session.render(view, rows, probe=probe)
+        look("renderer", self.renderer, f"image of view {view}", output.image)
+        with guarded("loss", self.loss, self.frame.index, iteration):
+            value = self._backward(view, output.image)
+        look.number("loss", self.loss, f"loss of view {view}", value)
+        look.gradients("renderer", self.renderer, "gradient of", rows)
+        fraction = iteration / self.iterations
+        self.table.set_lr("means", self.extent * _log_linear(s.lr_means, s.lr_means_final, fraction))
+        self.table.step()
+        look("first frame", self.table, "parameters,", rows)
+        if probe is not None and probe.grad is not None:
+            size = torch.tensor([self.frame.cameras.width / 2, self.frame.cameras.height / 2])
+            self.statistics = self.statistics.add(probe.grad * size)
+            if iteration >= s.densify_from and iteration % s.densify_every == 0:
+                self._densify()
+        self.smooth = value if math.isnan(self.smooth) else 0.98 * self.smooth + 0.02 * value
+        return self.smooth
+
+    def _backward(self, view: int, image: torch.Tensor) -> float:
+        """Loss, its gradient into the leaves, and the exposure step."""
+        exposure = self.exposure.exposure if self.exposure else None
+        target, weight = self.targets[view], self.recipe.loss.dssim
+        value, gradient = backward_view(image, view, exposure, self.loss, target, weight)
+        self._penalise()
+        if self.exposure:
+            self.exposure = self.exposure.step(view, image.detach(), gradient, lr=0.005, pull=1e-3)
+            if sum(self.exposure.steps) % CENTER_EVERY == 0:
+                self.exposure = self.exposure.centered()
+        return value
+
+    def _penalise(self) -> None:
+        """Gradients of the mean opacity and the mean scale, added by hand: they need no graph."""
+        count = max(1, len(self.levels))
+        opacities, scales = self.table["opacities"], self.table["scales"]
+        if self.settings.opacity_penalty and opacities.grad is not None:
+            p = opacities.detach().sigmoid()
+            opacities.grad.add_(p * (1 - p), alpha=self.settings.opacity_penalty / count)
+        if self.settings.scale_penalty and scales.grad is not None:
+            scales.grad.add_(scales.detach().exp(), alpha=self.settings.scale_penalty / (3 * count * self.extent))
+
+    def _densify(self) -> None:
+        gaussians = self.gaussians().map(torch.Tensor.detach)
+        edit, values = grow_and_prune(gaussians, self.statistics, self.settings, self.extent, self.generator)
+        self.table.edit(edit, values)
+        self.levels = self.levels[edit.source]
+        self.statistics = DensifyStatistics.zeros(len(self.levels))
+
+    def _next_view(self) -> int:
+        if not self.order:
+            self.order = torch.randperm(self.views, generator=self.generator).tolist()
+        return self.order.pop()
+
+
+def _log_linear(first: float, last: float, fraction: float) -> float:
+    if first <= 0 or last <= 0:
+        return first + (last - first) * fraction
+    return math.exp(math.log(first) * (1 - fraction) + math.log(last) * fraction)
+
+
+def sort_by_node(node_of: torch.Tensor) -> TopologyEdit:
+    """The permutation that stores Gaussians node by node (stable)."""
+    return TopologyEdit.permute(torch.argsort(node_of, stable=True))

@@ -1,0 +1,1 @@
+"""Later key packets, and going on from a stream."""

@@ -1,0 +1,1 @@
+"""A run on disk: session, metrics, progress, output folder."""

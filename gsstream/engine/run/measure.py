@@ -1,0 +1,68 @@
+"""Quality of decoded frames on held-out cameras, measured while a run goes on."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsstream.core.frame import Frame
+from gsstream.core.shapes import FloatArray
+from gsstream.engine.assembly.guard import guarded
+from gsstream.method.base import MethodState
+from gsstream.metrics import moving_mask, noise_sigma, psnr, ssim
+from gsstream.render.base import Renderer
+
+
+class HeldOut:
+    """Renders the decoded scene for the test cameras and compares with what they saw.
+
+    Moving pixels are those that differ from frame 0 beyond the camera's noise; the noise is measured once, between the
+    first two frames.
+    """
+
+    def __init__(self, renderer: Renderer, background: tuple[float, float, float]) -> None:
+        self._renderer, self._background = renderer, background
+        self._first: Frame | None = None
+        self._sigma: list[float] = []
+
+    def measure(self, state: MethodState, frame: Frame) -> dict[str, Any]:
+        """PSNR, SSIM and moving-pixel PSNR per test camera; None where undefined (nothing moves, or equal images)."""
+        if self._first is None:
+            self._first = frame
+        elif not self._sigma:
+            pairs = zip(self._first.images, frame.images, strict=True)
+            self._sigma = [noise_sigma(a, b) for a, b in pairs]
+        out: dict[str, Any] = {"psnr": {}, "ssim": {}, "psnr_moving": {}}
+        for view, name in enumerate(frame.cameras.ids):
+            image = self.render(state, frame, view)
+            truth = frame.images[view]
+            out["psnr"][name] = _finite(psnr(image, truth))
+            out["ssim"][name] = _finite(ssim(image, truth))
+            out["psnr_moving"][name] = self._moving(image, truth, view)
+        return out
+
+    def remember(self, first: Frame, second: Frame | None) -> None:
+        """What a resumed run must know of the frames it does not redo."""
+        self._first = first
+        if second is not None:
+            self._sigma = [noise_sigma(a, b) for a, b in zip(first.images, second.images, strict=True)]
+
+    def render(self, state: MethodState, frame: Frame, view: int) -> FloatArray:
+        """[H, W, 3] decoded image in [0, 1]."""
+        gaussians = state.player.gaussians.map(torch.from_numpy)
+        with torch.no_grad(), guarded("renderer", self._renderer, frame.index):
+            output = self._renderer.render(gaussians, frame.cameras, view, self._background)
+        return np.asarray(np.clip(output.image.numpy(), 0, 1))
+
+    def _moving(self, image: FloatArray, truth: FloatArray, view: int) -> float | None:
+        if self._first is None or not self._sigma:
+            return None
+        mask = moving_mask(truth, self._first.images[view], self._sigma[view])
+        return _finite(psnr(image, truth, mask))
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,1 @@
+"""What the encoder carries from frame to frame."""

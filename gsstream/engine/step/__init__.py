@@ -1,0 +1,1 @@
+"""One later frame."""

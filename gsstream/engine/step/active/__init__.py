@@ -1,0 +1,1 @@
+"""Which Gaussians take part in a frame."""

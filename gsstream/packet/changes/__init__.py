@@ -1,0 +1,1 @@
+"""One codec for each kind of change that a delta packet may hold (``core.changes``)."""

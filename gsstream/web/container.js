@@ -11,7 +11,7 @@ const MAGIC = [0x89, 0x47, 0x53, 0x53, 0x0d, 0x0a, 0x1a, 0x0a];
 export const KIND = { key: 1, delta: 2, empty: 3, index: 4 };
 export const KIND_NAMES = { 1: "key", 2: "delta", 3: "empty", 4: "index" };
 export const SECTION_NAMES = {
-  1: "meta", 2: "layout", 3: "gates", 4: "decoders", 5: "index", 6: "deaths", 7: "births",
+  1: "meta", 2: "layout", 3: "gates", 4: "decoders", 5: "index", 6: "deaths", 7: "births", 8: "motion",
   16: "means", 17: "quats", 18: "scales", 19: "opacities", 20: "sh0", 21: "shN",
 };
 
@@ -108,8 +108,9 @@ function splitSections(header, body, start) {
     }
     const name = SECTION_NAMES[body[at]];
     const length = view.getUint32(at + 1, true);
-    if (!name || sections.some((section) => section.name === name)) {
-      throw new PacketError(`section ${body[at]} is unknown or repeated`, start + at);
+    if (!name) throw new PacketError(`section ${body[at]} is unknown: a newer player is needed`, start + at);
+    if (sections.some((section) => section.name === name)) {
+      throw new PacketError(`section ${name} is repeated`, start + at);
     }
     at += SECTION_HEADER;
     if (length > body.length - at) {

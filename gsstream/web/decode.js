@@ -1,9 +1,11 @@
 // The state that a stream of packets leads to, bit for bit the one of the encoder. See docs/reference/packet-format.md.
 
+import { decodeMotions, marked, SECTIONS as MOTION } from "./changes/motion.js";
 import { applyResidual, decodeResidual, SECTIONS as RESIDUAL } from "./changes/residual.js";
 import { applyRows, decodeRows, SECTIONS as ROWS } from "./changes/rows.js";
 import { KIND, KIND_NAMES, parsePacket } from "./container.js";
-import { PacketError } from "./errors.js";
+import { PacketError, located } from "./errors.js";
+import { displacement, gatherDisplacement, gatherGroups, pick } from "./history.js";
 import { decodeKey } from "./key.js";
 import { ATTRIBUTES } from "./limits.js";
 
@@ -14,7 +16,8 @@ import { ATTRIBUTES } from "./limits.js";
  * decoded as a whole first, so after a PacketError the state still is that of the frame before.
  *
  * A state has `frame`, `number` (Gaussians), `scene` (attribute -> Float32Array), `widths` (values a row), `layout`,
- * `meta`, `decoders`, and `change`: what this packet did, for whoever shows it.
+ * `meta`, `decoders`, `groups` and `moved` (what the next packet may refer to), and `change`: what this packet did, for
+ * whoever shows it.
  */
 export function decodePacket(state, data, offset = 0) {
   const { header, sections } = parsePacket(data, offset);
@@ -26,6 +29,7 @@ export function decodePacket(state, data, offset = 0) {
   }
   if (header.kind === KIND.empty) {
     if (sections.length) throw new PacketError("empty packet with sections", offset);
+    state.moved = null;
     state.change = { kind: "empty" };
   } else {
     state.change = applyDelta(state, decodeDelta(sections, state, offset));
@@ -39,35 +43,67 @@ function keyState(header, sections, size, offset) {
   const number = layout.unitOf.length;
   const widths = { means: 3, quats: 4, scales: 3, opacities: 1, sh0: 3, shN: number ? scene.shN.length / number : 0 };
   return {
-    frame: header.frame, number, scene, widths, layout, meta, decoders: new Map(), change: { kind: KIND_NAMES[KIND.key] },
+    frame: header.frame, number, scene, widths, layout, meta, decoders: new Map(), groups: null, moved: null,
+    change: { kind: KIND_NAMES[KIND.key] },
   };
 }
 
+/** Sections of a delta packet in the order in which they stand there. */
+const ORDER = [...MOTION, ...RESIDUAL, ...ROWS];
+
 function decodeDelta(sections, state, offset) {
-  const found = Object.fromEntries(sections.map((section) => [section.name, section]));
-  const known = [...RESIDUAL, ...ROWS];
-  if (!found.gates || sections.some(({ name }) => !known.includes(name))) {
-    throw new PacketError(`delta packet: unexpected sections ${sections.map((s) => s.name)}`, offset);
+  const places = sections.map(({ name }) => ORDER.indexOf(name));
+  if (!places.length || places.some((place, i) => place < 0 || (i > 0 && place < places[i - 1]))) {
+    const names = sections.map(({ name }) => name).join(", ");
+    throw new PacketError(`delta packet: sections ${names || "none"} do not stand in this order`, offset);
   }
-  const residual = decodeResidual(found, state, offset);
+  const found = Object.fromEntries(sections.map((section) => [section.name, section]));
+  const { motion } = found;
+  const motions = motion ? located(motion.offset, () => decodeMotions(motion, state)) : null;
+  const stray = sections.find(({ name }) => RESIDUAL.includes(name));
+  if (stray && !found.gates) throw new PacketError(`delta packet: section ${stray.name} without gates`, stray.offset);
+  const residual = found.gates ? decodeResidual(found, state, offset) : null;
   const rows = found.deaths || found.births ? decodeRows(found, state, offset) : null;
-  return { residual, rows };
+  return { motions, residual, rows };
 }
 
 /**
- * Apply what was decoded, in order. Returns what changed: `moved`, rows with their gates as they were numbered before
- * births and deaths, and `source`, the row each row was before (null when none joined or left; see `applyRows`).
+ * Apply what was decoded, in order. Returns what changed: `moved`, lists of rows with their gates and attributes as they
+ * were numbered before births and deaths, and `source`, the row each row was before (null when none joined or left; see
+ * `applyRows`).
  */
-function applyDelta(state, { residual, rows }) {
-  applyResidual(state, residual);
-  const moved = [
-    { rows: residual.rows, gate: residual.gate, attributes: residual.parts.map((part) => part.name) },
-  ];
-  if (!rows) return { kind: "delta", moved, source: null, before: state.number };
-  const before = state.number;
-  const source = applyRows(state, rows);
-  state.number = source.length;
-  return { kind: "delta", moved, source, before };
+function applyDelta(state, { motions, residual, rows }) {
+  const touched = touchedRows(state.number, motions, residual);
+  const means = pick(state.scene.means, touched, 3);
+  const quats = pick(state.scene.quats, touched, 4);
+  const change = { kind: "delta", moved: [], source: null, before: state.number };
+  if (motions) {
+    Object.assign(state.scene, { means: motions.means, quats: motions.quats });
+    state.groups = motions.groups;
+    change.moved.push({ rows: motions.rows, gate: null, attributes: ["means", "quats"] });
+  }
+  if (residual) {
+    applyResidual(state, residual);
+    const attributes = residual.parts.map((part) => part.name);
+    change.moved.push({ rows: residual.rows, gate: residual.gate, attributes });
+  }
+  state.moved = displacement(touched, means, quats, state.scene);
+  if (rows) {
+    change.source = applyRows(state, rows);
+    state.moved = gatherDisplacement(state.moved, change.source, change.before);
+    state.groups = gatherGroups(state.groups, change.source, change.before);
+    state.number = change.source.length;
+  }
+  return change;
+}
+
+/** Rows of moving groups and rows behind open gates, ascending. */
+function touchedRows(number, motions, residual) {
+  if (!motions) return residual ? residual.rows : new Uint32Array(0);
+  if (!residual) return motions.rows;
+  const marks = new Uint8Array(number);
+  for (const rows of [motions.rows, residual.rows]) for (const row of rows) marks[row] = 1;
+  return marked(marks);
 }
 
 /** The bytes of all attributes in their order: two states are the same when these are. */

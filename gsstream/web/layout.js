@@ -2,7 +2,7 @@
 
 import { unpackParts } from "./bits.js";
 import { PacketError } from "./errors.js";
-import { MAX_LEVELS } from "./limits.js";
+import { MAX_UNITS } from "./limits.js";
 import { decodeSymbols, range } from "./symbols.js";
 
 /**
@@ -16,10 +16,10 @@ export function decodeLayout(data, most) {
   const number = view.getUint32(0, true);
   const nodes = view.getUint32(4, true);
   const kinds = data[8];
-  if (number > most || nodes > most || kinds > MAX_LEVELS) {
+  if (number > most || nodes > most || kinds > MAX_UNITS) {
     throw new PacketError(
       `layout of ${number} Gaussians, ${nodes} nodes, ${kinds} units is beyond the limits: at most ${most} ` +
-      `Gaussians and nodes in a packet of this size, ${MAX_LEVELS} units`);
+      `Gaussians and nodes in a packet of this size, ${MAX_UNITS} units`);
   }
   if (data.length - 9 < 4 * kinds) throw new PacketError("units cut short");
   const units = Float32Array.from({ length: kinds }, (_, i) => view.getFloat32(9 + 4 * i, true));

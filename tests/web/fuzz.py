@@ -18,10 +18,12 @@ from typing import Any, NamedTuple
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent / "packet")]
-from fuzz_cases import bases, mutate
+from fuzz_cases import Base, bases, mutate
+from moving_scenes import moving_packets
 from node_runs import play_in_node
 
 from gsstream.core.errors import PacketError
+from gsstream.packet.base import file_header
 from gsstream.player.playback import Playback
 
 SECONDS = 5.0
@@ -73,7 +75,7 @@ def disagreement(ours: Outcome, theirs: dict[str, Any], size: int) -> str | None
 
 def fuzz(count: int, seed: int, *, first: int = 0, chunk: int = 2000) -> tuple[Counter[str], list[str]]:
     """Outcomes by kind of mutation, and what went wrong."""
-    corpus = bases()
+    corpus = [*bases(), *(_moving(seed) for seed in (1, 2, 3))]
     outcomes: Counter[str] = Counter()
     failures: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
@@ -89,6 +91,13 @@ def fuzz(count: int, seed: int, *, first: int = 0, chunk: int = 2000) -> tuple[C
                 if why is not None:
                     failures.append(f"case {number} ({kind}): {why}")
     return outcomes, failures
+
+
+def _moving(seed: int) -> Base:
+    """A stream with motions in the form that the mutations take; what it decodes to is not needed here."""
+    packets = moving_packets(seed, frames=6, number=(30, 100, 300)[seed % 3], key_at=9)
+    data = file_header() + b"".join(packet.data for packet in packets)
+    return Base(data, (), (), tuple(packets))
 
 
 def main() -> int:

@@ -5,16 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 import subprocess
-import sys
 from pathlib import Path
 
+import constriction
 import numpy as np
 import pytest
-
-HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE), str(HERE.parent / "packet")]
-import constriction
-from fuzz import fuzz
+from decoder_fuzz import fuzz
 from moving_scenes import moving_packets
 from node_runs import NODE, needs_node, play_in_node
 
@@ -25,6 +21,7 @@ from gsstream.packet.symbols import encode_symbols
 from gsstream.player.playback import Playback
 
 pytestmark = needs_node
+HERE = Path(__file__).parent
 SAMPLES = HERE.parent / "packet" / "samples"
 
 

@@ -1,6 +1,6 @@
 """Hold the browser's decoder against Python's on damaged and lying streams.
 
-Usage: python tests/web/fuzz.py --count 20000 --seed 1
+Usage: python tests/web/decoder_fuzz.py --count 20000 --seed 1
 
 Every case must end in a PacketError with a byte inside the file, or in the very frames that Python plays; none may hang or
 take memory without bound. Cases are those of tests/packet/fuzz.py and follow from (seed, number) alone.
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE), str(HERE.parent / "packet")]
+sys.path.insert(0, str(HERE.parent / "packet"))
 from fuzz_cases import Base, bases, mutate
 from moving_scenes import moving_packets
 from node_runs import play_in_node

@@ -16,20 +16,21 @@ A plugin is a module named by an entry point of the group ``gsstream``::
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal
 
 import pluggy
 from pydantic import BaseModel, ConfigDict, Field
 
 from gsstream import API_VERSION
+from gsstream.core.kinds import PART_KINDS
 
 ENTRY_POINT_GROUP = "gsstream"
-Kind = Literal[
-    "structure", "confidence", "propagation", "gate", "regularizer", "update", "whole", "renderer", "loss", "optimiser",
-    "source", "metric",
-]  # fmt: skip
-#: Of whatever has a name: kinds of parts, and named methods (recipes).
-KINDS: tuple[str, ...] = (*get_args(Kind), "method")
+if TYPE_CHECKING:
+    Kind = str
+else:
+    Kind = Literal[tuple(PART_KINDS)]
+#: What a name in a listing may belong to: a kind of part, or a named method (a recipe).
+KINDS: tuple[str, ...] = (*PART_KINDS, "method")
 
 hookspec = pluggy.HookspecMarker("gsstream")
 hookimpl = pluggy.HookimplMarker("gsstream")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import ast
-import importlib.util
 import inspect
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -13,8 +13,11 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
+from tools.reference.api import exported
+from tools.reference.pages import PAGES
+
 ROOT = Path(__file__).parents[1]
-FOLDERS = [ROOT / "gsstream", *sorted((ROOT / "plugins").glob("*/src"))]
+FOLDERS = [ROOT / "gsstream", ROOT / "tools", *sorted((ROOT / "plugins").glob("*/src"))]
 LIBRARY = sorted(path for folder in FOLDERS for path in folder.rglob("*.py"))
 MAX_FILE, MAX_FUNCTION = 300, 60
 
@@ -26,7 +29,7 @@ def test_import_contracts() -> None:
     command = [sys.executable, "-c", "from importlinter.cli import lint_imports_command as main; main()", "--no-cache"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert result.returncode == 0, result.stdout + result.stderr
-    assert "5 kept, 0 broken" in result.stdout
+    assert " 0 broken" in result.stdout
 
 
 def modules_below(names: tuple[str, ...]) -> list[str]:
@@ -103,26 +106,14 @@ def test_public_names_have_docstrings() -> None:
     assert violations(check) == []
 
 
-def generator():
-    spec = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "reference" / "generate.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-PAGES = ["api.md", "checks.md", "cli.md", "recipe.md", "hooks.md", "parts.md", "scene-checks.md"]
-
-
 @pytest.mark.parametrize("page", PAGES)
 def test_reference_pages_say_what_the_code_says(page: str) -> None:
     written = (ROOT / "docs" / "reference" / page).read_text(encoding="utf-8")
-    assert written == generator().PAGES[page](), "run: python docs/reference/generate.py"
+    assert written == PAGES[page](), "run: python -m tools.reference"
 
 
 def test_every_exported_name_has_its_own_docstring() -> None:
-    for name, value in generator().exported().items():
+    for name, value in exported().items():
         if inspect.isclass(value) or inspect.isroutine(value):
             own = vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
             assert own, f"gsstream.api.{name} has no docstring"
@@ -136,7 +127,8 @@ def settings(model: type[BaseModel], name: str):
 
 
 def test_every_setting_is_described(monkeypatch: pytest.MonkeyPatch) -> None:
-    from gsstream.plugins.catalog import CONTRACTS, load_catalog
+    from gsstream.core.kinds import CONTRACTS
+    from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.model import Recipe
 
     monkeypatch.setenv("GSSTREAM_LOAD_PLUGINS", "")
@@ -148,6 +140,57 @@ def test_every_setting_is_described(monkeypatch: pytest.MonkeyPatch) -> None:
         assert model.model_config.get("frozen"), f"{name} can be changed after it was checked"
         for key, field in settings(model, name):
             assert field.description, f"{key} has no description"
+
+
+#: Written by people: not the pages made from the code, nor the reports of sweeps.
+PROSE = [
+    path
+    for path in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
+    if path.name != "report.md" and not path.read_text(encoding="utf-8").startswith("<!-- Made by")
+]
+MAX_PROSE = 125
+
+
+def prose_of(text: str) -> Iterator[tuple[int, str]]:
+    """Numbered lines of a page that are neither tables, nor code, nor pictures."""
+    fenced = False
+    for number, line in enumerate(text.splitlines(), 1):
+        fence = line.lstrip().startswith("```")
+        fenced ^= fence
+        if not (fence or fenced or line.startswith(("|", "    ", "!["))):
+            yield number, line
+
+
+def test_lines_of_prose_are_short() -> None:
+    """A sentence begins on a line of its own where a paragraph would be too wide: a change then shows what changed."""
+    assert len(PROSE) > 50, "the pages were not found"
+    lines = [(path, number, line) for path in PROSE for number, line in prose_of(path.read_text(encoding="utf-8"))]
+    assert [f"{p.relative_to(ROOT)}:{n}: {len(line)}" for p, n, line in lines if len(line) > MAX_PROSE] == []
+
+
+def test_decisions_have_one_form() -> None:
+    pages = sorted((ROOT / "docs" / "adr").glob("[0-9]*.md"))
+    index = (ROOT / "docs" / "adr" / "README.md").read_text(encoding="utf-8")
+    for page in pages:
+        text = page.read_text(encoding="utf-8")
+        title, status = text.splitlines()[0], text.splitlines()[2]
+        assert re.fullmatch(rf"# {page.name[:4]} .*[^.]", title), f"{page.name}: no title '# NUMBER Title': {title!r}"
+        assert status.startswith("Status: "), f"{page.name}: the third line says the status"
+        sections = re.findall(r"^## (.*)$", text, re.MULTILINE)
+        assert sections == ["Situation", "Decision", "Why", "What follows"], f"{page.name}: {sections}"
+        assert f"({page.name})" in index, f"docs/adr/README.md does not list {page.name}"
+    assert len(pages) > 20
+
+
+LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)\s]*)?\)")
+
+
+def test_links_of_the_docs_lead_somewhere() -> None:
+    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "configs").rglob("*.md")]
+    pages += (ROOT / "plugins").glob("*/README.md")
+    links = [(page, target) for page in pages for target in LINK.findall(page.read_text(encoding="utf-8"))]
+    assert len(links) > 100
+    assert [f"{p.relative_to(ROOT)}: {t}" for p, t in links if ":" not in t and not (p.parent / t).exists()] == []
 
 
 def test_the_requirements_cover_every_distribution_of_this_repository() -> None:

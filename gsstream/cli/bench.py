@@ -50,9 +50,9 @@ def render(
     from gsstream.plugins.catalog import load_catalog
 
     _check(out)
-    from gsstream.trade.bench_render import RenderPlan, bench_render
-    from gsstream.trade.bench_scene import read_points
-    from gsstream.trade.bench_tables import render_table
+    from gsstream.trade.bench.render import RenderPlan, bench_render
+    from gsstream.trade.bench.scene import read_points
+    from gsstream.trade.bench.tables import render_table
 
     plan = RenderPlan(
         sizes=_sizes(sizes, quick),
@@ -106,8 +106,8 @@ def frame(
             f"--method {method}: expected a method made of parts, got the whole method {recipe.whole.name!r}; time it "
             "with gsstream run, which reports seconds per frame"
         )
-    from gsstream.trade.bench_frame import FramePlan, bench_frame
-    from gsstream.trade.bench_tables import frame_table
+    from gsstream.trade.bench.frame import FramePlan, bench_frame
+    from gsstream.trade.bench.tables import frame_table
 
     width, height = _dimensions("--size", "80x60" if quick else size, 2)
     plan = FramePlan(
@@ -126,7 +126,7 @@ def frame(
 
 
 def _sizes(text: str, quick: bool) -> Any:
-    from gsstream.trade.bench_render import Size
+    from gsstream.trade.bench.render import Size
 
     if text:
         return tuple(Size(*_dimensions("--sizes", part, 3)) for part in text.split(","))
@@ -171,14 +171,14 @@ def _wrong(option: str, wanted: str, got: str) -> Exception:
 
 
 def _check(out: Path | None) -> None:
-    from gsstream.trade.bench_report import check_writable
+    from gsstream.trade.bench.timing import check_writable
 
     if out is not None:
         check_writable(out)
 
 
 def _report(data: Mapping[str, Any], table: Callable[[Mapping[str, Any]], str], out: Path | None) -> None:
-    from gsstream.trade.bench_report import write_json
+    from gsstream.trade.bench.timing import write_json
 
     typer.echo(table(data))
     if out is not None:

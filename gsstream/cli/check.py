@@ -76,7 +76,6 @@ def _entries(catalog: Catalog, name: str) -> list[tuple[str, str]]:
     Raises PluginUnavailable when it is in quarantine, UnknownName when nothing is called so.
     """
     from gsstream.core.errors import UnknownName
-    from gsstream.plugins.catalog import CONTRACTS
     from gsstream.spec import KINDS
 
     kind, _, part = name.rpartition("/")
@@ -86,7 +85,7 @@ def _entries(catalog: Catalog, name: str) -> list[tuple[str, str]]:
     for key, entry in catalog.entries.items():
         named = key[1] == part and kind in ("", key[0])
         shipped = not kind and name in (entry.plugin, entry.distribution)
-        if (named or shipped) and key[0] in (*CONTRACTS, "source", "method"):
+        if (named or shipped) and key[0] in KINDS:
             found.append(key)
     if found or name == "packets":
         return found

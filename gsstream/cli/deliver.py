@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from gsstream.cli.listing import plural
-from gsstream.cli.streams import Frames, Stream, chosen_frames, frame_range, progress_on, stream_file
+from gsstream.cli.streams import Frames, MaxMemory, Stream, fail_with, frame_range, progress_on, size_of, stream_file
 
 
 def export(
@@ -19,22 +19,27 @@ def export(
         typer.Option("--format", help="ply (3DGS), spz (by splat-transform), sequence (PLYs, list), onnx (decoders)."),
     ] = "ply",
     frames: Frames = None,
+    max_memory: MaxMemory = None,
 ) -> None:
     """Write decoded frames to files that other programs open."""
     first, last = frame_range(frames)
+    most = size_of(max_memory)
     file = stream_file(stream)
     from gsstream.player.decoders import export_decoders
     from gsstream.player.export import export as export_stream
     from gsstream.player.playback import Playback
 
-    with Playback(file) as playback:
-        chosen = chosen_frames(playback, first, last)
+    with Playback(file, max_memory=most) as playback:
+        chosen, damage = playback.sound(first, last)
     if kind == "onnx":
         written = export_decoders(file, out, frames=chosen)
     else:
-        written = export_stream(file, out, kind, frames=chosen, progress=progress_on("frame"))
+        written = export_stream(
+            file, out, kind, frames=chosen, progress=progress_on("frame"), max_memory=most
+        )
     size = sum(path.stat().st_size for path in written)
     typer.echo(f"{out}: {plural(len(written), 'file')}, {size / 1e6:.1f} MB")
+    fail_with(damage)
 
 
 def manifest(

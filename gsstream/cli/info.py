@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsstream.cli.listing import plural, table
+from gsstream.cli.listing import plural, printable, table
 from gsstream.cli.streams import Stream, progress_on, stream_file
 
 if TYPE_CHECKING:
     from gsstream.player.playback import Playback
-    from gsstream.trade.stream_stats import StreamStats
+    from gsstream.trade.measure.stream_stats import StreamStats
 
 
 def info(
@@ -21,7 +21,7 @@ def info(
     """Say what a stream holds: method, cameras, packets, their sizes and what they could cost at best."""
     file = stream_file(stream)
     from gsstream.player.playback import Playback
-    from gsstream.trade.stream_stats import stream_stats
+    from gsstream.trade.measure.stream_stats import stream_stats
 
     with Playback(file) as playback:
         if not as_json:
@@ -45,7 +45,7 @@ def _describe(playback: Playback) -> str:
     ]
     if reader.unfinished is not None:
         rows.append(("unfinished", f"{reader.unfinished.size} bytes from byte {reader.unfinished.offset}"))
-    lines = [plural(len(frames), "frame"), *(f"  {key:<11}{value}" for key, value in rows), ""]
+    lines = [plural(len(frames), "frame"), *(f"  {key:<11}{printable(value)}" for key, value in rows), ""]
     sizes: dict[str, list[int]] = {}
     for entry in reader.frames:
         sizes.setdefault(entry.kind.name.lower(), []).append(entry.size)

@@ -13,6 +13,14 @@ def table(heading: Sequence[str], rows: Iterable[Sequence[str]], indent: str = "
     return "\n".join(indent + "  ".join(cells).rstrip() for cells in padded)
 
 
+def printable(text: object, keep: str = "") -> str:
+    """A text in which everything is escaped that a terminal would obey: streams and recordings say what is printed.
+
+    ``keep``: characters left as they are although they are not printable, e.g. a line feed.
+    """
+    return "".join(sign if sign.isprintable() or sign in keep else ascii(sign)[1:-1] for sign in str(text))
+
+
 def plural(number: int, noun: str) -> str:
     """"1 part", "2 parts"."""
     return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -30,7 +30,13 @@ from gsstream.cli import (
     sweep,
     tune,
 )
+from gsstream.cli.listing import printable
 from gsstream.core.errors import GsstreamError, InputError
+
+#: Exit codes of runs that a service ended: 128 plus the number of the signal.
+_SIGNALS = {129: "SIGHUP", 143: "SIGTERM"}
+#: Messages may have several lines; nothing else in them that a terminal would obey is printed.
+_LINE = "\n"
 
 
 @dataclass
@@ -89,7 +95,8 @@ app.add_typer(scene.app, name="scene")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run one command and exit: 0 done, 2 something given is wrong, 130 interrupted, 1 everything else."""
+    """Run one command and exit: 0 done, 2 something given is wrong, 130 interrupted, 129 and 143 ended by a signal,
+    1 everything else."""
     sys.exit(run_command(sys.argv[1:] if argv is None else argv))
 
 
@@ -109,10 +116,12 @@ def run_command(argv: Sequence[str]) -> int:
             if options.debug:
                 traceback.print_exc()
             else:
-                typer.echo(f"error: {error}", err=True)
+                typer.echo(f"error: {printable(error, keep=_LINE)}", err=True)
             return 2 if isinstance(error, InputError) else 1
     if code == 130:
         return _interrupted()
+    if code in _SIGNALS:
+        typer.echo(f"ended by {_SIGNALS[code]}", err=True)
     return code if isinstance(code, int) else 0
 
 
@@ -122,4 +131,4 @@ def _interrupted() -> int:
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    typer.echo(f"warning: {message}", err=True)
+    typer.echo(f"warning: {printable(message, keep=_LINE)}", err=True)

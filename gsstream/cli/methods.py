@@ -8,13 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gsstream.cli.listing import table
+from gsstream.core.kinds import METHOD_SLOTS
 
 if TYPE_CHECKING:
     from gsstream.plugins.catalog import Catalog
     from gsstream.recipe.load import ResolvedRecipe
-
-#: Of a method made of parts.
-SLOTS = ("structure", "confidence", "propagation", "gate", "regularizer", "update", "renderer")
 
 app = typer.Typer(help="List the methods, or show one.", rich_markup_mode=None)
 
@@ -69,9 +67,9 @@ def _slots(resolved: ResolvedRecipe, catalog: Catalog) -> Iterator[tuple[str, st
     from gsstream.recipe.model import ComponentRef
 
     # A method is either whole or made of parts; the other's slots would say nothing about it.
-    shown = ("whole", "renderer") if resolved.recipe.whole.name != "none" else SLOTS
+    own = ("whole",) if resolved.recipe.whole.name != "none" else METHOD_SLOTS
     for slot, ref in resolved.recipe:
-        if isinstance(ref, ComponentRef) and slot in shown:
+        if isinstance(ref, ComponentRef) and slot in (*own, "renderer"):
             found = catalog.entries.get((slot, ref.name))
             missing = "the fastest that works here" if ref.name == "auto" else "not installed"
             yield slot, ref.name, found.origin if found else "-", found.spec.summary if found else missing

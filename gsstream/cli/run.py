@@ -36,9 +36,10 @@ def run(
     """Encode a recording as a stream of 3D Gaussians.
 
     The recipe of the run is the method's, changed by --recipe FILE, then by --set and the short options. Ctrl-C ends
-    after the current frame with a valid stream (exit code 130); --resume continues it to the same bytes.
+    after the current frame with a valid stream (exit code 130), SIGTERM does so too (143); --resume continues it to the
+    same bytes.
     """
-    from gsstream.engine.run.output import prepare_output
+    from gsstream.engine.run.output import claim_output, disk_errors, ended_by_signals
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
 
@@ -55,13 +56,13 @@ def run(
     first = None if first_frame is None else read_first_frame(stream_file(first_frame))
     recording = open_recording(source, assembly.recipe, catalog)
     try:
-        prepare_output(out, resume=resume, overwrite=overwrite)
-        result = run_session(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first)
-        _pictures(result, recording, not no_video, quiet, assembly.recipe.renderer.name == "reference")
+        with claim_output(out, resume=resume, overwrite=overwrite), disk_errors(out), ended_by_signals() as came:
+            result = run_session(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first)
+            _pictures(result, recording, not no_video, quiet, assembly.recipe.renderer.name == "reference")
     finally:
         recording.close()
     if result.interrupted:
-        raise typer.Exit(130)
+        raise typer.Exit(128 + came[0] if came else 130)
 
 
 def _pictures(result: RunResult, recording: FrameSource, video: bool, quiet: bool, warned: bool) -> None:
@@ -70,7 +71,7 @@ def _pictures(result: RunResult, recording: FrameSource, video: bool, quiet: boo
     ``warned``: the run has said already that nothing fast renders here; the player need not say it again.
     """
     from gsstream.player.render import SlowRendererWarning
-    from gsstream.trade.gallery import SUMMARY, write_gallery
+    from gsstream.trade.show.gallery import SUMMARY, write_gallery
 
     if result.frames == 0:
         return

@@ -4,62 +4,45 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 import gsstream
+from gsstream.core.kinds import PART_KINDS
 
-
-class PartKind(StrEnum):
-    """Kinds that a plugin can start from."""
-
-    structure = "structure"
-    confidence = "confidence"
-    propagation = "propagation"
-    gate = "gate"
-    regularizer = "regularizer"
-    update = "update"
-    whole = "whole"
-    renderer = "renderer"
-    loss = "loss"
-    source = "source"
-
-
-#: How a run uses a part of a kind that is no slot of its own name.
-USED_BY: Mapping[str, str] = {
-    "renderer": "--renderer <name> --source demo", "loss": "--set loss.backend=<name> --source demo",
-    "source": "--source <name>:",
-}  # fmt: skip
+#: Kinds that a plugin can start from.
+STARTABLE = tuple(name for name, kind in PART_KINDS.items() if kind.use is not None)
 #: What the contract test checks: a part, or of a source the recording that it opens.
 SUBJECTS: Mapping[str, str] = {"source": 'SourceUnderTest(<cls>, "<name>:")'}
 
 
 def new_plugin(
     name: Annotated[str, typer.Argument(help="Name of the part in recipes: lower case letters, digits, - and _.")],
-    kind: Annotated[PartKind, typer.Option("--kind", help="What the part is.")] = PartKind.gate,
+    kind: Annotated[str, typer.Option("--kind", help=f"What the part is: {', '.join(STARTABLE)}.")] = "gate",
     out: Annotated[Path | None, typer.Option("--out", help="Folder to write; by default gsstream-NAME.")] = None,
 ) -> None:
     """Write a distribution with one working part, its settings, contract test and README."""
-    from gsstream.core.errors import InputError, OutputError
+    from gsstream.core.errors import InputError, OutputError, UnknownName
     from gsstream.plugins.catalog import load_catalog
 
     if not re.fullmatch(r"[a-z][a-z0-9_-]*", name):
         raise InputError(f"plugin name: expected lower case letters, digits, - and _, a letter first; got {name!r}")
-    taken = load_catalog().entries.get((kind.value, name))
+    if kind not in STARTABLE:
+        raise UnknownName("kind to start from", kind, STARTABLE)
+    taken = load_catalog().entries.get((kind, name))
     if taken is not None:
-        raise InputError(f"the {kind.value} {name!r} is already provided by {taken.origin}; choose another name")
+        raise InputError(f"the {kind} {name!r} is already provided by {taken.origin}; choose another name")
     folder = out or Path(f"gsstream-{name}")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(f"{folder} exists and is not an empty folder; choose another --out")
-    for path, text in files(name, kind.value).items():
+    for path, text in files(name, kind).items():
         target = folder / path
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(text, encoding="utf-8")
         typer.echo(f"wrote {target}")
-    typer.echo(f"\nnext:\n  pip install -e {folder}\n  gsstream check {kind.value}/{name}")
+    typer.echo(f"\nnext:\n  pip install -e {folder}\n  gsstream check {kind}/{name}")
 
 
 def files(name: str, kind: str) -> Mapping[str, str]:
@@ -72,7 +55,7 @@ def files(name: str, kind: str) -> Mapping[str, str]:
     part = example.read_text(encoding="utf-8").replace(f"Example{kind.capitalize()}", cls)
     summary = part.splitlines()[0].strip('"')
     values = {"name": name, "kind": kind, "package": package, "cls": cls, "summary": summary, "module": kind}
-    values["use"] = _fill(USED_BY.get(kind, "--set <kind>=<name> --source demo"), values)
+    values["use"] = _fill(PART_KINDS[kind].use or "", values)
     values["subject"] = _fill(SUBJECTS.get(kind, "<cls>()"), values)
     values["kit"] = ", ".join([*(["SourceUnderTest"] if kind in SUBJECTS else []), "parametrize_with_checks"])
     values["claims"] = CLAIMS.get(kind, CLAIMS[""])

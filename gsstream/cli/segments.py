@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 from contextlib import closing
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,11 +15,8 @@ from gsstream.cli.listing import plural, table
 from gsstream.cli.streams import stream_file
 
 if TYPE_CHECKING:
-    from gsstream.engine.assembly.assemble import Assembly
-    from gsstream.recipe.load import ResolvedRecipe
-    from gsstream.source.base import FrameSource
-    from gsstream.trade.segments.drive import SegmentsResult, Setting
-    from gsstream.trade.segments.plan import SegmentPlan
+    from gsstream.trade.segments.drive import SegmentsResult
+    from gsstream.trade.segments.work import Wanted
 
 
 class SegmentStart(StrEnum):
@@ -65,25 +61,13 @@ def run_segments(
     Each segment begins with a key packet, at which players can also join. A killed worker's segment goes on where it
     stopped; after Ctrl-C or a failure, --resume keeps what is finished.
     """
+    from gsstream.trade.segments.work import Wanted
+
     changes = options.overrides(settings, frames=frames, scale=scale)
     wanted = Wanted(source, out, segments, start.value, key_epochs, first_frame, workers, threads, ray)
     result = _encode(wanted, method, recipe or (), changes, (resume, overwrite), (quiet, not no_video))
     if not quiet:
         typer.echo(_seams(result))
-
-
-class Wanted(NamedTuple):
-    """What was asked for besides the recipe."""
-
-    source: str
-    out: Path
-    segments: int
-    start: Literal["warm", "open", "anew"]
-    key_epochs: int
-    first_frame: Path | None
-    workers: int | None
-    threads: int
-    ray: str | None
 
 
 def _encode(
@@ -98,25 +82,26 @@ def _encode(
     resolved = resolve_recipe(method, catalog.recipe_path, recipe, changes)
     from gsstream.engine.assembly.assemble import assemble
     from gsstream.engine.run.recording import open_recording
-    from gsstream.trade.gallery import SUMMARY, write_gallery
+    from gsstream.trade.jobs.executor import make_executor
+    from gsstream.trade.jobs.folder import only_one
     from gsstream.trade.segments.drive import run_segments as drive
     from gsstream.trade.segments.job import run_segment
     from gsstream.trade.segments.join import first_frame_of
-    from gsstream.trade.sweep.drive import only_one
-    from gsstream.trade.sweep.executor import make_executor
+    from gsstream.trade.segments.work import make_work, prepare_folder
+    from gsstream.trade.show.gallery import SUMMARY, write_gallery
 
     assembly = assemble(resolved, catalog)
     first = None if wanted.first_frame is None else first_frame_of(stream_file(wanted.first_frame))
     recording = open_recording(wanted.source, assembly.recipe, catalog)
     out, (quiet, video) = wanted.out, shown
     try:
-        work = _work(wanted, first, resolved, assembly, recording)
+        work = make_work(wanted, first, resolved, assembly, recording)
         say = (lambda _: None) if quiet else typer.echo
         # Workers before the folder is touched: --overwrite must not delete a run for want of a cluster.
         with closing(make_executor(run_segment, wanted.workers, wanted.threads, wanted.ray)) as executor:
             out.mkdir(parents=True, exist_ok=True)
             with only_one(out, "run"):
-                _prepare(out, work.facts, first, resume=again[0], overwrite=again[1])
+                prepare_folder(out, work.facts, first, resume=again[0], overwrite=again[1])
                 result = drive(work.plan, work.setting, out, executor, say=say)
         written = write_gallery(out, recording, video=video)
     finally:
@@ -125,81 +110,6 @@ def _encode(
         typer.echo((out / SUMMARY).read_text(encoding="utf-8").rstrip())
         typer.echo("\n".join(f"wrote {path}" for path in (out / "stream.gss", *written)))
     return result
-
-
-class SegmentWork(NamedTuple):
-    """What is to be done; ``facts`` must be the same to go on with it."""
-
-    plan: SegmentPlan
-    setting: Setting
-    facts: dict[str, Any]
-
-
-def _work(
-    wanted: Wanted, first: bytes | None, resolved: ResolvedRecipe, assembly: Assembly, recording: FrameSource
-) -> SegmentWork:
-    from gsstream.core.errors import InputError
-    from gsstream.recipe.load import recipe_hash
-    from gsstream.trade.segments.drive import Setting
-    from gsstream.trade.segments.plan import make_plan
-    from gsstream.trade.sweep.drive import recording_uri
-
-    number = recording.info.num_frames
-    if number is None:
-        raise InputError(f"{wanted.source!r} grows while it is read: nobody knows where its segments end; use 'run'")
-    total = min(number, assembly.recipe.frames or number)
-    plan = make_plan(total, wanted.segments, wanted.start, first_given=first is not None)
-    uri = recording_uri(wanted.source, None)
-    setting = Setting(uri, resolved, _carrying(resolved, assembly, wanted), wanted.ray is None)
-    facts = {
-        "source": uri, "segments": wanted.segments, "frames": total, "start": wanted.start,
-        "key_epochs": wanted.key_epochs, "recipe": recipe_hash(assembly.recipe),
-        "first_frame": None if first is None else f"{zlib.crc32(first):08x}",
-    }  # fmt: skip
-    return SegmentWork(plan, setting, facts)
-
-
-def _carrying(resolved: ResolvedRecipe, assembly: Assembly, wanted: Wanted) -> ResolvedRecipe:
-    """The recipe of a leap. Raises InputError where there are no gates to open."""
-    from gsstream.core.errors import InputError
-    from gsstream.trade.segments.carry import leap_recipe, open_leap_recipe
-
-    if wanted.start != "open":
-        return leap_recipe(resolved, wanted.key_epochs, assembly.whole)
-    if assembly.whole is not None:
-        raise InputError(
-            f"--start open: expected a method made of parts, got the whole method {resolved.recipe.whole.name!r}, "
-            "which has no gates; use warm or anew"
-        )
-    return open_leap_recipe(resolved, wanted.key_epochs)
-
-
-def _prepare(
-    out: Path, facts: dict[str, Any], first: bytes | None, *, resume: bool, overwrite: bool
-) -> None:
-    """Make sure that ``out`` holds nothing else, or exactly this run; overwriting removes what such a run writes."""
-    from gsstream.core.errors import OutputError
-    from gsstream.engine.run.output import RUN_FILES, prepare_output
-    from gsstream.trade.segments.drive import KEY_STREAMS
-    from gsstream.trade.segments.plan import PLAN, write_plan
-
-    begun = (out / PLAN).is_file()
-    if resume and overwrite:
-        raise OutputError("--resume continues the run in the output folder, --overwrite deletes it: give one of them")
-    if begun and not resume and not overwrite:
-        raise OutputError(
-            f"the output folder {out} already holds a run in segments: continue it with --resume, replace it with "
-            "--overwrite, or choose another --out"
-        )
-    if not resume:
-        prepare_output(out, overwrite=overwrite)
-        for folder in (*out.glob("key-[0-9]*"), *out.glob("segment-[0-9]*")) if begun else ():
-            for name in RUN_FILES:
-                (folder / name).unlink(missing_ok=True)
-        (out / KEY_STREAMS).unlink(missing_ok=True)
-    write_plan(out, facts, resume=resume)
-    if first is not None:
-        (out / KEY_STREAMS).write_bytes(first)
 
 
 def _seams(result: SegmentsResult) -> str:

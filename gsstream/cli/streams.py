@@ -4,20 +4,28 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from gsstream.cli.listing import plural
 
 if TYPE_CHECKING:
+    from gsstream.core.errors import PacketError
+    from gsstream.packet import StreamMeta
     from gsstream.player.playback import Playback
+    from gsstream.plugins.catalog import Catalog
 
 Stream = Annotated[Path, typer.Argument(help="A stream (.gss), or the output folder of a run.")]
 Frames = Annotated[
     str | None, typer.Option("--frames", metavar="A:B", help="Frames A to B - 1; either may be left out.")
+]
+
+MaxMemory = Annotated[
+    str | None,
+    typer.Option("--max-memory", metavar="SIZE", help="Refuse what would take more, e.g. 500MB; default: no limit."),
 ]
 
 
@@ -26,23 +34,44 @@ def play(
     out: Annotated[Path, typer.Option("--out", help="Folder for pictures, or a file: .mp4, .webp or .gif.")],
     camera: Annotated[
         str | None,
-        typer.Option("--camera", help="Camera id, orbit, spiral, or train, test, all; default: the first test camera."),
+        typer.Option(
+            "--camera",
+            help="Camera id, orbit, spiral, train, test, all, or FILE.json with a path; default: first test camera.",
+        ),
     ] = None,
     frames: Frames = None,
+    size: Annotated[
+        str | None, typer.Option("--size", metavar="WxH", help="Pixels of the pictures; default: those of the camera.")
+    ] = None,
+    renderer: Annotated[
+        str | None,
+        typer.Option("--renderer", help="numpy, or one that a plugin offers; default: the first of those that works."),
+    ] = None,
+    max_memory: MaxMemory = None,
 ) -> None:
     """Decode a stream and render it, without torch or the recording."""
     first, last = frame_range(frames)
+    most, pixels = size_of(max_memory), picture_size(size)
     file = stream_file(stream)
+    from gsstream.player.play import check_target
     from gsstream.player.play import play as play_stream
     from gsstream.player.playback import Playback
+    from gsstream.player.render import named_renderer
 
-    with Playback(file) as playback:
+    chosen_renderer = None if renderer is None else named_renderer(renderer)
+    check_target(out)
+
+    with Playback(file, max_memory=most) as playback:
         cameras = _cameras(playback, camera)
-        chosen = chosen_frames(playback, first, last)
+        chosen, damage = playback.sound(first, last)
     for name in cameras:
         target = out if len(cameras) == 1 else _one_of_many(out, name or "")
-        played = play_stream(file, target, camera=name, frames=chosen, progress=progress_on(name or "camera"))
+        played = play_stream(
+            file, target, camera=name, frames=chosen, progress=progress_on(name or "camera"), max_memory=most,
+            size=pixels, renderer=chosen_renderer,
+        )  # fmt: skip
         typer.echo(f"{played.path}: {plural(played.frames, 'picture')}")
+    fail_with(damage)
 
 
 def evaluate(
@@ -60,30 +89,39 @@ def evaluate(
             "--lpips-range", metavar="-1|0", help="Lower end of the range that file is given; default: its metadata."
         ),
     ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Every view of every frame as JSON, for scripts.")] = False,
+    max_memory: MaxMemory = None,
 ) -> None:
     """Render the decoded frames and compare them with the recording's test cameras."""
+    most = size_of(max_memory)
     file = stream_file(stream)
     from gsstream.core.errors import InputError
     from gsstream.engine.run.recording import reopen_recording
     from gsstream.metrics import OnnxLpips
     from gsstream.player.playback import Playback
     from gsstream.plugins.catalog import load_catalog
-    from gsstream.trade.evaluate import evaluate as evaluate_stream
+    from gsstream.trade.measure.evaluate import evaluate as evaluate_stream
 
     if lpips_range is not None and lpips_onnx is None:
         raise InputError(f"--lpips-range {lpips_range}: without --lpips-onnx there is no LPIPS to give it to")
     lpips = None if lpips_onnx is None else OnnxLpips(lpips_onnx, lpips_range)
-    with Playback(file) as playback:
+    with Playback(file, max_memory=most) as playback:
         meta = playback.meta
-    uri = source or meta.extra.get("source_uri")
-    if not uri:
-        raise InputError(f"{file} does not say which recording it was made from; name it with --source")
-    recording = reopen_recording(str(uri), meta.recipe, load_catalog())
+        frames, damage = playback.sound()
+        if playback.limit is not None:
+            playback.limit.check_pictures(meta.test.width, meta.test.height, len(meta.test))
+            for frame in frames:
+                playback.state_at(frame)
+    catalog = load_catalog()
+    uri = source or named_recording(file, meta, catalog)
+    check_recipe(file, meta.recipe)
+    recording = reopen_recording(uri, meta.recipe, catalog)
     try:
-        evaluation = evaluate_stream(file, recording, lpips=lpips, progress=progress_on("frame"))
+        evaluation = evaluate_stream(file, recording, frames=frames, lpips=lpips, progress=progress_on("frame"))
     finally:
         recording.close()
-    typer.echo(evaluation.table())
+    typer.echo(evaluation.to_json() if as_json else evaluation.table())
+    fail_with(damage)
 
 
 def stream_file(path: Path) -> Path:
@@ -101,7 +139,9 @@ def stream_file(path: Path) -> Path:
 
 def _one_of_many(out: Path, camera: str) -> Path:
     """Several cameras make one file or folder each, named after the camera."""
-    return out.with_name(f"{out.stem}-{camera}{out.suffix}") if out.suffix else out / camera
+    from gsstream.core.names import child
+
+    return child(out.parent, f"{out.stem}-{camera}{out.suffix}") if out.suffix else child(out, camera)
 
 
 def _cameras(playback: Playback, wanted: str | None) -> list[str | None]:
@@ -118,13 +158,42 @@ def _cameras(playback: Playback, wanted: str | None) -> list[str | None]:
     return list(found)
 
 
-def chosen_frames(playback: Playback, first: int | None, last: int | None) -> list[int]:
-    """Frame indices from ``first`` to ``last`` - 1, by default all. Raises InputError outside the stream."""
-    start = playback.frames[0] if first is None else first
-    stop = playback.frames[-1] + 1 if last is None else last
-    for edge in (start, stop - 1):
-        playback.entry(edge)  # says which frames there are when this one is not
-    return list(range(start, stop))
+def named_recording(file: Path, meta: StreamMeta, catalog: Catalog) -> str:
+    """The recording that a stream says it was made from, as far as it may be opened because a file says so.
+
+    Folders, the demo and synthetic scenes are read as they are. What waits (watch:) or is opened by a plugin is only
+    opened when the user names it. Raises InputError.
+    """
+    from gsstream.core.errors import InputError
+
+    uri = str(meta.extra.get("source_uri", ""))
+    if not uri:
+        raise InputError(f"{file} does not say which recording it was made from; name it with --source")
+    for scheme in uri.split(":")[:-1]:
+        entry = catalog.entries.get(("source", scheme))
+        if scheme == "watch" or (entry is not None and entry.plugin != "builtin"):
+            raise InputError(
+                f"{file} says that it was made from {uri[:200]!r}, which is not opened because a file says so; if you "
+                "trust it, name it yourself with --source"
+            )
+    return uri
+
+
+def check_recipe(file: Path, recipe: Mapping[str, Any]) -> None:
+    """Refuse a recipe in a stream whose scale or seed no run can have had. Raises InputError."""
+    from gsstream.core.errors import InputError
+
+    scale, seed = recipe.get("scale", 1.0), recipe.get("seed", 0)
+    if isinstance(scale, bool) or not isinstance(scale, int | float) or not 0 < scale <= 1:
+        raise InputError(f"{file}: its recipe says scale = {str(scale)[:40]!r}; expected a factor in (0, 1]")
+    if type(seed) is not int:
+        raise InputError(f"{file}: its recipe says seed = {str(seed)[:40]!r}; expected a whole number")
+
+
+def fail_with(damage: PacketError | None) -> None:
+    """Raise what ended a stream early, once the frames before it are done: exit code 1 and the byte of the damage."""
+    if damage is not None:
+        raise damage
 
 
 def frame_range(text: str | None) -> tuple[int | None, int | None]:
@@ -136,6 +205,35 @@ def frame_range(text: str | None) -> tuple[int | None, int | None]:
     if last is not None and last <= (first or 0):
         raise InputError(f"--frames {text}: expected A:B with A < B, e.g. 0:30, or A: for all frames from A on")
     return first, last
+
+
+def picture_size(text: str | None) -> tuple[int, int] | None:
+    """(width, height) meant by ``--size``; None: that of the camera. Raises InputError."""
+    from gsstream.core.errors import InputError
+
+    if text is None:
+        return None
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    width, height = (int(side) for side in match.groups()) if match else (0, 0)
+    if not (0 < width <= 1 << 16 and 0 < height <= 1 << 16):
+        raise InputError(f"--size {text}: expected WIDTHxHEIGHT in pixels, each 1 to 65536, e.g. 1280x720")
+    return width, height
+
+
+def size_of(text: str | None) -> int | None:
+    """Bytes meant by ``--max-memory``; None: no limit."""
+    from gsstream.core.errors import InputError
+    from gsstream.recipe.budget import BYTES, read_quantity
+
+    if text is None:
+        return None
+    try:
+        size = read_quantity(text, BYTES)
+    except ValueError as error:
+        raise InputError(f"--max-memory {text}: {error}") from error
+    if size < 1:
+        raise InputError(f"--max-memory {text}: expected a positive size, e.g. 500MB")
+    return int(size)
 
 
 def progress_on(what: str) -> Callable[[int, int], None] | None:

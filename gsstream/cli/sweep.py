@@ -42,8 +42,8 @@ def sweep(
     if dry_run:
         typer.echo(_describe(plan, out))
         return
+    from gsstream.trade.jobs.executor import make_executor
     from gsstream.trade.sweep.drive import run_sweep
-    from gsstream.trade.sweep.executor import make_executor
     from gsstream.trade.sweep.job import run_job
 
     executor = make_executor(run_job, workers, threads, ray)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +15,7 @@ from gsstream.cli.streams import stream_file
 if TYPE_CHECKING:
     from gsstream.recipe.budget import Budget
     from gsstream.trade.sweep.plan import Plan
-    from gsstream.trade.tune import Trial
+    from gsstream.trade.sweep.tune import Trial
 
 
 def tune(
@@ -53,9 +54,10 @@ def tune(
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.budget import budget_overrides
     from gsstream.recipe.load import resolve_recipe
+    from gsstream.trade.jobs.folder import recording_uri
     from gsstream.trade.sweep.config import Scene
     from gsstream.trade.sweep.plan import make_plan
-    from gsstream.trade.tune import METHODS, pilot
+    from gsstream.trade.sweep.tune import METHODS, pilot
 
     catalog = load_catalog()
     limits = resolve_recipe(None, catalog.recipe_path, (), budget_overrides(budget)).recipe.budget
@@ -67,7 +69,7 @@ def tune(
     )  # fmt: skip
     plan = make_plan(pilot(place, tried, limits, seed), Path(), catalog.recipe_path)
     trials = _run(plan, limits, out, data, first_frame, workers, quiet)
-    _tell(plan, trials, limits, out)
+    _tell(plan, trials, limits, out, recording_uri(scene, data))
 
 
 def _values(settings: tuple[str, ...] | list[str]) -> dict[str, Any]:
@@ -80,11 +82,11 @@ def _values(settings: tuple[str, ...] | list[str]) -> dict[str, Any]:
 def _run(
     plan: Plan, limits: Budget, out: Path, data: Path | None, first: Path | None, workers: int | None, quiet: bool
 ) -> list[Trial]:
+    from gsstream.trade.jobs.executor import make_executor, usable_processors
     from gsstream.trade.sweep.drive import run_sweep
-    from gsstream.trade.sweep.executor import make_executor, usable_processors
     from gsstream.trade.sweep.job import run_job
     from gsstream.trade.sweep.table import read_table
-    from gsstream.trade.tune import give_first_frame, trial_of
+    from gsstream.trade.sweep.tune import give_first_frame, trial_of
 
     if first is not None:
         give_first_frame(plan, out, stream_file(first))
@@ -97,15 +99,21 @@ def _run(
     return [trial_of(point.variant, rows.get(point.id, {"status": "missing"}), limits) for point in plan.points]
 
 
-def _tell(plan: Plan, trials: list[Trial], limits: Budget, out: Path) -> None:
-    from gsstream.trade.tune import choose, nearest, tune_table, tuned_recipe
+def _next(source: str, out: Path) -> str:
+    """The command that encodes the whole recording as tuned, ready for a shell."""
+    words = ["gsstream", "run", "--source", source, "--recipe", str(out / "tuned.yaml"), "--out", str(out / "run")]
+    return shlex.join(words)
+
+
+def _tell(plan: Plan, trials: list[Trial], limits: Budget, out: Path, source: str) -> None:
+    from gsstream.trade.sweep.tune import choose, nearest, tune_table, tuned_recipe
 
     chosen = choose(trials)
     typer.echo(tune_table(trials, chosen))
     if chosen is not None:
         resolved = next(point.resolved for point in plan.points if point.variant == chosen.name)
         (out / "tuned.yaml").write_text(tuned_recipe(resolved), encoding="utf-8")
-        typer.echo(f"\nwrote {out / 'tuned.yaml'}: {chosen.name}; next: gsstream run --recipe {out / 'tuned.yaml'}")
+        typer.echo(f"\nwrote {out / 'tuned.yaml'}: {chosen.name}; next: {_next(source, out)}")
         return
     close = nearest(trials)
     if close is None:

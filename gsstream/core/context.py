@@ -1,8 +1,8 @@
-"""FrameContext: the read-only view of a frame step that a confidence estimator is given."""
+"""What a part may see of a frame (FrameContext), and what it may do with it (FrameWork)."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from gsstream.core.hierarchy import Hierarchy
 
@@ -55,3 +55,44 @@ class FrameContext(Protocol):
 
     def noise_sigma(self, view: int) -> float:
         """Robust standard deviation of the camera's noise between two frames, in [0, 1] image units."""
+
+
+class FrameWork(FrameContext, Protocol):
+    """A frame that a part works on: it renders with some rows moving, and is told how well that explains the images.
+
+    Colour maps of the cameras are applied and pulled through where they belong; a part need not know them.
+    """
+
+    @property
+    def optimiser(self) -> Any:
+        """The optimiser of the run (``gsstream.api.RowOptimiser``), for rows that a part fits on its own."""
+
+    def changed_rows(self, least_votes: float) -> torch.Tensor:
+        """Return [N] bool: Gaussians that are seen in a tile that changed.
+
+        Arguments:
+            least_votes: least share, 0 to 1, of the views a Gaussian projects into in which it must lie in or beside a
+                changed tile. Where change is not detected, all Gaussians count.
+        """
+
+    def changed_pixels(self, view: int) -> torch.Tensor:
+        """Return [H, W] bool: pixels in the tiles of a view that changed; all where change is not detected."""
+
+    def narrow(self, rows: torch.Tensor) -> None:
+        """From now on only the rows [A] int64, ascending, move; all others are frozen."""
+
+    def pull(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
+        """Render a view with these values of the rows that move, and compare it with what its camera recorded.
+
+        Arguments:
+            rows: the A rows of :meth:`narrow`, or all N; tensors with a graph get the gradient of the loss.
+
+        Returns:
+            (1 - w) L1 + w (1 - SSIM), on the tiles that the rows can change.
+        """
+
+    def shown(self, gaussians: Gaussians[torch.Tensor], view: int) -> torch.Tensor:
+        """Return [H, W, 3]: a scene as the camera of this view would record it, without a graph."""
+
+    def on(self, gaussians: Gaussians[torch.Tensor]) -> FrameWork:
+        """Return the same frame, to be worked on from another scene."""

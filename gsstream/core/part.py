@@ -28,7 +28,6 @@ class Traits:
         differentiable: gradients flow from output to input.
         conservative: (propagation) no node is less suspect than its most suspect Gaussian.
         idempotent: applying it twice equals applying it once.
-        stable: (structure) an identity edit changes nothing and co-members stay together.
         needs_renderer: (confidence) asks the context for screen gradients.
         reduction: (regularizer) "mean" or "sum" over Gaussians.
         weights: (regularizer) settings that its terms are proportional to.
@@ -48,7 +47,6 @@ class Traits:
     differentiable: bool = False
     conservative: bool = False
     idempotent: bool = False
-    stable: bool = False
     needs_renderer: bool = False
     reduction: str = "mean"
     weights: tuple[str, ...] = ()

@@ -6,7 +6,6 @@ from typing import final
 
 import torch
 
-from gsstream.core.state import GateState
 from gsstream.gate.base import GateSampler
 
 
@@ -18,17 +17,17 @@ class AlwaysOpen(GateSampler):
     def num_levels(self) -> int:
         return 1
 
-    def init(self, logits: torch.Tensor) -> GateState:
-        return GateState(logits=torch.zeros_like(logits))
+    def init(self, logits: torch.Tensor) -> torch.Tensor:
+        return torch.zeros_like(logits)
 
     def noise(self, num_nodes: int, generator: torch.Generator) -> torch.Tensor | None:
         return None
 
-    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
-        return torch.ones_like(state.logits)
+    def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
+        return torch.ones_like(logits)
 
-    def open_probability(self, state: GateState) -> torch.Tensor:
-        return torch.ones_like(state.logits)
+    def open_probability(self, logits: torch.Tensor) -> torch.Tensor:
+        return torch.ones_like(logits)
 
-    def bound(self, state: GateState) -> GateState:
-        return state
+    def bound(self, logits: torch.Tensor) -> torch.Tensor:
+        return logits

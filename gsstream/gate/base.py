@@ -7,14 +7,21 @@ from abc import abstractmethod
 import torch
 
 from gsstream.core.part import Part
-from gsstream.core.state import GateState
 
 
 class GateSampler(Part):
     """Samples gates in [0, 1] from trainable logits.
 
-    Noise is an argument, so sampling is a pure function. A closed gate is exactly 0.0 and a fully open one exactly 1.0;
-    every value is k / num_levels. ``sample(state, None)`` is the gate that goes into the packet.
+    The logits [M] are the whole state: the engine keeps them, trains them and hands them in. Noise is an argument, so
+    sampling is a pure function. A closed gate is exactly 0.0 and a fully open one exactly 1.0; every value is
+    k / num_levels.
+
+    When the engine calls what, in every frame:
+
+    * ``init``: once, with the propagated confidence; ``open_probability`` then says which rows take part;
+    * ``noise``, ``sample(logits, noise)``, ``open_probability`` (for the price): once per iteration;
+    * ``bound``: after each optimiser step on the logits;
+    * ``sample(logits, None)``: at the end of each pass, to let closed rows go, and for the gate in the packet.
     """
 
     @property
@@ -23,21 +30,21 @@ class GateSampler(Part):
         """Number of non-zero gate values, 1 (binary) to 255."""
 
     @abstractmethod
-    def init(self, logits: torch.Tensor) -> GateState:
-        """Start a frame from propagated confidence logits [M]; bounds on the logit are a documented setting."""
+    def init(self, logits: torch.Tensor) -> torch.Tensor:
+        """The logits [M] that a frame starts from, given the propagated confidence [M]."""
 
     @abstractmethod
     def noise(self, num_nodes: int, generator: torch.Generator) -> torch.Tensor | None:
         """Noise [M] for one training step, or None for a deterministic sampler."""
 
     @abstractmethod
-    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
-        """Gates [M]; differentiable in ``state.logits`` unless the gates are constant."""
+    def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
+        """Gates [M]; differentiable in ``logits`` unless the gates are constant."""
 
     @abstractmethod
-    def open_probability(self, state: GateState) -> torch.Tensor:
+    def open_probability(self, logits: torch.Tensor) -> torch.Tensor:
         """[M] probability that a gate is not zero; differentiable."""
 
     @abstractmethod
-    def bound(self, state: GateState) -> GateState:
-        """Project the logits back into their documented bounds after an optimiser step."""
+    def bound(self, logits: torch.Tensor) -> torch.Tensor:
+        """The logits projected into the bounds that the part keeps them in; say in its settings which they are."""

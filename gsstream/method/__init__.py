@@ -1,1 +1,1 @@
-"""A whole method, coarsely: for methods that are not five parts and an update rule."""
+"""The one interface to a method, and the simplest of them."""

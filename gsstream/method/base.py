@@ -1,8 +1,8 @@
-"""StreamingMethod: a whole method behind three calls. What it sends is played by every player.
+"""StreamingMethod: the one interface to a method, three calls. What it sends is played by every player.
 
-The five-part path (``engine.step.frame_step``) asks a method for its parts. A method that is built differently implements
-this contract instead: it is given a frame and what the engine can do (``Tools``), and returns a packet and the state it
-goes on from. The engine keeps the rest: recordings, recipes, the stream on disk, metrics, resume.
+A method is given a frame and what the engine can do (``Tools``), and returns a packet and the state it goes on from. The
+engine keeps the rest: recordings, recipes, the stream on disk, metrics, resume. ``engine.step.method.PartsMethod`` is
+the method made of parts; QUEEN is another one, built differently.
 """
 
 from __future__ import annotations
@@ -54,16 +54,22 @@ class Step(Generic[State]):
 
 
 class StreamingMethod(Part, Generic[State]):
-    """A whole method. Pure: state goes in and comes out, random numbers come from ``tools.rng`` by name and frame.
+    """A method. Pure: state goes in and comes out, random numbers come from ``tools.rng`` by name and frame.
 
     ``heeds`` names the recipe keys that this method reads besides what the engine itself does (frame 0, loss, renderer,
-    recording, packets), for example ``("stream.epochs",)``. A run that changes a key of the five parts or of later
-    frames that is not listed here is refused: no option falls through. ``least_cameras`` is how many training
-    cameras it needs: a recording with fewer is refused before anything is reconstructed.
+    recording, packets), for example ``("stream.epochs",)``. A run that changes a key of the parts or of later frames
+    that is not listed here is refused: no option is ignored in silence. ``least_cameras`` is how many training
+    cameras it needs: a recording with fewer is refused before anything is reconstructed. ``decodes_its_packets`` is true
+    of the engine's own method alone, whose state is made by the decoder; the packets of others are decoded and compared.
     """
 
     heeds: ClassVar[tuple[str, ...]] = ()
     least_cameras: ClassVar[int] = 1
+    decodes_its_packets: ClassVar[bool] = False
+
+    def reads(self, key: str) -> bool:
+        """Whether this method reads a recipe key: a slot ("gate"), or a setting of a section ("stream.epochs")."""
+        return key in self.heeds
 
     @abstractmethod
     def begin(self, frame: Frame, tools: Tools) -> Step[State]:
@@ -85,7 +91,8 @@ class StreamingMethod(Part, Generic[State]):
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> State:
         """The state after the last packet of a stream, as ``step`` returned it there.
 
-        ``shown`` are the training images of the last frame whose packet was not empty: what the scene shows.
+        ``shown`` are the training images of the last frame whose packet was not empty: what the scene shows. The
+        states of players since the last key packet are ``tools.since_key()``.
         """
 
     @final

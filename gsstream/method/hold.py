@@ -1,13 +1,11 @@
-"""Hold: frame 0, and nothing after it. The simplest whole method, and the floor that every other must beat."""
+"""Hold: frame 0, and nothing after it. The simplest method, and the floor that every other must beat."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import final
 
-import numpy as np
-
-from gsstream.core.delta import Delta
+from gsstream.core.changes import Delta
 from gsstream.core.frame import Frame
 from gsstream.method.base import Step, StreamingMethod
 from gsstream.method.packets import send_delta, send_key
@@ -32,8 +30,7 @@ class Hold(StreamingMethod[HoldState]):
         return Step(HoldState(player), packet, "key", first.metrics)
 
     def step(self, state: HoldState, frame: Frame, tools: Tools) -> Step[HoldState]:
-        closed = np.zeros(len(state.player.layout.node_counts), np.uint8)
-        packet, player = send_delta(state.player, Delta(closed, 1))
+        packet, player = send_delta(state.player, Delta())
         return Step(HoldState(player), packet, "empty")
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> HoldState:

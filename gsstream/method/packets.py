@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsstream.core.delta import Delta, Layout
+from gsstream.core.changes import Delta, Layout
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
 from gsstream.packet import (
@@ -35,7 +35,7 @@ def send_key(gaussians: Gaussians[FloatArray], layout: Layout, meta: StreamMeta,
 
 
 def send_delta(player: PlayerState, delta: Delta) -> Sent:
-    """The packet of the frame after ``player``; an empty one when every gate is closed.
+    """The packet of the frame after ``player``; an empty one when nothing changes.
 
     ``delta.decoders`` must come from ``quantise_decoders``. Raises ShapeError when it does not fit the layout.
     """

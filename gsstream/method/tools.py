@@ -1,15 +1,15 @@
-"""What the engine lends to a whole method. Protocols: the engine implements them, methods only call."""
+"""What the engine lends to a method. Protocols: the engine implements them, methods only call."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 
-from gsstream.core.context import FrameContext
-from gsstream.core.delta import Layout
+from gsstream.core.changes import Layout
+from gsstream.core.context import FrameWork
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
 from gsstream.packet import PlayerState, StreamMeta
@@ -26,7 +26,7 @@ class FirstFrame:
 
     Arguments:
         gaussians: the scene, with the values that a key packet holds.
-        layout: one node per Gaussian and one cell size; a method may send another.
+        layout: one node per Gaussian and one unit; a method may send another.
         meta: what the key packet says about the run, colour maps of the training cameras included.
         metrics: iterations and seconds.
     """
@@ -37,12 +37,8 @@ class FirstFrame:
     metrics: Mapping[str, Any]
 
 
-class FrameTools(FrameContext, Protocol):
-    """One frame: images, gradients of the scene before it, and the renderer with only some rows moving.
-
-    Images are as recorded. Colour maps of the cameras are applied and pulled through where they belong; a method need
-    not know them.
-    """
+class FrameTools(FrameWork, Protocol):
+    """One frame as a method works on it: what parts see of it, and the render session itself."""
 
     @property
     def session(self) -> RenderSession:
@@ -57,7 +53,7 @@ class FrameTools(FrameContext, Protocol):
 
 
 class Tools(Protocol):
-    """What a whole method may use. Nothing here keeps state between frames."""
+    """What a method may use. Nothing here keeps state between frames."""
 
     @property
     def rng(self) -> Rng:
@@ -76,6 +72,9 @@ class Tools(Protocol):
 
     def first_frame(self, frame: Frame) -> FirstFrame:
         """Reconstruct frame 0 by the recipe's ``first_frame``, or take it over from another stream."""
+
+    def since_key(self) -> Iterator[PlayerState]:
+        """While a stream is resumed: what players have after every packet from the last key packet on, in order."""
 
     def open(self, player: PlayerState, previous: Frame, frame: Frame) -> FrameTools:
         """Begin work on a frame. ``previous`` are the images that the scene of ``player`` is compared with."""

@@ -1,9 +1,10 @@
-"""StreamMeta: what a key packet says about the run, as JSON."""
+"""StreamMeta: what a key packet says about the run, as JSON. What a reader refuses, a writer does not write."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,7 +14,10 @@ import numpy as np
 from gsstream import __version__
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import PacketError, ShapeError
+from gsstream.core.names import check_camera_ids
 
+MAX_SIDE, MAX_PIXELS = 1 << 16, 1 << 27
+LEAST_FPS, MOST_FPS = 0.01, 100_000.0
 #: Conventions every value of a stream of this format follows.
 CONVENTIONS: Mapping[str, str] = {
     "viewmats": "world-to-camera, OpenCV axes", "Ks": "pixels, pixel-corner origin", "quats": "wxyz",
@@ -72,7 +76,14 @@ def hash_recipe(recipe: Mapping[str, Any]) -> str:
 
 
 def meta_to_json(meta: StreamMeta) -> bytes:
-    """UTF-8 JSON. Floats keep every bit (shortest representation that reads back)."""
+    """UTF-8 JSON. Floats keep every bit (shortest representation that reads back).
+
+    Raises ShapeError for values that readers refuse.
+    """
+    try:
+        _check(meta)
+    except (TypeError, ValueError) as error:
+        raise ShapeError(f"meta: {error}") from error
     data = {
         "version": meta.version, "method": meta.method, "source": meta.source, "recipe": meta.recipe,
         "recipe_hash": meta.recipe_hash, "plugins": meta.plugins, "fps": meta.fps, "background": meta.background,
@@ -84,21 +95,43 @@ def meta_to_json(meta: StreamMeta) -> bytes:
 def meta_from_json(data: bytes) -> StreamMeta:
     """Inverse of :func:`meta_to_json`. Raises PacketError (without offset)."""
     try:
-        value = json.loads(data, parse_constant=_refuse)
+        value = json.loads(data, parse_constant=_refuse, parse_float=_finite)
         meta = StreamMeta(
             method=_text(value["method"]), source=_text(value["source"]), recipe=_object(value["recipe"]),
-            train=_cameras(value["train"]), test=_cameras(value["test"]), fps=float(value["fps"]),
+            train=_cameras(value["train"]), test=_cameras(value["test"]), fps=_number(value["fps"]),
             background=_color(value["background"]), plugins=_object(value["plugins"]),
             conventions=_object(value["conventions"]), version=_text(value["version"]), extra=_object(value["extra"]),
         )  # fmt: skip
-        recorded = value["recipe_hash"]
+        _check(meta)
+        recorded, computed = value["recipe_hash"], meta.recipe_hash
     except KeyError as error:
         raise PacketError(f"meta: the entry {error} is missing") from error
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise PacketError(f"meta: not what was expected: {error}") from error
-    if recorded != meta.recipe_hash:
-        raise PacketError(f"meta: recipe hash {recorded!r} does not belong to the recipe ({meta.recipe_hash})")
+    if recorded != computed:
+        raise PacketError(f"meta: recipe hash {str(recorded)[:40]!r} does not belong to the recipe ({computed})")
     return meta
+
+
+def _check(meta: StreamMeta) -> None:
+    """Everything that must hold of a stream's meta besides its types. Raises TypeError or ValueError."""
+    if not LEAST_FPS <= meta.fps <= MOST_FPS:
+        raise ValueError(f"fps: expected {LEAST_FPS:g} to {MOST_FPS:g} frames per second, got {meta.fps!r}")
+    if not all(math.isfinite(value) for value in meta.background):
+        raise ValueError(f"background: expected three finite numbers, got {meta.background}")
+    if not len(meta.train) + len(meta.test):
+        raise ValueError("there is no camera; expected at least one in train or test")
+    for rig in (meta.train, meta.test):
+        check_camera_ids(rig.ids)
+        for side in (rig.width, rig.height):
+            if not 1 <= side <= MAX_SIDE:
+                raise ValueError(f"image size {rig.width} x {rig.height}: expected 1 to {MAX_SIDE} pixels a side")
+        if rig.width * rig.height > MAX_PIXELS:
+            raise ValueError(f"image size {rig.width} x {rig.height}: expected at most {MAX_PIXELS} pixels")
+    for name, version in meta.plugins.items():
+        _text(name), _text(version)
+    for key in ("source_uri", "licence"):
+        _text(meta.extra.get(key, ""))
 
 
 def _rig(cameras: Cameras) -> dict[str, Any]:
@@ -113,15 +146,13 @@ def _cameras(value: Any) -> Cameras:
     ids = tuple(_text(name) for name in value["ids"])
     viewmats = np.asarray(value["viewmats"], np.float64).reshape(len(ids), 4, 4)
     Ks = np.asarray(value["Ks"], np.float64).reshape(len(ids), 3, 3)
-    cameras = Cameras(ids, viewmats, Ks, int(value["width"]), int(value["height"]), float(value["near"]))
-    if not (0 <= cameras.width <= 1 << 16 and 0 <= cameras.height <= 1 << 16):
-        raise ValueError(f"image size {cameras.width} x {cameras.height} is beyond 65536")
+    cameras = Cameras(ids, viewmats, Ks, _whole(value["width"]), _whole(value["height"]), _number(value["near"]))
     cameras.validate()
     return cameras
 
 
 def _color(value: Any) -> tuple[float, float, float]:
-    red, green, blue = (float(v) for v in value)
+    red, green, blue = (_number(v) for v in value)
     return red, green, blue
 
 
@@ -131,9 +162,28 @@ def _text(value: Any) -> str:
     return value
 
 
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"expected a number, got {type(value).__name__}")
+    return float(value)
+
+
+def _whole(value: Any) -> int:
+    if type(value) is not int:
+        raise TypeError(f"expected a whole number, got {str(value)[:40]!r}")
+    return value
+
+
 def _object(value: Any) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise TypeError(f"expected an object, got {type(value).__name__}")
+    return value
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):  # 1e999 is well-formed JSON
+        raise ValueError(f"{text[:40]} is not a finite number")
     return value
 
 

@@ -12,8 +12,8 @@ from gsstream.core.changes import Layout
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.shapes import IntArray
 from gsstream.packet.base import MAX_GAUSSIANS, PacketKind, Section
-from gsstream.packet.changes.rows import HEAD_PARTS, decode_births
 from gsstream.packet.bits import unpack_blobs
+from gsstream.packet.changes.rows import HEAD_PARTS, decode_births
 from gsstream.packet.gates import decode_gates, run_tokens
 from gsstream.packet.symbols import decode_symbols
 

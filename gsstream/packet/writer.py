@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import BinaryIO
 
 from gsstream.core.errors import OutputError, PacketError
-from gsstream.packet.base import FORMAT_VERSION, EncodedPacket, PacketKind, build_packet, file_header
+from gsstream.packet.base import FORMAT_VERSION, PACKET_HEADER, EncodedPacket, PacketKind, build_packet, file_header
 from gsstream.packet.reader import Entry, StreamReader, index_body, key_offsets
 
 
@@ -115,15 +115,17 @@ def _sound_part(path: Path, last_frame: int | None) -> tuple[list[Entry], int]:
                 f"{path} is of packet format {reader.version}, this gsstream writes {FORMAT_VERSION}: it can be played "
                 "but not continued; start again in another place"
             )
-        total = path.stat().st_size
-        if reader.damage is not None and not _blank(path, reader.end):
+        # A header of which only the beginning was written has reserved zeros behind it, and no body.
+        torn = path.stat().st_size > reader.end + PACKET_HEADER.size and _blank(path, reader.end + PACKET_HEADER.size)
+        if reader.damage is not None and not torn and not _blank(path, reader.end):
             raise reader.damage
         for entry in reader.entries:
             try:
                 reader.read(entry)
             except PacketError:
-                # A power cut can leave the last packet at full length with blocks that never reached the disk.
-                if entry is not reader.entries[-1] or entry.offset + entry.size != total:
+                # A power cut can leave the last packet at full length with blocks that never reached the disk, and
+                # zeros behind it that were reserved for the next one.
+                if entry is not reader.entries[-1] or not _blank(path, entry.offset + entry.size):
                     raise
                 reader.entries.pop()
                 break

@@ -26,7 +26,7 @@ def export_decoders(
     """Write ``FRAME-ATTRIBUTE.onnx`` for every decoder that a frame brings or changes; returns the files.
 
     A model takes ``symbols`` [A, L] int32, as the packet carries them, and gives ``residual`` [A, D] float32, ungated
-    (``gsstream.core.delta.decode_residual``): step and weights are inside. The sum runs channel by channel in the order
+    (``gsstream.core.changes.decode_residual``): step and weights are inside. The sum runs channel by channel in the order
     of the format, so a runtime that rounds every operation gives the built-in path's very bits.
 
     Raises InputError without the package onnx, PacketError for a damaged stream, OutputError when ``out`` cannot be

@@ -22,24 +22,29 @@ _CONVERTER = "splat-transform"
 
 def export(
     stream: str | os.PathLike[str], out: str | os.PathLike[str], kind: str, *, frames: Sequence[int] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None, max_memory: int | None = None,
 ) -> list[Path]:  # fmt: skip
     """Write one file per frame into the folder ``out``; returns the files.
 
     Arguments:
         kind: ``ply``; ``spz`` (through splat-transform, an npm package); ``sequence``: PLYs and ``sequence.json`` with
             frame indices, times and the cameras.
-        frames: frame indices; default: all.
+        frames: frame indices; default: all up to the first damaged packet.
+        max_memory: bytes that decoding a frame may take at most; default: what the format allows.
 
-    Raises InputError for an unknown format or frame, PacketError for a damaged stream, OutputError when the folder
-    cannot be written or the converter is missing or fails.
+    Raises InputError for an unknown format or frame and beyond ``max_memory``, PacketError for a damaged stream
+    (without ``frames``: once the files before the damage are written), OutputError when the folder cannot be written
+    or the converter is missing or fails.
     """
     if kind not in FORMATS:
         raise InputError(f"cannot export to {kind!r}: expected one of {', '.join(FORMATS)}, onnx")
+    if Path(out).suffix.lower() in (".ply", ".spz", ".json", ".onnx") and not Path(out).is_dir():
+        raise OutputError(f"{out}: expected a folder, which holds one file per frame, got the name of a file")
     converter = find_converter() if kind == "spz" else ""
     folder, written = Path(out), []
-    with Playback(stream) as playback:
-        chosen = list(playback.frames if frames is None else frames)
+    with Playback(stream, max_memory=max_memory) as playback:
+        sound, damage = playback.sound() if frames is None else (frames, None)
+        chosen = list(sound)
         for frame in chosen:
             playback.entry(frame)
         try:
@@ -57,6 +62,8 @@ def export(
                 (folder / "sequence.json").write_text(_description(playback, chosen), encoding="utf-8")
         except OSError as error:
             raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
+    if damage is not None:
+        raise damage
     return written
 
 

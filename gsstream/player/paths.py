@@ -1,4 +1,4 @@
-"""Camera paths computed from a calibrated rig: a turn around what it looks at, a spiral around its middle."""
+"""Camera paths computed from a calibrated rig: around what it looks at, a spiral around its middle; other sizes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,10 @@ from gsstream.core.errors import ShapeError
 from gsstream.core.shapes import FloatArray
 
 PATHS = ("orbit", "spiral")
+#: A rig with a larger gap than this between neighbouring cameras does not surround what it looks at, radians.
+OPEN_GAP = np.pi / 2
+#: Half of the smallest swing, radians: a single camera, or a few side by side, still show some parallax.
+LEAST_SWING = np.pi / 18
 
 
 def camera_path(kind: str, rig: Cameras, number: int) -> Cameras:
@@ -36,7 +40,11 @@ def focus_point(rig: Cameras) -> FloatArray:
 
 
 def orbit(rig: Cameras, number: int) -> Cameras:
-    """One full turn around the focus point at the rig's mean distance and height, starting at its first camera."""
+    """A path around the focus point at the rig's mean distance and height, starting at its first camera.
+
+    Where cameras stand all around, one full turn; else a swing over the arc that they span and back, because nothing
+    was recorded of the other side.
+    """
     focus, up = focus_point(rig), _up(rig)
     offsets = rig.centers - focus
     height = float((offsets @ up).mean())
@@ -46,9 +54,33 @@ def orbit(rig: Cameras, number: int) -> Cameras:
         start = np.cross(up, [1.0, 0, 0]) if abs(up[0]) < 0.9 else np.cross(up, [0, 1.0, 0])
     first = start / np.linalg.norm(start)
     second = np.cross(up, first)
-    angle = np.arange(number) * (2 * np.pi / number)
+    angle = _angles(np.arctan2(offsets @ second, offsets @ first), number)
     ring = radius * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
     return _look_at(rig, focus + height * up + ring, focus, up)
+
+
+def resized(rig: Cameras, width: int, height: int) -> Cameras:
+    """The same cameras with pictures of another size: the vertical field of view stays, the sides show more or less."""
+    factor = height / rig.height
+    Ks = np.diag([factor, factor, 1.0]) @ rig.Ks
+    Ks[:, 0, 2] += (width - factor * rig.width) / 2
+    return replace(rig, Ks=Ks, width=width, height=height)
+
+
+def _angles(cameras: FloatArray, number: int) -> FloatArray:
+    """[number] angles of a path around cameras that stand at these angles, from that of the first (0)."""
+    places = np.sort(cameras % (2 * np.pi))
+    gaps = np.diff(places, append=places[0] + 2 * np.pi)
+    widest = int(gaps.argmax())
+    along = 2 * np.pi * np.arange(number) / number
+    if gaps[widest] <= OPEN_GAP:
+        return np.asarray(along)
+    start, span = places[(widest + 1) % len(places)], 2 * np.pi - gaps[widest]
+    half, middle = max(0.5 * span, LEAST_SWING), start + 0.5 * span
+    # The first camera is at angle 0 and somewhere on the arc; the swing begins there.
+    first = (np.pi - middle) % (2 * np.pi) - np.pi
+    phase = np.arcsin(np.clip(first / half, -1, 1))
+    return np.asarray(middle + half * np.sin(along + phase))
 
 
 def spiral(rig: Cameras, number: int, turns: float = 2.0) -> Cameras:

@@ -17,11 +17,14 @@ from PIL import Image
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError, OutputError
 from gsstream.core.shapes import FloatArray
-from gsstream.player.paths import PATHS, camera_path
+from gsstream.player.camera_file import read_path
+from gsstream.player.paths import PATHS, camera_path, resized
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, render, to_bytes
 
 _ANIMATED = (".webp", ".gif")
+#: File types that are written.
+SUFFIXES = (".mp4", *_ANIMATED)
 Bytes = np.ndarray[Any, np.dtype[np.uint8]]
 
 
@@ -36,34 +39,63 @@ class Played:
 def play(
     stream: str | os.PathLike[str], out: str | os.PathLike[str], *, camera: str | None = None,
     frames: Sequence[int] | None = None, fps: float | None = None, renderer: PlayerRenderer | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None, max_memory: int | None = None,
+    size: tuple[int, int] | None = None,
 ) -> Played:  # fmt: skip
     """Render a stream from one camera.
 
     Arguments:
         out: ``.mp4`` needs PyAV, and becomes a folder of PNGs (with a warning) where it is missing; ``.webp`` and
-            ``.gif`` are animated pictures; anything else is a folder.
-        camera: id of a train or test camera, "orbit" or "spiral"; default: the first test, else the first train camera.
-        frames: frame indices in the order to be shown; default: all.
+            ``.gif`` are animated pictures; a name without a suffix is a folder.
+        camera: id of a train or test camera, "orbit" or "spiral", or a JSON file with a path
+            (``player.camera_file``); default: the first test, else the first train camera.
+        frames: frame indices in the order to be shown; default: all up to the first damaged packet.
         fps: pictures per second; default: that of the recording.
         progress: called with (done, total) after every picture.
+        size: (width, height) of the pictures; default: that of the camera. The vertical field of view stays.
+        max_memory: bytes that decoding and drawing may take at most; default: what the format allows.
 
-    Raises InputError for an unknown camera or frame, PacketError for a damaged stream, OutputError when ``out`` cannot
-    be written.
+    Raises InputError for an unknown camera or frame and beyond ``max_memory``, PacketError for a damaged stream
+    (without ``frames``: once the pictures before the damage are written), OutputError when ``out`` cannot be written.
     """
-    with Playback(stream) as playback:
-        chosen = list(playback.frames if frames is None else frames)
+    check_target(Path(out))
+    with Playback(stream, max_memory=max_memory) as playback:
+        sound, damage = playback.sound() if frames is None else (frames, None)
+        chosen = list(sound)
         if not chosen:
             raise InputError("no frames to play: expected at least one frame index")
         cameras = choose_cameras(playback, camera, len(chosen))
+        cameras = cameras if size is None else resized(cameras, *size)
         for frame in chosen:
             playback.entry(frame)
+        if playback.limit is not None:
+            kept = len(chosen) if Path(out).suffix.lower() in _ANIMATED else 1
+            playback.limit.check_pictures(cameras.width, cameras.height, kept)
         images = _images(playback, chosen, cameras, renderer, progress)
         rate = playback.meta.fps if fps is None else fps
         try:
-            return _write(Path(out), images, chosen, rate)
+            played = _write(Path(out), images, chosen, rate)
         except OSError as error:
             raise OutputError(f"cannot write {out}: {error.strerror or error}") from error
+    if damage is not None:
+        raise damage
+    return played
+
+
+def check_target(out: Path) -> None:
+    """Refuse a file type that is not written, and the folder of a run: pictures do not belong among its results.
+
+    Raises OutputError.
+    """
+    suffix = out.suffix.lower()
+    if out.is_dir():
+        if (out / "stream.gss").exists():
+            raise OutputError(f"{out} is the folder of a run; choose another for pictures, e.g. {out / 'pictures'}")
+    elif suffix not in SUFFIXES and suffix[1:].isalnum() and not suffix[1:].isdigit():
+        raise OutputError(
+            f"{out}: {suffix} is not written; expected a file that ends with one of {', '.join(SUFFIXES)}, or a name "
+            "without a suffix: a folder for PNGs"
+        )
 
 
 def choose_cameras(playback: Playback, camera: str | None, number: int) -> Cameras:
@@ -71,6 +103,8 @@ def choose_cameras(playback: Playback, camera: str | None, number: int) -> Camer
     meta = playback.meta
     if camera in PATHS:
         return camera_path(camera, meta.train if len(meta.train) else meta.test, number)
+    if camera is not None and camera.lower().endswith(".json") and camera not in (*meta.test.ids, *meta.train.ids):
+        return read_path(Path(camera), meta.test if len(meta.test) else meta.train, number)
     return meta.camera((*meta.test.ids, *meta.train.ids)[0] if camera is None else camera)
 
 

@@ -3,30 +3,44 @@
 from __future__ import annotations
 
 import os
+import warnings
 from bisect import bisect_right
 from collections.abc import Iterator
 from typing import Literal
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.delta import Delta
+from gsstream.core.changes import Delta
 from gsstream.core.errors import InputError, PacketError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
 from gsstream.packet import Entry, PacketKind, PlayerState, StreamMeta, StreamReader, decode_packet
+from gsstream.player.memory import MemoryLimit
+
+
+class UnfinishedStreamWarning(UserWarning):
+    """The file ends in the middle of a packet: a run that is still writing, or was killed. What is before it plays."""
 
 
 class Playback:
     """A stream seen as scenes by frame index. Stepping forward decodes one packet; seeking starts at a key packet."""
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        """Open a stream. Raises SourceError when there is none, PacketError when its first packet is not readable."""
+    def __init__(self, path: str | os.PathLike[str], *, max_memory: int | None = None) -> None:
+        """Open a stream.
+
+        Arguments:
+            max_memory: bytes that decoding a frame may take at most; None: only the limits of the format hold.
+
+        Raises SourceError when there is no stream, PacketError when its first packet is not readable, InputError when
+        it would take more memory than allowed; so do all methods that decode.
+        """
         self.reader = StreamReader(path)
+        self.limit = None if max_memory is None else MemoryLimit(max_memory)
         try:
             if not self.reader.frames:
                 raise self.reader.damage or PacketError("the stream holds no complete packet yet", self.reader.end)
             self._entries = self.reader.frames
-            self._state = self._decode(None, self._entries[0])
-        except PacketError:
+            self._state: PlayerState = self._decode(None, self._entries[0])
+        except (PacketError, InputError):
             self.reader.close()
             raise
 
@@ -67,6 +81,42 @@ class Playback:
             raise InputError(f"frame {frame} is not in this stream: expected one of {known}")
         return self._entries[frame - self.frames[0]]
 
+    def sound(self, start: int | None = None, stop: int | None = None) -> tuple[range, PacketError | None]:
+        """Find out how far a stream can be played: reads the packets once and verifies their checksums.
+
+        Arguments:
+            start, stop: frames ``start`` to ``stop`` - 1 are wanted; default: from the first, to the last.
+
+        Returns the wanted frames before the first damaged packet, and that damage; None where there is none. What the
+        file loses after the damage counts as wanted where ``stop`` is not given. Warns (UnfinishedStreamWarning) when
+        the last packet is not complete and the frames up to the last are wanted.
+
+        Raises InputError for frames that are not in the stream, the damage when it leaves no frame to play.
+        """
+        first, end = self.frames[0], self.frames[-1] + 1
+        start = first if start is None else start
+        self.entry(start)
+        if stop is not None and stop > end and self.reader.damage is None:
+            self.entry(stop - 1)
+        for entry in self._entries[self._key_before(start) - first : None if stop is None else max(0, stop - first)]:
+            try:
+                if self.limit is not None:
+                    self.limit.check_packet(entry.size, entry.frame)
+                self.reader.read(entry)
+            except PacketError as error:
+                if entry.frame <= start:
+                    raise
+                return range(start, entry.frame), error
+        if stop is None and self.reader.unfinished is not None:
+            tail = self.reader.unfinished
+            warnings.warn(
+                f"{self.reader.path} ends in an unfinished packet ({tail.size} bytes from byte {tail.offset}): its run "
+                f"is still writing or was killed; frames {first} to {end - 1} are complete",
+                UnfinishedStreamWarning, stacklevel=2,
+            )  # fmt: skip
+        lost = self.reader.damage if stop is None or stop > end else None
+        return range(start, end if stop is None else min(stop, end)), lost
+
     def state_at(self, frame: int) -> Gaussians[FloatArray]:
         """The scene of a frame, decoded from the nearest earlier key packet or the frame last asked for."""
         return self.player_state(frame).gaussians
@@ -78,9 +128,7 @@ class Playback:
     def player_state(self, frame: int) -> PlayerState:
         """Scene, layout, decoders and last delta of a frame. Raises PacketError when a packet on the way is damaged."""
         self.entry(frame)
-        first = self.frames[0]
-        keys = [e.frame for e in self._entries if e.kind == PacketKind.KEY]
-        start = keys[bisect_right(keys, frame) - 1]
+        first, start = self.frames[0], self._key_before(frame)
         state: PlayerState | None = None
         if start <= self._state.frame <= frame:
             state, start = self._state, self._state.frame + 1
@@ -101,5 +149,15 @@ class Playback:
         self.reader.refresh()
         self._entries = self.reader.frames
 
+    def _key_before(self, frame: int) -> int:
+        """Frame of the last key packet up to ``frame``."""
+        keys = [e.frame for e in self._entries if e.kind == PacketKind.KEY]
+        return keys[bisect_right(keys, frame) - 1]
+
     def _decode(self, state: PlayerState | None, entry: Entry) -> PlayerState:
-        return decode_packet(state, self.reader.read(entry), offset=entry.offset)
+        if self.limit is None:
+            return decode_packet(state, self.reader.read(entry), offset=entry.offset)
+        self.limit.check_packet(entry.size, entry.frame)
+        data = self.reader.read(entry)
+        self.limit.check_decoding(data, state, entry.offset)
+        return decode_packet(state, data, offset=entry.offset)

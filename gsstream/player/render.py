@@ -5,6 +5,7 @@ A plugin offers one by an entry point of the group ``gsstream.player``::
     [project.entry-points."gsstream.player"]
     mine = "gsstream_mine.rasterizer:render_numpy"
 
+The first name in the alphabet is used, unless ``gsstream play --renderer NAME`` names another. ``render_numpy`` is
 a function that can be called like :func:`gsstream.player.software.render_numpy`, in a module that needs no torch.
 """
 
@@ -20,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.errors import PluginUnavailable, UnknownName
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray, check_finite, check_shape
 from gsstream.player.software import render_numpy
@@ -42,12 +44,9 @@ class SlowRendererWarning(UserWarning):
 def find_renderer() -> PlayerRenderer:
     """The first compiled renderer that loads, in the order of names; else numpy. Warns once when it is numpy."""
     problems = []
-    for point in sorted(importlib.metadata.entry_points(group=ENTRY_POINT_GROUP), key=lambda p: p.name):
+    for point in _entry_points():
         try:
-            function = point.load()
-            # Found out here, where there still is another renderer, and not at the first picture.
-            inspect.signature(function).bind(*[None] * 8, 1, 1, (0.0, 0.0, 0.0), near=0.01)
-            return PlayerRenderer(point.name, function)
+            return _load(point)
         except Exception as error:  # third-party code: whatever it raises is reported, and the player still plays
             problems.append(f"{point.name} ({point.value}) failed: {type(error).__name__}: {error}")
     why = f". Reason: {'; '.join(problems)}" if problems else ""
@@ -58,6 +57,34 @@ def find_renderer() -> PlayerRenderer:
         stacklevel=2,
     )
     return PlayerRenderer("numpy", render_numpy)
+
+
+def named_renderer(name: str) -> PlayerRenderer:
+    """The renderer of this name: "numpy", or one that a plugin offers.
+
+    Raises UnknownName for a name that nobody offers, PluginUnavailable with the reason for one that does not load.
+    """
+    if name == "numpy":
+        return PlayerRenderer("numpy", render_numpy)
+    points = {point.name: point for point in _entry_points()}
+    if name not in points:
+        raise UnknownName("renderer of the player", name, ["numpy", *points])
+    try:
+        return _load(points[name])
+    except Exception as error:  # third-party code: whatever it raises is the reason
+        value = points[name].value
+        raise PluginUnavailable(f"renderer {name!r} ({value}) failed: {type(error).__name__}: {error}") from error
+
+
+def _entry_points() -> list[importlib.metadata.EntryPoint]:
+    return sorted(importlib.metadata.entry_points(group=ENTRY_POINT_GROUP), key=lambda point: point.name)
+
+
+def _load(point: importlib.metadata.EntryPoint) -> PlayerRenderer:
+    function = point.load()
+    # Found out here, where there still is another renderer, and not at the first picture.
+    inspect.signature(function).bind(*[None] * 8, 1, 1, (0.0, 0.0, 0.0), near=0.01)
+    return PlayerRenderer(point.name, function)
 
 
 def render(

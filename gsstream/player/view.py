@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import threading
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,6 +41,9 @@ class Viewer:
         import viser
 
         self.playback = Playback(stream)
+        _, damage = self.playback.sound()
+        if damage is not None:
+            warnings.warn(f"{stream} is damaged, what is before is shown: {damage}", stacklevel=2)
         try:
             self.server = viser.ViserServer(host=host, port=port, label="gsstream", verbose=False)
         except OSError as error:

@@ -11,23 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from gsstream.core.errors import PluginUnavailable, UnknownName
+from gsstream.core.kinds import PART_KINDS
 from gsstream.plugins.discovery import Discovered, PluginFault, discover, spec_key
 from gsstream.spec import ComponentSpec, MethodSpec
-
-#: The abstract base class of each kind, named so that listing parts imports none of them. The kinds source and metric
-#: are Protocols: there is no class to inherit from. A source's target is called as target(uri, scale).
-CONTRACTS: Mapping[str, str] = {
-    "structure": "gsstream.structure.base:Structure",
-    "confidence": "gsstream.confidence.base:ConfidenceEstimator",
-    "propagation": "gsstream.propagation.base:Propagation",
-    "gate": "gsstream.gate.base:GateSampler",
-    "regularizer": "gsstream.regularizer.base:Regularizer",
-    "update": "gsstream.residual.base:UpdateRule",
-    "whole": "gsstream.method.base:StreamingMethod",
-    "renderer": "gsstream.render.base:Renderer",
-    "loss": "gsstream.loss.base:Loss",
-    "optimiser": "gsstream.optimiser.base:RowOptimiser",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,16 +134,15 @@ def _load_target(spec: ComponentSpec) -> type[Any]:
     target = getattr(importlib.import_module(module_name), attribute, None)
     if target is None:
         raise PluginFault(f"its target {spec.target!r} does not exist: {module_name} has no {attribute!r}")
-    contract = CONTRACTS.get(spec.kind)
-    if contract is None:
+    kind = PART_KINDS[spec.kind]
+    if kind.contract is None:
         if not callable(target):
             raise PluginFault(f"its target {spec.target!r} is a {type(target).__name__}; expected a class")
         return target  # type: ignore[no-any-return]
-    base_module, _, base_name = contract.partition(":")
-    base = getattr(importlib.import_module(base_module), base_name)
+    base = kind.contract_class()
     if not (isinstance(target, type) and issubclass(target, base)):
-        raise PluginFault(f"its target {spec.target!r} is not a {base_name}: declared as {spec.kind!r}")
+        raise PluginFault(f"its target {spec.target!r} is not a {base.__name__}: declared as {spec.kind!r}")
     if inspect.isabstract(target):
         missing = ", ".join(sorted(getattr(target, "__abstractmethods__", ())))
-        raise PluginFault(f"its target {spec.target!r} leaves these methods of {base_name} unwritten: {missing}")
+        raise PluginFault(f"its target {spec.target!r} leaves these methods of {base.__name__} unwritten: {missing}")
     return target

@@ -126,11 +126,6 @@ class Stream(Section):
         default=False,
         description="after each pass over the cameras, rows whose gate has closed leave the optimisation (ours)",
     )
-    min_gain: float = Field(
-        default=0.0, ge=0, lt=1,
-        description="a frame ends after a pass that gained less than this share of all it gained so far; 0: never "
-        "before its epochs (ours)",
-    )  # fmt: skip
     rate_weight: float = Field(
         default=0.0, ge=0, le=1,
         description="weight in the loss of the residual's estimated bits per pixel of one view; 0: none (ours)",
@@ -157,33 +152,6 @@ class GateTraining(Section):
     """Optimisation of the gate logits."""
 
     lr: float = Field(default=0.1, ge=0, description="Adam learning rate of the gate logits (released code: 0.1)")
-    warmup: float = Field(
-        default=0.0, ge=0, lt=1,
-        description="share of a frame's iterations before gates start to learn: a gate without a residual behind it "
-        "feels only the penalty and would close before any camera had its say (ours; paper and released code: 0)",
-    )  # fmt: skip
-    optimiser: Literal["fresh", "persistent"] = Field(
-        default="fresh", description="fresh: Adam moments restart each frame; persistent: they live on (released code)"
-    )
-
-
-class Insertion(Section):
-    """Births for what no move of the others can show (future work in the paper; ours)."""
-
-    per_frame: int = Field(default=0, ge=0, description="most Gaussians born in one frame; 0: the hierarchy is fixed")
-    error: float = Field(
-        default=0.15, gt=0, le=1, description="change and error of a pixel beyond which the scene lacks something there"
-    )
-    votes: float = Field(
-        default=0.75, gt=0, le=1, description="least share of a point's views in which it lands in such a pixel"
-    )
-    least_views: int = Field(default=4, ge=2, description="least number of these views")
-    agreement: float = Field(
-        default=0.12, gt=0, le=1, description="largest standard deviation of a colour channel over these views"
-    )
-    rays: int = Field(default=64, ge=1, description="rays searched per view")
-    epochs: int = Field(default=4, ge=0, description="passes over the training cameras that fit the newborn alone")
-    least_opacity: float = Field(default=0.1, ge=0, lt=1, description="newborn below this opacity are dropped again")
 
 
 class Codec(Section):
@@ -192,15 +160,6 @@ class Codec(Section):
     key_every: int = Field(
         default=0, ge=0, description="most frames from one key packet to the next, which replaces a delta; 0: no period"
     )
-    key_change: float = Field(
-        default=0.0, ge=0, le=1,
-        description="share of Gaussians behind open gates from which on a frame becomes a key packet; 0: never",
-    )  # fmt: skip
-    key_error_growth: float = Field(
-        default=0.0, ge=0, le=100,
-        description="dB on the training views lost since the last key packet from which on a frame becomes one; costs "
-        "one rendering of every training view a frame; 0: not watched",
-    )  # fmt: skip
     trim: float = Field(
         default=0.0, ge=0, lt=1,
         description="share of each delta packet's bytes given up, the symbols and gates that explain least per bit; "
@@ -219,11 +178,13 @@ class Recipe(Section):
     confidence: ComponentRef = Field(default=ComponentRef(name="uniform"), description="which Gaussians changed")
     propagation: ComponentRef = Field(default=ComponentRef(name="group-max"), description="how belief spreads to nodes")
     gate: ComponentRef = Field(default=ComponentRef(name="always-open"), description="which nodes may move")
+    motion: ComponentRef = Field(default=ComponentRef(name="still"), description="what moves before the residual")
     regularizer: ComponentRef = Field(default=ComponentRef(name="none"), description="what openness costs")
     update: ComponentRef = Field(default=ComponentRef(name="additive"), description="how a gated change is applied")
-    whole: ComponentRef = Field(
-        default=ComponentRef(name="none"),
-        description="a whole method in place of the six parts above; none: the parts are the method",
+    growth: ComponentRef = Field(default=ComponentRef(name="none"), description="which Gaussians are born and leave")
+    stepper: ComponentRef = Field(
+        default=ComponentRef(name="parts"),
+        description="what goes from frame to frame; parts: the slots above; other methods bring their own",
     )
     renderer: ComponentRef = Field(
         default=ComponentRef(name="auto"), description="auto: the fastest that works here, else the reference"
@@ -232,7 +193,6 @@ class Recipe(Section):
     stream: Stream = Field(default=Stream(), description="later frames")
     loss: Loss = Field(default=Loss(), description="photometric loss")
     gate_training: GateTraining = Field(default=GateTraining(), description="optimisation of gates")
-    insertion: Insertion = Field(default=Insertion(), description="Gaussians born while streaming")
     codec: Codec = Field(default=Codec(), description="packets")
     budget: Budget = Field(default=Budget(), description="what a frame may cost; nothing given: no limits")
     data: DataOptions = Field(default=DataOptions(), description="the split, and disturbances for experiments")

@@ -7,13 +7,14 @@ counts while the transmittance before it exceeds 1e-4, near plane ``cameras.near
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 
 import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.context import ScreenGradient
+from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.part import Part
 
@@ -67,7 +68,7 @@ class RenderSession(ABC):
     A session begins wide: every row may change. ``narrow`` says which rows change from then on; all others stay as they
     are in the session's scene. ``commit`` ends a frame: it gives the session of the next scene, wide again, which
     renders and differentiates exactly as one opened anew would, and in which a renderer may keep whatever did not
-    change. ``screen_gradient`` belongs to the session's scene and may be asked for at any time.
+    change. ``screen_gradient`` and ``visible`` belong to the session's scene and may be asked for at any time.
     """
 
     @abstractmethod
@@ -97,6 +98,28 @@ class RenderSession(ABC):
 
         What this projects and sorts, ``render`` need not do again. Where the gradient is zero in most of the image, a
         renderer may spend work only on the rest.
+        """
+
+    @abstractmethod
+    def visible(self, view: int, tiles: torch.Tensor) -> torch.Tensor:
+        """Say which Gaussians of the session's scene are drawn in the marked tiles of camera ``view``.
+
+        A Gaussian is drawn at a pixel when it lies behind the near plane, its alpha at the pixel's centre is at least
+        1/255, and the transmittance before it exceeds 1e-4: exactly then it adds light to the pixel. Its colour does
+        not matter; a black Gaussian on black is drawn. Two answers may differ in rows whose alpha or transmittance lies
+        at its bound within rounding. A renderer that draws whole blocks of pixels may count those that lie in a marked
+        tile beyond the image's edge. Nothing is differentiated; the work of a renderer that keeps a cache follows the
+        marked tiles once the view's cache is filled.
+
+        Arguments:
+            view: index of a camera of the rig.
+            tiles: [ceil(H / 16), ceil(W / 16)] bool, the tiles that are asked about.
+
+        Returns:
+            [N] bool, one per Gaussian of the session's scene, active or not.
+
+        Raises:
+            ShapeError: ``tiles`` of another shape or dtype.
         """
 
     @abstractmethod
@@ -191,8 +214,59 @@ class ScatterSession(RenderSession):
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
         return self._renderer.screen_gradient(self._gaussians, self._cameras, view, image_gradient)
 
+    def visible(self, view: int, tiles: torch.Tensor) -> torch.Tensor:
+        size = self._cameras.height, self._cameras.width
+        scene = self._gaussians
+        return drawn_rows(lambda g: self._renderer.render(g, self._cameras, view, (0.0,) * 3), scene, size, tiles)
+
     def narrow(self, active: torch.Tensor) -> None:
         self._active = active
 
     def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
         return self._renderer.open(gaussians, None, self._cameras, self._background)
+
+
+def drawn_rows(
+    render: Callable[[Gaussians[torch.Tensor]], RenderOutput],
+    gaussians: Gaussians[torch.Tensor],
+    size: tuple[int, int],
+    tiles: torch.Tensor,
+) -> torch.Tensor:
+    """Find by differentiation who is drawn in marked tiles: ``RenderSession.visible`` of any differentiable renderer.
+
+    The derivative of the image by the colour of a Gaussian is the sum of its weights alpha * transmittance, which are
+    positive where it is drawn and zero elsewhere, so nothing can cancel. All are drawn in grey, because a colour that
+    is clamped at 0 has no derivative.
+
+    Arguments:
+        render: draws a whole scene; differentiable by its colours.
+        gaussians: the scene, N rows.
+        size: (H, W) of the image, pixels.
+        tiles: [ceil(H / 16), ceil(W / 16)] bool.
+
+    Returns:
+        [N] bool.
+
+    Raises:
+        ShapeError: ``tiles`` of another shape or dtype.
+    """
+    check_tiles(tiles, size)
+    inside = tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[: size[0], : size[1]]
+    fixed = gaussians.map(torch.Tensor.detach)
+    colours = torch.zeros_like(fixed.sh0).requires_grad_()
+    with torch.enable_grad():
+        image = render(replace(fixed, sh0=colours, shN=torch.zeros_like(fixed.shN))).image
+        if not image.requires_grad:  # nothing is drawn at all
+            return torch.zeros(len(fixed), dtype=torch.bool)
+        (weights,) = torch.autograd.grad(image, colours, inside[..., None].expand_as(image).to(image.dtype))
+    return (weights > 0).flatten(1).any(1)
+
+
+def check_tiles(tiles: torch.Tensor, size: tuple[int, int]) -> None:
+    """Raise ShapeError unless ``tiles`` is bool [ceil(H / 16), ceil(W / 16)] for an image of ``size`` (H, W)."""
+    wanted = [-(-side // TILE) for side in size]
+    if tiles.dtype != torch.bool or list(tiles.shape) != wanted:
+        raise ShapeError(
+            f"tiles: expected bool {wanted} ({TILE} x {TILE} pixel tiles of a {size[1]} x {size[0]} image), got "
+            f"{tiles.dtype} {list(tiles.shape)}; give one mark per tile"
+        )

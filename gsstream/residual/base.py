@@ -1,7 +1,8 @@
 """UpdateRule: which attributes change, in which latent space, at which quantisation step.
 
-An internal seam, not yet a public component kind. The training forward pass here and ``core.delta.apply_delta`` (the
-transmitted truth, numpy) compute the same map; a test holds them together.
+An internal seam, not yet a public component kind. Training applies a change by ``residual.joint`` (torch, with its
+gradient written out), encoder and player by ``core.delta.apply_delta`` (numpy, from the integers that are sent);
+``check_update_closed_loop`` of the contract kit holds the two together.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 
@@ -69,62 +69,6 @@ def init_latents(rule: UpdateRule, base: Gaussians[torch.Tensor]) -> dict[str, t
         for name, code in rule.codes().items()
         if _width(base, name)
     }
-
-
-def quantise(latents: torch.Tensor, step: float) -> torch.Tensor:
-    """Round to multiples of ``step`` with a straight-through gradient (ours; the released code never rounds here).
-
-    The value is exactly symbol * step, as the decoder has it: latents - latents is 0, whereas latents plus the rounding
-    error would be an ulp off.
-    """
-    return torch.round(latents.detach() / step) * step + (latents - latents.detach())
-
-
-class Change(NamedTuple):
-    """One attribute's ungated residual: quantised latents [A, L] and what they decode to [A, D]."""
-
-    latents: torch.Tensor
-    decoded: torch.Tensor
-
-
-def decode_changes(
-    rule: UpdateRule, latents: Mapping[str, torch.Tensor], decoders: Mapping[str, torch.Tensor]
-) -> dict[str, Change]:
-    """Attribute -> quantised and decoded residual."""
-    codes = rule.codes()
-    quantised = {name: quantise(latent, codes[name].step) for name, latent in latents.items()}
-    return {name: Change(q, q @ decoders[name] if name in decoders else q) for name, q in quantised.items()}
-
-
-def add_changes(
-    base: Gaussians[torch.Tensor], changes: Mapping[str, Change], gates: torch.Tensor, units: torch.Tensor
-) -> Gaussians[torch.Tensor]:
-    """a_t = a_{t-1} + g * change; position changes are in cells, ``units`` [A] scene units."""
-    changed = dict(base.items())
-    for name, change in changes.items():
-        scale = gates * units if name == "means" else gates
-        value = changed[name]
-        changed[name] = value + (change.decoded * scale[:, None]).reshape(value.shape)
-    return Gaussians(**changed)
-
-
-def apply_residual(
-    rule: UpdateRule,
-    base: Gaussians[torch.Tensor],
-    gates: torch.Tensor,
-    latents: Mapping[str, torch.Tensor],
-    decoders: Mapping[str, torch.Tensor],
-    units: torch.Tensor,
-) -> Gaussians[torch.Tensor]:
-    """Gated, quantised, decoded residual on the A rows of ``base``; differentiable.
-
-    Arguments:
-        gates: [A] in [0, 1].
-        latents: attribute -> [A, L].
-        decoders: attribute -> [L, D].
-        units: [A] cell of each anchor, scene units.
-    """
-    return add_changes(base, decode_changes(rule, latents, decoders), gates, units)
 
 
 def coarser(codes: Mapping[str, AttributeCode], factor: float) -> Mapping[str, AttributeCode]:

@@ -1,8 +1,8 @@
-"""The residual of all attributes side by side, as one table: a few large operations instead of many small ones (ours).
+"""The residual of all attributes side by side, as one table: a few large operations instead of many small ones.
 
 Latents of all attributes are the columns of one [A, L] table, their decoders the blocks of one [L, D] matrix (identity
 where an attribute has no decoder), what changes the columns of one [A, D] table. The map is that of
-:func:`gsstream.residual.base.apply_residual`, up to rounding.
+:func:`gsstream.core.changes.apply_delta`, up to rounding.
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ from PIL import Image
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError, OutputError, suggest
 from gsstream.core.frame import PointCloud
+from gsstream.core.names import child
 from gsstream.core.shapes import FloatArray
 from gsstream.init.mapping import Lens, Mapping, reconstruct, triangulate
 from gsstream.init.thinning import thin_points
@@ -183,7 +184,7 @@ def _write_pictures(
     """Pictures of all cameras; the number of frames that all of them have."""
     counts = []
     for camera, lens in zip(cameras, lenses, strict=True):
-        folder = out / camera.name
+        folder = child(out, camera.name)
         folder.mkdir(parents=True)
         if lens is None and not camera.is_video and camera.files[0].suffix.lower() in (".png", ".jpg"):
             chosen = camera.files[: options.frames]

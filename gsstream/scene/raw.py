@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gsstream.core.errors import SourceError
+from gsstream.core.errors import ShapeError, SourceError
+from gsstream.core.names import check_camera_ids
 from gsstream.core.shapes import FloatArray
 from gsstream.source.calibration import CALIBRATION_FILE, frame_path, read_calibration
-from gsstream.source.images import read_image
+from gsstream.source.images import PICTURE_FORMATS, read_image
 
 PICTURES = (".png", ".jpg", ".jpeg")
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".ts")
@@ -60,6 +61,10 @@ def find_cameras(folder: Path) -> list[RawCamera]:
             f"{folder}: cameras found: {len(found)}; expected at least two: a folder of pictures per camera, "
             f"a video per camera, or a picture per camera ({', '.join(PICTURES + VIDEOS)})"
         )
+    try:
+        check_camera_ids(found)
+    except ShapeError as error:
+        raise SourceError(f"{folder}: {error}") from error
     return [RawCamera(name, files, _size(files[0])) for name, files in found.items()]
 
 
@@ -88,10 +93,10 @@ def _size(path: Path) -> tuple[int, int]:
     from PIL import Image
 
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=PICTURE_FORMATS) as image:
             return image.size
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read as a picture ({error}); export it again") from error
+    except (OSError, Image.DecompressionBombError) as error:
+        raise SourceError(f"{path}: cannot be read as a picture ({error}); expected PNG or JPEG") from error
 
 
 def _video_frames(path: Path, most: int | None) -> Iterator[FloatArray]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError, SourceError
+from gsstream.core.names import check_camera_ids
 from gsstream.source.base import Split
 
 SCHEMA = "opencv-multiview-1"
@@ -128,6 +129,10 @@ def _camera_id(path: Path, camera: dict[str, Any], index: int) -> str:
     camera_id = camera.get("id")
     if not isinstance(camera_id, str) or not camera_id:
         raise SourceError(f"{path}: camera number {index} needs a non-empty text 'id', got {_brief(camera_id)}")
+    try:
+        check_camera_ids([camera_id])
+    except ShapeError as error:
+        raise SourceError(f"{path}: {error}") from error
     return camera_id
 
 

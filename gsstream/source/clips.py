@@ -11,7 +11,7 @@ from PIL import Image, UnidentifiedImageError
 
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
-from gsstream.source.images import read_image
+from gsstream.source.images import PICTURE_FORMATS, read_image
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
@@ -85,10 +85,12 @@ class ImageClip:
 
 def _size_of(path: Path) -> tuple[int, int]:
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=PICTURE_FORMATS) as image:
             return image.size
-    except (OSError, UnidentifiedImageError) as error:
-        raise SourceError(f"{path}: the image cannot be opened ({error}); copy or export it again") from error
+    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+        raise SourceError(
+            f"{path}: the image cannot be opened ({error}); expected PNG or JPEG: copy or export it again"
+        ) from error
 
 
 def natural(path: Path) -> list[tuple[int, str]]:

@@ -14,6 +14,8 @@ from gsstream.core.shapes import FloatArray
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _RGB_COLOR_TYPE = 2
+#: The only decoders that Pillow may try: others are many, some start programs (EPS: Ghostscript), none is documented.
+PICTURE_FORMATS = ("PNG", "JPEG")
 _READABLE = "8-bit JPEG or PNG, or 16-bit PNG, without transparency"
 
 
@@ -74,7 +76,7 @@ def _decode(path: Path) -> tuple[np.ndarray[Any, Any], float]:
             head = file.read(26)
         if head.startswith(_PNG_SIGNATURE) and len(head) == 26 and head[24] == 16 and head[25] == _RGB_COLOR_TYPE:
             return _decode_rgb16(path), 65535.0
-        with Image.open(path) as image:
+        with Image.open(path, formats=PICTURE_FORMATS) as image:
             image.load()
             return _to_rgb(path, image)
     except FileNotFoundError as error:

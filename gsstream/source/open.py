@@ -43,9 +43,17 @@ def open_source(uri: str, scale: float = 1.0) -> FrameSource:
     named = scheme if separator and scheme in (*LAYOUTS, "folder") else None
     folder = Path(rest if named else uri)
     # An empty text is the current folder to Path, and never what was meant.
-    if not named and not (uri and folder.exists()):
-        raise SourceError(f"source {uri!r}: no such folder and no known scheme; expected {_KNOWN}")
+    if not (uri and _exists(folder)) and not named:
+        raise SourceError(f"source {uri[:200]!r}: no such folder and no known scheme; expected {_KNOWN}")
     layout = named or detect(folder)
     if layout == "folder":
         return MultiviewSource(folder, scale=scale, uri=uri)
     return RecordedSource(read_layout(layout, folder), scale=scale, uri=uri)
+
+
+def _exists(folder: Path) -> bool:
+    """Whether there is such a folder or file. Raises SourceError for a text that cannot be a path at all."""
+    try:
+        return folder.exists()
+    except (OSError, ValueError) as error:
+        raise SourceError(f"source {str(folder)[:200]!r} cannot be a path: {error}") from error

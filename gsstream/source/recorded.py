@@ -11,6 +11,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError, SourceError
 from gsstream.core.frame import Frame, PointCloud
+from gsstream.core.names import check_camera_ids
 from gsstream.core.shapes import FloatArray
 from gsstream.source.base import PointKind, SourceInfo, Split, check_index
 from gsstream.source.clips import Clip
@@ -147,6 +148,7 @@ def _checked(recording: Recording) -> Cameras:
     """The rig, once its clips are known to fit it."""
     rig = recording.rig
     try:
+        check_camera_ids(rig.ids)
         rig.validate()
     except ShapeError as error:
         raise SourceError(f"{recording.where}: {error}") from error

@@ -1,4 +1,4 @@
-"""Structure: place anchors, build and maintain a Hierarchy."""
+"""Structure: place anchors and group Gaussians into a Hierarchy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from gsstream.core.frame import PointCloud
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.part import Part
-from gsstream.core.topology import TopologyEdit
 
 
 @dataclass(frozen=True)
@@ -47,8 +46,8 @@ class Structure(Part):
 
     @abstractmethod
     def build(self, gaussians: Gaussians[torch.Tensor], anchors: Anchors) -> Hierarchy:
-        """Group the Gaussians (rows aligned with ``anchors.levels``)."""
+        """Group the Gaussians (rows aligned with ``anchors.levels``).
 
-    @abstractmethod
-    def update(self, hierarchy: Hierarchy, edit: TopologyEdit, gaussians: Gaussians[torch.Tensor]) -> Hierarchy:
-        """The hierarchy after a topology edit. The identity edit changes nothing."""
+        The engine asks for this at frame 0 and wherever a stream is taken up again; after births and deaths in between
+        it keeps the groups and gives new Gaussians the node that the packet says (``core.births``).
+        """

@@ -13,7 +13,6 @@ from gsstream.core.frame import PointCloud
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.part import PartConfig, Traits
-from gsstream.core.topology import TopologyEdit
 from gsstream.structure.base import Anchors, Structure
 
 
@@ -27,7 +26,7 @@ class Flat(Structure):
             description="position residuals are measured in (scene diameter / resolution); 1 to 65536",
         )  # fmt: skip
 
-    traits = Traits(stable=True, idempotent=True, local=True)
+    traits = Traits(idempotent=True, local=True)
 
     def seed(self, points: PointCloud, cameras: Cameras) -> Anchors:
         if len(points) == 0:
@@ -44,12 +43,5 @@ class Flat(Structure):
         )
 
     def build(self, gaussians: Gaussians[torch.Tensor], anchors: Anchors) -> Hierarchy:
-        return _identity(len(gaussians))
-
-    def update(self, hierarchy: Hierarchy, edit: TopologyEdit, gaussians: Gaussians[torch.Tensor]) -> Hierarchy:
-        return _identity(len(edit.source))
-
-
-def _identity(n: int) -> Hierarchy:
-    index = torch.arange(n)
-    return Hierarchy(node_of=index, parent=index, level=torch.zeros_like(index))
+        index = torch.arange(len(gaussians))
+        return Hierarchy(node_of=index, parent=index, level=torch.zeros_like(index))

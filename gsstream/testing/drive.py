@@ -38,15 +38,15 @@ def _propagation(part: Any, world: World) -> Outputs:
 
 
 def _gate(part: GateSampler, world: World) -> Outputs:
-    state = part.init(world.logits)
+    logits = part.init(world.logits)
     noise = draw(part, len(world.logits))
     found = {
-        "init().logits": state.logits,
-        "sample(None)": part.sample(state, None),
-        "open_probability()": part.open_probability(state),
-        "bound().logits": part.bound(state).logits,
+        "init()": logits,
+        "sample(None)": part.sample(logits, None),
+        "open_probability()": part.open_probability(logits),
+        "bound()": part.bound(logits),
     }
-    return found if noise is None else {**found, "sample(noise)": part.sample(state, noise)}
+    return found if noise is None else {**found, "sample(noise)": part.sample(logits, noise)}
 
 
 def draw(part: GateSampler, number: int, seed: int = 7) -> torch.Tensor | None:

@@ -6,34 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from gsstream.confidence.base import ConfidenceEstimator
+from gsstream.core.kinds import CONTRACTS, PART_KINDS
 from gsstream.core.part import Part
-from gsstream.gate.base import GateSampler
-from gsstream.loss.base import Loss
-from gsstream.method.base import StreamingMethod
-from gsstream.optimiser.base import RowOptimiser
-from gsstream.propagation.base import Propagation
-from gsstream.regularizer.base import Regularizer
-from gsstream.render.base import Renderer
-from gsstream.residual.base import UpdateRule
-from gsstream.structure.base import Structure
 from gsstream.testing.recording import Skip as Skip
 from gsstream.testing.recording import SourceUnderTest
 
-CONTRACTS: dict[str, type[Part]] = {
-    "structure": Structure,
-    "confidence": ConfidenceEstimator,
-    "propagation": Propagation,
-    "gate": GateSampler,
-    "regularizer": Regularizer,
-    "update": UpdateRule,
-    "whole": StreamingMethod,
-    "renderer": Renderer,
-    "loss": Loss,
-    "optimiser": RowOptimiser,
-}
 #: The kinds that all common checks are made on; of the others only settings, freezing and declaration.
-BEHAVED = ("structure", "confidence", "propagation", "gate", "regularizer")
+BEHAVED = tuple(name for name, kind in PART_KINDS.items() if kind.behaviour)
 
 CheckFunction = TypeVar("CheckFunction", bound=Callable[..., None])
 
@@ -81,8 +60,8 @@ def kind_of(part: Part | SourceUnderTest) -> str:
     """The kind whose abstract base class ``part`` implements. Raises TypeError when it is none of them."""
     if isinstance(part, SourceUnderTest):
         return "source"
-    for kind, contract in CONTRACTS.items():
-        if isinstance(part, contract):
+    for kind in CONTRACTS:
+        if isinstance(part, PART_KINDS[kind].contract_class()):
             return kind
     raise TypeError(f"expected a part of one of the kinds {', '.join(CONTRACTS)}, got {type(part).__name__}")
 

@@ -9,15 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from gsstream.core.frame import Frame
-from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.engine.frame0.begin import begin, begin_from
-from gsstream.engine.step.frame_step import frame_step
 from gsstream.engine.frame0.points import gather_points
-from gsstream.engine.keys.resume import resume_state
-from gsstream.engine.whole import WholeTools, begin_whole, resume_whole, step_whole
+from gsstream.engine.run.encoder import Encoder
 from gsstream.method.base import Step, StreamingMethod
-from gsstream.packet import PlayerState, StreamMeta, decode_packet
+from gsstream.packet import PlayerState, decode_packet
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import ComponentRef
@@ -32,23 +28,21 @@ FRAMES = 3
 
 
 class MethodUnderTest:
-    """A method, made of parts or whole, with a tiny budget; frames are stepped in memory. Saboteurs override one call.
-    """
+    """A method with a tiny budget; frames are stepped in memory. Saboteurs override one call."""
 
-    def __init__(self, name: str, whole: StreamingMethod[Any] | None = None) -> None:
-        """Method ``name``; or a whole method under its recipe."""
+    def __init__(self, name: str, method: StreamingMethod[Any] | None = None) -> None:
+        """Take the method ``name``; or ``method`` under the recipe of that name."""
         self.name = name
         catalog = load_catalog()
-        overrides = [("the contract kit", text) for text in TINY]
-        recipe = resolve_recipe(name, catalog.recipe_path, (), overrides).recipe
-        if recipe.whole.name != "none":
-            heeds = catalog.resolve("whole", recipe.whole.name).heeds
-            overrides = [item for item in overrides if not item[1].startswith("stream.") or _key(item[1]) in heeds]
+        recipe = resolve_recipe(name, catalog.recipe_path, (), [("the contract kit", text) for text in TINY]).recipe
+        reads = catalog.resolve("stepper", recipe.stepper.name)().reads
+        kept = [text for text in TINY if not text.startswith("stream.") or reads(text.partition("=")[0])]
+        overrides = [("the contract kit", text) for text in kept]
         self.parts: Assembly = assemble(resolve_recipe(name, catalog.recipe_path, (), overrides), catalog)
-        if whole is not None:
-            ref = ComponentRef(name="under-test", params=whole.config.model_dump(mode="json"))
-            self.parts = replace(self.parts, whole=whole, recipe=self.parts.recipe.model_copy(update={"whole": ref}))
-        self.seed = self.parts.recipe.seed
+        if method is not None:
+            ref = ComponentRef(name="under-test", params=method.config.model_dump(mode="json"))
+            recipe = self.parts.recipe.model_copy(update={"stepper": ref})
+            self.parts = replace(self.parts, stepper=method, recipe=recipe)
 
     def __repr__(self) -> str:
         return f"method {self.name}"
@@ -56,55 +50,44 @@ class MethodUnderTest:
     @property
     def least_cameras(self) -> int:
         """How many training cameras it says it needs."""
-        return 1 if self.parts.whole is None else self.parts.whole.least_cameras
+        return self.parts.stepper.least_cameras
 
-    def tools(self, uri: str = SOURCE, first: PlayerState | None = None) -> WholeTools:
-        """What the engine lends a whole method."""
+    def encoder(self, uri: str = SOURCE, first: PlayerState | None = None) -> Encoder:
+        """Return an encoder of this method, before frame 0."""
         source = open_source(uri)
-        info, recipe = source.info, self.parts.recipe
-
-        def meta(frame: Frame) -> StreamMeta:
-            return StreamMeta(
-                recipe.method, info.name, recipe.model_dump(mode="json"), frame.cameras, info.test, info.fps,
-                recipe.background, {},
-            )  # fmt: skip
-
-        return WholeTools(self.parts, source, Rng(self.seed), info.train.near, meta, first)
+        settings, parts = self.parts.recipe.first_frame, self.parts
+        encoder = Encoder(
+            parts, source.info, lambda frame: gather_points(source.points, frame, settings, encoder.rng),
+            first_frame=first,
+        )  # fmt: skip
+        return encoder
 
     def begin(self, frame: Frame, uri: str = SOURCE) -> Step[Any]:
-        """Frame 0."""
-        tools = self.tools(uri)
-        if self.parts.whole is not None:
-            return begin_whole(self.parts.whole, tools, frame)
-        points = gather_points(tools.source, frame, self.parts.recipe.first_frame, tools.rng)
-        return begin(self.parts, points, frame, tools.meta(frame), tools.rng, lambda *_: None)
+        """Make frame 0."""
+        return self.encoder(uri).encode(frame)
 
     def take_over(self, first: PlayerState, frame: Frame) -> Step[Any]:
-        """Frame 0 of another stream."""
-        tools = self.tools(first=first)
-        if self.parts.whole is not None:
-            return begin_whole(self.parts.whole, tools, frame)
-        return begin_from(self.parts, first, frame, tools.meta(frame), tools.rng)
+        """Make frame 0 from that of another stream."""
+        return self.encoder(first=first).encode(frame)
 
     def step(self, state: Any, frame: Frame) -> Step[Any]:
-        """A later frame."""
-        if self.parts.whole is not None:
-            return step_whole(self.parts.whole, self.tools(), state, frame)
-        return frame_step(self.parts, state, frame, Rng(self.seed))
+        """Make a later frame."""
+        encoder = self.encoder()
+        encoder.state = state
+        return encoder.encode(frame)
 
     def resume(self, stream: Path) -> Any:
-        """The encoder's state after the last packet of a stream."""
-        tools = self.tools()
-        if self.parts.whole is not None:
-            return resume_whole(self.parts.whole, tools, stream)
-        return resume_state(self.parts, stream, tools.source, tools.rng, tools.near)
+        """Return the encoder's state after the last packet of a stream."""
+        source, encoder = open_source(SOURCE), self.encoder()
+        encoder.resume(stream, source.frame)
+        return encoder.state
 
     def play(self, state: PlayerState | None, data: bytes) -> PlayerState:
-        """What a player does with a packet."""
+        """Do what a player does with a packet."""
         return decode_packet(state, data)
 
     def chain(self, uri: str = SOURCE, choose: Callable[[Frame], Frame] | None = None) -> list[Step[Any]]:
-        """All frames of a recording."""
+        """Make all frames of a recording."""
         source = open_source(uri)
         frames = [source.frame(index) for index in range(FRAMES)]
         frames = [choose(frame) for frame in frames] if choose else frames
@@ -120,10 +103,6 @@ class MethodUnderTest:
 
 
 @functools.lru_cache(maxsize=8)
-def around(whole: StreamingMethod[Any]) -> MethodUnderTest:
-    """A whole method as the subject of the checks of methods; its chain is encoded once."""
-    return MethodUnderTest("dense", whole)
-
-
-def _key(override: str) -> str:
-    return override.partition("=")[0]
+def around(method: StreamingMethod[Any]) -> MethodUnderTest:
+    """Return a method as the subject of the checks of methods; its chain is encoded once."""
+    return MethodUnderTest("dense", method)

@@ -42,10 +42,10 @@ OPTIONS = {
         "--first-frame", "--checks",
         "--overwrite", "--no-video", "--quiet", "--budget",
     ],
-    "gsstream play": ["STREAM", "--out", "--camera", "--frames"],
-    "gsstream evaluate": ["STREAM", "--source", "--lpips-onnx", "--lpips-range"],
+    "gsstream play": ["STREAM", "--out", "--camera", "--frames", "--size", "--renderer", "--max-memory"],
+    "gsstream evaluate": ["STREAM", "--source", "--lpips-onnx", "--lpips-range", "--json", "--max-memory"],
     "gsstream info": ["STREAM", "--json"],
-    "gsstream export": ["STREAM", "--out", "--format", "--frames"],
+    "gsstream export": ["STREAM", "--out", "--format", "--frames", "--max-memory"],
     "gsstream manifest": ["STREAM", "--out"],
     "gsstream view": ["STREAM", "--port", "--host"],
     "gsstream run-segments": [
@@ -241,3 +241,39 @@ def test_show_says_which_methods_set_what(
     rows = [line.split() for line in run(capsys, "plugins", "show", "structure/flat")[1].splitlines()]
     assert ["dense", "-", "-", "all", "defaults"] in rows
     assert ["mine", "resolution", "77", "method", "mine"] in rows
+
+
+def test_what_a_file_says_is_shown_and_not_obeyed() -> None:
+    """Texts of streams and recordings reach the terminal: no escape sequence and no forged line may come through."""
+    from gsstream.cli.listing import printable
+
+    hostile = "a\x1b]0;title\x07b\r\ncameras 99\ud800\u2028end\x9b2J"
+    shown = printable(hostile)
+    assert shown.isprintable()
+    assert shown.isascii()
+    assert "\\x1b]0;title\\x07" in shown
+    assert printable("Größe 30 µm ✓") == "Größe 30 µm ✓"
+    assert printable("two\nlines\x1b", keep="\n") == "two\nlines\\x1b"
+
+
+def test_info_of_a_stream_with_terminal_escapes(tmp_path, capsys: pytest.CaptureFixture[str]) -> None:
+    import numpy as np
+
+    from gsstream.core.cameras import Cameras
+    from gsstream.core.changes import Layout
+    from gsstream.core.gaussians import Gaussians
+    from gsstream.packet import KeyState, StreamMeta, StreamWriter, encode_key
+
+    rig = Cameras(("cam",), np.eye(4)[None], np.diag([8.0, 8.0, 1.0])[None], 8, 8)
+    meta = StreamMeta("x\x1b[2J\n  forged     1", "\x07", {}, rig, rig.select([]), 30.0)
+    f32 = {name: np.zeros((1, *shape), np.float32) for name, shape in
+           {"means": (3,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (0, 3)}.items()}  # fmt: skip
+    scene = Gaussians(quats=np.float32([[1, 0, 0, 0]]), **f32)
+    layout = Layout(np.int32([1]), np.uint8([0]), np.float32([1]))
+    with StreamWriter.open(tmp_path / "s.gss") as writer:
+        writer.append(encode_key(KeyState(scene, layout, meta)))
+    assert run_command(["info", str(tmp_path / "s.gss")]) == 0
+    said = capsys.readouterr().out
+    assert "\x1b" not in said
+    assert "\x07" not in said
+    assert "\n  forged" not in said

@@ -46,8 +46,8 @@ def test_contract(check) -> None:
 
 
 def test_every_part_that_is_declared_is_checked_here() -> None:
+    from gsstream.core.kinds import CONTRACTS
     from gsstream.plugins.builtin import gsstream_components
-    from gsstream.plugins.catalog import CONTRACTS
 
     declared = {spec.target.rpartition(":")[2] for spec in gsstream_components() if spec.kind in CONTRACTS}
     assert declared == {type(part).__name__ for part in BUILTIN}

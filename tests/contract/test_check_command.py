@@ -10,7 +10,7 @@ from gsstream.cli.main import run_command
 
 BROKEN = '''
 from typing import final
-from gsstream.api import GateSampler, GateState
+from gsstream.api import GateSampler
 import torch
 
 
@@ -20,11 +20,11 @@ class Half(GateSampler):
 
     @property
     def num_levels(self): return 1
-    def init(self, logits): return GateState(logits.clamp(-5, 5))
+    def init(self, logits): return logits.clamp(-5, 5)
     def noise(self, num_nodes, generator): return None
-    def sample(self, state, noise): return torch.full_like(state.logits, 0.5)
-    def open_probability(self, state): return torch.ones_like(state.logits)
-    def bound(self, state): return GateState(state.logits.clamp(-5, 5))
+    def sample(self, logits, noise): return torch.full_like(logits, 0.5)
+    def open_probability(self, logits): return torch.ones_like(logits)
+    def bound(self, logits): return logits.clamp(-5, 5)
 '''
 PLUGIN = '''
 from gsstream.spec import ComponentSpec, hookimpl

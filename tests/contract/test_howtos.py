@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gsstream.core.kinds import CONTRACTS
 from gsstream.core.part import Part
 from gsstream.engine.run.recording import open_recording
-from gsstream.plugins.catalog import CONTRACTS, load_catalog
+from gsstream.plugins.catalog import load_catalog
 from gsstream.plugins.discovery import Discovered
 from gsstream.recipe.model import Recipe
 from gsstream.source.prefetch import Prefetcher

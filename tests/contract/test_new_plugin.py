@@ -8,10 +8,10 @@ import pytest
 from fresh import gsstream, install, python
 
 from gsstream.cli.main import run_command
-from gsstream.cli.scaffold import PartKind
+from gsstream.cli.scaffold import STARTABLE
 
 
-@pytest.mark.parametrize("kind", [kind.value for kind in PartKind])
+@pytest.mark.parametrize("kind", STARTABLE)
 def test_passes_the_contract_untouched(kind: str, tmp_path: Path) -> None:
     project, site = tmp_path / "project", tmp_path / "site"
     assert run_command(["new-plugin", "my-own", "--kind", kind, "--out", str(project)]) == 0

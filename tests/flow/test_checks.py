@@ -12,7 +12,6 @@ import torch
 from flow_runs import TINY, WORLD, finish
 
 from gsstream.core.errors import ComponentError, GsstreamError, InputError
-from gsstream.core.state import GateState
 from gsstream.engine.assembly import checks as checks_module
 from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.assembly.checks import Checks, StepChecks, check_values, wanted_checks
@@ -55,23 +54,23 @@ class WrongGate(GateSampler):
     def num_levels(self) -> int:
         return 1
 
-    def init(self, logits: torch.Tensor) -> GateState:
-        return GateState(logits=torch.zeros_like(logits))
+    def init(self, logits: torch.Tensor) -> torch.Tensor:
+        return torch.zeros_like(logits)
 
     def noise(self, num_nodes: int, generator: torch.Generator) -> torch.Tensor | None:
         return torch.zeros(num_nodes)
 
-    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
-        gates = torch.ones_like(state.logits)
+    def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
+        gates = torch.ones_like(logits)
         if noise is not None and COUNTER.now(3):
             gates[5] = self.value
         return gates
 
-    def open_probability(self, state: GateState) -> torch.Tensor:
-        return torch.ones_like(state.logits)
+    def open_probability(self, logits: torch.Tensor) -> torch.Tensor:
+        return torch.ones_like(logits)
 
-    def bound(self, state: GateState) -> GateState:
-        return state
+    def bound(self, logits: torch.Tensor) -> torch.Tensor:
+        return logits
 
 
 class TooOpen(WrongGate):
@@ -248,7 +247,7 @@ def test_levels_do_not_change_what_is_sent_and_off_looks_at_no_number(
 
 def test_off_still_looks_at_shapes(tmp_path: Path) -> None:
     class Short(AlwaysOpen):  # type: ignore[misc]  # final, for everybody else
-        def open_probability(self, state: GateState) -> torch.Tensor:
+        def open_probability(self, logits: torch.Tensor) -> torch.Tensor:
             return torch.ones(3)
 
     assert "open_probability(): expected shape" in str(failure(assembly("off", gate=Short()), tmp_path))

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import torch
 from flow_runs import WORLD, Witness, demo_copy, encode, metrics, without_test_cameras
+from residual_oracle import train_rows
 
 from gsstream.cli.main import run_command
-from gsstream.core.delta import Layout, apply_delta
+from gsstream.core.changes import Layout, apply_delta
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.engine.step import frame_step as step_module
 from gsstream.packet import PacketKind
@@ -20,7 +21,6 @@ from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, find_renderer, render
 from gsstream.player.software import render_numpy
 from gsstream.render.reference import ReferenceRenderer
-from gsstream.residual.base import apply_residual
 
 METHODS = ["dense", "s2gs-edge"]
 
@@ -88,7 +88,7 @@ def test_training_and_transmission_apply_the_same_map(tmp_path: Path, monkeypatc
         layout: Layout = problem.state.player.layout
         gates = torch.from_numpy(delta.gates.astype(np.float32) / delta.num_levels)[problem.state.hierarchy.node_of]
         units = torch.from_numpy(layout.units[problem.active.numpy()])
-        rows = apply_residual(
+        rows = train_rows(
             parts.update, problem.base, gates[problem.active], solution.latents, solution.decoders, units
         )
         seen.append((problem, delta, rows))

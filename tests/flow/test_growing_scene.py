@@ -10,7 +10,7 @@ import pytest
 from flow_runs import Witness, encode
 
 from gsstream.cli.main import run_command
-from gsstream.core.births import in_nodes, own_nodes
+from gsstream.core.changes import in_nodes, own_nodes
 from gsstream.engine.step import frame_step as step_module
 from gsstream.packet import StreamReader
 from gsstream.player.playback import Playback

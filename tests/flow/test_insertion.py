@@ -11,7 +11,7 @@ from flow_runs import Witness, arguments, demo_copy, encode, metrics
 from PIL import Image, ImageDraw
 
 from gsstream.cli.main import run_command
-from gsstream.core.delta import Layout
+from gsstream.core.changes import Layout
 from gsstream.core.gaussians import Gaussians
 from gsstream.engine.step.insertion import place
 from gsstream.packet import StreamReader

@@ -22,12 +22,13 @@ from gsstream.packet import PacketKind, StreamReader
 from gsstream.player.playback import Playback
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
+from gsstream.trade.jobs.base import Finished
+from gsstream.trade.jobs.executor import LocalExecutor, make_executor
 from gsstream.trade.segments.carry import open_leap_recipe
 from gsstream.trade.segments.drive import Setting, run_segments
 from gsstream.trade.segments.job import SegmentOutcome, run_segment
 from gsstream.trade.segments.join import join
 from gsstream.trade.segments.plan import make_plan
-from gsstream.trade.sweep.executor import Finished, LocalExecutor, make_executor
 
 
 class Here:
@@ -176,7 +177,7 @@ def test_a_worker_killed_in_a_segment_goes_on_where_it_stopped(
     once = made(tmp_path / "once", Here(1), segments=2)
     out, said = tmp_path / "o", []
     out.mkdir()
-    executor = LocalExecutor(2, 1, segment_works.run_and_die_once, ["gsstream.trade.sweep.warm"])
+    executor = LocalExecutor(2, 1, segment_works.run_and_die_once, ["gsstream.trade.jobs.warm"])
     plan = make_plan(6, 2, "warm", first_given=False)
     run_segments(plan, setting(), out, executor, say=said.append)
     assert (out / "stream.gss").read_bytes() == once

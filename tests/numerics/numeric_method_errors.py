@@ -16,18 +16,18 @@ from gsstream_s2gs.latent import LatentResidual
 from gsstream_s2gs.normalise import robust
 from gsstream_s2gs.octree import StreamingOctree
 from numeric_scenes import camera, random_scene, upstream, worst
+from residual_oracle import train_rows
 
-from gsstream.core.delta import Delta, Layout, apply_delta
+from gsstream.core.changes import Delta, Layout, apply_delta
 from gsstream.core.frame import PointCloud
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.core.state import GateState
 from gsstream.optimiser.adam import ReferenceAdam
 from gsstream.optimiser.base import ADAM_BETAS, ADAM_EPS, AdamState, RowOptimiser
 from gsstream.packet.grids import KEY_BITS, from_codes, to_codes
 from gsstream.packet.symbols import decode_symbols, encode_symbols
 from gsstream.render.reference import ReferenceRenderer
-from gsstream.residual.base import apply_residual, init_latents
+from gsstream.residual.base import init_latents
 from gsstream.residual.rate import channel_spread, laplace_gradient
 
 Measure = Callable[[int], float]
@@ -83,7 +83,7 @@ def slope(seed: int) -> float:
     tau = (0.1, 0.3, 1.0, 10.0, 100.0)[seed % 5]
     logits = torch.linspace(-70 * tau, 70 * tau, 501)
     leaf = logits.clone().requires_grad_()
-    gates = GumbelSigmoid(GumbelSigmoid.Config(temperature=tau)).sample(GateState(leaf), None)
+    gates = GumbelSigmoid(GumbelSigmoid.Config(temperature=tau)).sample(leaf, None)
     (got,) = torch.autograd.grad(gates.sum(), leaf)
     x = logits.double() / tau
     # Above x = 0 written by exp(-x) alone: s (1 - s) loses its digits there in float64 too.
@@ -103,7 +103,7 @@ def noise(seed: int) -> float:
 def open_probability(seed: int) -> float:
     part = GumbelSigmoid(GumbelSigmoid.Config(levels=(1, 10, 255)[seed % 3]))
     logits = torch.linspace(-20, 20, 301)
-    got = part.open_probability(GateState(logits))
+    got = part.open_probability(logits)
     eta = 0.5 / part.num_levels
     margin = logits.double() - 0.3 * math.log(eta / (1 - eta))
     want = 1 / (1 + torch.exp(-margin))
@@ -113,7 +113,7 @@ def open_probability(seed: int) -> float:
 def rounding(seed: int) -> float:
     """Distance of a gate from the value the decoder computes for its level."""
     levels = 1 + seed * 37 % 255
-    gates = GumbelSigmoid(GumbelSigmoid.Config(levels=levels)).sample(GateState(torch.linspace(-6, 6, 999)), None)
+    gates = GumbelSigmoid(GumbelSigmoid.Config(levels=levels)).sample(torch.linspace(-6, 6, 999), None)
     integers = np.rint(gates.numpy() * levels).astype(np.uint8)
     return float(np.abs(gates.numpy() - integers.astype(np.float32) / np.float32(levels)).max())
 
@@ -151,7 +151,7 @@ def decoders(seed: int) -> float:
     for kind in (torch.float32, torch.float64):
         scene, gates, latents, matrices, units = _change(seed, kind)
         zero = scene.map(torch.zeros_like)
-        found[kind] = apply_residual(LatentResidual(), zero, gates, latents, matrices, units)
+        found[kind] = train_rows(LatentResidual(), zero, gates, latents, matrices, units)
     pairs = zip(found[torch.float32].items(), found[torch.float64].items(), strict=True)
     return max(worst(a, b) for (_, a), (_, b) in pairs)
 
@@ -160,7 +160,7 @@ def application(seed: int) -> float:
     """What encoder and player compute from the integers, against the trained map in float64."""
     rule = LatentResidual()
     scene, gates, latents, matrices, units = _change(seed, torch.float64)
-    want = apply_residual(rule, scene, gates, latents, matrices, units)
+    want = train_rows(rule, scene, gates, latents, matrices, units)
     n = len(scene)
     symbols = {k: torch.round(v / rule.codes()[k].step).to(torch.int32).numpy() for k, v in latents.items()}
     steps = {name: rule.codes()[name].step for name in symbols}

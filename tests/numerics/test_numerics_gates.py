@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numeric_scenes import some
 
-from gsstream.core.state import GateState
 from gsstream.engine.step.dead_gates import count_dead
 from gsstream.gate.always_open import AlwaysOpen
 
@@ -25,7 +24,7 @@ def sampler(**settings: object) -> GumbelSigmoid:
 
 def gradient(part: GumbelSigmoid | BinarySteGate, logits: torch.Tensor) -> torch.Tensor:
     leaf = logits.clone().requires_grad_()
-    (found,) = torch.autograd.grad(part.sample(GateState(leaf), None).sum(), leaf)
+    (found,) = torch.autograd.grad(part.sample(leaf, None).sum(), leaf)
     return found
 
 
@@ -34,17 +33,17 @@ def gradient(part: GumbelSigmoid | BinarySteGate, logits: torch.Tensor) -> torch
 @pytest.mark.parametrize("temperature", [0.01, 0.3, 100.0])
 def test_extreme_logits_give_levels_in_every_precision(temperature: float, levels: int, kind: torch.dtype) -> None:
     part = sampler(temperature=temperature, levels=levels)
-    state = GateState(EXTREMES.to(kind))
+    logits = EXTREMES.to(kind)
     for noise in (None, torch.full((11,), -17.4), torch.full((11,), 17.4)):
-        gates = part.sample(state, noise)
+        gates = part.sample(logits, noise)
         assert gates.dtype == kind
         steps = gates.double() * levels
         assert float((steps - steps.round()).abs().max()) <= levels * torch.finfo(kind).eps
         assert 0 <= float(gates.min()) <= float(gates.max()) <= 1
-        probability = part.open_probability(state)
+        probability = part.open_probability(logits)
         assert bool(torch.isfinite(probability).all())
         assert 0 <= float(probability.min()) <= float(probability.max()) <= 1
-    ends = part.init(EXTREMES.float()).logits
+    ends = part.init(EXTREMES.float())
     assert float(ends.abs().max()) == pytest.approx(math.log(1000.0))
 
 
@@ -53,7 +52,7 @@ def test_extreme_logits_give_levels_in_every_precision(temperature: float, level
 def test_the_decoder_has_the_sampled_value(levels: int, temperature: float, logit: float) -> None:
     """float32: round(g * levels) as a byte, divided by levels again, is g; so is every level in between."""
     part = sampler(levels=levels, temperature=temperature)
-    gate = part.sample(GateState(torch.tensor([logit, -logit, 0.0])), None)
+    gate = part.sample(torch.tensor([logit, -logit, 0.0]), None)
     byte = torch.round(gate * levels).to(torch.uint8)
     assert torch.equal(byte.float() / torch.tensor(float(levels)), gate)
 
@@ -61,7 +60,7 @@ def test_the_decoder_has_the_sampled_value(levels: int, temperature: float, logi
 @pytest.mark.parametrize("levels", [1, 3, 5, 255])
 def test_a_tie_between_two_levels_goes_to_the_even_one(levels: int) -> None:
     """An odd number of levels has a tie at logit 0: levels / 2 is half-way."""
-    gate = sampler(levels=levels).sample(GateState(torch.zeros(1)), None)
+    gate = sampler(levels=levels).sample(torch.zeros(1), None)
     assert float(gate * levels) == 2 * round(levels / 4)
 
 
@@ -102,9 +101,9 @@ def test_calibration_within_four_sigma_at_the_limits_of_the_settings(levels: int
         # The logit that opens with probability p, as far as the bound allows.
         eta = 0.5 / levels
         logit = math.log(p / (1 - p)) + temperature * math.log(eta / (1 - eta))
-        state = part.bound(GateState(torch.full((count,), logit)))
-        expected = float(part.open_probability(state)[0])
-        drawn = part.sample(state, part.noise(count, torch.Generator().manual_seed(levels)))
+        logits = part.bound(torch.full((count,), logit))
+        expected = float(part.open_probability(logits)[0])
+        drawn = part.sample(logits, part.noise(count, torch.Generator().manual_seed(levels)))
         share = float((drawn > 0).double().mean())
         assert abs(share - expected) <= 4 * math.sqrt(max(expected * (1 - expected), 1 / count) / count)
 
@@ -112,13 +111,13 @@ def test_calibration_within_four_sigma_at_the_limits_of_the_settings(levels: int
 def test_dead_gates_are_counted_and_there_are_none_by_default() -> None:
     spread = torch.linspace(-50, 50, 101)
     default = sampler()
-    assert count_dead(default, default.init(spread).logits) == 0
+    assert count_dead(default, default.init(spread)) == 0
     # With a bound of 50 and a cold gate the far logits are out of reach of images and price: float32 spacing at 1.
     cold = sampler(logit_bound=50.0, temperature=0.01)
     probability = 1 / (2 + 2 * torch.cosh(spread.double() - 0.01 * math.log(0.05 / 0.95)))
     image = 1 / (0.01 * (2 + 2 * torch.cosh(spread.double() / 0.01)))
     expected = int(((probability < 2.0**-24) & (image < 2.0**-24)).sum())
-    assert count_dead(cold, cold.init(spread).logits) == expected > 50
+    assert count_dead(cold, cold.init(spread)) == expected > 50
     assert count_dead(AlwaysOpen(), spread) == 0
     assert count_dead(default, torch.zeros(0)) == 0
 

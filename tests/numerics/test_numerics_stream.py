@@ -14,14 +14,16 @@ from gsstream_s2gs.latent import LatentResidual
 from hypothesis import given
 from hypothesis import strategies as st
 from numeric_scenes import random_scene, some
+from residual_oracle import decode_rows
 
-from gsstream.core.delta import Delta, Layout, apply_delta
+from gsstream.core.changes import Delta, Layout, apply_delta
 from gsstream.core.errors import PacketError, ShapeError
+from gsstream.core.gaussians import Gaussians
 from gsstream.packet import decode_delta, encode_delta, quantise_key
 from gsstream.packet.grids import KEY_BITS, MAX_CODE, from_codes, to_codes
 from gsstream.packet.symbols import MAX_BINS, decode_symbols, encode_symbols
-from gsstream.residual.additive import Additive
-from gsstream.residual.base import MAX_SYMBOL, quantise, symbols
+from gsstream.residual.additive import Additive, DirectCode
+from gsstream.residual.base import MAX_SYMBOL, symbols
 
 
 def layout(nodes: int = 6, rows: int = 2) -> Layout:
@@ -71,7 +73,10 @@ def test_latents_that_have_no_integer_are_refused(rule: Additive, bad: float) ->
 def test_every_symbol_up_to_the_limit_is_what_was_trained(symbol: int, step: float) -> None:
     """round(latent / step) of the trained value step * symbol gives symbol again, and the decoder its value."""
     latent = torch.tensor([[float(symbol)]]) * step
-    trained = quantise(latent, step)
+    rule = Additive(Additive.Config(opacities=DirectCode(step=step, lr=1)))
+    base = Gaussians(*(torch.zeros(1, *shape) for shape in ((3,), (4,), (3,), (), (1, 3), (0, 3))))
+    _, change = decode_rows(rule, base, {"opacities": latent}, {}, torch.ones(1))
+    trained = change.latents
     sent = torch.round(trained / step).to(torch.int32)
     decoded = np.float32(int(sent)) * np.float32(step)
     assert float(decoded) == pytest.approx(float(trained), rel=2e-7, abs=0)

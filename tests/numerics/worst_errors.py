@@ -13,6 +13,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from numeric_bounds import BOUNDS
 from numeric_errors import render_measures
 from numeric_method_errors import method_measures

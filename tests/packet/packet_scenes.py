@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gsstream.core.births import Births
+from gsstream.core.changes import Births
 from gsstream.core.cameras import Cameras
-from gsstream.core.delta import Delta, Layout, active_rows
+from gsstream.core.changes import Delta, Layout, active_rows
 from gsstream.core.gaussians import Gaussians
 from gsstream.packet import (
     EncodedPacket,

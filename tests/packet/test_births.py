@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from packet_scenes import decode_all, make_births, make_edit, make_key, make_packets, make_scene, replaced, same_bits
 
-from gsstream.core.births import Births, in_nodes, own_nodes
-from gsstream.core.delta import Delta, Layout, apply_delta, next_layout, row_gates
+from gsstream.core.changes import Births, in_nodes, own_nodes
+from gsstream.core.changes import Delta, Layout, apply_delta, next_layout, row_gates
 from gsstream.core.errors import OutputError, PacketError, ShapeError
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.packet import (
@@ -27,7 +27,7 @@ from gsstream.packet.births import HEAD_PARTS, most_births
 from gsstream.packet.bits import BitWriter, pack_blobs, unpack_blobs
 from gsstream.packet.gates import encode_gates
 from gsstream.packet.symbols import encode_symbols
-from gsstream.trade.stream_stats import stream_stats
+from gsstream.trade.measure.stream_stats import stream_stats
 
 SEEDS = st.integers(0, 2**32 - 1)
 NONE = np.zeros(0, np.int64)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from packet_scenes import make_delta, make_key, replaced, resealed
 
-from gsstream.core.delta import Layout
+from gsstream.core.changes import Layout
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.packet import decode_delta, decode_key, encode_delta, encode_key
 from gsstream.packet.base import MAX_GAUSSIANS, parse_packet

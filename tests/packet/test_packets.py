@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from packet_scenes import decode_all, make_delta, make_key, make_layout, make_meta, make_packets, make_scene, same_bits
 
-from gsstream.core.delta import Delta, Layout, apply_delta
+from gsstream.core.changes import Delta, Layout, apply_delta
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.packet import (
     KeyState,

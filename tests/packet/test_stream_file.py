@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from packet_scenes import decode_all, make_delta, make_key, make_packets, same_bits, write_stream
 
-from gsstream.core.delta import apply_delta
+from gsstream.core.changes import apply_delta
 from gsstream.core.errors import InputError, OutputError, PacketError, SourceError
 from gsstream.packet import (
     PacketKind,

@@ -203,7 +203,7 @@ def test_ply_faults_and_kinds(tmp_path: Path, world: World) -> None:
 )
 def test_data_set_recipes_state_split_size_and_frames(tmp_path: Path, world: World, name: str, recipe: str) -> None:
     catalog = load_catalog()
-    file = ROOT / "configs" / "datasets" / f"{recipe}.yaml"
+    file = ROOT / "configs" / "recordings" / f"{recipe}.yaml"
     resolved = resolve_recipe("dense", catalog.recipe_path, (file,), [])
     assert resolved.recipe.frames == 300
     assert resolved.recipe.data.leak == "none"

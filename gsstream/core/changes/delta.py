@@ -80,7 +80,7 @@ class Delta:
 
     def with_residual(self, residual: Residual | None) -> Delta:
         """Return the same delta with another residual, or with none."""
-        others = [change for change in self.changes if not isinstance(change, Residual)]
+        others: list[Change] = [change for change in self.changes if not isinstance(change, Residual)]
         if residual is not None:
             others.insert(len(self.motions), residual)
         return Delta(tuple(others))

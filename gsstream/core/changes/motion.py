@@ -126,7 +126,8 @@ def moves_of(scene: Scene, groups: Groups, moving: IntArray, predicted: bool) ->
     rows = np.flatnonzero(place >= 0)
     place = place[rows]
     centre = _means(scene.gaussians.means[rows], place, len(which))
-    shift, turn = np.zeros((len(which), 3)), np.zeros((len(which), 3))
+    shift: FloatArray = np.zeros((len(which), 3))
+    turn: FloatArray = np.zeros((len(which), 3))
     if predicted and scene.moved is not None:
         past = rank[groups.group_of[scene.moved.rows]]
         here = past >= 0

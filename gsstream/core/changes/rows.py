@@ -17,7 +17,7 @@ from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray, IntArray
 
-Rows = TypeVar("Rows", FloatArray, IntArray)
+Table = TypeVar("Table", FloatArray, IntArray)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,9 +113,9 @@ def next_counts(node_counts: IntArray, node_of: IntArray, births: Births | None,
     return counts.astype(np.int32)
 
 
-def join_rows(old: Rows, born: Rows | None, source: IntArray) -> Rows:
+def join_rows(old: Table, born: Table | None, source: IntArray) -> Table:
     """Rows of an attribute after births and deaths; ``source`` is :func:`gather_rows`."""
-    joined: Rows = (old if born is None else np.concatenate([old, born]))[source]
+    joined: Table = (old if born is None else np.concatenate([old, born]))[source]
     return joined
 
 

@@ -11,12 +11,17 @@ from typing import Any
 from gsstream.confidence.base import ConfidenceEstimator
 from gsstream.core.auto import AUTO, Choice
 from gsstream.core.errors import PluginUnavailable, UnknownName
+from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.core.part import Part
 from gsstream.engine.assembly.checks import Checks, wanted_checks
-from gsstream.engine.assembly.heeded import PART_SLOTS, unheeded
+from gsstream.engine.assembly.guard import guard, plain
+from gsstream.engine.assembly.heeded import unheeded
+from gsstream.engine.assembly.where import Where
 from gsstream.gate.base import GateSampler
+from gsstream.growth.base import Growth
 from gsstream.loss.base import Loss
 from gsstream.method.base import StreamingMethod
+from gsstream.motion.base import MotionPart
 from gsstream.optimiser.base import RowOptimiser
 from gsstream.plugins.catalog import Catalog
 from gsstream.propagation.base import Propagation
@@ -29,7 +34,9 @@ from gsstream.render.base import Renderer
 from gsstream.residual.base import UpdateRule
 from gsstream.structure.base import Structure
 
-SLOTS = ("structure", "confidence", "propagation", "gate", "regularizer", "update", "renderer")
+SLOTS = (*METHOD_SLOTS, "stepper", "renderer")
+#: Everything that is called behind a guard.
+GUARDED = (*SLOTS, "loss", "optimiser")
 #: What "auto" tries, fastest first, before it falls back to the reference.
 AUTO_RENDERERS = ("cpu",)
 AUTO_LOSSES = ("cpu", "reference")
@@ -46,12 +53,15 @@ class Assembly:
 
     Arguments:
         recipe: the recipe with every part's parameters written out and the renderer that was chosen.
-        whole: the whole method that runs in place of the parts; None: the parts are the method.
+        stepper: what goes from frame to frame: the parts above, or a method that is built otherwise.
         origins: path -> origin of every value that is not a default (for ``recipe.save.save_resolved``).
         distributions: installed distributions that the parts come from.
         checks: how closely the run looks at what parts return; nothing that is sent depends on it.
         pending: paths of values that are still ``auto``; the parts have their defaults there (``engine.auto.rules.settle``).
         chosen: key -> what the scene decided.
+        where: the frame and iteration that errors name.
+
+    Every part is behind a guard (:class:`gsstream.engine.assembly.guard.Guarded`), so no caller has to be careful.
     """
 
     recipe: Recipe
@@ -59,17 +69,29 @@ class Assembly:
     confidence: ConfidenceEstimator
     propagation: Propagation
     gate: GateSampler
-    regularizer: Regularizer
+    motion: MotionPart
     update: UpdateRule
+    growth: Growth
+    regularizer: Regularizer
+    stepper: StreamingMethod[Any]
     renderer: Renderer
     loss: Loss
     optimiser: RowOptimiser
-    whole: StreamingMethod[Any] | None = None
     origins: Mapping[KeyPath, Origin] = field(default_factory=dict)
     distributions: tuple[str, ...] = ()
     checks: Checks = Checks.FRAME
     pending: tuple[KeyPath, ...] = ()
     chosen: Mapping[str, Choice] = field(default_factory=dict)
+    where: Where = field(default_factory=Where, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        for slot in GUARDED:
+            object.__setattr__(self, slot, guard(slot, getattr(self, slot), self.where, self.checks))
+
+    def part(self, slot: str) -> Part:
+        """The part of a slot itself, without its guard."""
+        part: Part = plain(getattr(self, slot))
+        return part
 
     @property
     def resolved(self) -> ResolvedRecipe:
@@ -109,14 +131,10 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
             parts[slot] = built
             refs[slot] = _written_out(slot, ref, built, pending)
     loss = _loss(resolved, catalog, problems)
-    whole = _whole(resolved, catalog, problems)
-    if whole is not None:
-        parts["whole"] = whole
-        name = resolved.recipe.whole.name
-        refs["whole"] = _written_out("whole", resolved.recipe.whole, whole, pending)
-        hint = f"the whole method {name!r} does not read it; its own settings: gsstream plugins show whole/{name}"
-        paths = [*unheeded(resolved.recipe.model_copy(update=refs), whole, parts)]
-        paths += [path for path in pending if path[0] in PART_SLOTS and path[0] not in whole.heeds]
+    if "stepper" in parts:
+        name = resolved.recipe.stepper.name
+        hint = f"the stepper {name!r} does not read it; its own settings: gsstream plugins show stepper/{name}"
+        paths = unheeded(resolved.recipe.model_copy(update=refs), parts["stepper"], parts, pending)
         problems += [f"{resolved.near(path).where}: {'.'.join(path)}: {hint}" for path in paths]
     join_problems(problems)
     parts["loss"] = loss
@@ -181,18 +199,6 @@ def _construct(slot: str, name: str, cls: type[Any], config: Any, catalog: Catal
         origin = catalog.entry(slot, name).origin
         raise PluginUnavailable(f"{slot} {name!r} (from {origin}) could not be built: {error}") from error
     return part
-
-
-def _whole(resolved: ResolvedRecipe, catalog: Catalog, problems: list[str]) -> StreamingMethod[Any] | None:
-    """The whole method the recipe names, if it names one."""
-    ref = resolved.recipe.whole
-    if ref.name != "none":
-        part = _build("whole", ref, resolved, catalog, problems)
-        return part if isinstance(part, StreamingMethod) else None
-    if ref.params:
-        where = resolved.near(("whole", "params", next(iter(ref.params)))).where
-        problems.append(f"{where}: whole.params needs a named whole method, but whole.name is 'none'")
-    return None
 
 
 def _loss(resolved: ResolvedRecipe, catalog: Catalog, problems: list[str]) -> Part | None:

@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import StrEnum
 
 import torch
 
 from gsstream.core.errors import InputError
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.part import Part
-from gsstream.engine.assembly.guard import fault
+from gsstream.engine.assembly.fault import fault
+from gsstream.engine.assembly.where import Where
 
 VARIABLE = "GSSTREAM_CHECKS"
 UNIT = (0.0, 1.0)
@@ -26,8 +27,7 @@ class Checks(StrEnum):
     """Levels of looking; each looks at all that the one before it does.
 
     off: types and shapes at the seams alone. frame: also every number that crosses a seam, once per frame, the penalty
-    in every iteration (the default). step: also gates, rows, images, losses, gradients and parameters in every
-    iteration.
+    in every iteration (the default). step: also gates, images, losses, gradients and parameters in every iteration.
     """
 
     OFF = "off"
@@ -36,7 +36,7 @@ class Checks(StrEnum):
 
 
 def wanted_checks(given: str | None = None) -> Checks:
-    """The level asked for: ``given``, else that of the environment, else "frame".
+    """Return the level asked for: ``given``, else that of the environment, else "frame".
 
     Raises InputError for anything but the three levels.
     """
@@ -49,64 +49,87 @@ def wanted_checks(given: str | None = None) -> Checks:
         raise InputError(f"{where}: expected one of {known}, got {text!r}") from None
 
 
-def check_output(
-    level: Checks,
-    slot: str,
-    part: Part,
-    frame: int | None,
-    what: str,
-    value: object,
-    shape: tuple[int, ...],
-    limits: tuple[float, float] | None = None,
-) -> None:
-    """Raise ComponentError unless ``value`` is a finite floating point tensor of this shape, within ``limits``.
-
-    Once per frame and seam: what a part gets wrong is said with its name, before another part stumbles over it. With
-    the level "off" only type and shape are looked at.
-    """
-    if not isinstance(value, torch.Tensor) or not value.dtype.is_floating_point:
-        got = str(value.dtype) if isinstance(value, torch.Tensor) else type(value).__name__
-        raise fault(f"{what}: expected a floating point tensor, got {got}", slot, part, frame)
-    if tuple(value.shape) != shape:
-        raise fault(f"{what}: expected shape {list(shape)}, got {list(value.shape)}", slot, part, frame)
-    if level is not Checks.OFF:
-        check_values(slot, part, what, value, frame, limits=limits)
-
-
-def check_terms(level: Checks, part: Part, frame: int, iteration: int, terms: Mapping[str, torch.Tensor]) -> None:
-    """Raise ComponentError unless every term of a penalty is one number; except with "off", a finite one."""
-    for name, value in terms.items():
-        if value.numel() != 1 or not (level is Checks.OFF or bool(torch.isfinite(value).all())):
-            got = float(value) if value.numel() == 1 else f"shape {list(value.shape)}"
-            message = f"penalty {name!r}: expected one finite number, got {got}"
-            raise fault(message, "regularizer", part, frame, iteration)
-
-
-def check_values(
-    slot: str,
-    part: object,
-    what: str,
-    value: torch.Tensor,
-    frame: int | None,
-    iteration: int | None = None,
-    *,
-    limits: tuple[float, float] | None = None,
-    rows: torch.Tensor | None = None,
-) -> None:
-    """Raise ComponentError unless every number is finite and within ``limits``; the first that is not is named.
-
-    One pass without temporary memory when all is well.
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Looks at what one part returned.
 
     Arguments:
-        rows: [A] rows of the scene that ``value`` [A, ...] is about, so that the Gaussian can be named.
+        level: how closely. slot, part: whose it is. where: the frame and iteration that an error names.
     """
+
+    level: Checks
+    slot: str
+    part: object
+    where: Where
+
+    def output(
+        self, what: str, value: object, shape: tuple[int, ...], limits: tuple[float, float] | None = None
+    ) -> None:
+        """Raise ComponentError unless ``value`` is a finite floating point tensor of this shape, within ``limits``.
+
+        Type and shape are always looked at; numbers once per frame, and with the level "step" in every iteration.
+        """
+        if not isinstance(value, torch.Tensor) or not value.dtype.is_floating_point:
+            got = str(value.dtype) if isinstance(value, torch.Tensor) else type(value).__name__
+            raise self.fault(f"{what}: expected a floating point tensor, got {got}")
+        if tuple(value.shape) != shape:
+            raise self.fault(f"{what}: expected shape {list(shape)}, got {list(value.shape)}")
+        least = Checks.FRAME if self.where.iteration is None else Checks.STEP
+        if self.looks(least):
+            self.values(what, value, limits=limits)
+
+    def looks(self, least: Checks) -> bool:
+        """Whether the level is at least this one."""
+        order = list(Checks)
+        return order.index(self.level) >= order.index(least)
+
+    def step_values(self, what: str, value: torch.Tensor | Gaussians[torch.Tensor] | Mapping[str, torch.Tensor]) -> None:
+        """With the level "step": :meth:`values` on a tensor, or on each of several, whose name then follows ``what``."""
+        if self.level is not Checks.STEP:
+            return
+        named = {what: value} if isinstance(value, torch.Tensor) else {f"{what} {n}": v for n, v in value.items()}
+        for name, tensor in named.items():
+            self.values(name, tensor)
+
+    def values(
+        self, what: str, value: torch.Tensor, *, limits: tuple[float, float] | None = None,
+        rows: torch.Tensor | None = None,
+    ) -> None:  # fmt: skip
+        """Raise ComponentError unless every number is finite and within ``limits``; the first that is not is named.
+
+        One pass without temporary memory when all is well.
+
+        Arguments:
+            rows: [A] rows of the scene that ``value`` [A, ...] is about, so that the Gaussian can be named.
+        """
+        if self.level is not Checks.OFF:
+            problem = wrong_value(value, limits, rows)
+            if problem:
+                raise self.fault(f"{what}: {problem}")
+
+    def terms(self, terms: Mapping[str, torch.Tensor]) -> None:
+        """Raise ComponentError unless every term of a penalty is one number; except with "off", a finite one."""
+        for name, value in terms.items():
+            if value.numel() != 1 or not (self.level is Checks.OFF or bool(torch.isfinite(value).all())):
+                got = float(value) if value.numel() == 1 else f"shape {list(value.shape)}"
+                raise self.fault(f"penalty {name!r}: expected one finite number, got {got}")
+
+    def fault(self, message: str) -> Exception:
+        """The error about this part, here and now."""
+        return fault(message, self.slot, self.part, self.where)
+
+
+def wrong_value(
+    value: torch.Tensor, limits: tuple[float, float] | None = None, rows: torch.Tensor | None = None
+) -> str:
+    """Say which number is not finite or not within ``limits``; empty when all are. ``rows`` as in :meth:`Look.values`."""
     if value.numel() == 0:
-        return
+        return ""
     value = value.detach()
     low, high = torch.aminmax(value)
     least, most = _EVERYTHING if limits is None else limits
     if least <= float(low) and float(high) <= most:  # false for NaN, which aminmax passes on
-        return
+        return ""
     bad = ~torch.isfinite(value)
     wanted = "finite values"
     if limits is not None:
@@ -116,43 +139,4 @@ def check_values(
     place = f"index {list(index)}"
     if rows is not None:
         place += f" (Gaussian {int(rows[index[0]])})"
-    message = f"{what}: expected {wanted}, got {float(value[index])!r} at {place}"
-    raise fault(f"{message} ({int(bad.sum())} of {bad.numel()} values)", slot, part, frame, iteration)
-
-
-class StepChecks:
-    """What is looked at in every iteration: everything it is called with at the level step, nothing below it."""
-
-    __slots__ = ("frame", "iteration", "on")
-
-    def __init__(self, level: Checks, frame: int) -> None:
-        self.on, self.frame, self.iteration = level is Checks.STEP, frame, 0
-
-    def __call__(
-        self,
-        slot: str,
-        part: object,
-        what: str,
-        value: torch.Tensor | Gaussians[torch.Tensor] | Mapping[str, torch.Tensor],
-        limits: tuple[float, float] | None = None,
-        rows: torch.Tensor | None = None,
-    ) -> None:
-        """:func:`check_values` on a tensor, or on each of several, whose name then follows ``what``."""
-        if not self.on:
-            return
-        named = {what: value} if isinstance(value, torch.Tensor) else {f"{what} {n}": v for n, v in value.items()}
-        for name, tensor in named.items():
-            check_values(slot, part, name, tensor, self.frame, self.iteration, limits=limits, rows=rows)
-
-    def gradients(
-        self, slot: str, part: object, what: str, leaves: Gaussians[torch.Tensor], rows: torch.Tensor | None = None
-    ) -> None:
-        """The same on the gradients that wait on leaves; a leaf that nothing reached has none."""
-        if self.on:
-            found = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
-            self(slot, part, what, found, rows=rows)
-
-    def number(self, slot: str, part: object, what: str, value: float) -> None:
-        """The same on one number."""
-        if self.on:
-            self(slot, part, what, torch.tensor(value, dtype=torch.float64))
+    return f"expected {wanted}, got {float(value[index])!r} at {place} ({int(bad.sum())} of {bad.numel()} values)"

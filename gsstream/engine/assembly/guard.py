@@ -1,43 +1,97 @@
-"""Failures at a seam are wrapped with who, where and when (what comes out of a part: ``engine.assembly.checks``)."""
+"""A part guarded once: whatever it raises is said with its name and place, whatever it returns is looked at."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib.metadata import entry_points, packages_distributions
+from typing import Any, TypeVar, cast
 
-from gsstream.core.errors import ComponentError, GsstreamError, InputError, ShapeError
-from gsstream.core.part import Part
-from gsstream.spec import ENTRY_POINT_GROUP
+from gsstream.core.errors import GsstreamError, InputError, ShapeError
+from gsstream.engine.assembly.checks import Checks, Look
+from gsstream.engine.assembly.fault import fault
+from gsstream.engine.assembly.looks import LOOKS
+from gsstream.engine.assembly.where import Where
+from gsstream.render.base import RenderSession
+
+T = TypeVar("T")
+#: Sessions of a renderer are looked at under this name of a slot; errors say "renderer".
+SESSION = "session"
 
 
 @contextmanager
-def guarded(slot: str, part: Part, frame: int | None, iteration: int | None = None) -> Iterator[None]:
-    """Turn whatever a part raises into a ComponentError; errors raised on purpose pass unchanged.
+def blaming(slot: str, part: object, where: Where) -> Iterator[None]:
+    """Turn what a part raises into a ComponentError with slot, part, distribution, frame and iteration.
 
-    What a part refuses of another's gets the same place (slot, part, frame, iteration): a ShapeError, and of a renderer
-    every InputError, since it is given nothing but arrays.
+    So does what the part refuses of another's: a ShapeError, and of a renderer every InputError, because it is given
+    nothing but arrays. Other errors of gsstream pass unchanged.
     """
     try:
         yield
     except GsstreamError as error:
         if isinstance(error, ShapeError) or (slot == "renderer" and isinstance(error, InputError)):
-            raise fault(str(error), slot, part, frame, iteration) from error
+            raise fault(str(error), slot, part, where) from error
         raise
     except Exception as error:
-        raise fault(f"{type(error).__name__}: {error}", slot, part, frame, iteration) from error
+        raise fault(f"{type(error).__name__}: {error}", slot, part, where) from error
 
 
-def fault(message: str, slot: str, part: object, frame: int | None, iteration: int | None = None) -> ComponentError:
-    """The error about a part that failed, or did not do what it must."""
-    owner = _distribution(type(part).__module__.partition(".")[0])
-    name = type(part).__name__
-    return ComponentError(message, slot=slot, part=name, distribution=owner, frame=frame, iteration=iteration)
+class Guarded:
+    """Calls a part and stands in its place: attributes that are no functions are the part's own.
+
+    What its functions raise passes :func:`blaming`; what they return is looked at (``engine.assembly.looks``).
+    """
+
+    def __init__(self, slot: str, part: object, where: Where, level: Checks, kind: str = "") -> None:
+        self._slot, self._part, self._where, self._level = slot, part, where, level
+        self._subject, self._kind = part, kind or slot
+
+    @classmethod
+    def session(cls, session: RenderSession, guarded: Guarded) -> Guarded:
+        """A session of a guarded renderer, blamed under the renderer's name."""
+        made = cls(guarded._slot, guarded._part, guarded._where, guarded._level, SESSION)
+        made._subject = session
+        return made
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        value = getattr(self._subject, name)
+        if not callable(value) or isinstance(value, type):
+            return value
+        call = self._guarding(name, value)
+        self.__dict__[name] = call
+        return call
+
+    def _guarding(self, name: str, method: Callable[..., Any]) -> Callable[..., Any]:
+        slot, part, where, kind = self._slot, self._part, self._where, self._kind
+        look = LOOKS.get((kind, name))
+        looking = Look(self._level, slot, part, where)
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            with blaming(slot, part, where):
+                result = method(*args, **kwargs)
+            if look is not None:
+                look(looking, args, result)
+            return Guarded.session(result, self) if isinstance(result, RenderSession) else result
+
+        return call
+
+    def __eq__(self, other: object) -> bool:
+        return bool(self._subject == (other._subject if isinstance(other, Guarded) else other))
+
+    def __hash__(self) -> int:
+        return hash(self._subject)
+
+    def __repr__(self) -> str:
+        return repr(self._subject)
 
 
-def _distribution(package: str) -> str:
-    """Who ships a top-level package. Entry points first: of an editable install the list of files says nothing."""
-    for point in entry_points(group=ENTRY_POINT_GROUP):
-        if point.dist is not None and point.module.partition(".")[0] == package:
-            return point.dist.name
-    return packages_distributions().get(package, [package])[0]
+def guard(slot: str, part: T, where: Where, level: Checks) -> T:
+    """Return the part behind a guard; one that is guarded already gets this place and this level."""
+    return cast(T, Guarded(slot, plain(part), where, level))
+
+
+def plain(part: T) -> T:
+    """Return the part itself, without its guard."""
+    return cast(T, part._subject) if isinstance(part, Guarded) else part
+

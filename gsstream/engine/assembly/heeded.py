@@ -1,31 +1,34 @@
-"""Which written keys a whole method would not read: they are refused, not ignored."""
+"""Which written keys a method would not read: they are refused, not ignored."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.method.base import StreamingMethod
 from gsstream.recipe.document import KeyPath
 from gsstream.recipe.model import Recipe
 
-#: Keys that only the five-part path reads.
-PART_SLOTS = ("structure", "confidence", "propagation", "gate", "regularizer", "update")
-PART_SECTIONS = ("stream", "gate_training", "codec", "insertion", "budget")
+#: Sections that, beside the slots of parts, only a method made of parts reads.
+PART_SECTIONS = ("stream", "gate_training", "codec", "budget")
 #: Of those sections, what the engine itself reads for every method.
 SESSION_KEYS = ("codec.fsync", "budget.memory", "stream.on_error")
 
 
-def unheeded(recipe: Recipe, whole: StreamingMethod[Any], parts: Mapping[str, Any]) -> Iterator[KeyPath]:
-    """Paths of keys that differ from their default though the method does not read them.
+def unheeded(
+    recipe: Recipe, method: StreamingMethod[Any], parts: Mapping[str, Any], pending: Iterable[KeyPath]
+) -> Iterator[KeyPath]:
+    """Yield the paths of keys that differ from their default though the method does not read them.
 
     Arguments:
         recipe: with every part's parameters written out.
         parts: slot -> live part.
+        pending: paths of keys that the scene is to decide.
     """
     default = Recipe()
-    for slot in PART_SLOTS:
-        if slot not in parts or slot in whole.heeds:
+    for slot in METHOD_SLOTS:
+        if slot not in parts or method.reads(slot):
             continue
         if getattr(recipe, slot).name != getattr(default, slot).name:
             yield slot, "name"
@@ -34,5 +37,7 @@ def unheeded(recipe: Recipe, whole: StreamingMethod[Any], parts: Mapping[str, An
     for section in PART_SECTIONS:
         now, usual = getattr(recipe, section), getattr(default, section)
         for key in type(now).model_fields:
-            if getattr(now, key) != getattr(usual, key) and f"{section}.{key}" not in (*whole.heeds, *SESSION_KEYS):
+            path = f"{section}.{key}"
+            if getattr(now, key) != getattr(usual, key) and path not in SESSION_KEYS and not method.reads(path):
                 yield section, key
+    yield from (path for path in pending if path[0] in METHOD_SLOTS and not method.reads(path[0]))

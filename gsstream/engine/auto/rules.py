@@ -13,11 +13,12 @@ from typing import Any
 from pydantic import ValidationError
 
 from gsstream.core.auto import Choice, SceneFacts
-from gsstream.core.errors import OutputError, RecipeError
+from gsstream.core.errors import OutputError
 from gsstream.core.part import Part
 from gsstream.engine.assembly.assemble import Assembly, with_values
+from gsstream.engine.assembly.fault import fault
+from gsstream.engine.assembly.guard import blaming
 from gsstream.engine.auto.colour_gain import can_judge
-from gsstream.engine.assembly.guard import fault, guarded
 from gsstream.packet import PacketKind, PlayerState, StreamReader, decode_packet
 from gsstream.packet.base import FILE_HEADER
 from gsstream.recipe.document import KeyPath, Origin
@@ -119,16 +120,6 @@ def recorded(extra: Mapping[str, Any]) -> dict[str, Choice]:
     return {key: Choice(entry["value"], entry["why"]) for key, entry in extra.get("auto", {}).items()}
 
 
-def refuse_pending(parts: Assembly) -> None:
-    """Raise RecipeError while something is still ``auto``: only a run chooses."""
-    if parts.pending:
-        keys = ", ".join(".".join(path) for path in parts.pending)
-        raise RecipeError(
-            f"{keys}: 'auto' is chosen by 'gsstream run' and by sweeps, from the recording; give a value here "
-            "(recipe.yaml beside a stream has those of its run)"
-        )
-
-
 def _no_facts() -> SceneFacts:
     raise AssertionError("a resumed run chooses nothing")
 
@@ -137,13 +128,12 @@ def _choose(parts: Assembly, path: KeyPath, facts: SceneFacts) -> Choice:
     if ".".join(path) == DEGREE:
         return sh_degree(facts)
     slot, part = path[0], _part(parts, path[0])
-    with guarded(slot, part, None):
+    with blaming(slot, part, parts.where):
         return part.auto_rules[".".join(path[2:])](facts, part.config)
 
 
 def _part(parts: Assembly, slot: str) -> Part:
-    part: Part = getattr(parts, slot)
-    return part
+    return parts.part(slot)
 
 
 def put(parts: Assembly, path: KeyPath, choice: Choice) -> Assembly:
@@ -163,7 +153,7 @@ def put(parts: Assembly, path: KeyPath, choice: Choice) -> Assembly:
         config = part.Config.model_validate(with_values(part.config.model_dump(), {inner: choice.value}))
     except ValidationError as error:
         reason = error.errors(include_url=False)[0]["msg"]
-        raise fault(f"its rule for {inner} chose {choice.value!r}: {reason}", slot, part, None) from error
+        raise fault(f"its rule for {inner} chose {choice.value!r}: {reason}", slot, part, parts.where) from error
     # The other settings that wait keep their 'auto' in the recipe until it is their turn.
     params = with_values(ref.params, {inner: choice.value})
     recipe = parts.recipe.model_copy(update={slot: ComponentRef(name=ref.name, params=params)})

@@ -19,7 +19,6 @@ from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import begin, seeded
-from gsstream.engine.assembly.guard import guarded
 from gsstream.metrics import psnr
 from gsstream.packet import StreamMeta
 
@@ -125,7 +124,7 @@ class FirstFrameTrials:
 def _judged(parts: Assembly, gaussians: Gaussians[torch.Tensor], judges: Frame) -> float:
     found = []
     for view, target in enumerate(judges.images):
-        with torch.no_grad(), guarded("renderer", parts.renderer, judges.index):
+        with torch.no_grad():
             image = parts.renderer.render(gaussians, judges.cameras, view, parts.recipe.background).image
         found.append(psnr(colour_matched(image.numpy(), target), target))
     return fmean(found)

@@ -12,9 +12,9 @@ from typing import Any
 
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.engine.assembly.assemble import Assembly, value_at
-from gsstream.engine.auto.rules import DEGREE, USUAL_DEGREE, settle, taken_over
 from gsstream.engine.auto.climb import try_out
 from gsstream.engine.auto.facts import scene_facts
+from gsstream.engine.auto.rules import DEGREE, USUAL_DEGREE, settle, taken_over
 from gsstream.engine.auto.short_fits import FirstFrameTrials, left_out
 from gsstream.packet import PlayerState, StreamMeta
 
@@ -41,7 +41,7 @@ def choose(
     parts = settle(parts, lambda: scene_facts(points(), frame), taken_over(first) if first else {})
     settings = parts.recipe.first_frame
     folds = left_out(len(frame.cameras), settings.trial_cameras, settings.trial_folds)
-    if first is not None or parts.whole is not None or not folds:
+    if first is not None or not parts.stepper.reads("structure") or not folds:
         return parts
     return try_out(parts, usual, FirstFrameTrials(points(), frame, meta, parts.recipe.seed, folds), say)
 

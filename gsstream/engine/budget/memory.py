@@ -6,6 +6,7 @@ Constants, not what the process has now, so that a resumed run computes the same
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from gsstream.core.errors import InputError
 from gsstream.engine.assembly.assemble import Assembly
@@ -61,7 +62,8 @@ def _with_cache(parts: Assembly, megabytes: float) -> Assembly:
     config = type(config)(**{**config.model_dump(), "cache_mb": cache})
     ref = parts.recipe.renderer.model_copy(update={"params": config.model_dump(mode="json")})
     recipe = parts.recipe.model_copy(update={"renderer": ref})
-    return replace(parts, recipe=recipe, renderer=type(parts.renderer)(config))
+    renderer: Any = type(parts.part("renderer"))(config)
+    return replace(parts, recipe=recipe, renderer=renderer)
 
 
 def _fixed(info: SourceInfo) -> int:

@@ -64,6 +64,10 @@ class Pace:
         self._weights: list[float] = []
         self.stopped_by_clock = False
         self._allowance, self._views = allowance, views
+        #: Seconds until the optimisation began, and of it, by the budget's clock.
+        self.before = self.optimise = 0.0
+        if allowance is not None:
+            self.before = allowance.clock() - allowance.started
         #: Seconds a pass is expected to take.
         self._each = 0.0
         self._iteration_began = 0.0
@@ -90,6 +94,11 @@ class Pace:
         seconds, after = self._timed.plan.seconds, self._timed.plan.after
         kept = min(self._each, UNKNOWN_RESERVE * seconds) if after is None else after
         return self._timed.started + seconds - kept - now
+
+    def close(self) -> None:
+        """The optimisation has ended."""
+        if self._allowance is not None:
+            self.optimise = self._allowance.clock() - self._allowance.started - self.before
 
     @property
     def typical_weight(self) -> float:

@@ -10,13 +10,13 @@ from gsstream.recipe.model import Stream
 
 
 def spent(
-    allowance: Allowance, pace: Pace, fitted: Fitted, stream: Stream, *, epochs: float, before: float, optimise: float
+    allowance: Allowance, pace: Pace, fitted: Fitted, stream: Stream, epochs: float
 ) -> dict[str, Any]:
     """The entry ``budget`` of a frame, before the session adds limits and what the whole frame cost.
 
     Arguments:
         stream: the recipe's own settings, from which the plan departed.
-        epochs: passes made. before, optimise: seconds until they began, and of them, by the frame's clock.
+        epochs: passes made.
     """
     plan = allowance.plan
     given_up: dict[str, Any] = {}
@@ -43,6 +43,6 @@ def spent(
         "spent": {
             "epochs": epochs, "planned_epochs": plan.epochs, "rate_weight": pace.typical_weight,
             "step_scale": plan.step_scale, "change_threshold": plan.change_threshold, "estimate": pace.estimate,
-            "untrimmed": fitted.untrimmed, "before": before, "optimise": optimise,
+            "untrimmed": fitted.untrimmed, "before": pace.before, "optimise": pace.optimise,
         },
     }  # fmt: skip

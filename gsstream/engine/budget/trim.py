@@ -1,4 +1,4 @@
-"""Making a finished packet fit: symbols that explain little per bit go first, then whole gates, then everything. Ours.
+"""Making a finished packet fit: symbols that explain little per bit go first, then whole gates, then everything.
 
 What a symbol is worth is read from the optimiser: the running mean of a latent's squared gradient stands for its
 curvature (empirical Fisher), so moving it by d costs about curvature * d^2 of loss, up to one factor for all. What it
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gsstream.core.delta import Delta, Layout
+from gsstream.core.changes import Delta, Layout, Residual
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.packet import EncodedPacket
 
@@ -50,7 +50,7 @@ def fit(
 
     Arguments:
         packet: the delta, encoded.
-        curvature: attribute -> [A, L] >= 0, aligned with ``delta.symbols``.
+        curvature: attribute -> [A, L] >= 0, aligned with the symbols of the delta's residual.
         encode: delta -> packet; a delta that changes nothing must give the smallest packet there is.
         max_bytes: at least the size of an empty packet.
 
@@ -59,15 +59,15 @@ def fit(
     untrimmed = len(packet.data)
     if untrimmed <= max_bytes:
         return Fitted(delta, packet, untrimmed)
-    found = _trimmed(delta, packet, curvature, layout, encode, max_bytes) if delta.symbols else None
+    able = delta.residual is not None and delta.residual.symbols
+    found = _trimmed(delta, packet, curvature, layout, encode, max_bytes) if able else None
     if found is None and delta.edits_rows:
         # What is born is fitted last and costs most per row: without it the rest may fit.
-        rest = replace(delta, births=None, deaths=np.zeros(0, np.int64))
+        rest = delta.with_rows(None)
         plain = fit(rest, encode(rest), curvature, layout, encode, max_bytes)
         return replace(plain, untrimmed=untrimmed, births=0 if delta.births is None else len(delta.births))
     if found is None:
-        empty = Delta(np.zeros_like(delta.gates), delta.num_levels)
-        found = empty, encode(empty)
+        found = Delta(), encode(Delta())
     assert len(found[1].data) <= max_bytes, "an empty packet is above the budget"
     return Fitted(*found, untrimmed, _changed(delta, found[0], layout), _open(delta) - _open(found[0]))
 
@@ -77,21 +77,22 @@ def _trimmed(
     encode: Callable[[Delta], EncodedPacket], max_bytes: int,
 ) -> tuple[Delta, EncodedPacket] | None:  # fmt: skip
     """The largest packet found that fits, real bytes; None when none did."""
-    table = _Table(delta, curvature, layout)
+    assert delta.residual is not None
+    table = _Table(delta.residual, curvature, layout)
     best: tuple[Delta, EncodedPacket] | None = None
     # Estimated bits and real bytes of a packet that fits and of one that does not; in between a straight line.
     low, high = (0.0, 0.0), (table.bits, float(len(packet.data)))
     for _ in range(TRIES):
         share = (0.98 * max_bytes - low[1]) / (high[1] - low[1])
         aim = low[0] + min(max(share, 0.05), 0.95) * (high[0] - low[0])
-        smaller = table.at_most(aim)
+        smaller = delta.with_residual(table.at_most(aim))
         tried = encode(smaller)
         size = len(tried.data)
         if size > max_bytes:
             high = aim, float(size)
             continue
         low = aim, float(size)
-        if not smaller.is_empty and (best is None or size > len(best[1].data)):
+        if smaller.residual is not None and (best is None or size > len(best[1].data)):
             best = smaller, tried
         if size >= GOOD_ENOUGH * max_bytes:
             break
@@ -104,12 +105,12 @@ class _Table:
     A zero has no choice, and most symbols are zeros: only the K others are weighed against a price.
     """
 
-    def __init__(self, delta: Delta, curvature: Mapping[str, FloatArray], layout: Layout) -> None:
-        self.delta = delta
-        self.opened = np.flatnonzero((delta.gates > 0) & (np.asarray(layout.node_counts) > 0))
+    def __init__(self, residual: Residual, curvature: Mapping[str, FloatArray], layout: Layout) -> None:
+        self.residual = residual
+        self.opened = np.flatnonzero((residual.gates > 0) & (np.asarray(layout.node_counts) > 0))
         self.counts = np.asarray(layout.node_counts)[self.opened]
-        self.names = list(delta.symbols)
-        self.symbols = symbols = np.concatenate([delta.symbols[n] for n in self.names], 1).astype(np.int64)
+        self.names = list(residual.symbols)
+        self.symbols = symbols = np.concatenate([residual.symbols[n] for n in self.names], 1).astype(np.int64)
         codes = [_code_lengths(column) for column in symbols.T]
         self.place = rows, columns = symbols.nonzero()
         gate = np.repeat(np.arange(len(self.opened)), self.counts)
@@ -117,7 +118,7 @@ class _Table:
         #: What the zeros behind each open gate cost, and the gate itself: [G].
         self.fixed = np.bincount(gate, zeros, len(self.opened)) + _GATE_BITS
         self.gate = gate[rows]
-        steps = [np.full(delta.symbols[n].shape[1], delta.steps[n]) for n in self.names]
+        steps = [np.full(residual.symbols[n].shape[1], residual.steps[n]) for n in self.names]
         worth = np.concatenate([np.asarray(curvature[n], np.float64) for n in self.names], 1)[rows, columns]
         worth *= np.concatenate(steps)[columns] ** 2
         kept = symbols[rows, columns]
@@ -133,15 +134,15 @@ class _Table:
         #: A price at which nothing is worth its bits.
         self.most = float(self.losses[2].sum()) + 1e-30
 
-    def at_most(self, bits: float) -> Delta:
-        """The delta at the lowest price at which it is estimated to take no more than ``bits``."""
+    def at_most(self, bits: float) -> Residual | None:
+        """The residual at the lowest price at which it is estimated to take no more than ``bits``; None: nothing."""
         low, high = self.most * 1e-14, self.most * 10
         if self._choose(low)[2] <= bits:
-            return self._delta(*self._choose(low)[:2])
+            return self._residual(*self._choose(low)[:2])
         for _ in range(_BISECTIONS):
             middle = float(np.sqrt(low * high))
             low, high = (low, middle) if self._choose(middle)[2] <= bits else (middle, high)
-        return self._delta(*self._choose(high)[:2])
+        return self._residual(*self._choose(high)[:2])
 
     def _choose(self, price: float) -> tuple[IntArray, BoolArray, float]:
         """(symbols [K], open [G] of the gates, bits) at a price of loss per bit."""
@@ -154,25 +155,26 @@ class _Table:
         """[G] sums over the symbols behind each open gate."""
         return np.asarray(np.bincount(self.gate, values, len(self.opened)), np.float64)
 
-    def _delta(self, values: IntArray, opened: BoolArray) -> Delta:
+    def _residual(self, values: IntArray, opened: BoolArray) -> Residual | None:
         # A gate behind which every symbol is zero is closed, as in hardening.
         opened = opened & (self._by_gate((values != 0).astype(np.float64)) > 0)
+        if not opened.any():
+            return None
         rows = np.repeat(opened, self.counts)
-        gates = self.delta.gates.copy()
+        gates = self.residual.gates.copy()
         gates[self.opened[~opened]] = 0
         kept = np.zeros_like(self.symbols)
         kept[self.place] = values
         symbols, at = {}, 0
         for name in self.names:
-            width = self.delta.symbols[name].shape[1]
+            width = self.residual.symbols[name].shape[1]
             part = kept[rows, at : at + width].astype(np.int32)
             at += width
             if part.any():
                 symbols[name] = part
-        decoders = {n: v for n, v in self.delta.decoders.items() if n in symbols}
-        return replace(
-            self.delta, gates=gates, symbols=symbols, steps={n: self.delta.steps[n] for n in symbols}, decoders=decoders
-        )
+        decoders = {n: v for n, v in self.residual.decoders.items() if n in symbols}
+        steps = {n: self.residual.steps[n] for n in symbols}
+        return replace(self.residual, gates=gates, symbols=symbols, steps=steps, decoders=decoders)
 
 
 def _code_lengths(column: IntArray) -> Callable[[IntArray], FloatArray]:
@@ -184,17 +186,20 @@ def _code_lengths(column: IntArray) -> Callable[[IntArray], FloatArray]:
 
 
 def _open(delta: Delta) -> int:
-    return int(np.count_nonzero(delta.gates))
+    return 0 if delta.residual is None else int(np.count_nonzero(delta.residual.gates))
 
 
 def _changed(before: Delta, after: Delta, layout: Layout) -> int:
     """Symbols that are not as they were; those of rows that are no longer sent count when they were not zero."""
-    opened = np.flatnonzero(before.gates)
-    kept = np.repeat(after.gates[opened] != 0, np.asarray(layout.node_counts)[opened])
+    if before.residual is None:
+        return 0
+    opened = np.flatnonzero(before.residual.gates)
+    gates, symbols = after.gates(layout), {} if after.residual is None else after.residual.symbols
+    kept = np.repeat(gates[opened] != 0, np.asarray(layout.node_counts)[opened])
     changed = 0
-    for name, symbols in before.symbols.items():
-        now = np.zeros_like(symbols)
-        if name in after.symbols:
-            now[kept] = after.symbols[name]
-        changed += int((now != symbols).sum())
+    for name, table in before.residual.symbols.items():
+        now = np.zeros_like(table)
+        if name in symbols:
+            now[kept] = symbols[name]
+        changed += int((now != table).sum())
     return changed

@@ -8,12 +8,8 @@ held-out ones) sees the scene as it is.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
-
-from gsstream.engine.fit.backward import pull_back
-from gsstream.loss.base import Loss
 
 
 @dataclass(frozen=True)
@@ -34,30 +30,6 @@ class Exposure:
     def pull(self, view: int, gradient: torch.Tensor) -> torch.Tensor:
         """Gradient with respect to recorded colours -> gradient with respect to scene colours."""
         return (gradient.reshape(-1, 3) @ self.matrix[view]).reshape(gradient.shape)
-
-
-def backward_view(
-    image: torch.Tensor,
-    view: int,
-    exposure: Exposure | None,
-    loss: Loss,
-    target: Any,
-    dssim: float,
-    tiles: torch.Tensor | None = None,
-) -> tuple[float, torch.Tensor]:
-    """Judge a rendered view as its camera records it, and pull the loss back into whatever ``image`` was rendered from.
-
-    Arguments:
-        image: [H, W, 3] scene colours, with a graph.
-        target: what ``loss.prepare`` made of the recorded image.
-        tiles: the only tiles that what is optimised can change (``RenderOutput.tiles``).
-
-    Returns the loss, and its gradient [H, W, 3] with respect to the recorded colours.
-    """
-    raw = image.detach()
-    value, gradient = loss.evaluate(exposure.apply(view, raw) if exposure else raw, target, dssim, tiles)
-    pull_back([image], [exposure.pull(view, gradient) if exposure else gradient])
-    return value, gradient
 
 
 @dataclass(frozen=True)

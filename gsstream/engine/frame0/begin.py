@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.delta import Layout
+from gsstream.core.changes import Layout
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.gaussians import Gaussians
@@ -19,9 +19,9 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.auto.rules import refuse_pending
+from gsstream.engine.assembly.guard import blaming
+from gsstream.engine.assembly.pending import refuse_pending
 from gsstream.engine.fit.exposure import Exposure
-from gsstream.engine.assembly.guard import guarded
 from gsstream.engine.frame0.root import Progress, initial_gaussians, optimise_root, sort_by_node
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.init.thinning import thin_points
@@ -72,8 +72,7 @@ def seeded(parts: Assembly, points: PointCloud, frame: Frame) -> Anchors:
     """
     most = parts.recipe.first_frame.max_gaussians
     while True:
-        with guarded("structure", parts.structure, frame.index):
-            anchors = parts.structure.seed(points, frame.cameras)
+        anchors = parts.structure.seed(points, frame.cameras)
         if len(anchors.positions) <= most or len(points) == 1:
             return anchors
         points = thin_points(points, max(1, int(0.95 * len(points) * most / len(anchors.positions))))
@@ -121,8 +120,7 @@ def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMe
 def own_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
     """The grid this method's structure would lay; each Gaussian gets the level of the nearest cell size."""
     theirs = decoded_anchors(first)
-    with guarded("structure", parts.structure, frame.index):
-        grid = parts.structure.seed(cloud_of(first), frame.cameras)
+    grid = parts.structure.seed(cloud_of(first), frame.cameras)
     sizes = theirs.cell_sizes[theirs.levels]
     levels = (sizes.log()[:, None] - grid.cell_sizes.log()[None]).abs().argmin(1)
     return replace(theirs, levels=levels, cell_sizes=grid.cell_sizes, origin=grid.origin)
@@ -140,8 +138,8 @@ def decoded_anchors(player: PlayerState) -> Anchors:
     return Anchors(
         positions=gaussians.means,
         colors=torch.zeros_like(gaussians.means),
-        levels=torch.from_numpy(player.layout.octree_levels.astype(np.int64)),
-        cell_sizes=torch.from_numpy(np.asarray(player.layout.cell_sizes)),
+        levels=torch.from_numpy(player.layout.unit_of.astype(np.int64)),
+        cell_sizes=torch.from_numpy(np.asarray(player.layout.units)),
         origin=torch.tensor(player.meta.extra["origin"], dtype=torch.float32),
     )
 
@@ -150,8 +148,8 @@ def arrange(
     parts: Assembly, gaussians: Gaussians[torch.Tensor], levels: torch.Tensor, anchors: Anchors
 ) -> tuple[Hierarchy, torch.Tensor, Gaussians[torch.Tensor]]:
     """Group the Gaussians and store them node by node: (hierarchy, levels, Gaussians), all in the new order."""
-    with guarded("structure", parts.structure, 0):
-        hierarchy = parts.structure.build(gaussians, anchors)
+    hierarchy = parts.structure.build(gaussians, anchors)
+    with blaming("structure", parts.part("structure"), parts.where):
         hierarchy.validate()
     edit = sort_by_node(hierarchy.node_of)
     return hierarchy.rows(edit.source), levels[edit.source], gaussians.rows(edit.source)
@@ -162,8 +160,8 @@ def make_layout(hierarchy: Hierarchy, levels: torch.Tensor, anchors: Anchors) ->
     counts = torch.bincount(hierarchy.node_of, minlength=hierarchy.num_nodes)
     return Layout(
         node_counts=counts.numpy().astype(np.int32),
-        octree_levels=levels.numpy().astype(np.uint8),
-        cell_sizes=anchors.cell_sizes.numpy().astype(np.float32),
+        unit_of=levels.numpy().astype(np.uint8),
+        units=anchors.cell_sizes.numpy().astype(np.float32),
     )
 
 
@@ -183,8 +181,7 @@ def key_state(
     arrays: Gaussians[FloatArray] = gaussians.map(lambda t: np.ascontiguousarray(t.numpy()))
     packet = encode_key(KeyState(arrays, layout, replace(meta, extra=extra)), frame=frame.index)
     player = decode_packet(None, packet.data)
-    with guarded("update", parts.update, frame.index):
-        decoders = parts.update.init_decoders(gaussians, rng.stream("decoders", frame.index))
+    decoders = parts.update.init_decoders(gaussians, rng.stream("decoders", frame.index))
     state = StreamState(
         player=player, hierarchy=hierarchy, previous=frame, decoders=decoders,
         exposure=exposure_from_meta(player.meta), key_frame=player.frame,

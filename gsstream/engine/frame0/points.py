@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,21 +12,26 @@ from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.rng import Rng
 from gsstream.init.seeding import fill_volume, photo_consistent_seeds, thin_points
 from gsstream.recipe.model import FirstFrame
-from gsstream.source.base import FrameSource
+from gsstream.source.base import FrameSource, PointKind
 
 #: Fewer points than this cannot carry a scene: "auto" then sweeps the views for more.
 SPARSE = 2000
 SWEEP_WIDTH = 160
 
 
-def gather_points(source: FrameSource, frame: Frame, settings: FirstFrame, rng: Rng) -> PointCloud:
-    """Points to seed from. Only the cameras of ``frame`` take part, and points that the source vouches for.
+def gather_points(
+    shipped: Callable[[PointKind], PointCloud | None], frame: Frame, settings: FirstFrame, rng: Rng
+) -> PointCloud:
+    """Return the points to seed from. Only the cameras of ``frame`` take part, and points that the source vouches for.
+
+    Arguments:
+        shipped: the points that the recording ships, by kind (``FrameSource.points``); None where it ships none.
 
     Raises InputError when the recipe asks for a kind of points that the recording does not have, or nothing is left.
     """
     pixels = frame.images[..., 0].size
     limit = max(1, int(pixels / settings.pixels_per_seed)) if settings.pixels_per_seed else settings.max_points
-    cloud = thin_points(_base_points(source, frame, settings), min(settings.max_points, limit))
+    cloud = thin_points(_base_points(shipped, frame, settings), min(settings.max_points, limit))
     if settings.fill_points == 0:
         if len(cloud) == 0:
             raise InputError("no points to start from: the recording ships none; set first_frame.fill_points above 0")
@@ -63,16 +69,18 @@ def join(first: PointCloud, second: PointCloud) -> PointCloud:
     )
 
 
-def _base_points(source: FrameSource, frame: Frame, settings: FirstFrame) -> PointCloud:
+def _base_points(
+    ships: Callable[[PointKind], PointCloud | None], frame: Frame, settings: FirstFrame
+) -> PointCloud:
     wanted = settings.points
     if wanted == "sfm":
         return _triangulate(frame)
     if wanted == "sweep":
         return _sweep(frame, settings)
-    shipped = source.points("sparse" if wanted == "sparse" else "recording")
+    shipped = ships("sparse" if wanted == "sparse" else "recording")
     if shipped is None and wanted != "auto":
         raise InputError(
-            f"first_frame.points = {wanted!r}, but the recording {source.info.name!r} ships no points, "
+            f"first_frame.points = {wanted!r}, but the recording ships no points, "
             "or none that its test cameras took no part in; use 'auto', 'sweep' or 'sfm'"
         )
     if shipped is not None and (wanted != "auto" or len(shipped) >= SPARSE):

@@ -18,11 +18,11 @@ from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.topology import TopologyEdit
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.assembly.checks import VARIABLE, Checks, StepChecks, check_values
-from gsstream.engine.frame0.densify import DensifyStatistics, grow_and_prune
-from gsstream.engine.fit.exposure import Exposure, ExposureFit, backward_view
-from gsstream.engine.assembly.guard import guarded
-from gsstream.engine.frame0.nearest import neighbour_distance
+from gsstream.engine.assembly.checks import VARIABLE, Look
+from gsstream.engine.fit.densify import DensifyStatistics, grow_and_prune
+from gsstream.engine.fit.exposure import Exposure, ExposureFit
+from gsstream.engine.fit.judge import Judge
+from gsstream.engine.fit.nearest import neighbour_distance
 from gsstream.engine.fit.row_table import RowTable
 from gsstream.recipe.model import FirstFrame
 from gsstream.render.activations import logit, rgb_to_sh0
@@ -88,10 +88,10 @@ def optimise_root(
         progress(iteration, run.iterations, value, len(run.levels))
     exposure = run.exposure.centered().exposure if run.exposure else None
     found = run.gaussians().map(torch.Tensor.detach)
+    parts.where.enter(frame.index)
+    look = Look(parts.checks, "first frame", run.table, parts.where)
     for name, values in found.items():
-        if parts.checks is not Checks.OFF:
-            what = f"{name} after the last iteration ({VARIABLE}=step finds the first)"
-            check_values("first frame", run.table, what, values, frame.index)
+        look.values(f"{name} after the last iteration ({VARIABLE}=step finds the first)", values)
     return RootResult(found, run.levels, exposure, run.iterations)
 
 
@@ -101,15 +101,14 @@ class _RootRun:
     def __init__(
         self, start: Gaussians[torch.Tensor], levels: torch.Tensor, frame: Frame, parts: Assembly, rng: Rng
     ) -> None:
-        self.settings, self.recipe, self.frame = parts.recipe.first_frame, parts.recipe, frame
-        self.renderer, self.loss, self.levels = parts.renderer, parts.loss, levels
-        self.look = StepChecks(parts.checks, frame.index)
+        self.parts, self.settings, self.recipe, self.frame = parts, parts.recipe.first_frame, parts.recipe, frame
+        self.renderer, self.levels = parts.renderer, levels
         self.views = len(frame.cameras)
         self.extent = frame.cameras.extent
         self.iterations = min(self.settings.epochs * self.views, self.settings.max_iterations)
         self.generator = rng.stream("root", frame.index)
         self.table = RowTable(dict(start.items()), first_rates(self.settings, self.extent), parts.optimiser)
-        self.targets = [self.loss.prepare(torch.from_numpy(image)) for image in frame.images]
+        self.judge = Judge(parts.loss, parts.recipe.loss.dssim, frame.images, None)
         self.exposure = ExposureFit.start(self.views) if self.settings.exposure else None
         self.statistics = DensifyStatistics.zeros(len(start))
         self.order: list[int] = []
@@ -120,23 +119,15 @@ class _RootRun:
 
     def step(self, iteration: int) -> float:
         s = self.settings
-        view, look = self._next_view(), self.look
-        look.iteration = iteration
+        view, self.parts.where.iteration = self._next_view(), iteration
         densify = s.densify_from <= iteration + s.densify_every and iteration <= s.densify_until * self.iterations
         rows = self.gaussians()
         probe = torch.zeros(len(rows), 2, requires_grad=True) if densify else None
-        with guarded("renderer", self.renderer, self.frame.index, iteration):
-            session = self.renderer.open(rows, None, self.frame.cameras, self.recipe.background)
-            output = session.render(view, rows, probe=probe)
-        look("renderer", self.renderer, f"image of view {view}", output.image)
-        with guarded("loss", self.loss, self.frame.index, iteration):
-            value = self._backward(view, output.image)
-        look.number("loss", self.loss, f"loss of view {view}", value)
-        look.gradients("renderer", self.renderer, "gradient of", rows)
+        session = self.renderer.open(rows, None, self.frame.cameras, self.recipe.background)
+        value = self._backward(view, session.render(view, rows, probe=probe).image)
         fraction = iteration / self.iterations
         self.table.set_lr("means", self.extent * _log_linear(s.lr_means, s.lr_means_final, fraction))
         self.table.step()
-        look("first frame", self.table, "parameters,", rows)
         if probe is not None and probe.grad is not None:
             size = torch.tensor([self.frame.cameras.width / 2, self.frame.cameras.height / 2])
             self.statistics = self.statistics.add(probe.grad * size)
@@ -147,9 +138,8 @@ class _RootRun:
 
     def _backward(self, view: int, image: torch.Tensor) -> float:
         """Loss, its gradient into the leaves, and the exposure step."""
-        exposure = self.exposure.exposure if self.exposure else None
-        target, weight = self.targets[view], self.recipe.loss.dssim
-        value, gradient = backward_view(image, view, exposure, self.loss, target, weight)
+        self.judge.exposure = self.exposure.exposure if self.exposure else None
+        value, gradient = self.judge.backward(view, image)
         self._penalise()
         if self.exposure:
             self.exposure = self.exposure.step(view, image.detach(), gradient, lr=0.005, pull=1e-3)

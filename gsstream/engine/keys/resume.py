@@ -2,58 +2,74 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from gsstream.core.errors import OutputError, PacketError
-from gsstream.core.frame import Frame
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import decoded_anchors, exposure_from_meta
-from gsstream.engine.keys.keyframes import with_key_quality
-from gsstream.engine.state.rows import follow
+from gsstream.engine.state.follow import follow
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.packet import PacketKind, PlayerState, StreamMeta, StreamReader, decode_packet
 from gsstream.packet.base import FILE_HEADER
-from gsstream.source.base import FrameSource, SourceInfo
+from gsstream.source.base import SourceInfo
 
 
-def resume_state(
-    parts: Assembly, path: Path, source: FrameSource, rng: Rng, near: float, last: int | None = None
-) -> StreamState | None:
-    """Encoder state after the last complete packet of a stream; None when not even frame 0 is complete.
+class Ended(NamedTuple):
+    """Where a stream ends: what players have then, the frame of the picture that this scene shows, the last key frame."""
+
+    player: PlayerState
+    shown: int
+    key_frame: int
+
+
+def ended(path: Path, last: int | None = None) -> Ended:
+    """Decode a stream to its last sound packet.
 
     Arguments:
-        last: go on after this frame, whatever the stream holds beyond it.
+        last: stop after this frame, whatever the stream holds beyond it.
 
-    Raises OutputError when the recipe or the recording is not the one the stream was written with, or when the recipe
-    carries state that a stream does not hold (gate moments across frames).
+    Raises PacketError when not even the first key packet is sound.
     """
-    if parts.recipe.gate_training.optimiser == "persistent":
-        raise OutputError(
-            "gate_training.optimiser = 'persistent' carries Adam moments that no stream holds: such a run cannot be "
-            "resumed; start it again with --overwrite"
-        )
-    # Before the replay: other parts would fail over a stream that is not theirs, and say something else.
-    if not check_stream(parts, path, source.info) or (last is not None and last < 0):
-        return None
+    player: PlayerState | None = None
+    shown = key = 0
+    for player, kind in _played(path, last):
+        if kind == PacketKind.KEY:
+            key = player.frame
+            # A key packet says which picture its scene shows: it may stand for an older one.
+            shown = int(player.meta.extra.get("shown", player.frame))
+        elif kind != PacketKind.EMPTY:
+            shown = player.frame
+    if player is None:
+        raise PacketError("the first key packet of the stream is damaged", 0)
+    return Ended(player, shown, key)
+
+
+def since_key(path: Path, end: Ended) -> Iterator[PlayerState]:
+    """Yield what players have after every packet from the last key packet to the end."""
+    for player, _ in _played(path, end.player.frame):
+        if player.frame >= end.key_frame:
+            yield player
+
+
+def _played(path: Path, last: int | None) -> Iterator[tuple[PlayerState, PacketKind]]:
+    """States and kinds of packets up to ``last`` or the first that is not sound."""
+    player: PlayerState | None = None
     with StreamReader(path) as reader:
-        state = _replay(parts, reader, rng, last)
-        shown = [e for e in reader.frames if e.kind != PacketKind.EMPTY and e.frame <= state.player.frame][-1]
-        key = decode_packet(None, reader.read(reader.frames[state.key_frame - reader.frames[0].frame]))
-
-    def training(index: int) -> Frame:
-        frame = source.frame(index, "train")
-        return replace(frame, cameras=replace(frame.cameras, near=near))
-
-    # A key packet says which picture its scene shows: it may stand for an older one.
-    index = shown.frame if shown.kind != PacketKind.KEY else int(state.player.meta.extra.get("shown", shown.frame))
-    at_key = with_key_quality(parts, replace(state, player=key), training(state.key_frame))
-    return replace(state, previous=training(index), key_quality=at_key.key_quality)
+        for entry in reader.frames:
+            if last is not None and entry.frame > last:
+                return
+            try:
+                player = decode_packet(player, reader.read(entry), offset=entry.offset)
+            except PacketError:
+                return
+            yield player, entry.kind
 
 
 def check_stream(parts: Assembly, path: Path, info: SourceInfo) -> bool:
@@ -72,42 +88,20 @@ def check_stream(parts: Assembly, path: Path, info: SourceInfo) -> bool:
     return True
 
 
-def replay(reader: StreamReader) -> PlayerState:
-    """What every player has after the last complete packet."""
-    player: PlayerState | None = None
-    for entry in reader.frames:
-        try:
-            player = decode_packet(player, reader.read(entry), offset=entry.offset)
-        except PacketError:
-            break
-    if player is None:
-        raise PacketError("the first key packet of the stream is damaged", 0)
-    return player
+def state_after(parts: Assembly, states: Iterable[PlayerState], rng: Rng) -> StreamState:
+    """Return the encoder state after these player states, the first of which is that of a key packet.
 
-
-def _replay(parts: Assembly, reader: StreamReader, rng: Rng, last: int | None) -> StreamState:
-    """Decode all packets; rebuild what the key packet implies at every key packet."""
-    player: PlayerState | None = None
+    ``previous`` is not set: no stream holds images.
+    """
     state: StreamState | None = None
-    for entry in reader.frames:
-        if last is not None and entry.frame > last:
-            break
-        try:
-            player = decode_packet(player, reader.read(entry), offset=entry.offset)
-        except PacketError:
-            break
-        if entry.kind == PacketKind.KEY:
-            state = key_state_from_player(parts, player, rng)
-        else:
-            assert state is not None
-            state = follow(state, player)
-    if state is None:
-        raise PacketError("the first key packet of the stream is damaged", 0)
+    for player in states:
+        state = key_state_from_player(parts, player, rng) if state is None else follow(state, player)
+    assert state is not None, "a stream without a key packet"
     return state
 
 
 def key_state_from_player(parts: Assembly, player: PlayerState, rng: Rng) -> StreamState:
-    """The encoder state right after a key packet, from the decoded packet alone (``previous`` is not set)."""
+    """Return the encoder state right after a key packet, from the decoded packet alone (``previous`` is not set)."""
     gaussians = player.gaussians.map(torch.from_numpy)
     decoders = parts.update.init_decoders(gaussians, rng.stream("decoders", player.frame))
     return StreamState(

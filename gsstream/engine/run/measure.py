@@ -10,7 +10,6 @@ import torch
 
 from gsstream.core.frame import Frame
 from gsstream.core.shapes import FloatArray
-from gsstream.engine.assembly.guard import guarded
 from gsstream.method.base import MethodState
 from gsstream.metrics import moving_mask, noise_sigma, psnr, ssim
 from gsstream.render.base import Renderer
@@ -53,7 +52,7 @@ class HeldOut:
     def render(self, state: MethodState, frame: Frame, view: int) -> FloatArray:
         """[H, W, 3] decoded image in [0, 1]."""
         gaussians = state.player.gaussians.map(torch.from_numpy)
-        with torch.no_grad(), guarded("renderer", self._renderer, frame.index):
+        with torch.no_grad():
             output = self._renderer.render(gaussians, frame.cameras, view, self._background)
         return np.asarray(np.clip(output.image.numpy(), 0, 1))
 

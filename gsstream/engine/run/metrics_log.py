@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from gsstream.core.errors import InputError
+from gsstream.engine.run.output import disk_errors, write_whole
 
 
 def read_metrics(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -42,11 +45,41 @@ def last_written(path: Path) -> int:
 
 
 def trim_metrics(path: Path, last: int) -> list[dict[str, Any]]:
-    """Drop lines of frames that the stream does not hold (a kill can fall between packet and line); those that stay."""
+    """Drop lines of frames that the stream does not hold (a kill can fall between packet and line); those that stay.
+
+    The file is replaced at once: a kill leaves it as it was or as it is to be.
+    """
     kept = [line for line in _written(path) if int(line["frame"]) <= last]
     if path.exists():
-        path.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
+        write_whole(path, "".join(json.dumps(line) + "\n" for line in kept))
     return kept
+
+
+def lost_lines(path: Path, first: int, last: int) -> list[int]:
+    """Frames ``first`` to ``last`` of a stream that have no line: a kill fell between their packet and their line.
+
+    Tables of such a file leave these frames out; a run that goes on measures them again, or says so.
+    """
+    written = {int(line["frame"]) for line in _written(path)}
+    return [frame for frame in range(first, last + 1) if frame not in written]
+
+
+def append_metrics(path: Path, line: dict[str, Any]) -> None:
+    """Add the record of one frame, in one write. Raises OutputError when there is no room for it.
+
+    A line that was only written in part is taken back, so that what follows does not stand behind half of one.
+    """
+    data = (json.dumps(line) + "\n").encode()
+    with disk_errors(path.parent), path.open("ab", buffering=0) as log:
+        before = log.tell()
+        try:
+            written = log.write(data)
+        except OSError:
+            log.truncate(before)
+            raise
+        if written != len(data):
+            log.truncate(before)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
 def _written(path: Path) -> list[dict[str, Any]]:

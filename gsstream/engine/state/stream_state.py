@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.core.state import rows
 from gsstream.engine.fit.exposure import Exposure
 from gsstream.method.base import Step as MethodStep
 from gsstream.packet import PlayerState
@@ -29,21 +28,17 @@ class StreamState:
         decoders: linear decoders to continue from; equal to the player's once they were sent.
         exposure: colour maps of the training cameras, or None.
         key_frame: frame of the last key packet.
-        key_quality: PSNR of that frame on the training views, dB; None when the recipe does not watch it.
-        gate_moments: Adam moments of the gate logits when the recipe carries them over (released code), else empty.
         session: what the renderer keeps of this scene from one frame to the next. Nothing but time depends on it: a
             state without one (the first, a resumed one) goes on to the same bytes.
     """
 
     player: PlayerState
-    hierarchy: Hierarchy = rows("gaussian")
-    previous: Frame = rows(None)
-    decoders: Mapping[str, torch.Tensor] = rows(None, default_factory=dict)
-    exposure: Exposure | None = rows(None, default=None)
-    key_frame: int = rows(None, default=0)
-    key_quality: float | None = rows(None, default=None)
-    gate_moments: Mapping[str, torch.Tensor] = rows("node", default_factory=dict)
-    session: RenderSession | None = rows(None, default=None, compare=False, repr=False)
+    hierarchy: Hierarchy
+    previous: Frame
+    decoders: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    exposure: Exposure | None = None
+    key_frame: int = 0
+    session: RenderSession | None = field(default=None, compare=False, repr=False)
 
     @property
     def gaussians(self) -> Gaussians[torch.Tensor]:
@@ -51,5 +46,5 @@ class StreamState:
         return self.player.gaussians.map(torch.from_numpy)
 
 
-#: Outcome of one frame step of the five-part path.
+#: Outcome of one frame of a method made of parts.
 Step = MethodStep[StreamState]

@@ -1,4 +1,4 @@
-"""The frame context that confidence estimators see."""
+"""One frame as parts and methods see it: images, what changed, gradients, and rendering with some rows moving."""
 
 from __future__ import annotations
 
@@ -10,38 +10,50 @@ from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.storage import unpacked
+from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.fit.exposure import Exposure
+from gsstream.engine.fit.judge import Judge, shown
+from gsstream.engine.step.active.candidates import changed_rows
 from gsstream.engine.step.active.change import MOST_PIXEL_SIGMA, Change
-from gsstream.engine.state.stream_state import StreamState
 from gsstream.metrics.noise import noise_sigma
-from gsstream.render.base import Renderer, RenderSession
+from gsstream.optimiser.base import RowOptimiser
+from gsstream.render.base import RenderSession
 
 
-class StepContext:
-    """Read-only view of one frame step (implements ``gsstream.core.context.FrameContext``).
+class FrameView:
+    """One frame over a decoded scene (implements ``core.context.FrameWork`` and ``method.tools.FrameTools``).
 
-    Images are as recorded; gradients are pulled through the camera's colour map, so that estimators need not know it.
+    Images are as recorded; gradients are pulled through the camera's colour map, so that parts need not know it.
+
+    Arguments:
+        gaussians, hierarchy: the decoded scene before the frame and its groups.
+        previous: training images that this scene shows.
+        change: what changed since; None: everything counts as changed.
+        session: a render session of this scene that is kept from before, or None.
     """
 
     def __init__(
-        self,
-        state: StreamState,
-        frame: Frame,
-        renderer: Renderer,
-        background: tuple[float, float, float],
-        change: Change | None = None,
-    ) -> None:
-        self._state, self._frame, self._renderer, self._background = state, frame, renderer, background
-        self._change = change
-        self._gaussians = state.gaussians
-        #: What the last frame or an estimator made the renderer project and sort is not done again.
-        self.session = state.session or renderer.open(self._gaussians, None, frame.cameras, background)
-        self._touched: dict[int, torch.Tensor] = {}
+        self, parts: Assembly, gaussians: Gaussians[torch.Tensor], hierarchy: Hierarchy, frame: Frame, previous: Frame,
+        exposure: Exposure | None, change: Change | None = None, session: RenderSession | None = None,
+    ) -> None:  # fmt: skip
+        self._parts, self._gaussians, self._hierarchy = parts, gaussians, hierarchy
+        self._frame, self._previous, self._change = frame, previous, change
+        self._background = parts.recipe.background
+        self.judge = Judge(parts.loss, parts.recipe.loss.dssim, frame.images, exposure)
+        self._session = session
 
-    def session_for(self, active: torch.Tensor) -> RenderSession:
-        """The session in which only the rows ``active`` change. When all do, no cache is of use: a new one."""
-        if len(active) == len(self._gaussians):
-            return self._renderer.open(self._gaussians, None, self.cameras, self._background)
-        self.session.narrow(active)
+    @property
+    def session(self) -> RenderSession:
+        """The render session of this scene: what the last frame or a part made it project is not done again."""
+        if self._session is None:
+            self._session = self._parts.renderer.open(self._gaussians, None, self.cameras, self._background)
+        return self._session
+
+    def session_for(self, rows: torch.Tensor) -> RenderSession:
+        """The session in which only ``rows`` change. When all do, no cache is of use: a new one."""
+        if len(rows) == len(self._gaussians):
+            return self._parts.renderer.open(self._gaussians, None, self.cameras, self._background)
+        self.session.narrow(rows)
         return self.session
 
     @property
@@ -54,7 +66,7 @@ class StepContext:
 
     @property
     def hierarchy(self) -> Hierarchy:
-        return self._state.hierarchy
+        return self._hierarchy
 
     @property
     def cameras(self) -> Cameras:
@@ -64,46 +76,55 @@ class StepContext:
         return torch.from_numpy(self._frame.images[view])
 
     def previous_image(self, view: int) -> torch.Tensor:
-        return torch.from_numpy(unpacked(self._state.previous.images[view]))
+        return torch.from_numpy(unpacked(self._previous.images[view]))
 
     def previous_render(self, view: int) -> torch.Tensor:
-        with torch.no_grad():
-            image = self._renderer.render(self._gaussians, self.cameras, view, self._background).image
-        return self._state.exposure.apply(view, image) if self._state.exposure else image
+        return self.shown(self._gaussians, view)
+
+    def shown(self, gaussians: Gaussians[torch.Tensor], view: int) -> torch.Tensor:
+        return shown(self._parts.renderer, gaussians, self.cameras, view, self._background, self.judge.exposure)
 
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
         upstream = image_gradient.float()
         if self._change is not None:
             if not bool(self._change.tiles[view].any()):
-                nothing = torch.zeros(len(self._gaussians), dtype=torch.bool)
-                self._touched.setdefault(view, nothing)
-                return ScreenGradient(torch.zeros(len(nothing), 2), nothing)
+                number = len(self._gaussians)
+                return ScreenGradient(torch.zeros(number, 2), torch.zeros(number, dtype=torch.bool))
             upstream = upstream * self._change.pixels(view)
-        if self._state.exposure:
-            upstream = self._state.exposure.pull(view, upstream)
-        result = self.session.screen_gradient(view, upstream.contiguous())
-        self._touched.setdefault(view, (result.gradient != 0).any(1))
-        return result
-
-    def suspects(self, least_votes: float) -> torch.Tensor:
-        """[N] bool: Gaussians visible in a changed tile of some view, with at least this share of votes.
-
-        All of them when change is not detected.
-
-        Views that the estimator already differentiated cost nothing here: what it got back shows whom they touch.
-        """
-        everyone = torch.ones(len(self._gaussians), dtype=torch.bool)
-        if self._change is None:
-            return everyone
-        for view in range(len(self.cameras)):
-            if view not in self._touched:
-                self.screen_gradient(view, torch.ones_like(self.image(view)))
-        touched = torch.stack(list(self._touched.values())).any(0) if self._touched else ~everyone
-        rows = touched.nonzero()[:, 0]
-        touched[rows] = self._change.votes(self._gaussians.means[rows], self.cameras) >= least_votes
-        return touched
+        if self.judge.exposure:
+            upstream = self.judge.exposure.pull(view, upstream)
+        return self.session.screen_gradient(view, upstream.contiguous())
 
     def noise_sigma(self, view: int) -> float:
         # Where everything moves, the estimate is the change itself; see MOST_SIGMA.
-        measured = noise_sigma(unpacked(self._state.previous.images[view]), self._frame.images[view])
+        measured = noise_sigma(unpacked(self._previous.images[view]), self._frame.images[view])
         return min(measured, MOST_PIXEL_SIGMA)
+
+    @property
+    def optimiser(self) -> RowOptimiser:
+        return self._parts.optimiser
+
+    def changed_rows(self, least_votes: float) -> torch.Tensor:
+        return changed_rows(self._change, self._gaussians.means, self.cameras, self.session, least_votes)
+
+    def changed_pixels(self, view: int) -> torch.Tensor:
+        if self._change is None:
+            return torch.ones(self.cameras.height, self.cameras.width, dtype=torch.bool)
+        return self._change.pixels(view)[..., 0] > 0
+
+    def narrow(self, rows: torch.Tensor) -> None:
+        self._session = self.session_for(rows)
+
+    def pull(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
+        output = self.session.render(view, rows)
+        return self.judge.backward(view, output.image, output.tiles)[0]
+
+    def backward(self, view: int, image: torch.Tensor, tile_mask: torch.Tensor | None = None) -> float:
+        where = self._parts.where
+        where.iteration = 1 if where.iteration is None else where.iteration + 1
+        return self.judge.backward(view, image, tile_mask)[0]
+
+    def on(self, gaussians: Gaussians[torch.Tensor]) -> FrameView:
+        return FrameView(
+            self._parts, gaussians, self._hierarchy, self._frame, self._previous, self.judge.exposure, self._change
+        )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 
-from gsstream.core.state import GateState
 from gsstream.gate.base import GateSampler
 
 #: Spacing of float32 below 1: a smaller slope changes no gate by a logit's step.
@@ -19,9 +18,8 @@ def count_dead(gate: GateSampler, logits: torch.Tensor) -> int:
     nothing to move and no dead gates.
     """
     leaf = logits.detach().clone().requires_grad_()
-    state = GateState(leaf)
     with torch.enable_grad():
-        felt = [value for value in (gate.sample(state, None), gate.open_probability(state)) if value.requires_grad]
+        felt = [value for value in (gate.sample(leaf, None), gate.open_probability(leaf)) if value.requires_grad]
         slopes = [torch.autograd.grad(value.sum(), leaf)[0].abs() for value in felt]
     if not slopes:
         return 0

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 
 import torch
 
-from gsstream.core.frame import Frame
+from gsstream.core.changes import Layout
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.state import GateState
+from gsstream.core.hierarchy import Hierarchy
 from gsstream.engine.budget.pace import Allowance, Pace
-from gsstream.engine.state.stream_state import StreamState
+from gsstream.engine.fit.judge import Judge
 from gsstream.render.base import RenderSession
 
 
@@ -20,19 +20,31 @@ class Problem:
     """What one frame's optimisation is given.
 
     Arguments:
-        active: [A] int64 rows that may change, ascending.
-        base: those rows of the decoded previous scene.
-        gate: initial gate state [M].
-        session: an open render session in which only ``active`` changes.
+        frame: index of the frame.
+        effort: share of the recipe's epochs that the frame is worth, 0 to 1.
+        layout, hierarchy: how the scene is stored and grouped.
+        rows: [A] int64 candidates, ascending.
+        base: those rows of the scene that the residual is added to.
+        logits: [M] initial gate logits.
+        decoders: attribute -> [L, D] linear decoder to go on from.
+        session: a render session in which only ``rows`` change.
+        judge: compares renders with what the V cameras recorded.
+        pixels: of one view.
         allowance: what the frame may spend; None: what the recipe says.
     """
 
-    state: StreamState
-    frame: Frame
-    active: torch.Tensor
+    frame: int
+    effort: float
+    layout: Layout
+    hierarchy: Hierarchy
+    rows: torch.Tensor
     base: Gaussians[torch.Tensor]
-    gate: GateState
+    logits: torch.Tensor
+    decoders: Mapping[str, torch.Tensor]
     session: RenderSession
+    judge: Judge
+    views: int
+    pixels: int
     allowance: Allowance | None = None
 
     @property
@@ -46,8 +58,10 @@ class Solution:
     """What the optimisation found.
 
     Arguments:
-        active: [A] int64 rows that stayed to the end, ascending; what other rows had is given up.
+        rows: [A] int64 rows that stayed to the end, ascending; what other rows had is given up.
         latents: attribute -> [A, L].
+        decoders: attribute -> [L, D] as trained.
+        logits: [M] of all gates.
         loss: mean over the last pass, of the tiles that took part.
         iterations: views rendered.
         curvature: attribute -> [A, L], mean squared gradient of the latents: what a latent is worth, up to a factor.
@@ -55,13 +69,12 @@ class Solution:
         dead_gates: gates of rows that stayed which ended where nothing moves them (:func:`count_dead`).
     """
 
-    active: torch.Tensor
+    rows: torch.Tensor
     latents: Mapping[str, torch.Tensor]
     decoders: Mapping[str, torch.Tensor]
-    gate: GateState
-    gate_moments: Mapping[str, torch.Tensor]
-    loss: float
-    iterations: int
+    logits: torch.Tensor
+    loss: float = 0.0
+    iterations: int = 0
     curvature: Mapping[str, torch.Tensor] = field(default_factory=dict)
     pace: Pace | None = None
     dead_gates: int = 0

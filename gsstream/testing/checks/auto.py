@@ -8,9 +8,10 @@ from typing import Any
 from pydantic import ValidationError
 
 from gsstream.core.auto import Choice, SceneFacts
+from gsstream.core.kinds import CONTRACTS
 from gsstream.core.part import Part
 from gsstream.engine.assembly.assemble import with_values
-from gsstream.testing.registry import CONTRACTS, Skip, check
+from gsstream.testing.registry import Skip, check
 
 
 def extreme_scenes() -> list[SceneFacts]:

@@ -20,12 +20,13 @@ import torch
 from pydantic import BaseModel, ValidationError
 
 from gsstream.core.errors import InputError
+from gsstream.core.kinds import CONTRACTS
 from gsstream.core.part import Part
 from gsstream.testing.cases import fingerprint, world
 from gsstream.testing.compare import ROUNDING, all_equal, finite
 from gsstream.testing.drive import draw, outputs
 from gsstream.testing.recording import SourceUnderTest
-from gsstream.testing.registry import BEHAVED, CONTRACTS, Skip, check, kind_of
+from gsstream.testing.registry import BEHAVED, Skip, check, kind_of
 
 ALL = tuple(CONTRACTS)
 #: Where an idea is from: every docstring of a part says it.

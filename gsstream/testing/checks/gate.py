@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import io
 from itertools import pairwise
 
 import torch
 
-from gsstream.core.state import GateState, edit_state
-from gsstream.core.topology import TopologyEdit
 from gsstream.gate.base import GateSampler
 from gsstream.testing.cases import world
 from gsstream.testing.compare import ROUNDING, all_equal, at_most, equal, finite
@@ -24,10 +21,10 @@ def _spread() -> torch.Tensor:
     return torch.linspace(-6, 6, 241)
 
 
-def _samples(part: GateSampler, state: GateState) -> list[tuple[str, torch.Tensor]]:
-    noise = draw(part, len(state.logits))
-    drawn = [] if noise is None else [("with noise", part.sample(state, noise))]
-    return [("without noise", part.sample(state, None)), *drawn]
+def _samples(part: GateSampler, logits: torch.Tensor) -> list[tuple[str, torch.Tensor]]:
+    noise = draw(part, len(logits))
+    drawn = [] if noise is None else [("with noise", part.sample(logits, noise))]
+    return [("without noise", part.sample(logits, None)), *drawn]
 
 
 @check("gate")
@@ -46,8 +43,8 @@ def check_gate_range_and_levels(part: GateSampler) -> None:
 def check_gate_init_calibrated(part: GateSampler) -> None:
     """A fresh gate opens at least as probably as the confidence says; a stochastic binary one, exactly so."""
     p = torch.linspace(0.01, 0.99, 99)
-    state = part.init(torch.logit(p))
-    opened = part.open_probability(state)
+    logits = part.init(torch.logit(p))
+    opened = part.open_probability(logits)
     at_most("confidence against open probability", p, opened, 1e-4, ROUNDING)
     if part.num_levels == 1 and part.claims().stochastic:
         equal("open probability of a binary gate", opened, p, 1e-4, ROUNDING)
@@ -57,9 +54,9 @@ def check_gate_init_calibrated(part: GateSampler) -> None:
 def check_gate_calibration(part: GateSampler) -> None:
     """Over 4096 draws the share of open gates is the open probability, within 4 standard deviations."""
     for p in PROBABILITIES:
-        state = part.init(torch.logit(torch.tensor(p)).expand(DRAWS).clone())
-        expected = float(part.open_probability(state)[0])
-        got = float((part.sample(state, draw(part, DRAWS)) > 0).float().mean())
+        logits = part.init(torch.logit(torch.tensor(p)).expand(DRAWS).clone())
+        expected = float(part.open_probability(logits)[0])
+        got = float((part.sample(logits, draw(part, DRAWS)) > 0).float().mean())
         sigma = max(expected * (1 - expected), 1 / DRAWS) ** 0.5 / DRAWS**0.5
         assert abs(got - expected) <= 4 * sigma, (
             f"confidence {p}: expected a share of {expected:.4f} open gates, got {got:.4f}; "
@@ -70,22 +67,22 @@ def check_gate_calibration(part: GateSampler) -> None:
 @check("gate", trait="stochastic")
 def check_gate_really_stochastic(part: GateSampler) -> None:
     """With noise, gates vary from draw to draw."""
-    state = part.init(torch.zeros(256))
-    first, second = (part.sample(state, draw(part, 256, seed)) for seed in (1, 2))
+    logits = part.init(torch.zeros(256))
+    first, second = (part.sample(logits, draw(part, 256, seed)) for seed in (1, 2))
     differ = int((first != second).sum())
     assert differ > 0, "gates of confidence 0.5 are the same in two draws of 256: the noise has no effect"
 
 
 @check("gate", trait="stochastic")
 def check_gate_noise_is_data(part: GateSampler) -> None:
-    """Sampling is a function of (state, noise); permuted noise permutes the gates; 65536 draws are finite."""
-    state = part.init(_spread())
-    noise = draw(part, len(state.logits))
+    """Sampling is a function of (logits, noise); permuted noise permutes the gates; 65536 draws are finite."""
+    logits = part.init(_spread())
+    noise = draw(part, len(logits))
     assert noise is not None, "claims to be stochastic, but noise is None"
     order = torch.randperm(len(noise), generator=torch.Generator().manual_seed(9))
-    gates = part.sample(state, noise)
-    equal("the same noise again", part.sample(state, noise), gates)
-    equal("permuted rows and noise", part.sample(GateState(state.logits[order]), noise[order]), gates[order])
+    gates = part.sample(logits, noise)
+    equal("the same noise again", part.sample(logits, noise), gates)
+    equal("permuted rows and noise", part.sample(logits[order], noise[order]), gates[order])
     many = draw(part, 65536)
     assert many is not None
     finite("65536 draws", many)
@@ -104,7 +101,7 @@ def check_gate_monotone(part: GateSampler) -> None:
 def check_gate_gradient_flow(part: GateSampler) -> None:
     """The gradient is finite, never negative, and alive for nine in ten logits within +-1, hard gates included."""
     logits = torch.linspace(-1, 1, 101, requires_grad=True)
-    for how, gates in _samples(part, GateState(logits)):
+    for how, gates in _samples(part, logits):
         assert gates.requires_grad, f"gates {how} carry no gradient"
         (gradient,) = torch.autograd.grad(gates.sum(), logits)
         finite(f"gradient {how}", gradient)
@@ -117,10 +114,10 @@ def check_gate_gradient_flow(part: GateSampler) -> None:
 @check("gate")
 def check_gate_extremes(part: GateSampler) -> None:
     """Logits of +-1e4 give gates in [0, 1], finite probabilities and finite gradients."""
-    for state in (part.init(torch.tensor([-1e4, 1e4])), GateState(torch.tensor([-1e4, 1e4]))):
-        logits = state.logits.detach().clone().requires_grad_(True)
-        gates = part.sample(GateState(logits), None)
-        probability = part.open_probability(GateState(logits))
+    for start in (part.init(torch.tensor([-1e4, 1e4])), torch.tensor([-1e4, 1e4])):
+        logits = start.detach().clone().requires_grad_(True)
+        gates = part.sample(logits, None)
+        probability = part.open_probability(logits)
         finite("open probability at +-1e4", probability)
         assert float(gates[1].detach()) == 1.0, f"logit 1e4: expected a gate of exactly 1.0, got {gates[1].item()!r}"
         total = (gates + probability).sum()
@@ -143,34 +140,31 @@ def check_gate_temperature_limit(part: GateSampler) -> None:
 
 @check("gate")
 def check_gate_deterministic_is_final(part: GateSampler) -> None:
-    """The transmitted gate, sample(state, None), does not depend on gradients being recorded."""
-    logits = part.init(_spread()).logits.detach()
+    """The transmitted gate, sample(logits, None), does not depend on gradients being recorded."""
+    logits = part.init(_spread()).detach()
     with torch.no_grad():
-        quiet = part.sample(GateState(logits), None)
-    recorded = part.sample(GateState(logits.clone().requires_grad_(True)), None).detach()
+        quiet = part.sample(logits, None)
+    recorded = part.sample(logits.clone().requires_grad_(True), None).detach()
     equal("gates with gradients recorded", recorded, quiet)
 
 
 @check("gate")
 def check_gate_bound(part: GateSampler) -> None:
-    """Bounds are a projection: bounding twice is bounding once, and a fresh state is within them."""
+    """Bounds are a projection: bounding twice is bounding once, and a fresh logits is within them."""
     fresh = part.init(_spread() * 10)
-    equal("bound(init(z))", part.bound(fresh).logits, fresh.logits)
-    once = part.bound(GateState(_spread() * 10))
-    equal("bound(bound(s))", part.bound(once).logits, once.logits)
-    at_most("order of bounded logits", once.logits[:-1], once.logits[1:], 0.0, "bounds keep the order")
+    equal("bound(init(z))", part.bound(fresh), fresh)
+    once = part.bound(_spread() * 10)
+    equal("bound(bound(z))", part.bound(once), once)
+    at_most("order of bounded logits", once[:-1], once[1:], 0.0, "bounds keep the order")
 
 
 @check("gate")
 def check_gate_state_resume(part: GateSampler) -> None:
-    """A state saved and loaded gives the same bits, and its rows follow an edit."""
-    state = part.init(world("cloud").logits)
-    buffer = io.BytesIO()
-    torch.save(state.logits, buffer)
-    buffer.seek(0)
-    loaded = type(state)(logits=torch.load(buffer, weights_only=True))
-    all_equal("loaded state", dict(_samples(part, loaded)), dict(_samples(part, state)))
-    edited = edit_state(state, TopologyEdit.keep(torch.zeros(len(state.logits), dtype=torch.bool)))
-    assert len(edited.logits) == len(state.logits), "gates live on nodes: an edit of Gaussians must not change them"
-    got = tuple(state.logits.shape)
-    assert got == (len(world("cloud").logits),), f"logits: expected one per node, got shape {list(got)}"
+    """The logits are all there is: one plain float32 tensor per node, and a copy of it gives the same gates."""
+    start = world("cloud").logits
+    logits = part.init(start)
+    assert type(logits) is torch.Tensor, f"init(): expected a plain torch.Tensor, got {type(logits).__name__}"
+    got = tuple(logits.shape)
+    assert got == (len(start),), f"init(): expected one logit per node, shape [{len(start)}], got {list(got)}"
+    copy = torch.from_numpy(logits.detach().numpy().copy())
+    all_equal("gates of copied logits", dict(_samples(part, copy)), dict(_samples(part, logits)))

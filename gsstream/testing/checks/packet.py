@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.delta import Delta, Layout, active_rows, apply_delta
+from gsstream.core.changes import Delta, Layout, active_rows, apply_delta
 from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray

@@ -7,7 +7,8 @@ from dataclasses import replace
 import torch
 
 from gsstream.core.cameras import Cameras
-from gsstream.render.base import Renderer, RenderOutput
+from gsstream.render.base import TILE, Renderer, RenderOutput
+from gsstream.render.reference import ALPHA_CUT, project
 from gsstream.testing.cases import BLACK, RENDERER, SIZE, Scene, fingerprint, world
 from gsstream.testing.compare import EXACT, at_most, equal, finite
 from gsstream.testing.registry import check
@@ -114,6 +115,48 @@ def check_renderer_screen_gradient(part: Renderer) -> None:
 
 
 @check("renderer")
+def check_renderer_visible(part: Renderer) -> None:
+    """Who has a gradient in marked tiles is visible in them, and the footprint of who is visible meets one of them."""
+    weights = torch.randn(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(7))
+    count = -(-SIZE // TILE)
+    first, last = (torch.arange(count * count).reshape(count, count) == place for place in (0, count * count - 1))
+    masks = (first, last, first | True)
+    for name in ("empty", "line", "cloud", "unseen"):
+        case = world(name)
+        session = part.open(case.gaussians, None, case.cameras, GREY)
+        for view in range(len(case.cameras)):
+            for mask in masks:
+                what = f"world {name!r}, camera {view}, tiles {mask.int().tolist()}"
+                seen = session.visible(view, mask)
+                shape = (tuple(seen.shape), seen.dtype)
+                assert shape == ((len(case.gaussians),), torch.bool), f"{what}: expected [N] bool, got {shape}"
+                inside = mask.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:SIZE, :SIZE, None]
+                moved = (session.screen_gradient(view, weights * inside).gradient != 0).any(1)
+                left_out = (moved & ~seen).nonzero()[:, 0].tolist()
+                assert not left_out, f"{what}: rows {left_out} have a gradient and are not visible"
+                reached = _reached(case.gaussians, case.cameras, view, mask)
+                too_many = (seen & ~reached).nonzero()[:, 0].tolist()
+                assert not too_many, f"{what}: rows {too_many} are visible and reach no marked tile"
+        session.narrow(torch.arange(0, len(case.gaussians), 9))
+        fresh = part.open(case.gaussians, None, case.cameras, GREY)
+        got, want = (each.visible(0, masks[-1]) for each in (session, fresh))
+        equal(f"world {name!r}: visible in the narrowed session", got, want)
+
+
+def _reached(scene: Scene, cameras: Cameras, view: int, mask: torch.Tensor) -> torch.Tensor:
+    """[N] bool: the box around alpha >= 1/255, made larger by a pixel, meets the pixel centres of a marked tile."""
+    means, conics, _, depths, opacities = project(scene.map(torch.Tensor.double), cameras, view)
+    reach = 2 * torch.log(opacities / ALPHA_CUT)
+    half = (reach[:, None].clamp_min(0) * torch.linalg.inv(conics).diagonal(dim1=1, dim2=2)).sqrt() + 1
+    found = torch.zeros(len(means), dtype=torch.bool)
+    for row, column in mask.nonzero().tolist():
+        # A tile at the image's edge counts whole: renderers draw blocks of pixels.
+        first = torch.tensor([column, row], dtype=torch.float64) * TILE + 0.5
+        found |= ((means + half >= first) & (means - half <= first + TILE - 1)).all(1)
+    return found & (depths > cameras.near) & (reach >= -0.01)
+
+
+@check("renderer")
 def check_renderer_session(part: Renderer) -> None:
     """A session whose active rows changed shows what a fresh render of the whole shows, with the same gradients."""
     case = world("cloud")
@@ -160,6 +203,10 @@ def check_renderer_commit(part: Renderer) -> None:
     last = _next(later, others)
     for view in range(len(case.cameras)):
         a, b = (each.screen_gradient(view, weights) for each in (kept, fresh))
+        first = torch.zeros(-(-SIZE // TILE), -(-SIZE // TILE), dtype=torch.bool)
+        first[0] = True
+        seen, expected = (each.visible(view, first) for each in (kept, fresh))
+        equal(f"camera {view}: visible in the upper tiles", seen, expected)
         # Sums of gradients may run in no fixed order; images may not differ.
         scale = float(b.gradient.abs().max()) or 1.0
         equal(f"camera {view}: screen gradient", a.gradient / scale, b.gradient / scale, 1e-5, SUMS)

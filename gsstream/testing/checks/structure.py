@@ -10,7 +10,6 @@ import torch
 from gsstream.core.errors import InputError
 from gsstream.core.frame import PointCloud
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.core.topology import TopologyEdit
 from gsstream.structure.base import Structure
 from gsstream.testing.cases import World, world
 from gsstream.testing.compare import finite
@@ -98,44 +97,6 @@ def check_structure_locality(part: Structure) -> None:
                 f"world {name!r}: members of node {node} are {span:.6g} apart; expected at most one root cell, "
                 f"{cell:.6g} (1e-5 of it for float32 cell borders)"
             )
-
-
-@check("structure", trait="stable")
-def check_structure_stable_update(part: Structure) -> None:
-    """The identity edit changes nothing; co-members stay together after a removal; a copy joins its source."""
-    case = world("cloud")
-    forest, n = _built(part, case), len(case.gaussians)
-    same = part.update(forest, TopologyEdit.keep(torch.ones(n, dtype=torch.bool)), case.gaussians)
-    for field in ("node_of", "parent", "level"):
-        got, want = getattr(same, field), getattr(forest, field)
-        assert torch.equal(got, want), f"the identity edit changed {field}: expected {want[:5]}, got {got[:5]}"
-    keep = torch.arange(n) % 3 != 0
-    less = part.update(forest, TopologyEdit.keep(keep), case.gaussians.rows(keep))
-    less.validate()
-    assert canonical(less.node_of) == canonical(forest.node_of[keep]), "survivors of a removal were grouped anew"
-    if int(torch.bincount(forest.node_of).max()) == 1:
-        return  # one node each: a copy cannot share its source's
-    source = torch.cat([torch.arange(n), torch.tensor([4])])
-    edit = TopologyEdit(source, source.new_zeros(n + 1, dtype=torch.bool))
-    more = part.update(forest, edit, case.gaussians.rows(source))
-    got, want = int(more.node_of[n]), int(more.node_of[4])
-    assert got == want, f"a copy of row 4 got node {got}; expected its source's, {want}"
-
-
-@check("structure")
-def check_structure_edits_compose(part: Structure) -> None:
-    """Two edits one after the other group as their composition does."""
-    case = world("cloud")
-    forest, n = _built(part, case), len(case.gaussians)
-    first = TopologyEdit.keep(torch.arange(n) % 4 != 0)
-    second = TopologyEdit.permute(torch.randperm(len(first.source), generator=torch.Generator().manual_seed(2)))
-    both = first.then(second)
-    middle = part.update(forest, first, case.gaussians.rows(first.source))
-    stepwise = part.update(middle, second, case.gaussians.rows(both.source))
-    at_once = part.update(forest, both, case.gaussians.rows(both.source))
-    a, b = canonical(stepwise.node_of), canonical(at_once.node_of)
-    assert a == b, f"two edits and their composition disagree on {sum(x != y for x, y in zip(a, b, strict=True))} rows"
-    assert stepwise.num_nodes == at_once.num_nodes, f"nodes: {stepwise.num_nodes} and {at_once.num_nodes}"
 
 
 @check("structure", trait="idempotent")

@@ -7,11 +7,12 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
-from gsstream.core.delta import Delta, Layout, active_rows, apply_delta
+from gsstream.core.changes import Delta, Layout, active_rows, apply_delta
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.packet import quantise_decoders
 from gsstream.packet.base import MAX_CHANNELS
-from gsstream.residual.base import UpdateRule, apply_residual, init_latents, symbols
+from gsstream.residual.base import UpdateRule, init_latents, symbols
+from gsstream.residual.joint import add_joint, decode_joint, join_features, joint_code
 from gsstream.testing.cases import fingerprint, world
 from gsstream.testing.compare import equal
 from gsstream.testing.registry import check
@@ -74,7 +75,11 @@ def check_update_closed_loop(part: UpdateRule) -> None:
         name: codes[name].step * 3 * torch.randn(value.shape, generator=g)
         for name, value in init_latents(part, case.gaussians).items()
     }
-    trained = apply_residual(part, case.gaussians, level / LEVELS, latents, decoders, torch.full((n,), 0.25))
+    code = joint_code(codes, latents, decoders, case.gaussians)
+    table = torch.cat(list(latents.values()), 1) if latents else torch.zeros(n, 0)
+    change = decode_joint(code, table, code.join_decoders(decoders), torch.full((n,), 0.25))
+    features = join_features(code, case.gaussians)
+    trained = add_joint(code, case.gaussians, features, change, level / LEVELS)
     rows = active_rows(layout, level.numpy())
     integers: Mapping[str, torch.Tensor] = symbols(codes, latents)
     delta = Delta(

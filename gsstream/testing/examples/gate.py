@@ -7,7 +7,7 @@ from typing import final
 import torch
 from pydantic import Field
 
-from gsstream.api import GateSampler, GateState, PartConfig, Traits, check_finite
+from gsstream.api import GateSampler, PartConfig, Traits, check_finite
 
 
 @final
@@ -27,22 +27,22 @@ class ExampleGate(GateSampler):
     def num_levels(self) -> int:
         return 1
 
-    def init(self, logits: torch.Tensor) -> GateState:
+    def init(self, logits: torch.Tensor) -> torch.Tensor:
         check_finite("logits", logits)
-        return self.bound(GateState(logits=logits.detach()))
+        return self.bound(logits.detach())
 
     def noise(self, num_nodes: int, generator: torch.Generator) -> torch.Tensor | None:
         # Half a step away from 0 and 1, where the logarithms would be infinite.
         u = torch.rand(num_nodes, generator=generator).double() + 2.0**-25
         return (torch.log(u) - torch.log1p(-u)).float()
 
-    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
-        z = state.logits if noise is None else state.logits + noise.to(state.logits.dtype)
+    def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
+        z = logits if noise is None else logits + noise.to(logits.dtype)
         soft = torch.sigmoid(z / self.config.temperature)
         return (z.detach() > 0).to(z.dtype) + (soft - soft.detach())
 
-    def open_probability(self, state: GateState) -> torch.Tensor:
-        return torch.sigmoid(state.logits)
+    def open_probability(self, logits: torch.Tensor) -> torch.Tensor:
+        return torch.sigmoid(logits)
 
-    def bound(self, state: GateState) -> GateState:
-        return GateState(logits=state.logits.clamp(-self.config.bound, self.config.bound))
+    def bound(self, logits: torch.Tensor) -> torch.Tensor:
+        return logits.clamp(-self.config.bound, self.config.bound)

@@ -16,7 +16,6 @@ from gsstream.api import (
     PartConfig,
     PointCloud,
     Structure,
-    TopologyEdit,
     Traits,
     check_finite,
 )
@@ -29,7 +28,7 @@ class ExampleStructure(Structure):
     class Config(PartConfig):
         cells: int = Field(default=32, ge=1, le=65536, description="cells along the longest side of the points")
 
-    traits = Traits(stable=True, idempotent=True, local=True)
+    traits = Traits(idempotent=True, local=True)
 
     def seed(self, points: PointCloud, cameras: Cameras) -> Anchors:
         if len(points) == 0:
@@ -49,14 +48,6 @@ class ExampleStructure(Structure):
         means = gaussians.means.detach()
         check_finite("means", means)
         cells = torch.floor((means.double() - anchors.origin.double()) / float(anchors.cell_sizes[0])).long()
-        return _nodes(torch.unique(cells, dim=0, return_inverse=True)[1])
-
-    def update(self, hierarchy: Hierarchy, edit: TopologyEdit, gaussians: Gaussians[torch.Tensor]) -> Hierarchy:
-        return _nodes(hierarchy.node_of[edit.source])
-
-
-def _nodes(labels: torch.Tensor) -> Hierarchy:
-    """One root per label that occurs, in ascending order."""
-    names, node_of = torch.unique(labels, return_inverse=True)
-    index = torch.arange(len(names))
-    return Hierarchy(node_of, index, torch.zeros_like(index))
+        occupied, node_of = torch.unique(cells, dim=0, return_inverse=True)
+        index = torch.arange(len(occupied))
+        return Hierarchy(node_of, index, torch.zeros_like(index))

@@ -8,7 +8,6 @@ from typing import Any, final
 import torch
 
 from gsstream.core.auto import Choice, SceneFacts
-from gsstream.core.state import GateState
 from gsstream.testing.examples.confidence import ExampleConfidence
 from gsstream.testing.examples.gate import ExampleGate
 from gsstream.testing.examples.propagation import ExamplePropagation
@@ -75,8 +74,8 @@ class Gambler(Gate):
 class Narrow(Gate):
     """Gates are float32, whatever the logits are."""
 
-    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
-        gates: torch.Tensor = super().sample(state, noise)
+    def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
+        gates: torch.Tensor = super().sample(logits, noise)
         return gates.float()
 
 
@@ -84,10 +83,10 @@ class Narrow(Gate):
 class NeverEmpty(Gate):
     """Takes the maximum of no logits."""
 
-    def init(self, logits: torch.Tensor) -> GateState:
+    def init(self, logits: torch.Tensor) -> torch.Tensor:
         logits.max()
-        state: GateState = super().init(logits)
-        return state
+        start: torch.Tensor = super().init(logits)
+        return start
 
 
 @spoils("check_rejects_nonfinite")

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 
-from gsstream.core.state import GateState, rows
 from gsstream.testing.examples.gate import ExampleGate
 from gsstream.testing.saboteurs.register import spoils
 
@@ -18,8 +16,8 @@ Gate: Any = ExampleGate
 class AlmostClosed(Gate):
     """A closed gate is not exactly 0, so no row can be left out."""
 
-    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
-        gates: torch.Tensor = super().sample(state, noise)
+    def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
+        gates: torch.Tensor = super().sample(logits, noise)
         return gates - 1e-8 * (gates.detach() == 0)
 
 
@@ -27,9 +25,9 @@ class AlmostClosed(Gate):
 class Sceptic(Gate):
     """Starts half a logit below the confidence."""
 
-    def init(self, logits: torch.Tensor) -> GateState:
-        state: GateState = super().init(logits - 0.5)
-        return state
+    def init(self, logits: torch.Tensor) -> torch.Tensor:
+        start: torch.Tensor = super().init(logits - 0.5)
+        return start
 
 
 @spoils("check_gate_calibration")
@@ -55,8 +53,8 @@ class Table(Gate):
 class Neighbour(Gate):
     """Every gate uses the noise of the gate before it."""
 
-    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
-        gates: torch.Tensor = super().sample(state, None if noise is None else noise.roll(1))
+    def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
+        gates: torch.Tensor = super().sample(logits, None if noise is None else noise.roll(1))
         return gates
 
 
@@ -64,17 +62,17 @@ class Neighbour(Gate):
 class Doubtful(Gate):
     """The surest gates say that they are less sure."""
 
-    def open_probability(self, state: GateState) -> torch.Tensor:
-        p: torch.Tensor = super().open_probability(state)
-        return torch.where(state.logits > 6.2, 0.99 * p, p)
+    def open_probability(self, logits: torch.Tensor) -> torch.Tensor:
+        p: torch.Tensor = super().open_probability(logits)
+        return torch.where(logits > 6.2, 0.99 * p, p)
 
 
 @spoils("check_gate_gradient_flow")
 class Clamped(Gate):
     """A clamp after rounding, as released: a gate at 0 or 1 has no gradient."""
 
-    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
-        gates: torch.Tensor = super().sample(state, noise)
+    def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
+        gates: torch.Tensor = super().sample(logits, noise)
         return gates.detach() + 0.0 * (gates - gates.detach())
 
 
@@ -82,9 +80,9 @@ class Clamped(Gate):
 class Overflow(Gate):
     """The sigmoid as exp(z) / (1 + exp(z)): infinity over infinity for large logits."""
 
-    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
-        gates: torch.Tensor = super().sample(state, noise)
-        power = torch.exp(state.logits / self.config.temperature)
+    def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
+        gates: torch.Tensor = super().sample(logits, noise)
+        power = torch.exp(logits / self.config.temperature)
         soft = power / (1 + power)
         return gates + 0 * (soft - soft.detach())
 
@@ -97,8 +95,8 @@ class Thaw(Gate):
     def num_levels(self) -> int:
         return 10 if self.config.temperature < 0.2 else 1
 
-    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
-        gates: torch.Tensor = super().sample(state, noise)
+    def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
+        gates: torch.Tensor = super().sample(logits, noise)
         return 0.9 * gates if self.num_levels == 10 else gates
 
 
@@ -106,9 +104,9 @@ class Thaw(Gate):
 class TwoFaced(Gate):
     """A higher threshold while no gradient is recorded: the packet gets other gates than the loss."""
 
-    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
-        shift = 0.0 if state.logits.requires_grad or noise is not None else -0.2
-        gates: torch.Tensor = super().sample(GateState(state.logits + shift), noise)
+    def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
+        shift = 0.0 if logits.requires_grad or noise is not None else -0.2
+        gates: torch.Tensor = super().sample(logits + shift, noise)
         return gates
 
 
@@ -116,31 +114,28 @@ class TwoFaced(Gate):
 class Creeping(Gate):
     """Bounding again moves large logits a little further."""
 
-    def init(self, logits: torch.Tensor) -> GateState:
+    def init(self, logits: torch.Tensor) -> torch.Tensor:
         super().init(logits)
-        return GateState(logits.detach().clamp(-7, 7))
+        return logits.detach().clamp(-7, 7)
 
-    def bound(self, state: GateState) -> GateState:
-        bounded: torch.Tensor = super().bound(state).logits
-        return GateState(torch.where(bounded.abs() > 6.5, bounded - 0.1 * (bounded - 6.5 * bounded.sign()), bounded))
+    def bound(self, logits: torch.Tensor) -> torch.Tensor:
+        bounded: torch.Tensor = super().bound(logits)
+        return torch.where(bounded.abs() > 6.5, bounded - 0.1 * (bounded - 6.5 * bounded.sign()), bounded)
 
 
-@dataclass(frozen=True)
-class Smuggled(GateState):
-    """A state with a field that nobody saves."""
-
-    shift: torch.Tensor | None = rows(None, default=None)
+class Smuggled(torch.Tensor):
+    """Logits with a note that nobody saves."""
 
 
 @spoils("check_gate_state_resume")
 class Smuggler(Gate):
-    """Hides something in its state that is lost when the state is saved."""
+    """Hides something in its logits that is lost when they are copied."""
 
-    def init(self, logits: torch.Tensor) -> GateState:
-        state: GateState = super().init(logits)
-        return Smuggled(state.logits, torch.tensor(0.3) if len(logits) == 200 else None)
+    def init(self, logits: torch.Tensor) -> torch.Tensor:
+        start: torch.Tensor = super().init(logits)
+        return start.as_subclass(Smuggled) if len(logits) == 200 else start
 
-    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
-        shift = getattr(state, "shift", None)
-        gates: torch.Tensor = super().sample(state if shift is None else GateState(state.logits + shift), noise)
+    def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
+        shift = 0.3 if isinstance(logits, Smuggled) else 0.0
+        gates: torch.Tensor = super().sample(logits.as_subclass(torch.Tensor) + shift, noise)
         return gates

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gsstream.core.delta import active_rows
+from gsstream.core.changes import active_rows
 from gsstream.core.errors import PacketError
 from gsstream.packet import EncodedPacket, PlayerState, decode_packet, encode_delta
 from gsstream.packet.base import parse_header

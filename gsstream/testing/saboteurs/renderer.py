@@ -59,6 +59,24 @@ class Normalised(Reference):
         return pulled._replace(gradient=pulled.gradient * cameras.width / 2)
 
 
+class _SeesEverywhere(Session):
+    def visible(self, view: int, tiles: torch.Tensor) -> torch.Tensor:
+        found: torch.Tensor = super().visible(view, torch.ones_like(tiles))
+        return found
+
+    def commit(self, gaussians: Any, changed: torch.Tensor) -> RenderSession:
+        return _SeesEverywhere(self._renderer, gaussians, None, self._cameras, self._background)
+
+
+@spoils("check_renderer_visible")
+class Unmasked(Reference):
+    """Names everyone who is drawn anywhere in the image, whichever tiles are asked about."""
+
+    def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
+        session: RenderSession = _SeesEverywhere(self, gaussians, active, cameras, background)
+        return session
+
+
 class _StaleOpacities(Session):
     def render(self, view: int, rows: Any, **options: Any) -> RenderOutput:
         if self._active is not None:

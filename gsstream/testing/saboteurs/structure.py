@@ -17,14 +17,6 @@ Structure: Any = ExampleStructure
 LINE = 20
 
 
-def _merge(forest: Hierarchy, which: torch.Tensor) -> Hierarchy:
-    """The forest with the marked nodes made one."""
-    label = torch.where(which, which.nonzero()[0, 0], torch.arange(forest.num_nodes))
-    _, label = torch.unique(label, return_inverse=True)
-    index = torch.arange(int(label.max()) + 1)
-    return Hierarchy(label[forest.node_of], index, torch.zeros_like(index))
-
-
 @spoils("check_structure_partition")
 class Barren(Structure):
     """A node without member or child."""
@@ -69,28 +61,6 @@ class Wide(Structure):
         wide = 3 if len(gaussians) == LINE else 1
         forest: Hierarchy = super().build(gaussians, replace(anchors, cell_sizes=wide * anchors.cell_sizes))
         return forest
-
-
-@spoils("check_structure_stable_update")
-class Restless(Structure):
-    """Renames all nodes when nothing is edited."""
-
-    def update(self, hierarchy: Hierarchy, edit: Any, gaussians: Any) -> Hierarchy:
-        forest: Hierarchy = super().update(hierarchy, edit, gaussians)
-        if not torch.equal(edit.source, torch.arange(hierarchy.num_gaussians)):
-            return forest
-        return replace(forest, node_of=forest.num_nodes - 1 - forest.node_of)
-
-
-@spoils("check_structure_edits_compose")
-class Forgetful(Structure):
-    """Puts all Gaussians into one node at the second edit in a row."""
-
-    def update(self, hierarchy: Hierarchy, edit: Any, gaussians: Any) -> Hierarchy:
-        forest: Hierarchy = super().update(hierarchy, edit, gaussians)
-        if hierarchy.num_gaussians == 200:
-            return forest
-        return _merge(forest, torch.ones(forest.num_nodes, dtype=torch.bool))
 
 
 @spoils("check_structure_idempotent")

@@ -170,8 +170,9 @@ def write_sheets(folder: Path, data: SweepData, scenes: Sequence[str], recording
 
     from gsstream.engine.run.recording import reopen_recording
     from gsstream.plugins.catalog import load_catalog
-    from gsstream.trade.contact_sheet import sheet_of_stream
-    from gsstream.trade.sweep.drive import cell_file, recording_uri
+    from gsstream.trade.jobs.folder import recording_uri
+    from gsstream.trade.show.contact_sheet import sheet_of_stream
+    from gsstream.trade.sweep.drive import cell_file
 
     out, catalog = {}, load_catalog()
     uris = {scene["name"]: scene["uri"] for scene in data.config["scenes"]}

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsstream.core.errors import OutputError
-from gsstream.trade.summary import format_table
+from gsstream.trade.measure.summary import format_table
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,10 +14,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
-from gsstream.trade.plots import COLORS, plot_runs
 from gsstream.trade.report.fronts import knee, pareto_front
 from gsstream.trade.report.groups import Group, seed_noise, waited
 from gsstream.trade.report.quantities import BY_KEY, COSTS, GOODS
+from gsstream.trade.show.plots import COLORS, plot_runs
 
 _CURVES = len(COLORS)
 

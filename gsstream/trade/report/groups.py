@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gsstream.core.errors import InputError
-from gsstream.trade.records import FrameRecord, record_of
+from gsstream.trade.measure.records import FrameRecord, record_of
 from gsstream.trade.report.quantities import QUANTITIES, values_of
 from gsstream.trade.sweep.table import TableData, read_table
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from gsstream.metrics import total_joules
-from gsstream.trade.records import FrameRecord, mean
-from gsstream.trade.summary import Summary, summarise
+from gsstream.trade.measure.records import FrameRecord, mean
+from gsstream.trade.measure.summary import Summary, summarise
 
 Row = Mapping[str, Any]
 

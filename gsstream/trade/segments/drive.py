@@ -11,12 +11,12 @@ from pathlib import Path
 from gsstream.core.errors import GsstreamError
 from gsstream.engine.run.session import METRICS, RECIPE
 from gsstream.recipe.load import ResolvedRecipe
-from gsstream.trade.records import read_lines
+from gsstream.trade.jobs.base import Executor, Finished
+from gsstream.trade.jobs.schedule import finished_tasks
+from gsstream.trade.measure.records import read_lines
 from gsstream.trade.segments.job import SegmentJob, SegmentOutcome
 from gsstream.trade.segments.join import Seam, join, seams
 from gsstream.trade.segments.plan import STREAM, SegmentPlan, Task
-from gsstream.trade.sweep.executor import Executor, Finished
-from gsstream.trade.sweep.schedule import finished_tasks
 
 KEY_STREAMS = "first.gss"
 

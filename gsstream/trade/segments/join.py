@@ -10,7 +10,7 @@ from typing import Any
 
 from gsstream.core.errors import OutputError, PacketError
 from gsstream.packet import EncodedPacket, PacketKind, StreamReader, StreamWriter
-from gsstream.trade.records import mean
+from gsstream.trade.measure.records import mean
 
 
 @dataclass(frozen=True, slots=True)

@@ -61,12 +61,24 @@ class Variant(Section):
     name: str = Field(pattern=_NAME, description="name in tables")
     method: str | None = Field(default=None, description="method whose recipe it starts from; default: the file's")
     recipe: str | None = Field(default=None, description="recipe file, relative to the sweep's file")
+    base: str | None = Field(
+        default=None,
+        pattern=r"^[^#]+(#[^#]+)?$",
+        description="FILE or FILE#NAME: start from the variant of that name (default: this one's) in another sweep's "
+        "file, without the settings that file makes for all",
+    )
     set: dict[str, Any] = Field(default_factory=dict, description="recipe keys, e.g. stream.epochs: 10")
     axes: dict[str, Axis] = Field(default_factory=dict, description="axes of this variant, besides those of all")
     base_seeds: list[int] = Field(
         default_factory=list,
         description="search 'each': further seeds of the variant as it is, to tell differences from noise",
     )
+
+    @model_validator(mode="after")
+    def _one_start(self) -> Variant:
+        if self.base and (self.method or self.recipe):
+            raise ValueError(f"variant {self.name}: base brings method and recipe file along; leave them out")
+        return self
 
 
 class FirstFrame(Section):

@@ -7,21 +7,21 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from gsstream.core.errors import OutputError
-from gsstream.trade.records import mean
-from gsstream.trade.sweep.executor import Executor, Finished
+from gsstream.trade.jobs.base import Executor, Finished
+from gsstream.trade.jobs.folder import only_one, recording_uri
+from gsstream.trade.jobs.schedule import finished_tasks
+from gsstream.trade.measure.records import mean
 from gsstream.trade.sweep.job import Job, Outcome
 from gsstream.trade.sweep.plan import Cell, FirstFrameRun, Plan
-from gsstream.trade.sweep.schedule import finished_tasks
 from gsstream.trade.sweep.table import FORMAT, TableWriter
 
-FIRST_FRAMES, CELLS, WORK, LOCK = "first_frames", "cells", "work", "sweep.lock"
+FIRST_FRAMES, CELLS, WORK = "first_frames", "cells", "work"
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,26 +203,3 @@ def summary_line(frames: Sequence[Mapping[str, Any]]) -> str:
 
 def _seconds(outcome: Outcome) -> float:
     return float(sum(outcome.frames[0]["seconds"].values()))
-
-
-def recording_uri(uri: str, data: Path | None) -> str:
-    """The recording as a worker opens it, wherever it works: a relative folder lies in ``data``, or here."""
-    scheme, colon, rest = uri.rpartition(":")
-    folder = (data or Path()) / rest
-    return f"{scheme}{colon}{folder.resolve()}" if uri != "demo" and rest and folder.is_dir() else uri
-
-
-@contextmanager
-def only_one(out: Path, what: str) -> Iterator[None]:
-    """Hold the folder for one sweep or run; the lock goes with the process, however it ends."""
-    try:
-        import fcntl
-    except ImportError:  # no such lock on this system: nobody is kept out
-        yield
-        return
-    with (out / LOCK).open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise OutputError(f"another {what} works in {out}; wait for it, or choose another --out") from error
-        yield

@@ -22,7 +22,7 @@ from gsstream.trade.sweep.config import Measure
 if TYPE_CHECKING:
     from gsstream.engine.assembly.assemble import Assembly
     from gsstream.source.base import FrameSource
-    from gsstream.trade.evaluate import Evaluation
+    from gsstream.trade.measure.evaluate import Evaluation
 
 #: What says where a view belongs; the rest of it are numbers. Extra metrics are numbers, too, by their own names.
 _PLACE = ("frame", "camera", "extra")
@@ -99,7 +99,7 @@ def _run(job: Job, folder: Path) -> Outcome:
         (folder / "first.gss").write_bytes(job.first_frame)
         first = read_first_frame(folder / "first.gss")
     recording = open_recording(job.uri, parts.recipe, catalog)
-    import gsstream.trade.sweep.warm  # noqa: F401  # what torch imports late is not part of any frame's time
+    import gsstream.trade.jobs.warm  # noqa: F401  # what torch imports late is not part of any frame's time
 
     try:
         with EnergyMeter() if job.alone else contextlib.nullcontext() as energy:
@@ -123,8 +123,8 @@ def _run(job: Job, folder: Path) -> Outcome:
 def _measure(measure: Measure, stream: Path, recording: FrameSource, frames: list[dict[str, Any]]) -> dict[str, Any]:
     """Measure decoded frames; their values go into ``frames``. Returns facts about the whole stream."""
     from gsstream.metrics import SSIM_VARIANT, OnnxLpips
-    from gsstream.trade.evaluate import evaluate
-    from gsstream.trade.extras import VARIANTS, extras
+    from gsstream.trade.measure.evaluate import evaluate
+    from gsstream.trade.measure.extras import VARIANTS, extras
 
     if len(recording.info.test) == 0:
         return {"not_measured": "the recording has no test cameras"}
@@ -172,7 +172,7 @@ def _machine(parts: Assembly) -> tuple[dict[str, Any], dict[str, Any]]:
     """(what stays, what changes from run to run) of the machine and the code."""
     from importlib.metadata import version
 
-    from gsstream.trade.bench_report import machine_facts
+    from gsstream.trade.jobs.machine import machine_facts
 
     facts = machine_facts()
     when = {name: facts.pop(name) for name in ("date", "load_average")}

@@ -15,6 +15,7 @@ from typing import Any
 from gsstream.recipe.document import Layer, Leaf, Origin
 from gsstream.recipe.load import FindMethod, ResolvedRecipe, recipe_hash, resolve_recipe
 from gsstream.trade.sweep.config import Axis, Range, Scene, SweepConfig, Variant, flat_settings
+from gsstream.trade.sweep.rows import with_bases
 
 #: Sections of a recipe that say nothing of frame 0; a section that nobody thought of counts as one that does.
 LATER_KEYS = (
@@ -90,11 +91,12 @@ def make_plan(config: SweepConfig, folder: Path, find_method: FindMethod) -> Pla
     """Resolve every cell of a sweep.
 
     Arguments:
-        folder: where the sweep's file lies; recipe files are relative to it.
+        folder: where the sweep's file lies; recipe files and bases of variants are relative to it.
         find_method: name -> recipe file (``Catalog.recipe_path``).
 
-    Raises RecipeError for keys and values that no recipe has, UnknownName for methods.
+    Raises RecipeError for keys and values that no recipe has, UnknownName for methods and bases of variants.
     """
+    config = with_bases(config, folder)
     points: list[Cell] = []
     firsts: dict[str, FirstFrameRun] = {}
     for scene, seed in itertools.product(config.scenes, _all_seeds(config)):

@@ -8,7 +8,7 @@ from gsstream_binary_ste.binary import BinarySteGate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsstream.api import GateState, ShapeError
+from gsstream.api import ShapeError
 
 Config = BinarySteGate.Config
 
@@ -17,46 +17,45 @@ Config = BinarySteGate.Config
 def test_the_temperature_does_not_change_how_often_a_gate_opens(temperature: float) -> None:
     part = BinarySteGate(Config(temperature=temperature))
     for p in (0.1, 0.5, 0.9):
-        state = part.init(torch.logit(torch.tensor(p)).expand(20_000).clone())
+        logits = part.init(torch.logit(torch.tensor(p)).expand(20_000).clone())
         noise = part.noise(20_000, torch.Generator().manual_seed(1))
-        share = float(part.sample(state, noise).mean())
+        share = float(part.sample(logits, noise).mean())
         assert abs(share - p) < 4 * (p * (1 - p) / 20_000) ** 0.5
 
 
 @settings(max_examples=100, deadline=None)
 @given(z=st.floats(-50, 50, width=32), n=st.floats(-17, 17, width=32))
 def test_gates_are_exactly_0_or_1_and_follow_the_sign(z: float, n: float) -> None:
-    gate = BinarySteGate().sample(GateState(torch.tensor([z])), torch.tensor([n]))
+    gate = BinarySteGate().sample(torch.tensor([z]), torch.tensor([n]))
     assert float(gate) == float(torch.tensor([z]) + torch.tensor([n]) > 0)
 
 
 def test_the_gradient_is_that_of_the_soft_gate() -> None:
     part = BinarySteGate()
     z = torch.linspace(-2, 2, 9, dtype=torch.float64, requires_grad=True)
-    (got,) = torch.autograd.grad(part.sample(GateState(z), None).sum(), z)
+    (got,) = torch.autograd.grad(part.sample(z, None).sum(), z)
     soft = torch.sigmoid(z.detach() / 0.3)
     assert torch.allclose(got, soft * (1 - soft) / 0.3, rtol=1e-12)
-    blocked = BinarySteGate(Config(clamp_gradient=True)).sample(GateState(z), None)
+    blocked = BinarySteGate(Config(clamp_gradient=True)).sample(z, None)
     assert torch.equal(torch.autograd.grad(blocked.sum(), z)[0], torch.zeros_like(z))
 
 
 def open_after_training(part: BinarySteGate) -> tuple[int, int]:
     """(needed, needless) gates open after training: 40 of 200 gates lower the error when open, all have a price."""
     needed = torch.arange(200) % 5 == 0
-    state = part.init(torch.zeros(200))
-    logits = state.logits.clone().requires_grad_(True)
+    logits = part.init(torch.zeros(200)).clone().requires_grad_(True)
     optimiser = torch.optim.Adam([logits], lr=0.1)
     generator = torch.Generator().manual_seed(0)
     for _ in range(150):
-        gates = part.sample(GateState(logits), part.noise(200, generator))
+        gates = part.sample(logits, part.noise(200, generator))
         error = torch.where(needed, 1 - gates, gates * 0.0).sum()
-        price = 0.2 * part.open_probability(GateState(logits)).sum()
+        price = 0.2 * part.open_probability(logits).sum()
         optimiser.zero_grad()
         (error + price).backward()
         optimiser.step()
         with torch.no_grad():
-            logits.copy_(part.bound(GateState(logits)).logits)
-    opened = part.sample(GateState(logits.detach()), None) > 0
+            logits.copy_(part.bound(logits))
+    opened = part.sample(logits.detach(), None) > 0
     return int(opened[needed].sum()), int(opened[~needed].sum())
 
 

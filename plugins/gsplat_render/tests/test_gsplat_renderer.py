@@ -131,6 +131,21 @@ def test_screen_gradient_agrees_with_the_reference(backend: Backend) -> None:
     assert 0 < int(got.visible.sum()) < N
 
 
+def test_visible_in_tiles_agrees_with_the_reference(backend: Backend) -> None:
+    """But for rows at a cut; gsplat leaves out the Gaussian that would take the transmittance below 1e-4."""
+    session = open_session(backend, scene(), torch.tensor([90, 3, 40, 41]))
+    truth = ReferenceRenderer().open(scene().map(torch.Tensor.double), None, rig(), BACKGROUND)
+    for place in range(12):
+        tiles = (torch.arange(12) == place).reshape(3, 4)
+        got, want = session.visible(0, tiles), truth.visible(0, tiles)
+        assert int((got != want).sum()) <= 2
+        assert got.shape == (N,)
+    assert not bool(session.visible(0, torch.zeros(3, 4, dtype=torch.bool)).any())
+    assert bool(session.visible(0, torch.ones(3, 4, dtype=torch.bool)).any())
+    with pytest.raises(ShapeError, match=r"tiles: expected bool \[3, 4\]"):
+        session.visible(0, torch.ones(4, 3, dtype=torch.bool))
+
+
 def test_a_session_of_some_rows_equals_the_whole_scene(backend: Backend) -> None:
     base, moved = scene(), scene(seed=1)
     active = torch.tensor([90, 3, 40, 41])

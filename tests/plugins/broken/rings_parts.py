@@ -6,7 +6,7 @@ from typing import final
 import torch
 from pydantic import Field
 
-from gsstream.api import ConfidenceEstimator, GateSampler, GateState, PartConfig, Propagation, Regularizer, ShapeError
+from gsstream.api import ConfidenceEstimator, GateSampler, PartConfig, Propagation, Regularizer, ShapeError
 
 FIRST_BAD_FRAME = 3
 
@@ -25,19 +25,19 @@ class Sound(GateSampler):
     num_levels = 1
 
     def init(self, logits):
-        return GateState(logits.detach())
+        return logits.detach()
 
     def noise(self, num_nodes, generator):
         return None
 
-    def sample(self, state, noise):
-        return torch.ones_like(state.logits)
+    def sample(self, logits, noise):
+        return torch.ones_like(logits)
 
-    def open_probability(self, state):
-        return torch.ones_like(state.logits)
+    def open_probability(self, logits):
+        return torch.ones_like(logits)
 
-    def bound(self, state):
-        return state
+    def bound(self, logits):
+        return logits
 
 
 @final
@@ -89,10 +89,10 @@ class Tripping(GateSampler):
     num_levels = 1
     init, noise, open_probability, bound = Sound.init, Sound.noise, Sound.open_probability, Sound.bound
 
-    def sample(self, state, noise):
+    def sample(self, logits, noise):
         if broken():
             raise RuntimeError("out of luck")
-        return torch.ones_like(state.logits)
+        return torch.ones_like(logits)
 
 
 @final

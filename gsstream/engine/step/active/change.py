@@ -1,13 +1,4 @@
-"""What may change in a frame: cost follows change.
-
-A tile has changed when enough of its pixels differ from the last frame beyond the camera's measured noise. A Gaussian
-takes part when it is visible in a changed tile of some training view, its centre lies in or beside changed tiles in
-enough of the views that it projects into, and its gate may open. Everything else is frozen: it is neither projected nor
-optimised nor sent.
-
-The vote is what keeps many cameras from making everything suspect: a wall is behind a moving person in some view, but
-only what moves is in changed tiles in most of them (the idea of a visual hull).
-"""
+"""Which tiles of which views changed since the last frame, beyond the measured noise of their camera."""
 
 from __future__ import annotations
 
@@ -19,7 +10,7 @@ import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame
-from gsstream.core.shapes import FloatArray
+from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.core.storage import unpacked
 from gsstream.metrics.noise import MAD_TO_SIGMA, median_deviation
 from gsstream.render.base import TILE
@@ -101,16 +92,26 @@ def _changed(before: FloatArray, after: FloatArray, threshold: float) -> BoolArr
     """[rows, columns] bool of one view."""
     means = _block_means(after - before)
     sigma = min(max(min(MAD_TO_SIGMA * float(median_deviation(means)), _rough(means)), LEAST_SIGMA), MOST_SIGMA)
-    moved = (np.abs(means) > threshold * sigma).any(-1)
-    side = TILE // BLOCK
-    rows, columns = -(-moved.shape[0] // side), -(-moved.shape[1] // side)
-    padded = np.zeros((rows * side, columns * side), bool)
-    padded[: moved.shape[0], : moved.shape[1]] = moved
-    # A tile cut off by the border has fewer blocks to show a change with.
-    inside = np.zeros_like(padded)
-    inside[: moved.shape[0], : moved.shape[1]] = True
-    count, blocks = (x.reshape(rows, side, columns, side).sum((1, 3)) for x in (padded, inside))
+    moved: BoolArray = np.asarray((np.abs(means) > threshold * sigma).any(-1))
+    count, blocks = marked_per_tile(moved, TILE // BLOCK)
     return np.asarray(count >= np.minimum(LEAST_BLOCKS, blocks))
+
+
+def marked_per_tile(marked: BoolArray, side: int = TILE) -> tuple[IntArray, IntArray]:
+    """Count what is marked in each tile: ([rows, columns] how many are, and how many there are).
+
+    A tile cut off by the border has fewer to show a change with.
+
+    Arguments:
+        marked: [H, W] bool, pixels or blocks of them. side: of a tile, in these.
+    """
+    rows, columns = -(-marked.shape[0] // side), -(-marked.shape[1] // side)
+    padded = np.zeros((rows * side, columns * side), bool)
+    padded[: marked.shape[0], : marked.shape[1]] = marked
+    inside = np.zeros_like(padded)
+    inside[: marked.shape[0], : marked.shape[1]] = True
+    count, number = (x.reshape(rows, side, columns, side).sum((1, 3)) for x in (padded, inside))
+    return count, number
 
 
 def _rough(means: FloatArray) -> float:

@@ -9,7 +9,7 @@ from typing import Literal, final
 import torch
 from pydantic import Field
 
-from gsstream.api import GateSampler, GateState, PartConfig, Traits, check_finite
+from gsstream.api import GateSampler, PartConfig, Traits, check_finite
 
 
 @final
@@ -48,10 +48,10 @@ class BinarySteGate(GateSampler):
     def num_levels(self) -> int:
         return 1
 
-    def init(self, logits: torch.Tensor) -> GateState:
+    def init(self, logits: torch.Tensor) -> torch.Tensor:
         """Start from confidence logits [M], limited to the documented bound. Raises ShapeError if one is not finite."""
         check_finite("confidence logits", logits)
-        return self.bound(GateState(logits=logits.detach()))
+        return self.bound(logits.detach())
 
     def noise(self, num_nodes: int, generator: torch.Generator) -> torch.Tensor | None:
         """[num_nodes] float32, or None when ``noise`` is none."""
@@ -61,9 +61,9 @@ class BinarySteGate(GateSampler):
         u = torch.rand(num_nodes, generator=generator, device=generator.device).double() + 2.0**-25
         return (torch.log(u) - torch.log1p(-u)).float()
 
-    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
+    def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
         """Gates [M], each exactly 0.0 or 1.0, dtype of the logits; a soft gate of exactly 1/2 is closed."""
-        z = state.logits if noise is None else state.logits + noise.detach().to(state.logits.dtype)
+        z = logits if noise is None else logits + noise.detach().to(logits.dtype)
         tau: float = self.config.temperature
         x = z.detach() / tau
         # The soft gate's slope; s (1 - s) would be exactly 0 from x = 17 on, and an open gate not feel the images.
@@ -73,10 +73,10 @@ class BinarySteGate(GateSampler):
             through = 0.0 * through
         return (z.detach() > 0).to(z.dtype) + through
 
-    def open_probability(self, state: GateState) -> torch.Tensor:
+    def open_probability(self, logits: torch.Tensor) -> torch.Tensor:
         """[M] sigmoid(z), the probability that z plus logistic noise is positive."""
-        return torch.sigmoid(state.logits)
+        return torch.sigmoid(logits)
 
-    def bound(self, state: GateState) -> GateState:
+    def bound(self, logits: torch.Tensor) -> torch.Tensor:
         """Project the logits into [-logit_bound, logit_bound]."""
-        return GateState(logits=state.logits.clamp(-self.config.logit_bound, self.config.logit_bound))
+        return logits.clamp(-self.config.logit_bound, self.config.logit_bound)

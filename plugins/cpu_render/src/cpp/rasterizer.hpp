@@ -61,6 +61,9 @@ class Rasterizer {
   void backward_cached(const Scene& scene, const float* image_gradient, float* means2d_gradient);
   // out [N]: 1 for the rows of the cached scene that touch a cached tile.
   void visible_in_cache(uint8_t* out) const;
+  // out [N]: 1 for the rows of the cached scene that added light to a pixel of a wanted tile. Costs follow these tiles,
+  // but for clearing `out`. Border blocks reach beyond the image and are counted whole.
+  void drawn_in_cache(const uint8_t* mask, uint8_t* out);
 
   // Ends the life of the arrays given to the last forward; no backward may follow.
   void forget() { mode_ = Mode::none; }

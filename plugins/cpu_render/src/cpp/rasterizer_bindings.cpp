@@ -81,6 +81,13 @@ class PyRasterizer {
     rasterizer_.visible_in_cache(out.data());
   }
 
+  void drawn_in_cache(std::optional<ByteArray> tile_mask, ByteOutArray out) {
+    require_shape(out, {rasterizer_.scene_count()}, "out");
+    const uint8_t* mask = mask_data(tile_mask, rasterizer_.width(), rasterizer_.height());
+    const nb::gil_scoped_release release;
+    rasterizer_.drawn_in_cache(mask, out.data());
+  }
+
   void shed_scratch() {
     rasterizer_.shed_scratch();
     current_ = {};
@@ -227,6 +234,7 @@ void bind_rasterizer(nb::module_& module) {
       .def("update", &PyRasterizer::update, strict("changed"), GSS_SCENE, strict("background"), GSS_TARGET)
       .def("backward_cached", &PyRasterizer::backward_cached, GSS_SCENE, strict("v_image"), strict("v_means2d"))
       .def("visible_in_cache", &PyRasterizer::visible_in_cache, strict("out"))
+      .def("drawn_in_cache", &PyRasterizer::drawn_in_cache, strict("tile_mask").none(), strict("out"))
       .def("shed_scratch", &PyRasterizer::shed_scratch)
       .def("forward_cached", &PyRasterizer::forward_cached, strict("background"), strict("tile_mask").none(),
            GSS_TARGET)

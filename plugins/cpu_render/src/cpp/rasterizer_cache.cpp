@@ -109,6 +109,21 @@ void Rasterizer::visible_in_cache(uint8_t* out) const {
   for (std::size_t row = 0; row < scene_count_; row++) out[row] = cached_visible_.contains(static_cast<uint32_t>(row));
 }
 
+void Rasterizer::drawn_in_cache(const uint8_t* mask, uint8_t* out) {
+  const Claim claim(busy_);
+  if (!cached_)
+    throw std::invalid_argument(
+        "drawn_in_cache: expected a forward pass of the whole scene before, got none. Call forward first.");
+  TileSelection wanted;
+  wanted.build(camera_.width, camera_.height, mask);
+  if (!cached_selection_.contains(wanted))
+    throw std::invalid_argument("drawn_in_cache: tile_mask has tiles that the cached forward pass did not cover.");
+  std::fill_n(out, scene_count_, uint8_t{0});
+  for (uint32_t tile : wanted.active)
+    for (uint32_t e = cached_lists_.begin[tile]; e < cached_lists_.end[tile]; e++)
+      if (cached_lists_.contributed[e] & wanted.blocks[tile]) out[cached_lists_.entries[e].record] = 1;
+}
+
 void Rasterizer::shed_scratch() {
   const Claim claim(busy_);
   mode_ = Mode::none;

@@ -230,6 +230,22 @@ class NumpyRasterizer(NativeRasterizer):
         self._call("visible_in_cache", visible)
         return v_means2d, visible.view(np.bool_)
 
+    def drawn_in_cache(self, tile_mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+        """Say which rows of the cached scene added light to a pixel of the marked tiles: [N] bool.
+
+        Nothing is rendered or differentiated; the lists of the marked tiles are read. At the image's border the 4 x 4
+        blocks are counted whole, so a row may be named for a pixel up to three beyond the edge.
+
+        Arguments:
+            tile_mask: [ceil(H / 16), ceil(W / 16)] bool or uint8; tiles that the cache covers. None: all.
+
+        Raises:
+            InputError: wrong dtype or shape, no full forward yet, tiles that are not cached.
+        """
+        drawn = np.empty(self._native.scene_count, np.uint8)
+        self._call("drawn_in_cache", require_mask(tile_mask, self.width, self.height), drawn)
+        return drawn.view(np.bool_)
+
     def forward_cached(
         self,
         *,

@@ -9,7 +9,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsstream.api import Cameras, Gaussians, InputError, RenderCache, RenderOutput, RenderSession, ScreenGradient
+from gsstream.api import (
+    Cameras,
+    Gaussians,
+    InputError,
+    RenderCache,
+    RenderOutput,
+    RenderSession,
+    ScreenGradient,
+    check_tiles,
+)
 from gsstream_cpu_render.arrays import SplatArrays
 from gsstream_cpu_render.autograd import differentiable, splats_of
 from gsstream_cpu_render.checks import Float32, as_array
@@ -59,6 +68,13 @@ class CpuSession(RenderSession):
         cached = self._view(view)  # its owner while the native call runs
         gradient, visible = cached.rasterizer.backward_cached(splats, upstream)
         return ScreenGradient(torch.from_numpy(gradient), torch.from_numpy(visible))
+
+    def visible(self, view: int, tiles: torch.Tensor) -> torch.Tensor:
+        check_tiles(tiles, (self._cameras.height, self._cameras.width))
+        if not bool(tiles.any()):
+            return torch.zeros(len(self._gaussians), dtype=torch.bool)
+        cached = self._view(view)  # its owner while the native call runs
+        return torch.from_numpy(cached.rasterizer.drawn_in_cache(as_array("tiles", tiles)))
 
     def render(
         self,

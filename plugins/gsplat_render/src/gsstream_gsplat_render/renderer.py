@@ -21,6 +21,7 @@ from gsstream.api import (
     RenderSession,
     ScreenGradient,
     ShapeError,
+    drawn_rows,
 )
 from gsstream_gsplat_render.kernels import Kernels, load_kernels
 from gsstream_gsplat_render.splat import Background, Drawn, Target, draw, pixels, target
@@ -112,6 +113,11 @@ class GsplatSession(RenderSession):
             image = torch.where(inside[..., None], image, cached.image)
             alpha = torch.where(inside, alpha, cached.alpha)
         return RenderOutput(image.cpu(), alpha.cpu())
+
+    def visible(self, view: int, tiles: torch.Tensor) -> torch.Tensor:
+        wide = GsplatSession(self._kernels, self._device, self._gaussians, None, self._cameras, self._background)
+        size = self._cameras.height, self._cameras.width
+        return drawn_rows(lambda scene: wide.render(view, scene), self._gaussians, size, tiles)
 
     def narrow(self, active: torch.Tensor) -> None:
         self._active = active.to(self._device)

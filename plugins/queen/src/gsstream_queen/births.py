@@ -7,30 +7,8 @@ from typing import NamedTuple
 import torch
 
 from gsstream.api import Gaussians
+from gsstream.blocks import SPLIT_SIZE, children
 from gsstream_queen.settings import BirthSettings
-
-SPLIT_SHRINK = 1.6  # 3DGS: both halves of a split Gaussian are 1.6 times smaller
-SPLIT_SIZE = 0.01  # 3DGS: larger than this fraction of the extent is split, smaller is cloned
-
-
-class Statistics(NamedTuple):
-    """Sum of screen-gradient norms [A], half image widths, and how often each row was hit [A]."""
-
-    total: torch.Tensor
-    hits: torch.Tensor
-
-    @staticmethod
-    def zeros(number: int) -> Statistics:
-        return Statistics(torch.zeros(number), torch.zeros(number))
-
-    def add(self, gradient: torch.Tensor) -> Statistics:
-        """Add one iteration's gradients [A, 2]."""
-        norm = gradient.norm(dim=1)
-        return Statistics(self.total + norm, self.hits + (norm > 0))
-
-    @property
-    def mean(self) -> torch.Tensor:
-        return self.total / self.hits.clamp_min(1)
 
 
 class Litter(NamedTuple):
@@ -66,19 +44,5 @@ def densify(
     cost = torch.cumsum(torch.where(large[order], 2, 1), 0)
     chosen = order[cost <= room].sort().values
     parents = torch.cat([chosen[~large[chosen]], chosen[large[chosen]].repeat_interleave(2)])
-    born = rows.rows(parents).map(torch.clone)
-    halves = large[parents]
-    if bool(halves.any()):
-        spread = torch.randn(int(halves.sum()), 3, generator=generator) * born.scales[halves].exp()
-        born.means[halves] += turn(born.quats[halves], spread)
-        born.scales[halves] -= torch.tensor(SPLIT_SHRINK).log()
-    return Litter(born, chosen[large[chosen]])
+    return Litter(children(rows, parents, large[parents], generator), chosen[large[chosen]])
 
-
-def turn(quats: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
-    """[S, 3] vectors rotated by quaternions [S, 4] wxyz of any norm."""
-    unit = torch.nn.functional.normalize(quats, dim=1)
-    w, axis = unit[:, :1], unit[:, 1:]
-    across = 2 * torch.linalg.cross(axis, vectors)
-    turned: torch.Tensor = vectors + w * across + torch.linalg.cross(axis, across)
-    return turned

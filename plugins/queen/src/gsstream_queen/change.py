@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 
 from gsstream.api import FrameTools, Renderer
+from gsstream.blocks import marked_per_tile
 from gsstream_queen.settings import MaskSettings
 
 TILE = 16
@@ -60,14 +61,8 @@ def changed_tiles(
     for view in range(len(cameras)):
         with torch.no_grad():
             alpha = renderer.render(alone, cameras, view, (0.0, 0.0, 0.0)).alpha
-        opaque = torch.zeros(rows * TILE, columns * TILE)
-        opaque[: cameras.height, : cameras.width] = (alpha > settings.alpha).float()
-        count = opaque.reshape(rows, TILE, columns, TILE).sum((1, 3))
-        # A tile cut off by the border has fewer pixels to show a change with.
-        inside = torch.zeros_like(opaque)
-        inside[: cameras.height, : cameras.width] = 1
-        size = inside.reshape(rows, TILE, columns, TILE).sum((1, 3))
-        changed = (count >= size * settings.pixels / TILE**2).float()[None, None]
+        count, size = marked_per_tile((alpha > settings.alpha).numpy())
+        changed = torch.from_numpy(count >= size * settings.pixels / TILE**2).float()[None, None]
         kernel = 2 * settings.dilate + 1
         masks.append(torch.nn.functional.max_pool2d(changed, kernel, 1, settings.dilate)[0, 0] > 0)
     return masks

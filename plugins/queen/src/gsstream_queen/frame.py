@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import torch
 
 from gsstream.api import Cameras, FrameTools, Gaussians, Renderer, RenderSession
-from gsstream_queen.births import Statistics, densify, densify_epochs
+from gsstream.blocks import DensifyStatistics
+from gsstream_queen.births import densify, densify_epochs
 from gsstream_queen.settings import QueenConfig
 from gsstream_queen.trainable import NewRows, OldRows, Solution, concat
 
@@ -78,7 +79,7 @@ class _Frame:
         self._session: RenderSession = problem.work.session
         if len(problem.active) < len(self._scene):
             self._session.narrow(problem.active)
-        self._statistics = Statistics.zeros(len(problem.active))
+        self._statistics = DensifyStatistics.zeros(len(problem.active))
 
     @property
     def _alive(self) -> torch.Tensor:
@@ -123,7 +124,7 @@ class _Frame:
             litter = densify(
                 rows, self._statistics.mean, may, config.most - born_so_far, self._extent, config, self._generator
             )
-        self._statistics = Statistics.zeros(len(self._problem.active))
+        self._statistics = DensifyStatistics.zeros(len(self._problem.active))
         if len(litter.gaussians) == 0:
             return
         self._gone[self._problem.active[litter.replaced]] = True

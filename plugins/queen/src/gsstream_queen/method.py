@@ -1,4 +1,4 @@
-"""QUEEN (Girish et al., NeurIPS 2024) as a whole method of gsstream."""
+"""QUEEN (Girish et al., NeurIPS 2024) as a method of its own."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from gsstream.api import (
     Gaussians,
     Layout,
     PlayerState,
+    Residual,
+    Rows,
     Step,
     StreamingMethod,
     Tools,
@@ -75,17 +77,17 @@ class Queen(StreamingMethod[QueenState]):
     def step(self, state: QueenState, frame: Frame, tools: Tools) -> Step[QueenState]:
         clock = [time.perf_counter()]
         if frame.effort == 0:
-            return self._send(state, frame, tools, nothing(state.player), {})
+            return self._send(state, frame, tools, Delta(), {})
         work = tools.open(state.player, state.previous, frame)
         change = gradient_difference(work)
         clock.append(time.perf_counter())
         if not bool((change.difference > 0).any()):
             # Not a pixel differs from the images before: nothing to learn.
-            return self._send(state, frame, tools, nothing(state.player), {})
+            return self._send(state, frame, tools, Delta(), {})
         dynamic = change.difference > self.config.dynamic
         active = torch.arange(len(dynamic)) if self.config.rows == "all" else dynamic.nonzero()[:, 0]
         if len(active) == 0:
-            return self._send(state, frame, tools, nothing(state.player), {})
+            return self._send(state, frame, tools, Delta(), {})
         logits = initial_logits(change.difference, change.seen, self.config.gate)[active]
         problem = Problem(
             work, tools.renderer, tools.background, active, dynamic, self._masks(work, dynamic, tools), logits,
@@ -98,7 +100,7 @@ class Queen(StreamingMethod[QueenState]):
         clock.append(time.perf_counter())
         facts = {
             "dynamic_gaussians": int(dynamic.sum()), "births": len(result.born), "deaths": int(result.gone.sum()),
-            "moved_gaussians": int(result.solution.symbols["means"].any(1).sum()) if "means" in delta.symbols else 0,
+            "moved_gaussians": int(result.solution.symbols["means"].any(1).sum()) if delta.residual is not None and "means" in delta.residual.symbols else 0,
             "seconds": dict(zip(("confidence", "optimise", "code"), np.diff(clock).tolist(), strict=True)),
         }  # fmt: skip
         return replace(step, metrics={**step.metrics, **facts})
@@ -129,15 +131,8 @@ class Queen(StreamingMethod[QueenState]):
         symbols = {name: value[changed].astype(np.int32) for name, value in table.items() if value.any()}
         steps = {name: self.config.means.step if name == "means" else 1.0 for name in symbols}
         learned = {n: v.numpy() for n, v in result.solution.decoders.items() if n in symbols}
-        return Delta(
-            gates, 1, symbols, steps, quantise_decoders(learned), births(result.born, len(layout.node_counts)),
-            np.flatnonzero(result.gone.numpy()),
-        )  # fmt: skip
-
-
-def nothing(player: PlayerState) -> Delta:
-    """All gates closed."""
-    return Delta(np.zeros(len(player.layout.node_counts), np.uint8), 1)
+        rows = Rows(births(result.born, len(layout.node_counts)), np.flatnonzero(result.gone.numpy()))
+        return Delta((Residual(gates, 1, symbols, steps, quantise_decoders(learned)),)).with_rows(rows)
 
 
 def births(born: Gaussians[torch.Tensor], nodes: int) -> Births | None:

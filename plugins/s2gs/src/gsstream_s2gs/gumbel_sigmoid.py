@@ -9,7 +9,7 @@ from typing import Literal, final
 import torch
 from pydantic import Field
 
-from gsstream.api import GateSampler, GateState, PartConfig, Traits, check_finite
+from gsstream.api import GateSampler, PartConfig, Traits, check_finite
 
 #: Half the spacing of float32 uniforms: moves the lattice k / 2^24 into the open interval (0, 1), symmetrically.
 HALF_STEP = 2.0**-25
@@ -28,7 +28,7 @@ class GumbelSigmoid(GateSampler):
     * A rounded gate is open when its soft gate exceeds eta = 0.5 / levels; with 10 levels that is the paper's eta
       of 0.05. Under logistic noise this has probability sigmoid(alpha - tau * logit(eta)) (the binary concrete's
       distribution function), which is what ``open_probability`` returns and the paper's regulariser calls pi.
-    * ``sample(state, None)`` is the deterministic gate that is transmitted.
+    * ``sample(logits, None)`` is the deterministic gate that is transmitted.
 
     Released code: no noise while training, one Gumbel draw at initialisation whose result has no effect, and a clamp
     after rounding that blocks the gradient of every gate at 0 or 1; see ``noise`` and ``clamp_gradient``.
@@ -62,10 +62,10 @@ class GumbelSigmoid(GateSampler):
     def num_levels(self) -> int:
         return int(self.config.levels)
 
-    def init(self, logits: torch.Tensor) -> GateState:
+    def init(self, logits: torch.Tensor) -> torch.Tensor:
         """Start from confidence logits [M], limited to the documented bound. Raises ShapeError if one is not finite."""
         check_finite("confidence logits", logits)
-        return self.bound(GateState(logits=logits.detach()))
+        return self.bound(logits.detach())
 
     def noise(self, num_nodes: int, generator: torch.Generator) -> torch.Tensor | None:
         """[num_nodes] float32 on the generator's device, within +-17.4 (logistic); None when ``noise`` is none."""
@@ -74,9 +74,9 @@ class GumbelSigmoid(GateSampler):
         uniform = torch.rand(num_nodes, generator=generator, device=generator.device)
         return logistic(uniform) if self.config.noise == "logistic" else gumbel(uniform)
 
-    def sample(self, state: GateState, noise: torch.Tensor | None) -> torch.Tensor:
+    def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
         """Gates [M] in {0, 1/levels, ..., 1}, dtype of the logits."""
-        alpha = state.logits if noise is None else state.logits + noise.detach().to(state.logits.dtype)
+        alpha = logits if noise is None else logits + noise.detach().to(logits.dtype)
         soft = torch.sigmoid(alpha.detach() / self.config.temperature)
         # Divided by a tensor, not by a number: some devices turn the latter into a product with 1/levels, which is not
         # the value the decoder computes.
@@ -89,18 +89,18 @@ class GumbelSigmoid(GateSampler):
             through = through * ((hard > 0) & (hard < 1))
         return hard + through
 
-    def open_probability(self, state: GateState) -> torch.Tensor:
+    def open_probability(self, logits: torch.Tensor) -> torch.Tensor:
         """[M] P(rounded gate > 0) under the noise law; without noise the logistic form (as the released code does)."""
         eta = 0.5 / self.num_levels
-        margin = state.logits - self.config.temperature * math.log(eta / (1 - eta))
+        margin = logits - self.config.temperature * math.log(eta / (1 - eta))
         if self.config.noise == "gumbel":
             # Beyond 30 the probability is 1 in any float, while exp would overflow and its gradient become 0 * inf.
             return -torch.expm1(-torch.exp(margin.clamp_max(30.0)))
         return torch.sigmoid(margin)
 
-    def bound(self, state: GateState) -> GateState:
+    def bound(self, logits: torch.Tensor) -> torch.Tensor:
         """Project the logits into [-logit_bound, logit_bound]."""
-        return GateState(logits=state.logits.clamp(-self.config.logit_bound, self.config.logit_bound))
+        return logits.clamp(-self.config.logit_bound, self.config.logit_bound)
 
 
 def slope(x: torch.Tensor) -> torch.Tensor:

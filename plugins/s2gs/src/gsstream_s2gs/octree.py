@@ -18,7 +18,6 @@ from gsstream.api import (
     PartConfig,
     PointCloud,
     Structure,
-    TopologyEdit,
     Traits,
     check_finite,
     check_shape,
@@ -96,7 +95,7 @@ class StreamingOctree(Structure):
                 )
             return self
 
-    traits = Traits(stable=True, idempotent=True, local=True)
+    traits = Traits(idempotent=True, local=True)
     auto_rules = OCTREE_RULES
 
     def seed(self, points: PointCloud, cameras: Cameras) -> Anchors:
@@ -142,18 +141,6 @@ class StreamingOctree(Structure):
         if self.config.grouping == "gaussian":
             return _one_each(torch.argsort(keys, stable=True))
         return _forest(keys, self.config.gate_level)
-
-    def update(self, hierarchy: Hierarchy, edit: TopologyEdit, gaussians: Gaussians[torch.Tensor]) -> Hierarchy:
-        """The forest after an edit: copies stay in their source's node (fixed hierarchy, paper), empty nodes vanish."""
-        node_of = hierarchy.node_of[edit.source]
-        if self.config.grouping == "gaussian":
-            return _one_each(torch.argsort(node_of, stable=True))
-        used = torch.zeros(hierarchy.num_nodes, dtype=torch.bool, device=node_of.device)
-        used[node_of] = True
-        for _ in range(self.config.gate_level):
-            used[hierarchy.parent[used]] = True
-        label = torch.cumsum(used, 0) - 1
-        return Hierarchy(label[node_of], label[hierarchy.parent[used]], hierarchy.level[used])
 
     def _num_levels(self, far: float, near: float) -> int:
         """H of step 1. A point at a camera (near = 0) asks for infinitely many levels and gets the most allowed."""

@@ -1,0 +1,31 @@
+"""Verbs for methods and parts that do more than fill a slot: what the engine itself is built from.
+
+``gsstream.api`` has the nouns (records and contracts); these are the functions that a whole method would otherwise copy:
+densify, count changed tiles, learn residuals side by side, weigh their rate, judge a view, fit a packet.
+"""
+
+from gsstream.engine.budget.trim import Fitted as Fitted
+from gsstream.engine.fit.backward import pull_back as pull_back
+from gsstream.engine.fit.densify import SPLIT_SIZE as SPLIT_SIZE
+from gsstream.engine.fit.densify import DensifyStatistics as DensifyStatistics
+from gsstream.engine.fit.densify import children as children
+from gsstream.engine.fit.judge import Judge as Judge
+from gsstream.engine.fit.nearest import nearest_rows as nearest_rows
+from gsstream.engine.fit.nearest import neighbour_distance as neighbour_distance
+from gsstream.engine.fit.row_table import RowTable as RowTable
+from gsstream.engine.step.active.change import Change as Change
+from gsstream.engine.step.active.change import detect_change as detect_change
+from gsstream.engine.step.active.change import marked_per_tile as marked_per_tile
+from gsstream.engine.step.harden import rows_of as rows_of
+from gsstream.render.activations import activate_opacities as activate_opacities
+from gsstream.render.activations import activate_scales as activate_scales
+from gsstream.render.activations import logit as logit
+from gsstream.render.activations import rgb_to_sh0 as rgb_to_sh0
+from gsstream.residual.base import MAX_SYMBOL as MAX_SYMBOL
+from gsstream.residual.joint import JointCode as JointCode
+from gsstream.residual.joint import add_joint as add_joint
+from gsstream.residual.joint import decode_joint as decode_joint
+from gsstream.residual.joint import join_features as join_features
+from gsstream.residual.joint import joint_code as joint_code
+from gsstream.residual.joint import pull_back_joint as pull_back_joint
+from gsstream.residual.rate import rate_gradient as rate_gradient

@@ -1,0 +1,72 @@
+"""The kinds of parts, in one table. Whoever needs a list of kinds, slots or contracts derives it from here.
+
+A new kind is one entry here, a room with its contract class, and a room in ``gsstream.testing``: its checks, an example
+that new plugins start from and, where ``behaviour`` is set, what the common checks need to know of it. A kind that is a
+slot also gets a field of its name in ``recipe.model.Recipe`` and ``engine.assembly.assemble.Assembly``.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class PartKind:
+    """One kind of part.
+
+    Arguments:
+        name: as recipes, plugins and errors write it.
+        contract: "module:Class" of the abstract base class, as text, so that listing kinds imports no torch; None:
+            there is no class to inherit from (a source is anything that is called as ``target(uri, scale)``).
+        slot: a method that is made of parts has one of this kind.
+        default: the part that a recipe names when nobody chooses; None: recipes have no section of this name.
+        behaviour: the common checks of behaviour (purity, shapes, precision, permutation) are made on it, beside those
+            of settings and declaration, which every kind with a contract gets.
+        use: the options by which a run names such a part, with <name> and <kind>; None: the engine chooses, so a plugin
+            author has nothing to start from.
+    """
+
+    name: str
+    contract: str | None
+    slot: bool = False
+    default: str | None = None
+    behaviour: bool = False
+    use: str | None = "--set <kind>=<name> --source demo"
+
+    def contract_class(self) -> type[Any]:
+        """The contract itself, imported. Raises TypeError for a kind without one."""
+        if self.contract is None:
+            raise TypeError(f"the kind {self.name!r} has no contract class to inherit from")
+        module, _, name = self.contract.partition(":")
+        found: type[Any] = getattr(importlib.import_module(module), name)
+        return found
+
+
+_KINDS = (
+    PartKind("structure", "gsstream.structure.base:Structure", slot=True, default="flat", behaviour=True),
+    PartKind(
+        "confidence", "gsstream.confidence.base:ConfidenceEstimator", slot=True, default="uniform", behaviour=True
+    ),
+    PartKind("propagation", "gsstream.propagation.base:Propagation", slot=True, default="group-max", behaviour=True),
+    PartKind("gate", "gsstream.gate.base:GateSampler", slot=True, default="always-open", behaviour=True),
+    PartKind("motion", "gsstream.motion.base:MotionPart", slot=True, default="still"),
+    PartKind("update", "gsstream.residual.base:UpdateRule", slot=True, default="additive"),
+    PartKind("growth", "gsstream.growth.base:Growth", slot=True, default="none"),
+    PartKind("regularizer", "gsstream.regularizer.base:Regularizer", slot=True, default="none", behaviour=True),
+    PartKind("stepper", "gsstream.method.base:StreamingMethod", default="parts"),
+    PartKind("renderer", "gsstream.render.base:Renderer", default="auto", use="--renderer <name> --source demo"),
+    PartKind("loss", "gsstream.loss.base:Loss", use="--set loss.backend=<name> --source demo"),
+    PartKind("optimiser", "gsstream.optimiser.base:RowOptimiser", use=None),
+    PartKind("source", None, use="--source <name>:"),
+)
+
+#: Name -> kind, in the order in which kinds are listed.
+PART_KINDS: Mapping[str, PartKind] = MappingProxyType({kind.name: kind for kind in _KINDS})
+#: Slots of a method that is made of parts.
+METHOD_SLOTS = tuple(name for name, kind in PART_KINDS.items() if kind.slot)
+#: Kind -> "module:Class" of its contract, for the kinds that have one.
+CONTRACTS: Mapping[str, str] = MappingProxyType({kind.name: kind.contract for kind in _KINDS if kind.contract})

@@ -1,0 +1,17 @@
+"""Where a run is: the place that an error about a part names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass
+class Where:
+    """The frame and the iteration in which parts are being called; None outside of them. One for all parts of a run."""
+
+    frame: int | None = None
+    iteration: int | None = None
+
+    def enter(self, frame: int | None) -> None:
+        """Begin a frame; no iteration of it has begun."""
+        self.frame, self.iteration = frame, None

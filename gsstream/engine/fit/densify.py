@@ -1,0 +1,80 @@
+"""Where frame 0 needs more Gaussians and where it has too many (3DGS rules, Kerbl et al. 2023, section 5.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.topology import TopologyEdit
+from gsstream.recipe.model import FirstFrame
+from gsstream.render.activations import activate_opacities, activate_scales, rotation_matrices
+
+SPLIT_SHRINK = 1.6  # 3DGS: both halves of a split Gaussian are 1.6 times smaller
+SPLIT_SIZE = 0.01  # 3DGS: larger than this fraction of the extent is split, smaller is cloned
+
+
+@dataclass(frozen=True)
+class DensifyStatistics:
+    """Sum of screen-gradient norms [N] in half-width units, and the number of iterations each Gaussian was hit [N]."""
+
+    total: torch.Tensor
+    count: torch.Tensor
+
+    @staticmethod
+    def zeros(num: int) -> DensifyStatistics:
+        return DensifyStatistics(torch.zeros(num), torch.zeros(num))
+
+    def add(self, gradient: torch.Tensor) -> DensifyStatistics:
+        """Add one iteration's gradients [N, 2]."""
+        norm = gradient.norm(dim=1)
+        return DensifyStatistics(self.total + norm, self.count + (norm > 0))
+
+    @property
+    def mean(self) -> torch.Tensor:
+        return self.total / self.count.clamp_min(1)
+
+
+def grow_and_prune(
+    gaussians: Gaussians[torch.Tensor],
+    statistics: DensifyStatistics,
+    settings: FirstFrame,
+    extent: float,
+    generator: torch.Generator,
+) -> tuple[TopologyEdit, dict[str, torch.Tensor]]:
+    """Clone small and split large Gaussians with large screen gradients; drop transparent and oversized ones.
+
+    Returns the edit and the new contents of every attribute. The population never exceeds ``settings.max_gaussians``.
+    """
+    largest = activate_scales(gaussians.scales).amax(1)
+    keep = (activate_opacities(gaussians.opacities) > settings.prune_opacity) & (largest < settings.max_scale * extent)
+    budget = max(0, settings.max_gaussians - int(keep.sum()))
+    score = torch.where(keep, statistics.mean, torch.zeros_like(largest))
+    hot = (score > settings.densify_gradient).nonzero()[:, 0]
+    hot = hot[torch.argsort(score[hot], descending=True, stable=True)][:budget].sort().values
+    split = torch.zeros_like(keep)
+    split[hot] = largest[hot] > SPLIT_SIZE * extent
+    kept = keep.nonzero()[:, 0]
+    source = torch.cat([kept, hot])
+    fresh = torch.cat([split[kept], torch.ones(len(hot), dtype=torch.bool)])
+    values = dict(children(gaussians, source, split[source], generator).items())
+    return TopologyEdit(source, fresh), values
+
+
+def children(
+    gaussians: Gaussians[torch.Tensor], parents: torch.Tensor, halves: torch.Tensor, generator: torch.Generator
+) -> Gaussians[torch.Tensor]:
+    """Return copies of Gaussians, those that are halves of a split drawn from their parent and made smaller (3DGS).
+
+    Arguments:
+        parents: [P] rows that are copied.
+        halves: [P] bool, copies that are one half of a split parent; the others are as their parent is.
+    """
+    born = gaussians.rows(parents).map(torch.clone)
+    if bool(halves.any()):
+        spread = torch.randn(int(halves.sum()), 3, generator=generator) * activate_scales(born.scales[halves])
+        turned = (rotation_matrices(born.quats[halves]) @ spread[..., None])[..., 0]
+        born.means[halves] += turned
+        born.scales[halves] -= float(torch.tensor(SPLIT_SHRINK).log())
+    return born

@@ -1,0 +1,189 @@
+"""Encoder: frames in, packets out. The one way to encode, under sessions, benchmarks, the contract kit and scripts."""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from gsstream.core.errors import InputError
+from gsstream.core.frame import Frame, PointCloud
+from gsstream.core.rng import Rng
+from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.auto.rules import recall, record, stream_extra
+from gsstream.engine.auto.trials import choose
+from gsstream.engine.budget.controller import Controller
+from gsstream.engine.budget.pace import CLOCKS
+from gsstream.engine.frame0.begin import cloud_of
+from gsstream.engine.frame0.points import gather_points
+from gsstream.engine.frame0.root import Progress
+from gsstream.engine.keys.resume import check_stream, ended, since_key
+from gsstream.engine.run.held import begin_held, step_held
+from gsstream.engine.run.threads import one_torch_thread
+from gsstream.engine.step.tools import RunTools
+from gsstream.method.base import Step
+from gsstream.metrics import peak_memory_mb
+from gsstream.packet import EncodedPacket, PlayerState, StreamMeta
+from gsstream.source.base import SourceInfo
+
+#: Makes the seeds of frame 0 from its training images.
+Seeds = Callable[[Frame], PointCloud]
+
+
+@dataclass(frozen=True)
+class Listeners:
+    """What is told of an encoder's work.
+
+    Arguments:
+        packet: every packet, as soon as it is made; what it does counts as part of the frame.
+        chosen: the assembly after the scene has decided every ``auto``, before frame 0.
+        progress: iterations of frame 0.
+        say: one line for a person.
+    """
+
+    packet: Callable[[EncodedPacket], object] = lambda _: None
+    chosen: Callable[[Assembly], None] = lambda _: None
+    progress: Progress = lambda *_: None
+    say: Callable[[str], None] = lambda _: None
+
+
+class Encoder:
+    """Encodes the frames of one recording with one method, in memory.
+
+    :meth:`encode` takes the frames in order and returns a :class:`gsstream.method.base.Step` for each: its ``packet`` is
+    what a player reads, its ``metrics`` say what the frame cost. A frame that fails leaves the encoder as it was.
+
+    Arguments:
+        parts: the live parts of a recipe (``engine.assembly.assemble``).
+        info: what the recording says about itself: cameras, frames per second, names.
+        seeds: makes the points that frame 0 starts from; None: a plane sweep over its training images.
+        first_frame: frame 0 of another stream, taken over instead of being reconstructed.
+        listeners: what is told of the work.
+    """
+
+    def __init__(
+        self, parts: Assembly, info: SourceInfo, seeds: Seeds | None = None, *, first_frame: PlayerState | None = None,
+        listeners: Listeners | None = None,
+    ) -> None:  # fmt: skip
+        self.parts, self.info = parts, info
+        self.rng = Rng(parts.recipe.seed)
+        self.near = parts.recipe.near * info.train.extent
+        #: State after the last frame; None before frame 0.
+        self.state: Any = None
+        self.controller = Controller(parts.recipe.budget, parts.recipe.stream)
+        self._seeds, self._first, self._listeners = seeds or self._swept, first_frame, listeners or Listeners()
+
+    def encode(self, frame: Frame) -> Step[Any]:
+        """Encode the next frame: the first as a key packet, later ones as the method decides.
+
+        Arguments:
+            frame: training images; its index follows that of the frame before, from 0.
+
+        Raises:
+            ShapeError: images that do not fit the cameras, or values outside [0, 1].
+            ComponentError: a part fails and the recipe says ``stream.on_error: raise``.
+        """
+        frame.validate()
+        frame = self.at_near(frame)
+        clock = CLOCKS[self.parts.recipe.budget.clock]
+        started, worked, began = time.perf_counter(), time.process_time(), clock()
+        with one_torch_thread():
+            step = self._begin(frame) if self.state is None else self._step(frame)
+        self._listeners.packet(step.packet)
+        total, cpu = time.perf_counter() - started, time.process_time() - worked
+        seconds = step.metrics["seconds"]
+        metrics: dict[str, Any] = {
+            "frame": frame.index, "status": step.status, **step.metrics,
+            "seconds": {**seconds, "other": max(0.0, total - sum(seconds.values()))},
+            "cpu_seconds": cpu, "peak_memory_mb": peak_memory_mb(),
+        }  # fmt: skip
+        if frame.index == 0:
+            metrics |= record(self.parts)
+        step = replace(step, metrics=self.controller.settle(metrics, clock() - began))
+        self.state = step.state
+        return step
+
+    def resume(self, stream: Path, image: Callable[[int], Frame], last: int | None = None) -> int | None:
+        """Go on after the last sound packet of a stream that this method wrote; return that frame's index.
+
+        Arguments:
+            image: frame index -> its training images.
+            last: go on after this frame, whatever the stream holds beyond it.
+
+        Returns:
+            None when the stream holds no complete frame 0: then the encoder begins there.
+
+        Raises OutputError when the recipe or the recording is not the one the stream was written with.
+        """
+        if (extra := stream_extra(stream)) is not None:
+            self.parts = recall(self.parts, extra)
+        # Before the replay: other parts would fail over a stream that is not theirs, and say something else.
+        if not check_stream(self.parts, stream, self.info) or (last is not None and last < 0):
+            return None
+        end = ended(stream, last)
+        tools = self._tools(replay=lambda: since_key(stream, end))
+        self.parts.where.enter(end.player.frame)
+        with one_torch_thread():
+            self.state = self.parts.stepper.resume(end.player, self.at_near(image(end.shown)), tools)
+        return end.player.frame
+
+    def at_near(self, frame: Frame) -> Frame:
+        """The frame with the near plane that the recipe gives this rig."""
+        return replace(frame, cameras=replace(frame.cameras, near=self.near))
+
+    def _begin(self, frame: Frame) -> Step[Any]:
+        if self.parts.pending:
+            seeds = functools.cache(lambda: self._points(frame))
+            meta, say = self._meta(frame), self._listeners.say
+            self.parts = choose(self.parts, seeds, frame, meta, self._first, say)
+            self._listeners.chosen(self.parts)
+            return begin_held(self._tools(points=lambda _: seeds()), frame)
+        return begin_held(self._tools(), frame)
+
+    def _step(self, frame: Frame) -> Step[Any]:
+        expected = self.state.player.frame + 1
+        if frame.index != expected:
+            raise InputError(f"frame {frame.index}: expected frame {expected}, frames are encoded in order")
+        allowance = self.controller.allow()
+        tools = self._tools(
+            allowance=allowance, refuse_key=lambda number: self.controller.key_refusal(number, allowance)
+        )
+        return step_held(tools, self.state, frame)
+
+    def _tools(self, **changes: Any) -> RunTools:
+        given: dict[str, Any] = {"points": self._points, "replay": _nothing, **changes}
+        return RunTools(
+            self.parts, self.rng, self._meta, first=self._first, progress=self._listeners.progress, **given
+        )
+
+    def _points(self, frame: Frame) -> PointCloud:
+        """What frame 0 starts from: seeds, or the centres of the Gaussians that are taken over."""
+        return self._seeds(frame) if self._first is None else cloud_of(self._first)
+
+    def _swept(self, frame: Frame) -> PointCloud:
+        return gather_points(lambda _: None, frame, self.parts.recipe.first_frame, self.rng)
+
+    def _meta(self, frame: Frame) -> StreamMeta:
+        info, recipe = self.info, self.parts.recipe
+        distributions = {"gsstream", *self.parts.distributions}
+        return StreamMeta(
+            method=recipe.method,
+            source=info.name,
+            recipe=recipe.model_dump(mode="json"),
+            train=frame.cameras,
+            test=replace(info.test, near=self.near),
+            fps=info.fps,
+            background=recipe.background,
+            plugins={name: version(name) for name in sorted(distributions)},
+            extra={"source_uri": info.uri, "licence": info.licence, **record(self.parts)},
+        )
+
+
+def _nothing() -> Iterator[PlayerState]:
+    return iter(())
+
+

@@ -1,0 +1,135 @@
+"""Calling a method, and holding it to its contract: what it returns is decoded as a player would, and compared."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from gsstream.core.changes import row_gates
+from gsstream.core.errors import ComponentError, ShapeError
+from gsstream.core.frame import Frame
+from gsstream.core.gaussians import ATTRIBUTES
+from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.assembly.fault import fault
+from gsstream.engine.frame0.begin import check_cameras
+from gsstream.engine.step.tools import RunTools
+from gsstream.method.base import MethodState, Step
+from gsstream.packet import PlayerState, decode_packet
+
+
+class RepeatedFrameWarning(UserWarning):
+    """A part failed, and its frame was sent as "nothing changed"."""
+
+
+def begin_held(tools: RunTools, frame: Frame) -> Step[Any]:
+    """Make frame 0. Raises InputError with fewer cameras than the method needs, ComponentError when it fails."""
+    parts = tools.parts
+    name = parts.recipe.stepper.name if parts.recipe.stepper.name != "parts" else parts.recipe.method
+    check_cameras(frame.cameras, parts.stepper.least_cameras, f"the method {name!r}")
+    parts.where.enter(frame.index)
+    return _held(parts, None, frame, lambda: parts.stepper.begin(frame, tools))
+
+
+def step_held(tools: RunTools, state: MethodState, frame: Frame) -> Step[Any]:
+    """Make a later frame.
+
+    Raises ComponentError when the method fails, unless the recipe says ``stream.on_error: repeat``: then the method is
+    asked for the same frame as one that is worth nothing, which it has to answer by an empty packet.
+    """
+    started = time.perf_counter()
+    try:
+        return _step(tools, state, frame)
+    except (ComponentError, ShapeError) as error:
+        if tools.parts.recipe.stream.on_error == "raise":
+            raise
+        lost = time.perf_counter() - started
+        step = _step(tools, state, replace(frame, effort=0.0))
+        if step.status != "empty":
+            raise  # it does not keep its contract: what it sends instead cannot be trusted either
+        warnings.warn(f"frame {frame.index} repeats the one before it: {error}", RepeatedFrameWarning, stacklevel=2)
+        seconds = {**step.metrics["seconds"], "failed": lost}
+        return replace(step, metrics={**step.metrics, "seconds": seconds, "error": str(error)})
+
+
+def _step(tools: RunTools, state: MethodState, frame: Frame) -> Step[Any]:
+    parts = tools.parts
+    parts.where.enter(frame.index)
+    return _held(parts, state.player, frame, lambda: parts.stepper.step(state, frame, tools))
+
+
+def _held(parts: Assembly, before: PlayerState | None, frame: Frame, make: Callable[[], Step[Any]]) -> Step[Any]:
+    """Make a step; decode its packet as a player would and compare; add the numbers that follow from the packet."""
+    started = time.perf_counter()
+    step = make()
+    seconds = time.perf_counter() - started
+    parts.where.enter(frame.index)
+    method = parts.part("stepper")
+    if step.packet.frame != frame.index or step.packet.kind.name.lower() != step.status:
+        raise fault(
+            f"expected a packet of frame {frame.index} of the kind it says, {step.status!r}; got "
+            f"{step.packet.kind.name.lower()!r} of frame {step.packet.frame}", "stepper", method, parts.where
+        )  # fmt: skip
+    if parts.stepper.decodes_its_packets:
+        return step
+    player = decode_packet(before, step.packet.data)
+    difference = difference_between(player, step.state.player)
+    if difference:
+        raise fault(
+            f"its state is not what players have after its packet: {difference}. Go on from "
+            "decoder()(state.player, packet.data)", "stepper", method, parts.where
+        )  # fmt: skip
+    return replace(step, metrics={**_facts(player, step), "seconds": {"step": seconds}, **step.metrics})
+
+
+def difference_between(player: PlayerState, claimed: PlayerState) -> str:
+    """Say what differs between two player states; empty when nothing does."""
+    if player.frame != claimed.frame:
+        return f"frame {claimed.frame} instead of {player.frame}"
+    for name in ATTRIBUTES:
+        want, got = getattr(player.gaussians, name), getattr(claimed.gaussians, name)
+        if want.shape != got.shape:
+            return f"{name} has the shape {list(got.shape)} instead of {list(want.shape)}"
+        if want.tobytes() != got.tobytes():
+            return f"{name} is off by up to {float(np.abs(got - want).max()):.3g}"
+    for name in ("node_counts", "unit_of", "units"):
+        if not np.array_equal(getattr(player.layout, name), getattr(claimed.layout, name)):
+            return f"layout: {name}"
+    if set(player.decoders) != set(claimed.decoders) or any(
+        value.tobytes() != claimed.decoders[name].tobytes() for name, value in player.decoders.items()
+    ):
+        return "decoders"
+    return _history_difference(player, claimed)
+
+
+def _history_difference(player: PlayerState, claimed: PlayerState) -> str:
+    """What differs in what later motions are predicted from."""
+    for name, fields in (("moved", ("rows", "shift", "turn")), ("groups", ("group_of",))):
+        want, got = getattr(player.scene, name), getattr(claimed.scene, name)
+        if (want is None) != (got is None):
+            return f"scene: {name}"
+        if want is not None and any(getattr(want, f).tobytes() != getattr(got, f).tobytes() for f in fields):
+            return f"scene: {name}"
+    return ""
+
+
+def _facts(player: PlayerState, step: Step[Any]) -> dict[str, Any]:
+    """Sizes and counts, from the packet alone."""
+    rows, gates = len(player.gaussians), 0
+    if player.delta is not None and player.before is not None:
+        born = 0 if player.delta.births is None else len(player.delta.births.parents)
+        rows = int((row_gates(player.before, player.delta) > 0).sum())
+        gates = int((player.delta.gates(player.before) != 0).sum()) + born
+    elif step.status == "empty":
+        rows = 0
+    return {
+        "bytes": dict(step.packet.sizes),
+        "num_gaussians": len(player.gaussians),
+        "active_gaussians": rows,
+        "num_gates": len(player.layout.node_counts),
+        "active_gates": gates,
+    }

@@ -1,0 +1,37 @@
+"""What the encoder carries over a packet: rows, nodes and decoders follow what players decode."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from gsstream.core.changes import Births, Layout
+from gsstream.core.hierarchy import Hierarchy
+from gsstream.engine.state.stream_state import StreamState
+from gsstream.packet import PlayerState
+
+
+def follow(state: StreamState, player: PlayerState) -> StreamState:
+    """Return ``state`` after the packet that led to ``player`` (decoded, no key packet).
+
+    A resumed run calls this for every packet it replays, so it depends on nothing but the packet.
+    """
+    decoders = {**state.decoders, **{name: torch.from_numpy(value) for name, value in player.decoders.items()}}
+    after = replace(state, player=player, decoders=decoders)
+    if player.delta is None or not player.delta.edits_rows:
+        return after
+    return replace(after, hierarchy=next_hierarchy(state.hierarchy, player.delta.births, player.layout))
+
+
+def next_hierarchy(hierarchy: Hierarchy, births: Births | None, layout: Layout) -> Hierarchy:
+    """Return the forest after births and deaths; ``layout`` is that after them. Old nodes stay, also empty ones."""
+    parents, levels = hierarchy.parent, hierarchy.level
+    if births is not None and len(births.parents):
+        parents = torch.cat([parents, torch.from_numpy(births.parents.astype(np.int64))])
+        known = levels.tolist()
+        for node, parent in enumerate(births.parents.tolist(), len(known)):
+            known.append(0 if parent == node else known[parent] + 1)
+        levels = torch.tensor(known, dtype=levels.dtype)
+    return Hierarchy(torch.from_numpy(layout.node_of), parents, levels)

@@ -1,0 +1,24 @@
+"""Births and deaths of a frame, as the growth part proposes them."""
+
+from __future__ import annotations
+
+import torch
+
+from gsstream.core.changes import Delta, apply_delta
+from gsstream.core.rng import Rng
+from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.state.stream_state import StreamState
+from gsstream.engine.step.context import FrameView
+from gsstream.growth.none import NoGrowth
+
+
+def grown(parts: Assembly, state: StreamState, delta: Delta, view: FrameView, rng: Rng) -> Delta:
+    """Return the delta with the rows that leave and those that join.
+
+    Raises ComponentError when the part fails, ShapeError when what it proposes does not fit the scene.
+    """
+    if isinstance(parts.part("growth"), NoGrowth):
+        return delta  # nobody looks at the scene after the residual, so it need not be made
+    after = apply_delta(state.player.scene, delta)
+    rows = parts.growth.propose(after, view.on(after.gaussians.map(torch.from_numpy)), rng)
+    return delta.with_rows(rows)

@@ -1,0 +1,72 @@
+"""From what was learned to what is sent: deterministic gates and integer symbols."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsstream.core.changes import Residual
+from gsstream.core.shapes import IntArray
+from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.assembly.checks import VARIABLE, Look
+from gsstream.engine.step.problem import Problem, Solution
+from gsstream.packet import quantise_decoders
+from gsstream.residual.base import coarser
+from gsstream.residual.base import symbols as residual_symbols
+
+#: Largest symbol a residual may have; float32 rounds what lies between it and 2^31 up.
+MOST_SYMBOL = 2.0**31 - 256
+
+
+def harden(parts: Assembly, problem: Problem, solution: Solution) -> Residual | None:
+    """Return the transmitted integers; None when nothing changes.
+
+    A gate behind which every symbol is zero is closed: it would cost bits and change nothing.
+
+    Raises ComponentError when what was learned cannot be sent: not finite, or beyond symbols of 32 bits.
+    """
+    check_solution(parts, problem, solution)
+    layout = problem.layout
+    final = parts.gate.sample(solution.logits, None)
+    gates = torch.round(final * parts.gate.num_levels).numpy().astype(np.uint8)
+    rows = solution.rows.numpy()
+    codes = coarser(parts.update.codes(), problem.step_scale)
+    integers = {name: value.numpy() for name, value in residual_symbols(codes, solution.latents).items()}
+    changing = np.zeros(len(rows), bool)
+    for value in integers.values():
+        changing |= value.any(1)
+    touched = np.zeros(len(gates), bool)
+    touched[layout.node_of[rows[changing]]] = True
+    gates = np.where(touched, gates, 0).astype(np.uint8)
+    if not gates.any():
+        return None
+    sent = np.flatnonzero(np.repeat(gates != 0, layout.node_counts))
+    table = {name: rows_of(value, rows, sent) for name, value in integers.items()}
+    table = {name: value for name, value in table.items() if value.any()}
+    decoders = {name: value.numpy() for name, value in solution.decoders.items() if name in table}
+    steps = {name: codes[name].step for name in table}
+    return Residual(gates, parts.gate.num_levels, table, steps, quantise_decoders(decoders))
+
+
+def check_solution(parts: Assembly, problem: Problem, solution: Solution) -> None:
+    """Raise ComponentError unless what was learned can be sent: finite, and residuals within 32 bit symbols."""
+    codes, look = coarser(parts.update.codes(), problem.step_scale), Look(
+        parts.checks, "update", parts.part("update"), parts.where
+    )
+    for name, value in solution.latents.items():
+        most = codes[name].step * MOST_SYMBOL
+        what = f"{name} after the last iteration ({VARIABLE}=step finds the first)"
+        look.values(what, value, limits=(-most, most), rows=solution.rows)
+    for name, value in solution.decoders.items():
+        look.values(f"decoder of {name}", value)
+
+
+def rows_of(values: np.ndarray[Any, Any], known: IntArray, wanted: IntArray) -> np.ndarray[Any, Any]:
+    """Return the rows ``wanted`` of a table whose rows belong to ``known`` (both ascending); others are zero."""
+    out = np.zeros((len(wanted), values.shape[1]), values.dtype)
+    place = np.searchsorted(known, wanted)
+    inside = (place < len(known)) & (known[np.minimum(place, max(0, len(known) - 1))] == wanted)
+    out[inside] = values[place[inside]]
+    return out

@@ -1,0 +1,30 @@
+"""What the renderer keeps for the next frame."""
+
+from __future__ import annotations
+
+import torch
+
+from gsstream.core.changes import Delta, Scene, sent_rows
+from gsstream.engine.step.context import FrameView
+from gsstream.packet import PlayerState
+from gsstream.render.base import RenderSession
+
+
+def kept_session(view: FrameView, scene: Scene, delta: Delta, player: PlayerState) -> RenderSession | None:
+    """Return the session of the decoded scene, in which everything that did not change is still projected and sorted.
+
+    None where keeping costs more than it saves: rows came or went, or most of them changed.
+
+    Arguments:
+        view: the frame, seen from ``scene``.
+        scene: after the frame's motions, before its residual.
+        delta: what was sent. player: what it was decoded to.
+    """
+    if delta.edits_rows:
+        return None
+    if delta.is_empty and scene.gaussians is not player.gaussians:
+        return None  # not even the motions were sent: the decoded scene is the one before them
+    rows = sent_rows(scene.layout, delta.gates(scene.layout))
+    if 2 * len(rows) > len(player.gaussians):
+        return None
+    return view.session.commit(player.gaussians.map(torch.from_numpy), torch.from_numpy(rows))

@@ -1,0 +1,48 @@
+"""The scene that a frame's residual starts from: that of the frame before, after the motions that the part proposes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from gsstream.core.changes import Motion, Scene
+from gsstream.core.changes.motion import apply_motion
+from gsstream.core.frame import Frame
+from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.state.stream_state import StreamState
+from gsstream.engine.step.active.change import Change
+from gsstream.engine.step.context import FrameView
+
+
+class Moved(NamedTuple):
+    """The motions that move anything, the scene after them, and the frame seen from that scene."""
+
+    motions: tuple[Motion, ...]
+    scene: Scene
+    view: FrameView
+
+
+def moved(parts: Assembly, state: StreamState, frame: Frame, change: Change | None) -> Moved:
+    """Ask the motion part, and apply what it proposes as every player will.
+
+    Raises ComponentError when the part fails, ShapeError when its motions do not fit the scene.
+    """
+    scene = state.player.scene
+    view = FrameView(
+        parts, state.gaussians, state.hierarchy, frame, state.previous, state.exposure, change, state.session
+    )
+    motions = tuple(motion for motion in parts.motion.propose(scene, view) if not motion.is_empty)
+    if not motions:
+        return Moved((), scene, view)
+    touched = np.zeros(0, np.int64)
+    for motion in motions:
+        scene, rows = apply_motion(scene, motion)
+        touched = np.union1d(touched, rows)
+    gaussians = scene.gaussians.map(torch.from_numpy)
+    # The session goes on to the moved scene with what stands still in it; state.session must stay as it is until the
+    # frame has succeeded, which a session that committed does (it only has to fill its caches again).
+    session = view.session.commit(gaussians, torch.from_numpy(touched)) if 2 * len(touched) <= len(gaussians) else None
+    after = FrameView(parts, gaussians, state.hierarchy, frame, state.previous, state.exposure, change, session)
+    return Moved(motions, scene, after)

@@ -1,0 +1,1 @@
+"""Which Gaussians are born and which leave after a frame was optimised."""

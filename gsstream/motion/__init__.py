@@ -1,0 +1,1 @@
+"""How groups of Gaussians are carried along before the residual is learned."""

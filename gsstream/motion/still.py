@@ -1,0 +1,19 @@
+"""Still: nothing is moved before the residual."""
+
+from __future__ import annotations
+
+from typing import ClassVar, final
+
+from gsstream.core.changes import Motion, Scene
+from gsstream.core.context import FrameWork
+from gsstream.motion.base import MotionPart
+
+
+@final
+class Still(MotionPart):
+    """Proposes no motion: every frame starts from where the last one ended (the null part, and S2GS as published)."""
+
+    source: ClassVar[str] = "gsstream"
+
+    def propose(self, scene: Scene, work: FrameWork) -> tuple[Motion, ...]:
+        return ()

@@ -1,0 +1,93 @@
+"""How much memory a packet and a picture would take, known before they are decoded: for players with a limit.
+
+A few bytes can announce millions of Gaussians inside the limits of the format. What a packet announces stands in its
+first bytes; the factors below are peaks that were measured while decoding, with a margin.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+import zstandard
+
+from gsstream.core.errors import InputError
+from gsstream.packet import PacketKind, PlayerState
+from gsstream.packet.base import MAX_META, Section, located, parse_packet
+from gsstream.packet.bits import BitReader, unpack_blobs
+
+#: Bytes at the peak for every number of a Gaussian in a key packet or a birth (4 of them stay), for every Gaussian
+#: that a delta reaches, for every byte of meta as JSON (lists of empty objects are worst), and for every pixel.
+PER_NUMBER, PER_DELTA_ROW, PER_META_BYTE, PER_PIXEL = 30, 200, 30, 48
+_COUNTS = struct.Struct("<II")
+
+
+@dataclass(frozen=True, slots=True)
+class MemoryLimit:
+    """A limit on what playing a stream takes, beside the program itself (about 80 MB).
+
+    Arguments:
+        most: bytes.
+    """
+
+    most: int
+
+    def check_packet(self, size: int, frame: int) -> None:
+        """Refuse a packet of ``size`` bytes before it is read. Raises InputError."""
+        self._check(2 * size, f"the packet of frame {frame}")
+
+    def check_decoding(self, data: bytes, state: PlayerState | None, offset: int) -> None:
+        """Refuse a packet by what it announces, before it is decoded.
+
+        Arguments:
+            data: the complete packet. offset: its place in the file.
+            state: what is held while it is decoded.
+
+        Raises InputError beyond the limit, PacketError for a damaged packet.
+        """
+        header, sections = parse_packet(data, offset)
+        held = 0 if state is None else sum(array.nbytes for _, array in state.gaussians.items())
+        wanted = held + 2 * len(data)
+        if header.kind == PacketKind.KEY:
+            wanted += _key(sections)
+        elif header.kind == PacketKind.DELTA and state is not None:
+            rows, numbers = len(state.gaussians), 14 + 3 * state.gaussians.shN.shape[1]
+            wanted += rows * (PER_DELTA_ROW + 8 * numbers) + _births(sections) * PER_NUMBER * numbers
+        self._check(wanted, f"decoding frame {header.frame}")
+
+    def check_pictures(self, width: int, height: int, kept: int = 1) -> None:
+        """Refuse pictures of a size of which ``kept`` are in memory at a time, as bytes. Raises InputError."""
+        self._check(width * height * (PER_PIXEL + 3 * kept), f"drawing {width} x {height} pixels")
+
+    def _check(self, wanted: int, what: str) -> None:
+        if wanted > self.most:
+            raise InputError(
+                f"{what} takes about {_mb(wanted)} MB; the limit is {_mb(self.most)} MB. Raise --max-memory "
+                "if you trust this stream"
+            )
+
+
+def _mb(size: int) -> str:
+    return f"{size / 1e6:,.0f}" if size >= 10_000_000 else f"{size / 1e6:.3g}"
+
+
+def _key(sections: dict[str, Section]) -> int:
+    """Bytes for the sections of a key packet; what is missing or cut short is left to the decoder to refuse."""
+    layout, rest, meta = (sections[name].data if name in sections else b"" for name in ("layout", "shN", "meta"))
+    gaussians, nodes = _COUNTS.unpack_from(layout) if len(layout) >= _COUNTS.size else (0, 0)
+    channels = rest[1] if len(rest) > 1 else 0
+    try:
+        text = min(max(0, zstandard.frame_content_size(meta)), MAX_META)
+    except zstandard.ZstdError:
+        text = 0
+    return int(gaussians * PER_NUMBER * (14 + min(channels, 45)) + 64 * nodes + text * PER_META_BYTE)
+
+
+def _births(sections: dict[str, Section]) -> int:
+    """How many Gaussians a delta packet adds, by the head of its section."""
+    if "births" not in sections:
+        return 0
+    section = sections["births"]
+    with located(section.offset):
+        # The number stands in the first bits; a head may be as long as the packet, and bits take memory, too.
+        return BitReader(unpack_blobs(section.data, 2)[0][:16]).gamma() + 1

@@ -1,0 +1,235 @@
+"""What a stream costs: bytes by section and frame, beside entropy, the paper's estimate and a plain codec."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from statistics import median
+from typing import Any
+
+import numpy as np
+import zstandard
+
+from gsstream.core.changes import active_rows, gather_rows
+from gsstream.core.errors import PacketError
+from gsstream.core.gaussians import ATTRIBUTES, Gaussians
+from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.packet import Entry, PacketKind, PlayerState, StreamReader, decode_packet
+from gsstream.packet.base import parse_packet
+from gsstream.packet.tables import coded_tables
+
+
+@dataclass(frozen=True, slots=True)
+class PacketStats:
+    """One packet. Sizes in bytes.
+
+    Arguments:
+        kind: key, delta or empty.
+        size: all bytes of the packet. sections: section -> bytes; ``header`` holds all headers.
+        active_gaussians, active_nodes: behind open gates; all of them in a key packet.
+        coded: bytes of the entropy-coded sections, the tables of their models included.
+        entropy: empirical entropy of their symbols, each channel by itself or all together as they were modelled, and
+            the bits sent plainly. coded / entropy is the coder's efficiency.
+        float16_zstd: the same rows of the attributes that change, as float16 by zstandard level 19 (rows not named).
+        paper: the estimate of the S2GS paper (see :func:`paper_estimate`); no stream that can be decoded is that small.
+        decode_ms: wall time of decoding and updating the state, milliseconds.
+    """
+
+    frame: int
+    kind: str
+    size: int
+    sections: dict[str, int]
+    active_gaussians: int
+    active_nodes: int
+    coded: int
+    entropy: float
+    float16_zstd: int
+    paper: float
+    decode_ms: float
+
+
+@dataclass(frozen=True, slots=True)
+class StreamStats:
+    """All packets of a stream.
+
+    Arguments:
+        num_gaussians, num_nodes: of the last key packet. raw_key_bytes: its attributes as float32.
+        fps: pictures per second of the recording.
+    """
+
+    packets: tuple[PacketStats, ...]
+    num_gaussians: int
+    num_nodes: int
+    raw_key_bytes: int
+    fps: float
+
+    def of(self, *kinds: str) -> list[PacketStats]:
+        """The packets of these kinds."""
+        return [packet for packet in self.packets if packet.kind in kinds]
+
+    @property
+    def kb_per_frame(self) -> float | None:
+        """Mean of delta and empty packets, 1 KB = 1,000 bytes; None without any."""
+        return _mean([p.size / 1000 for p in self.of("delta", "empty")])
+
+    @property
+    def kb_amortised(self) -> float:
+        """All bytes over all frames."""
+        return sum(p.size for p in self.packets) / 1000 / len(self.packets)
+
+    @property
+    def mbit_per_second(self) -> float | None:
+        """Rate of delta and empty packets at the recording's speed, 10^6 bits."""
+        return None if self.kb_per_frame is None else self.kb_per_frame * 8e-3 * self.fps
+
+    def efficiency(self, *kinds: str) -> float | None:
+        """Coded bytes over entropy, all packets of these kinds together."""
+        chosen = self.of(*kinds)
+        entropy = sum(p.entropy for p in chosen)
+        return sum(p.coded for p in chosen) / entropy if entropy else None
+
+    def sections(self, *kinds: str) -> dict[str, int]:
+        """Section -> bytes, all packets of these kinds together."""
+        out: dict[str, int] = {}
+        for packet in self.of(*kinds):
+            for name, size in packet.sections.items():
+                out[name] = out.get(name, 0) + size
+        return out
+
+    def summary(self) -> dict[str, Any]:
+        """The numbers of a table row."""
+        deltas, keys = self.of("delta"), self.of("key")
+        coded, plain = (sum(getattr(p, name) for p in deltas) for name in ("coded", "float16_zstd"))
+        return {
+            "frames": len(self.packets), "gaussians": self.num_gaussians, "nodes": self.num_nodes, "fps": self.fps,
+            "key_bytes": keys[-1].size, "key_raw_over_coded": self.raw_key_bytes / keys[-1].size,
+            "kb_per_frame": self.kb_per_frame, "kb_amortised": self.kb_amortised,
+            "mbit_per_second": self.mbit_per_second,
+            "paper_kb_per_frame": _mean([p.paper / 1000 for p in self.of("delta", "empty")]),
+            "paper_kb_with_frame_0": _mean([p.paper / 1000 for p in self.packets]),
+            "key_coder_over_entropy": self.efficiency("key"), "delta_coder_over_entropy": self.efficiency("delta"),
+            "float16_zstd_over_coded": plain / coded if coded else None,
+            "active_share": _mean([p.active_gaussians / max(self.num_gaussians, 1) for p in self.of("delta", "empty")]),
+            "delta_decode_ms_median": median(p.decode_ms for p in deltas) if deltas else None,
+            "delta_decode_ms_most": max((p.decode_ms for p in deltas), default=None),
+        }  # fmt: skip
+
+    def to_json(self) -> str:
+        """Summary, sections and every packet."""
+        data = {
+            "summary": self.summary(), "key_sections": self.sections("key"), "delta_sections": self.sections("delta"),
+            "packets": [asdict(packet) for packet in self.packets],
+        }  # fmt: skip
+        return json.dumps(data, indent=1, allow_nan=False)
+
+
+def stream_stats(
+    stream: str | os.PathLike[str], *, progress: Callable[[int, int], None] | None = None
+) -> StreamStats:
+    """Decode every packet of a stream and measure it. Raises PacketError for a damaged stream."""
+    packets: list[PacketStats] = []
+    state: PlayerState | None = None
+    raw = 0
+    with StreamReader(stream) as reader:
+        frames = reader.frames
+        for done, entry in enumerate(frames, 1):
+            data = reader.read(entry)
+            started = time.perf_counter()
+            state = decode_packet(state, data, offset=entry.offset)
+            seconds = time.perf_counter() - started
+            packets.append(_packet(entry, data, state, seconds))
+            if entry.kind == PacketKind.KEY:
+                raw = sum(array.nbytes for _, array in state.gaussians.items())
+            if progress is not None:
+                progress(done, len(frames))
+        if reader.damage is not None:
+            raise reader.damage
+    if state is None:
+        raise PacketError("the stream holds no complete packet yet", reader.end)
+    return StreamStats(tuple(packets), len(state.gaussians), len(state.layout.node_counts), raw, state.meta.fps)
+
+
+def paper_estimate(state: PlayerState, kind: PacketKind) -> float:
+    """Bytes the S2GS paper would report for this packet (s2gs released code, its size function; read and restated).
+
+    Frame 0: every attribute but positions and view-dependent colour as float32, position offsets as float32, and the
+    zero-order entropy of the view-dependent colour. Later: decoders as float32 in every frame, position offsets of
+    active Gaussians as float32, the entropy of the other symbols over all Gaussians (closed gates count as zeros) and
+    of the open/closed map. Headers, model tables, gate levels and anchors are not counted there.
+    """
+    if kind == PacketKind.KEY:
+        return _plain_estimate(state.gaussians)
+    if state.delta is None:
+        return 0.0
+    delta, bits = state.delta, 0.0
+    bits += 32 * sum(decoder.size for decoder in delta.decoders.values())
+    assert state.before is not None
+    number, rows = len(state.before.octree_levels), len(active_rows(state.before, delta.gates))
+    for name, table in delta.symbols.items():
+        if name == "means":
+            bits += 96.0 * rows
+            continue
+        for column in table.T:
+            bits += entropy_bits(np.concatenate([column, np.zeros(number - rows, column.dtype)]))
+    born = 0.0 if delta.births is None else _plain_estimate(delta.births.gaussians)
+    return (bits + entropy_bits(delta.gates != 0)) / 8 + born
+
+
+def _plain_estimate(gaussians: Gaussians[FloatArray]) -> float:
+    """Bytes of whole Gaussians by the rule of frame 0; also used for births, which the paper's method does not have."""
+    colors = np.asarray(gaussians.shN).reshape(len(gaussians), -1)
+    plain = sum(array.nbytes for name, array in gaussians.items() if name != "shN")
+    return float(plain) + sum(entropy_bits(column) for column in colors.T) / 8
+
+
+def entropy_bits(values: Any) -> float:
+    """Zero-order entropy of an array, bits in total."""
+    _, counts = np.unique(values, return_counts=True)
+    return float((counts * np.log2(counts.sum() / counts)).sum())
+
+
+def float16_bytes(gaussians: Gaussians[FloatArray], names: Sequence[str], rows: IntArray) -> int:
+    """Bytes of these rows as float16 by zstandard level 19: what a plain codec would send."""
+    parts = [getattr(gaussians, name)[rows].astype(np.float16).tobytes() for name in names]
+    return len(zstandard.ZstdCompressor(level=19).compress(b"".join(parts)))
+
+
+def _plain_bytes(state: PlayerState, rows: IntArray) -> int:
+    """:func:`float16_bytes` of a packet: moved rows by what moved, whole Gaussians for keys and births."""
+    delta = state.delta
+    if delta is None:
+        return float16_bytes(state.gaussians, ATTRIBUTES, rows)
+    born = 0
+    if delta.births is not None:
+        born = float16_bytes(delta.births.gaussians, ATTRIBUTES, np.arange(len(delta.births)))
+    if not delta.edits_rows:
+        return float16_bytes(state.gaussians, tuple(delta.symbols), rows)
+    assert state.before is not None
+    source = gather_rows(state.before.node_of, delta.births, delta.deaths)
+    return born + float16_bytes(state.gaussians, tuple(delta.symbols), np.flatnonzero(np.isin(source, rows)))
+
+
+def _packet(entry: Entry, data: bytes, state: PlayerState, seconds: float) -> PacketStats:
+    _, sections = parse_packet(data, entry.offset)
+    sizes = {name: len(section.data) for name, section in sections.items()}
+    layout, delta = state.before or state.layout, state.delta
+    rows = np.arange(len(state.gaussians)) if delta is None else active_rows(layout, delta.gates)
+    empty = entry.kind == PacketKind.EMPTY
+    tables = coded_tables(sections, entry.kind, layout)
+    return PacketStats(
+        frame=entry.frame, kind=entry.kind.name.lower(), size=entry.size,
+        sections={**sizes, "header": entry.size - sum(sizes.values())},
+        active_gaussians=0 if empty else len(rows),
+        active_nodes=0 if empty else int(np.count_nonzero(delta.gates)) if delta else len(layout.node_counts),
+        coded=sum(table.size for table in tables),
+        entropy=sum(table.entropy_bits for table in tables) / 8,
+        float16_zstd=0 if empty else _plain_bytes(state, rows),
+        paper=paper_estimate(state, entry.kind), decode_ms=1000 * seconds,
+    )  # fmt: skip
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return sum(values) / len(values) if values else None

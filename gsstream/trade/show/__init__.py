@@ -1,0 +1,1 @@
+"""Pictures of a run: curves over frames, contact sheets, and the gallery of a run folder."""

@@ -1,6 +1,0 @@
-"""What every cell imports, in one module: a fork server loads it once. Starts no thread."""
-
-import gsstream.engine.assembly.assemble
-import gsstream.engine.run.session
-import gsstream.trade.bench_report
-import gsstream.trade.evaluate  # noqa: F401

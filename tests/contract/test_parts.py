@@ -1,0 +1,341 @@
+"""The null parts, and the one map that encoder and player share."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from residual_oracle import apply_residual, decode_rows, train_rows
+
+from gsstream.api import (
+    ATTRIBUTES,
+    Cameras,
+    Delta,
+    Gaussians,
+    Hierarchy,
+    InputError,
+    Layout,
+    Part,
+    PointCloud,
+    apply_delta,
+)
+from gsstream.confidence.uniform import Uniform
+from gsstream.gate.always_open import AlwaysOpen
+from gsstream.propagation.group_max import GroupMax
+from gsstream.regularizer.none import NoRegularizer
+from gsstream.render.reference import ReferenceRenderer
+from gsstream.residual.additive import Additive, DirectCode
+from gsstream.residual.base import AttributeCode, UpdateRule, init_latents, symbols
+from gsstream.residual.joint import add_joint, decode_joint, join_features, joint_code, pull_back_joint
+from gsstream.structure.flat import Flat
+
+PARTS = [Flat, Uniform, GroupMax, AlwaysOpen, NoRegularizer, Additive, ReferenceRenderer]
+
+
+def rig() -> Cameras:
+    return Cameras(("a",), np.eye(4)[None], np.array([[[50.0, 0, 8], [0, 50, 8], [0, 0, 1]]]), 16, 16)
+
+
+def make(n: int, bases: int = 4, seed: int = 0) -> Gaussians[np.ndarray]:
+    g = np.random.default_rng(seed)
+    shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, bases - 1, 3)]
+    return Gaussians(**{k: g.normal(size=s).astype(np.float32) for k, s in zip(ATTRIBUTES, shapes, strict=True)})
+
+
+def cloud(n: int, seed: int = 0) -> PointCloud:
+    g = np.random.default_rng(seed)
+    return PointCloud(g.normal(size=(n, 3)).astype(np.float32), g.random((n, 3)).astype(np.float32), "test")
+
+
+class Coded(UpdateRule):
+    """Latents for some attributes, identity for others; the shape S2GS has."""
+
+    def codes(self) -> dict[str, AttributeCode]:
+        return {
+            "means": AttributeCode(step=0.02, lr=0.1),
+            "quats": AttributeCode(step=1.0, lr=0.1, latent=6, decoder_std=0.1),
+            "scales": AttributeCode(step=0.5, lr=0.1, latent=8, decoder_std=0.1),
+            "opacities": AttributeCode(step=1.0, lr=0.1, latent=1, decoder_std=0.1),
+            "sh0": AttributeCode(step=0.01, lr=0.1),
+            "shN": AttributeCode(step=1.0, lr=0.1, latent=4, decoder_std=0.1),
+        }
+
+
+@pytest.mark.parametrize("kind", PARTS, ids=lambda k: k.__name__)
+class TestEveryPart:
+    def test_is_frozen(self, kind: type[Part]) -> None:
+        part = kind()
+        for name in ("config", "anything"):
+            with pytest.raises(AttributeError, match="is frozen: state is passed in and returned"):
+                setattr(part, name, 1)
+        with pytest.raises(ValidationError):
+            part.config.__setattr__("anything", 1)
+
+    def test_is_final_and_copies_are_equal(self, kind: type[Part]) -> None:
+        assert getattr(kind, "__final__", False)
+        assert not inspect.isabstract(kind)
+        part = kind()
+        assert copy.deepcopy(part) == part == pickle.loads(pickle.dumps(part))
+        assert hash(copy.deepcopy(part)) == hash(part)
+        assert repr(part.config) in repr(part)
+
+    def test_config_round_trip(self, kind: type[Part]) -> None:
+        config = kind.Config()
+        assert kind.Config.model_validate_json(config.model_dump_json()) == config
+        with pytest.raises(ValidationError, match="no_such_key"):
+            kind.Config(no_such_key=1)
+        assert all(field.description for field in kind.Config.model_fields.values())
+
+
+def test_different_settings_are_different_parts() -> None:
+    assert Uniform(Uniform.Config(logit=1)) != Uniform()
+    assert Uniform() != AlwaysOpen()
+
+
+class TestFlat:
+    def test_every_gaussian_is_its_own_root(self) -> None:
+        points, flat = cloud(20), Flat()
+        anchors = flat.seed(points, rig())
+        scene = make(20).map(torch.from_numpy)
+        hierarchy = flat.build(scene, anchors)
+        hierarchy.validate()
+        assert hierarchy.num_nodes == hierarchy.num_gaussians == 20
+        assert torch.equal(hierarchy.parent, torch.arange(20))
+        assert np.array_equal(anchors.positions.numpy(), points.xyz)
+
+    @pytest.mark.parametrize("n", [1, 2])
+    def test_coincident_points_have_a_unit(self, n: int) -> None:
+        points = PointCloud(np.ones((n, 3), np.float32), np.ones((n, 3), np.float32), "test")
+        assert Flat().seed(points, rig()).cell_sizes.tolist() == [1.0]
+
+    def test_nothing_to_start_from(self) -> None:
+        with pytest.raises(InputError, match="expected at least 1, got 0; give points or enable seeding"):
+            Flat().seed(cloud(0), rig())
+
+
+@st.composite
+def grouped(draw: st.DrawFn) -> tuple[torch.Tensor, Hierarchy]:
+    nodes = draw(st.integers(1, 6))
+    node_of = draw(st.lists(st.integers(0, nodes - 1), min_size=0, max_size=20))
+    values = draw(st.lists(st.floats(-1e4, 1e4, width=32), min_size=len(node_of), max_size=len(node_of)))
+    index = torch.arange(nodes)
+    members = torch.tensor(node_of, dtype=torch.int64)
+    return torch.tensor(values, dtype=torch.float32), Hierarchy(members, index, torch.zeros_like(index))
+
+
+class TestGroupMax:
+    @given(grouped())
+    @settings(max_examples=60, deadline=None)
+    def test_is_the_maximum_of_each_group(self, case: tuple[torch.Tensor, Hierarchy]) -> None:
+        logits, hierarchy = case
+        found = GroupMax().propagate(logits, hierarchy)
+        for node in range(hierarchy.num_nodes):
+            members = logits[hierarchy.node_of == node]
+            assert float(found[node]) == (float(members.max()) if len(members) else -50.0)
+        spread = found[hierarchy.node_of]
+        assert bool((spread >= logits).all())
+        assert torch.equal(GroupMax().propagate(spread, hierarchy), found)
+
+    def test_is_the_identity_on_the_flat_structure(self) -> None:
+        logits = torch.tensor([3.0, -80.0, 0.0])  # below the value of an empty node, too
+        index = torch.arange(3)
+        hierarchy = Hierarchy(index, index, torch.zeros_like(index))
+        assert torch.equal(GroupMax().propagate(logits, hierarchy), logits)
+
+
+class TestAlwaysOpen:
+    def test_everything_passes(self) -> None:
+        gate = AlwaysOpen()
+        state = gate.bound(gate.init(torch.tensor([-50.0, 0.0, 50.0])))
+        assert gate.num_levels == 1
+        assert gate.noise(3, torch.Generator()) is None
+        assert torch.equal(gate.sample(state, None), torch.ones(3))
+        assert torch.equal(gate.open_probability(state), torch.ones(3))
+        assert gate.sample(gate.init(torch.zeros(0)), None).shape == (0,)
+
+
+def test_uniform_is_one_logit_each() -> None:
+    class Context:
+        gaussians = make(7).map(torch.from_numpy)
+
+    found = Uniform(Uniform.Config(logit=2.5)).estimate(Context())  # type: ignore[arg-type]
+    assert torch.equal(found, torch.full((7,), 2.5))
+    with pytest.raises(ValidationError, match="logit"):
+        Uniform.Config(logit=51)
+
+
+def test_no_regularizer_has_no_terms() -> None:
+    index = torch.arange(2)
+    hierarchy = Hierarchy(index, index, torch.zeros_like(index))
+    assert NoRegularizer().penalty(torch.ones(2), torch.ones(2, 3), hierarchy, 2) == {}
+
+
+class TestAdditive:
+    def test_rate_zero_freezes_an_attribute(self) -> None:
+        rule = Additive(Additive.Config(shN=DirectCode(step=0.1, lr=0)))
+        assert set(rule.codes()) == set(ATTRIBUTES) - {"shN"}
+        assert rule.init_decoders(make(3).map(torch.from_numpy), torch.Generator()) == {}
+
+    @pytest.mark.parametrize("bad", [{"step": 0.0, "lr": 0.1}, {"step": 0.1, "lr": -1.0}])
+    def test_impossible_codes_are_refused(self, bad: dict[str, float]) -> None:
+        with pytest.raises(ValidationError):
+            DirectCode(**bad)
+
+
+class TestQuantise:
+    @given(st.floats(-1e3, 1e3, width=32), st.sampled_from([1.0, 0.5, 0.02, 0.1, 1e-3]))
+    @settings(max_examples=200, deadline=None)
+    def test_the_value_is_what_the_decoder_computes(self, value: float, step: float) -> None:
+        """Exactly symbol * step in float32, not an ulp beside it."""
+        rule = Additive(Additive.Config(opacities=DirectCode(step=step, lr=1)))
+        latents = {"opacities": torch.tensor([[value]], dtype=torch.float32)}
+        base = make(1).map(torch.from_numpy)
+        _, change = decode_rows(rule, base, latents, {}, torch.ones(1))
+        symbol = symbols(rule.codes(), latents)["opacities"].numpy()
+        assert np.array_equal(change.latents.numpy(), symbol.astype(np.float32) * np.float32(step))
+
+
+def transmitted(
+    rule: UpdateRule, scene: Gaussians[np.ndarray], seed: int, levels: int
+) -> tuple[Gaussians[torch.Tensor], Gaussians[np.ndarray], np.ndarray]:
+    """The same change by both paths: training forward on the active rows, and the player's on the whole scene."""
+    g = np.random.default_rng(seed)
+    counts = g.multinomial(len(scene), np.ones(7) / 7).astype(np.int32)
+    layout = Layout(counts, g.integers(0, 3, len(scene)).astype(np.uint8), np.array([0.5, 0.3, 0.1], np.float32))
+    gates = (g.integers(0, levels + 1, 7) * (g.random(7) < 0.7)).astype(np.uint8)
+    gates[:1] = levels
+    active = np.flatnonzero(gates[layout.node_of])
+    base = scene.rows(active).map(torch.from_numpy)
+    generator = torch.Generator().manual_seed(seed)
+    latents = {
+        name: 3 * rule.codes()[name].step * torch.randn(zero.shape, generator=generator)
+        for name, zero in init_latents(rule, base).items()
+    }
+    decoders = rule.init_decoders(base, generator)
+    gate = torch.from_numpy(gates[layout.node_of[active]].astype(np.float32)) / levels
+    units = torch.from_numpy(layout.units[active])
+    trained = train_rows(rule, base, gate, latents, decoders, units)
+    delta = Delta(
+        gates, levels,
+        {name: value.numpy() for name, value in symbols(rule.codes(), latents).items()},
+        {name: code.step for name, code in rule.codes().items()},
+        {name: value.numpy() for name, value in decoders.items()},
+    )  # fmt: skip
+    return trained, apply_delta(scene, layout, delta), active
+
+
+@pytest.mark.parametrize("rule", [Additive(), Coded()], ids=["additive", "coded"])
+@pytest.mark.parametrize(("levels", "bases"), [(1, 1), (10, 9), (255, 16)])
+def test_training_and_playing_compute_the_same_map(rule: UpdateRule, levels: int, bases: int) -> None:
+    scene = make(60, bases, seed=levels)
+    trained, played, active = transmitted(rule, scene, seed=levels, levels=levels)
+    for name in ATTRIBUTES:
+        if bases == 1 and name == "shN":
+            continue
+        ours, theirs = getattr(trained, name).numpy(), getattr(played, name)[active]
+        # float32: the decoder sums channel by channel, the product here in another order
+        np.testing.assert_allclose(ours, theirs, rtol=2e-6, atol=2e-6, err_msg=name)
+        assert not np.array_equal(theirs, getattr(scene, name)[active])
+        rest = np.setdiff1d(np.arange(60), active)
+        assert getattr(played, name)[rest].tobytes() == getattr(scene, name)[rest].tobytes()
+
+
+def test_attributes_without_a_decoder_agree_to_a_rounding() -> None:
+    """Training adds the gated change in one fused operation, the player in two: one rounding apart, no more."""
+    scene = make(80, 4, seed=5)
+    trained, played, active = transmitted(Additive(), scene, seed=5, levels=10)
+    for name in ATTRIBUTES:
+        ours, theirs = getattr(trained, name).numpy(), getattr(played, name)[active]
+        size = np.maximum(np.abs(theirs), np.abs(getattr(scene, name)[active]))
+        assert (np.abs(ours - theirs) <= 2 * np.finfo(np.float32).eps * size).all(), name
+
+
+def test_zero_latents_change_nothing() -> None:
+    base = make(9).map(torch.from_numpy)
+    rule = Coded()
+    latents, decoders = init_latents(rule, base), rule.init_decoders(base, torch.Generator().manual_seed(0))
+    same = train_rows(rule, base, torch.ones(9), latents, decoders, torch.ones(9))
+    assert all(torch.equal(getattr(same, n), getattr(base, n)) for n in ATTRIBUTES)
+
+
+def test_latents_follow_width_and_degree() -> None:
+    latents = init_latents(Coded(), make(5, bases=1).map(torch.from_numpy))
+    assert {n: tuple(v.shape) for n, v in latents.items()} == {
+        "means": (5, 3), "quats": (5, 6), "scales": (5, 8), "opacities": (5, 1), "sh0": (5, 3)
+    }  # fmt: skip
+    empty = init_latents(Coded(), make(0, bases=9).map(torch.from_numpy))
+    assert tuple(empty["shN"].shape) == (0, 4)
+    decoders = Coded().init_decoders(make(0, bases=9).map(torch.from_numpy), torch.Generator().manual_seed(0))
+    assert tuple(decoders["shN"].shape) == (4, 24)
+
+
+def test_every_input_of_the_residual_feels_the_loss() -> None:
+    base, rule = make(6).map(torch.from_numpy), Coded()
+    generator = torch.Generator().manual_seed(1)
+    latents = {
+        n: (2 * torch.randn(v.shape, generator=generator)).requires_grad_() for n, v in init_latents(rule, base).items()
+    }
+    decoders = {n: v.requires_grad_() for n, v in rule.init_decoders(base, generator).items()}
+    gates = torch.full((6,), 0.5, requires_grad=True)
+    out = apply_residual(rule, base, gates, latents, decoders, torch.ones(6))
+    sum((value**2).sum() for _, value in out.items()).backward()
+    for value in [gates, *latents.values(), *decoders.values()]:
+        assert value.grad is not None
+        assert torch.isfinite(value.grad).all()
+        assert value.grad.abs().max() > 0
+
+
+def test_written_out_gradient_equals_autograd() -> None:
+    """The joint table is apply_residual and its gradient, with and without decoders, in every argument."""
+    generator = torch.Generator().manual_seed(3)
+
+    def draw(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    count = 7
+    base = Gaussians(draw(count, 3), draw(count, 4), draw(count, 3), draw(count), draw(count, 1, 3), draw(count, 8, 3))
+    rule = Additive()
+    widths = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "sh0": 3, "shN": 24}
+    decoders = {"quats": draw(6, 4).requires_grad_(), "shN": draw(4, 24).requires_grad_()}
+    latents = {
+        name: draw(count, decoders[name].shape[0] if name in decoders else width).requires_grad_()
+        for name, width in widths.items()
+    }
+    gates, units = torch.rand(count, generator=generator, dtype=torch.float64).requires_grad_(), draw(count).abs()
+    upstream = base.map(lambda value: draw(*value.shape))
+    changed = apply_residual(rule, base, gates, latents, decoders, units)
+    pairs = zip(changed.items(), upstream.items(), strict=True)
+    sum((value * weight).sum() for (_, value), (_, weight) in pairs).backward()
+    with torch.no_grad():
+        code = joint_code(rule.codes(), latents, decoders, base)
+        joined, matrix = torch.cat(list(latents.values()), 1), code.join_decoders(decoders)
+        change = decode_joint(code, joined, matrix, units)
+        ours = add_joint(code, base, join_features(code, base), change, gates)
+        back = pull_back_joint(code, join_features(code, upstream), change, matrix, gates, units)
+    for (name, value), (_, truth) in zip(ours.items(), changed.items(), strict=True):
+        torch.testing.assert_close(value, truth, msg=name)
+    torch.testing.assert_close(back.gates, gates.grad)
+    by_latent, by_decoder = code.split(back.latents), code.split_decoders(back.matrix, decoders)
+    for name, latent in latents.items():
+        torch.testing.assert_close(by_latent[name], latent.grad)
+    for name, decoder in decoders.items():
+        torch.testing.assert_close(by_decoder[name], decoder.grad)
+    # Nothing leaks into the blocks between attributes: there is nothing to train.
+    assert not bool(back.matrix[code.trained == 0].any())
+
+
+def test_joint_table_of_attributes_that_do_not_change() -> None:
+    base = make(4).map(torch.from_numpy)
+    none = joint_code(Additive().codes(), init_latents(Additive(), base.rows(torch.arange(0))), {}, base)
+    assert tuple(join_features(none, base.rows(torch.arange(0))).shape) == (0, none.trained.shape[1])
+    code = joint_code(Additive().codes(), {}, {}, base)
+    change = decode_joint(code, torch.zeros(4, 0), code.join_decoders({}), torch.ones(4))
+    same = add_joint(code, base, join_features(code, base), change, torch.ones(4))
+    assert all(torch.equal(a, b) for (_, a), (_, b) in zip(same.items(), base.items(), strict=True))

@@ -1,0 +1,93 @@
+"""Encoder state over births and deaths: hierarchy, moments and decoders follow the packet and nothing else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsstream.core.changes import Births, own_nodes
+from gsstream.core.changes import Delta, Layout
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.topology import TopologyEdit
+from gsstream.engine.fit.row_table import RowTable
+from gsstream.engine.state.follow import follow
+from gsstream.engine.state.stream_state import StreamState
+from gsstream.optimiser.adam import ReferenceAdam
+from gsstream.packet import decode_packet, encode_delta, encode_key
+from gsstream.testing.checks.packet import tiny_key
+
+
+def scene(number: int, seed: int = 0) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (3, 3)}
+    return Gaussians(**{n: rng.normal(size=(number, *s)).astype(np.float32) for n, s in shapes.items()})
+
+
+@pytest.fixture
+def state() -> StreamState:
+    player = decode_packet(None, encode_key(tiny_key()).data)
+    nodes = len(player.layout.node_counts)
+    parent = torch.tensor([0] * 3 + [0] * (nodes - 3))
+    parent[1:3] = torch.tensor([1, 2])
+    level = (parent != torch.arange(nodes)).long()
+    hierarchy = Hierarchy(torch.from_numpy(player.layout.node_of), parent, level)
+    steps = torch.full((nodes,), 7, dtype=torch.int32)
+    moments = {"steps": steps, "exp_avg": torch.arange(nodes).float(), "exp_avg_sq": torch.ones(nodes)}
+    return StreamState(player, hierarchy, None, {"sh0": torch.ones(2, 3)}, gate_moments=moments)
+
+
+def step(state: StreamState, delta: Delta) -> StreamState:
+    player = state.player
+    packet = encode_delta(delta, player.layout, player.decoders, frame=player.frame + 1)
+    return follow(state, decode_packet(player, packet.data))
+
+
+def delta_of(layout: Layout, births: Births | None, deaths: list[int] | None = None) -> Delta:
+    gates = np.zeros(len(layout.node_counts), np.uint8)
+    return Delta(gates, 1, births=births, deaths=np.array(deaths or [], np.int64))
+
+
+def test_the_forest_grows_with_the_packet(state):
+    nodes = len(state.player.layout.node_counts)
+    # Two new nodes: one below node 4 (which is below node 0), one below that one, and a new root.
+    parents = np.array([4, nodes, nodes + 2])
+    born = Births(scene(4), np.array([2, nodes, nodes + 1, nodes + 2]), np.zeros(4, np.uint8), parents)
+    after = step(state, delta_of(state.player.layout, born, [0, 7]))
+    after.hierarchy.validate()
+    assert after.hierarchy.num_gaussians == len(after.player.gaussians) == 42
+    assert after.hierarchy.level.tolist()[nodes:] == [2, 3, 0]
+    assert after.hierarchy.parent.tolist()[nodes:] == [4, nodes, nodes + 2]
+    assert np.array_equal(after.hierarchy.node_of.numpy(), after.player.layout.node_of)
+    assert torch.equal(after.hierarchy.parent[:nodes], state.hierarchy.parent)
+
+
+def test_gate_moments_stay_with_their_nodes(state):
+    nodes = len(state.player.layout.node_counts)
+    after = step(state, delta_of(state.player.layout, own_nodes(scene(3), np.zeros(3), nodes), [1]))
+    assert after.gate_moments["steps"].tolist() == [7] * nodes + [0] * 3
+    assert after.gate_moments["exp_avg"].tolist() == [*range(nodes), 0, 0, 0]
+    assert after.gate_moments["exp_avg_sq"].tolist() == [1] * nodes + [0] * 3
+
+
+def test_a_packet_without_births_leaves_the_forest_alone(state):
+    gates = np.ones(len(state.player.layout.node_counts), np.uint8)
+    symbols = {"opacities": np.ones((40, 1), np.int32)}
+    after = step(state, Delta(gates, 1, symbols, {"opacities": 0.1}))
+    assert after.hierarchy is state.hierarchy
+    assert after.gate_moments is state.gate_moments
+    assert torch.equal(after.decoders["sh0"], torch.ones(2, 3))
+
+
+def test_per_gaussian_moments_follow_the_edit():
+    """Row 1 is copied as a fresh row, row 0 goes: what stays keeps its moment, what is fresh starts at zero."""
+    table = RowTable({"x": torch.arange(40.0)[:, None]}, {"x": 0.0}, ReferenceAdam())
+    table.step({"x": torch.arange(40.0)[:, None] + 1})
+    source = torch.cat([torch.arange(1, 40), torch.tensor([1])])
+    fresh = torch.arange(40) == 39
+    table.edit(TopologyEdit(source, fresh))
+    moments = table.moments("x")["exp_avg"][:, 0]
+    torch.testing.assert_close(moments[:39], 0.1 * (source[:39] + 1.0))
+    assert moments[39] == 0
+    assert table["x"][:, 0].tolist() == source.tolist()

@@ -1,0 +1,190 @@
+"""One run at a time in a folder, whole files or none, one sentence for a full disk, and a polite end by signals."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from gsstream.core.errors import OutputError
+from gsstream.engine.run import output
+from gsstream.engine.run.metrics_log import append_metrics, lost_lines, trim_metrics
+from gsstream.engine.run.output import claim_output, disk_errors, ended_by_signals, run_lock, write_whole
+
+HOLD = """
+import sys
+from pathlib import Path
+from gsstream.engine.run.output import claim_output
+with claim_output(Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def holder(tmp_path: Path):
+    """Another process that holds tmp_path / "out"."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path / "out")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "held\n"
+    yield process
+    process.kill()
+    process.wait()
+
+
+@pytest.mark.parametrize("how", [{}, {"overwrite": True}])
+def test_a_second_run_is_told_who_holds_the_folder(how, tmp_path, holder) -> None:
+    before = (tmp_path / "out" / output.LOCK).read_bytes()
+    with (
+        pytest.raises(OutputError, match=rf"another run works in .*process {holder.pid} on .*choose another --out"),
+        claim_output(tmp_path / "out", **how),
+    ):
+        raise AssertionError("two runs in one folder")
+    assert (tmp_path / "out" / output.LOCK).read_bytes() == before
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, None])
+def test_the_lock_goes_with_its_process(end, tmp_path, holder) -> None:
+    if end is None:
+        holder.stdin.close()
+    else:
+        holder.send_signal(end)
+    holder.wait()
+    with claim_output(tmp_path / "out") as again:
+        assert again is False
+        assert json.loads((tmp_path / "out" / output.LOCK).read_text())["pid"] == os.getpid()
+    assert list((tmp_path / "out").iterdir()) == [], "a finished run leaves its results and nothing else"
+
+
+def test_what_is_refused_leaves_no_folder(tmp_path) -> None:
+    with pytest.raises(OutputError, match="nothing to resume"), claim_output(tmp_path / "new", resume=True):
+        pass
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_lock_that_says_nothing_still_holds(tmp_path) -> None:
+    with run_lock(tmp_path):
+        (tmp_path / output.LOCK).write_text("")
+        with pytest.raises(OutputError, match=r"another sweep works in [^(]*: wait"), run_lock(tmp_path, "sweep"):
+            pass
+
+
+@pytest.mark.parametrize("moment", ["write", "replace"])
+def test_a_file_is_whole_or_as_before(moment, tmp_path, monkeypatch) -> None:
+    path = tmp_path / "summary.txt"
+    write_whole(path, "old")
+
+    def fail(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", fail) if moment == "write" else patch.setattr(Path, "replace", fail)
+        with pytest.raises(KeyboardInterrupt):
+            write_whole(path, "new" * 1000)
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"summary.txt": "old"}
+    write_whole(path, b"new")
+    assert path.read_bytes() == b"new"
+    plain = tmp_path / "plain"
+    plain.write_text("")
+    assert path.stat().st_mode == plain.stat().st_mode
+
+
+FULL = "/dev/full"
+
+
+@pytest.mark.skipif(not Path(FULL).exists(), reason="no device that is always full here")
+def test_a_full_disk_is_one_sentence() -> None:
+    with pytest.raises(OutputError, match=r"No space left on device; make room\. What is complete stays valid"), \
+            disk_errors(Path("out")), open(FULL, "w", buffering=1) as file:  # fmt: skip
+        file.write("x\n")
+
+
+@pytest.mark.parametrize(("number", "advice"), [(errno.EROFS, "writable"), (errno.ENOENT, "do not move or delete")])
+def test_other_faults_of_a_folder(number, advice, tmp_path) -> None:
+    with pytest.raises(OutputError, match=advice), disk_errors(tmp_path):
+        raise OSError(number, os.strerror(number), str(tmp_path / "metrics.jsonl"))
+
+
+def test_other_errors_pass_unchanged(tmp_path) -> None:
+    with pytest.raises(BlockingIOError), disk_errors(tmp_path):
+        raise BlockingIOError(errno.EAGAIN, "again")
+    with pytest.raises(KeyError), disk_errors(tmp_path):
+        raise KeyError("x")
+
+
+def test_a_kill_while_metrics_are_trimmed_loses_no_line(tmp_path, monkeypatch) -> None:
+    path = tmp_path / "metrics.jsonl"
+    for frame in range(3):
+        append_metrics(path, {"frame": frame})
+    before = path.read_bytes()
+
+    def killed(*_: object) -> None:
+        raise SystemExit
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", killed)
+        with pytest.raises(SystemExit):
+            trim_metrics(path, 1)
+    assert path.read_bytes() == before
+    assert trim_metrics(path, 1) == [{"frame": 0}, {"frame": 1}]
+
+
+def test_lost_lines_are_the_holes(tmp_path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    assert lost_lines(path, 0, 2) == [0, 1, 2]
+    for frame in (0, 1, 3, 5):
+        append_metrics(path, {"frame": frame})
+    assert lost_lines(path, 0, 5) == [2, 4]
+    assert lost_lines(path, 3, 5) == [4]
+
+
+def test_a_line_without_room_leaves_no_half(tmp_path) -> None:
+    """In a process of its own: the limit on file sizes cannot be raised again by everybody."""
+    code = (
+        "import resource, signal, sys; from pathlib import Path\n"
+        "from gsstream.engine.run.metrics_log import append_metrics\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (50, 50))\n"
+        "for frame in range(9): append_metrics(Path(sys.argv[1]), {'frame': frame, 'psnr': 1.5})\n"
+    )
+    path = tmp_path / "metrics.jsonl"
+    done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=False)
+    assert "OutputError" in done.stderr or "File too large" in done.stderr
+    assert [json.loads(line)["frame"] for line in path.read_text().splitlines()] == [0]
+    assert path.read_bytes().endswith(b"\n")
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_signals_of_services_arrive_as_an_interrupt(name) -> None:
+    number = getattr(signal, name)
+    before = signal.getsignal(number)
+    stopped = threading.Event()
+    previous = signal.signal(signal.SIGINT, lambda *_: stopped.set())
+    try:
+        with ended_by_signals() as came:
+            os.kill(os.getpid(), number)
+            assert stopped.wait(5)
+        assert came == [number]
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    assert signal.getsignal(number) is before
+
+
+def test_nohup_stays_nohup() -> None:
+    previous = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with ended_by_signals() as came:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+        assert came == []
+    finally:
+        signal.signal(signal.SIGHUP, previous)

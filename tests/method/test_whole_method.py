@@ -1,0 +1,304 @@
+"""The engine holds a whole method to its packets, lends it what it asks for, and refuses keys it would not read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from gsstream.cli.main import run_command
+from gsstream.core.changes import Delta
+from gsstream.core.errors import ComponentError, RecipeError
+from gsstream.engine.assembly.assemble import assemble
+from gsstream.engine.fit.exposure import Exposure
+from gsstream.engine.step.frame_step import RepeatedFrameWarning
+from gsstream.method.base import StreamingMethod
+from gsstream.method.hold import Hold, HoldState
+from gsstream.method.packets import send_delta
+from gsstream.packet import PacketKind
+from gsstream.player.playback import Playback
+from gsstream.plugins.catalog import load_catalog
+from gsstream.recipe.load import resolve_recipe
+from gsstream.recipe.model import Recipe
+from gsstream.source.open import open_source
+from gsstream.testing.examples.whole import ExampleWhole
+from gsstream.testing.stepping import SOURCE, MethodUnderTest
+
+Follow: Any = ExampleWhole  # final: only what is wrong on purpose may inherit from it
+
+RUN = [
+    "run", "--source", SOURCE, "--method", "hold", "--quiet", "--no-video", "--set", "first_frame.max_iterations=5",
+    "--set", "first_frame.points=recording", "--set", "first_frame.fill_points=0",
+]  # fmt: skip
+
+
+class Spoilt(Hold):  # type: ignore[misc]  # wrong on purpose
+    """Holds, and then does one thing wrong in ``spoil``."""
+
+    def step(self, state, frame, tools):
+        return self.spoil(super().step(state, frame, tools))
+
+
+def spoilt(wrong) -> StreamingMethod:
+    return type("Wrong", (Spoilt,), {"spoil": lambda _, step: wrong(step)})()
+
+
+def drift(step):
+    gaussians = step.state.player.gaussians
+    moved = replace(gaussians, means=gaussians.means + np.float32(0.25))
+    return replace(step, state=HoldState(replace(step.state.player, gaussians=moved)))
+
+
+def lose_one(step):
+    player = step.state.player
+    return replace(step, state=HoldState(replace(player, gaussians=player.gaussians.rows(slice(1, None)))))
+
+
+def stand_still(step):
+    return replace(step, state=HoldState(replace(step.state.player, frame=0)))
+
+
+def keep_decoder(step):
+    player = replace(step.state.player, decoders={"sh0": np.ones((1, 3), np.float32)})
+    return replace(step, state=HoldState(player))
+
+
+def other_layout(step):
+    layout = replace(step.state.player.layout, cell_sizes=np.array([9.0], np.float32))
+    return replace(step, state=HoldState(replace(step.state.player, layout=layout)))
+
+
+def misname(step):
+    return replace(step, status="delta")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (drift, "its state is not what players have after its packet: means is off by up to 0.25"),
+        (lose_one, "means has the shape ["),
+        (stand_still, "frame 0 instead of 1"),
+        (keep_decoder, "packet: decoders"),
+        (other_layout, "packet: layout: cell_sizes"),
+        (misname, "expected a packet of frame 1 of the kind it says, 'delta'; got 'empty' of frame 1"),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_a_state_that_players_do_not_have_is_an_error(wrong, message: str) -> None:
+    subject = MethodUnderTest("dense", spoilt(wrong))
+    start = subject.begin(open_source(SOURCE).frame(0))
+    with pytest.raises(ComponentError) as caught:
+        subject.step(start.state, open_source(SOURCE).frame(1))
+    assert message in str(caught.value)
+    assert (caught.value.slot, caught.value.part, caught.value.frame) == ("whole", "Wrong", 1)
+
+
+def test_a_packet_of_another_frame_is_an_error() -> None:
+    def repeat(step):
+        packet, player = send_delta(step.state.player, Delta(np.zeros(len(step.state.player.layout.node_counts)), 1))
+        return replace(step, packet=packet, state=HoldState(player))
+
+    subject = MethodUnderTest("dense", spoilt(repeat))
+    start = subject.begin(open_source(SOURCE).frame(0))
+    with pytest.raises(ComponentError, match=r"expected a packet of frame 1 .* got 'empty' of frame 2"):
+        subject.step(start.state, open_source(SOURCE).frame(1))
+
+
+def test_what_a_method_raises_is_reported_with_its_name() -> None:
+    def fail(step):
+        raise RuntimeError("out of ideas")
+
+    subject = MethodUnderTest("dense", spoilt(fail))
+    start = subject.begin(open_source(SOURCE).frame(0))
+    with pytest.raises(ComponentError, match=r"whole 'Wrong' .* failed at frame 1: RuntimeError: out of ideas"):
+        subject.step(start.state, open_source(SOURCE).frame(1))
+
+
+def repeating(subject: MethodUnderTest) -> MethodUnderTest:
+    recipe = subject.parts.recipe
+    stream = recipe.stream.model_copy(update={"on_error": "repeat"})
+    subject.parts = replace(subject.parts, recipe=recipe.model_copy(update={"stream": stream}))
+    return subject
+
+
+class FailsAt1(Follow):  # type: ignore[misc]  # wrong on purpose
+    """Follows the light, and fails at frame 1 unless it is worth nothing."""
+
+    def step(self, state, frame, tools):
+        if frame.index == 1 and frame.effort > 0:
+            raise RuntimeError("out of ideas")
+        return super().step(state, frame, tools)
+
+
+def test_a_failed_frame_is_repeated_when_the_recipe_says_so() -> None:
+    subject = repeating(MethodUnderTest("dense", FailsAt1()))
+    source = open_source(SOURCE)
+    start = subject.begin(source.frame(0))
+    with pytest.warns(RepeatedFrameWarning, match=r"frame 1 repeats .* 'FailsAt1' .* RuntimeError: out of ideas"):
+        failed = subject.step(start.state, source.frame(1))
+    assert failed.status == "empty"
+    assert failed.packet.kind == PacketKind.EMPTY
+    assert "out of ideas" in failed.metrics["error"]
+    assert failed.metrics["seconds"]["failed"] > 0
+    for name, value in failed.state.player.gaussians.items():
+        assert np.array_equal(value, getattr(start.state.player.gaussians, name))
+    after = subject.step(failed.state, source.frame(2))
+    assert (after.packet.frame, after.status) == (2, "delta")
+    assert "error" not in after.metrics
+
+
+def test_a_method_that_cannot_skip_either_ends_the_run() -> None:
+    def busy(step):
+        raise RuntimeError("out of ideas")
+
+    subject = repeating(MethodUnderTest("dense", spoilt(busy)))
+    start = subject.begin(open_source(SOURCE).frame(0))
+    with pytest.raises(ComponentError, match="out of ideas"):
+        subject.step(start.state, open_source(SOURCE).frame(1))
+
+
+def test_what_is_sent_in_place_of_a_failed_frame_must_be_empty() -> None:
+    class Stubborn(Follow):
+        def step(self, state, frame, tools):
+            if frame.effort > 0:
+                raise RuntimeError("out of ideas")
+            return super().step(state, replace(frame, effort=1.0), tools)
+
+    subject = repeating(MethodUnderTest("dense", Stubborn()))
+    start = subject.begin(open_source(SOURCE).frame(0))
+    with pytest.raises(ComponentError, match="out of ideas"):
+        subject.step(start.state, open_source(SOURCE).frame(1))
+
+
+def test_a_run_repeats_failed_frames_of_a_whole_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hold = Hold.step
+
+    def fails(self, state, frame, tools):
+        if frame.index == 2 and frame.effort > 0:
+            raise RuntimeError("out of ideas")
+        return hold(self, state, frame, tools)
+
+    monkeypatch.setattr(Hold, "step", fails)
+    assert run_command([*RUN, "--out", str(tmp_path / "raise")]) == 1
+    assert run_command([*RUN, "--set", "stream.on_error=repeat", "--out", str(tmp_path / "repeat")]) == 0
+    lines = (tmp_path / "repeat" / "metrics.jsonl").read_text().splitlines()
+    assert ['"error"' in line for line in lines] == [False, False, True, False]
+    with Playback(tmp_path / "repeat" / "stream.gss") as playing:
+        assert list(playing.frames) == [0, 1, 2, 3]
+
+
+def refusal(*sets: str, method: str = "hold") -> list[str]:
+    catalog = load_catalog()
+    overrides = [("--set", text) for text in ("renderer=reference", *sets)]
+    with pytest.raises(RecipeError) as caught:
+        assemble(resolve_recipe(method, catalog.recipe_path, (), overrides), catalog)
+    return str(caught.value).splitlines()
+
+
+def test_keys_that_a_whole_method_does_not_read_are_refused() -> None:
+    why = "the whole method 'hold' does not read it; its own settings: gsstream plugins show whole/hold"
+    assert refusal("structure.resolution=64", "gate_training.lr=0.5", "stream.epochs=3", "update.sh0.lr=1.0") == [
+        "4 problems in the recipe:",
+        f"  --set structure.resolution=64: structure.params: {why}",
+        f"  --set update.sh0.lr=1.0: update.params: {why}",
+        f"  --set stream.epochs=3: stream.epochs: {why}",
+        f"  --set gate_training.lr=0.5: gate_training.lr: {why}",
+    ]
+    # Written, but not changed: a saved recipe spells every default out.
+    catalog = load_catalog()
+    sets = [("--set", text) for text in ("renderer=reference", "stream.epochs=20", "structure.resolution=1024")]
+    assembly = assemble(resolve_recipe("hold", catalog.recipe_path, (), sets), catalog)
+    assert isinstance(assembly.whole, Hold)
+    assert assemble(assembly.recipe, catalog).recipe == assembly.recipe
+
+
+def test_settings_of_a_whole_method() -> None:
+    assert refusal("whole.speed=3") == ["--set whole.speed=3: unknown key 'whole.params.speed'; none are registered"]
+    assert "whole.name: no whole named 'hodl'; did you mean 'hold'?" in refusal("whole=hodl")[0]
+    wanted = "whole.params needs a named whole method, but whole.name is 'none'"
+    assert wanted in refusal("whole.speed=3", method="dense")[0]
+
+
+def test_any_recipe_may_name_one(tmp_path: Path) -> None:
+    """``--set whole=NAME`` is enough to run a part that ships no recipe."""
+    command = [text if text != "hold" else "dense" for text in RUN]
+    assert run_command([*command, "--set", "whole=hold", "--out", str(tmp_path / "o")]) == 0
+    with Playback(tmp_path / "o" / "stream.gss") as playback:
+        assert [playback.entry(f).kind for f in playback.frames] == [PacketKind.KEY, *[PacketKind.EMPTY] * 3]
+
+
+def test_a_held_scene_is_frame_0_and_resumes(tmp_path: Path) -> None:
+    out = tmp_path / "o"
+    assert run_command([*RUN, "--out", str(out)]) == 0
+    once = (out / "stream.gss").read_bytes()
+    with Playback(out / "stream.gss") as playback:
+        scenes = [playback.state_at(frame) for frame in playback.frames]
+        assert all(scene.means.tobytes() == scenes[0].means.tobytes() for scene in scenes)
+        cut = playback.entry(2).offset + 3
+    (out / "stream.gss").write_bytes(once[:cut])
+    assert run_command([*RUN, "--out", str(out), "--resume"]) == 0
+    assert (out / "stream.gss").read_bytes() == once
+    assert run_command(["info", str(out)]) == 0
+    assert run_command(["evaluate", str(out), "--source", SOURCE]) == 0
+
+
+def test_resuming_with_other_settings_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "o"
+    assert run_command([*RUN, "--out", str(out)]) == 0
+    assert run_command([*RUN, "--out", str(out), "--resume", "--seed", "5"]) == 2
+    assert "the stream was written with another recipe: seed differ" in capsys.readouterr().err
+
+
+def test_the_benchmark_of_the_parts_refuses_a_whole_method(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["bench", "frame", "--method", "hold", "--quick"]) == 2
+    assert "expected a method made of parts, got the whole method 'hold'" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def begun():
+    """(subject, what a player has after frame 0, frame 0, frame 1)"""
+    subject = MethodUnderTest("dense", Hold())
+    source = open_source(SOURCE)
+    return subject, subject.begin(source.frame(0)).state.player, source.frame(0), source.frame(1)
+
+
+class TestTools:
+    """What the engine lends, against the same thing computed apart."""
+
+    def test_backward_is_the_loss_through_the_colour_map(self, begun) -> None:
+        subject, player, before, now = begun
+        generator = torch.Generator().manual_seed(3)
+        matrix = torch.eye(3) + 0.1 * torch.randn(3, 3, 3, generator=generator)
+        offset = 0.1 * torch.randn(3, 3, generator=generator)
+        extra = {**player.meta.extra, "exposure": {"matrix": matrix.tolist(), "offset": offset.tolist()}}
+        work = subject.tools().open(replace(player, meta=replace(player.meta, extra=extra)), before, now)
+        image = torch.rand(24, 32, 3, generator=generator, requires_grad=True)
+        value = work.backward(1, image)
+        loss = subject.parts.loss
+        twin = image.detach().clone().requires_grad_()
+        shown = Exposure(matrix, offset).apply(1, twin)
+        want, gradient = loss.evaluate(shown.detach(), loss.prepare(torch.from_numpy(now.images[1])), 0.2)
+        shown.backward(gradient)
+        assert value == want
+        torch.testing.assert_close(image.grad, twin.grad, rtol=0, atol=1e-7)
+
+    def test_a_tile_mask_limits_the_loss(self, begun) -> None:
+        subject, player, before, now = begun
+        work = subject.tools().open(player, before, now)
+        mask = torch.zeros(2, 2, dtype=torch.bool)
+        mask[0, 1] = True
+        image = torch.rand(24, 32, 3, generator=torch.Generator().manual_seed(3), requires_grad=True)
+        work.backward(0, image, mask)
+        # SSIM windows reach five pixels beyond the tile.
+        assert bool((image.grad[22:] == 0).all())
+        assert bool((image.grad[:, :10] == 0).all())
+        assert bool((image.grad[:16, 16:] != 0).any())
+
+    def test_a_frame_that_is_worth_less_has_fewer_epochs(self, begun) -> None:
+        subject, _, _, now = begun
+        tools = replace(subject.tools(), parts=replace(subject.parts, recipe=Recipe()))
+        assert [tools.epochs(replace(now, effort=e)) for e in (1.0, 0.5, 0.01)] == [20, 10, 1]

@@ -1,0 +1,118 @@
+"""Meta that is well-formed JSON and no sensible recording: refused when read, and not written either."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from packet_scenes import make_key, make_meta, make_packets, replaced, write_stream
+
+from gsstream.core.errors import PacketError, ShapeError
+from gsstream.packet import StreamReader, StreamWriter, decode_key, encode_key
+from gsstream.packet.base import PACKET_HEADER
+from gsstream.packet.bulk import compress
+from gsstream.packet.meta import hash_recipe, meta_from_json, meta_to_json
+
+
+def put(**values: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda meta: meta.update(values)
+
+
+def in_rig(**values: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda meta: meta["train"].update(values)
+
+
+def no_cameras(meta: dict[str, Any]) -> None:
+    for split in ("train", "test"):
+        meta[split] |= {"ids": [], "viewmats": [], "Ks": []}
+
+
+
+LIES = {
+    **{f"fps {fps!r}": put(fps=fps) for fps in (0, -5, 1e-300, 1e300, "30", True, None, [30])},
+    **{f"width {width!r}": in_rig(width=width) for width in (0, -1, 40.9, "30", 65537, True)},
+    "too many pixels": in_rig(width=65536, height=65536),
+    "near as text": in_rig(near="0.1"),
+    "no cameras": no_cameras,
+    "method is no text": put(method=3),
+    "plugin version is no text": put(plugins={"p": 1}),
+    "background of texts": put(background=["0", "0", "0"]),
+    "source_uri is no text": put(extra={"source_uri": ["a"]}),
+    "licence is no text": put(extra={"licence": 7}),
+}
+
+
+def meta_with(change: Callable[[dict[str, Any]], None]) -> bytes:
+    data = json.loads(meta_to_json(make_meta()))
+    change(data)
+    data["recipe_hash"] = hash_recipe(data["recipe"])
+    return json.dumps(data).encode()
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_lies_are_refused_with_the_place_of_the_meta(lie: str) -> None:
+    data = meta_with(LIES[lie])
+    key = encode_key(make_key(np.random.default_rng(0)))
+    with pytest.raises(PacketError, match=r"meta: .*\(at byte \d+\)"):
+        decode_key(replaced(key, "meta", compress(data)))
+
+
+@pytest.mark.parametrize("number", ["1e999", "-1e999", "NaN", "Infinity"])
+@pytest.mark.parametrize("place", ['"temperature": 0.3', '"fps": 30.0'])
+def test_numbers_that_are_not_finite_are_refused(number: str, place: str) -> None:
+    """1e999 is well-formed JSON and reads as infinity: its recipe has no canonical form and no hash."""
+    data = json.dumps(json.loads(meta_to_json(make_meta())))
+    assert place in data
+    with pytest.raises(PacketError, match="meta"):
+        meta_from_json(data.replace(place, f"{place.partition(':')[0]}: {number}").encode())
+
+
+def test_a_recipe_nested_too_deep_is_refused() -> None:
+    text = meta_to_json(make_meta()).decode()
+    deep = '{"a":' * 20_000 + "1" + "}" * 20_000
+    with pytest.raises(PacketError, match="meta"):
+        meta_from_json(text.replace('"recipe":{', f'"recipe":{{"x":{deep},').encode())
+
+
+BAD_FIELDS = {"fps": 0.0, "background": (0.0, float("nan"), 0.0), "plugins": {"p": 1}, "extra": {"source_uri": 5}}
+
+
+@pytest.mark.parametrize("name", BAD_FIELDS)
+def test_what_is_not_read_is_not_written(name: str) -> None:
+    with pytest.raises(ShapeError, match="meta"):
+        meta_to_json(dataclasses.replace(make_meta(), **{name: BAD_FIELDS[name]}))
+
+
+def test_a_torn_last_packet_before_reserved_zeros_is_cut_off(tmp_path) -> None:
+    """A crash can leave any beginning of the last packet, then zeros; every other packet must stay."""
+    packets = make_packets()
+    data = write_stream(tmp_path / "whole.gss", packets, index=False)
+    with StreamReader(tmp_path / "whole.gss") as reader:
+        last = reader.frames[-1]
+    path = tmp_path / "torn.gss"
+    # The last bytes of this packet are zeros: a cut there loses nothing, so the cuts stay before them.
+    for cut in (1, 5, PACKET_HEADER.size - 2, PACKET_HEADER.size, PACKET_HEADER.size + 7, last.size // 2):
+        for zeros in (0, 3, last.size, 5 * last.size):
+            path.write_bytes(data[: last.offset + cut] + bytes(zeros))
+            with StreamWriter.open(path, resume=True) as writer:
+                assert writer.next_frame == last.frame, (cut, zeros)
+                writer.append(packets[-1])
+                writer.close(index=False)
+            assert path.read_bytes() == data, (cut, zeros)
+
+
+def test_damage_before_the_last_packet_is_never_cut_off(tmp_path) -> None:
+    data = write_stream(tmp_path / "whole.gss", make_packets(), index=False)
+    with StreamReader(tmp_path / "whole.gss") as reader:
+        third = reader.frames[2].offset
+    hurt = bytearray(data) + bytes(1000)
+    hurt[third + 5] ^= 1
+    path = tmp_path / "hurt.gss"
+    path.write_bytes(hurt)
+    with pytest.raises(PacketError, match=f"at byte {third}"):
+        StreamWriter.open(path, resume=True)
+    assert path.read_bytes() == hurt

@@ -1,0 +1,78 @@
+"""The page of ``gsstream.api``: every exported name with its signature."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Iterator
+from typing import Any
+
+from tools.reference.text import NOTE, signature
+
+
+def exported() -> dict[str, Any]:
+    """Every public name of gsstream.api, modules left out."""
+    import gsstream.api
+
+    names = {name: value for name, value in vars(gsstream.api).items() if not name.startswith("_")}
+    return {name: names[name] for name in sorted(names, key=str.lower) if not inspect.ismodule(names[name])}
+
+
+def api() -> str:
+    """Every exported name: one line in a table, then its exact signature, fields and methods."""
+    lines = [NOTE, "# gsstream.api", "", "Everything a plugin or a script may import.", ""]
+    lines += ["| name | what it is | defined in |", "|---|---|---|"]
+    for name, value in exported().items():
+        described = inspect.isclass(value) or inspect.isroutine(value)
+        text = (inspect.getdoc(value) or "").splitlines()[0] if described else f"constant, `{value!r}`"
+        module = getattr(value, "__module__", "gsstream") if described else "-"
+        lines.append(f"| `{name}` | {text.replace('|', chr(92) + '|')} | `{module}` |")
+    lines += ["", "## Signatures", ""]
+    for name, value in exported().items():
+        if inspect.isclass(value) or inspect.isroutine(value):
+            lines += [f"### {name}", "", "```python", *_declared(name, value), "```", ""]
+    return "\n".join(lines)
+
+
+def _declared(name: str, value: Any) -> Iterator[str]:
+    """A function's signature; of a class how it is made, its fields and its public methods, inherited ones too."""
+    if not inspect.isclass(value):
+        yield f"def {signature(name, value)}"
+        return
+    bases = ", ".join(base.__name__ for base in value.__bases__ if base is not object)
+    yield f"class {name}({bases}):" if bases else f"class {name}:"
+    for field, kind in _fields(value):
+        yield f"    {field}: {kind}"
+    made = dataclasses.is_dataclass(value) or "__init__" in vars(value)
+    if made and not getattr(value, "_is_protocol", False):
+        yield f"    def {signature('__init__', value.__init__)}"
+    for method, member in _members(value):
+        function = getattr(member, "fget", None) or getattr(member, "__func__", member)
+        if isinstance(member, property | staticmethod | classmethod):
+            yield f"    @{type(member).__name__}"
+        if getattr(member, "__isabstractmethod__", False):
+            yield "    @abstractmethod"
+        yield f"    def {signature(method, function)}"
+
+
+def _fields(value: type) -> Iterator[tuple[str, str]]:
+    """Annotated names of a class that are no constructor arguments told anyway: those of parts, protocols, errors."""
+    if dataclasses.is_dataclass(value):
+        return
+    for field, kind in inspect.get_annotations(value).items():
+        if not field.startswith("_"):
+            # Named tuples keep annotations as forward references.
+            yield field, kind if isinstance(kind, str) else getattr(kind, "__forward_arg__", str(kind))
+
+
+def _members(value: type) -> Iterator[tuple[str, Any]]:
+    """Public functions and properties by name, in the order in which classes declare them, the nearest class first."""
+    seen: set[str] = set()
+    for cls in value.__mro__:
+        if not cls.__module__.startswith("gsstream"):
+            continue
+        for name, member in vars(cls).items():
+            known = isinstance(member, property | staticmethod | classmethod) or inspect.isfunction(member)
+            if known and not name.startswith("_") and name not in seen:
+                seen.add(name)
+                yield name, member

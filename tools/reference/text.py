@@ -1,0 +1,22 @@
+"""What the pages share: the note at their top, and code as cells and signatures."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+NOTE = "<!-- Made by python -m tools.reference from the code. Do not edit. -->\n"
+
+
+def signature(name: str, function: Any) -> str:
+    """A call as it is written, with annotations and defaults."""
+    # Annotations are text already: their quotes say nothing, those of defaults do.
+    return name + re.sub(r"(: |-> )([\"'])(.*?)\2", r"\1\3", str(inspect.signature(function)))
+
+
+def cell(text: str) -> str:
+    """A text inside a table: the bar that ends a cell is escaped."""
+    return text.replace("|", chr(92) + "|")

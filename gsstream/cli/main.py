@@ -19,6 +19,7 @@ from gsstream.cli import (
     deliver,
     info,
     methods,
+    package,
     plugins,
     recipe,
     report,
@@ -81,6 +82,7 @@ app.command(name="info")(info.info)
 app.command(name="export")(deliver.export)
 app.command(name="manifest")(deliver.manifest)
 app.command(name="view")(deliver.view)
+app.command(name="package")(package.package)
 app.command(name="run-segments")(segments.run_segments)
 app.command(name="sweep")(sweep.sweep)
 app.command(name="tune")(tune.tune)

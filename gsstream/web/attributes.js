@@ -1,0 +1,103 @@
+// Whole Gaussians as integers: the attribute sections of a key packet, and the births of a delta packet.
+
+import { PacketError, located } from "./errors.js";
+import { MAX_BITS, MAX_CODE, WIDTHS } from "./limits.js";
+import { decodePositions } from "./positions.js";
+import { decodeSymbols } from "./symbols.js";
+
+/**
+ * Decode whole Gaussians: attribute -> Float32Array of `number` rows, all six attributes.
+ *
+ * `sections`: attribute -> `{ data, offset }`. Throws PacketError with the offset of the section.
+ */
+export function decodeAttributes(sections, number) {
+  const out = {};
+  for (const name of ["quats", "scales", "opacities", "sh0", "shN"]) {
+    const { data, offset } = sections[name];
+    const { codes, bits, width } = located(offset, () => decodeCodes(name, data, number));
+    out[name] = name === "sh0" || name === "shN" ? fromLuma(codes, bits, width) : fromCodes(codes, bits, width);
+    if (name === "scales") {
+      const means = sections.means;
+      out.means = located(means.offset, () => decodePositions(means.data, codes, bits, number));
+    }
+  }
+  return out;
+}
+
+function decodeCodes(name, data, number) {
+  if (data.length < 2) throw new PacketError(`${name} cut short`);
+  const bits = (data[0] << 24) >> 24;
+  const width = data[1];
+  if (!WIDTHS[name].includes(width) || bits < 1 || bits > MAX_BITS) {
+    throw new PacketError(`${name}: ${width} channels of ${bits} fractional bits cannot be`);
+  }
+  const payload = data.subarray(2);
+  if (name === "quats") return { codes: unfoldQuats(decodeSymbols(payload, number, 5), bits), bits, width };
+  const codes = decodeSymbols(payload, number, width);
+  for (let i = 0; i < codes.length; i += 1) {
+    if (codes[i] >= MAX_CODE || codes[i] <= -MAX_CODE) throw new PacketError(`${name}: code out of range`);
+  }
+  return { codes, bits, width };
+}
+
+/** Codes of quaternions from five symbols each: the largest component is what the unit norm leaves for it. */
+function unfoldQuats(symbols, bits) {
+  const number = symbols.length / 5;
+  const out = new Int32Array(4 * number);
+  const one = 4 ** bits;
+  for (let i = 0; i < number; i += 1) {
+    const largest = symbols[i];
+    if (largest < 0 || largest > 3) {
+      throw new PacketError("quats: the index of the largest component is outside 0 to 3");
+    }
+    let squares = 0;
+    let most = 0;
+    for (let k = 0, to = 0; k < 3; k += 1, to += 1) {
+      if (to === largest) to += 1;
+      const code = symbols[(1 + k) * number + i];
+      if (code >= MAX_CODE || code <= -MAX_CODE) throw new PacketError("quats: code out of range");
+      out[to * number + i] = code;
+      squares += code * code;
+      most = Math.max(most, Math.abs(code));
+    }
+    // The root of an integer below 2^42 is never halfway between two integers, so both ways of rounding agree.
+    const value = symbols[4 * number + i] + Math.round(Math.sqrt(Math.max(one - squares, 0)));
+    if (value < most || value <= 0 || value >= MAX_CODE) {
+      throw new PacketError("quats: the largest component is not the largest, or out of range");
+    }
+    out[largest * number + i] = value;
+  }
+  return out;
+}
+
+/** Values row by row from codes channel by channel. */
+function fromCodes(codes, bits, width) {
+  const out = new Float32Array(codes.length);
+  const number = codes.length / width;
+  const step = 2 ** -bits;
+  for (let c = 0; c < width; c += 1) {
+    for (let i = 0; i < number; i += 1) out[i * width + c] = codes[c * number + i] * step;
+  }
+  return out;
+}
+
+/** Colours from luma and two chroma channels; every sum is exact in float64 and rounded once. */
+function fromLuma(codes, bits, width) {
+  const out = new Float32Array(codes.length);
+  if (width === 0) return out;
+  const number = codes.length / width;
+  const fine = 2 ** -bits;
+  const coarse = 2 ** (1 - bits);
+  for (let i = 0; i < number; i += 1) {
+    for (let c = 0; c < width; c += 3) {
+      const orange = codes[(c + 1) * number + i] * coarse;
+      const green = codes[(c + 2) * number + i] * coarse;
+      const middle = codes[c * number + i] * fine - green / 2;
+      const blue = middle - orange / 2;
+      out[i * width + c] = blue + orange;
+      out[i * width + c + 1] = green + middle;
+      out[i * width + c + 2] = blue;
+    }
+  }
+  return out;
+}

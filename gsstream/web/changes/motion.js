@@ -1,0 +1,191 @@
+// Motion: groups of rows move rigidly, as predicted from the last frame and corrected (section 5.1 of the format).
+
+import { unpackParts } from "../bits.js";
+import { PacketError } from "../errors.js";
+import { decodeGates } from "../gates.js";
+import { decodeSymbols } from "../symbols.js";
+
+/** Sections that this change is made of. */
+export const SECTIONS = ["motion"];
+
+const PREDICTED = 1;
+const REGROUP = 2;
+const MAX_MOTIONS = 8;
+const MAX_SHADES = 16;
+const MAX_SHIFT = 1e18;
+const HALF_GRID = 32768;
+const SH0 = 0.28209479177387814;
+
+/**
+ * Decode the motions of a frame and apply them, one after the other, to copies of what they change.
+ *
+ * Returns `{ means, quats, groups, rows }`: arrays of the whole scene after the motions, its groups, and the rows of
+ * moving groups, ascending. Nothing of `state` changes.
+ */
+export function decodeMotions(section, state) {
+  const number = section.data.length ? section.data[0] : 0;
+  if (number < 1 || number > MAX_MOTIONS) {
+    throw new PacketError(`motion: expected 1 to ${MAX_MOTIONS} motions, got ${number}`);
+  }
+  const { means, quats, sh0 } = state.scene;
+  const scene = { means: means.slice(), quats: quats.slice(), sh0, groups: state.groups };
+  const touched = new Uint8Array(state.number);
+  for (const part of unpackParts(section.data.subarray(1), number)) {
+    const motion = decodeMotion(part, scene);
+    scene.groups = motion.groups;
+    moveRows(scene, motion, state.moved, touched);
+  }
+  return { means: scene.means, quats: scene.quats, groups: scene.groups, rows: marked(touched) };
+}
+
+/** Which rows carry a mark, ascending. */
+export function marked(marks) {
+  const rows = new Uint32Array(marks.reduce((sum, mark) => sum + mark, 0));
+  for (let row = 0, at = 0; row < marks.length; row += 1) if (marks[row]) rows[at++] = row;
+  return rows;
+}
+
+function decodeMotion(data, scene) {
+  if (data.length < 14) throw new PacketError("motion cut short");
+  const [flags, shades] = data;
+  if (flags & ~(PREDICTED | REGROUP)) throw new PacketError(`motion: unknown flags ${flags}; a newer player is needed`);
+  const view = new DataView(data.buffer, data.byteOffset, data.byteLength);
+  const [cell, shiftStep, turnStep] = [2, 6, 10].map((at) => view.getFloat32(at, true));
+  if (![cell, shiftStep, turnStep].every((value) => value > 0 && value < 1e9)) {
+    throw new PacketError("motion: expected a cell and steps above 0 and below 1e9");
+  }
+  if (shades < 1 || shades > MAX_SHADES) {
+    throw new PacketError(`motion: expected 1 to ${MAX_SHADES} shades, got ${shades}`);
+  }
+  const known = scene.groups;
+  const keep = known && !(flags & REGROUP) && known.cell === cell && known.shades === shades;
+  const groups = keep ? known : formGroups(scene, cell, shades);
+  const [marks, table] = unpackParts(data.subarray(14), 2);
+  const { gates: moving, levels } = decodeGates(marks, groups.count);
+  if (levels !== 1) throw new PacketError("motion: groups move or stand still, there are no levels");
+  const number = moving.reduce((sum, gate) => sum + gate, 0);
+  const symbols = decodeSymbols(table, number, 6);
+  let largest = 0;
+  for (let i = 0; i < symbols.length; i += 1) largest = Math.max(largest, Math.abs(symbols[i]));
+  if (largest * Math.max(shiftStep, turnStep) > MAX_SHIFT) throw new PacketError("motion: a correction that cannot be");
+  return { groups, moving, number, symbols, shiftStep, turnStep, predicted: (flags & PREDICTED) !== 0 };
+}
+
+/** Rows of one cell of a grid and of one class of brightness are a group; groups are numbered by cell, then class. */
+function formGroups({ means, sh0 }, cell, shades) {
+  const number = means.length / 3;
+  const keys = new Float64Array(number);
+  const index = (value) => Math.min(Math.max(Math.floor(value / cell), -HALF_GRID), HALF_GRID - 1) + HALF_GRID;
+  for (let i = 0; i < number; i += 1) {
+    const bright = 0.5 + SH0 * (0.25 * sh0[3 * i] + 0.5 * sh0[3 * i + 1] + 0.25 * sh0[3 * i + 2]);
+    const shade = Math.min(Math.max(Math.floor(bright * shades), 0), shades - 1);
+    const place = (index(means[3 * i]) * 2 * HALF_GRID + index(means[3 * i + 1])) * 2 * HALF_GRID;
+    keys[i] = (place + index(means[3 * i + 2])) * MAX_SHADES + shade;
+  }
+  const names = new Map();
+  for (const key of keys.slice().sort()) if (!names.has(key)) names.set(key, names.size);
+  const groupOf = new Int32Array(number);
+  for (let i = 0; i < number; i += 1) groupOf[i] = names.get(keys[i]);
+  return { cell, shades, groupOf, count: names.size };
+}
+
+/** Move the rows of moving groups in place, in float64 and in the order of operations of the format. */
+function moveRows(scene, motion, moved, touched) {
+  const { groups, moving, number } = motion;
+  const rank = new Int32Array(groups.count).fill(-1);
+  for (let group = 0, k = 0; group < moving.length; group += 1) if (moving[group]) rank[group] = k++;
+  const own = new Float64Array(3 * number);
+  const counts = new Int32Array(number);
+  for (let row = 0; row < groups.groupOf.length; row += 1) {
+    const k = rank[groups.groupOf[row]];
+    if (k < 0) continue;
+    counts[k] += 1;
+    for (let axis = 0; axis < 3; axis += 1) own[3 * k + axis] += scene.means[3 * row + axis];
+  }
+  divide(own, counts);
+  const { shift, turn } = transforms(motion, moved, rank);
+  const quats = unitQuats(turn);
+  for (let row = 0; row < groups.groupOf.length; row += 1) {
+    const k = rank[groups.groupOf[row]];
+    if (k < 0) continue;
+    touched[row] = 1;
+    moveCentre(scene.means, row, quats, own, shift, k);
+    turnQuat(scene.quats, row, quats, k);
+  }
+}
+
+function divide(sums, counts) {
+  for (let i = 0; i < sums.length; i += 1) sums[i] /= Math.max(counts[(i / 3) | 0], 1);
+}
+
+/** Shift and turn of every moving group: the mean displacement of its rows in the last frame, corrected. */
+function transforms({ groups, number, symbols, shiftStep, turnStep, predicted }, moved, rank) {
+  const shift = new Float64Array(3 * number);
+  const turn = new Float64Array(3 * number);
+  if (predicted && moved) {
+    const counts = new Int32Array(number);
+    for (let i = 0; i < moved.rows.length; i += 1) {
+      const k = rank[groups.groupOf[moved.rows[i]]];
+      if (k < 0) continue;
+      counts[k] += 1;
+      for (let axis = 0; axis < 3; axis += 1) {
+        shift[3 * k + axis] += moved.shift[3 * i + axis];
+        turn[3 * k + axis] += moved.turn[3 * i + axis];
+      }
+    }
+    divide(shift, counts);
+    divide(turn, counts);
+  }
+  for (let k = 0; k < number; k += 1) {
+    for (let axis = 0; axis < 3; axis += 1) {
+      shift[3 * k + axis] += symbols[axis * number + k] * shiftStep;
+      turn[3 * k + axis] += symbols[(3 + axis) * number + k] * turnStep;
+    }
+  }
+  return { shift, turn };
+}
+
+/** Unit quaternions wxyz of turns given as axis * tan(angle / 2). */
+function unitQuats(turn) {
+  const out = new Float64Array((turn.length / 3) * 4);
+  for (let k = 0; 3 * k < turn.length; k += 1) {
+    const [x, y, z] = turn.subarray(3 * k, 3 * k + 3);
+    const scale = 1 / Math.sqrt(1 + x * x + y * y + z * z);
+    out.set([scale, x * scale, y * scale, z * scale], 4 * k);
+  }
+  return out;
+}
+
+function moveCentre(means, row, quats, centre, shift, k) {
+  const w = quats[4 * k];
+  const x = quats[4 * k + 1];
+  const y = quats[4 * k + 2];
+  const z = quats[4 * k + 3];
+  const d0 = means[3 * row] - centre[3 * k];
+  const d1 = means[3 * row + 1] - centre[3 * k + 1];
+  const d2 = means[3 * row + 2] - centre[3 * k + 2];
+  const t0 = (1 - 2 * (y * y + z * z)) * d0 + 2 * (x * y - w * z) * d1 + 2 * (x * z + w * y) * d2;
+  const t1 = 2 * (x * y + w * z) * d0 + (1 - 2 * (x * x + z * z)) * d1 + 2 * (y * z - w * x) * d2;
+  const t2 = 2 * (x * z - w * y) * d0 + 2 * (y * z + w * x) * d1 + (1 - 2 * (x * x + y * y)) * d2;
+  means[3 * row] = t0 + centre[3 * k] + shift[3 * k];
+  means[3 * row + 1] = t1 + centre[3 * k + 1] + shift[3 * k + 1];
+  means[3 * row + 2] = t2 + centre[3 * k + 2] + shift[3 * k + 2];
+  if (!Number.isFinite(means[3 * row]) || !Number.isFinite(means[3 * row + 1]) || !Number.isFinite(means[3 * row + 2])) {
+    throw new PacketError("motion: it leads to positions beyond the range of float32");
+  }
+}
+
+function turnQuat(values, row, quats, k) {
+  const w0 = quats[4 * k];
+  const x0 = quats[4 * k + 1];
+  const y0 = quats[4 * k + 2];
+  const z0 = quats[4 * k + 3];
+  const w1 = values[4 * row];
+  const x1 = values[4 * row + 1];
+  const y1 = values[4 * row + 2];
+  const z1 = values[4 * row + 3];
+  values[4 * row] = w0 * w1 - x0 * x1 - y0 * y1 - z0 * z1;
+  values[4 * row + 1] = w0 * x1 + x0 * w1 + y0 * z1 - z0 * y1;
+  values[4 * row + 2] = w0 * y1 - x0 * z1 + y0 * w1 + z0 * x1;
+  values[4 * row + 3] = w0 * z1 + x0 * y1 - y0 * x1 + z0 * w1;
+}

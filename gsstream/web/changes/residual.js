@@ -1,0 +1,164 @@
+// The residual of a delta packet: the Gaussians behind open gates change by decoded symbols.
+
+import { PacketError, located } from "../errors.js";
+import { decodeGates } from "../gates.js";
+import { ATTRIBUTES, MAX_CHANNELS, WIDTHS } from "../limits.js";
+import { decodeSymbols } from "../symbols.js";
+
+const LATENT = 1;
+const MAX_CHANGE = 1e18;
+
+/** Sections that this change is made of. */
+export const SECTIONS = ["gates", "decoders", ...ATTRIBUTES];
+
+/**
+ * Decode the residual from sections by name. Nothing of `state` changes.
+ *
+ * Returns `{ rows: Uint32Array [A], gate: Float32Array [A], levels, parts, decoders }`: the rows that change with their
+ * gates, for each attribute its symbols, step and decoder, and the decoders that hold from now on.
+ */
+export function decodeResidual(sections, state, offset) {
+  const { counts } = state.layout;
+  const { gates, levels } = located(sections.gates.offset, () => decodeGates(sections.gates.data, counts.length));
+  const { rows, gate } = openRows(counts, gates, levels);
+  const decoders = new Map(state.decoders);
+  const sent = sections.decoders
+    ? located(sections.decoders.offset, () => decodeDecoders(sections.decoders.data)) : new Map();
+  for (const [name, decoder] of sent) decoders.set(name, decoder);
+  const parts = [];
+  for (const name of ATTRIBUTES) {
+    const section = sections[name];
+    if (section) parts.push(located(section.offset, () => decodePart(name, section.data, rows.length, decoders)));
+  }
+  for (const name of sent.keys()) {
+    if (!parts.some((part) => part.name === name && part.decoder)) {
+      throw new PacketError("delta packet: a decoder is sent that no attribute uses", sections.decoders.offset);
+    }
+  }
+  if (rows.length) checkWidths(parts, state.scene, state.layout.unitOf.length, offset);
+  return { rows, gate, levels, parts, decoders };
+}
+
+/** Change the rows of `state` in place, in float32 and in the order of operations of the format. */
+export function applyResidual(state, residual) {
+  const { rows, gate, parts } = residual;
+  state.decoders = residual.decoders;
+  if (rows.length === 0) return;
+  const { unitOf, units } = state.layout;
+  const scale = new Float32Array(rows.length);
+  for (let i = 0; i < rows.length; i += 1) scale[i] = gate[i] * units[unitOf[rows[i]]];
+  for (const part of parts) {
+    addPart(state.scene[part.name], rows, part.name === "means" ? scale : gate, part);
+  }
+}
+
+function addPart(values, rows, gate, part) {
+  const { symbols, channels, step, width } = part;
+  const latents = new Float32Array(symbols.length);
+  for (let i = 0; i < symbols.length; i += 1) latents[i] = Math.fround(symbols[i]) * step;
+  if (part.decoder) addDecoded(values, rows, gate, latents, part.decoder.values, channels, width);
+  else addDirect(values, rows, gate, latents, width);
+}
+
+function addDirect(values, rows, gate, latents, width) {
+  const number = rows.length;
+  for (let i = 0; i < number; i += 1) {
+    const start = rows[i] * width;
+    for (let d = 0; d < width; d += 1) values[start + d] += Math.fround(latents[d * number + i] * gate[i]);
+  }
+}
+
+function addDecoded(values, rows, gate, latents, weights, channels, width) {
+  const number = rows.length;
+  for (let i = 0; i < number; i += 1) {
+    const start = rows[i] * width;
+    for (let d = 0; d < width; d += 1) {
+      let change = Math.fround(latents[i] * weights[d]);
+      for (let c = 1; c < channels; c += 1) {
+        change = Math.fround(change + Math.fround(latents[c * number + i] * weights[c * width + d]));
+      }
+      values[start + d] += Math.fround(change * gate[i]);
+    }
+  }
+}
+
+function openRows(counts, gates, levels) {
+  let number = 0;
+  for (let node = 0; node < gates.length; node += 1) if (gates[node]) number += counts[node];
+  const rows = new Uint32Array(number);
+  const gate = new Float32Array(number);
+  for (let node = 0, row = 0, at = 0; node < gates.length; node += 1) {
+    const end = row + counts[node];
+    if (gates[node]) {
+      gate.fill(gates[node] / levels, at, at + counts[node]);
+      for (; row < end; row += 1) rows[at++] = row;
+    }
+    row = end;
+  }
+  return { rows, gate };
+}
+
+function decodeDecoders(data) {
+  const out = new Map();
+  const view = new DataView(data.buffer, data.byteOffset, data.byteLength);
+  let at = 0;
+  while (at < data.length) {
+    if (at + 3 > data.length) throw new PacketError("decoder header cut short");
+    const [index, latents, width] = data.subarray(at, at + 3);
+    at += 3;
+    const name = ATTRIBUTES[index];
+    if (!name || out.has(name) || latents < 1 || latents > MAX_CHANNELS) {
+      throw new PacketError(`decoder of attribute ${index} with ${latents} latents is repeated or cannot be`);
+    }
+    if (!WIDTHS[name].includes(width) || width === 0 || 2 * latents * width > data.length - at) {
+      throw new PacketError(`decoder of ${name}: ${latents} x ${width} does not fit the section`);
+    }
+    const start = at;
+    const values = Float32Array.from({ length: latents * width }, (_, i) => half(view.getUint16(start + 2 * i, true)));
+    if (!values.every(Number.isFinite)) throw new PacketError(`decoder of ${name}: a value is not finite`);
+    out.set(name, { values, latents, width });
+    at += 2 * latents * width;
+  }
+  return out;
+}
+
+/** A float16 from its bits. */
+export function half(bits) {
+  const sign = bits & 0x8000 ? -1 : 1;
+  const exponent = (bits >> 10) & 31;
+  const fraction = bits & 1023;
+  if (exponent === 0) return sign * fraction * 2 ** -24;
+  if (exponent === 31) return fraction ? NaN : sign * Infinity;
+  return sign * (1024 + fraction) * 2 ** (exponent - 25);
+}
+
+function decodePart(name, data, rows, known) {
+  if (data.length < 6) throw new PacketError(`${name} cut short`);
+  const [mode, channels] = data;
+  const step = new DataView(data.buffer, data.byteOffset).getFloat32(2, true);
+  const decoder = mode === LATENT ? known.get(name) : null;
+  if (mode > LATENT || decoder === undefined) {
+    throw new PacketError(`${name}: mode ${mode} is unknown, or its decoder was never sent`);
+  }
+  if (!(step > 0 && step < 1e6)) throw new PacketError(`step of ${name}: expected above 0 and below 1e6, got ${step}`);
+  const fits = decoder ? channels === decoder.latents : WIDTHS[name].includes(channels);
+  if (!fits || channels === 0) throw new PacketError(`symbols of ${name}: ${channels} channels do not fit`);
+  const symbols = decodeSymbols(data.subarray(6), rows, channels);
+  let largest = 0;
+  for (let i = 0; i < symbols.length; i += 1) largest = Math.max(largest, Math.abs(symbols[i]));
+  const gain = decoder ? channels * decoder.values.reduce((most, v) => Math.max(most, Math.abs(v)), 0) : 1;
+  if (largest * step * gain > MAX_CHANGE) {
+    throw new PacketError(`${name}: a residual of ${largest * step * gain} cannot be`);
+  }
+  return { name, symbols, channels, step, decoder, width: decoder ? decoder.width : channels };
+}
+
+function checkWidths(parts, scene, number, offset) {
+  for (const { name, width } of parts) {
+    if (width * number !== scene[name].length) {
+      throw new PacketError(
+        `delta of ${name}: expected ${scene[name].length / number} values a row, got ${width}; ` +
+        "the packet belongs to another scene", offset);
+    }
+  }
+}

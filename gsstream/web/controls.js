@@ -1,0 +1,100 @@
+// Mouse, touch and keys move the view: orbit, pan, zoom and fly.
+
+import { distance, looked, moved, orbited, zoomed } from "./camera.js";
+
+const RADIANS_PER_PIXEL = 0.006;
+const FLY = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, 1, 0], e: [0, -1, 0] };
+
+/** Moves `scene.view` and `scene.pivot` and calls `scene.moved()`. Listens on `canvas` and, for keys, on `keys`. */
+export class Controls {
+  constructor(canvas, keys, scene) {
+    Object.assign(this, { canvas, scene });
+    this.pointers = new Map();
+    this.held = new Set();
+    this.abort = new AbortController();
+    const { signal } = this.abort;
+    const on = (target, name, handler, options = {}) => target.addEventListener(name, handler, { signal, ...options });
+    canvas.style.touchAction = "none";
+    on(canvas, "contextmenu", (event) => event.preventDefault());
+    on(canvas, "pointerdown", (event) => this._down(event));
+    on(canvas, "pointermove", (event) => this._move(event));
+    on(canvas, "pointerup", (event) => this.pointers.delete(event.pointerId));
+    on(canvas, "pointercancel", (event) => this.pointers.delete(event.pointerId));
+    on(canvas, "wheel", (event) => this._wheel(event), { passive: false });
+    on(keys, "keydown", (event) => this._key(event, true));
+    on(keys, "keyup", (event) => this._key(event, false));
+    on(keys, "blur", () => this.held.clear());
+  }
+
+  dispose() {
+    this.abort.abort();
+  }
+
+  /** Fly with the keys that are held, for `seconds`; returns whether the view moved. */
+  fly(seconds) {
+    const { scene } = this;
+    if (!this.held.size || !scene.view) return false;
+    const speed = 0.6 * distance(scene.view, scene.pivot) * seconds;
+    for (const key of this.held) this._shift(FLY[key].map((v) => v * speed));
+    return true;
+  }
+
+  _down(event) {
+    this.canvas.setPointerCapture(event.pointerId);
+    this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+  }
+
+  _move(event) {
+    const last = this.pointers.get(event.pointerId);
+    if (!last || !this.scene.view) return;
+    const dx = event.clientX - last.x;
+    const dy = event.clientY - last.y;
+    if (this.pointers.size === 2) this._pinch(event, last, dx, dy);
+    else if (event.shiftKey || event.buttons & 6) this._pan(dx, dy);
+    else if (event.altKey) this._set(looked(this.scene.view, this.scene.pivot, dx * 0.003, -dy * 0.003));
+    else this._set(orbited(this.scene.view, this.scene.pivot, -dx * RADIANS_PER_PIXEL, -dy * RADIANS_PER_PIXEL));
+    this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+  }
+
+  _pinch(event, last, dx, dy) {
+    const other = [...this.pointers].find(([id]) => id !== event.pointerId)[1];
+    const before = Math.hypot(last.x - other.x, last.y - other.y);
+    const after = Math.hypot(event.clientX - other.x, event.clientY - other.y);
+    if (after > 1) this._set(zoomed(this.scene.view, this.scene.pivot, before / after));
+    this._pan(dx / 2, dy / 2);
+  }
+
+  /** What is at the pivot's distance follows the pointer. */
+  _pan(dx, dy) {
+    const { view, pivot } = this.scene;
+    const scale = Math.min(this.canvas.clientWidth / view.width, this.canvas.clientHeight / view.height);
+    const size = distance(view, pivot) / (view.fx * scale);
+    this._shift([-dx * size, -dy * size, 0]);
+  }
+
+  _shift(step) {
+    const { view, pivot } = moved(this.scene.view, this.scene.pivot, step);
+    this.scene.pivot = pivot;
+    this._set(view);
+  }
+
+  _set(view) {
+    this.scene.view = view;
+    this.scene.moved();
+  }
+
+  _wheel(event) {
+    event.preventDefault();
+    if (!this.scene.view) return;
+    const lines = event.deltaMode === 1 ? 30 : 1;
+    this._set(zoomed(this.scene.view, this.scene.pivot, Math.exp(Math.max(-1, Math.min(1, event.deltaY * lines * 0.0015)))));
+  }
+
+  _key(event, down) {
+    const key = event.key.toLowerCase();
+    if (!FLY[key] || event.ctrlKey || event.metaKey) return;
+    if (down) this.held.add(key);
+    else this.held.delete(key);
+    event.preventDefault();
+  }
+}

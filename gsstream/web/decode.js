@@ -1,0 +1,119 @@
+// The state that a stream of packets leads to, bit for bit the one of the encoder. See docs/reference/packet-format.md.
+
+import { decodeMotions, marked, SECTIONS as MOTION } from "./changes/motion.js";
+import { applyResidual, decodeResidual, SECTIONS as RESIDUAL } from "./changes/residual.js";
+import { applyRows, decodeRows, SECTIONS as ROWS } from "./changes/rows.js";
+import { KIND, KIND_NAMES, parsePacket } from "./container.js";
+import { PacketError, located } from "./errors.js";
+import { displacement, gatherDisplacement, gatherGroups, pick } from "./history.js";
+import { decodeKey } from "./key.js";
+import { ATTRIBUTES } from "./limits.js";
+
+/**
+ * The state after one complete packet at byte `offset` of its file.
+ *
+ * `state` is that of the frame before (null is fine for a key packet). A delta changes it in place and returns it: it is
+ * decoded as a whole first, so after a PacketError the state still is that of the frame before.
+ *
+ * A state has `frame`, `number` (Gaussians), `scene` (attribute -> Float32Array), `widths` (values a row), `layout`,
+ * `meta`, `decoders`, `groups` and `moved` (what the next packet may refer to), and `change`: what this packet did, for
+ * whoever shows it.
+ */
+export function decodePacket(state, data, offset = 0) {
+  const { header, sections } = parsePacket(data, offset);
+  if (header.kind === KIND.key) return keyState(header, sections, data.length, offset);
+  if (header.kind === KIND.index) throw new PacketError("expected a frame's packet, got the index", offset);
+  if (state === null || header.frame !== state.frame + 1) {
+    const had = state === null ? "none" : `frame ${state.frame}`;
+    throw new PacketError(`frame ${header.frame} needs the state of the frame before it, got ${had}`, offset);
+  }
+  if (header.kind === KIND.empty) {
+    if (sections.length) throw new PacketError("empty packet with sections", offset);
+    state.moved = null;
+    state.change = { kind: "empty" };
+  } else {
+    state.change = applyDelta(state, decodeDelta(sections, state, offset));
+  }
+  state.frame = header.frame;
+  return state;
+}
+
+function keyState(header, sections, size, offset) {
+  const { scene, layout, meta } = decodeKey(sections, size, offset);
+  const number = layout.unitOf.length;
+  const widths = { means: 3, quats: 4, scales: 3, opacities: 1, sh0: 3, shN: number ? scene.shN.length / number : 0 };
+  return {
+    frame: header.frame, number, scene, widths, layout, meta, decoders: new Map(), groups: null, moved: null,
+    change: { kind: KIND_NAMES[KIND.key] },
+  };
+}
+
+/** Sections of a delta packet in the order in which they stand there. */
+const ORDER = [...MOTION, ...RESIDUAL, ...ROWS];
+
+function decodeDelta(sections, state, offset) {
+  const places = sections.map(({ name }) => ORDER.indexOf(name));
+  if (!places.length || places.some((place, i) => place < 0 || (i > 0 && place < places[i - 1]))) {
+    const names = sections.map(({ name }) => name).join(", ");
+    throw new PacketError(`delta packet: sections ${names || "none"} do not stand in this order`, offset);
+  }
+  const found = Object.fromEntries(sections.map((section) => [section.name, section]));
+  const { motion } = found;
+  const motions = motion ? located(motion.offset, () => decodeMotions(motion, state)) : null;
+  const stray = sections.find(({ name }) => RESIDUAL.includes(name));
+  if (stray && !found.gates) throw new PacketError(`delta packet: section ${stray.name} without gates`, stray.offset);
+  const residual = found.gates ? decodeResidual(found, state, offset) : null;
+  const rows = found.deaths || found.births ? decodeRows(found, state, offset) : null;
+  return { motions, residual, rows };
+}
+
+/**
+ * Apply what was decoded, in order. Returns what changed: `moved`, lists of rows with their gates and attributes as they
+ * were numbered before births and deaths, and `source`, the row each row was before (null when none joined or left; see
+ * `applyRows`).
+ */
+function applyDelta(state, { motions, residual, rows }) {
+  const touched = touchedRows(state.number, motions, residual);
+  const means = pick(state.scene.means, touched, 3);
+  const quats = pick(state.scene.quats, touched, 4);
+  const change = { kind: "delta", moved: [], source: null, before: state.number };
+  if (motions) {
+    Object.assign(state.scene, { means: motions.means, quats: motions.quats });
+    state.groups = motions.groups;
+    change.moved.push({ rows: motions.rows, gate: null, attributes: ["means", "quats"] });
+  }
+  if (residual) {
+    applyResidual(state, residual);
+    const attributes = residual.parts.map((part) => part.name);
+    change.moved.push({ rows: residual.rows, gate: residual.gate, attributes });
+  }
+  state.moved = displacement(touched, means, quats, state.scene);
+  if (rows) {
+    change.source = applyRows(state, rows);
+    state.moved = gatherDisplacement(state.moved, change.source, change.before);
+    state.groups = gatherGroups(state.groups, change.source, change.before);
+    state.number = change.source.length;
+  }
+  return change;
+}
+
+/** Rows of moving groups and rows behind open gates, ascending. */
+function touchedRows(number, motions, residual) {
+  if (!motions) return residual ? residual.rows : new Uint32Array(0);
+  if (!residual) return motions.rows;
+  const marks = new Uint8Array(number);
+  for (const rows of [motions.rows, residual.rows]) for (const row of rows) marks[row] = 1;
+  return marked(marks);
+}
+
+/** The bytes of all attributes in their order: two states are the same when these are. */
+export function sceneBytes(state) {
+  const arrays = ATTRIBUTES.map((name) => state.scene[name]);
+  const out = new Uint8Array(arrays.reduce((sum, array) => sum + array.byteLength, 0));
+  let at = 0;
+  for (const array of arrays) {
+    out.set(new Uint8Array(array.buffer, array.byteOffset, array.byteLength), at);
+    at += array.byteLength;
+  }
+  return out;
+}

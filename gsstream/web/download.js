@@ -1,0 +1,120 @@
+// Bytes of a file from a web server, in order, through the ways in which servers and connections fail.
+
+/** Why nothing comes, in one sentence for whoever looks at the page. */
+export class SourceError extends Error {
+  constructor(message) {
+    super(message);
+    this.name = "SourceError";
+  }
+}
+
+const RETRIES = 4;
+const FIRST_PAUSE = 300;
+
+/** How downloads are made; tests shorten the waiting. */
+export const settings = { patience: 15_000, firstPause: FIRST_PAUSE, fetch: (...args) => globalThis.fetch(...args) };
+
+function sleep(milliseconds, signal) {
+  return new Promise((resolve, reject) => {
+    const timer = setTimeout(resolve, milliseconds);
+    signal?.addEventListener("abort", () => {
+      clearTimeout(timer);
+      reject(signal.reason);
+    }, { once: true });
+  });
+}
+
+/** Ask for bytes `start` to `end` (inclusive; null: to the end) of a file; `ranged` false asks for all of it. */
+export async function request(url, { start = 0, end = null, ranged = true, signal } = {}) {
+  const headers = ranged ? { Range: start < 0 ? `bytes=${start}` : `bytes=${start}-${end ?? ""}` } : {};
+  const stall = new AbortController();
+  const stop = () => stall.abort(signal.reason);
+  signal?.addEventListener("abort", stop, { once: true });
+  const timer = setTimeout(() => stall.abort(new SourceError("The server does not answer.")), settings.patience);
+  try {
+    return await settings.fetch(url, { headers, signal: stall.signal });
+  } catch (error) {
+    if (signal?.aborted) throw signal.reason;
+    throw stall.signal.aborted ? stall.signal.reason : error;
+  } finally {
+    clearTimeout(timer);
+  }
+}
+
+/** The chunks of a response's body. A server that sends nothing for long counts as gone. */
+export async function* chunksOf(response, signal) {
+  const reader = response.body.getReader();
+  try {
+    for (;;) {
+      let timer;
+      const stalled = new Promise((_, reject) => {
+        timer = setTimeout(() => reject(new SourceError("The server stopped sending.")), settings.patience);
+      });
+      const { value, done } = await Promise.race([reader.read(), stalled]).finally(() => clearTimeout(timer));
+      if (signal?.aborted) throw signal.reason;
+      if (done) return;
+      yield value;
+    }
+  } finally {
+    reader.cancel().catch(() => {});
+  }
+}
+
+/**
+ * Bytes `start` to `end` of a file as chunks, in order. `whole`: the file is just these bytes, so the first request needs
+ * no range. A connection that breaks is taken up where it broke, a few times.
+ *
+ * Throws SourceError when the file is not there or the server stops for good.
+ */
+export async function* bytesOf(url, { start = 0, end = null, whole = false, signal } = {}) {
+  let at = start;
+  for (let failures = 0; ; ) {
+    try {
+      const ranged = !(whole && at === start);
+      const response = await request(url, { start: at, end, ranged, signal });
+      const first = firstByte(response, url, ranged ? at : start);
+      if (first === null) return;
+      for await (const chunk of clipped(chunksOf(response, signal), first, at, end)) {
+        at += chunk.length;
+        failures = 0;
+        yield chunk;
+      }
+      if (end === null || at > end) return;
+      throw new SourceError("The file ends before it should.");
+    } catch (error) {
+      if (signal?.aborted || error.final) throw error;
+      failures += 1;
+      if (failures > RETRIES) throw new SourceError(`${sentence(error)} What was loaded until then is played.`);
+      await sleep(settings.firstPause * 2 ** (failures - 1), signal);
+    }
+  }
+}
+
+/** Byte of the file at which a response begins; null when there is nothing from `at` on. Throws when it is an error. */
+function firstByte(response, url, at) {
+  if (response.status === 206) {
+    const range = /^bytes (\d+)-/.exec(response.headers.get("Content-Range") ?? "");
+    return range ? Number(range[1]) : at;
+  }
+  if (response.status === 200) return 0;
+  if (response.status === 416) return null;
+  const error = new SourceError(`There is no stream at ${url}: the server answers ${response.status}.`);
+  error.final = response.status < 500;
+  throw error;
+}
+
+/** Chunks that begin at byte `first` of the file, without what lies before `at` or after `end`. */
+async function* clipped(chunks, first, at, end) {
+  let place = first;
+  for await (const chunk of chunks) {
+    const from = Math.max(0, at - place);
+    const to = end === null ? chunk.length : Math.min(chunk.length, end + 1 - place);
+    if (from < to) yield chunk.subarray(from, to);
+    place += chunk.length;
+    if (end !== null && place > end) return;
+  }
+}
+
+function sentence(error) {
+  return error instanceof SourceError ? error.message : "The connection to the server is cut.";
+}

@@ -1,0 +1,19 @@
+// Limits of section 8 of the packet format: what a reader checks before it allocates.
+
+export const FORMAT_MAJOR = 2;
+export const FORMAT_MINOR = 0;
+export const MAX_GAUSSIANS = 4_000_000;
+export const FREE_GAUSSIANS = 1 << 16;
+export const MAX_GAUSSIANS_PER_BYTE = 64;
+export const MAX_BODY = 2 ** 30;
+export const MAX_SECTIONS = 16;
+export const MAX_META = 16 << 20;
+export const MAX_UNITS = 64;
+export const MAX_CHANNELS = 64;
+export const MAX_BINS = 1 << 14;
+export const MAX_CODE = 1 << 20;
+export const MAX_BITS = 20;
+
+/** Attributes in the order used by every table and packet, and the widths each may have. */
+export const ATTRIBUTES = ["means", "quats", "scales", "opacities", "sh0", "shN"];
+export const WIDTHS = { means: [3], quats: [4], scales: [3], opacities: [1], sh0: [3], shN: [0, 9, 24, 45] };

@@ -1,0 +1,287 @@
+// Plays a stream on a canvas: loads, decodes, keeps time, and draws from where the viewer looks.
+
+import { PacketBuffer } from "./buffer.js";
+import { cameraOf, pivotOf, viewsOf } from "./camera.js";
+import { decodePacket } from "./decode.js";
+import { PacketError } from "./errors.js";
+import { Renderer } from "./renderer.js";
+import { openSource } from "./source.js";
+import { Snapshots } from "./snapshots.js";
+
+/** Decoding may take so many milliseconds of one picture's time before the page gets its turn. */
+const BUDGET = 24;
+
+/**
+ * Events: `ready` (the first picture can be drawn), `frame`, `state` (playing, waiting, paused, ended), `problem` (detail: a
+ * sentence), `view`.
+ */
+export class Player extends EventTarget {
+  constructor(canvas, options = {}) {
+    super();
+    this.canvas = canvas;
+    this.options = options;
+    this.renderer = new Renderer(canvas, { onChange: () => this.invalidate(), useWorker: options.worker !== false });
+    this.loop = options.loop ?? true;
+    this.speed = options.speed ?? 1;
+    this.playing = false;
+    this.state = null;
+    this.view = null;
+    this.views = [];
+    this.pivot = null;
+    this.buffer = null;
+    this.snapshots = new Snapshots();
+    this.problem = null;
+    this.statistics = { drawn: 0, decode: 0, bytes: 0, uploaded: 0 };
+    this._target = null;
+    this._clock = 0;
+    this._dirty = false;
+    this._then = null;
+    this._closed = false;
+    this._tick = (now) => this._turn(now);
+    requestAnimationFrame(this._tick);
+  }
+
+  /** Open a stream; resolves when its first frame is decoded. Rejects with an Error of one sentence. */
+  async open(url) {
+    this.close();
+    this._abort = new AbortController();
+    this.source = await openSource(url, this._abort.signal);
+    await this._start(this.source.segments, null);
+  }
+
+  /** Go on with another rendition of the recording, from the key packet before the frame that is shown. */
+  async choose(index) {
+    const chosen = this.source.renditions[index];
+    const frame = this.frame;
+    this.buffer.dispose();
+    this.state = null;
+    await this._start(chosen.segments, frame);
+  }
+
+  _start(segments, frame) {
+    this.snapshots.clear();
+    this.buffer = new PacketBuffer(segments, () => this._news());
+    this.buffer.fps = this.source.fps ?? 30;
+    this._target = frame ?? this.buffer.first ?? 0;
+    this.buffer.want(this._target);
+    return new Promise((resolve, reject) => {
+      this._opened = { resolve, reject };
+    });
+  }
+
+  get frame() {
+    return this.state ? this.state.frame : null;
+  }
+
+  get fps() {
+    return this.state?.meta.fps ?? this.source?.fps ?? 30;
+  }
+
+  get first() {
+    return this.buffer?.first ?? 0;
+  }
+
+  /** Last frame there is; of a stream without an index the last one loaded. */
+  get last() {
+    return this.buffer?.last ?? this.buffer?.lastLoaded ?? 0;
+  }
+
+  play() {
+    if (this.playing) return;
+    if (this.frame !== null && this.buffer.last !== null && this.frame >= this.last) this.seek(this.first);
+    if (this.problem) this.buffer?.retry();
+    this.problem = null;
+    this.playing = true;
+    this._clock = 0;
+    this._say("state");
+  }
+
+  pause() {
+    this.playing = false;
+    this._say("state");
+  }
+
+  /** Show a frame as soon as it is there. */
+  seek(frame) {
+    const wanted = Math.max(this.first, Math.min(Math.round(frame), this.last));
+    this._target = wanted;
+    this._clock = 0;
+    this.buffer?.want(wanted);
+    this.invalidate();
+  }
+
+  /** Look through one of the recording's cameras. */
+  look(index) {
+    this.view = { ...this.views[index] };
+    this.pivot = pivotOf(this.views);
+    this.moved();
+  }
+
+  moved() {
+    this.invalidate();
+    this._say("view");
+  }
+
+  set marks(on) {
+    this.renderer.marks = on;
+    this.invalidate();
+  }
+
+  get marks() {
+    return this.renderer.marks;
+  }
+
+  /** Draw again at the next opportunity. */
+  invalidate() {
+    this._dirty = true;
+  }
+
+  /** Draw now. With `exact` the depth order is found first; otherwise it may be that of the picture before. */
+  draw(options = {}) {
+    if (!this.state || !this.view) return;
+    this.renderer.draw(cameraOf(this.view, this.canvas.width, this.canvas.height), options);
+    this.statistics.drawn += 1;
+    this.statistics.uploaded += this.renderer.uploaded;
+  }
+
+  close() {
+    this._abort?.abort(new DOMException("the player is closed", "AbortError"));
+    this.buffer?.dispose();
+    this.buffer = null;
+    this.state = null;
+    this.view = null;
+    this.problem = null;
+    this._target = null;
+  }
+
+  dispose() {
+    this._closed = true;
+    this.close();
+    this.renderer.dispose();
+  }
+
+  _turn(now) {
+    if (this._closed) return;
+    requestAnimationFrame(this._tick);
+    const seconds = this._then === null ? 0 : Math.min((now - this._then) / 1000, 0.25);
+    this._then = now;
+    this.options.beforeFrame?.(seconds);
+    if (this.buffer) this._advance(seconds);
+    if (this._dirty && this.state) {
+      this._dirty = false;
+      this.draw();
+    }
+  }
+
+  /** Let the clock run and decode up to the frame it says. */
+  _advance(seconds) {
+    if (this._target === null && this.playing && this.state) {
+      this._clock += seconds * this.fps * this.speed;
+      if (this._clock >= 1) {
+        const step = Math.floor(this._clock);
+        this._clock -= step;
+        this._step(step);
+      }
+    }
+    if (this._target !== null) this._decodeTo(this._target);
+  }
+
+  _step(step) {
+    const next = this.state.frame + step;
+    if (this.buffer.last === null || next <= this.buffer.last) {
+      this._target = next;
+    } else if (this.state.frame < this.buffer.last) {
+      this._target = this.buffer.last;
+    } else if (this.loop && this.buffer.last > this.first) {
+      this._target = this.first;
+    } else {
+      this.playing = false;
+      this._say("state");
+    }
+    if (this._target !== null) this.buffer.want(this._target);
+  }
+
+  _decodeTo(frame) {
+    const started = performance.now();
+    try {
+      while (this.state === null || this.state.frame !== frame) {
+        const packet = this._nextPacket(frame);
+        if (!packet) return this._missing(frame);
+        this._decode(packet);
+        if (performance.now() - started > BUDGET && this.state.frame !== frame) return undefined;
+      }
+    } catch (error) {
+      return this._stop(error);
+    }
+    this._target = null;
+    this.invalidate();
+    this._say("frame");
+    return undefined;
+  }
+
+  /** The packet that leads towards `frame` from the state there is, or from a key packet or a snapshot of one. */
+  _nextPacket(frame) {
+    const key = this.buffer.keyOf(frame);
+    if (key === null) return undefined;
+    const near = this.state !== null && this.state.frame < frame && this.state.frame >= key;
+    return this.buffer.packet(near ? this.state.frame + 1 : key);
+  }
+
+  _decode(packet) {
+    const started = performance.now();
+    const known = packet.header.kind === 1 ? this.snapshots.get(packet) : null;
+    this.state = known ?? decodePacket(this.state, packet.data, packet.offset);
+    if (!known && packet.header.kind === 1) this.snapshots.keep(packet, this.state);
+    this.renderer.update(this.state);
+    this.statistics.decode = performance.now() - started;
+    this.statistics.bytes = packet.data.length;
+    if (this.view === null) this._ready();
+    if (this._opened) {
+      this._opened.resolve();
+      this._opened = null;
+    }
+  }
+
+  _ready() {
+    this.views = viewsOf(this.state.meta);
+    if (!this.views.length) throw new Error("The stream names no camera to look from.");
+    const wanted = this.views.findIndex((view) => view.id === this.options.camera);
+    this.look(Math.max(wanted, 0));
+    this.buffer.fps = this.fps;
+    this._say("ready");
+  }
+
+  /** A frame is not loaded: wait for it, or, when it will never come, say why and go on with what is sound. */
+  _missing(frame) {
+    const failure = this.buffer.failure(frame);
+    if (!failure) {
+      this.buffer.want(frame);
+      return;
+    }
+    this._stop(failure);
+  }
+
+  /** Say what is wrong. A damaged segment is left out where another one follows; anything else ends the playing. */
+  _stop(error) {
+    const next = error instanceof PacketError && this.playing ? this.buffer.nextSegment(this._target) : null;
+    this._target = next;
+    this.playing &&= next !== null;
+    this.problem = error.message;
+    if (this._opened) {
+      this._opened.reject(error);
+      this._opened = null;
+    }
+    this.dispatchEvent(new CustomEvent("problem", { detail: error.message }));
+    this._say("state");
+  }
+
+  _news() {
+    // The first frame of a file without an index is known only now.
+    if (this.state === null && this.buffer?.first !== null && this._target < this.buffer.first) this._target = this.buffer.first;
+    this.invalidate();
+  }
+
+  _say(name) {
+    this.dispatchEvent(new Event(name));
+  }
+}

@@ -1,0 +1,141 @@
+// GLSL of the renderer. The conventions are those of the streams: 0.3 px blur, alpha cut 1/255, alpha clamp 0.999.
+
+/** Texels of one Gaussian in the texture of centres, rotations and scales. */
+export const GEOMETRY_TEXELS = 3;
+
+/** Texels of one Gaussian in the texture of colour coefficients of a degree: coefficients are packed without gaps. */
+export function colourTexels(degree) {
+  return Math.ceil((3 * (degree + 1) ** 2) / 4);
+}
+
+const CONSTANTS = [
+  "0.28209479177387814",
+  "-0.4886025119029199 * y", "0.4886025119029199 * z", "-0.4886025119029199 * x",
+  "1.0925484305920792 * x * y", "-1.0925484305920792 * y * z", "0.31539156525252005 * (2.0 * z * z - x * x - y * y)",
+  "-1.0925484305920792 * x * z", "0.5462742152960396 * (x * x - y * y)",
+  "-0.5900435899266435 * y * (3.0 * x * x - y * y)", "2.890611442640554 * x * y * z",
+  "-0.4570457994644658 * y * (5.0 * z * z - 1.0)", "0.3731763325901154 * z * (5.0 * z * z - 3.0)",
+  "-0.4570457994644658 * x * (5.0 * z * z - 1.0)", "1.445305721320277 * z * (x * x - y * y)",
+  "-0.5900435899266435 * x * (x * x - 3.0 * y * y)",
+];
+
+function colourSum(degree) {
+  const lane = (i) => `v[${i >> 2}].${"xyzw"[i & 3]}`;
+  return CONSTANTS.slice(0, (degree + 1) ** 2)
+    .map((basis, k) => `  sum += (${basis}) * vec3(${lane(3 * k)}, ${lane(3 * k + 1)}, ${lane(3 * k + 2)});`)
+    .join("\n");
+}
+
+/** The vertex shader for spherical harmonics of a degree: one quad for each Gaussian, as far as it is seen. */
+export function vertexShader(degree) {
+  return `#version 300 es
+precision highp float;
+precision highp int;
+precision highp sampler2D;
+const int TEXELS = ${colourTexels(degree)};
+uniform sampler2D geometry;
+uniform sampler2D colours;
+uniform ivec2 lines;       // log2 of the Gaussians in one line of either texture
+uniform mat3 rotation;     // world to camera
+uniform vec3 translation;
+uniform vec3 eye;
+uniform vec4 intrinsics;   // fx, fy, cx, cy in pixels
+uniform vec2 size;
+uniform float near;
+uniform float blur;        // pixels squared
+uniform vec2 marking;      // frame shown, or -1 without marks; and how many frames a mark lasts
+layout(location = 0) in uint slot;
+flat out vec2 center;
+flat out vec4 conic;       // xx, xy, yy, opacity
+flat out vec3 colour;
+
+mat3 rotationOf(vec4 q) {
+  q /= max(length(q), 1e-10);
+  float w = q.x, x = q.y, y = q.z, z = q.w;
+  return mat3(
+    1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
+    2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x),
+    2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
+}
+
+vec3 seenFrom(vec3 direction, int at, int line) {
+  vec4 v[TEXELS];
+  for (int i = 0; i < TEXELS; i++) v[i] = texelFetch(colours, ivec2(at + i, line), 0);
+  vec3 unit = direction / max(length(direction), 1e-10);
+  float x = unit.x, y = unit.y, z = unit.z;
+  vec3 sum = vec3(0.5);
+${colourSum(degree)}
+  return max(sum, 0.0);
+}
+
+vec3 marked(vec3 plain, float stamp) {
+  if (marking.x < 0.0) return plain;
+  float age = marking.x - stamp;
+  float heat = stamp >= 0.0 && age >= 0.0 ? exp(-age / marking.y) : 0.0;
+  vec3 grey = vec3(dot(plain, vec3(0.25, 0.5, 0.25))) * 0.45;
+  return mix(grey, mix(vec3(0.9, 0.15, 0.1), vec3(1.0, 0.85, 0.2), heat), heat);
+}
+
+void main() {
+  gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
+  int s = int(slot);
+  ivec2 texel = ivec2((s & ((1 << lines.x) - 1)) * 3, s >> lines.x);
+  vec4 first = texelFetch(geometry, texel, 0);
+  vec4 third = texelFetch(geometry, texel + ivec2(2, 0), 0);
+  float opacity = 1.0 / (1.0 + exp(-first.w));
+  vec3 p = rotation * first.xyz + translation;
+  if (!(p.z > near) || opacity < 1.0 / 255.0) return;
+  vec2 focal = intrinsics.xy;
+  center = focal * p.xy / p.z + intrinsics.zw;
+  vec2 margin = 0.15 * size / focal;
+  vec2 t = clamp(p.xy / p.z, -intrinsics.zw / focal - margin, (size - intrinsics.zw) / focal + margin);
+  mat3 axes = rotation * rotationOf(texelFetch(geometry, texel + ivec2(1, 0), 0));
+  vec3 spread = exp(third.xyz);
+  vec3 across = focal.x / p.z * vec3(axes[0].x - t.x * axes[0].z, axes[1].x - t.x * axes[1].z, axes[2].x - t.x * axes[2].z) * spread;
+  vec3 down = focal.y / p.z * vec3(axes[0].y - t.y * axes[0].z, axes[1].y - t.y * axes[1].z, axes[2].y - t.y * axes[2].z) * spread;
+  float a = dot(across, across) + blur, b = dot(across, down), c = dot(down, down) + blur;
+  float determinant = a * c - b * b;
+  if (!(determinant > 0.0)) return;
+  conic = vec4(vec3(c, -b, a) / determinant, opacity);
+  float middle = 0.5 * (a + c), radius = length(vec2(0.5 * (a - c), b));
+  float large = middle + radius, small = max(determinant / large, 0.0);
+  vec2 along = abs(b) < 1e-9 * large ? (a >= c ? vec2(1, 0) : vec2(0, 1)) : normalize(vec2(b, large - a));
+  float reach = 2.0 * log(max(opacity * 255.0, 1.0));
+  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
+  vec2 offset = corner.x * (sqrt(reach * large) + 0.01) * along
+    + corner.y * (sqrt(reach * small) + 0.01) * vec2(-along.y, along.x);
+  vec2 place = (center + offset) / size;
+  gl_Position = vec4(2.0 * place.x - 1.0, 1.0 - 2.0 * place.y, 0.0, 1.0);
+  colour = marked(seenFrom(first.xyz - eye, (s & ((1 << lines.y) - 1)) * TEXELS, s >> lines.y), third.w);
+}`;
+}
+
+export const FRAGMENT_SHADER = `#version 300 es
+precision highp float;
+uniform vec2 size;
+flat in vec2 center;
+flat in vec4 conic;
+flat in vec3 colour;
+out vec4 result;
+
+void main() {
+  vec2 d = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y) - center;
+  float power = 0.5 * (conic.x * d.x * d.x + conic.z * d.y * d.y) + conic.y * d.x * d.y;
+  float alpha = min(conic.w * exp(-power), 0.999);
+  if (alpha < 1.0 / 255.0) discard;
+  result = vec4(colour * alpha, alpha);
+}`;
+
+export const COPY_VERTEX_SHADER = `#version 300 es
+void main() {
+  gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0);
+}`;
+
+export const COPY_FRAGMENT_SHADER = `#version 300 es
+precision highp float;
+uniform sampler2D picture;
+out vec4 result;
+
+void main() {
+  result = vec4(clamp(texelFetch(picture, ivec2(gl_FragCoord.xy), 0).rgb, 0.0, 1.0), 1.0);
+}`;

@@ -1,0 +1,87 @@
+// The depth order of what is drawn, from a worker where there is one. At most one request is under way.
+
+import { DepthSorter } from "./sorting.js";
+
+/** Hands positions to the sorter and keeps its last answer in `order`. */
+export class SortQueue {
+  /** `onOrder` is called when a new order has come. `useWorker` false sorts on the calling thread. */
+  constructor(onOrder, useWorker = true) {
+    this.onOrder = onOrder;
+    this.order = new Uint32Array(0);
+    this.milliseconds = 0;
+    this.busy = false;
+    this.waiting = null;
+    this.worker = useWorker ? startWorker() : null;
+    this.local = this.worker ? null : new DepthSorter();
+    if (this.worker) {
+      this.worker.onmessage = ({ data }) => this._received(data);
+      this.worker.onerror = (event) => this._withoutWorker(event);
+    }
+    this.mirror = { capacity: 0, positions: new Float32Array(0) };
+  }
+
+  reset(capacity) {
+    this.mirror = { capacity, positions: new Float32Array(3 * capacity).fill(NaN) };
+    if (this.worker) this.worker.postMessage({ reset: capacity });
+    else this.local.reset(capacity);
+  }
+
+  update(slots, positions) {
+    for (let i = 0; i < slots.length; i += 1) this.mirror.positions.set(positions.subarray(3 * i, 3 * i + 3), 3 * slots[i]);
+    if (this.worker) this.worker.postMessage({ slots, positions }, [slots.buffer, positions.buffer]);
+    else this.local.update(slots, positions);
+  }
+
+  /** Ask for the order of a view; of several requests that wait only the last one is carried out. */
+  request(axis, near) {
+    if (!this.worker) {
+      this.order = this.local.sort(axis, near);
+    } else if (this.busy) {
+      this.waiting = { axis, near };
+    } else {
+      this.busy = true;
+      this.worker.postMessage({ axis, near });
+    }
+  }
+
+  /** The exact order of a view at once, on this thread: for pictures that are to be measured. */
+  sortNow(axis, near) {
+    const sorter = new DepthSorter();
+    sorter.reset(this.mirror.capacity);
+    sorter.positions.set(this.mirror.positions);
+    this.order = sorter.sort(axis, near);
+  }
+
+  dispose() {
+    if (this.worker) this.worker.terminate();
+  }
+
+  _received({ order, milliseconds }) {
+    this.order = order;
+    this.milliseconds = milliseconds;
+    this.busy = false;
+    const { waiting } = this;
+    this.waiting = null;
+    if (waiting) this.request(waiting.axis, waiting.near);
+    this.onOrder();
+  }
+
+  /** A worker that does not start (a page of another origin, a strict policy) is replaced by this thread. */
+  _withoutWorker(event) {
+    event.preventDefault();
+    this.worker = null;
+    this.local = new DepthSorter();
+    this.local.reset(this.mirror.capacity);
+    this.local.positions.set(this.mirror.positions);
+    this.busy = false;
+    this.onOrder();
+  }
+}
+
+function startWorker() {
+  try {
+    return new Worker(new URL("./sort-worker.js", import.meta.url), { type: "module" });
+  } catch {
+    return null;
+  }
+}

@@ -1,0 +1,43 @@
+// Numbers about the playing: sizes, rates and times, over the last second or so.
+
+/** Watches a player; `update` once or twice a second, `text` for people. */
+export class Statistics {
+  constructor(player) {
+    this.player = player;
+    this.frames = [];
+    this.decoding = [];
+    this.last = null;
+    this.drawn = 0;
+    this.uploaded = 0;
+    player.addEventListener("frame", () => {
+      this.frames = [...this.frames.slice(-59), player.statistics.bytes];
+      this.decoding = [...this.decoding.slice(-59), player.statistics.decode];
+    });
+  }
+
+  update() {
+    const now = performance.now();
+    const { drawn, uploaded } = this.player.statistics;
+    if (this.last) {
+      const seconds = (now - this.last.now) / 1000;
+      this.drawn = (drawn - this.last.drawn) / seconds;
+      this.uploaded = (uploaded - this.last.uploaded) / Math.max(1, drawn - this.last.drawn);
+    }
+    this.last = { now, drawn, uploaded };
+  }
+
+  text() {
+    const { player } = this;
+    if (!player.state) return "";
+    const mean = (list) => (list.length ? list.reduce((sum, value) => sum + value, 0) / list.length : 0);
+    const bytes = mean(this.frames);
+    return [
+      `frame ${player.frame} of ${player.first} to ${player.last}`,
+      `${player.state.number.toLocaleString("en")} Gaussians`,
+      `${(bytes / 1000).toFixed(1)} KB a frame, ${((bytes * 8 * player.fps) / 1e6).toFixed(2)} Mbit/s`,
+      `${(player.buffer.received / 1e6).toFixed(2)} MB loaded, ${player.buffer.secondsAfter(player.frame).toFixed(1)} s ahead`,
+      `decoding ${mean(this.decoding).toFixed(1)} ms, sorting ${player.renderer.sorter.milliseconds.toFixed(1)} ms`,
+      `${(this.uploaded / 1000).toFixed(0)} KB to the graphics a picture, ${this.drawn.toFixed(0)} pictures/s`,
+    ].join("\n");
+  }
+}

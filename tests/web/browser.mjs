@@ -1,0 +1,109 @@
+// A Chromium without a window, driven through its debugging pipe: no package is needed for it.
+
+import { spawn } from "node:child_process";
+import { mkdtempSync, rmSync } from "node:fs";
+import { tmpdir } from "node:os";
+import { join } from "node:path";
+
+const FLAGS = [
+  "--headless", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+  "--ignore-gpu-blocklist", "--remote-debugging-pipe", "--no-first-run", "--disable-dev-shm-usage", "--hide-scrollbars",
+];
+
+/** One browser with one page. */
+export class Browser {
+  /** Start the program at `path`; `flags` are added to those it always gets. */
+  static async start(path, { width = 960, height = 600, flags = [] } = {}) {
+    const browser = new Browser();
+    browser.profile = mkdtempSync(join(tmpdir(), "chromium-"));
+    browser.child = spawn(path, [...FLAGS, ...flags, `--user-data-dir=${browser.profile}`, "about:blank"],
+      { stdio: ["ignore", "ignore", "ignore", "pipe", "pipe"] });
+    browser.last = 0;
+    browser.waiting = new Map();
+    browser.messages = [];
+    browser._listen();
+    const { targetInfos } = await browser.send("Target.getTargets");
+    const { targetId } = targetInfos.find(({ type }) => type === "page");
+    ({ sessionId: browser.session } = await browser.send("Target.attachToTarget", { targetId, flatten: true }));
+    await browser.send("Page.enable");
+    await browser.send("Runtime.enable");
+    await browser.send("Network.enable");
+    await browser.send("Emulation.setDeviceMetricsOverride", { width, height, deviceScaleFactor: 1, mobile: false });
+    return browser;
+  }
+
+  _listen() {
+    let rest = "";
+    this.child.stdio[4].setEncoding("utf8").on("data", (text) => {
+      const parts = (rest + text).split("\0");
+      rest = parts.pop();
+      for (const part of parts) this._received(JSON.parse(part));
+    });
+    this.child.on("exit", (code) => {
+      for (const { reject } of this.waiting.values()) reject(new Error(`the browser ended with code ${code}`));
+    });
+  }
+
+  _received(message) {
+    const { id, method, params } = message;
+    if (this.waiting.has(id)) {
+      const { resolve, reject } = this.waiting.get(id);
+      this.waiting.delete(id);
+      if (message.error) reject(new Error(message.error.message));
+      else resolve(message.result);
+    } else if (method === "Runtime.consoleAPICalled" && params.type === "error") {
+      this.messages.push(params.args.map((arg) => arg.value ?? arg.description).join(" "));
+    } else if (method === "Runtime.exceptionThrown") {
+      this.messages.push(params.exceptionDetails.exception?.description ?? params.exceptionDetails.text);
+    }
+  }
+
+  send(method, params = {}) {
+    this.last += 1;
+    const id = this.last;
+    const message = { id, method, params, ...(this.session ? { sessionId: this.session } : {}) };
+    this.child.stdio[3].write(`${JSON.stringify(message)}\0`);
+    return new Promise((resolve, reject) => this.waiting.set(id, { resolve, reject }));
+  }
+
+  go(url) {
+    return this.send("Page.navigate", { url });
+  }
+
+  /** What an expression (a promise is awaited) comes to in the page. */
+  async evaluate(expression) {
+    const { result, exceptionDetails } = await this.send("Runtime.evaluate", {
+      expression, awaitPromise: true, returnByValue: true,
+    });
+    if (exceptionDetails) throw new Error(exceptionDetails.exception?.description ?? exceptionDetails.text);
+    return result.value;
+  }
+
+  /** Wait until an expression is true in the page. */
+  async until(expression, seconds = 60) {
+    const end = Date.now() + 1000 * seconds;
+    while (Date.now() < end) {
+      if (await this.evaluate(`Boolean(${expression})`)) return;
+      await new Promise((resolve) => setTimeout(resolve, 50));
+    }
+    throw new Error(`after ${seconds} s still not: ${expression}; the page said: ${this.messages.join("; ")}`);
+  }
+
+  async screenshot() {
+    const { data } = await this.send("Page.captureScreenshot", { format: "png" });
+    return Buffer.from(data, "base64");
+  }
+
+  async stop() {
+    const ended = new Promise((resolve) => this.child.on("exit", resolve));
+    this.session = null;
+    this.send("Browser.close").catch(() => {});
+    const timer = setTimeout(() => this.child.kill("SIGKILL"), 5000);
+    await ended;
+    clearTimeout(timer);
+    rmSync(this.profile, { recursive: true, force: true, maxRetries: 5 });
+  }
+}
+
+/** JavaScript that stands for the player of the page. */
+export const PLAYER = "document.querySelector('gsstream-player').player";

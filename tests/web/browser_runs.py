@@ -1,0 +1,105 @@
+"""Web servers with known faults, and steps in a headless Chromium: what the tests of the page share."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import subprocess
+import threading
+from collections.abc import Iterator, Sequence
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+from node_runs import HERE, NODE
+
+CHROMIUM = os.environ.get("GSSTREAM_CHROMIUM") or next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+needs_browser = pytest.mark.skipif(NODE is None or CHROMIUM is None, reason="node or a Chromium is not installed")
+
+
+class Handler(SimpleHTTPRequestHandler):
+    """A static server. ``faults`` of the server: ranges, cut_after, status, stop_after (requests)."""
+
+    extensions_map = SimpleHTTPRequestHandler.extensions_map | {".js": "text/javascript", ".gss": "application/octet-stream"}
+
+    def log_message(self, *_: object) -> None:
+        """Say nothing."""
+
+    def do_GET(self) -> None:
+        faults = self.server.faults  # type: ignore[attr-defined]
+        self.server.requests.append((self.path, self.headers.get("Range")))  # type: ignore[attr-defined]
+        if not self.path.split("?")[0].endswith(".gss"):
+            super().do_GET()
+            return
+        data = Path(self.translate_path(self.path))
+        if not data.is_file() or faults.get("status"):
+            self.send_error(faults.get("status", 404))
+            return
+        self._send(data.read_bytes(), self.headers.get("Range"), faults)
+
+    def _send(self, data: bytes, wanted: str | None, faults: dict[str, Any]) -> None:
+        start, end, status = 0, len(data) - 1, 200
+        if wanted and faults.get("ranges", True):
+            first, last = wanted.removeprefix("bytes=").split("-")
+            start = int(first) if first else max(0, len(data) - int(last))
+            end = min(int(last), end) if first and last else end
+            status = 206
+            if start > end:
+                self.send_response(416)
+                self.send_header("Content-Range", f"bytes */{len(data)}")
+                self.send_header("Content-Length", "0")
+                self.end_headers()
+                return
+        part = data[start : end + 1]
+        self.send_response(status)
+        if status == 206:
+            self.send_header("Content-Range", f"bytes {start}-{end}/{len(data)}")
+        self.send_header("Content-Length", str(len(part)))
+        self.end_headers()
+        cut = faults.get("cut_after")
+        with contextlib.suppress(OSError):
+            self.wfile.write(part if cut is None else part[:cut])
+            if cut is not None and len(part) > cut:
+                self.connection.close()
+
+
+@contextlib.contextmanager
+def serving(folder: Path, **faults: Any) -> Iterator[tuple[str, ThreadingHTTPServer]]:
+    """Serve a folder on loopback; yields its address and the server (``requests``, ``faults``)."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(folder)))
+    server.faults, server.requests = faults, []  # type: ignore[attr-defined]
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_address[1]}", server
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+def in_browser(steps: Sequence[Sequence[Any]], folder: Path, *, flags: Sequence[str] = (), size=(640, 400)) -> list[Any]:
+    """Carry out steps (see scenario.mjs) and return what each gave; the page must not report an error."""
+    results, messages = try_in_browser(steps, folder, flags=flags, size=size)
+    assert messages == []
+    return results
+
+
+def try_in_browser(
+    steps: Sequence[Sequence[Any]], folder: Path, *, flags: Sequence[str] = (), size=(640, 400)
+) -> tuple[list[Any], list[str]]:
+    """Like :func:`in_browser`; also returns the errors that the page reported."""
+    plan, out = folder / "steps.json", folder / "steps-results.json"
+    plan.write_text(json.dumps({"width": size[0], "height": size[1], "flags": list(flags), "steps": list(steps)}))
+    command = [str(NODE), str(HERE / "scenario.mjs"), str(CHROMIUM), str(plan), str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(out.read_text())
+    assert found["failure"] is None, found
+    return found["results"], found["messages"]

@@ -1,0 +1,117 @@
+"""Hold the browser's decoder against Python's on damaged and lying streams.
+
+Usage: python tests/web/decoder_fuzz.py --count 20000 --seed 1
+
+Every case must end in a PacketError with a byte inside the file, or in the very frames that Python plays; none may hang or
+take memory without bound. Cases are those of tests/packet/fuzz.py and follow from (seed, number) alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import sys
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent / "packet"))
+from fuzz_cases import Base, bases, mutate
+from moving_scenes import moving_packets
+from node_runs import play_in_node
+
+from gsstream.core.errors import PacketError
+from gsstream.packet.base import file_header
+from gsstream.player.playback import Playback
+
+SECONDS = 5.0
+#: Node itself needs about 60 MB; the rest is the bytes of a chunk and what their decoding takes.
+MEGABYTES = 400
+
+
+class Outcome(NamedTuple):
+    """What Python makes of a stream."""
+
+    digests: list[str]
+    error: PacketError | None
+
+
+def play_in_python(path: Path, data: bytes) -> Outcome:
+    """Digests of the frames until the end or the error."""
+    path.write_bytes(data)
+    digests: list[str] = []
+    try:
+        with Playback(path) as playback:
+            for _, scene in playback:
+                digests.append(hashlib.sha256(b"".join(a.tobytes() for _, a in scene.items())).hexdigest())
+            playback.reader.check()
+    except PacketError as error:
+        return Outcome(digests, error)
+    return Outcome(digests, None)
+
+
+def disagreement(ours: Outcome, theirs: dict[str, Any], size: int) -> str | None:
+    """Why the two outcomes do not go together; None when they do."""
+    error = theirs["error"]
+    if error is not None and not (error["expected"] and error["offset"] is not None and 0 <= error["offset"] <= size):
+        return f"not an error of the format with a byte inside the file: {error}"
+    if theirs["milliseconds"] > 1000 * SECONDS:
+        return f"took {theirs['milliseconds'] / 1000:.1f} s"
+    shared = min(len(ours.digests), len(theirs["digests"]))
+    if ours.digests[:shared] != theirs["digests"][:shared]:
+        return "other frames than Python's"
+    # The player does not read the recipe and other text of meta, so it may play what Python refuses for it.
+    lenient = ours.error is not None and str(ours.error).startswith("meta: ")
+    if error is None and ours.error is not None and not lenient:
+        return f"played although Python says: {ours.error}"
+    if error is not None and ours.error is None:
+        return f"refused although Python plays it: {error}"
+    if len(theirs["digests"]) != len(ours.digests) and not lenient:
+        return f"{len(theirs['digests'])} frames, Python has {len(ours.digests)}: {error}, {ours.error}"
+    return None
+
+
+def fuzz(count: int, seed: int, *, first: int = 0, chunk: int = 2000) -> tuple[Counter[str], list[str]]:
+    """Outcomes by kind of mutation, and what went wrong."""
+    corpus = [*bases(), *(_moving(seed) for seed in (1, 2, 3))]
+    outcomes: Counter[str] = Counter()
+    failures: list[str] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for start in range(first, first + count, chunk):
+            numbers = range(start, min(start + chunk, first + count))
+            cases = [mutate(corpus, seed, number) for number in numbers]
+            found = play_in_node([data for _, data, _ in cases], Path(folder), timeout=60 + len(cases) * SECONDS)
+            if found["megabytes"] > MEGABYTES:
+                failures.append(f"cases from {start}: {found['megabytes']:.0f} MB")
+            for number, (kind, data, _), theirs in zip(numbers, cases, found["streams"], strict=True):
+                why = disagreement(play_in_python(Path(folder) / "s.gss", data), theirs, len(data))
+                outcomes[f"{kind}: {'refused' if theirs['error'] else 'played'}"] += 1
+                if why is not None:
+                    failures.append(f"case {number} ({kind}): {why}")
+    return outcomes, failures
+
+
+def _moving(seed: int) -> Base:
+    """A stream with motions in the form that the mutations take; what it decodes to is not needed here."""
+    packets = moving_packets(seed, frames=6, number=(30, 100, 300)[seed % 3], key_at=9)
+    data = file_header() + b"".join(packet.data for packet in packets)
+    return Base(data, (), (), tuple(packets))
+
+
+def main() -> int:
+    """Run the job; the exit code is 1 when a case failed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=20_000, help="number of cases")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--first", type=int, default=0, help="number of the first case")
+    arguments = parser.parse_args()
+    outcomes, failures = fuzz(arguments.count, arguments.seed, first=arguments.first)
+    print(*(f"{name}: {number}" for name, number in sorted(outcomes.items())), sep="\n")
+    print(*failures, f"{arguments.count} cases, {len(failures)} failures", sep="\n")
+    return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

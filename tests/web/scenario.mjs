@@ -1,0 +1,59 @@
+// Carry out steps in a headless browser. Usage: node scenario.mjs CHROMIUM STEPS RESULTS (both JSON files)
+//
+// STEPS: { width, height, throttle (bytes/s), steps: [[name, ...arguments], ...] }. RESULTS: a list with what each step gave, and
+// `messages`, the errors that the page reported.
+
+import { readFileSync, writeFileSync } from "node:fs";
+
+import { Browser, PLAYER } from "./browser.mjs";
+
+const [, , chromium, from, to] = process.argv;
+const plan = JSON.parse(readFileSync(from));
+const browser = await Browser.start(chromium, plan);
+const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
+
+const actions = {
+  go: (url) => browser.go(url),
+  until: (expression, seconds) => browser.until(expression, seconds),
+  evaluate: (expression) => browser.evaluate(expression),
+  pause,
+  throttle: (bytes) => browser.send("Network.emulateNetworkConditions",
+    { offline: false, latency: 20, downloadThroughput: bytes, uploadThroughput: bytes }),
+  screenshot: async (path) => writeFileSync(path, await browser.screenshot()),
+  key: async (key) => {
+    await browser.send("Input.dispatchKeyEvent", { type: "keyDown", key, text: key.length === 1 ? key : undefined });
+    await browser.send("Input.dispatchKeyEvent", { type: "keyUp", key });
+  },
+  drag: async (x, y, dx, dy, button = "left") => {
+    const buttons = button === "left" ? 1 : 2;
+    await browser.send("Input.dispatchMouseEvent", { type: "mousePressed", x, y, button, buttons, clickCount: 1 });
+    for (let i = 1; i <= 8; i += 1) {
+      await browser.send("Input.dispatchMouseEvent", { type: "mouseMoved", x: x + (dx * i) / 8, y: y + (dy * i) / 8, button, buttons });
+    }
+    await browser.send("Input.dispatchMouseEvent", { type: "mouseReleased", x: x + dx, y: y + dy, button, clickCount: 1 });
+  },
+  wheel: (x, y, deltaY) => browser.send("Input.dispatchMouseEvent", { type: "mouseWheel", x, y, deltaX: 0, deltaY }),
+  // RGBA bytes of a frame, drawn at the recording's size in exact depth order.
+  picture: (frame, width, height) => browser.evaluate(`(async () => {
+    const player = ${PLAYER};
+    player.canvas.width = ${width};
+    player.canvas.height = ${height};
+    player.seek(${frame});
+    while (player.frame !== ${frame}) await new Promise(requestAnimationFrame);
+    player.draw({ exact: true });
+    const bytes = player.renderer.readPixels();
+    let text = "";
+    for (const byte of bytes) text += String.fromCharCode(byte);
+    return btoa(text);
+  })()`),
+};
+
+const results = [];
+let failure = null;
+try {
+  for (const [name, ...rest] of plan.steps) results.push((await actions[name](...rest)) ?? null);
+} catch (error) {
+  failure = `${plan.steps[results.length]?.[0]}: ${error.message}`;
+}
+writeFileSync(to, JSON.stringify({ results, messages: browser.messages, failure }));
+await browser.stop();

@@ -1,0 +1,157 @@
+"""The browser's decoder in node: the same bits as Python after every packet, and no harm from damaged streams."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+from pathlib import Path
+
+import constriction
+import numpy as np
+import pytest
+from decoder_fuzz import fuzz
+from moving_scenes import moving_packets
+from node_runs import NODE, needs_node, play_in_node
+
+from gsstream.cli.main import run_command
+from gsstream.packet import decode_packet
+from gsstream.packet.base import file_header
+from gsstream.packet.symbols import encode_symbols
+from gsstream.player.playback import Playback
+
+pytestmark = needs_node
+HERE = Path(__file__).parent
+SAMPLES = HERE.parent / "packet" / "samples"
+
+
+def digests(path: Path) -> list[str]:
+    with Playback(path) as playback:
+        return [hashlib.sha256(b"".join(a.tobytes() for _, a in s.items())).hexdigest() for _, s in playback]
+
+
+def node(code: str, given: object, folder: Path) -> object:
+    """What a piece of JavaScript makes of ``given`` (JSON): it sees ``given`` and the folder of modules ``web``."""
+    file = folder / "given.json"
+    file.write_text(json.dumps(given))
+    script = (
+        "import { readFileSync } from 'node:fs';\n"
+        f"const given = JSON.parse(readFileSync({json.dumps(str(file))}));\n"
+        f"const load = (name) => import({json.dumps(str(HERE.parents[1] / 'gsstream' / 'web'))} + '/' + name);\n"
+        f"console.log(JSON.stringify(await (async () => {{ {code} }})()));\n"
+    )
+    done = subprocess.run(
+        [str(NODE), "--input-type=module", "-"], input=script, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_stored_streams_decode_to_the_bits_they_always_decoded_to(tmp_path):
+    folders = sorted(folder for folder in SAMPLES.iterdir() if _readable(folder.name))
+    assert folders, "no stored stream has the version that the player reads"
+    found = play_in_node([(folder / "stream.gss").read_bytes() for folder in folders], tmp_path)
+    for folder, stream in zip(folders, found["streams"], strict=True):
+        assert stream["error"] is None
+        assert stream["digests"] == json.loads((folder / "expected.json").read_text()), folder.name
+
+
+def _readable(version: str) -> bool:
+    text = (HERE.parents[1] / "gsstream" / "web" / "limits.js").read_text()
+    major = next(line for line in text.splitlines() if "FORMAT_MAJOR" in line).split("= ")[1].rstrip(";")
+    return version.split(".")[0] == major
+
+
+def test_a_real_run_decodes_to_the_same_bits(tmp_path):
+    source = "synthetic:frames=30&views=3&width=40&height=30"
+    settings = ["--set", "first_frame.max_iterations=5", "--set", "first_frame.fill_points=200"]
+    run = ["run", "--source", source, "--out", str(tmp_path / "run"), "--method", "s2gs-fast", *settings]
+    assert run_command([*run, "--quiet", "--no-video"]) == 0
+    stream = tmp_path / "run" / "stream.gss"
+    (found,) = play_in_node([stream.read_bytes()], tmp_path)["streams"]
+    assert found["error"] is None
+    assert len(found["digests"]) == 30
+    assert len(set(found["digests"])) > 10, "a run in which nothing changes tests little"
+    assert found["digests"] == digests(stream)
+
+
+@pytest.mark.parametrize(("sh_rest", "number"), [(0, 1), (3, 40), (8, 500), (15, 200)])
+def test_streams_with_every_kind_of_change_decode_to_the_same_bits(tmp_path, sh_rest, number):
+    packets = moving_packets(seed=sh_rest, frames=30, key_at=20, number=number, sh_rest=sh_rest)
+    (found,) = play_in_node([file_header() + b"".join(p.data for p in packets)], tmp_path)["streams"]
+    assert found["error"] is None
+    state, expected = None, []
+    for packet in packets:
+        state = decode_packet(state, packet.data)
+        expected.append(hashlib.sha256(b"".join(a.tobytes() for _, a in state.gaussians.items())).hexdigest())
+    assert found["digests"] == expected
+
+
+def test_cut_points_are_those_of_the_entropy_coder_on_random_histograms(tmp_path):
+    """The quantised intervals, seen from outside: symbols that constriction encodes come back."""
+    rng = np.random.default_rng(5)
+    cases = []
+    for _ in range(60):
+        bins = int(2 ** rng.uniform(1, 13))
+        counts = np.floor(2.0 ** rng.uniform(0, 32, bins)) * (rng.random(bins) < 0.7)
+        counts[int(rng.integers(bins))] += 1
+        chosen = rng.integers(0, bins, 400)
+        coder = constriction.stream.stack.AnsCoder()
+        model = constriction.stream.model.Categorical(counts, perfect=False)
+        coder.encode_reverse(chosen.astype(np.int32), model)
+        words = coder.get_compressed().astype("<u4").tobytes()
+        cases.append({"counts": counts.tolist(), "words": words.hex(), "symbols": chosen.tolist()})
+    code = """
+        const { AnsDecoder, quantiseCounts } = await load('ans.js');
+        return given.map(({ counts, words, symbols }) => {
+          const coder = new AnsDecoder(new Uint8Array(Buffer.from(words, 'hex')));
+          const out = new Int32Array(symbols.length);
+          coder.decode(quantiseCounts(counts), 0, out);
+          return coder.isEmpty && symbols.every((symbol, i) => symbol === out[i]);
+        });"""
+    assert node(code, cases, tmp_path) == [True] * len(cases)
+
+
+def test_tables_of_any_integers_come_back(tmp_path):
+    rng = np.random.default_rng(6)
+    cases = []
+    for scale in (0, 1, 5, 300, 2**20, 2**31 - 1):
+        for rows, channels in ((1, 1), (7, 3), (400, 5)):
+            table = np.clip(np.rint(rng.standard_cauchy((rows, channels)) * scale), -(2**31), 2**31 - 1)
+            data = encode_symbols(table.astype(np.int32))
+            cases.append({"data": data.hex(), "table": table.astype(int).tolist()})
+    code = """
+        const { decodeSymbols } = await load('symbols.js');
+        return given.map(({ data, table }) => {
+          const out = decodeSymbols(new Uint8Array(Buffer.from(data, 'hex')), table.length, table[0].length);
+          return table.every((row, i) => row.every((value, c) => out[c * table.length + i] === value));
+        });"""
+    assert node(code, cases, tmp_path) == [True] * len(cases)
+
+
+def test_half_precision_numbers_are_read_as_numpy_reads_them(tmp_path):
+    values = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float64)
+    finite = np.isfinite(values)
+    code = "const { half } = await load('changes/residual.js'); return given.map((bits) => half(bits));"
+    got = node(code, np.flatnonzero(finite).tolist(), tmp_path)
+    assert got == values[finite].tolist()
+
+
+def test_damaged_and_lying_streams_end_as_in_python():
+    outcomes, failures = fuzz(1000, seed=7)
+    assert failures == []
+    assert sum(n for name, n in outcomes.items() if name.endswith("refused")) > 500
+    assert sum(n for name, n in outcomes.items() if name.endswith("played")) > 50
+
+
+def test_streams_that_are_none_are_refused_in_one_sentence(tmp_path):
+    sample = file_header() + b"".join(p.data for p in moving_packets(seed=1, frames=3))
+    newer = bytearray(sample)
+    newer[8] = 99
+    older = (SAMPLES / "1.1" / "stream.gss").read_bytes()
+    cases = [b"", b"<!doctype html><title>404</title>", sample[:16], sample[16:], bytes(newer), older]
+    found = play_in_node(cases, tmp_path)["streams"]
+    for stream in found:
+        assert stream["digests"] == []
+        assert stream["error"]["expected"]
+        assert stream["error"]["offset"] is not None

@@ -27,9 +27,9 @@ from gsstream.testing.examples.loss import ExampleLoss
 from gsstream.testing.examples.propagation import ExamplePropagation
 from gsstream.testing.examples.regularizer import ExampleRegularizer
 from gsstream.testing.examples.source import ExampleSource
+from gsstream.testing.examples.stepper import ExampleStepper
 from gsstream.testing.examples.structure import ExampleStructure
 from gsstream.testing.examples.update import ExampleUpdate
-from gsstream.testing.examples.stepper import ExampleStepper
 from gsstream.testing.kit import all_checks, summary
 
 BUILTIN = [

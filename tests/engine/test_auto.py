@@ -20,9 +20,9 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ComponentError, InputError, OutputError, RecipeError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.engine.assembly.assemble import assemble
-from gsstream.engine.auto.rules import recall, record, refuse_pending, settle, sh_degree
 from gsstream.engine.auto.colour_gain import colour_gain
 from gsstream.engine.auto.facts import scene_facts
+from gsstream.engine.auto.rules import recall, record, refuse_pending, settle, sh_degree
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import load_recipe, resolve_recipe
 from gsstream.recipe.save import save_resolved

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from gsstream.core.changes import own_nodes
-from gsstream.core.changes import Delta, Layout, active_rows
+from gsstream.core.changes import Delta, Layout, active_rows, own_nodes
 from gsstream.core.gaussians import Gaussians
 from gsstream.engine.budget.trim import _GATE_BITS, _Table, fit
 from gsstream.packet import EncodedPacket, encode_delta, encode_empty, quantise_decoders

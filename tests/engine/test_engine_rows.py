@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsstream.core.changes import Births, own_nodes
-from gsstream.core.changes import Delta, Layout
+from gsstream.core.changes import Births, Delta, Layout, own_nodes
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.topology import TopologyEdit

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from gsstream.engine.stopping import Gains, watch
 from hypothesis import given
 from hypothesis import strategies as st
-
-from gsstream.engine.stopping import Gains, watch
 
 
 def epoch(gains: Gains, losses: list[float], tiles: int = 5) -> float:

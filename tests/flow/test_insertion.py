@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from flow_runs import Witness, arguments, demo_copy, encode, metrics
+from gsstream.engine.step.insertion import place
 from PIL import Image, ImageDraw
 
 from gsstream.cli.main import run_command
 from gsstream.core.changes import Layout
 from gsstream.core.gaussians import Gaussians
-from gsstream.engine.step.insertion import place
 from gsstream.packet import StreamReader
 from gsstream.player.playback import Playback
 

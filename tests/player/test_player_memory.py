@@ -11,6 +11,7 @@ import pytest
 from test_player import make_stream
 
 from gsstream.cli.main import run_command
+from gsstream.core.changes import Delta
 from gsstream.core.errors import InputError
 from gsstream.packet import StreamWriter, decode_packet, encode_delta, encode_key
 from gsstream.player.memory import MemoryLimit
@@ -18,7 +19,7 @@ from gsstream.player.play import play
 from gsstream.player.playback import Playback
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "packet"))
-from packet_scenes import make_delta, make_edit, make_key
+from packet_scenes import make_delta, make_edit, make_key, make_motions
 
 MB = 1_000_000
 
@@ -29,7 +30,7 @@ def many_equal(path: Path, number: int) -> Path:
 
     state = make_key(np.random.default_rng(0), 1, 1, 15)
     scene = state.gaussians.map(lambda a: np.repeat(a, number, axis=0))
-    layout = type(state.layout)(np.int32([number]), np.zeros(number, np.uint8), state.layout.cell_sizes)
+    layout = type(state.layout)(np.int32([number]), np.zeros(number, np.uint8), state.layout.units)
     with StreamWriter.open(path) as writer:
         writer.append(encode_key(KeyState(scene, layout, state.meta)))
     return path
@@ -51,7 +52,7 @@ def test_a_small_file_that_announces_much_is_refused_cheaply(tmp_path) -> None:
 
 @pytest.mark.parametrize("sh_rest", [0, 3, 15])
 def test_the_estimate_bounds_what_decoding_takes(sh_rest) -> None:
-    """Peaks of key packets, deltas, and deltas with births, each against what was announced for them."""
+    """Peaks of key packets, deltas, deltas with births and with motions, each against what was announced for them."""
     rng = np.random.default_rng(1)
     state, number = None, 20_000
     key = make_key(rng, number, number // 8, sh_rest)
@@ -60,6 +61,11 @@ def test_the_estimate_bounds_what_decoding_takes(sh_rest) -> None:
     packets.append(encode_delta(make_delta(rng, state.layout, 1.0), state.layout, {}, frame=1))
     state = decode_packet(state, packets[1].data)
     packets.append(encode_delta(make_edit(rng, state, births=5000), state.layout, state.decoders, frame=2))
+    state = decode_packet(state, packets[2].data)
+    packets.append(encode_delta(make_motions(rng, state.scene, 2), state.layout, {}, frame=3))
+    state = decode_packet(state, packets[3].data)
+    predicted = make_motions(rng, state.scene, 1).changes
+    packets.append(encode_delta(Delta((*predicted, *make_edit(rng, state, births=5000).changes)), state.layout, {}, frame=4))
     state = None
     for packet in packets:
         smallest = least_limit(packet.data, state)

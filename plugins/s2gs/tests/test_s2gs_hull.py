@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from gsstream.init.hull import Hull, hull_points, one_per_cell
+from gsstream_s2gs.hull import Hull, hull_points, one_per_cell
 
 from gsstream.testing import images, rig, scene
 

@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from flow_runs import Witness, arguments, demo_copy, encode, metrics
-from gsstream.engine.step.insertion import place
+from gsstream_s2gs.anchor_insertion import place
 from PIL import Image, ImageDraw
 
+from gsstream.api import Gaussians, Layout
 from gsstream.cli.main import run_command
-from gsstream.core.changes import Layout
-from gsstream.core.gaussians import Gaussians
 from gsstream.packet import StreamReader
 from gsstream.player.playback import Playback
 
@@ -41,15 +40,18 @@ def with_a_ball(folder: Path) -> Path:
 
 SETS = {
     "stream__change_threshold": 6.0, "first_frame__max_iterations": 150, "stream__epochs": 3,
-    "insertion__least_views": 3, "first_frame__max_points": 3000,
+    "first_frame__max_points": 3000,
 }  # fmt: skip
+
+
+BORN = {"growth": "anchor-insertion", "growth__per_frame": 64, "growth__least_views": 3}
 
 
 def test_a_ball_out_of_nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = str(with_a_ball(tmp_path / "recording"))
     encode(tmp_path / "fixed", source=source, method="s2gs-edge", **SETS)
     witness = Witness(monkeypatch)
-    once = encode(tmp_path / "born", source=source, method="s2gs-edge", insertion__per_frame=64, **SETS)
+    once = encode(tmp_path / "born", source=source, method="s2gs-edge", **BORN, **SETS)
     fixed, born = metrics(tmp_path / "fixed"), metrics(tmp_path / "born")
     assert [line["births"] for line in fixed[1:]] == [0, 0]
     assert 1 <= born[1]["births"] <= 64
@@ -68,14 +70,14 @@ def test_a_ball_out_of_nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         last = reader.frames[2]
     with stream.open("r+b") as file:
         file.truncate(last.offset + 3)
-    again = encode(tmp_path / "born", "--resume", source=source, method="s2gs-edge", insertion__per_frame=64, **SETS)
+    again = encode(tmp_path / "born", "--resume", source=source, method="s2gs-edge", **BORN, **SETS)
     assert again == once
 
 
 def test_nothing_is_born_where_nothing_changes(tmp_path: Path) -> None:
     source = "synthetic:frames=2&views=3&width=48&height=32&supersample=1&motion=0"
     # Without an active set, so that the frames are really optimised.
-    sets = {"stream__change_threshold": 0.0, "insertion__per_frame": 64}
+    sets = {"stream__change_threshold": 0.0, **BORN}
     assert run_command(arguments(tmp_path, source=source, method="s2gs-edge", **sets)) == 0
     assert [line["births"] for line in metrics(tmp_path)[1:]] == [0]
 
@@ -89,5 +91,5 @@ def test_newborn_join_the_group_beside_them_or_found_one() -> None:
     births = place(Gaussians(means=where, **rows), means, layout)
     assert births.nodes.tolist() == [0, 1, 2, 3]
     assert births.parents.tolist() == [2, 3]
-    assert births.octree_levels.tolist() == [1, 1, 1, 1]
+    assert births.unit_of.tolist() == [1, 1, 1, 1]
     assert births.gaussians.means[:, 0].tolist() == pytest.approx([0.2, 5.4, 20, 30])

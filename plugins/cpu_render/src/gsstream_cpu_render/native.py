@@ -81,7 +81,7 @@ class NativeRasterizer:
     # ---- checks
 
     def _expect(self, operation: str) -> None:
-        """Raise InputError unless this operation may follow now: before its arguments are held against the last pass."""
+        """Raise InputError unless this operation may follow now; asked before its arguments meet the last pass."""
         try:
             self._native.expect(operation)
         except ValueError as error:

@@ -1,5 +1,4 @@
-"""Moving and changed pixels: where a view differs from how it began. A method that freezes the scene must lose there.
-"""
+"""Moving and changed pixels: where a view differs from how it began, and a method that freezes the scene loses."""
 
 from __future__ import annotations
 

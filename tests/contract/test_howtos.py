@@ -25,7 +25,7 @@ HOWTOS = Path(__file__).parents[2] / "docs" / "howto"
 PAGES = {
     "structure": "write-a-structure", "confidence": "write-a-confidence", "propagation": "write-a-propagation",
     "gate": "write-a-gate", "regularizer": "write-a-regularizer", "update": "write-an-update-rule",
-    "renderer": "write-a-renderer",
+    "motion": "write-a-motion", "growth": "write-a-growth", "renderer": "write-a-renderer",
 }  # fmt: skip
 
 

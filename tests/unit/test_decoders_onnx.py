@@ -13,7 +13,7 @@ from gsstream.core.errors import InputError
 from gsstream.packet import StreamWriter, decode_packet, encode_delta, encode_key, quantise_decoders
 from gsstream.player.decoders import decoder_model, export_decoders, quantise_output, run_decoder
 from gsstream.player.playback import Playback
-from gsstream.testing.checks.packet import tiny_key
+from gsstream.testing.packet.checks import tiny_key
 
 onnx = pytest.importorskip("onnx", reason="needs the package onnx (extra export)")
 pytest.importorskip("onnxruntime", reason="needs onnxruntime (extra onnx)")

@@ -25,8 +25,8 @@ from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe
 from gsstream.source.open import open_source
-from gsstream.testing.examples.whole import ExampleWhole
 from gsstream.testing.stepping import SOURCE, MethodUnderTest
+from gsstream.testing.whole.example import ExampleWhole
 
 Follow: Any = ExampleWhole  # final: only what is wrong on purpose may inherit from it
 

@@ -1,0 +1,1 @@
+"""What every method promises, made of parts or whole."""

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.testing.examples.regularizer import ExampleRegularizer
-from gsstream.testing.saboteurs.register import spoils
+from gsstream.testing.regularizer.example import ExampleRegularizer
+from saboteurs.register import spoils
 
 Regularizer: Any = ExampleRegularizer
 Terms = dict[str, torch.Tensor]

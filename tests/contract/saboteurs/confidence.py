@@ -6,8 +6,8 @@ from typing import Any
 
 import torch
 
-from gsstream.testing.examples.confidence import ExampleConfidence
-from gsstream.testing.saboteurs.register import spoils
+from gsstream.testing.confidence.example import ExampleConfidence
+from saboteurs.register import spoils
 
 Confidence: Any = ExampleConfidence
 LINE = 20

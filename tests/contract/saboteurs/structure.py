@@ -9,8 +9,8 @@ import torch
 
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.structure.base import Anchors
-from gsstream.testing.examples.structure import ExampleStructure
-from gsstream.testing.saboteurs.register import spoils
+from gsstream.testing.structure.example import ExampleStructure
+from saboteurs.register import spoils
 
 Structure: Any = ExampleStructure
 #: Size of the world "line", on which a few checks alone are made.

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 
 from gsstream.core.hierarchy import Hierarchy, tree_roots
-from gsstream.testing.examples.propagation import ExamplePropagation
-from gsstream.testing.saboteurs.register import spoils
+from gsstream.testing.propagation.example import ExamplePropagation
+from saboteurs.register import spoils
 
 Propagation: Any = ExamplePropagation
 

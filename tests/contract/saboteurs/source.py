@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from gsstream.core.frame import Frame, PointCloud
-from gsstream.testing.examples.source import ExampleSource
 from gsstream.testing.recording import SourceUnderTest
-from gsstream.testing.saboteurs.register import spoils
+from gsstream.testing.source.example import ExampleSource
+from saboteurs.register import spoils
 
 
 def _spoils(check: str) -> Callable[[type[ExampleSource]], type[ExampleSource]]:

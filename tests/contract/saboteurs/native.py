@@ -10,9 +10,9 @@ import torch
 
 from gsstream.optimiser.adam import ReferenceAdam
 from gsstream.residual.base import AttributeCode
-from gsstream.testing.examples.loss import ExampleLoss
-from gsstream.testing.examples.update import ExampleUpdate
-from gsstream.testing.saboteurs.register import spoils
+from gsstream.testing.loss.example import ExampleLoss
+from gsstream.testing.update.example import ExampleUpdate
+from saboteurs.register import spoils
 
 # They are final; only a saboteur may inherit from them, and only behind the type checker's back.
 Update: Any = ExampleUpdate

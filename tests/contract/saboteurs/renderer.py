@@ -11,8 +11,8 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.context import ScreenGradient
 from gsstream.render.base import RenderOutput, RenderSession, ScatterSession
 from gsstream.render.reference import ReferenceRenderer
-from gsstream.testing.examples.renderer import ExampleRenderer
-from gsstream.testing.saboteurs.register import spoils
+from gsstream.testing.renderer.example import ExampleRenderer
+from saboteurs.register import spoils
 
 # The reference is final; only a saboteur may inherit from it, and only behind the type checker's back.
 Reference: Any = ReferenceRenderer

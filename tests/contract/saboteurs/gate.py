@@ -6,8 +6,8 @@ from typing import Any
 
 import torch
 
-from gsstream.testing.examples.gate import ExampleGate
-from gsstream.testing.saboteurs.register import spoils
+from gsstream.testing.gate.example import ExampleGate
+from saboteurs.register import spoils
 
 Gate: Any = ExampleGate
 

@@ -22,9 +22,10 @@ from gsstream.core.errors import InputError
 from gsstream.core.kinds import CONTRACTS
 from gsstream.core.part import Part
 from gsstream.gate.base import GateSampler
-from gsstream.testing.cases import fingerprint, world
+from gsstream.testing.cases import World, fingerprint, world
+from gsstream.testing.common import auto as auto
 from gsstream.testing.compare import ROUNDING, all_equal, finite
-from gsstream.testing.drive import draw, outputs
+from gsstream.testing.drive import behaviour_of, draw, outputs
 from gsstream.testing.recording import SourceUnderTest
 from gsstream.testing.registry import BEHAVED, LEAST_REASON, Skip, check, checks_for, kind_of
 
@@ -175,8 +176,7 @@ def check_dtype_and_device(part: Part) -> None:
         for name, value in outputs(part, case).items():
             assert value.device == case.logits.device, f"{name}: expected {case.logits.device}, got {value.device}"
             if value.dtype.is_floating_point:
-                kind = kind_of(part)
-                want = torch.float32 if kind in ("structure", "confidence") else case.logits.dtype
+                want = case.logits.dtype if behaviour_of(part).keeps_precision else torch.float32
                 assert value.dtype == want, f"{name}: expected {want}, got {value.dtype} from {case.logits.dtype} input"
 
 
@@ -206,7 +206,7 @@ def check_rejects_nonfinite(part: Part) -> None:
             continue
         if all(bool((~torch.isfinite(value)).any()) for value in got.values() if value.dtype.is_floating_point):
             # Seams called once per iteration may hand it on: it shows in the loss.
-            assert kind_of(part) == "regularizer" or not got, f"{bad} was passed on; expected an InputError naming it"
+            assert behaviour_of(part).hands_on or not got, f"{bad} was passed on; expected an InputError naming it"
             continue
         ignored = _same(outputs(part, clean), outputs(part, other))
         assert ignored, f"{bad} in the input was repaired silently; expected an InputError naming the argument"
@@ -216,24 +216,11 @@ def _same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bo
     return all(torch.equal(value, second[name]) for name, value in first.items())
 
 
-def _poisoned(part: Part, value: float) -> Any:
+def _poisoned(part: Part, value: float) -> World:
     """The cloud with one value of what the part reads replaced."""
     case = world("cloud")
-    kind = kind_of(part)
-    if kind == "structure":
-        case.gaussians.means[5, 0] = value
-    elif kind == "confidence":
-        for image in case.now:
-            image[SPOT] = value
-    elif kind == "regularizer":
-        case.residual[5, 0] = value
-    else:
-        case.logits[5] = value
+    behaviour_of(part).poison(case, value)
     return case
-
-
-#: A pixel that every camera of the cloud covers.
-SPOT = (10, 10)
 
 
 @check("common", kinds=BEHAVED)
@@ -242,12 +229,10 @@ def check_permutation(part: Part) -> None:
     case = world("cloud")
     order = torch.randperm(len(case.logits), generator=torch.Generator().manual_seed(3))
     first, second = outputs(part, case), outputs(part, case.permuted(order))
-    kind = kind_of(part)
+    behaviour = behaviour_of(part)
     for name in list(first):
-        if kind == "structure" and name.startswith("build"):
-            del first[name], second[name]  # node names may change: check_structure_label_free compares partitions
-        elif name == "sample(noise)":
-            del first[name], second[name]  # the noise stayed in place: check_gate_noise_is_data permutes it too
-        elif kind in ("confidence", "gate"):
+        if behaviour.no_order is not None and name.startswith(behaviour.no_order):
+            del first[name], second[name]
+        elif behaviour.by_gaussian:
             first[name] = first[name][order]
     all_equal("permuted Gaussians", second, first, 1e-4, f"{ROUNDING}; splats at equal depth may swap")

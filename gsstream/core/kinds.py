@@ -2,7 +2,7 @@
 
 A new kind is one entry here, a room with its contract class, and a room of its name in ``gsstream.testing``:
 ``checks``, an ``example`` that new plugins start from (``use``), and ``behaviour``, what the common checks need to know
-of it. A kind that is a slot also gets a field of its name in ``recipe.model.Recipe`` and 
+of it. A kind that is a slot also gets a field of its name in ``recipe.model.Recipe`` and
 ``engine.assembly.assemble.Assembly``.
 """
 

@@ -34,8 +34,13 @@ class Calibration:
     patterns: dict[str, str]
 
 
-def read_calibration(folder: Path, *, growing: bool = False) -> Calibration:
-    """Read and check ``folder/cameras.json``; ``growing``: the number of frames may be left out.
+def read_calibration(folder: Path, *, growing: bool = False, to_size: bool = False) -> Calibration:
+    """Read and check ``folder/cameras.json``.
+
+    Arguments:
+        growing: the number of frames may be left out.
+        to_size: cameras of several sizes are given as they are once cut to the smallest width and height, where
+            pictures are about to be brought to that size; else they are an error.
 
     Raises SourceError saying which file, camera or key is wrong, and what was expected.
     """
@@ -50,7 +55,7 @@ def read_calibration(folder: Path, *, growing: bool = False) -> Calibration:
     if len(set(ids)) != len(ids):
         twice = sorted({i for i in ids if ids.count(i) > 1})
         raise SourceError(f"{path}: camera ids must be unique, these occur more than once: {', '.join(twice)}")
-    rig = _rig(path, ids, cameras)
+    rig = _rig(path, ids, cameras, to_size)
     splits = _splits(path, ids, cameras, data.get("test_cameras"))
     train = [i for i, split in enumerate(splits) if split == "train"]
     if not train:
@@ -83,17 +88,20 @@ def _load_json(path: Path) -> dict[str, Any]:
     return data
 
 
-def _rig(path: Path, ids: list[str], cameras: list[dict[str, Any]]) -> Cameras:
+def _rig(path: Path, ids: list[str], cameras: list[dict[str, Any]], to_size: bool) -> Cameras:
     sizes = {i: _size(path, i, camera) for i, camera in zip(ids, cameras, strict=True)}
     first = sizes[ids[0]]
     for camera_id, size in sizes.items():
-        if size != first:
+        if size != first and not to_size:
             raise SourceError(
                 f"{path}: all cameras of a rig must share one image size, but {ids[0]!r} is {first[0]} x {first[1]} "
                 f"and {camera_id!r} is {size[0]} x {size[1]}; 'gsstream scene prepare' brings them to one"
             )
     poses = np.stack([_matrix(path, i, c, "w2c", 4) for i, c in zip(ids, cameras, strict=True)])
     intrinsics = np.stack([_matrix(path, i, c, "K", 3) for i, c in zip(ids, cameras, strict=True)])
+    if to_size:
+        first = min(w for w, _ in sizes.values()), min(h for _, h in sizes.values())
+        intrinsics = np.stack([cut_to(K, sizes[i], first) for i, K in zip(ids, intrinsics, strict=True)])
     rig = Cameras(tuple(ids), poses, intrinsics, *first)
     try:
         rig.validate()
@@ -103,6 +111,23 @@ def _rig(path: Path, ids: list[str], cameras: list[dict[str, Any]]) -> Cameras:
         if not np.allclose(poses[i, 3], (0, 0, 0, 1)) or not np.allclose(intrinsics[i, 2], (0, 0, 1)):
             raise SourceError(f"{path}: camera {camera_id!r}: the last row of w2c must be 0 0 0 1 and of K 0 0 1")
     return rig
+
+
+def cut_to(K: np.ndarray[Any, Any], size: tuple[int, int], target: tuple[int, int]) -> np.ndarray[Any, Any]:
+    """[3, 3] intrinsics of pictures shrunk evenly until they cover ``target``, and cut around their middle.
+
+    Arguments:
+        size, target: (width, height) before and after. Sides whose shares agree within a pixel are shrunk each by its
+            own share, so that rounded heights cut nothing.
+    """
+    across, down = target[0] / size[0], target[1] / size[1]
+    if abs(across * size[1] - target[1]) < 1:
+        scaled: np.ndarray[Any, Any] = np.diag([across, down, 1.0]) @ K
+        return scaled
+    factor = max(across, down)
+    out: np.ndarray[Any, Any] = np.diag([factor, factor, 1.0]) @ K
+    out[:2, 2] -= (factor * np.array(size) - np.array(target)) / 2
+    return out
 
 
 def _splits(path: Path, ids: list[str], cameras: list[dict[str, Any]], named: Any) -> list[Split]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -15,6 +16,8 @@ from gsstream.core.names import check_camera_ids
 from gsstream.source.base import Split
 
 SCHEMA = "opencv-multiview-1"
+#: Beyond these a file describes no recording; checked before anything is allocated or opened.
+MAX_SIDE, MAX_FRAMES, MAX_TEXT, MAX_PATTERN = 1 << 16, 10_000_000, 1 << 20, 1000
 CALIBRATION_FILE = "cameras.json"
 
 
@@ -61,10 +64,10 @@ def read_calibration(folder: Path, *, growing: bool = False, to_size: bool = Fal
     if not train:
         raise SourceError(f'{path}: there is no training camera; give at least one camera "split": "train"')
     return Calibration(
-        name=str(data.get("name", folder.name)),
+        name=_text(path, "name", data.get("name", folder.name), MAX_PATTERN),
         fps=_positive(path, "fps", data.get("fps", 30.0)),
         num_frames=0 if growing and "frames" not in data else _count(path, data.get("frames")),
-        licence=str(data.get("licence", "")),
+        licence=_text(path, "licence", data.get("licence", ""), MAX_TEXT),
         train=rig.select(train),
         test=rig.select([i for i, split in enumerate(splits) if split == "test"]),
         patterns={i: _pattern(path, i, camera) for i, camera in zip(ids, cameras, strict=True)},
@@ -78,7 +81,7 @@ def _load_json(path: Path) -> dict[str, Any]:
         raise SourceError(
             f"{path}: no such file; a recording folder holds {CALIBRATION_FILE} (schema {SCHEMA!r}) beside its images"
         ) from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, numbers of thousands of digits, deep nesting
         raise SourceError(f"{path}: not valid JSON: {error}") from error
     except OSError as error:
         raise SourceError(f"{path}: cannot be read: {error}") from error
@@ -131,7 +134,7 @@ def cut_to(K: np.ndarray[Any, Any], size: tuple[int, int], target: tuple[int, in
 
 
 def _splits(path: Path, ids: list[str], cameras: list[dict[str, Any]], named: Any) -> list[Split]:
-    if named is not None and not isinstance(named, list):
+    if named is not None and not (isinstance(named, list) and all(isinstance(name, str) for name in named)):
         raise SourceError(f"{path}: 'test_cameras' must be a list of camera ids, got {_brief(named)}")
     test = set(named or [])
     if unknown := sorted(str(t) for t in test - set(ids)):
@@ -163,17 +166,18 @@ def _camera_id(path: Path, camera: dict[str, Any], index: int) -> str:
 
 def _size(path: Path, camera_id: str, camera: dict[str, Any]) -> tuple[int, int]:
     width, height = camera.get("width"), camera.get("height")
-    if type(width) is not int or type(height) is not int or width < 1 or height < 1:
-        raise SourceError(
-            f"{path}: camera {camera_id!r}: width and height must be positive whole pixels, got {width!r} x {height!r}"
-        )
-    return width, height
+    if type(width) is int and type(height) is int and 1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE:
+        return width, height
+    raise SourceError(
+        f"{path}: camera {camera_id!r}: width and height must be positive whole pixels up to {MAX_SIDE}, got "
+        f"{_brief(width)} x {_brief(height)}"
+    )
 
 
 def _matrix(path: Path, camera_id: str, camera: dict[str, Any], key: str, side: int) -> np.ndarray[Any, Any]:
     try:
         matrix = np.asarray(camera.get(key), dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise SourceError(f"{path}: camera {camera_id!r}: {key} is not a matrix of numbers ({error})") from error
     if matrix.shape != (side, side):
         raise SourceError(
@@ -189,6 +193,8 @@ def _pattern(path: Path, camera_id: str, camera: dict[str, Any]) -> str:
             f"{path}: camera {camera_id!r} has no frames; "
             f'give "frames" as a path pattern such as "{camera_id}/%06d.png"'
         )
+    if len(pattern) > MAX_PATTERN or re.search(r"%[^a-zA-Z]*\d{3}", pattern):
+        raise SourceError(f"{path}: camera {camera_id!r}: 'frames' {_brief(pattern)} is longer than a path can be")
     try:
         example = frame_path(pattern, 0)
     except (TypeError, ValueError) as error:
@@ -207,17 +213,32 @@ def frame_path(pattern: str, index: int) -> str:
 
 
 def _count(path: Path, frames: Any) -> int:
-    if type(frames) is not int or frames < 1:
-        raise SourceError(f"{path}: 'frames' must be the number of frames, at least 1, got {_brief(frames)}")
+    if type(frames) is not int or not 1 <= frames <= MAX_FRAMES:
+        raise SourceError(
+            f"{path}: 'frames' must be the number of frames, at least 1 and at most {MAX_FRAMES}, got {_brief(frames)}"
+        )
     return frames
 
 
+def _text(path: Path, key: str, value: Any, most: int) -> str:
+    """A text that streams, plots and terminals can carry; other plain values are written out."""
+    text = str(value)
+    if len(text) > most:
+        raise SourceError(f"{path}: {key!r} is {len(text)} letters long; expected at most {most}")
+    # A folder's name may have been no UTF-8; a JSON text has no such excuse.
+    if path.parent.name != text and any("\ud800" <= sign <= "\udfff" for sign in text):
+        raise SourceError(f"{path}: {key!r} holds half of a character (a lone surrogate); write it as UTF-8")
+    return text
+
+
 def _positive(path: Path, key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < float("inf"):
-        raise SourceError(f"{path}: {key!r} must be a positive number, got {_brief(value)}")
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 1e6:
+        raise SourceError(f"{path}: {key!r} must be a positive number below a million, got {_brief(value)}")
     return float(value)
 
 
 def _brief(value: Any) -> str:
+    if isinstance(value, int) and abs(value) >= 10**60:
+        return "a number of more than 60 digits"
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."

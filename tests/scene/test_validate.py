@@ -93,3 +93,21 @@ def test_what_a_fault_is_follows_from_its_kind_and_not_from_its_words() -> None:
 
     assert fails(FilesMissing("reworded")) == ["files"]
     assert fails(SourceError("3 frames are missing from what I think")) == ["calibration"]
+
+
+@pytest.mark.sfm
+@needs_pycolmap
+def test_wrong_poses_are_not_taken_for_wrong_clocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Camera-to-world in place of world-to-camera also puts what moves at different places; shifting frames would spoil
+    a recording that is in step."""
+    from gsstream.scene import validate as module
+    from gsstream.scene.findings import error
+
+    write_good(tmp_path / "good")
+    folder = spoiled(tmp_path / "good", tmp_path / "bad", next(b for b in BAD if b.name == "camera-to-world"))
+    # Whatever the hull of motion makes of these poses: here it blames a clock, as it does on the demo.
+    monkeypatch.setattr(module, "check_sync", lambda _: [error("sync", "camera 'cam00' is 3 frames late")])
+    found = findings(folder)
+    assert [finding.code for finding in found] == ["epipolar"]
+    assert "invert w2c" in found[0].message
+    assert [finding.code for finding in findings(tmp_path / "good")] == ["sync"], "with sound poses it is heard"

@@ -111,3 +111,22 @@ def test_wrong_poses_are_not_taken_for_wrong_clocks(tmp_path: Path, monkeypatch:
     assert [finding.code for finding in found] == ["epipolar"]
     assert "invert w2c" in found[0].message
     assert [finding.code for finding in findings(tmp_path / "good")] == ["sync"], "with sound poses it is heard"
+
+
+def test_the_demo_with_inverted_poses_is_told_so_without_features(tmp_path: Path) -> None:
+    """Its pictures are too small for features; motion alone must not send its user to the clocks."""
+    import shutil
+
+    import numpy as np
+
+    from gsstream.source.open import DEMO_FOLDER
+
+    shutil.copytree(DEMO_FOLDER, tmp_path / "c2w")
+    path = tmp_path / "c2w" / "cameras.json"
+    data = json.loads(path.read_text())
+    for camera in data["cameras"]:
+        camera["w2c"] = np.linalg.inv(np.array(camera["w2c"])).tolist()
+    path.write_text(json.dumps(data))
+    found = validate(lambda scale: open_source(str(tmp_path / "c2w"), scale), features=False)
+    assert [finding.code for finding in found] == ["axes"]
+    assert "invert w2c" in found[0].message

@@ -16,7 +16,7 @@ DEMO_OUT ?= runs/demo
 
 # The stamps carry a checksum of what they were made from, so a change of contents, not of dates, sets up again.
 LISTS := requirements.txt $(wildcard pyproject.toml plugins/*/pyproject.toml)
-NATIVE := $(wildcard plugins/cpu_render/CMakeLists.txt plugins/cpu_render/pyproject.toml plugins/cpu_render/src/cpp/*)
+NATIVE := $(wildcard plugins/cpu_render/CMakeLists.txt plugins/cpu_render/pyproject.toml plugins/cpu_render/src/cpp/*/*)
 checksum = $(firstword $(shell cat $(1) | cksum))
 INSTALLED := $(VENV)/.installed-$(call checksum,$(LISTS))
 BUILT := $(VENV)/.built-$(call checksum,$(NATIVE))

@@ -5,6 +5,7 @@ Importing this module imports torch (the parts are torch code); ``gsstream.spec`
 
 from gsstream import API_VERSION as API_VERSION
 from gsstream.confidence.base import ConfidenceEstimator as ConfidenceEstimator
+from gsstream.confidence.base import ConfidenceTraits as ConfidenceTraits
 from gsstream.core.auto import AutoRule as AutoRule
 from gsstream.core.auto import Choice as Choice
 from gsstream.core.auto import SceneFacts as SceneFacts
@@ -52,6 +53,7 @@ from gsstream.core.shapes import IntArray as IntArray
 from gsstream.core.shapes import check_finite as check_finite
 from gsstream.core.shapes import check_shape as check_shape
 from gsstream.gate.base import GateSampler as GateSampler
+from gsstream.gate.base import GateTraits as GateTraits
 from gsstream.growth.base import Growth as Growth
 from gsstream.loss.base import Loss as Loss
 from gsstream.method.base import MethodState as MethodState
@@ -73,7 +75,9 @@ from gsstream.packet import PlayerState as PlayerState
 from gsstream.packet import StreamMeta as StreamMeta
 from gsstream.packet import quantise_decoders as quantise_decoders
 from gsstream.propagation.base import Propagation as Propagation
+from gsstream.propagation.base import PropagationTraits as PropagationTraits
 from gsstream.regularizer.base import Regularizer as Regularizer
+from gsstream.regularizer.base import RegularizerTraits as RegularizerTraits
 from gsstream.render.base import RenderCache as RenderCache
 from gsstream.render.base import Renderer as Renderer
 from gsstream.render.base import RenderOutput as RenderOutput
@@ -87,3 +91,4 @@ from gsstream.source.base import FrameSource as FrameSource
 from gsstream.source.base import SourceInfo as SourceInfo
 from gsstream.structure.base import Anchors as Anchors
 from gsstream.structure.base import Structure as Structure
+from gsstream.structure.base import StructureTraits as StructureTraits

@@ -15,16 +15,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
-from typing import Any
 
-from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.assembly.checks import Checks
-from gsstream.engine.frame0.begin import begin, begin_from
 from gsstream.engine.frame0.points import gather_points
+from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.run.recording import open_recording, read_first_frame
-from gsstream.engine.step.frame_step import frame_step
-from gsstream.packet import PlayerState, StreamMeta
+from gsstream.packet import PlayerState
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.source.base import FrameSource
@@ -37,29 +34,21 @@ def measure(
 
     Raises AssertionError when two levels write different packets: looking must change nothing.
     """
-    info, rng = source.info, Rng(parts.recipe.seed)
-    near = parts.recipe.near * info.train.extent
-
-    def read(index: int) -> Any:
-        frame = source.frame(index, "train")
-        return replace(frame, cameras=replace(frame.cameras, near=near))
-
-    frame = read(0)
-    test = replace(info.test, near=near)
-    recipe = parts.recipe.model_dump(mode="json")
-    meta = StreamMeta(parts.recipe.method, info.name, recipe, frame.cameras, test, info.fps, parts.recipe.background)
-    if first is not None:
-        state = begin_from(parts, first, frame, meta, rng).state
-    else:
-        points = gather_points(source, frame, parts.recipe.first_frame, rng)
-        state = begin(parts, points, frame, meta, rng, lambda *_: None).state
+    settings = parts.recipe.first_frame
+    encoder = Encoder(
+        parts, source.info, lambda frame: gather_points(source.points, frame, settings, encoder.rng), first_frame=first
+    )
+    state = encoder.encode(source.frame(0)).state
     spent: dict[Checks, list[float]] = {level: [] for level in Checks}
     for index in range(1, frames + 1):
-        frame, packets, seconds = read(index), set(), {level: [] for level in Checks}  # type: ignore[var-annotated]
+        frame, packets = source.frame(index), set()
+        seconds: dict[Checks, list[float]] = {level: [] for level in Checks}
         for _ in range(rounds):
             for level in Checks:
+                other = Encoder(replace(parts, checks=level), source.info)
+                other.state = replace(state, session=None)
                 started = time.process_time()
-                step = frame_step(replace(parts, checks=level), replace(state, session=None), frame, rng)
+                step = other.encode(frame)
                 seconds[level].append(time.process_time() - started)
                 packets.add(step.packet.data)
         assert len(packets) == 1, f"frame {index}: levels of checks changed what is sent"

@@ -22,22 +22,21 @@ import numpy as np
 
 from gsstream.core.errors import OutputError
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.engine.frame0.begin import begin
 from gsstream.engine.frame0.points import gather_points
-from gsstream.engine.keys.keyframes import refresh
+from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.run.recording import open_recording
-from gsstream.engine.state.stream_state import StreamState
-from gsstream.engine.step.frame_step import frame_step
+from gsstream.method.base import MethodState
 from gsstream.metrics.trend import slope_per_100
-from gsstream.packet import StreamMeta, StreamWriter
+from gsstream.packet import StreamWriter
 from gsstream.player.playback import Playback
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
-from gsstream.source.base import FrameSource
+from gsstream.source.base import FrameSource, Split
+
+SPLITS: tuple[Split, ...] = ("train", "test")
 
 
 @dataclass(frozen=True)
@@ -112,30 +111,18 @@ def digest(gaussians: Gaussians[FloatArray]) -> str:
 
 def _encode(
     parts: Assembly, source: FrameSource, frames: int, writer: StreamWriter
-) -> Iterator[tuple[str, int, dict[str, Any], StreamState]]:
-    info, rng = source.info, Rng(parts.recipe.seed)
-    near, length = parts.recipe.near * info.train.extent, info.num_frames or 1
+) -> Iterator[tuple[str, int, dict[str, Any], MethodState]]:
+    length, settings = source.info.num_frames or 1, parts.recipe.first_frame
     held_out = HeldOut(parts.renderer, parts.recipe.background)
-    recipe = parts.recipe.model_dump(mode="json")
-
-    def meta(cameras: Any) -> StreamMeta:
-        test = replace(info.test, near=near)
-        return StreamMeta(parts.recipe.method, info.name, recipe, cameras, test, info.fps, parts.recipe.background)
-
-    state: StreamState | None = None
+    encoder = Encoder(
+        parts, source.info, lambda frame: gather_points(source.points, frame, settings, encoder.rng)
+    )
     for index in range(frames):
         at = there_and_back(index, length)
-        train, test = (source.frame(at, split) for split in ("train", "test"))
-        train, test = (replace(f, index=index, cameras=replace(f.cameras, near=near)) for f in (train, test))
-        if state is None:
-            points = gather_points(source, train, parts.recipe.first_frame, rng)
-            step = begin(parts, points, train, meta(train.cameras), rng, lambda *_: None)
-        else:
-            step = frame_step(parts, state, train, rng)
-        step = refresh(parts, step, train, meta, rng)
-        state = step.state
-        quality = held_out.measure(state, test) if len(test.cameras) else {}
-        yield step.status, writer.append(step.packet), quality, state
+        train, test = (replace(source.frame(at, split), index=index) for split in SPLITS)
+        step = encoder.encode(train)
+        quality = held_out.measure(step.state, encoder.at_near(test)) if len(test.cameras) else {}
+        yield step.status, writer.append(step.packet), quality, step.state
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

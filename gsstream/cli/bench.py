@@ -101,9 +101,9 @@ def frame(
     if quick:
         changes.insert(0, ("--quick", "stream.epochs=1"))
     recipe = resolve_recipe(method, catalog.recipe_path, (), changes).recipe
-    if recipe.whole.name != "none":
+    if recipe.stepper.name != "parts":
         raise InputError(
-            f"--method {method}: expected a method made of parts, got the whole method {recipe.whole.name!r}; time it "
+            f"--method {method}: expected a method made of parts, got the stepper {recipe.stepper.name!r}; time it "
             "with gsstream run, which reports seconds per frame"
         )
     from gsstream.trade.bench.frame import FramePlan, bench_frame

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gsstream.core.errors import InputError
+from gsstream.core.errors import InputError, PluginUnavailable
 
 if TYPE_CHECKING:
     from gsstream.plugins.catalog import Catalog
@@ -16,10 +17,23 @@ if TYPE_CHECKING:
 MARKS = {"passed": "✓", "failed": "✗", "expected failure": "⚠", "skipped": "⚠"}
 
 
+@dataclass(frozen=True)
+class Subject:
+    """One thing that was checked. ``absent``: it cannot be made on this machine, so that nothing could be checked."""
+
+    heading: str
+    results: list[CheckResult]
+    absent: bool = False
+
+
 def check(
     name: Annotated[str, typer.Argument(help="A part (NAME or KIND/NAME), a plugin, a method, or 'packets'.")],
     source: Annotated[
         str | None, typer.Option("--source", help="Recording on which a source is checked; by default 'NAME:'.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Setting of the part, e.g. temperature=0.3; repeatable."),
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print only what did not pass, and the counts.")] = False,
 ) -> None:
@@ -27,47 +41,80 @@ def check(
     from gsstream.plugins.catalog import load_catalog
     from gsstream.testing.kit import summary
 
-    everything: list[CheckResult] = []
-    for heading, results in _subjects(load_catalog(), name, source):
-        typer.echo(heading)
-        for result in results:
+    subjects = []
+    for subject in _subjects(load_catalog(), name, source, settings or []):
+        typer.echo(subject.heading)
+        # One reason for all of them is said once.
+        for result in subject.results[:1] if subject.absent else subject.results:
             if not (quiet and result.status == "passed"):
-                typer.echo(_line(result))
-        everything += results
-        typer.echo(f"  {summary(results)}")
-    if not all(result.ok for result in everything) or all(result.status == "skipped" for result in everything):
+                typer.echo(_line(result, "every check" if subject.absent else result.check))
+        typer.echo(f"  {summary(subject.results)}")
+        subjects.append(subject)
+    everything = [result for subject in subjects for result in subject.results]
+    # Nothing checked is no success, unless it is this machine that lacks something.
+    idle = all(result.status == "skipped" for result in everything) and not all(subject.absent for subject in subjects)
+    if idle or not all(result.ok for result in everything):
         raise typer.Exit(1)
 
 
-def _line(result: CheckResult) -> str:
-    text = f"  {MARKS[result.status]} {result.check.removeprefix('check_')}"
+def _line(result: CheckResult, what: str) -> str:
+    text = f"  {MARKS[result.status]} {what.removeprefix('check_')}"
     if result.status == "passed":
         return text
     indented = result.message.replace("\n", "\n      ")
     return f"{text}: {indented}" if result.status == "failed" else f"{text} ({result.status}): {indented}"
 
 
-def _subjects(catalog: Catalog, name: str, source: str | None) -> Iterator[tuple[str, list[CheckResult]]]:
-    """(heading, results) of everything meant by a name: first of all names, so that a wrong one is answered at once."""
+def _subjects(catalog: Catalog, name: str, source: str | None, settings: list[str]) -> Iterator[Subject]:
+    """Everything meant by a name, checked: first of all names, so that a wrong one is answered at once."""
     wanted = _entries(catalog, name)
     if source is not None and not any(kind == "source" for kind, _ in wanted):
         raise InputError(f"--source is the recording on which a source is checked; {name!r} holds no source")
+    configured = None
+    if settings:
+        if len(wanted) != 1 or wanted[0][0] in ("source", "method"):
+            found = ", ".join(f"{kind}/{part}" for kind, part in wanted) or name
+            raise InputError(f"--set gives settings to one part, KIND/NAME; {name!r} means {found}")
+        configured = _config(catalog.resolve(*wanted[0]), settings)
     # The slow imports come last, so that a mistake on the command line is answered at once.
-    from gsstream.testing.kit import run_checks, run_method_checks, run_packet_checks
+    from gsstream.testing.kit import run_checks, run_method_checks, run_packet_checks, skip_checks
     from gsstream.testing.recording import SourceUnderTest
 
     if name == "packets":
-        yield "packet format", run_packet_checks()
+        yield Subject("packet format", run_packet_checks())
     for kind, part in wanted:
         heading = f"{kind} {part} (from {catalog.entry(kind, part).origin})"
         if kind == "method":
-            yield heading, run_method_checks(part)
+            yield Subject(heading, run_method_checks(part))
         elif kind == "source":
             # The demo is no folder and needs no place; any other source is asked for its simplest recording.
             guess = part if part == "demo" else f"{part}:"
-            yield heading, run_checks(SourceUnderTest(catalog.resolve(kind, part), source or guess, given=bool(source)))
+            recording = SourceUnderTest(catalog.resolve(kind, part), source or guess, given=bool(source))
+            yield Subject(heading, run_checks(recording))
         else:
-            yield heading, run_checks(catalog.resolve(kind, part)())
+            cls = catalog.resolve(kind, part)
+            try:
+                built = cls(configured or cls.Config())
+            except PluginUnavailable as error:
+                yield Subject(heading, skip_checks(kind, part, str(error)), absent=True)
+            else:
+                yield Subject(heading, run_checks(built))
+
+
+def _config(cls: type[Any], settings: list[str]) -> Any:
+    """The part's settings with these KEY=VALUE changed. Raises RecipeError for keys and values that it refuses."""
+    from gsstream.engine.assembly.assemble import with_values
+    from gsstream.recipe.check import join_problems, validate
+    from gsstream.recipe.document import Origin, read_override
+
+    values: dict[str, Any] = {}
+    for text in settings:
+        path, leaf = read_override(text)
+        values = with_values(values, {".".join(path): leaf.value})
+    problems: list[str] = []
+    config = validate(cls.Config, values, lambda _: Origin("command line", "--set"), (), problems)
+    join_problems(problems, f"the settings of {cls.__name__}")
+    return config
 
 
 def _entries(catalog: Catalog, name: str) -> list[tuple[str, str]]:

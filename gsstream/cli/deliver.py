@@ -16,7 +16,7 @@ def export(
     out: Annotated[Path, typer.Option("--out", help="Folder for the files.")],
     kind: Annotated[
         str,
-        typer.Option("--format", help="ply (3DGS), spz (by splat-transform), sequence (PLYs, list), onnx (decoders)."),
+        typer.Option("--format", help="ply (3DGS), spz (by splat-transform), sequence (PLYs, list)."),
     ] = "ply",
     frames: Frames = None,
     max_memory: MaxMemory = None,
@@ -25,18 +25,12 @@ def export(
     first, last = frame_range(frames)
     most = size_of(max_memory)
     file = stream_file(stream)
-    from gsstream.player.decoders import export_decoders
     from gsstream.player.export import export as export_stream
     from gsstream.player.playback import Playback
 
     with Playback(file, max_memory=most) as playback:
         chosen, damage = playback.sound(first, last)
-    if kind == "onnx":
-        written = export_decoders(file, out, frames=chosen)
-    else:
-        written = export_stream(
-            file, out, kind, frames=chosen, progress=progress_on("frame"), max_memory=most
-        )
+    written = export_stream(file, out, kind, frames=chosen, progress=progress_on("frame"), max_memory=most)
     size = sum(path.stat().st_size for path in written)
     typer.echo(f"{out}: {plural(len(written), 'file')}, {size / 1e6:.1f} MB")
     fail_with(damage)

@@ -101,6 +101,7 @@ def _describe(catalog: Catalog, kind: str, name: str, entry: Entry) -> str:
         return f"{heading}\nsee: gsstream methods show {name}"
     target = catalog.resolve(kind, name)
     lines = [heading, f"target: {entry.spec.target}, component API {entry.spec.api}; defaults: its Config"]
+    lines += [f"source: {cited}"] if (cited := getattr(target, "source", None)) else []
     config = getattr(target, "Config", None)
     rows = list(setting_rows(config)) if config is not None else []
     lines += ["", table(("SETTING", "TYPE", "DEFAULT", "MEANING"), rows)] if rows else ["no settings"]

@@ -113,7 +113,7 @@ gsstream plugins show <kind>/<name>
 gsstream run --method dense <use> --out run/
 ```
 
-The part is in `src/<package>/<module>.py`. Change it and its docstring, and check again:
+The part is in `src/<package>/<module>.py`. Change it, its docstring and its `source`, and check again:
 `gsstream check <kind>/<name>`, or `pytest` for one test per check. <claims>
 """,
     "src/<package>/__init__.py": '"""<summary> Importing this package imports no torch."""\n',

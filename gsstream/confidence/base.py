@@ -3,11 +3,33 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 
 from gsstream.core.context import FrameContext
-from gsstream.core.part import Part
+from gsstream.core.part import Part, Traits
+
+
+@dataclass(frozen=True, slots=True)
+class ConfidenceTraits(Traits):
+    """What a confidence estimator claims.
+
+    Arguments:
+        needs_renderer: asks the context for screen gradients.
+        floor: largest logit of a Gaussian that nobody sees, or of a scene that stands still.
+        finds_motion: ranks what moved above what did not.
+        monotone_in_change: a stronger change never makes what changed less suspect.
+        brightness: largest mean logit of a still scene that becomes brighter by a fiftieth of full scale; None: no
+            promise.
+    """
+
+    needs_renderer: bool = False
+    floor: float = 0.0
+    finds_motion: bool = False
+    monotone_in_change: bool = False
+    brightness: float | None = None
 
 
 class ConfidenceEstimator(Part):
@@ -17,6 +39,11 @@ class ConfidenceEstimator(Part):
     computes log(p / (1 - p)) and nothing overflows at p = 0 or 1. Logits are finite; identical consecutive frames give
     at most the estimator's declared floor; no ``.grad`` and no graph is left behind.
     """
+
+    traits: ClassVar[ConfidenceTraits] = ConfidenceTraits()
+
+    def claims(self) -> ConfidenceTraits:
+        return self.traits
 
     @abstractmethod
     def estimate(self, context: FrameContext) -> torch.Tensor:

@@ -7,20 +7,22 @@ from typing import final
 import torch
 from pydantic import Field
 
-from gsstream.confidence.base import ConfidenceEstimator
+from gsstream.confidence.base import ConfidenceEstimator, ConfidenceTraits
 from gsstream.core.context import FrameContext
-from gsstream.core.part import PartConfig, Traits
+from gsstream.core.part import PartConfig
 
 
 @final
 class Uniform(ConfidenceEstimator):
-    """The same logit for all (ours, the null part; large values give the paper's constant-one ablation)."""
+    """The same logit for all; large values give the paper's constant-one ablation."""
+
+    source = "gsstream"
 
     class Config(PartConfig):
         logit: float = Field(default=0.0, ge=-50, le=50, description="logit of the confidence, -50 to 50; 0 is p = 0.5")
 
-    def claims(self) -> Traits:
-        return Traits(floor=self.config.logit, brightness=self.config.logit)
+    def claims(self) -> ConfidenceTraits:
+        return ConfidenceTraits(floor=self.config.logit, brightness=self.config.logit)
 
     def estimate(self, context: FrameContext) -> torch.Tensor:
-        return torch.full((len(context.gaussians),), float(self.config.logit))
+        return torch.full((len(context.gaussians),), self.config.logit)

@@ -1,4 +1,4 @@
-"""Part: what the five kinds have in common. Abstract or final; configured once; no mutable state."""
+"""Part: what all kinds have in common. Abstract or final; configured once; no mutable state."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from abc import ABC
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
@@ -21,50 +21,33 @@ class PartConfig(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Traits:
-    """What a part claims about itself; the contract kit checks every claim and reports every claim denied.
+    """What a part claims about itself. Each kind that has claims extends this record in its own room (``GateTraits``).
 
-    Arguments:
-        stochastic: draws noise (only through its noise argument).
-        differentiable: gradients flow from output to input.
-        conservative: (propagation) no node is less suspect than its most suspect Gaussian.
-        idempotent: applying it twice equals applying it once.
-        needs_renderer: (confidence) asks the context for screen gradients.
-        reduction: (regularizer) "mean" or "sum" over Gaussians.
-        weights: (regularizer) settings that its terms are proportional to.
-        gate_terms: (regularizer) terms that price gates alone: no residual changes them.
-        floor: (confidence) largest logit of a Gaussian that nobody sees, or of a scene that stands still.
-        finds_motion: (confidence) ranks what moved above what did not.
-        monotone_in_change: (confidence) a stronger change never makes what changed less suspect.
-        brightness: (confidence) largest mean logit of a still scene that becomes brighter by a fiftieth of full scale;
-            None: no promise.
-        normalised: (propagation) keeps the scale: constants stay constant, the flat structure changes nothing.
-        parent_bound: (propagation) no node is less suspect than its children.
-        local: (structure) the members of a node lie within one root cell of each other, along every axis.
-        temperature: (gate) has a setting ``temperature``; gates harden as it falls.
+    The contract kit checks every claim that is made, and counts the checks of those that are not as skipped.
     """
 
-    stochastic: bool = False
-    differentiable: bool = False
-    conservative: bool = False
-    idempotent: bool = False
-    needs_renderer: bool = False
-    reduction: str = "mean"
-    weights: tuple[str, ...] = ()
-    gate_terms: tuple[str, ...] = ()
-    floor: float = 0.0
-    finds_motion: bool = False
-    monotone_in_change: bool = False
-    brightness: float | None = None
-    normalised: bool = False
-    parent_bound: bool = False
-    local: bool = False
-    temperature: bool = False
+
+ConfigT = TypeVar("ConfigT", bound=PartConfig)
+ConfigT_co = TypeVar("ConfigT_co", covariant=True)
 
 
-class Part(ABC):
+class _Configured(Protocol[ConfigT_co]):
+    """Anything with a nested ``Config``."""
+
+    @property
+    def Config(self) -> type[ConfigT_co]: ...
+
+
+class Part(ABC):  # noqa: B024 - each kind adds what is abstract
     """A swappable part. Subclasses are abstract or final and nest a ``Config``.
 
     State and noise are arguments and results, never attributes: after construction no attribute may be set.
+
+    ``source``: where the idea is from, for listings: a citation such as ``"S2GS, section 3.2"``, or the name of the
+    distribution that had it first.
+
+    ``denied``: checks of the contract kit that the part cannot pass -> why not, in 20 characters or more. They are made
+    all the same and must fail: a denial that is no longer true is itself a failure.
 
     ``auto_rules``: settings that a recipe may leave to the scene by saying ``auto``, and the rule that chooses each, in
     the order in which they choose. A nested setting is written with dots. A part is never built with ``auto`` in its
@@ -72,9 +55,15 @@ class Part(ABC):
     """
 
     Config: ClassVar[type[PartConfig]] = PartConfig
+    source: ClassVar[str] = ""
     traits: ClassVar[Traits] = Traits()
+    denied: ClassVar[Mapping[str, str]] = MappingProxyType({})
     auto_rules: ClassVar[Mapping[str, AutoRule]] = MappingProxyType({})
-    config: Any
+    if TYPE_CHECKING:
+
+        @property
+        def config(self: _Configured[ConfigT]) -> ConfigT:
+            """The settings, an instance of the part's own ``Config``."""
 
     __slots__ = ("config",)
 
@@ -84,6 +73,10 @@ class Part(ABC):
     def claims(self) -> Traits:
         """The traits of this part as it is configured; override where a setting changes a claim."""
         return self.traits
+
+    def denials(self) -> Mapping[str, str]:
+        """``denied`` of this part as it is configured; override where a setting breaks a promise."""
+        return self.denied
 
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(f"{type(self).__name__} is frozen: state is passed in and returned, never kept ({name!r})")

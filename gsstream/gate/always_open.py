@@ -11,7 +11,9 @@ from gsstream.gate.base import GateSampler
 
 @final
 class AlwaysOpen(GateSampler):
-    """Every gate is 1 and nothing is trained (ours, the null part)."""
+    """Every gate is 1 and nothing is trained."""
+
+    source = "gsstream"
 
     @property
     def num_levels(self) -> int:

@@ -3,10 +3,27 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 
-from gsstream.core.part import Part
+from gsstream.core.part import Part, Traits
+
+
+@dataclass(frozen=True, slots=True)
+class GateTraits(Traits):
+    """What a gate claims.
+
+    Arguments:
+        stochastic: draws noise (only through its noise argument).
+        differentiable: gradients flow from gates to logits.
+        temperature: has a setting ``temperature``; gates harden as it falls.
+    """
+
+    stochastic: bool = False
+    differentiable: bool = False
+    temperature: bool = False
 
 
 class GateSampler(Part):
@@ -23,6 +40,11 @@ class GateSampler(Part):
     * ``bound``: after each optimiser step on the logits;
     * ``sample(logits, None)``: at the end of each pass, to let closed rows go, and for the gate in the packet.
     """
+
+    traits: ClassVar[GateTraits] = GateTraits()
+
+    def claims(self) -> GateTraits:
+        return self.traits
 
     @property
     @abstractmethod

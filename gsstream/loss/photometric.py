@@ -22,6 +22,8 @@ TILE = 16
 class ReferenceLoss(Loss):
     """Autograd through kornia's SSIM; about ten times slower than the rasteriser it judges."""
 
+    source = "3DGS (Kerbl et al. 2023)"
+
     def prepare(self, target: torch.Tensor) -> Any:
         return target
 

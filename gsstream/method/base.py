@@ -1,8 +1,8 @@
 """StreamingMethod: the one interface to a method, three calls. What it sends is played by every player.
 
-A method is given a frame and what the engine can do (``Tools``), and returns a packet and the state it goes on from. The
-engine keeps the rest: recordings, recipes, the stream on disk, metrics, resume. ``engine.step.method.PartsMethod`` is
-the method made of parts; QUEEN is another one, built differently.
+A method is given a frame and what the engine can do (``Tools``), and returns a packet and the state it goes on from.
+The engine keeps the rest: recordings, recipes, the stream on disk, metrics, resume. ``engine.method.parts.PartsMethod``
+is the method made of parts; QUEEN is another one, built differently.
 """
 
 from __future__ import annotations
@@ -59,8 +59,9 @@ class StreamingMethod(Part, Generic[State]):
     ``heeds`` names the recipe keys that this method reads besides what the engine itself does (frame 0, loss, renderer,
     recording, packets), for example ``("stream.epochs",)``. A run that changes a key of the parts or of later frames
     that is not listed here is refused: no option is ignored in silence. ``least_cameras`` is how many training
-    cameras it needs: a recording with fewer is refused before anything is reconstructed. ``decodes_its_packets`` is true
-    of the engine's own method alone, whose state is made by the decoder; the packets of others are decoded and compared.
+    cameras it needs: a recording with fewer is refused before anything is reconstructed. ``decodes_its_packets`` is
+    true of the engine's own method alone, whose state is made by the decoder; the packets of others are decoded and
+    compared.
     """
 
     heeds: ClassVar[tuple[str, ...]] = ()

@@ -22,7 +22,9 @@ class HoldState:
 
 @final
 class Hold(StreamingMethod[HoldState]):
-    """Sends frame 0 and then 16 bytes a frame (ours, the null method)."""
+    """Sends frame 0 and then 16 bytes a frame."""
+
+    source = "gsstream"
 
     def begin(self, frame: Frame, tools: Tools) -> Step[HoldState]:
         first = tools.first_frame(frame)

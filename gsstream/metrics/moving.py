@@ -1,4 +1,4 @@
-"""Moving pixels: where a view differs from how it began. A method that freezes the scene must lose visibly."""
+"""Moving and changed pixels: where a view differs from how it began, and a method that freezes the scene loses."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from gsstream.metrics.psnr import Mask, check_pair, psnr
 
 #: Least difference that counts as motion, [0, 1] units, and the width of the rim added around it, pixels.
 FLOOR, DILATION = 6 / 255, 2
+#: Least difference of a changed pixel, [0, 1] units.
+CHANGED = 0.1
 
 
 def moving_mask(image: FloatArray, first: FloatArray, sigma: float) -> Mask:
@@ -25,6 +27,17 @@ def moving_mask(image: FloatArray, first: FloatArray, sigma: float) -> Mask:
     threshold = max(4 * math.sqrt(2) * sigma, FLOOR)
     moved: Mask = np.any(np.abs(np.asarray(image, np.float64) - first) > threshold, axis=-1)
     return dilate(moved, DILATION)
+
+
+def changed_mask(image: FloatArray, first: FloatArray) -> Mask:
+    """Return [H, W] bool: some channel differs from frame 0 by more than 0.1; the bodies, without shadows and rims.
+
+    Arguments:
+        image, first: [H, W, 3] ground truth of this frame and of frame 0, [0, 1].
+    """
+    check_pair(image, first)
+    changed: Mask = np.any(np.abs(np.asarray(image, np.float64) - first) > CHANGED, axis=-1)
+    return changed
 
 
 def dilate(mask: Mask, radius: int) -> Mask:

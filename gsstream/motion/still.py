@@ -6,6 +6,7 @@ from typing import ClassVar, final
 
 from gsstream.core.changes import Motion, Scene
 from gsstream.core.context import FrameWork
+from gsstream.core.rng import Rng
 from gsstream.motion.base import MotionPart
 
 
@@ -15,5 +16,5 @@ class Still(MotionPart):
 
     source: ClassVar[str] = "gsstream"
 
-    def propose(self, scene: Scene, work: FrameWork) -> tuple[Motion, ...]:
+    def propose(self, scene: Scene, work: FrameWork, rng: Rng) -> tuple[Motion, ...]:
         return ()

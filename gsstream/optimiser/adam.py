@@ -16,6 +16,8 @@ from gsstream.optimiser.base import ADAM_BETAS, ADAM_EPS, MAX_GRADIENT, AdamStat
 class ReferenceAdam(RowOptimiser):
     """Written for clarity; a dozen torch calls per table."""
 
+    source = "Adam (Kingma and Ba 2015)"
+
     def step(
         self,
         values: Mapping[str, torch.Tensor],

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from gsstream.core.changes import Change, Delta, Layout, Scene
-from gsstream.core.errors import PacketError
+from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.shapes import FloatArray
 from gsstream.packet.base import EncodedPacket, PacketKind, Section, build_packet, expect
@@ -37,13 +37,15 @@ def encode_delta(
         layout: that of the frame before.
         previous_decoders: the decoders last sent since the last key packet (:func:`next_decoders`).
 
-    Raises ShapeError when a change does not fit the layout.
+    Raises ShapeError when a change does not fit the layout, or when there is none: that is an empty packet.
     """
     sections = encode_motions(delta.motions)
     if delta.residual is not None:
         sections += encode_residual(delta.residual, layout, previous_decoders)
     if delta.rows is not None:
         sections += encode_rows_change(delta.rows, layout)
+    if not sections:
+        raise ShapeError("delta: expected at least one change, got none; encode_empty makes the packet of such a frame")
     return build_packet(PacketKind.DELTA, frame, sections)
 
 

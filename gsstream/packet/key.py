@@ -91,8 +91,8 @@ def _check_layout(gaussians: Gaussians[FloatArray], layout: Layout) -> None:
     number, unit_of = len(gaussians), layout.unit_of
     if number > MAX_GAUSSIANS:
         raise ShapeError(f"expected at most {MAX_GAUSSIANS} Gaussians, got {number}")
-    if len(unit_of) != number or int(np.sum(layout.node_counts)) != number or np.any(np.asarray(layout.node_counts) < 0):
-        nodes = int(np.sum(layout.node_counts))
+    nodes = int(np.sum(layout.node_counts))
+    if len(unit_of) != number or nodes != number or np.any(np.asarray(layout.node_counts) < 0):
         raise ShapeError(f"layout: expected {number} Gaussians, got nodes holding {nodes} and {len(unit_of)} units")
     if len(layout.node_counts) > MAX_GAUSSIANS or len(layout.units) > MAX_UNITS:
         raise ShapeError(f"layout: at most {MAX_GAUSSIANS} nodes and {MAX_UNITS} units")
@@ -113,8 +113,8 @@ def _decode_layout(data: bytes, most: int) -> Layout:
     number, nodes, number_of_units = _LAYOUT.unpack_from(data)
     if number > most or nodes > most or number_of_units > MAX_UNITS:
         raise PacketError(
-            f"layout of {number} Gaussians, {nodes} nodes, {number_of_units} units is beyond the limits: at most {most} "
-            f"Gaussians and nodes in a packet of this size, {MAX_UNITS} units"
+            f"layout of {number} Gaussians, {nodes} nodes, {number_of_units} units is beyond the limits: at most "
+            f"{most} Gaussians and nodes in a packet of this size, {MAX_UNITS} units"
         )
     rest = data[_LAYOUT.size :]
     if len(rest) < 4 * number_of_units:

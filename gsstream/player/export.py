@@ -37,8 +37,8 @@ def export(
     or the converter is missing or fails.
     """
     if kind not in FORMATS:
-        raise InputError(f"cannot export to {kind!r}: expected one of {', '.join(FORMATS)}, onnx")
-    if Path(out).suffix.lower() in (".ply", ".spz", ".json", ".onnx") and not Path(out).is_dir():
+        raise InputError(f"cannot export to {kind!r}: expected one of {', '.join(FORMATS)}")
+    if Path(out).suffix.lower() in (".ply", ".spz", ".json") and not Path(out).is_dir():
         raise OutputError(f"{out}: expected a folder, which holds one file per frame, got the name of a file")
     converter = find_converter() if kind == "spz" else ""
     folder, written = Path(out), []

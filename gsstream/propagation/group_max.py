@@ -8,19 +8,21 @@ import torch
 from pydantic import Field
 
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.core.part import PartConfig, Traits
+from gsstream.core.part import PartConfig
 from gsstream.core.shapes import check_finite
-from gsstream.propagation.base import Propagation
+from gsstream.propagation.base import Propagation, PropagationTraits
 
 
 @final
 class GroupMax(Propagation):
-    """Maximum over each node's own members; on the flat structure the identity (ours, the null part)."""
+    """Maximum over each node's own members; on the flat structure the identity."""
+
+    source = "gsstream"
 
     class Config(PartConfig):
         empty: float = Field(default=-50.0, description="logit of a node without members")
 
-    traits = Traits(conservative=True, idempotent=True, differentiable=True, normalised=True)
+    traits = PropagationTraits(conservative=True, idempotent=True, differentiable=True, normalised=True)
 
     def propagate(self, logits: torch.Tensor, hierarchy: Hierarchy) -> torch.Tensor:
         check_finite("logits", logits)

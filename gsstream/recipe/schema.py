@@ -65,7 +65,7 @@ def _slot(
     slot: str, field: Schema, parts: Mapping[str, PartSchema], default: str | None, definitions: Schema
 ) -> Schema:
     """A bare name, or {name, params}; the name decides which settings are known."""
-    # What a slot is without being asked need not be a part: "auto" of the renderer, "none" of a whole method.
+    # What a slot is without being asked need not be a part: the renderer may say "auto".
     names = list(dict.fromkeys([Recipe.model_fields[slot].default.name, *parts]))
     keys: set[str] = set()
     cases = []

@@ -4,15 +4,39 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import torch
 
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.core.part import Part
+from gsstream.core.part import Part, Traits
+
+
+@dataclass(frozen=True, slots=True)
+class RegularizerTraits(Traits):
+    """What a regularizer claims.
+
+    Arguments:
+        differentiable: gradients flow from the terms to gates and residuals.
+        reduction: over Gaussians.
+        weights: settings that its terms are proportional to.
+        gate_terms: terms that price gates alone: no residual changes them.
+    """
+
+    differentiable: bool = False
+    reduction: Literal["mean", "sum"] = "mean"
+    weights: tuple[str, ...] = ()
+    gate_terms: tuple[str, ...] = ()
 
 
 class Regularizer(Part):
     """Each term is a finite scalar >= 0; the total is their sum; all closed and zero residual costs exactly 0."""
+
+    traits: ClassVar[RegularizerTraits] = RegularizerTraits()
+
+    def claims(self) -> RegularizerTraits:
+        return self.traits
 
     @abstractmethod
     def penalty(

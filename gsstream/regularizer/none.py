@@ -13,7 +13,9 @@ from gsstream.regularizer.base import Regularizer
 
 @final
 class NoRegularizer(Regularizer):
-    """No terms (ours, the null part)."""
+    """No terms."""
+
+    source = "gsstream"
 
     def penalty(
         self, open_probability: torch.Tensor, residual: torch.Tensor, hierarchy: Hierarchy, num_gaussians: int

@@ -160,11 +160,24 @@ class Renderer(Part):
     ) -> RenderOutput:
         """Render one camera of the rig; differentiable in every attribute."""
 
-    @abstractmethod
     def screen_gradient(
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, image_gradient: torch.Tensor
     ) -> ScreenGradient:
-        """Pull an upstream image gradient [H, W, 3] back to the 2-D means (pixels)."""
+        """Pull an upstream image gradient [H, W, 3] back to the 2-D means (pixels) of a scene on black.
+
+        By default a session is asked. A renderer that opens a ``ScatterSession`` overrides this method: that session
+        asks its renderer.
+
+        Raises:
+            NotImplementedError: neither the renderer nor its session knows the gradient of the 2-D means.
+        """
+        session = self.open(gaussians, None, cameras, (0.0, 0.0, 0.0))
+        if type(session).screen_gradient is ScatterSession.screen_gradient:
+            name = type(self).__name__
+            raise NotImplementedError(
+                f"{name}: expected 'screen_gradient', or an 'open' whose session has its own, got neither; write one"
+            )
+        return session.screen_gradient(view, image_gradient)
 
     def open(
         self,

@@ -30,6 +30,8 @@ QUAT_NORMS = (1e-10, 1e10)
 class ReferenceRenderer(Renderer):
     """EWA splatting (Zwicker et al. 2001; Kerbl et al. 2023) written for clarity."""
 
+    source = "EWA splatting (Zwicker et al. 2001) as in 3DGS (Kerbl et al. 2023)"
+
     class Config(PartConfig):
         rows_per_pass: int = Field(default=32, ge=1, description="image rows composited at once; bounds the memory")
 

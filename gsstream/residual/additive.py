@@ -20,7 +20,9 @@ class DirectCode(PartConfig):
 
 @final
 class Additive(UpdateRule):
-    """theta_t = theta_{t-1} + g * delta in raw parameter space (ours, the null part of the update)."""
+    """theta_t = theta_{t-1} + g * delta in raw parameter space."""
+
+    source = "gsstream"
 
     class Config(PartConfig):
         means: DirectCode = Field(default=DirectCode(step=0.02, lr=0.1), description="centres, in cells")

@@ -13,6 +13,7 @@ from gsstream.core.names import check_camera_ids
 from gsstream.core.shapes import FloatArray
 from gsstream.source.calibration import CALIBRATION_FILE, frame_path, read_calibration
 from gsstream.source.images import PICTURE_FORMATS, read_image
+from gsstream.source.video import upright
 
 PICTURES = (".png", ".jpg", ".jpeg")
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".ts")
@@ -111,7 +112,8 @@ def _video_frames(path: Path, most: int | None) -> Iterator[FloatArray]:
                 if most is not None and count >= most:
                     return
                 count += 1
-                yield frame.to_ndarray(format="rgb24").astype(np.float32) / np.float32(255)
+                pixels = upright(frame.to_ndarray(format="rgb24"), frame.rotation, path)
+                yield pixels.astype(np.float32) / np.float32(255)
     except av.FFmpegError as error:
         raise SourceError(f"{path}: the video cannot be decoded after {count} frames ({error})") from error
     if count == 0:

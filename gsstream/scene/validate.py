@@ -21,7 +21,7 @@ from gsstream.scene.match_checks import check_matches
 from gsstream.scene.picture_checks import Thumbnails, check_blank, check_change, check_same, read_thumbnails
 from gsstream.scene.rig_checks import check_axes, check_intrinsics, check_overlap, check_placement
 from gsstream.scene.sync_checks import check_sync
-from gsstream.source.base import FrameSource
+from gsstream.source.base import FilesMissing, FrameSource
 
 #: Width of the pictures that are compared over time, and of those whose features are matched.
 SMALL, LARGE = 160, 640
@@ -41,8 +41,7 @@ def validate(open_scene: Open, *, frames: int = FRAMES, features: bool = True) -
     try:
         source = open_scene(1.0)
     except SourceError as fault:
-        missing = any(text in str(fault) for text in ("frames are missing", "has no frames; expected"))
-        return [error("files" if missing else "calibration", str(fault))]
+        return [error("files" if isinstance(fault, FilesMissing) else "calibration", str(fault))]
     try:
         found: list[Finding] = []
         for stage in _stages(source, open_scene, frames, features):

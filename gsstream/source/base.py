@@ -15,6 +15,10 @@ Split = Literal["train", "test"]
 PointKind = Literal["recording", "sparse"]
 
 
+class FilesMissing(SourceError):
+    """Pictures that a recording declares are not there; the calibration itself may be sound."""
+
+
 @dataclass(frozen=True, slots=True)
 class SourceInfo:
     """What a recording says about itself.

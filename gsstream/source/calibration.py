@@ -90,7 +90,7 @@ def _rig(path: Path, ids: list[str], cameras: list[dict[str, Any]]) -> Cameras:
         if size != first:
             raise SourceError(
                 f"{path}: all cameras of a rig must share one image size, but {ids[0]!r} is {first[0]} x {first[1]} "
-                f"and {camera_id!r} is {size[0]} x {size[1]}; resample the odd ones (and their K)"
+                f"and {camera_id!r} is {size[0]} x {size[1]}; 'gsstream scene prepare' brings them to one"
             )
     poses = np.stack([_matrix(path, i, c, "w2c", 4) for i, c in zip(ids, cameras, strict=True)])
     intrinsics = np.stack([_matrix(path, i, c, "K", 3) for i, c in zip(ids, cameras, strict=True)])

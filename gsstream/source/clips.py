@@ -11,8 +11,11 @@ from PIL import Image, UnidentifiedImageError
 
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
+from gsstream.source.base import FilesMissing
 from gsstream.source.images import PICTURE_FORMATS, read_image
 
+#: What to do about cameras of different sizes, for messages.
+PREPARE = "'gsstream scene prepare' brings pictures to one size"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 
@@ -55,7 +58,7 @@ class ImageClip:
     def __init__(self, files: Sequence[Path], first: int = 0) -> None:
         self._files, self._first = tuple(files), first
         if missing := [path for path in files if not path.is_file()]:
-            raise SourceError(
+            raise FilesMissing(
                 f"{missing[0]}: the picture is missing ({len(missing)} of {len(files)} of this camera are); restore it"
             )
         self._size = _size_of(self._files[0])

@@ -11,7 +11,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.shapes import FloatArray
-from gsstream.source.base import PointKind, SourceInfo, Split, check_index
+from gsstream.source.base import FilesMissing, PointKind, SourceInfo, Split, check_index
 from gsstream.source.calibration import Calibration, frame_path, read_calibration
 from gsstream.source.images import read_image
 
@@ -132,9 +132,9 @@ def _check_rig_files(folder: Path, cameras: Cameras, calibration: Calibration) -
         paths = [folder / frame_path(pattern, t) for t in range(calibration.num_frames)]
         missing = [p for p in paths if not p.is_file()]
         if len(missing) == len(paths):
-            raise SourceError(f"{folder}: camera {camera_id!r} has no frames; expected {missing[0]} and its followers")
+            raise FilesMissing(f"{folder}: camera {camera_id!r} has no frames; expected {missing[0]} and its followers")
         if missing:
-            raise SourceError(
+            raise FilesMissing(
                 f"{folder}: camera {camera_id!r}: {len(missing)} of {len(paths)} frames are missing, the first is "
                 f'{missing[0]}; restore them or lower "frames" in cameras.json'
             )

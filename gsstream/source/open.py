@@ -45,10 +45,24 @@ def open_source(uri: str, scale: float = 1.0) -> FrameSource:
     # An empty text is the current folder to Path, and never what was meant.
     if not (uri and _exists(folder)) and not named:
         raise SourceError(f"source {uri[:200]!r}: no such folder and no known scheme; expected {_KNOWN}")
+    if named == "nerfstudio" and not _exists(folder):
+        return _nerfstudio(rest, scale, uri)
     layout = named or detect(folder)
     if layout == "folder":
         return MultiviewSource(folder, scale=scale, uri=uri)
     return RecordedSource(read_layout(layout, folder), scale=scale, uri=uri)
+
+
+def _nerfstudio(rest: str, scale: float, uri: str) -> FrameSource:
+    """``nerfstudio:DIR?missing=refuse``. Raises SourceError for another option."""
+    from gsstream.source.layouts.nerfstudio import read
+
+    text, _, query = rest.partition("?")
+    if query not in ("", "missing=refuse", "missing=skip"):
+        raise SourceError(f"source {uri[:200]!r}: expected ?missing=skip or ?missing=refuse, got ?{query[:100]}")
+    if not Path(text).is_dir():
+        return RecordedSource(read_layout("nerfstudio", Path(text)), scale=scale, uri=uri)
+    return RecordedSource(read(Path(text), "refuse" if query.endswith("refuse") else "skip"), scale=scale, uri=uri)
 
 
 def _exists(folder: Path) -> bool:

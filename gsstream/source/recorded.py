@@ -14,7 +14,7 @@ from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.names import check_camera_ids
 from gsstream.core.shapes import FloatArray
 from gsstream.source.base import PointKind, SourceInfo, Split, check_index
-from gsstream.source.clips import Clip
+from gsstream.source.clips import PREPARE, Clip
 from gsstream.source.distortion import Lens, Undistorter, pinhole_intrinsics
 from gsstream.source.multiview import scaled_size
 from gsstream.source.sync import align
@@ -161,7 +161,7 @@ def _checked(recording: Recording) -> Cameras:
         if clip.size != (rig.width, rig.height):
             raise SourceError(
                 f"{clip.where}: pictures of camera {name!r} are {clip.size[0]} x {clip.size[1]} pixels, but "
-                f"{recording.where} is for {rig.width} x {rig.height}; all cameras of a rig share one size: export "
-                "the pictures again, or correct the calibration"
+                f"{recording.where} is for {rig.width} x {rig.height}; all cameras of a rig share one size: correct "
+                f"the calibration, or {PREPARE}"
             )
     return rig

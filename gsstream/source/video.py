@@ -21,9 +21,9 @@ class VideoClip:
 
     Frame n is the n-th picture in the order of display. Reading in order decodes each picture once; other orders seek
     to the key frame before. Full-range and limited-range colour and the file's matrix are honoured by the decoder;
-    more than 8 bits per channel are kept.
+    more than 8 bits per channel are kept. Pictures are turned as the file says (phones record upright films lying).
 
-    Raises SourceError when the file cannot be read, has no picture stream or no time stamps, or is turned by metadata.
+    Raises SourceError when the file cannot be read, has no picture stream or no time stamps.
     """
 
     def __init__(self, path: Path) -> None:
@@ -46,12 +46,17 @@ class VideoClip:
             # A file cut right behind its header has a stream, but nothing to learn the kind of pictures from.
             if not table or context.format is None:
                 raise SourceError(f"{path}: the video holds no pictures; record or copy it again")
-            self._size = (context.width, context.height)
+            self._stored = (context.width, context.height)
             self._deep = any(component.bits > 8 for component in context.format.components)
         if any(pts is None for pts, _, _ in table):
             raise SourceError(
                 f"{path}: pictures without time stamps; put the stream into a container: ffmpeg -i IN -c copy OUT.mp4"
             )
+        with self._guard("opened"), self._av.open(str(path)) as container:
+            # Only a decoded picture says how the file wants to be turned.
+            first = next(container.decode(video=0), None)
+        self._rotation = 0 if first is None else int(first.rotation)
+        self._size = self._stored if _quarters(path, self._rotation) % 2 == 0 else self._stored[::-1]
         self._pts = sorted(pts for pts, _, _ in table)
         self._keys = sorted((pts, pts if dts is None else dts) for pts, dts, key in table if key)
 
@@ -146,18 +151,14 @@ class VideoClip:
     def _pixels(self, frame: Any, index: int) -> np.ndarray[Any, Any]:
         if frame.is_corrupt:
             raise SourceError(f"{self._path}: frame {index} is damaged; copy or record the video again")
-        if frame.rotation:
+        if (frame.width, frame.height) != self._stored or frame.rotation != self._rotation:
             raise SourceError(
-                f"{self._path}: the file says to turn its pictures by {frame.rotation} degrees; re-encode it upright, "
-                "so that calibration and pictures agree"
-            )
-        if (frame.width, frame.height) != self._size:
-            raise SourceError(
-                f"{self._path}: frame {index} is {frame.width} x {frame.height}, the first was "
-                f"{self._size[0]} x {self._size[1]}; re-encode the video at one size"
+                f"{self._path}: frame {index} is {frame.width} x {frame.height} turned by {frame.rotation} degrees, "
+                f"the first was {self._stored[0]} x {self._stored[1]} turned by {self._rotation}; re-encode the video "
+                "at one size"
             )
         pixels: np.ndarray[Any, Any] = frame.to_ndarray(format="rgb48le" if self._deep else "rgb24")
-        return pixels
+        return upright(pixels, self._rotation, self._path)
 
     def _drop(self) -> None:
         if self._container is not None:
@@ -166,6 +167,23 @@ class VideoClip:
 
     def _guard(self, doing: str) -> _AvErrors:
         return _AvErrors(self._path, doing, self._av)
+
+
+def upright(pixels: np.ndarray[Any, Any], rotation: int, path: Path) -> np.ndarray[Any, Any]:
+    """[H, W, 3] pixels turned counterclockwise by what the file's display matrix says, degrees.
+
+    Raises SourceError for an angle that is no multiple of 90.
+    """
+    quarters = _quarters(path, rotation)
+    return pixels if quarters == 0 else np.ascontiguousarray(np.rot90(pixels, quarters))
+
+
+def _quarters(path: Path, rotation: int) -> int:
+    if rotation % 90:
+        raise SourceError(
+            f"{path}: the file says to turn its pictures by {rotation} degrees; expected a multiple of 90: re-encode it"
+        )
+    return rotation // 90 % 4
 
 
 class _AvErrors:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 
@@ -11,7 +12,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.frame import PointCloud
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.core.part import Part
+from gsstream.core.part import Part, Traits
 
 
 @dataclass(frozen=True)
@@ -33,12 +34,30 @@ class Anchors:
     origin: torch.Tensor
 
 
+@dataclass(frozen=True, slots=True)
+class StructureTraits(Traits):
+    """What a structure claims.
+
+    Arguments:
+        idempotent: building again from the same Gaussians, also stored node by node, gives the same forest.
+        local: the members of a node lie within one root cell of each other, along every axis.
+    """
+
+    idempotent: bool = False
+    local: bool = False
+
+
 class Structure(Part):
     """Groups Gaussians; gates live on the nodes of the hierarchy it builds.
 
     Invariants (checked by the contract kit): ``node_of`` in [0, M); parents end at a root; the same Gaussians give the
     same partition whatever their order; no gradient is carried.
     """
+
+    traits: ClassVar[StructureTraits] = StructureTraits()
+
+    def claims(self) -> StructureTraits:
+        return self.traits
 
     @abstractmethod
     def seed(self, points: PointCloud, cameras: Cameras) -> Anchors:

@@ -12,13 +12,15 @@ from gsstream.core.errors import InputError
 from gsstream.core.frame import PointCloud
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.core.part import PartConfig, Traits
-from gsstream.structure.base import Anchors, Structure
+from gsstream.core.part import PartConfig
+from gsstream.structure.base import Anchors, Structure, StructureTraits
 
 
 @final
 class Flat(Structure):
-    """No grouping: M = N, every node a root. Anchors are the points themselves (ours, the null part)."""
+    """No grouping: M = N, every node a root. Anchors are the points themselves."""
+
+    source = "gsstream"
 
     class Config(PartConfig):
         resolution: int = Field(
@@ -26,7 +28,7 @@ class Flat(Structure):
             description="position residuals are measured in (scene diameter / resolution); 1 to 65536",
         )  # fmt: skip
 
-    traits = Traits(idempotent=True, local=True)
+    traits = StructureTraits(idempotent=True, local=True)
 
     def seed(self, points: PointCloud, cameras: Cameras) -> Anchors:
         if len(points) == 0:

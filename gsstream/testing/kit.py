@@ -27,7 +27,7 @@ from gsstream.testing.checks import (
     update,
 )
 from gsstream.testing.recording import SourceUnderTest
-from gsstream.testing.registry import CHECKS, Check, Skip, checks_for, kind_of
+from gsstream.testing.registry import CHECKS, LEAST_REASON, Check, Skip, checks_for, denied_by, kind_of
 
 Status = Literal["passed", "failed", "expected failure", "skipped"]
 #: Importing these modules fills the registry; the order is that of the reports.
@@ -35,7 +35,6 @@ MODULES = (
     common, auto, structure, confidence, propagation, gate, regularizer, update, renderer, loss, optimiser, source,
     method, packet,
 )  # fmt: skip
-LEAST_REASON = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,13 +53,19 @@ class CheckResult:
 
 
 def run_check(entry: Check, subject: Any, expected: str | None = None) -> CheckResult:
-    """Make one check; whatever the part raises is a failure with its name."""
+    """Make one check; whatever the part raises is a failure with its name.
+
+    Arguments:
+        subject: a part, or what stands for one (a source on a recording, a method, a packet codec).
+        expected: why the check must fail; None: it must pass.
+    """
     name = repr(subject)
-    if entry.trait is not None and not claimed(subject, entry.trait):
-        return CheckResult(entry.name, name, "skipped", f"not claimed: Traits.{entry.trait}")
-    if entry.kind == "method" and isinstance(subject, StreamingMethod):
-        subject = stepping.around(subject)
     try:
+        if entry.trait is not None and not claimed(subject, entry.trait):
+            missing = f"not claimed: {type(subject.claims()).__name__}.{entry.trait}"
+            return CheckResult(entry.name, name, "skipped", missing)
+        if entry.kind == "method" and isinstance(subject, StreamingMethod):
+            subject = stepping.around(subject)
         entry.function(subject)
     except Skip as reason:
         return CheckResult(entry.name, name, "skipped", str(reason))
@@ -69,29 +74,39 @@ def run_check(entry: Check, subject: Any, expected: str | None = None) -> CheckR
         return CheckResult(entry.name, name, status, str(error) if expected is None else f"{expected} ({error})")
     except Exception as error:  # a part may raise anything; that is what is being found out
         status = "failed" if expected is None else "expected failure"
-        return CheckResult(entry.name, name, status, f"raised {type(error).__name__}: {error}")
+        raised = f"raised {type(error).__name__}: {error}"
+        return CheckResult(entry.name, name, status, raised if expected is None else f"{expected} ({raised})")
     if expected is not None:
         return CheckResult(entry.name, name, "failed", f"passed, but was expected to fail: {expected}; drop the entry")
     return CheckResult(entry.name, name, "passed")
 
 
 def claimed(subject: Any, trait: str) -> bool:
-    """Whether a part claims a trait; a claim may be a number, and that number 0."""
-    value = getattr(subject.claims(), trait)
+    """Whether a part claims a trait; a claim may be a number, and that number 0.
+
+    Raises AssertionError when its claims are not the record of its kind.
+    """
+    claims = subject.claims()
+    assert hasattr(claims, trait), f"claims(): expected the record of its kind with {trait!r}, got {claims!r}"
+    value = getattr(claims, trait)
     return value is not None and value is not False and value != ()
 
 
 def run_checks(part: Part | SourceUnderTest, expected_failures: Mapping[str, str] | None = None) -> list[CheckResult]:
-    """Make every check of the part's kind.
+    """Make every check of the part's kind. Checks that the part itself denies (``Part.denied``) must fail.
 
     Arguments:
-        expected_failures: check -> why it fails, at least 20 characters. Passing unexpectedly is a failure.
+        expected_failures: further checks that must fail -> why, at least 20 characters. Passing is a failure.
 
     Raises:
         ValueError: an expected failure names no check of this kind, or its reason is none.
     """
-    expected = dict(expected_failures or {})
-    return run_subject(kind_of(part), part, expected)
+    return run_subject(kind_of(part), part, expected_failures)
+
+
+def skip_checks(kind: str, name: str, reason: str) -> list[CheckResult]:
+    """What :func:`run_checks` says of a part that cannot be made here: every check of its kind is skipped."""
+    return [CheckResult(entry.name, name, "skipped", reason) for entry in checks_for(kind)]
 
 
 def run_method_checks(name: str, expected_failures: Mapping[str, str] | None = None) -> list[CheckResult]:
@@ -99,19 +114,20 @@ def run_method_checks(name: str, expected_failures: Mapping[str, str] | None = N
 
     Raises RecipeError, UnknownName or PluginUnavailable when it cannot be assembled.
     """
-    return run_subject("method", stepping.MethodUnderTest(name), dict(expected_failures or {}))
+    return run_subject("method", stepping.MethodUnderTest(name), expected_failures)
 
 
 def run_packet_checks(codec: packet.PacketCodec | None = None) -> list[CheckResult]:
     """Make the checks of the packet format."""
-    return run_subject("packet", codec or packet.PacketCodec(), {})
+    return run_subject("packet", codec or packet.PacketCodec())
 
 
 def run_subject(kind: str, subject: Any, expected: Mapping[str, str] | None = None) -> list[CheckResult]:
     """Make every check of a kind on something that is no part of a recipe."""
-    expected = expected or {}
+    given = dict(expected or {})
     entries = checks_for(kind)
-    _check_reasons(expected, [entry.name for entry in entries])
+    _check_reasons(given, [entry.name for entry in entries])
+    expected = {**denied_by(subject), **given}
     return [run_check(entry, subject, expected.get(entry.name)) for entry in entries]
 
 
@@ -120,7 +136,8 @@ def parametrize_with_checks(
 ) -> Callable[[Callable[..., Any]], Any]:
     """Decorate ``def test_contract(check): check()`` to make every check on every part, one test each.
 
-    A skipped check is a skipped test with its reason; an expected failure is an xfail, strictly.
+    A skipped check is a skipped test with its reason; an expected failure is an xfail, strictly. What the parts
+    themselves deny (``Part.denied``) is expected; ``expected_failures`` (check -> reason) adds to it for all of them.
     """
     import pytest
 
@@ -129,9 +146,10 @@ def parametrize_with_checks(
     _check_reasons(expected, known)
     cases = []
     for place, part in enumerate(parts):
+        reasons = {**denied_by(part), **expected}
         label = type(part).__name__ if len(parts) == 1 else f"{type(part).__name__}{place}"
         for entry in checks_for(kind_of(part)):
-            case = functools.partial(_as_test, entry, part, expected.get(entry.name))
+            case = functools.partial(_as_test, entry, part, reasons.get(entry.name))
             cases.append(pytest.param(case, id=f"{label}-{entry.name.removeprefix('check_')}"))
     return pytest.mark.parametrize("check", cases)
 

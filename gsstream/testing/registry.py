@@ -14,6 +14,9 @@ from gsstream.testing.recording import SourceUnderTest
 #: The kinds that all common checks are made on; of the others only settings, freezing and declaration.
 BEHAVED = tuple(name for name, kind in PART_KINDS.items() if kind.behaviour)
 
+#: Characters of a reason why a check fails, at least: enough for a sentence, too many for "todo".
+LEAST_REASON = 20
+
 CheckFunction = TypeVar("CheckFunction", bound=Callable[..., None])
 
 
@@ -25,7 +28,7 @@ class Check:
         name: name of the function; stable, because expected failures are given by it.
         kind: "common", a kind of part, "source", "method" or "packet".
         kinds: kinds of part it is made on.
-        trait: the claim (a field of ``Traits``) that calls for it; None: every part of these kinds.
+        trait: the claim (a field of the kind's ``Traits``) that calls for it; None: every part of these kinds.
         function: raises AssertionError with numbers.
     """
 
@@ -69,3 +72,13 @@ def kind_of(part: Part | SourceUnderTest) -> str:
 def checks_for(kind: str) -> list[Check]:
     """All checks made on a kind of part, common ones first."""
     return [entry for entry in CHECKS.values() if kind in entry.kinds]
+
+
+def denied_by(subject: object) -> dict[str, str]:
+    """Check -> why it fails, of all that a part denies; nothing for what is no part, or a part that cannot say it."""
+    if not isinstance(subject, Part):
+        return {}
+    try:
+        return dict(subject.denials())
+    except Exception:  # a part may raise anything; ``check_denials`` reports it
+        return {}

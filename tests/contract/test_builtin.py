@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import final
+
 import pytest
 import torch
 
-from gsstream.api import Traits
 from gsstream.confidence.uniform import Uniform
+from gsstream.core.kinds import CONTRACTS, PART_KINDS
 from gsstream.gate.always_open import AlwaysOpen
+from gsstream.gate.base import GateSampler
 from gsstream.loss.photometric import ReferenceLoss
 from gsstream.method.hold import Hold
 from gsstream.optimiser.adam import ReferenceAdam
@@ -24,9 +27,9 @@ from gsstream.testing.examples.loss import ExampleLoss
 from gsstream.testing.examples.propagation import ExamplePropagation
 from gsstream.testing.examples.regularizer import ExampleRegularizer
 from gsstream.testing.examples.source import ExampleSource
+from gsstream.testing.examples.stepper import ExampleStepper
 from gsstream.testing.examples.structure import ExampleStructure
 from gsstream.testing.examples.update import ExampleUpdate
-from gsstream.testing.examples.whole import ExampleWhole
 from gsstream.testing.kit import all_checks, summary
 
 BUILTIN = [
@@ -34,7 +37,7 @@ BUILTIN = [
     ReferenceRenderer(), ReferenceLoss(), ReferenceAdam(), Hold(),
 ]  # fmt: skip
 EXAMPLES = [ExampleStructure(), ExampleConfidence(), ExamplePropagation(), ExampleGate(), ExampleRegularizer()]
-EXAMPLES += [ExampleWhole(), ExampleUpdate(), ExampleLoss()]
+EXAMPLES += [ExampleStepper(), ExampleUpdate(), ExampleLoss()]
 TINY = "synthetic:frames=4&views=3&width=32&height=24&supersample=1"
 SOURCES = [SourceUnderTest(ExampleSource, "square:"), SourceUnderTest(open_source, "demo")]
 SOURCES += [SourceUnderTest(open_source, TINY)]
@@ -46,7 +49,6 @@ def test_contract(check) -> None:
 
 
 def test_every_part_that_is_declared_is_checked_here() -> None:
-    from gsstream.core.kinds import CONTRACTS
     from gsstream.plugins.builtin import gsstream_components
 
     declared = {spec.target.rpartition(":")[2] for spec in gsstream_components() if spec.kind in CONTRACTS}
@@ -70,10 +72,75 @@ def test_a_known_failure_needs_a_reason_and_must_still_fail() -> None:
     assert "passed, but was expected to fail" in result.message
 
 
+@final
+class Denier(GateSampler):
+    """A gate that denies what ``denied`` says."""
+
+    source = "this test"
+
+    @property
+    def num_levels(self) -> int:
+        return 1
+
+    def init(self, logits: torch.Tensor) -> torch.Tensor:
+        return torch.zeros_like(logits)
+
+    def noise(self, num_nodes: int, generator: torch.Generator) -> torch.Tensor | None:
+        return None
+
+    def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
+        return torch.full_like(logits, 0.5)
+
+    def open_probability(self, logits: torch.Tensor) -> torch.Tensor:
+        return torch.ones_like(logits)
+
+    def bound(self, logits: torch.Tensor) -> torch.Tensor:
+        return logits
+
+
+def test_what_a_part_denies_is_expected_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    honest = {
+        "check_gate_range_and_levels": "half a gate is no multiple of one, on purpose",
+        "check_gate_extremes": "a gate that is always half open never opens fully",
+    }
+    found = {result.check for result in run_checks(Denier()) if not result.ok}
+    assert found == set(honest)
+    monkeypatch.setattr(Denier, "denied", honest)
+    results = {result.check: result for result in run_checks(Denier())}
+    assert all(result.ok for result in results.values())
+    assert results["check_gate_extremes"].status == "expected failure"
+    cases = parametrize_with_checks([Denier()]).args[1]
+    by_name = {case.id: case.values[0] for case in cases}
+    with pytest.raises(pytest.xfail.Exception, match="always half open"):
+        by_name["Denier-gate_extremes"]()
+
+
+@pytest.mark.parametrize(
+    ("denied", "check", "message"),
+    [
+        ({"check_gate_monotone": "it is monotone, whatever is said here"}, "check_gate_monotone", "passed, but"),
+        ({"check_structure_forest": "a gate has no forest to speak of"}, "check_denials", "made on a gate"),
+        ({"check_gate_extremes": "todo"}, "check_denials", "at least 20 characters, got 'todo'"),
+    ],
+)
+def test_denials_that_are_not_true_are_failures(
+    monkeypatch: pytest.MonkeyPatch, denied: dict[str, str], check: str, message: str
+) -> None:
+    monkeypatch.setattr(Denier, "denied", denied)
+    failed = {result.check: result.message for result in run_checks(Denier()) if not result.ok}
+    assert message in failed[check]
+
+
+def test_claims_of_another_kind_are_a_failure_and_no_crash(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Denier, "claims", lambda self: Flat().claims())
+    failed = {result.check: result.message for result in run_checks(Denier()) if not result.ok}
+    assert "expected the record of its kind with 'stochastic', got StructureTraits" in failed["check_gate_calibration"]
+
+
 def test_skips_are_counted_and_say_which_claim_is_missing() -> None:
     results = run_checks(AlwaysOpen())
     skipped = [r for r in results if r.status == "skipped"]
-    assert all(r.message.startswith(("not claimed: Traits.", "offers no 'auto'")) for r in skipped)
+    assert all(r.message.startswith(("not claimed: GateTraits.", "offers no 'auto'")) for r in skipped)
     assert summary(results) == f"{len(results) - len(skipped)} passed, {len(skipped)} skipped"
 
 
@@ -83,5 +150,5 @@ def test_names_and_meanings_of_checks() -> None:
     for entry in checks:
         assert entry.meaning.endswith((".", ")")), f"{entry.name}: {entry.meaning!r} is no sentence"
         if entry.trait:
-            assert hasattr(Traits(), entry.trait)
+            assert hasattr(PART_KINDS[entry.kind].contract_class().traits, entry.trait)
     assert not torch.is_inference_mode_enabled()

@@ -16,7 +16,9 @@ import torch
 
 @final
 class Half(GateSampler):
-    """Half open gates (ours)."""
+    """Half open gates."""
+
+    source = "this test"
 
     @property
     def num_levels(self): return 1
@@ -41,8 +43,8 @@ def test_a_sound_part(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     assert out.startswith("propagation group-max (from gsstream ")
     assert "  ✓ propagation_monotone\n" in out
-    assert "  ⚠ propagation_parent_bound (skipped): not claimed: Traits.parent_bound\n" in out
-    assert "19 passed, 2 skipped" in out.splitlines()[-1]
+    assert "  ⚠ propagation_parent_bound (skipped): not claimed: PropagationTraits.parent_bound\n" in out
+    assert "21 passed, 2 skipped" in out.splitlines()[-1]
 
 
 def test_kind_and_name_choose_one_of_several(capsys: pytest.CaptureFixture[str]) -> None:

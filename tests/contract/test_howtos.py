@@ -25,7 +25,7 @@ HOWTOS = Path(__file__).parents[2] / "docs" / "howto"
 PAGES = {
     "structure": "write-a-structure", "confidence": "write-a-confidence", "propagation": "write-a-propagation",
     "gate": "write-a-gate", "regularizer": "write-a-regularizer", "update": "write-an-update-rule",
-    "renderer": "write-a-renderer",
+    "motion": "write-a-motion", "growth": "write-a-growth", "renderer": "write-a-renderer",
 }  # fmt: skip
 
 
@@ -53,7 +53,7 @@ def test_the_example_passes_every_check_of_its_kind(kind: str, monkeypatch: pyte
 
 
 def test_there_is_a_page_for_every_kind_with_a_contract() -> None:
-    internal = {"loss", "optimiser", "whole"}  # whole methods have a page of their own
+    internal = {"loss", "optimiser", "stepper"}  # whole methods have a page of their own
     assert {*PAGES, *internal} >= set(CONTRACTS)
 
 

@@ -24,6 +24,8 @@ from gsstream.api import (
     Layout,
     Part,
     PointCloud,
+    Residual,
+    Scene,
     apply_delta,
 )
 from gsstream.confidence.uniform import Uniform
@@ -220,15 +222,15 @@ def transmitted(
     }
     decoders = rule.init_decoders(base, generator)
     gate = torch.from_numpy(gates[layout.node_of[active]].astype(np.float32)) / levels
-    units = torch.from_numpy(layout.units[active])
+    units = torch.from_numpy(layout.units_of(active))
     trained = train_rows(rule, base, gate, latents, decoders, units)
-    delta = Delta(
+    residual = Residual(
         gates, levels,
         {name: value.numpy() for name, value in symbols(rule.codes(), latents).items()},
         {name: code.step for name, code in rule.codes().items()},
         {name: value.numpy() for name, value in decoders.items()},
     )  # fmt: skip
-    return trained, apply_delta(scene, layout, delta), active
+    return trained, apply_delta(Scene(scene, layout), Delta((residual,))).gaussians, active
 
 
 @pytest.mark.parametrize("rule", [Additive(), Coded()], ids=["additive", "coded"])

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.changes import Delta, Layout, active_rows, apply_delta
+from gsstream.core.changes import Delta, Layout, Motion, Residual, Rows, Scene, apply_delta, sent_rows
 from gsstream.core.errors import (
     ComponentError,
     GsstreamError,
@@ -276,11 +276,11 @@ class TestDelta:
             "gates": np.array([0, 7, 5], np.uint8), "num_levels": 10, "symbols": {"means": np.ones((3, 3), np.int32)},
             "steps": {"means": 0.1}, "decoders": {},
         }  # fmt: skip
-        return Delta(**(fields | changes))
+        return Delta((Residual(**(fields | changes)),))
 
     def test_by_hand(self) -> None:
         scene = make(5)
-        after = apply_delta(scene, self.layout(), self.delta())
+        after = apply_delta(Scene(scene, self.layout()), self.delta()).gaussians
         change = np.array([[0.0], [0.0], [0.5], [0.25], [0.25]]) * 0.5 * 0.1
         np.testing.assert_allclose(after.means, scene.means + change, rtol=1e-6)
         assert after.means[:2].tobytes() == scene.means[:2].tobytes()
@@ -289,36 +289,58 @@ class TestDelta:
     def test_closed_gates_change_nothing(self) -> None:
         scene, closed = make(5), self.delta(gates=np.zeros(3, np.uint8), symbols={"means": np.ones((0, 3), np.int32)})
         assert closed.is_empty
-        assert apply_delta(scene, self.layout(), closed) is scene
+        assert apply_delta(Scene(scene, self.layout()), closed).gaussians is scene
 
     def test_input_is_not_written_to(self) -> None:
         scene = make(5)
         before = scene.means.copy()
-        apply_delta(scene, self.layout(), self.delta())
+        apply_delta(Scene(scene, self.layout()), self.delta())
         assert np.array_equal(scene.means, before)
 
     def test_layout(self) -> None:
         assert self.layout().node_of.tolist() == [0, 0, 2, 2, 2]
-        assert self.layout().units.tolist() == [0.5, 0.25, 0.5, 0.25, 0.25]
-        assert active_rows(self.layout(), np.array([1, 0, 0])).tolist() == [0, 1]
+        assert self.layout().units_of(np.arange(5)).tolist() == [0.5, 0.25, 0.5, 0.25, 0.25]
+        assert sent_rows(self.layout(), np.array([1, 0, 0])).tolist() == [0, 1]
 
     @pytest.mark.parametrize(
         ("changes", "message"),
         [
             ({"gates": np.array([1, 1], np.uint8)}, r"gates: expected one for each of 3 nodes, got shape \[2\]"),
             ({"gates": np.array([0, 0, 11], np.uint8)}, "gates: expected levels 0 to 10, got 11"),
-            ({"symbols": {"means": np.ones((2, 3), np.int32)}}, "delta of means: expected 3 rows of 3 values"),
+            ({"symbols": {"means": np.ones((2, 3), np.int32)}}, "residual of means: expected 3 rows of 3 values"),
             ({"symbols": {"means": np.ones((3, 4), np.int32)}}, r"got \[3, 4\]; the packet belongs to another scene"),
             ({"symbols": {"colour": np.ones((3, 4), np.int32)}}, "symbols: expected attributes among .* got 'colour'"),
             ({"steps": {}}, "steps: expected one for every coded attribute, got none for 'means'"),
             ({"decoders": {"means": np.ones((2, 3), np.float32)}}, r"decoder of means: expected 3 rows .* got 2"),
             ({"decoders": {"means": np.ones((4, 3), np.float32)}}, r"decoder of means: expected 3 rows .* got 4"),
-            ({"decoders": {"means": np.ones((3, 2), np.float32)}}, "delta of means: expected 3 rows of 3 values"),
+            ({"decoders": {"means": np.ones((3, 2), np.float32)}}, "residual of means: expected 3 rows of 3 values"),
         ],
     )
     def test_misfits_are_refused(self, changes: dict[str, object], message: str) -> None:
         with pytest.raises(ShapeError, match=message):
-            apply_delta(make(5), self.layout(), self.delta(**changes))
+            apply_delta(Scene(make(5), self.layout()), self.delta(**changes))
+
+    @pytest.mark.parametrize("kinds", [
+        (Residual, Motion), (Rows, Motion), (Rows, Residual), (Residual, Residual), (Rows, Rows), (Motion, Rows, Motion),
+    ])  # fmt: skip
+    def test_changes_in_another_order_are_refused(self, kinds: tuple[type, ...]) -> None:
+        some = {
+            Motion: Motion(1.0, 1, np.zeros(1, np.uint8), np.zeros((0, 6), np.int32)),
+            Residual: self.delta().residual, Rows: Rows(deaths=np.array([0])),
+        }  # fmt: skip
+        names = ", ".join(kind.__name__ for kind in kinds)
+        with pytest.raises(ShapeError, match=f"motions, then one residual, then one change of rows; got {names}"):
+            Delta(tuple(some[kind] for kind in kinds))
+
+    def test_a_residual_or_rows_are_exchanged_in_their_place(self) -> None:
+        motion = Motion(1.0, 1, np.zeros(1, np.uint8), np.zeros((0, 6), np.int32))
+        residual, rows = self.delta().residual, Rows(deaths=np.array([0]))
+        whole = Delta((motion, motion, residual, rows))
+        assert Delta((motion, motion)).with_rows(rows).with_residual(residual).changes == whole.changes
+        assert whole.with_residual(None).changes == (motion, motion, rows)
+        assert whole.with_rows(Rows()).changes == (motion, motion, residual)
+        assert (whole.motions, whole.residual, whole.rows) == ((motion, motion), residual, rows)
+        assert whole.with_residual(None).gates(self.layout()).tolist() == [0, 0, 0]
 
     def test_rows_do_not_depend_on_their_neighbours(self) -> None:
         """A matrix product may round a row differently when there are more of them; the decoder must not."""
@@ -326,12 +348,13 @@ class TestDelta:
         n = 257
         scene, layout = make(n), Layout(np.ones(n, np.int32), np.zeros(n, np.uint8), np.ones(1, np.float32))
         symbols, decoder = g.integers(-9, 9, (n, 8)).astype(np.int32), g.normal(size=(8, 3)).astype(np.float32)
-        whole = apply_delta(scene, layout, Delta(np.ones(n, np.uint8), 1, {"scales": symbols}, {"scales": 1.0},
-                                                 {"scales": decoder}))  # fmt: skip
+        before, step = Scene(scene, layout), {"scales": 1.0}
+        everything = Residual(np.ones(n, np.uint8), 1, {"scales": symbols}, step, {"scales": decoder})
+        whole = apply_delta(before, Delta((everything,))).gaussians
         gates = np.zeros(n, np.uint8)
         gates[100] = 1
-        one = apply_delta(scene, layout, Delta(gates, 1, {"scales": symbols[100:101]}, {"scales": 1.0},
-                                               {"scales": decoder}))  # fmt: skip
+        alone = Residual(gates, 1, {"scales": symbols[100:101]}, step, {"scales": decoder})
+        one = apply_delta(before, Delta((alone,))).gaussians
         assert one.scales[100].tobytes() == whole.scales[100].tobytes()
 
 

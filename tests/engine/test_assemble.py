@@ -30,7 +30,8 @@ def test_the_null_parts_assemble(builtin: Catalog) -> None:
     assembly = assemble(resolve(builtin, "structure.resolution=64"), builtin)
     assert isinstance(assembly, Assembly)
     for slot in SLOTS:
-        part = getattr(assembly, slot)
+        part = assembly.part(slot)
+        assert getattr(assembly, slot) == part
         assert type(part) is builtin.resolve(slot, getattr(assembly.recipe, slot).name)
         assert getattr(assembly.recipe, slot).params == part.config.model_dump(mode="json")
     assert assembly.structure.config.resolution == 64

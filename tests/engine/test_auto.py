@@ -20,9 +20,10 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ComponentError, InputError, OutputError, RecipeError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.engine.assembly.assemble import assemble
-from gsstream.engine.auto.rules import recall, record, refuse_pending, settle, sh_degree
+from gsstream.engine.assembly.pending import refuse_pending
 from gsstream.engine.auto.colour_gain import colour_gain
 from gsstream.engine.auto.facts import scene_facts
+from gsstream.engine.auto.rules import recall, record, settle, sh_degree
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import load_recipe, resolve_recipe
 from gsstream.recipe.save import save_resolved
@@ -242,10 +243,10 @@ def test_auto_where_nobody_offers_it(setting: str, message: str) -> None:
         assemble(resolve_recipe("s2gs-edge", catalog.recipe_path, (), [("--set", setting)]), catalog)
 
 
-def test_a_whole_method_that_reads_no_structure_refuses_its_auto() -> None:
+def test_a_stepper_that_reads_no_structure_refuses_its_auto() -> None:
     catalog = load_catalog()
     sets = [("--set", "structure=octree"), ("--set", "structure.root_exponent=auto")]
-    with pytest.raises(RecipeError, match=r"root_exponent: the whole method 'hold' does not read it"):
+    with pytest.raises(RecipeError, match=r"root_exponent: the stepper 'hold' does not read it"):
         assemble(resolve_recipe("hold", catalog.recipe_path, (), sets), catalog)
 
 

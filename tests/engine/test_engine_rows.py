@@ -1,4 +1,4 @@
-"""Encoder state over births and deaths: hierarchy, moments and decoders follow the packet and nothing else."""
+"""Encoder state over births and deaths: hierarchy and decoders follow the packet and nothing else."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsstream.core.changes import Births, own_nodes
-from gsstream.core.changes import Delta, Layout
+from gsstream.core.changes import Births, Delta, Residual, Rows
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.topology import TopologyEdit
@@ -33,9 +32,7 @@ def state() -> StreamState:
     parent[1:3] = torch.tensor([1, 2])
     level = (parent != torch.arange(nodes)).long()
     hierarchy = Hierarchy(torch.from_numpy(player.layout.node_of), parent, level)
-    steps = torch.full((nodes,), 7, dtype=torch.int32)
-    moments = {"steps": steps, "exp_avg": torch.arange(nodes).float(), "exp_avg_sq": torch.ones(nodes)}
-    return StreamState(player, hierarchy, None, {"sh0": torch.ones(2, 3)}, gate_moments=moments)
+    return StreamState(player, hierarchy, None, {"sh0": torch.ones(2, 3)})
 
 
 def step(state: StreamState, delta: Delta) -> StreamState:
@@ -44,9 +41,8 @@ def step(state: StreamState, delta: Delta) -> StreamState:
     return follow(state, decode_packet(player, packet.data))
 
 
-def delta_of(layout: Layout, births: Births | None, deaths: list[int] | None = None) -> Delta:
-    gates = np.zeros(len(layout.node_counts), np.uint8)
-    return Delta(gates, 1, births=births, deaths=np.array(deaths or [], np.int64))
+def delta_of(births: Births | None, deaths: list[int] | None = None) -> Delta:
+    return Delta((Rows(births, np.array(deaths or [], np.int64)),))
 
 
 def test_the_forest_grows_with_the_packet(state):
@@ -54,7 +50,7 @@ def test_the_forest_grows_with_the_packet(state):
     # Two new nodes: one below node 4 (which is below node 0), one below that one, and a new root.
     parents = np.array([4, nodes, nodes + 2])
     born = Births(scene(4), np.array([2, nodes, nodes + 1, nodes + 2]), np.zeros(4, np.uint8), parents)
-    after = step(state, delta_of(state.player.layout, born, [0, 7]))
+    after = step(state, delta_of(born, [0, 7]))
     after.hierarchy.validate()
     assert after.hierarchy.num_gaussians == len(after.player.gaussians) == 42
     assert after.hierarchy.level.tolist()[nodes:] == [2, 3, 0]
@@ -63,20 +59,11 @@ def test_the_forest_grows_with_the_packet(state):
     assert torch.equal(after.hierarchy.parent[:nodes], state.hierarchy.parent)
 
 
-def test_gate_moments_stay_with_their_nodes(state):
-    nodes = len(state.player.layout.node_counts)
-    after = step(state, delta_of(state.player.layout, own_nodes(scene(3), np.zeros(3), nodes), [1]))
-    assert after.gate_moments["steps"].tolist() == [7] * nodes + [0] * 3
-    assert after.gate_moments["exp_avg"].tolist() == [*range(nodes), 0, 0, 0]
-    assert after.gate_moments["exp_avg_sq"].tolist() == [1] * nodes + [0] * 3
-
-
 def test_a_packet_without_births_leaves_the_forest_alone(state):
     gates = np.ones(len(state.player.layout.node_counts), np.uint8)
     symbols = {"opacities": np.ones((40, 1), np.int32)}
-    after = step(state, Delta(gates, 1, symbols, {"opacities": 0.1}))
+    after = step(state, Delta((Residual(gates, 1, symbols, {"opacities": 0.1}),)))
     assert after.hierarchy is state.hierarchy
-    assert after.gate_moments is state.gate_moments
     assert torch.equal(after.decoders["sh0"], torch.ones(2, 3))
 
 

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from gsstream.core.auto import Choice
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.engine.auto.rules import settle
 from gsstream.engine.auto.climb import MARGIN, try_out
+from gsstream.engine.auto.rules import settle
 from gsstream.engine.auto.short_fits import Trial
 from gsstream.engine.auto.trials import usual_values
 from gsstream.plugins.catalog import load_catalog

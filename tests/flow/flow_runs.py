@@ -15,6 +15,8 @@ from typing import Any
 import pytest
 
 from gsstream.cli.main import run_command
+from gsstream.core.frame import Frame
+from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.source.open import DEMO_FOLDER
 
@@ -79,35 +81,29 @@ class Witness:
     """Remembers the encoder's state after every frame of runs in this process; changes nothing."""
 
     def __init__(self, monkeypatch: Any) -> None:
-        from gsstream.engine.run import session
-
         self.states: list[StreamState] = []
-        for name in ("begin", "begin_from", "frame_step"):
-            monkeypatch.setattr(session, name, self._watched(getattr(session, name)))
+        encode = Encoder.encode
 
-    def _watched(self, step: Callable[..., Any]) -> Callable[..., Any]:
-        def watched(*args: Any, **kwargs: Any) -> Any:
-            outcome = step(*args, **kwargs)
-            self.states.append(outcome.state)
-            return outcome
+        def watched(encoder: Encoder, frame: Frame) -> Any:
+            step = encode(encoder, frame)
+            self.states.append(step.state)
+            return step
 
-        return watched
+        monkeypatch.setattr(Encoder, "encode", watched)
 
 
 @contextmanager
 def broken_off_in(frame: int) -> Iterator[None]:
     """Runs in this process are interrupted, as by Ctrl-C, when they are about to step to this frame."""
-    from gsstream.engine.run import session
+    encode = Encoder.encode
 
-    step = session.frame_step
-
-    def impatient(parts: Any, state: Any, now: Any, *more: Any) -> Any:
+    def impatient(encoder: Encoder, now: Frame) -> Any:
         if now.index == frame:
             raise KeyboardInterrupt
-        return step(parts, state, now, *more)
+        return encode(encoder, now)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(session, "frame_step", impatient)
+        patch.setattr(Encoder, "encode", impatient)
         yield
 
 

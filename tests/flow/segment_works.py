@@ -7,7 +7,8 @@ import signal
 from pathlib import Path
 from typing import Any
 
-from gsstream.engine.run import session
+from gsstream.core.frame import Frame
+from gsstream.engine.run.encoder import Encoder
 from gsstream.trade.segments.job import SegmentJob, SegmentOutcome, run_segment
 
 #: The frame in which a worker is killed, once.
@@ -17,14 +18,16 @@ FATAL = 4
 def run_and_die_once(job: SegmentJob) -> SegmentOutcome:
     """Encode a segment; the first to step to frame 4 dies there, as if killed from outside. Steps leave marks."""
     marks = Path(os.environ["SEGMENT_TEST_MARKS"])
-    step = session.frame_step
+    encode = Encoder.encode
 
-    def watched(parts: Any, state: Any, frame: Any, *more: Any) -> Any:
+    def watched(encoder: Encoder, frame: Frame) -> Any:
+        if encoder.state is None:
+            return encode(encoder, frame)
         marks.joinpath(f"{job.id}-{frame.index}-{os.getpid()}").touch()
         if job.id.startswith("segment") and frame.index == FATAL and not (marks / "dead").exists():
             (marks / "dead").touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        return step(parts, state, frame, *more)
+        return encode(encoder, frame)
 
-    session.frame_step = watched  # type: ignore[assignment]
+    Encoder.encode = watched  # type: ignore[method-assign]
     return run_segment(job)

@@ -11,7 +11,8 @@ import pytest
 from flow_runs import WORLD, arguments, broken_off_in, demo_copy, encode, metrics, without_test_cameras
 
 from gsstream.cli.main import run_command
-from gsstream.engine.run import session, trials
+from gsstream.engine.auto import trials
+from gsstream.engine.run import encoder
 from gsstream.packet import StreamReader, decode_packet
 from gsstream.recipe.load import load_recipe
 
@@ -68,7 +69,7 @@ def test_resume_takes_the_values_from_the_stream(
     command = arguments(tmp_path / "o", method="s2gs-edge", codec__key_every=4, **AUTO)
     with broken_off_in(3):
         assert run_command(command) == 130
-    monkeypatch.setattr(session, "choose", never)
+    monkeypatch.setattr(encoder, "choose", never)
     if saved:
         recipe = (tmp_path / "o" / "recipe.yaml").rename(tmp_path / "recipe.yaml")
         command = ["run", "--source", WORLD, "--recipe", str(recipe), "--out", str(tmp_path / "o"), "--no-video"]

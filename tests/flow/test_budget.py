@@ -154,7 +154,7 @@ def test_seeds_are_limited_as_well_as_growth(tmp_path: Path) -> None:
 
 def test_a_whole_method_has_no_budget_of_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(arguments(tmp_path, "--budget", "size=1KB", method="hold")) == 2
-    assert "budget.size: the whole method 'hold' does not read it" in capsys.readouterr().err
+    assert "budget.size: the stepper 'hold' does not read it" in capsys.readouterr().err
 
 
 def test_a_budget_is_data(tmp_path: Path) -> None:

@@ -14,7 +14,8 @@ from flow_runs import TINY, WORLD, finish
 from gsstream.core.errors import ComponentError, GsstreamError, InputError
 from gsstream.engine.assembly import checks as checks_module
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.engine.assembly.checks import Checks, StepChecks, check_values, wanted_checks
+from gsstream.engine.assembly.checks import Checks, Look, wanted_checks
+from gsstream.engine.assembly.where import Where
 from gsstream.engine.run.recording import open_recording
 from gsstream.engine.run.session import run
 from gsstream.gate.always_open import AlwaysOpen
@@ -239,7 +240,7 @@ def test_levels_do_not_change_what_is_sent_and_off_looks_at_no_number(
     def never(*_: Any, **__: Any) -> None:
         raise AssertionError("looked at a number")
 
-    monkeypatch.setattr(checks_module, "check_values", never)
+    monkeypatch.setattr(checks_module, "wrong_value", never)
     monkeypatch.setattr(checks_module.torch, "isfinite", never)
     streams.append(encode(assembly("off", "s2gs-edge"), tmp_path / "off"))
     assert streams[0] == streams[1] == streams[2]
@@ -278,22 +279,25 @@ def test_a_wrong_level_ends_the_command_before_anything_is_written(tmp_path: Pat
     assert not (tmp_path / "o").exists()
 
 
+def look_at(level: Checks = Checks.FRAME, iteration: int | None = None) -> Look:
+    return Look(level, "gate", AlwaysOpen(), Where(7, iteration))
+
+
 def test_the_first_wrong_number_is_named_with_its_gaussian() -> None:
     values, rows = torch.zeros(4, 3), torch.tensor([10, 20, 30, 40])
-    check_values("gate", AlwaysOpen(), "x", values, 7, rows=rows)
+    look_at().values("x", values, rows=rows)
     values[2, 1], values[3, 0] = -float("inf"), NAN
     with pytest.raises(ComponentError, match=r"got -inf at index \[2, 1\] \(Gaussian 30\) \(2 of 12 values\)"):
-        check_values("gate", AlwaysOpen(), "x", values, 7, 1, rows=rows)
-    check_values("gate", AlwaysOpen(), "nothing", torch.zeros(0, 3), 7)
-    check_values("gate", AlwaysOpen(), "edges", torch.tensor([0.0, 1.0]), 7, limits=(0, 1))
-    check_values("gate", AlwaysOpen(), "largest", torch.tensor([3.4028234e38, -3.4028234e38]), 7)
-    check_values("gate", AlwaysOpen(), "half", torch.zeros(3, dtype=torch.bfloat16), 7)
+        look_at(iteration=1).values("x", values, rows=rows)
+    look_at().values("nothing", torch.zeros(0, 3))
+    look_at().values("edges", torch.tensor([0.0, 1.0]), limits=(0, 1))
+    look_at().values("largest", torch.tensor([3.4028234e38, -3.4028234e38]))
+    look_at().values("half", torch.zeros(3, dtype=torch.bfloat16))
 
 
 def test_below_step_nothing_is_looked_at_in_an_iteration() -> None:
     for level in (Checks.OFF, Checks.FRAME):
-        look = StepChecks(level, 0)
-        look("gate", AlwaysOpen(), "x", torch.tensor([NAN]))
-        look.number("loss", AlwaysOpen(), "y", NAN)
-    with pytest.raises(ComponentError, match="frame 0, iteration 0: y: expected finite values, got inf"):
-        StepChecks(Checks.STEP, 0).number("loss", AlwaysOpen(), "y", float("inf"))
+        look_at(level, iteration=0).output("x", torch.tensor([NAN]), (1,))
+        look_at(level).step_values("x", {"y": torch.tensor([NAN])})
+    with pytest.raises(ComponentError, match="frame 7, iteration 0: x: expected finite values, got inf"):
+        look_at(Checks.STEP, 0).output("x", torch.tensor([float("inf")]), (1,))

@@ -13,7 +13,7 @@ from flow_runs import WORLD, Witness, demo_copy, encode, metrics, without_test_c
 from residual_oracle import train_rows
 
 from gsstream.cli.main import run_command
-from gsstream.core.changes import Layout, apply_delta
+from gsstream.core.changes import Delta, apply_delta
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.engine.step import frame_step as step_module
 from gsstream.packet import PacketKind
@@ -84,24 +84,24 @@ def test_training_and_transmission_apply_the_same_map(tmp_path: Path, monkeypatc
     seen = []
 
     def harden(parts, problem, solution):
-        delta = original(parts, problem, solution)
-        layout: Layout = problem.state.player.layout
-        gates = torch.from_numpy(delta.gates.astype(np.float32) / delta.num_levels)[problem.state.hierarchy.node_of]
-        units = torch.from_numpy(layout.units[problem.active.numpy()])
-        rows = train_rows(
-            parts.update, problem.base, gates[problem.active], solution.latents, solution.decoders, units
-        )
-        seen.append((problem, delta, rows))
-        return delta
+        residual = original(parts, problem, solution)
+        share = torch.from_numpy(residual.gates.astype(np.float32) / residual.num_levels)
+        gates = share[problem.hierarchy.node_of][problem.rows]
+        units = torch.from_numpy(problem.layout.units_of(problem.rows.numpy()))
+        rows = train_rows(parts.update, problem.base, gates, solution.latents, solution.decoders, units)
+        seen.append((problem, residual, rows))
+        return residual
 
     original = step_module.harden
     monkeypatch.setattr(step_module, "harden", harden)
-    encode(tmp_path, "--frames", "4", method="s2gs-edge")
+    witness = Witness(monkeypatch)
+    encode(tmp_path, "--frames", "4", method="s2gs-edge", codec__trim=0)
     assert len(seen) == 3
-    for problem, delta, rows in seen:
-        sent = apply_delta(problem.state.player.gaussians, problem.state.player.layout, delta)
-        active = problem.active.numpy()
-        assert delta.gates.any()
+    for problem, residual, rows in seen:
+        before = witness.states[problem.frame - 1].player.scene
+        sent = apply_delta(before, Delta((residual,))).gaussians
+        active = problem.rows.numpy()
+        assert residual.gates.any()
         for name in ATTRIBUTES:
             trained, decoded = getattr(rows, name).numpy(), getattr(sent, name)[active]
             # Decoders travel as half floats: the only difference between the two, beside the order of sums.

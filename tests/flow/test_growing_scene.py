@@ -10,7 +10,7 @@ import pytest
 from flow_runs import Witness, encode
 
 from gsstream.cli.main import run_command
-from gsstream.core.changes import in_nodes, own_nodes
+from gsstream.core.changes import Rows, in_nodes, own_nodes
 from gsstream.engine.step import frame_step as step_module
 from gsstream.packet import StreamReader
 from gsstream.player.playback import Playback
@@ -18,25 +18,24 @@ from gsstream.player.playback import Playback
 
 def growing(monkeypatch: pytest.MonkeyPatch, method: str) -> None:
     """Every second frame splits 20 Gaussians off and removes ten."""
-    original = step_module.harden
 
-    def harden(parts, problem, solution):
-        delta, player = original(parts, problem, solution), problem.state.player
+    def grown(parts, state, delta, view, rng):
+        player = state.player
         if player.frame % 2:
             return delta
         rng = np.random.default_rng(player.frame)
         rows = np.sort(rng.choice(len(player.gaussians), 20, replace=False))
         copies = player.gaussians.rows(rows)
         copies = replace(copies, means=copies.means + rng.normal(0, 0.02, (20, 3)).astype(np.float32))
-        levels = player.layout.octree_levels[rows]
+        levels = player.layout.unit_of[rows]
         if method == "dense":
             births = own_nodes(copies, levels, len(player.layout.node_counts))
         else:
             births = in_nodes(copies, player.layout.node_of[rows], levels)
         gone = np.sort(rng.choice(len(player.gaussians), 10, replace=False))
-        return replace(delta, births=births, deaths=gone)
+        return delta.with_rows(Rows(births, gone))
 
-    monkeypatch.setattr(step_module, "harden", harden)
+    monkeypatch.setattr(step_module, "grown", grown)
 
 
 @pytest.mark.parametrize("method", ["dense", "s2gs-edge"])

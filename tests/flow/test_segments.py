@@ -157,7 +157,7 @@ def test_an_open_leap_frees_every_gaussian_and_the_segment_is_the_method_s_own(t
         for state in (first, later):
             assert state.meta.recipe == first.meta.recipe
             assert state.meta.recipe["gate"]["name"] == "gumbel-sigmoid"
-        levels = [np.sort(state.layout.octree_levels) for state in (first, later)]
+        levels = [np.sort(state.layout.unit_of) for state in (first, later)]
     assert np.array_equal(*levels), "what a Gaussian's residuals are measured in goes on"
 
 

@@ -25,10 +25,10 @@ from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe
 from gsstream.source.open import open_source
-from gsstream.testing.examples.whole import ExampleWhole
+from gsstream.testing.examples.stepper import ExampleStepper
 from gsstream.testing.stepping import SOURCE, MethodUnderTest
 
-Follow: Any = ExampleWhole  # final: only what is wrong on purpose may inherit from it
+Follow: Any = ExampleStepper  # final: only what is wrong on purpose may inherit from it
 
 RUN = [
     "run", "--source", SOURCE, "--method", "hold", "--quiet", "--no-video", "--set", "first_frame.max_iterations=5",

@@ -18,7 +18,7 @@ from gsstream_s2gs.octree import StreamingOctree
 from numeric_scenes import camera, random_scene, upstream, worst
 from residual_oracle import train_rows
 
-from gsstream.core.changes import Delta, Layout, apply_delta
+from gsstream.core.changes import Delta, Layout, Residual, Scene, apply_delta
 from gsstream.core.frame import PointCloud
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
@@ -166,8 +166,8 @@ def application(seed: int) -> float:
     steps = {name: rule.codes()[name].step for name in symbols}
     layout = Layout(np.ones(n, np.int32), np.arange(n).astype(np.uint8), units.float().numpy())
     levels = torch.round(gates * 10).numpy().astype(np.uint8)
-    delta = Delta(levels, 10, symbols, steps, {k: v.float().numpy() for k, v in matrices.items()})
-    got = apply_delta(scene.map(lambda v: v.float().numpy()), layout, delta)
+    delta = Delta((Residual(levels, 10, symbols, steps, {k: v.float().numpy() for k, v in matrices.items()}),))
+    got = apply_delta(Scene(scene.map(lambda v: v.float().numpy()), layout), delta).gaussians
     return max(worst(torch.from_numpy(a), b) for (_, a), (_, b) in zip(got.items(), want.items(), strict=True))
 
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numeric_scenes import random_scene, some
 from residual_oracle import decode_rows
 
-from gsstream.core.changes import Delta, Layout, apply_delta
+from gsstream.core.changes import Delta, Layout, Residual, Scene, apply_delta
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.packet import decode_delta, encode_delta, quantise_key
@@ -35,7 +35,7 @@ def moves(gates: object, levels: int = 10, size: int = 3) -> Delta:
     opened = np.asarray(gates, np.uint8)
     rows = 2 * int((opened > 0).sum())
     table = np.arange(3 * rows, dtype=np.int32).reshape(rows, 3) % (2 * size + 1) - size
-    return Delta(opened, levels, {"means": table}, {"means": 0.25})
+    return Delta((Residual(opened, levels, {"means": table}, {"means": 0.25}),))
 
 
 @pytest.mark.parametrize("levels", [1, 10, 255])
@@ -45,11 +45,11 @@ def test_no_row_one_row_and_every_row(share: str, levels: int) -> None:
     gates[{"none": slice(0), "one": slice(3, 4), "all": slice(None)}[share]] = levels
     delta = moves(gates, levels)
     data = encode_delta(delta, layout(), {}, frame=1).data
-    back = decode_delta(data, layout(), {})
-    assert np.array_equal(back.gates, gates)
-    assert np.array_equal(back.symbols["means"], delta.symbols["means"])
     scene = random_scene(0, n=12).map(lambda value: value.numpy())
-    moved = apply_delta(scene, layout(), back)
+    back = decode_delta(data, Scene(scene, layout()), {})
+    assert np.array_equal(back.residual.gates, gates)
+    assert np.array_equal(back.residual.symbols["means"], delta.residual.symbols["means"])
+    moved = apply_delta(Scene(scene, layout()), back).gaussians
     closed = np.repeat(gates == 0, 2)
     for (name, before), (_, after) in zip(scene.items(), moved.items(), strict=True):
         assert np.array_equal(before[closed], after[closed]), f"{name}: rows behind closed gates keep their bits"
@@ -118,9 +118,10 @@ def test_a_key_packet_refuses_what_it_cannot_hold(name: str, bad: float) -> None
 
 
 def test_a_residual_that_would_leave_float32_is_refused_by_the_reader() -> None:
-    delta = Delta(
+    residual = Residual(
         np.full(6, 10, np.uint8), 10, {"scales": np.full((12, 1), 2**31 - 1, np.int32)}, {"scales": 9e5},
         {"scales": np.full((1, 3), 65504, np.float32)},
     )  # fmt: skip
+    scene = Scene(random_scene(0, n=12).map(lambda value: value.numpy()), layout())
     with pytest.raises(PacketError, match=r"a residual of .* cannot be"):
-        decode_delta(encode_delta(delta, layout(), {}, frame=1).data, layout(), {})
+        decode_delta(encode_delta(Delta((residual,)), layout(), {}, frame=1).data, scene, {})

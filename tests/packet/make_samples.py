@@ -1,5 +1,8 @@
 """Write the stored samples of the current format version. Run once per format version; old samples are never rewritten.
 
+``stream.gss`` has every kind of packet, births and deaths; ``moving.gss`` has motions: from rest, predicted, corrected,
+of groups formed anew, two in a frame, and births after one.
+
 Usage: python tests/packet/make_samples.py
 """
 
@@ -9,7 +12,7 @@ import hashlib
 import json
 from pathlib import Path
 
-from packet_scenes import decode_all, make_packets, write_stream
+from packet_scenes import decode_all, make_moving_packets, make_packets, write_stream
 
 from gsstream.core.gaussians import Gaussians
 from gsstream.packet import FORMAT_VERSION
@@ -23,13 +26,17 @@ def digest(gaussians: Gaussians) -> str:
 
 
 def main() -> None:
-    packets = make_packets(seed=11, number=30, nodes=9, edits=(3, 6))
+    streams = {
+        "stream": make_packets(seed=11, number=30, nodes=9, edits=(3, 6)),
+        "moving": make_moving_packets(seed=12, number=30, nodes=9),
+    }
     folder = SAMPLES / FORMAT_VERSION
     folder.mkdir(parents=True)
-    write_stream(folder / "stream.gss", packets)
+    for name, packets in streams.items():
+        write_stream(folder / f"{name}.gss", packets)
     for name, packet in (("key", 0), ("delta", 1), ("empty", 2), ("births", 3)):
-        (folder / f"{name}.bin").write_bytes(packets[packet].data)
-    expected = [digest(state.gaussians) for state in decode_all(packets)]
+        (folder / f"{name}.bin").write_bytes(streams["stream"][packet].data)
+    expected = {name: [digest(state.gaussians) for state in decode_all(packets)] for name, packets in streams.items()}
     (folder / "expected.json").write_text(json.dumps(expected, indent=1) + "\n")
 
 

@@ -7,9 +7,19 @@ from pathlib import Path
 
 import numpy as np
 
-from gsstream.core.changes import Births
 from gsstream.core.cameras import Cameras
-from gsstream.core.changes import Delta, Layout, active_rows
+from gsstream.core.changes import (
+    Births,
+    Delta,
+    Layout,
+    Motion,
+    Residual,
+    Rows,
+    Scene,
+    apply_motion,
+    groups_for,
+    sent_rows,
+)
 from gsstream.core.gaussians import Gaussians
 from gsstream.packet import (
     EncodedPacket,
@@ -61,11 +71,11 @@ def make_delta(
 ) -> Delta:
     nodes = len(layout.node_counts)
     gates = (rng.random(nodes) < share) * rng.integers(1, levels + 1, nodes)
-    rows = len(active_rows(layout, gates))
+    rows = len(sent_rows(layout, gates))
     widths = {"means": 3, "quats": 4, "opacities": 1, "sh0": 2 if latent else 3}
     symbols = {n: np.rint(2 * rng.laplace(size=(rows, w))).astype(np.int32) for n, w in widths.items()}
     decoders = quantise_decoders({"sh0": rng.normal(size=(2, 3))}) if latent else {}
-    return Delta(gates.astype(np.uint8), levels, symbols, dict.fromkeys(widths, 0.01), decoders)
+    return Delta((Residual(gates.astype(np.uint8), levels, symbols, dict.fromkeys(widths, 0.01), decoders),))
 
 
 def make_births(rng: np.random.Generator, layout: Layout, number: int, new: int, sh_rest: int = 3) -> Births:
@@ -82,7 +92,60 @@ def make_edit(rng: np.random.Generator, state: PlayerState, births: int = 3, dea
     born = None
     if births:
         born = make_births(rng, state.layout, births, int(rng.integers(0, 3)), state.gaussians.shN.shape[1])
-    return replace(delta, births=born, deaths=gone)
+    return delta.with_rows(Rows(born, gone))
+
+
+def make_motion(
+    rng: np.random.Generator, scene: Scene, cell: float = 1.5, shades: int = 2, share: float = 0.6, **said: bool
+) -> Motion:
+    """A motion of a share of the scene's groups; most corrections are 0."""
+    groups = groups_for(scene, cell, shades, said.get("regroup", False))
+    moving = (rng.random(groups.count) < share).astype(np.uint8)
+    symbols = np.rint(rng.laplace(size=(int(moving.sum()), 6)) * 2).astype(np.int32)
+    return Motion(cell, shades, moving, symbols, float(np.float32(0.02)), float(np.float32(0.01)), **said)
+
+
+def make_motions(rng: np.random.Generator, scene: Scene, number: int, **said: bool) -> Delta:
+    """A delta of ``number`` motions, coarse to fine: the groups of each depend on where the one before led."""
+    motions = []
+    for level in range(number):
+        motions.append(make_motion(rng, scene, cell=2.0 / 2**level, **said))
+        scene, _ = apply_motion(scene, motions[-1])
+    return Delta(tuple(motions))
+
+
+def make_moving_packets(seed: int = 0, **sizes: int) -> list[EncodedPacket]:
+    """Key, then frames that move: from rest, predicted, corrected with a residual, still, formed anew, two at once, with
+    births after the motion, predicted with what was born.
+    """
+    rng = np.random.default_rng(seed)
+    state = decode_packet(None, encode_key(make_key(rng, **sizes)).data)
+    packets = [encode_key(make_key(np.random.default_rng(seed), **sizes))]
+
+    def add(delta: Delta | None) -> None:
+        nonlocal state
+        frame = state.frame + 1
+        if delta is None:
+            packet = encode_empty(frame=frame)
+        else:
+            packet = encode_delta(delta, state.layout, state.decoders, frame=frame)
+        packets.append(packet)
+        state = decode_packet(state, packet.data)
+
+    def moved(**said: bool) -> Motion:
+        return make_motion(rng, state.scene, **said)
+
+    add(Delta((moved(predicted=False),)))
+    still = moved()
+    add(Delta((replace(still, symbols=np.zeros_like(still.symbols)),)))
+    add(Delta((moved(), *make_delta(rng, state.layout).changes)))
+    add(None)
+    add(Delta((moved(),)))
+    add(Delta((moved(regroup=True),)))
+    add(make_motions(rng, state.scene, 2))
+    add(Delta((moved(), *make_edit(rng, state).changes)))
+    add(Delta((moved(),)))
+    return packets
 
 
 def make_packets(

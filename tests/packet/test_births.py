@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from packet_scenes import decode_all, make_births, make_edit, make_key, make_packets, make_scene, replaced, same_bits
 
-from gsstream.core.changes import Births, in_nodes, own_nodes
-from gsstream.core.changes import Delta, Layout, apply_delta, next_layout, row_gates
-from gsstream.core.errors import OutputError, PacketError, ShapeError
+from gsstream.core.changes import Births, Delta, Layout, Residual, Rows, apply_delta, in_nodes, own_nodes, row_gates
+from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.packet import (
     StreamWriter,
@@ -23,8 +22,8 @@ from gsstream.packet import (
     quantise_key,
 )
 from gsstream.packet.base import parse_packet
-from gsstream.packet.births import HEAD_PARTS, most_births
 from gsstream.packet.bits import BitWriter, pack_blobs, unpack_blobs
+from gsstream.packet.changes.rows import HEAD_PARTS, most_births
 from gsstream.packet.gates import encode_gates
 from gsstream.packet.symbols import encode_symbols
 from gsstream.trade.measure.stream_stats import stream_stats
@@ -33,8 +32,8 @@ SEEDS = st.integers(0, 2**32 - 1)
 NONE = np.zeros(0, np.int64)
 
 
-def closed(layout: Layout, births: Births | None = None, deaths=NONE) -> Delta:
-    return Delta(np.zeros(len(layout.node_counts), np.uint8), 1, births=births, deaths=deaths)
+def closed(births: Births | None = None, deaths=NONE) -> Delta:
+    return Delta().with_rows(Rows(births, deaths))
 
 
 def first_state(rng, number=40, nodes=12, sh_rest=3):
@@ -42,20 +41,19 @@ def first_state(rng, number=40, nodes=12, sh_rest=3):
 
 
 def naive(state, delta):
-    """Rows of the next scene as (node, level, values), one Gaussian at a time, in plain Python."""
-    gates_only = dataclasses.replace(delta, births=None, deaths=NONE)
-    moved = apply_delta(state.gaussians, state.layout, gates_only)
+    """Rows of the next scene as (node, unit, values), one Gaussian at a time, in plain Python."""
+    moved = apply_delta(state.scene, delta.with_rows(None)).gaussians
     gone = set(delta.deaths.tolist())
     table = [
-        (int(node), int(level), tuple(value[i].tobytes() for _, value in moved.items()))
-        for i, (node, level) in enumerate(zip(state.layout.node_of, state.layout.octree_levels, strict=True))
+        (int(node), int(unit), tuple(value[i].tobytes() for _, value in moved.items()))
+        for i, (node, unit) in enumerate(zip(state.layout.node_of, state.layout.unit_of, strict=True))
         if i not in gone
     ]
     if delta.births is not None:
         coded = quantise_key(delta.births.gaussians)
         table += [
-            (int(node), int(level), tuple(value[i].tobytes() for _, value in coded.items()))
-            for i, (node, level) in enumerate(zip(delta.births.nodes, delta.births.octree_levels, strict=True))
+            (int(node), int(unit), tuple(value[i].tobytes() for _, value in coded.items()))
+            for i, (node, unit) in enumerate(zip(delta.births.nodes, delta.births.unit_of, strict=True))
         ]
     return sorted(table, key=lambda row: row[0])  # stable: old rows first within a node
 
@@ -72,13 +70,13 @@ def test_a_decoded_edit_is_what_plain_python_makes_of_it(seed, number, nodes, bi
     packet = encode_delta(delta, state.layout, {}, frame=1)
     after = decode_packet(state, packet.data)
     assert naive(state, delta) == [
-        (int(node), int(level), tuple(value[i].tobytes() for _, value in after.gaussians.items()))
-        for i, (node, level) in enumerate(zip(after.layout.node_of, after.layout.octree_levels, strict=True))
+        (int(node), int(unit), tuple(value[i].tobytes() for _, value in after.gaussians.items()))
+        for i, (node, unit) in enumerate(zip(after.layout.node_of, after.layout.unit_of, strict=True))
     ]
     assert encode_delta(after.delta, state.layout, {}, frame=1).data == packet.data
     assert np.array_equal(after.delta.deaths, delta.deaths)
     if births:
-        for name in ("nodes", "octree_levels", "parents"):
+        for name in ("nodes", "unit_of", "parents"):
             assert np.array_equal(getattr(after.delta.births, name), getattr(delta.births, name)), name
     assert int(after.layout.node_counts.sum()) == len(after.gaussians) == len(row_gates(state.layout, delta))
     after.gaussians.validate()
@@ -92,7 +90,7 @@ def test_a_stream_of_edits_never_loses_track(seed):
     for frame in range(1, 7):
         delta = make_edit(rng, state, int(rng.integers(0, 5)), 0.1)
         state = decode_packet(state, encode_delta(delta, state.layout, state.decoders, frame=frame).data)
-        assert len(state.layout.octree_levels) == len(state.gaussians)
+        assert len(state.layout.unit_of) == len(state.gaussians)
     key = encode_key(make_key(rng))  # the layout that grew is still one a key packet can hold
     again = dataclasses.replace(make_key(rng), gaussians=state.gaussians, layout=state.layout)
     assert len(encode_key(again).data) > 0 < len(key.data)
@@ -101,22 +99,22 @@ def test_a_stream_of_edits_never_loses_track(seed):
 def test_births_and_deaths_alone_are_a_packet():
     state = first_state(np.random.default_rng(1))
     for delta in (
-        closed(state.layout, deaths=np.array([3])),
-        closed(state.layout, in_nodes(make_scene(np.random.default_rng(2), 2), [4, 1], [0, 1])),
+        closed(deaths=np.array([3])),
+        closed(in_nodes(make_scene(np.random.default_rng(2), 2), [4, 1], [0, 1])),
     ):
         assert not delta.is_empty
         after = decode_packet(state, encode_delta(delta, state.layout, {}, frame=1).data)
-        assert len(after.gaussians) == len(next_layout(state.layout, delta).octree_levels) != 40
+        assert len(after.gaussians) == len(after.layout.unit_of) != 40
 
 
 def test_everything_may_leave_and_something_come_again():
     state = first_state(np.random.default_rng(3))
-    nothing = closed(state.layout, deaths=np.arange(40))
+    nothing = closed(deaths=np.arange(40))
     state = decode_packet(state, encode_delta(nothing, state.layout, {}, frame=1).data)
     assert len(state.gaussians) == 0
     assert len(state.layout.node_counts) == 12
     born = own_nodes(make_scene(np.random.default_rng(4), 5), np.zeros(5), 12)
-    state = decode_packet(state, encode_delta(closed(state.layout, born), state.layout, {}, frame=2).data)
+    state = decode_packet(state, encode_delta(closed(born), state.layout, {}, frame=2).data)
     assert same_bits(state.gaussians, quantise_key(born.gaussians))
     assert state.layout.node_counts.tolist() == [0] * 12 + [1] * 5
 
@@ -130,8 +128,8 @@ def _unfit():
     yield state, change(births, nodes=np.array([0, 1, 2, 14])), NONE, "nodes from 0 to 13"
     yield state, change(births, parents=np.array([12, 14])), NONE, "parent"
     yield state, change(births, parents=np.array([-1, 0])), NONE, "parent"
-    yield state, change(births, octree_levels=np.full(4, 3, np.uint8)), NONE, "cell size"
-    yield state, change(births, octree_levels=np.zeros(3, np.uint8)), NONE, "levels"
+    yield state, change(births, unit_of=np.full(4, 3, np.uint8)), NONE, "expected units 0 to 2"
+    yield state, change(births, unit_of=np.zeros(3, np.uint8)), NONE, "units like nodes"
     yield state, None, np.array([4, 4]), "deaths"
     yield state, None, np.array([5, 4]), "deaths"
     yield state, None, np.array([40]), "deaths"
@@ -144,13 +142,13 @@ def _unfit():
 def test_encoder_refuses_edits_that_do_not_fit(case):
     state, births, deaths, message = list(_unfit())[case]
     with pytest.raises(ShapeError, match=message):
-        encode_delta(closed(state.layout, births, deaths), state.layout, {}, frame=1)
+        encode_delta(closed(births, deaths), state.layout, {}, frame=1)
 
 
 def test_births_of_another_degree_are_refused_with_the_packets_offset():
     rng = np.random.default_rng(6)
     state = first_state(rng, sh_rest=3)
-    packet = encode_delta(closed(state.layout, make_births(rng, state.layout, 2, 0, 8)), state.layout, {}, frame=1)
+    packet = encode_delta(closed(make_births(rng, state.layout, 2, 0, 8)), state.layout, {}, frame=1)
     with pytest.raises(PacketError, match="shN") as caught:
         decode_packet(state, packet.data, offset=99)
     assert caught.value.offset == 99
@@ -161,7 +159,7 @@ def test_births_are_refused_once_most_of_them_are_equal():
     state = first_state(rng)
     many = in_nodes(make_scene(rng, 1).rows(np.zeros(200_000, np.int64)), np.zeros(200_000), np.zeros(200_000))
     with pytest.raises(ShapeError, match="Gaussians that differ"):
-        encode_delta(closed(state.layout, many), state.layout, {}, frame=1)
+        encode_delta(closed(many), state.layout, {}, frame=1)
 
 
 def _head(number: int, new: int) -> bytes:
@@ -185,7 +183,7 @@ def _head(number: int, new: int) -> bytes:
 def test_lies_about_births_are_refused_before_they_cost_anything(part, data):
     rng = np.random.default_rng(8)
     state = first_state(rng)
-    packet = encode_delta(closed(state.layout, make_births(rng, state.layout, 4, 2)), state.layout, {}, frame=1)
+    packet = encode_delta(closed(make_births(rng, state.layout, 4, 2)), state.layout, {}, frame=1)
     parts = unpack_blobs(parse_packet(packet.data)[1]["births"].data, HEAD_PARTS + len(ATTRIBUTES))
     parts[part] = data
     with pytest.raises(PacketError) as caught:
@@ -197,28 +195,29 @@ def test_lies_about_births_are_refused_before_they_cost_anything(part, data):
 def test_a_scene_cannot_grow_beyond_the_limit(monkeypatch):
     rng = np.random.default_rng(9)
     state = first_state(rng)
-    packet = encode_delta(closed(state.layout, make_births(rng, state.layout, 4, 2)), state.layout, {}, frame=1)
-    monkeypatch.setattr("gsstream.packet.delta.MAX_GAUSSIANS", 43)
+    packet = encode_delta(closed(make_births(rng, state.layout, 4, 2)), state.layout, {}, frame=1)
+    monkeypatch.setattr("gsstream.packet.changes.rows.MAX_GAUSSIANS", 43)
     with pytest.raises(PacketError, match="beyond the limits"):
-        decode_delta(packet.data, state.layout, {})
-    monkeypatch.setattr("gsstream.packet.delta.MAX_GAUSSIANS", 44)
-    assert len(decode_delta(packet.data, state.layout, {}).births) == 4
+        decode_delta(packet.data, state.scene, {})
+    monkeypatch.setattr("gsstream.packet.changes.rows.MAX_GAUSSIANS", 44)
+    assert len(decode_delta(packet.data, state.scene, {}).births) == 4
+    monkeypatch.undo()
     assert most_births(10) == 640
 
 
 @pytest.mark.parametrize("gone", [np.zeros(40, np.uint8), np.full(40, 2, np.uint8)])
 def test_lies_about_deaths_are_refused(gone):
     state = first_state(np.random.default_rng(10))
-    packet = encode_delta(closed(state.layout, deaths=np.array([1])), state.layout, {}, frame=1)
+    packet = encode_delta(closed(deaths=np.array([1])), state.layout, {}, frame=1)
     with pytest.raises(PacketError, match="deaths"):
         decode_packet(state, replaced(packet, "deaths", encode_gates(gone, 2 if gone.any() else 1)))
 
 
 def test_gates_are_shown_on_the_rows_they_moved():
     state = first_state(np.random.default_rng(11), 6, 2)
-    layout = Layout(np.int32([4, 2]), state.layout.octree_levels, state.layout.cell_sizes)
+    layout = Layout(np.int32([4, 2]), state.layout.unit_of, state.layout.units)
     born = in_nodes(make_scene(np.random.default_rng(12), 1), [0], [0])
-    delta = Delta(np.uint8([0, 2]), 4, births=born, deaths=np.array([0, 5]))
+    delta = Delta((Residual(np.uint8([0, 2]), 4), Rows(born, np.array([0, 5]))))
     assert row_gates(layout, delta).tolist() == [0, 0, 0, 1, 0.5]
 
 
@@ -233,12 +232,3 @@ def test_costs_of_births_are_accounted_for(tmp_path):
         assert found.coded >= found.entropy * 0.99 if found.kind != "empty" else found.coded == 0
         assert (found.float16_zstd > 0) == (state.delta is not None or found.kind == "key")
     assert stats.num_gaussians == len(decode_all(packets)[-1].gaussians)
-
-
-def test_a_stream_of_an_older_format_is_played_but_not_continued(tmp_path):
-    from make_samples import SAMPLES
-
-    path = tmp_path / "s.gss"
-    path.write_bytes((SAMPLES / "1.0" / "stream.gss").read_bytes())
-    with pytest.raises(OutputError, match=r"packet format 1\.0"):
-        StreamWriter.open(path, resume=True)

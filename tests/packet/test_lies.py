@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from packet_scenes import make_delta, make_key, replaced, resealed
 
-from gsstream.core.changes import Layout
+from gsstream.core.changes import Layout, Scene
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.packet import decode_delta, decode_key, encode_delta, encode_key
 from gsstream.packet.base import MAX_GAUSSIANS, parse_packet
@@ -27,8 +27,8 @@ def test_lying_counts_are_refused_before_allocation():
     liars = {
         "Gaussians": struct.pack("<IIB", many, 4, 3),
         "nodes": struct.pack("<IIB", 10, many, 3),
-        "levels": struct.pack("<IIB", 10, 4, 255),
-        "cells": struct.pack("<IIB", 10, 4, 3) + b"\0" * 5,
+        "units": struct.pack("<IIB", 10, 4, 255),
+        "units cut short": struct.pack("<IIB", 10, 4, 3) + b"\0" * 5,
         "just beyond": struct.pack("<IIB", MAX_GAUSSIANS + 1, 4, 3),
         "more than the bytes can mean": struct.pack("<IIB", most_gaussians(len(key.data) + 20) + 1, 4, 3),
     }
@@ -63,7 +63,7 @@ def test_histograms_beyond_the_limit_are_refused():
         head.bits(0, 1)
         body = pack_blobs([head.to_bytes(), b""])
         with pytest.raises(PacketError, match="histogram"):
-            decode_delta(replaced(packet, "means", prefix + body), state.layout, {})
+            decode_delta(replaced(packet, "means", prefix + body), Scene(state.gaussians, state.layout), {})
 
 
 @pytest.mark.parametrize(
@@ -76,14 +76,14 @@ def test_impossible_attribute_headers_are_refused(mode, channels, step):
     packet = encode_delta(make_delta(rng, state.layout, 1.0, 1, latent=False), state.layout, {}, frame=1)
     old = parse_packet(packet.data)[1]["means"].data
     with pytest.raises(PacketError):
-        decode_delta(replaced(packet, "means", struct.pack("<BBf", mode, channels, step) + old[6:]), state.layout, {})
+        decode_delta(replaced(packet, "means", struct.pack("<BBf", mode, channels, step) + old[6:]), Scene(state.gaussians, state.layout), {})
 
 
 def test_huge_residuals_cannot_overflow_the_scene():
     rng = np.random.default_rng(7)
     state = make_key(rng, 10, 4)
     delta = make_delta(rng, state.layout, 1.0, 1, latent=True)
-    delta.symbols["sh0"][:] = 2**31 - 1
+    delta.residual.symbols["sh0"][:] = 2**31 - 1
     packet = encode_delta(delta, state.layout, {}, frame=1)
     old = parse_packet(packet.data)[1]
     large = {
@@ -92,7 +92,7 @@ def test_huge_residuals_cannot_overflow_the_scene():
     }
     huge = resealed(packet, lambda name, data: large.get(name, data))
     with pytest.raises(PacketError, match="cannot be"):
-        decode_delta(huge, state.layout, {})
+        decode_delta(huge, Scene(state.gaussians, state.layout), {})
 
 
 @pytest.mark.parametrize("meta", [b"", b"[]", b"{}", b"[" * 100_000, b'{"version": NaN}', b"\xff\xfe", b"1" * 5000])
@@ -106,7 +106,7 @@ def test_more_equal_gaussians_than_readers_accept_are_not_written():
     number = 400_000
     state = make_key(np.random.default_rng(9), 1, 1)
     rows = np.zeros(number, np.int64)
-    layout = Layout(np.int32([number]), np.zeros(number, np.uint8), state.layout.cell_sizes)
+    layout = Layout(np.int32([number]), np.zeros(number, np.uint8), state.layout.units)
     with pytest.raises(ShapeError, match="Gaussians that differ"):
         encode_key(dataclasses.replace(state, gaussians=state.gaussians.rows(rows), layout=layout))
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from packet_scenes import decode_all, make_delta, make_key, make_layout, make_meta, make_packets, make_scene, same_bits
 
-from gsstream.core.changes import Delta, Layout, apply_delta
+from gsstream.core.changes import Delta, Layout, Residual, Scene, apply_delta
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.packet import (
     KeyState,
@@ -166,17 +166,19 @@ def test_delta_round_trip(seed, number, nodes, share, levels, latent):
     state = make_key(rng, number, nodes)
     delta = make_delta(rng, state.layout, share, levels, latent)
     packet = encode_delta(delta, state.layout, {}, frame=1)
-    decoded = decode_delta(packet.data, state.layout, {})
-    assert np.array_equal(decoded.gates, delta.gates)
-    assert decoded.num_levels == levels
-    assert set(decoded.symbols) == set(delta.symbols)
-    for name in delta.symbols:
-        assert np.array_equal(decoded.symbols[name], delta.symbols[name])
-        assert np.float32(decoded.steps[name]) == np.float32(delta.steps[name])
-    for name in delta.decoders:
-        assert decoded.decoders[name].tobytes() == delta.decoders[name].tobytes()
-    scene = quantise_key(state.gaussians)
-    assert same_bits(apply_delta(scene, state.layout, decoded), apply_delta(scene, state.layout, delta))
+    scene = Scene(quantise_key(state.gaussians), state.layout)
+    decoded = decode_delta(packet.data, scene, {})
+    found, sent = decoded.residual, delta.residual
+    assert decoded.changes == (found,)
+    assert np.array_equal(found.gates, sent.gates)
+    assert found.num_levels == levels
+    assert set(found.symbols) == set(sent.symbols)
+    for name in sent.symbols:
+        assert np.array_equal(found.symbols[name], sent.symbols[name])
+        assert np.float32(found.steps[name]) == np.float32(sent.steps[name])
+    for name in sent.decoders:
+        assert found.decoders[name].tobytes() == sent.decoders[name].tobytes()
+    assert same_bits(apply_delta(scene, decoded).gaussians, apply_delta(scene, delta).gaussians)
 
 
 def test_sizes_account_for_every_byte():
@@ -199,13 +201,15 @@ def test_decoders_are_sent_only_when_they_change():
     state = make_key(rng)
     delta = make_delta(rng, state.layout)
     first = encode_delta(delta, state.layout, {}, frame=1)
-    again = encode_delta(delta, state.layout, delta.decoders, frame=2)
+    decoders = delta.residual.decoders
+    again = encode_delta(delta, state.layout, decoders, frame=2)
     assert "decoders" in first.sizes
     assert "decoders" not in again.sizes
-    decoded = decode_delta(again.data, state.layout, delta.decoders)
-    assert decoded.decoders["sh0"].tobytes() == delta.decoders["sh0"].tobytes()
+    scene = Scene(quantise_key(state.gaussians), state.layout)
+    decoded = decode_delta(again.data, scene, decoders)
+    assert decoded.residual.decoders["sh0"].tobytes() == decoders["sh0"].tobytes()
     with pytest.raises(PacketError, match="never sent"):
-        decode_delta(again.data, state.layout, {})
+        decode_delta(again.data, scene, {})
 
 
 def test_a_key_packet_forgets_the_decoders():
@@ -224,7 +228,7 @@ def test_decoder_rounding_is_idempotent_and_refuses_overflow():
 def _broken_deltas():
     rng = np.random.default_rng(7)
     state = make_key(rng)
-    delta = make_delta(rng, state.layout)
+    delta = make_delta(rng, state.layout).residual
     rows = delta.symbols["means"].shape[0]
     change = dataclasses.replace
     yield state.layout, change(delta, gates=delta.gates[:-1]), "gates"
@@ -243,9 +247,9 @@ def _broken_deltas():
 
 @pytest.mark.parametrize("case", range(11))
 def test_encoder_refuses_deltas_that_do_not_fit(case):
-    layout, delta, message = list(_broken_deltas())[case]
+    layout, residual, message = list(_broken_deltas())[case]
     with pytest.raises(ShapeError, match=message):
-        encode_delta(delta, layout, {}, frame=1)
+        encode_delta(Delta((residual,)), layout, {}, frame=1)
 
 
 def test_a_delta_needs_the_frame_before_it():
@@ -261,7 +265,7 @@ def test_a_delta_of_another_scene_is_refused():
     rng = np.random.default_rng(8)
     first, second = make_key(rng, 40, 12, 3), make_key(rng, 40, 12, 8)
     rows = int(first.layout.node_counts.sum())
-    delta = Delta(np.ones(12, np.uint8), 1, {"shN": np.ones((rows, 9), np.int32)}, {"shN": 0.1})
+    delta = Delta((Residual(np.ones(12, np.uint8), 1, {"shN": np.ones((rows, 9), np.int32)}, {"shN": 0.1}),))
     packet = encode_delta(delta, first.layout, {}, frame=1)
     state = decode_packet(None, encode_key(second).data)
     with pytest.raises(PacketError) as caught:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from packet_scenes import decode_all, make_delta, make_key, make_packets, same_bits, write_stream
 
-from gsstream.core.changes import apply_delta
+from gsstream.core.changes import Scene, apply_delta
 from gsstream.core.errors import InputError, OutputError, PacketError, SourceError
 from gsstream.packet import (
     PacketKind,
@@ -59,17 +59,17 @@ def test_three_hundred_frames_without_drift(tmp_path):
     """The encoder adds up its own symbols, the player what it reads: equal bits, not tolerances, after every frame."""
     rng = np.random.default_rng(12)
     key = make_key(rng, 120, 30)
-    scene, decoders, expected = quantise_key(key.gaussians), {}, []
+    scene, decoders, expected = Scene(quantise_key(key.gaussians), key.layout), {}, []
     with StreamWriter.open(tmp_path / "s.gss") as writer:
         writer.append(encode_key(key))
-        expected.append(scene)
+        expected.append(scene.gaussians)
         for frame in range(1, 300):
             delta = make_delta(rng, key.layout, share=0.1, latent=frame % 7 == 0)
             packet = encode_delta(delta, key.layout, decoders, frame=frame)
             decoders = next_decoders(decoders, delta)
-            scene = apply_delta(scene, key.layout, delta)
+            scene = apply_delta(scene, delta)
             writer.append(packet)
-            expected.append(scene)
+            expected.append(scene.gaussians)
     with Playback(tmp_path / "s.gss") as playback:
         for frame, shown in playback:
             assert same_bits(shown, expected[frame])

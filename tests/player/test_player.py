@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.changes import Delta, Layout
+from gsstream.core.changes import Delta, Layout, Residual
 from gsstream.core.errors import InputError, ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.packet import KeyState, StreamMeta, StreamWriter, encode_delta, encode_empty, encode_key
@@ -70,7 +70,7 @@ def make_stream(path, frames=5):
         for frame in range(1, frames):
             gates = (rng.random(len(scene)) < 0.3).astype(np.uint8)
             moves = {"means": rng.integers(-9, 10, (int(gates.sum()), 3)).astype(np.int32)}
-            delta = encode_delta(Delta(gates, 1, moves, {"means": 0.02}), layout, {}, frame=frame)
+            delta = encode_delta(Delta((Residual(gates, 1, moves, {"means": 0.02}),)), layout, {}, frame=frame)
             writer.append(encode_empty(frame=frame) if frame == 2 else delta)
     return path
 

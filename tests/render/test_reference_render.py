@@ -11,6 +11,7 @@ import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
+from gsstream.render.base import Renderer
 from gsstream.render.reference import ReferenceRenderer, evaluate_sh, project
 
 F, W, H = 20.0, 14, 10
@@ -172,6 +173,17 @@ def test_what_leaves_a_trace_is_visible() -> None:
     assert bool((visible | ~traces).all())
     assert 3 < int(traces.sum()) < 57
     assert int(visible.sum()) <= int(traces.sum()) + 10
+
+
+def test_a_renderer_without_any_screen_gradient_says_so() -> None:
+    class Draws(Renderer):
+        def render(self, gaussians, cameras, view, background):  # type: ignore[no-untyped-def]
+            return ReferenceRenderer().render(gaussians, cameras, view, background)
+
+    session = Draws().open(scene([[0, 0, 2.0]]), None, camera(), BLACK)
+    assert session.visible(0, torch.ones(1, 1, dtype=torch.bool)).tolist() == [True]
+    with pytest.raises(NotImplementedError, match="Draws: expected 'screen_gradient'"):
+        session.screen_gradient(0, torch.ones(H, W, 3))
 
 
 def test_visible_is_whose_colour_matters_in_the_marked_tiles() -> None:

@@ -77,3 +77,19 @@ def test_recordings_at_hand_raise_no_alarm(name: str) -> None:
         pytest.skip(f"the recording {name} is not here")
     found = validate(lambda scale: open_source(str(RECORDINGS / name), scale), frames=10, features=False)
     assert [finding for finding in found if finding.severity != "note"] == []
+
+
+def test_what_a_fault_is_follows_from_its_kind_and_not_from_its_words() -> None:
+    """A message may be reworded; the finding's code is a promise to scripts."""
+    from gsstream.core.errors import SourceError
+    from gsstream.scene.validate import validate
+    from gsstream.source.base import FilesMissing
+
+    def fails(fault: SourceError):
+        def open_scene(scale: float):
+            raise fault
+
+        return [finding.code for finding in validate(open_scene)]
+
+    assert fails(FilesMissing("reworded")) == ["files"]
+    assert fails(SourceError("3 frames are missing from what I think")) == ["calibration"]

@@ -232,3 +232,40 @@ def test_a_rig_of_videos_from_many_threads(tmp_path: Path) -> None:
         for train, test in frames:
             np.testing.assert_array_equal(np.round(train.images * 255), world.pictures[train.index, 1:])
             np.testing.assert_array_equal(np.round(test.images * 255), world.pictures[test.index, :1])
+
+
+@pytest.mark.parametrize("degrees", [90, -90, 180, 0])
+def test_a_film_of_a_turned_phone_comes_upright(degrees: int, tmp_path: Path) -> None:
+    """The display matrix says how to turn what is stored; ``rotation`` counts counterclockwise."""
+    from gsstream.scene.raw import find_cameras
+
+    stored = numbered(3)
+    for camera in ("a", "b"):
+        path = tmp_path / f"{camera}.mp4"
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream("libx264rgb", rate=30)
+            stream.height, stream.width = stored.shape[1:3]
+            stream.pix_fmt, stream.options = "rgb24", {"qp": "0", "bf": "0"}
+            stream.set_display_rotation(degrees)
+            for picture in stored:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            container.mux(stream.encode())
+    with av.open(str(path)) as container:
+        told = next(container.decode(video=0)).rotation
+    assert abs(told) == abs(degrees), "the sign is the library's, the turn is what it tells"
+    expected = np.rot90(stored, told // 90, axes=(1, 2))
+    clip = VideoClip(path)
+    assert clip.size == (expected.shape[2], expected.shape[1])
+    for index in (2, 0, 1):
+        assert np.array_equal(np.rint(clip.read(index, clip.size) * 255).astype(np.uint8), expected[index])
+    camera = find_cameras(tmp_path)[0]
+    assert camera.size == clip.size
+    for image, picture in zip(camera.frames(None), expected, strict=True):
+        assert np.array_equal(np.rint(image * 255).astype(np.uint8), picture)
+
+
+def test_a_film_turned_by_a_crooked_angle_is_refused(tmp_path: Path) -> None:
+    from gsstream.source.video import upright
+
+    with pytest.raises(SourceError, match="multiple of 90"):
+        upright(np.zeros((2, 3, 3), np.uint8), 45, tmp_path / "x.mp4")

@@ -11,7 +11,7 @@ import zstandard
 from test_player import make_stream
 
 from gsstream.cli.main import run_command
-from gsstream.core.changes import Delta, Layout
+from gsstream.core.changes import Delta, Layout, Residual
 from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import Gaussians
 from gsstream.packet import KeyState, StreamReader, StreamWriter, encode_delta, encode_empty, encode_key
@@ -92,7 +92,7 @@ def test_large_tables_are_coded_within_four_percent_of_their_entropy(tmp_path):
     symbols = {n: np.rint(rng.laplace(size=(rows, w)) * 2).astype(np.int32) for n, w in widths.items()}
     with StreamWriter.open(tmp_path / "s.gss") as writer:
         writer.append(encode_key(KeyState(scene, layout, meta)))
-        writer.append(encode_delta(Delta(gates, 1, symbols, dict.fromkeys(widths, 0.01)), layout, {}, frame=1))
+        writer.append(encode_delta(Delta((Residual(gates, 1, symbols, dict.fromkeys(widths, 0.01)),)), layout, {}, frame=1))
         writer.append(encode_empty(frame=2))
     stats = stream_stats(tmp_path / "s.gss")
     assert 1 <= stats.efficiency("key") < 1.01

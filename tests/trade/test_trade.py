@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.changes import Delta, Layout
+from gsstream.core.changes import Delta, Layout, Residual
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
@@ -51,7 +51,7 @@ def make_stream(path):
     layout = Layout(np.int32([2, 18, 10, 10]), np.zeros(number, np.uint8), np.float32([1]))
     jump = np.zeros((2, 3), np.int32)
     jump[:, 0] = 4
-    delta = Delta(np.array([1, 0, 0, 0], np.uint8), 1, {"means": jump}, {"means": 0.1})
+    delta = Delta((Residual(np.array([1, 0, 0, 0], np.uint8), 1, {"means": jump}, {"means": 0.1}),))
     with StreamWriter.open(path) as writer:
         writer.append(encode_key(KeyState(scene, layout, meta)))
         for frame in (1, 2, 3):

@@ -20,7 +20,7 @@ def checks() -> str:
         "`gsstream.testing.parametrize_with_checks` makes one test of each. A check with a claim is made on parts",
         "whose traits claim it, and is otherwise skipped and counted. Each check has a saboteur: a "
         "part that is wrong in one",
-        "way and fails this check alone: [the whole table](saboteurs.md).",
+        "way and fails this check alone.",
         "",
     ]
     kinds = list(dict.fromkeys(entry.kind for entry in all_checks()))
@@ -59,9 +59,9 @@ ELSEWHERE = {
 def hooks() -> str:
     """Every hook, what it returns, and what a part of each kind has to implement, with exact signatures."""
     from gsstream.cli.plugins import setting_rows
+    from gsstream.core.kinds import CONTRACTS, PART_KINDS
     from gsstream.core.part import Traits
     from gsstream.plugins import hookspecs
-    from gsstream.plugins.catalog import CONTRACTS
     from gsstream.source.base import FrameSource
     from gsstream.spec import KINDS, ComponentSpec, MethodSpec
 
@@ -91,8 +91,11 @@ def hooks() -> str:
     usage = "`auto_rules = {SETTING: rule}`, `rule(facts, settings) -> Choice(value, why, ladder=())`"
     lines += ["## Rules of `auto`", "", usage]
     lines += ["([how](../howto/auto.md)). What a rule is told:", "", "```", rules, "```", ""]
-    lines += ["## Traits", "", "What a part claims, `traits = Traits(...)`; each claim calls for checks.", ""]
-    lines += ["```", inspect.getdoc(Traits) or "", "```", ""]
+    lines += ["## Traits", "", "What a part claims, `traits = GateTraits(...)`; each claim calls for checks.", ""]
+    for kind in PART_KINDS.values():
+        record = Traits if kind.contract is None else type(kind.contract_class().traits)
+        if record is not Traits:
+            lines += [f"### {record.__name__}", "", "```", inspect.getdoc(record) or "", "```", ""]
     return "\n".join(lines)
 
 

@@ -151,12 +151,12 @@ def draw_case(seed: int, index: int, catalog: Catalog) -> Case:
         settings["data.train_views"] = int(rng.integers(2, views))
     if width * height <= REFERENCE_PIXELS and rng.random() < 0.2:
         settings["renderer"] = "reference"
-    whole = whole_of(method, catalog)
-    if whole is not None:
-        heeds = getattr(catalog.resolve("whole", whole), "heeds", ())
+    stepper = stepper_of(method, catalog)
+    if stepper is not None:
+        heeds = getattr(catalog.resolve("stepper", stepper), "heeds", ())
         read = (*heeds, *SESSION_KEYS)
         settings = {k: v for k, v in settings.items() if k in read or k.partition(".")[0] not in PART_SECTIONS}
-        settings |= dict(_settings_of(catalog, "whole", whole, rng, share))
+        settings |= dict(_settings_of(catalog, "stepper", stepper, rng, share))
     else:
         settings |= {key: draw(rng) for key, draw in OF_PARTS.items() if rng.random() < share}
         settings |= _parts(catalog, rng, share)
@@ -164,12 +164,12 @@ def draw_case(seed: int, index: int, catalog: Catalog) -> Case:
     return Case(seed, index, source, method, tuple(settings.items()))
 
 
-def whole_of(method: str, catalog: Catalog) -> str | None:
-    """The whole method behind a method's name; None where it is made of parts."""
+def stepper_of(method: str, catalog: Catalog) -> str | None:
+    """The stepper behind a method's name; None where it is made of parts."""
     from gsstream.recipe.load import resolve_recipe
 
-    name = resolve_recipe(method, catalog.recipe_path).recipe.whole.name
-    return None if name == "none" else name
+    name = resolve_recipe(method, catalog.recipe_path).recipe.stepper.name
+    return None if name == "parts" else name
 
 
 def _parts(catalog: Catalog, rng: Generator, share: float) -> dict[str, Any]:

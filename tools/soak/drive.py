@@ -17,9 +17,9 @@ import numpy as np
 
 from gsstream.core.errors import ComponentError, InputError, PluginUnavailable, ShapeError
 from gsstream.engine.assembly.assemble import Assembly, assemble
+from gsstream.engine.method.held import RepeatedFrameWarning
 from gsstream.engine.run.recording import open_recording
 from gsstream.engine.run.session import METRICS, STREAM, run
-from gsstream.engine.step.frame_step import RepeatedFrameWarning
 from gsstream.method.base import Step
 from gsstream.packet import PlayerState
 from gsstream.player.playback import Playback
@@ -129,8 +129,8 @@ def _play(stream: Path, digests: list[str], background: tuple[float, float, floa
 def digest(state: PlayerState) -> str:
     """SHA-256 of all that a player has: scene, layout, decoders."""
     layout = state.layout
-    arrays = [*(value for _, value in state.gaussians.items()), layout.node_counts, layout.octree_levels]
-    arrays += [layout.cell_sizes, *(state.decoders[name] for name in sorted(state.decoders))]
+    arrays = [*(value for _, value in state.gaussians.items()), layout.node_counts, layout.unit_of]
+    arrays += [layout.units, *(state.decoders[name] for name in sorted(state.decoders))]
     sums = hashlib.sha256(" ".join(sorted(state.decoders)).encode())
     for array in arrays:
         sums.update(f"{array.dtype}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())

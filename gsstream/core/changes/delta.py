@@ -108,7 +108,10 @@ def apply_delta(scene: Scene, delta: Delta) -> Scene:
 
 
 def row_gates(layout: Layout, delta: Delta) -> FloatArray:
-    """Return the gate, 0 to 1, [N'] float32 of every row after the delta; ``layout`` is that before it. Births are open."""
+    """Return the gate [N'] float32, 0 to 1, of every row after the delta; births are open.
+
+    ``layout`` is that before the delta.
+    """
     residual = delta.residual
     if residual is None:
         gates = np.zeros(len(layout.unit_of), np.float32)

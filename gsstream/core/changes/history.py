@@ -1,4 +1,4 @@
-"""Displacement: how far rows were moved by the last frame. Both ends compute it, so a motion can be predicted from it."""
+"""Displacement: how far rows were moved by the last frame. Both ends compute it, to predict motions from it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ def displacement(
     before: Gaussians[FloatArray], after: Gaussians[FloatArray], rows: IntArray
 ) -> Displacement | None:
     """Measure what a frame did to ``rows`` [A], ascending, all that it may have touched; None when nothing moved."""
-    shift = after.means[rows] - before.means[rows]
+    with np.errstate(over="ignore"):  # beyond float32 it is infinite; a motion predicted from that is refused
+        shift = after.means[rows] - before.means[rows]
     turn = turn_between(before.quats[rows], after.quats[rows])
     some = (shift != 0).any(1) | (turn != 0).any(1)
     return Displacement(rows[some], shift[some], turn[some]) if bool(some.any()) else None

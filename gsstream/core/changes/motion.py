@@ -1,8 +1,8 @@
 """Motion: groups of rows move rigidly, positions and orientations, as predicted from the last frame and corrected.
 
-A residual that is learned from zero in every frame cannot travel as far as a body does, so Gaussians are left behind and
-the body is repainted with what happens to stand there. A motion carries them along: it costs a bit or so per group where
-the prediction holds, and six small integers where it does not.
+A residual that is learned from zero in every frame cannot travel as far as a body does, so Gaussians are left behind
+and the body is repainted with what happens to stand there. A motion carries them along: it costs a bit or so per group
+where the prediction holds, and six small integers where it does not.
 """
 
 from __future__ import annotations
@@ -40,16 +40,17 @@ class Groups:
     group_of: IntArray
     count: int
 
-    def gathered(self, source: IntArray) -> Groups:
-        """Return the groups of the rows after births and deaths; a birth joins the group of the row stored before it."""
-        number = len(self.group_of)
-        if number == 0 or len(source) == 0:
-            return replace(self, group_of=np.zeros(len(source), np.int32))
-        old = source < number
+    def gathered(self, source: IntArray) -> Groups | None:
+        """Return the groups of the rows after births and deaths; a birth joins the group of the row stored before it.
+
+        Without any row that was there before, there is nothing to join: None.
+        """
+        old = source < len(self.group_of)
+        if not bool(old.any()):
+            return None
         before = np.maximum.accumulate(np.where(old, np.arange(len(source)), -1))
         before[before < 0] = int(np.argmax(old))
-        known = np.where(old, source, 0)[before]
-        return replace(self, group_of=self.group_of[known])
+        return replace(self, group_of=self.group_of[source[before]])
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +174,7 @@ def transformed(gaussians: Gaussians[FloatArray], moves: Moves) -> Gaussians[Flo
     x, y, z = offset.T
     turned = np.stack([matrix[:, i, 0] * x + matrix[:, i, 1] * y + matrix[:, i, 2] * z for i in range(3)], 1)
     means, turns = gaussians.means.copy(), gaussians.quats.copy()
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         means[rows] = (turned + centre + moves.shift[place]).astype(np.float32)
     if not bool(np.isfinite(means[rows]).all()):
         raise ShapeError("motion: it leads to positions beyond the range of float32")

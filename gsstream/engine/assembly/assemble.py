@@ -57,7 +57,8 @@ class Assembly:
         origins: path -> origin of every value that is not a default (for ``recipe.save.save_resolved``).
         distributions: installed distributions that the parts come from.
         checks: how closely the run looks at what parts return; nothing that is sent depends on it.
-        pending: paths of values that are still ``auto``; the parts have their defaults there (``engine.auto.rules.settle``).
+        pending: paths of values that are still ``auto``; the parts have their defaults there
+            (``engine.auto.rules.settle``).
         chosen: key -> what the scene decided.
         where: the frame and iteration that errors name.
 

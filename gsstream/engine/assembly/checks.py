@@ -13,7 +13,6 @@ from enum import StrEnum
 import torch
 
 from gsstream.core.errors import InputError
-from gsstream.core.gaussians import Gaussians
 from gsstream.engine.assembly.fault import fault
 from gsstream.engine.assembly.where import Where
 
@@ -83,13 +82,11 @@ class Look:
         order = list(Checks)
         return order.index(self.level) >= order.index(least)
 
-    def step_values(self, what: str, value: torch.Tensor | Gaussians[torch.Tensor] | Mapping[str, torch.Tensor]) -> None:
-        """With the level "step": :meth:`values` on a tensor, or on each of several, whose name then follows ``what``."""
-        if self.level is not Checks.STEP:
-            return
-        named = {what: value} if isinstance(value, torch.Tensor) else {f"{what} {n}": v for n, v in value.items()}
-        for name, tensor in named.items():
-            self.values(name, tensor)
+    def step_values(self, what: str, values: Mapping[str, torch.Tensor]) -> None:
+        """With the level "step", look at each of several tensors (:meth:`values`); their names follow ``what``."""
+        if self.level is Checks.STEP:
+            for name, tensor in values.items():
+                self.values(f"{what} {name}", tensor)
 
     def values(
         self, what: str, value: torch.Tensor, *, limits: tuple[float, float] | None = None,
@@ -122,7 +119,10 @@ class Look:
 def wrong_value(
     value: torch.Tensor, limits: tuple[float, float] | None = None, rows: torch.Tensor | None = None
 ) -> str:
-    """Say which number is not finite or not within ``limits``; empty when all are. ``rows`` as in :meth:`Look.values`."""
+    """Say which number is not finite or not within ``limits``; empty when all are.
+
+    ``rows`` as in :meth:`Look.values`.
+    """
     if value.numel() == 0:
         return ""
     value = value.detach()

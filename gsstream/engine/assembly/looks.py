@@ -1,5 +1,7 @@
 """What is looked at behind each call of a part: one entry per kind and function, nothing else checks by hand."""
 
+# ruff: noqa: ARG001  # a table of functions with one signature
+
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping

@@ -1,7 +1,7 @@
 """A trial: frame 0 as a run makes it, packet and all, with fewer passes and without the cameras that judge it. Ours.
 
 It is made once for every fold, each without other cameras: three cameras have liked one of two scenes as much as the
-other, and three others told them apart by 0.4 dB (docs/results-auto.md).
+other, and three others told them apart by 0.4 dB (docs/results/auto.md).
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """``auto`` tried out: short frames 0 without some of the training cameras, judged on those. Ours.
 
 A rule knows the cameras and the seeds, not what they are worth: how many Gaussians a scene can pin down shows in a
-camera that nobody fitted. So the rules say where to begin and which way to look (``engine.auto.rules``), trials say how good
-a place is (``engine.auto.short_fits``), and a search goes on step by step while it gets better (``engine.auto.climb``).
+camera that nobody fitted. So the rules say where to begin and which way to look (``engine.auto.rules``), trials say how
+good a place is (``engine.auto.short_fits``), and a search goes on step by step while it gets better
+(``engine.auto.climb``).
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ WINDOW = 5
 #: Share of a time budget that is planned with; the rest is for what no plan sees coming.
 TIME_MARGIN = 0.93
 #: Below this share of a size budget the weight falls; above this multiple it rises. In between the packet is trimmed:
-#: that takes 43 % of the bytes for less than any weight does (docs/results-budget.md).
+#: that takes 43 % of the bytes for less than any weight does (docs/results/budget.md).
 SIZE_AIM, MOST_TRIMMED = 0.94, 2.0
 #: Share of a time that is kept at most for what follows the passes while no frame has shown what it costs.
 UNKNOWN_RESERVE = 0.2
@@ -28,7 +28,7 @@ UNKNOWN_RESERVE = 0.2
 FIXED_SHARE = 0.3
 #: Fewer passes than this are worth less than fewer candidates.
 LEAST_EPOCHS = 4
-#: Weights of the rate that the controller may use; recipes ship 3e-4, which halves the bytes (docs/results-stream.md).
+#: Weights of the rate that the controller may use; recipes ship 3e-4, which halves the bytes (docs/results/stream.md).
 LEAST_WEIGHT, MOST_WEIGHT = 3e-5, 3e-2
 #: Steps get at most this much coarser.
 MOST_STEP_SCALE = 4.0
@@ -193,7 +193,7 @@ def _weight(budget: Budget, stream: Stream, recent: Sequence[Past]) -> float:
     """The recipe's, or less where the last frame left bytes over.
 
     Never more: a residual that is taxed from the first pass on does not grow to what it should be. To let it grow and
-    to trim the packet is better by far at equal bytes (docs/results-budget.md).
+    to trim the packet is better by far at equal bytes (docs/results/budget.md).
     """
     start = stream.rate_weight or LEAST_WEIGHT
     if recent and budget.size is not None:

@@ -42,7 +42,8 @@ class Judge:
         """
         if view not in self._targets:
             self._targets[view] = self._loss.prepare(torch.from_numpy(self._images[view]))
-        value, gradient = self._loss.evaluate(self.recorded(view, image.detach()), self._targets[view], self._dssim, tiles)
+        recorded = self.recorded(view, image.detach())
+        value, gradient = self._loss.evaluate(recorded, self._targets[view], self._dssim, tiles)
         pull_back([image], [self.exposure.pull(view, gradient) if self.exposure else gradient])
         return value, gradient
 

@@ -22,7 +22,7 @@ from gsstream.source.base import SourceInfo
 
 
 class Ended(NamedTuple):
-    """Where a stream ends: what players have then, the frame of the picture that this scene shows, the last key frame."""
+    """Where a stream ends: what players have, the frame whose picture this scene shows, the last key frame."""
 
     player: PlayerState
     shown: int

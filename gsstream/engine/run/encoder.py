@@ -22,7 +22,7 @@ from gsstream.engine.frame0.begin import cloud_of
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.frame0.root import Progress
 from gsstream.engine.keys.resume import check_stream, ended, since_key
-from gsstream.engine.run.held import begin_held, step_held
+from gsstream.engine.method.held import begin_held, step_held
 from gsstream.engine.run.threads import one_torch_thread
 from gsstream.engine.step.tools import RunTools
 from gsstream.method.base import Step
@@ -54,8 +54,8 @@ class Listeners:
 class Encoder:
     """Encodes the frames of one recording with one method, in memory.
 
-    :meth:`encode` takes the frames in order and returns a :class:`gsstream.method.base.Step` for each: its ``packet`` is
-    what a player reads, its ``metrics`` say what the frame cost. A frame that fails leaves the encoder as it was.
+    :meth:`encode` takes the frames in order and returns a :class:`gsstream.method.base.Step` for each: its ``packet``
+    is what a player reads, its ``metrics`` say what the frame cost. A frame that fails leaves the encoder as it was.
 
     Arguments:
         parts: the live parts of a recipe (``engine.assembly.assemble``).

@@ -11,7 +11,7 @@ import torch
 from gsstream.core.frame import Frame
 from gsstream.core.shapes import FloatArray
 from gsstream.method.base import MethodState
-from gsstream.metrics import moving_mask, noise_sigma, psnr, ssim
+from gsstream.metrics import changed_mask, moving_mask, noise_sigma, psnr, ssim
 from gsstream.render.base import Renderer
 
 
@@ -34,13 +34,14 @@ class HeldOut:
         elif not self._sigma:
             pairs = zip(self._first.images, frame.images, strict=True)
             self._sigma = [noise_sigma(a, b) for a, b in pairs]
-        out: dict[str, Any] = {"psnr": {}, "ssim": {}, "psnr_moving": {}}
+        out: dict[str, Any] = {"psnr": {}, "ssim": {}, "psnr_moving": {}, "psnr_changed": {}}
         for view, name in enumerate(frame.cameras.ids):
             image = self.render(state, frame, view)
             truth = frame.images[view]
             out["psnr"][name] = _finite(psnr(image, truth))
             out["ssim"][name] = _finite(ssim(image, truth))
             out["psnr_moving"][name] = self._moving(image, truth, view)
+            out["psnr_changed"][name] = _finite(psnr(image, truth, changed_mask(truth, self._first.images[view])))
         return out
 
     def remember(self, first: Frame, second: Frame | None) -> None:

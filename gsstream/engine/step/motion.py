@@ -10,6 +10,7 @@ import torch
 from gsstream.core.changes import Motion, Scene
 from gsstream.core.changes.motion import apply_motion
 from gsstream.core.frame import Frame
+from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.active.change import Change
@@ -24,7 +25,7 @@ class Moved(NamedTuple):
     view: FrameView
 
 
-def moved(parts: Assembly, state: StreamState, frame: Frame, change: Change | None) -> Moved:
+def moved(parts: Assembly, state: StreamState, frame: Frame, change: Change | None, rng: Rng) -> Moved:
     """Ask the motion part, and apply what it proposes as every player will.
 
     Raises ComponentError when the part fails, ShapeError when its motions do not fit the scene.
@@ -33,7 +34,7 @@ def moved(parts: Assembly, state: StreamState, frame: Frame, change: Change | No
     view = FrameView(
         parts, state.gaussians, state.hierarchy, frame, state.previous, state.exposure, change, state.session
     )
-    motions = tuple(motion for motion in parts.motion.propose(scene, view) if not motion.is_empty)
+    motions = tuple(motion for motion in parts.motion.propose(scene, view, rng) if not motion.is_empty)
     if not motions:
         return Moved((), scene, view)
     touched = np.zeros(0, np.int64)

@@ -24,7 +24,7 @@ _MAX_SHIFT = 1e18
 
 
 def encode_motions(motions: tuple[Motion, ...]) -> list[tuple[str, bytes]]:
-    """Return the section that holds the motions of a frame; none without any. Raises ShapeError for what is no motion."""
+    """Return the section that holds the motions of a frame; none without any. Raises ShapeError for a bad one."""
     if not motions:
         return []
     if len(motions) > MAX_MOTIONS:
@@ -57,6 +57,7 @@ def _encode(motion: Motion) -> bytes:
         problem = f"symbols: expected [{int(np.count_nonzero(moving))}, 6], got {list(motion.symbols.shape)}"
     if problem is None and motion.symbols.dtype != np.int32:
         problem = f"symbols: expected int32, got {motion.symbols.dtype}"
+    problem = problem or _too_far(motion)
     if problem:
         raise ShapeError(f"motion: {problem}")
     flags = _PREDICTED * motion.predicted | _REGROUP * motion.regroup
@@ -81,10 +82,11 @@ def _decode(data: bytes, scene: Scene) -> Motion:
     if levels != 1:
         raise PacketError("motion: groups move or stand still, there are no levels")
     symbols = decode_symbols(table, int(np.count_nonzero(moving)), 6)
-    largest = float(np.abs(symbols.astype(np.float64)).max()) if symbols.size else 0.0
-    if largest * max(shift_step, turn_step) > _MAX_SHIFT:
-        raise PacketError(f"motion: a correction of {largest * max(shift_step, turn_step):g} cannot be")
-    return Motion(cell, shades, moving, symbols, shift_step, turn_step, bool(flags & _PREDICTED), regroup)
+    motion = Motion(cell, shades, moving, symbols, shift_step, turn_step, bool(flags & _PREDICTED), regroup)
+    problem = _too_far(motion)
+    if problem:
+        raise PacketError(f"motion: {problem}")
+    return motion
 
 
 def _misfit(motion: Motion) -> str | None:
@@ -96,3 +98,12 @@ def _misfit(motion: Motion) -> str | None:
     if not 1 <= motion.shades <= MAX_SHADES or not math.isfinite(motion.cell):
         return f"shades: expected 1 to {MAX_SHADES}, got {motion.shades}"
     return None
+
+
+def _too_far(motion: Motion) -> str | None:
+    """Why the corrections of a motion cannot be; None when they can."""
+    if motion.symbols.size == 0:
+        return None
+    sizes = np.abs(motion.symbols.astype(np.float64)).max(0)
+    largest = max(float(sizes[:3].max()) * motion.shift_step, float(sizes[3:].max()) * motion.turn_step)
+    return f"a correction of {largest:g} cannot be, expected at most {_MAX_SHIFT:g}" if largest > _MAX_SHIFT else None

@@ -103,7 +103,7 @@ def _check_residual(residual: Residual, layout: Layout) -> None:
     unknown = set(residual.symbols) - set(ATTRIBUTES)
     if unknown or set(residual.symbols) - set(residual.steps) or set(residual.decoders) - set(residual.symbols):
         raise ShapeError(
-            "residual: expected symbols and a step per attribute, decoders only where there are symbols; got symbols of "
+            "residual: expected symbols and a step per attribute, decoders only where symbols are; got symbols of "
             f"{sorted(residual.symbols)}, steps of {sorted(residual.steps)}, decoders of {sorted(residual.decoders)}"
         )
     for name, table in residual.symbols.items():

@@ -1,4 +1,4 @@
-"""Rows of a delta packet, sections deaths and births: rows that leave as runs, rows that come coded like those of a key packet."""
+"""Rows of a delta packet: those that leave as runs (deaths), those that join coded as in a key packet (births)."""
 
 from __future__ import annotations
 

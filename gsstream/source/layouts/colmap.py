@@ -16,7 +16,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import PointCloud
 from gsstream.core.shapes import FloatArray
-from gsstream.source.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip, images_in
+from gsstream.source.clips import PREPARE, VIDEO_SUFFIXES, Clip, ImageClip, folder_clip, images_in
 from gsstream.source.distortion import Lens
 from gsstream.source.layouts.colmap_model import (
     ModelCamera,
@@ -62,7 +62,7 @@ def read(folder: Path) -> Recording:
             lenses[name] = lens
     if len(set(sizes.values())) > 1:
         told = ", ".join(f"{name} {w} x {h}" for name, (w, h) in sizes.items())
-        raise SourceError(f"{model}: all cameras of a rig must share one image size, got {told}")
+        raise SourceError(f"{model}: all cameras of a rig must share one image size, got {told}; {PREPARE}")
     rig = Cameras(tuple(names), np.stack(poses), np.stack(Ks), *sizes[names[0]])
     clips = {name: _clip(folder, name, images[number].name) for name, number in zip(names, numbers, strict=True)}
     return Recording(

@@ -6,7 +6,8 @@ Intrinsics ``fl_x fl_y cx cy w h`` and distortion ``k1 k2 k3 k4 p1 p2`` once or 
 corner, world units are whatever wrote the file.
 
 One camera per entry: its ``file_path`` is a video, a folder of frames, or one image (a still scene of one frame).
-Entries of one folder with equal poses are one camera's frames, in the order of ``time`` if given, else of their names.
+Entries of one folder with equal poses are one camera's frames, in the order of ``time`` if given, else of their names;
+in one flat folder those of equal pose and intrinsics are. Entries without a picture are skipped, with a warning.
 ``test_filenames`` judge (and ``val_filenames`` too); without them no camera does. ``ply_file_path``: points, made from
 all images.
 """
@@ -15,21 +16,25 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
-from gsstream.source.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip, natural
+from gsstream.source.clips import PREPARE, VIDEO_SUFFIXES, Clip, ImageClip, folder_clip
 from gsstream.source.distortion import Lens
+from gsstream.source.layouts.nerfstudio_groups import group_entries
 from gsstream.source.pointfiles import read_ply_points
 from gsstream.source.poses import from_opengl
 from gsstream.source.recorded import Recording, SeenPoints
+from gsstream.source.sync import RecordingWarning
 
 FILE = "transforms.json"
+Missing = Literal["skip", "refuse"]
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
 
 
@@ -38,11 +43,23 @@ def looks_like(folder: Path) -> bool:
     return (folder / FILE).is_file()
 
 
-def read(folder: Path) -> Recording:
-    """One rig of cameras that stand still. Raises SourceError for a camera that moves."""
+def read(folder: Path, missing: Missing = "skip") -> Recording:
+    """One rig of cameras that stand still.
+
+    Arguments:
+        missing: entries whose picture is missing are skipped with a warning, or refused.
+
+    Raises SourceError for a camera that moves, for cameras of different sizes, and for what is not as expected.
+    """
     path = folder / FILE
     data = _load(path)
-    groups = _group(path, data["frames"])
+    there = _present(folder, path, data["frames"], missing)
+    groups = group_entries(path, there, _pose)
+    if len(there) < len(data["frames"]) and any(len(g) > 1 and "time" not in g[0] for g in groups.values()):
+        raise SourceError(
+            f"{path}: pictures of a recording are missing, and no 'time' says which instants are left: the cameras "
+            "would be shifted against each other. Restore them, or give every entry its 'time'"
+        )
     poses, Ks, lenses, sizes = [], [], {}, {}
     clips: dict[str, Clip] = {}
     for name, entries in groups.items():
@@ -56,7 +73,7 @@ def read(folder: Path) -> Recording:
             lenses[name] = lens
     if len(set(sizes.values())) > 1:
         told = ", ".join(f"{name} {w} x {h}" for name, (w, h) in sizes.items())
-        raise SourceError(f"{path}: all cameras of a rig must share one image size, got {told}")
+        raise SourceError(f"{path}: all cameras of a rig must share one image size, got {told}; {PREPARE}")
     names = tuple(groups)
     judges = {str(f) for key in ("test_filenames", "val_filenames") for f in data.get(key) or ()}
     test = tuple(name for name, entries in groups.items() if any(e["file_path"] in judges for e in entries))
@@ -94,37 +111,30 @@ def _load(path: Path) -> dict[str, Any]:
     return known
 
 
-def _group(path: Path, frames: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """Camera id -> its entries, in time order."""
-    by_folder: dict[str, list[dict[str, Any]]] = {}
-    for frame in frames:
-        by_folder.setdefault(str(PurePosixPath(frame["file_path"]).parent), []).append(frame)
-    still = all(
-        np.allclose(_pose(path, entry), _pose(path, entries[0]), atol=1e-9)
-        for entries in by_folder.values()
-        for entry in entries
-    )
-    if still and len(by_folder) > 1:
-        names = [PurePosixPath(folder).name for folder in by_folder]
-        if len(set(names)) < len(names):
-            names = [folder.replace("/", "_") for folder in by_folder]
-        ordered = [sorted(entries, key=_when) for entries in by_folder.values()]
-        return dict(sorted(zip(names, ordered, strict=True), key=lambda item: natural(Path(item[0]))))
-    single = {PurePosixPath(frame["file_path"]).stem: [frame] for frame in frames}
-    if len(single) < len(frames) or len(by_folder) > 1:
-        raise SourceError(
-            f"{path}: a folder of frames has several poses: a camera that moves. Expected one camera per entry (a "
-            "video, a folder of frames or one image), or one folder per camera with one pose"
-        )
-    return dict(sorted(single.items(), key=lambda item: natural(Path(item[0]))))
+def _present(folder: Path, path: Path, frames: list[dict[str, Any]], missing: Missing) -> list[dict[str, Any]]:
+    """The entries whose picture, video or folder is there; nerfstudio itself passes over the others, too."""
+    there = [entry for entry in frames if _file(folder, entry).exists()]
+    if len(there) == len(frames):
+        return there
+    first = next(entry["file_path"] for entry in frames if not _file(folder, entry).exists())
+    told = f"{path}: {len(frames) - len(there)} of {len(frames)} pictures are missing, the first is {first}"
+    if not there or missing == "refuse":
+        raise SourceError(f"{told}; restore them, or take them out of the file")
+    warnings.warn(
+        f"{told}; they are skipped, as nerfstudio does. To refuse them: --source 'nerfstudio:{folder}?missing=refuse'",
+        RecordingWarning, stacklevel=2,
+    )  # fmt: skip
+    return there
 
 
-def _when(entry: dict[str, Any]) -> tuple[float, list[tuple[int, str]]]:
-    return float(entry.get("time", 0.0)), natural(Path(entry["file_path"]))
+def _file(folder: Path, entry: dict[str, Any]) -> Path:
+    """The file or folder of an entry; Blender's scenes leave the suffix out."""
+    file: Path = folder / entry["file_path"]
+    return file if file.suffix or file.exists() else file.with_suffix(".png")
 
 
 def _clip(folder: Path, entries: list[dict[str, Any]]) -> Clip:
-    files = [folder / entry["file_path"] for entry in entries]
+    files = [_file(folder, entry) for entry in entries]
     if len(files) > 1:
         return ImageClip(files)
     if files[0].is_dir():
@@ -133,8 +143,6 @@ def _clip(folder: Path, entries: list[dict[str, Any]]) -> Clip:
         from gsstream.source.video import VideoClip
 
         return VideoClip(files[0])
-    if not files[0].suffix and not files[0].is_file():
-        files = [files[0].with_suffix(".png")]  # Blender's scenes leave it out
     return ImageClip(files)
 
 

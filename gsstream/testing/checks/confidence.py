@@ -29,7 +29,7 @@ def check_confidence_range(part: ConfidenceEstimator) -> None:
 
 @check("confidence")
 def check_confidence_static_frame(part: ConfidenceEstimator) -> None:
-    """Identical consecutive frames: finite, and at most the declared floor (Traits.floor)."""
+    """Identical consecutive frames: finite, and at most the declared floor."""
     got = part.estimate(world("static"))
     finite("a frame in which nothing changed", got)
     at_most("a frame in which nothing changed", got, part.claims().floor, 1e-5, "float32 of the declared floor")

@@ -34,7 +34,7 @@ def _bytes(what: str, got: Step[Any], expected: Step[Any]) -> None:
     raise AssertionError(f"{what}: packet of frame {frame} differs from byte {place} on ({len(a)} and {len(b)} bytes)")
 
 
-@check("method", kinds=("method", "whole"))
+@check("method", kinds=("method", "stepper"))
 def check_method_closed_loop(method: MethodUnderTest) -> None:
     """A fresh player that has the packets alone reaches the encoder's state bit by bit, frame by frame."""
     player: PlayerState | None = None
@@ -46,14 +46,14 @@ def check_method_closed_loop(method: MethodUnderTest) -> None:
             assert drift == 0.0, f"frame {player.frame}: {name} drifted by {drift:.3g}; expected 0, bitwise on the CPU"
 
 
-@check("method", kinds=("method", "whole"))
+@check("method", kinds=("method", "stepper"))
 def check_method_deterministic(method: MethodUnderTest) -> None:
     """The same seed gives the same packets, byte by byte."""
     for again, first in zip(method.chain(), method.steps, strict=True):
         _bytes("second run", again, first)
 
 
-@check("method", kinds=("method", "whole"))
+@check("method", kinds=("method", "stepper"))
 def check_method_resume(method: MethodUnderTest) -> None:
     """Stopped after frame 1 and continued from the stream alone, the rest is byte by byte the same."""
     with tempfile.TemporaryDirectory() as folder:
@@ -70,7 +70,7 @@ def check_method_resume(method: MethodUnderTest) -> None:
         state = again.state
 
 
-@check("method", kinds=("method", "whole"))
+@check("method", kinds=("method", "stepper"))
 def check_method_failed_frame(method: MethodUnderTest) -> None:
     """A frame that fails leaves the state as it was; the next attempt gives what it would have given."""
     state = method.steps[1].state
@@ -85,7 +85,7 @@ def check_method_failed_frame(method: MethodUnderTest) -> None:
     _bytes("after a failed frame", method.step(state, frame), method.steps[2])
 
 
-@check("method", kinds=("method", "whole"))
+@check("method", kinds=("method", "stepper"))
 def check_method_static_video(method: MethodUnderTest) -> None:
     """When nothing moves, frames cost no more than when something does."""
     still = method.chain(SOURCE + "&static=true")
@@ -97,7 +97,7 @@ def check_method_static_video(method: MethodUnderTest) -> None:
     )
 
 
-@check("method", kinds=("method", "whole"))
+@check("method", kinds=("method", "stepper"))
 def check_method_one_camera(method: MethodUnderTest) -> None:
     """One camera, or as many as it says it needs, are enough to run, and everything stays finite."""
     for step in method.chain(choose=lambda frame: _with_cameras(frame, method.least_cameras)):
@@ -109,7 +109,7 @@ def _with_cameras(frame: Frame, number: int) -> Frame:
     return replace(frame, images=frame.images[:number], cameras=frame.cameras.select(range(number)))
 
 
-@check("method", kinds=("method", "whole"))
+@check("method", kinds=("method", "stepper"))
 def check_method_declared_needs(method: MethodUnderTest) -> None:
     """With one camera fewer than it says it needs, frame 0 is refused by an InputError that says how many."""
     frame = _with_cameras(open_source(SOURCE).frame(0), method.least_cameras - 1)
@@ -121,7 +121,7 @@ def check_method_declared_needs(method: MethodUnderTest) -> None:
     raise AssertionError(f"started with {len(frame.cameras)} cameras; it says it needs {method.least_cameras}")
 
 
-@check("method", kinds=("method", "whole"))
+@check("method", kinds=("method", "stepper"))
 def check_method_size_is_true(method: MethodUnderTest) -> None:
     """Reported bytes are the bytes written, and no more gates or Gaussians are active than there are."""
     for step in method.steps:
@@ -134,7 +134,7 @@ def check_method_size_is_true(method: MethodUnderTest) -> None:
             assert 0 <= active <= have, f"frame {frame}: {active} active {name} of {have}"
 
 
-@check("method", kinds=("method", "whole"))
+@check("method", kinds=("method", "stepper"))
 def check_method_global_rng(method: MethodUnderTest) -> None:
     """Torch's global generator is neither read nor moved by a frame."""
     state, frame = method.steps[0].state, open_source(SOURCE).frame(1)
@@ -144,7 +144,7 @@ def check_method_global_rng(method: MethodUnderTest) -> None:
     _bytes("frame 1 again", again, method.steps[1])
 
 
-@check("method", kinds=("method", "whole"))
+@check("method", kinds=("method", "stepper"))
 def check_method_inputs_kept(method: MethodUnderTest) -> None:
     """A frame leaves the images it was given and the state it started from as they were."""
     state, frame = method.steps[1].state, open_source(SOURCE).frame(2)
@@ -153,7 +153,7 @@ def check_method_inputs_kept(method: MethodUnderTest) -> None:
     assert fingerprint((frame.images, state.player)) == before, "the frame changed its images or the state before it"
 
 
-@check("method", kinds=("method", "whole"))
+@check("method", kinds=("method", "stepper"))
 def check_method_takes_first_frame(method: MethodUnderTest) -> None:
     """Given frame 0 of another stream, it starts from exactly those Gaussians, in an order of its own."""
     own = method.steps[0].state.player
@@ -170,7 +170,7 @@ def _sorted_rows(gaussians: Gaussians[FloatArray]) -> FloatArray:
     return np.asarray(rows[np.lexsort(rows.T)])
 
 
-@check("method", kinds=("method", "whole"))
+@check("method", kinds=("method", "stepper"))
 def check_method_says_what_it_is(method: MethodUnderTest) -> None:
     """The key packet names the method and carries the recipe and the cameras of the run."""
     meta, recipe = method.steps[0].state.player.meta, method.parts.recipe
@@ -181,7 +181,7 @@ def check_method_says_what_it_is(method: MethodUnderTest) -> None:
         assert have.ids == want.ids, f"{split} cameras: expected {want.ids}, got {have.ids}"
 
 
-@check("method", kinds=("method", "whole"))
+@check("method", kinds=("method", "stepper"))
 def check_method_skips(method: MethodUnderTest) -> None:
     """A frame that is worth no effort becomes an empty packet, and the stream goes on from it."""
     state, frame = method.steps[0].state, open_source(SOURCE).frame(1)

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.changes import Delta, Layout, active_rows, apply_delta
+from gsstream.core.changes import Delta, Layout, Residual, apply_delta, sent_rows
 from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
@@ -61,10 +61,10 @@ def tiny_delta(layout: Layout, seed: int = 1) -> Delta:
     """About half of the nodes open, three attributes change."""
     rng = np.random.default_rng(seed)
     gates = (rng.random(len(layout.node_counts)) < 0.5) * rng.integers(1, 5, len(layout.node_counts))
-    rows = len(active_rows(layout, gates))
+    rows = len(sent_rows(layout, gates))
     widths = {"means": 3, "opacities": 1, "sh0": 3}
     symbols = {name: rng.integers(-3, 4, (rows, width)).astype(np.int32) for name, width in widths.items()}
-    return Delta(gates.astype(np.uint8), 4, symbols, dict.fromkeys(widths, 0.02))
+    return Delta((Residual(gates.astype(np.uint8), 4, symbols, dict.fromkeys(widths, 0.02)),))
 
 
 def _start(codec: PacketCodec) -> tuple[PlayerState, Delta, EncodedPacket]:
@@ -95,11 +95,14 @@ def _refused(what: str, attempt: Callable[[], object]) -> None:
 def check_packet_round_trip(codec: PacketCodec) -> None:
     """A delta comes back with the gates, levels and symbols it was written with."""
     state, delta, packet = _start(codec)
-    got = codec.decode(state, packet.data).delta
-    assert got is not None, "the decoded state holds no delta"
-    assert np.array_equal(got.gates, delta.gates), f"gates: expected {delta.gates}, got {got.gates}"
-    assert got.num_levels == delta.num_levels, f"levels: expected {delta.num_levels}, got {got.num_levels}"
-    for name, value in delta.symbols.items():
+    played, wrote = codec.decode(state, packet.data).delta, delta.residual
+    assert played is not None, "the decoded state holds no delta"
+    got = played.residual
+    assert got is not None, "the decoded delta holds no residual"
+    assert wrote is not None
+    assert np.array_equal(got.gates, wrote.gates), f"gates: expected {wrote.gates}, got {got.gates}"
+    assert got.num_levels == wrote.num_levels, f"levels: expected {wrote.num_levels}, got {got.num_levels}"
+    for name, value in wrote.symbols.items():
         wrong = int((got.symbols[name] != value).sum())
         assert wrong == 0, f"symbols of {name}: {wrong} of {value.size} differ"
 
@@ -108,8 +111,8 @@ def check_packet_round_trip(codec: PacketCodec) -> None:
 def check_packet_closed_loop(codec: PacketCodec) -> None:
     """Rows behind open gates become bitwise what the encoder computes."""
     state, delta, packet = _start(codec)
-    expected = apply_delta(state.gaussians, state.layout, delta)
-    rows = active_rows(state.layout, delta.gates)
+    expected = apply_delta(state.scene, delta).gaussians
+    rows = sent_rows(state.layout, delta.gates(state.layout))
     _same_rows("open rows", codec.decode(state, packet.data).gaussians, expected, rows)
 
 
@@ -118,7 +121,7 @@ def check_packet_closed_rows(codec: PacketCodec) -> None:
     """Rows behind closed gates keep every bit."""
     state, delta, packet = _start(codec)
     before = state.gaussians.map(np.copy)
-    closed = np.setdiff1d(np.arange(len(before)), active_rows(state.layout, delta.gates))
+    closed = np.setdiff1d(np.arange(len(before)), sent_rows(state.layout, delta.gates(state.layout)))
     _same_rows("closed rows", codec.decode(state, packet.data).gaussians, before, closed)
 
 

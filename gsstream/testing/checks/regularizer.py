@@ -76,10 +76,10 @@ def check_regularizer_monotone(part: Regularizer) -> None:
 
 @check("regularizer")
 def check_regularizer_linear_in_weight(part: Regularizer) -> None:
-    """Doubling the weights (Traits.weights) doubles the total; zero weights give exactly 0 and no gradient."""
+    """Doubling the claimed weights doubles the total; zero weights give exactly 0 and no gradient."""
     weights = part.claims().weights
     if not weights:
-        raise Skip("claims no weights (Traits.weights)")
+        raise Skip("claims no weights (RegularizerTraits.weights)")
     case = world("cloud")
 
     def scaled(factor: float) -> Regularizer:
@@ -113,7 +113,7 @@ def check_regularizer_gradient(part: Regularizer) -> None:
 
 @check("regularizer")
 def check_regularizer_reduction(part: Regularizer) -> None:
-    """A scene beside its own copy costs the same (Traits.reduction "mean") or twice as much ("sum")."""
+    """A scene beside its own copy costs the same (reduction "mean") or twice as much ("sum")."""
     case = world("cloud")
     once, m = _total(_terms(part, case)), case.hierarchy.num_nodes
     half = forest(len(case.logits))
@@ -150,9 +150,9 @@ def check_regularizer_empty(part: Regularizer) -> None:
 
 @check("regularizer", trait="gate_terms")
 def check_regularizer_uses_what_it_says(part: Regularizer) -> None:
-    """Terms said to price gates alone (Traits.gate_terms) do not depend on the residual."""
+    """Terms said to price gates alone (gate_terms) do not depend on the residual."""
     case = world("cloud")
     still, moving = (_terms(part, case, None, factor * case.residual) for factor in (0.0, 1.0))
     for name in part.claims().gate_terms:
-        assert name in moving, f"Traits.gate_terms names {name!r}; the terms are {', '.join(moving)}"
+        assert name in moving, f"RegularizerTraits.gate_terms names {name!r}; the terms are {', '.join(moving)}"
         equal(f"term {name!r}, with and without motion", moving[name], still[name])

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
-from gsstream.core.changes import Delta, Layout, active_rows, apply_delta
+from gsstream.core.changes import Layout, Residual, apply_residual, sent_rows
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.packet import quantise_decoders
 from gsstream.packet.base import MAX_CHANNELS
@@ -80,13 +80,13 @@ def check_update_closed_loop(part: UpdateRule) -> None:
     change = decode_joint(code, table, code.join_decoders(decoders), torch.full((n,), 0.25))
     features = join_features(code, case.gaussians)
     trained = add_joint(code, case.gaussians, features, change, level / LEVELS)
-    rows = active_rows(layout, level.numpy())
+    rows = sent_rows(layout, level.numpy())
     integers: Mapping[str, torch.Tensor] = symbols(codes, latents)
-    delta = Delta(
+    residual = Residual(
         level.numpy().astype(np.uint8), LEVELS, {name: value.numpy()[rows] for name, value in integers.items()},
         {name: codes[name].step for name in integers}, sent,
     )  # fmt: skip
-    played = apply_delta(case.gaussians.map(lambda t: t.numpy()), layout, delta)
+    played = apply_residual(case.gaussians.map(lambda t: t.numpy()), layout, residual)
     assert fingerprint(case.gaussians) == before, "the scene before was changed in place"
     for name, value in played.items():
         want = torch.from_numpy(np.asarray(value))

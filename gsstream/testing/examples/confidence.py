@@ -8,23 +8,25 @@ from typing import final
 import torch
 from pydantic import Field
 
-from gsstream.api import ConfidenceEstimator, FrameContext, PartConfig, Traits, check_finite
+from gsstream.api import ConfidenceEstimator, ConfidenceTraits, FrameContext, PartConfig, check_finite
 
 
 @final
 class ExampleConfidence(ConfidenceEstimator):
-    """z = gain * (|m| / max|m| - 1/2), |m| the mean over views of the screen gradient's norm (ours).
+    """z = gain * (|m| / max|m| - 1/2), |m| the mean over views of the screen gradient's norm.
 
     The gradient is that of half the squared difference of the two frames. Where nothing pulls, z is ``floor``.
     """
+
+    source = "gsstream"
 
     class Config(PartConfig):
         gain: float = Field(default=10.0, gt=0, le=100, description="steepness, logits per share of the largest pull")
         floor: float = Field(default=-6.0, ge=-50, le=0, description="logit of a Gaussian that nothing pulls")
 
-    traits = Traits(needs_renderer=True, finds_motion=True, monotone_in_change=True)
+    traits = ConfidenceTraits(needs_renderer=True, finds_motion=True, monotone_in_change=True)
 
-    def claims(self) -> Traits:
+    def claims(self) -> ConfidenceTraits:
         # A share of the largest pull: an even change of light makes a few Gaussians suspect, never half of them.
         return replace(self.traits, floor=self.config.floor, brightness=0.0)
 

@@ -7,21 +7,23 @@ from typing import final
 import torch
 from pydantic import Field
 
-from gsstream.api import GateSampler, PartConfig, Traits, check_finite
+from gsstream.api import GateSampler, GateTraits, PartConfig, check_finite
 
 
 @final
 class ExampleGate(GateSampler):
-    """g = 1 where z + n > 0, else 0, with n ~ Logistic(0, 1) while training: P(g = 1) = sigmoid(z) (ours).
+    """g = 1 where z + n > 0, else 0, with n ~ Logistic(0, 1) while training: P(g = 1) = sigmoid(z).
 
     The gradient is that of sigmoid((z + n) / temperature), straight through the step.
     """
+
+    source = "gsstream"
 
     class Config(PartConfig):
         temperature: float = Field(default=0.5, ge=0.05, le=10, description="softness of the gradient, no unit")
         bound: float = Field(default=7.0, gt=0, le=50, description="logits are kept in [-bound, bound]")
 
-    traits = Traits(stochastic=True, differentiable=True, temperature=True)
+    traits = GateTraits(stochastic=True, differentiable=True, temperature=True)
 
     @property
     def num_levels(self) -> int:

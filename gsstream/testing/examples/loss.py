@@ -37,6 +37,8 @@ class ExampleLoss(Loss):
     A loss is an implementation: all give the same value, so that runs compare. Make yours faster, not different.
     """
 
+    source = "3DGS (Kerbl et al. 2023)"
+
     def prepare(self, target: torch.Tensor) -> Any:
         return target
 

@@ -7,17 +7,21 @@ from typing import final
 import torch
 from pydantic import Field
 
-from gsstream.api import Hierarchy, PartConfig, Propagation, Traits, check_finite, check_shape, tree_max
+from gsstream.api import Hierarchy, PartConfig, Propagation, PropagationTraits, check_finite, check_shape, tree_max
 
 
 @final
 class ExamplePropagation(Propagation):
-    """z_node = max of z_i over the node's tree (ours, after the paper's propagation by a maximum)."""
+    """z_node = max of z_i over the node's tree."""
+
+    source = "gsstream, after the propagation of S2GS"
 
     class Config(PartConfig):
         empty: float = Field(default=-50.0, ge=-1e4, le=0, description="logit of a tree without Gaussians")
 
-    traits = Traits(conservative=True, idempotent=True, differentiable=True, normalised=True, parent_bound=True)
+    traits = PropagationTraits(
+        conservative=True, idempotent=True, differentiable=True, normalised=True, parent_bound=True
+    )
 
     def propagate(self, logits: torch.Tensor, hierarchy: Hierarchy) -> torch.Tensor:
         check_shape("logits", logits, (hierarchy.num_gaussians,))

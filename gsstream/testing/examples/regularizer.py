@@ -8,18 +8,22 @@ from typing import final
 import torch
 from pydantic import Field
 
-from gsstream.api import Hierarchy, PartConfig, Regularizer, Traits, check_shape
+from gsstream.api import Hierarchy, PartConfig, Regularizer, RegularizerTraits, check_shape
 
 
 @final
 class ExampleRegularizer(Regularizer):
-    """mean over Gaussians of pi (gates + motion |r|^2), pi the open probability of the Gaussian's node (ours)."""
+    """mean over Gaussians of pi (gates + motion |r|^2), pi the open probability of the Gaussian's node."""
+
+    source = "gsstream"
 
     class Config(PartConfig):
         gates: float = Field(default=0.01, ge=0, le=1e6, description="price of an open gate, loss units per Gaussian")
         motion: float = Field(default=0.01, ge=0, le=1e6, description="price of motion, loss units per squared cell")
 
-    traits = Traits(differentiable=True, reduction="mean", weights=("gates", "motion"), gate_terms=("gates",))
+    traits = RegularizerTraits(
+        differentiable=True, reduction="mean", weights=("gates", "motion"), gate_terms=("gates",)
+    )
 
     def penalty(
         self, open_probability: torch.Tensor, residual: torch.Tensor, hierarchy: Hierarchy, num_gaussians: int

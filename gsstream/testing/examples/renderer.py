@@ -13,10 +13,12 @@ from gsstream.testing.cases import RENDERER
 
 @final
 class ExampleRenderer(Renderer):
-    """The reference renderer in another coat (ours); put calls of your library in its place.
+    """The reference renderer in another coat; put calls of your library in its place.
 
     Sessions, masks and caches have defaults that are right and slow: ``gsstream/render/base.py`` says what to override.
     """
+
+    source = "gsstream"
 
     class Config(PartConfig):
         gain: float = Field(default=1.0, gt=0, le=4, description="factor on the colours, no unit")

@@ -16,19 +16,21 @@ from gsstream.api import (
     PartConfig,
     PointCloud,
     Structure,
-    Traits,
+    StructureTraits,
     check_finite,
 )
 
 
 @final
 class ExampleStructure(Structure):
-    """A regular grid with ``cells`` cells along the longest side; every node is a root (ours)."""
+    """A regular grid with ``cells`` cells along the longest side; every node is a root."""
+
+    source = "gsstream"
 
     class Config(PartConfig):
         cells: int = Field(default=32, ge=1, le=65536, description="cells along the longest side of the points")
 
-    traits = Traits(idempotent=True, local=True)
+    traits = StructureTraits(idempotent=True, local=True)
 
     def seed(self, points: PointCloud, cameras: Cameras) -> Anchors:
         if len(points) == 0:

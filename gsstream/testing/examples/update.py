@@ -12,7 +12,9 @@ from gsstream.api import AttributeCode, PartConfig, UpdateRule
 
 @final
 class ExampleUpdate(UpdateRule):
-    """Positions directly, degree-0 colour through a latent channel and a linear decoder, nothing else (ours)."""
+    """Positions directly, degree-0 colour through a latent channel and a linear decoder, nothing else."""
+
+    source = "gsstream"
 
     class Config(PartConfig):
         move: float = Field(default=0.02, gt=0, le=1, description="quantisation step of positions, cells")

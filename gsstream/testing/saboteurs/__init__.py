@@ -25,5 +25,4 @@ def saboteur_of(check: str) -> str:
         return INSTALLED[check]
     if check in PACKET_SABOTEURS:
         return PACKET_SABOTEURS[check].name + "."
-    text = ({**SABOTEURS, **METHOD_SABOTEURS}[check].__doc__ or "").strip()
-    return text.removesuffix("(ours, wrong on purpose)").strip()
+    return ({**SABOTEURS, **METHOD_SABOTEURS}[check].__doc__ or "Has no docstring.").strip()

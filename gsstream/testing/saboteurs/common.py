@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from types import MappingProxyType
-from typing import Any, final
+from typing import Any
 
 import torch
 
@@ -20,7 +20,7 @@ Confidence: Any = ExampleConfidence
 
 
 @spoils("check_config_round_trip")
-class Undescribed(Gate):
+class Unexplained(Gate):
     """A setting without a description."""
 
     class Config(ExampleGate.Config):
@@ -29,13 +29,28 @@ class Undescribed(Gate):
 
 @spoils("check_frozen_and_final", leave=True)
 class Open(Gate):
-    """Not marked final (ours, wrong on purpose)."""
+    """Not marked final."""
 
 
-@spoils("check_docstring", leave=True)
-@final
+@spoils("check_docstring")
+class Undescribed(Gate):
+    """Has no docstring."""
+
+    __doc__ = ""
+
+
+@spoils("check_citation")
 class Unsourced(Gate):
-    """Threshold gates."""
+    """Cites nothing."""
+
+    source = " "
+
+
+@spoils("check_denials")
+class Evasive(Gate):
+    """Denies a check that there is not."""
+
+    denied = MappingProxyType({"check_gate_kindness": "no gate has ever been kind, and this one is none"})
 
 
 def _refused(facts: SceneFacts, _settings: Any) -> Choice:

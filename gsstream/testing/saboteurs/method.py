@@ -54,7 +54,7 @@ class DriftingPlayer(Remembered):
     def play(self, state: PlayerState | None, data: bytes) -> PlayerState:
         after = super().play(state, data)
         means = np.nextafter(after.gaussians.means, np.float32(np.inf))
-        return replace(after, gaussians=replace(after.gaussians, means=means))
+        return replace(after, scene=replace(after.scene, gaussians=replace(after.gaussians, means=means)))
 
 
 @_spoils("check_method_deterministic")

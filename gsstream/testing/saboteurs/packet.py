@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gsstream.core.changes import active_rows
+from gsstream.core.changes import sent_rows
 from gsstream.core.errors import PacketError
 from gsstream.packet import EncodedPacket, PlayerState, decode_packet, encode_delta
 from gsstream.packet.base import parse_header
@@ -39,21 +39,22 @@ def _mend(words: str) -> Decode:
 def _nudge(after: PlayerState, rows: Any) -> PlayerState:
     means = after.gaussians.means.copy()
     means[rows] = np.nextafter(means[rows], np.float32(np.inf))
-    return replace(after, gaussians=replace(after.gaussians, means=means))
+    return replace(after, scene=replace(after.scene, gaussians=replace(after.gaussians, means=means)))
 
 
 def _wrong_symbols(_: PlayerState | None, after: PlayerState) -> PlayerState:
-    if after.delta is None:
+    residual = None if after.delta is None else after.delta.residual
+    if after.delta is None or residual is None:
         return after
-    symbols = {name: value + 1 for name, value in after.delta.symbols.items()}
-    return replace(after, delta=replace(after.delta, symbols=symbols))
+    symbols = {name: value + 1 for name, value in residual.symbols.items()}
+    return replace(after, delta=after.delta.with_residual(replace(residual, symbols=symbols)))
 
 
 def _drift(which: str) -> Callable[[PlayerState | None, PlayerState], PlayerState]:
     def change(_: PlayerState | None, after: PlayerState) -> PlayerState:
         if after.delta is None:
             return after
-        rows = active_rows(after.layout, after.delta.gates)
+        rows = sent_rows(after.layout, after.delta.gates(after.layout))
         return _nudge(after, rows if which == "open" else np.setdiff1d(np.arange(len(after.gaussians)), rows))
 
     return change

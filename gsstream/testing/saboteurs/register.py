@@ -16,15 +16,12 @@ SABOTEURS: dict[str, Callable[[], Part | SourceUnderTest]] = {}
 def spoils(check: str, *, leave: bool = False) -> Callable[[Any], Any]:
     """Enter a class as the saboteur of a check. Its docstring says what is wrong with it.
 
-    ``leave`` keeps the class as it is; otherwise it is made final and its docstring given a source, as checks demand.
+    ``leave`` keeps the class as it is; otherwise it is made final, as checks demand.
     """
 
     def enter(cls: Saboteur) -> Saboteur:
         assert check not in SABOTEURS, check
         SABOTEURS[check] = cls
-        if leave:
-            return cls
-        cls.__doc__ = f"{cls.__doc__} (ours, wrong on purpose)"
-        return final(cls)
+        return cls if leave else final(cls)
 
     return enter

@@ -22,7 +22,7 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.engine.auto.rules import refuse_pending
+from gsstream.engine.assembly.pending import refuse_pending
 from gsstream.engine.frame0.begin import begin_from
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.frame_step import frame_step
@@ -258,7 +258,7 @@ def _timed(
         for name, parts in assemblies.items():
             state = under_way(parts, cases[name].state, last.get(name))
             started, worked = time.perf_counter(), time.process_time()
-            last[name] = frame_step(parts, state, cases[name].frame, Rng(plan.seed))
+            last[name] = frame_step(parts, state, cases[name].frame, Rng(plan.seed)).step
             elapsed, spent = time.perf_counter() - started, time.process_time() - worked
             if round_ < plan.warm_up:
                 continue

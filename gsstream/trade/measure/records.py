@@ -19,7 +19,8 @@ class FrameRecord:
 
     Arguments:
         frame: frame index.
-        psnr, ssim, psnr_moving: test camera -> value (dB, 1, dB); cameras where nothing moves are left out.
+        psnr, ssim, psnr_moving, psnr_changed: test camera -> value (dB, SSIM 1); cameras where nothing moves, or
+            changes, are left out of the last two.
         bytes: packet section -> bytes, headers included.
         seconds: phase -> wall seconds.
         active_gaussians, num_gaussians, active_gates, num_gates: counts.
@@ -37,6 +38,7 @@ class FrameRecord:
     active_gates: int = 0
     num_gates: int = 0
     peak_memory_mb: float = math.nan
+    psnr_changed: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def is_key(self) -> bool:
@@ -92,7 +94,7 @@ def record_of(data: Mapping[str, Any]) -> FrameRecord:
         bytes={name: int(v) for name, v in _numbers(data.get("bytes")).items()}, seconds=_numbers(data.get("seconds")),
         active_gaussians=int(data.get("active_gaussians") or 0), num_gaussians=int(data.get("num_gaussians") or 0),
         active_gates=int(data.get("active_gates") or 0), num_gates=int(data.get("num_gates") or 0),
-        peak_memory_mb=math.nan if memory is None else float(memory),
+        peak_memory_mb=math.nan if memory is None else float(memory), psnr_changed=_numbers(data.get("psnr_changed")),
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import zstandard
 
-from gsstream.core.changes import active_rows, gather_rows
+from gsstream.core.changes import Residual, gather_rows, sent_rows
 from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.shapes import FloatArray, IntArray
@@ -164,18 +164,21 @@ def paper_estimate(state: PlayerState, kind: PacketKind) -> float:
         return _plain_estimate(state.gaussians)
     if state.delta is None:
         return 0.0
-    delta, bits = state.delta, 0.0
-    bits += 32 * sum(decoder.size for decoder in delta.decoders.values())
     assert state.before is not None
-    number, rows = len(state.before.octree_levels), len(active_rows(state.before, delta.gates))
-    for name, table in delta.symbols.items():
+    delta, bits = state.delta, 0.0
+    residual, gates = delta.residual or Residual(delta.gates(state.before), 1), delta.gates(state.before)
+    bits += 32 * sum(decoder.size for decoder in residual.decoders.values())
+    # The paper's method has no motions; by its rule each number would be a float32.
+    bits += sum(32 * motion.symbols.size for motion in delta.motions)
+    number, rows = len(state.before.unit_of), len(sent_rows(state.before, gates))
+    for name, table in residual.symbols.items():
         if name == "means":
             bits += 96.0 * rows
             continue
         for column in table.T:
             bits += entropy_bits(np.concatenate([column, np.zeros(number - rows, column.dtype)]))
     born = 0.0 if delta.births is None else _plain_estimate(delta.births.gaussians)
-    return (bits + entropy_bits(delta.gates != 0)) / 8 + born
+    return (bits + entropy_bits(gates != 0)) / 8 + born
 
 
 def _plain_estimate(gaussians: Gaussians[FloatArray]) -> float:
@@ -205,25 +208,26 @@ def _plain_bytes(state: PlayerState, rows: IntArray) -> int:
     born = 0
     if delta.births is not None:
         born = float16_bytes(delta.births.gaussians, ATTRIBUTES, np.arange(len(delta.births)))
+    names = () if delta.residual is None else tuple(delta.residual.symbols)
     if not delta.edits_rows:
-        return float16_bytes(state.gaussians, tuple(delta.symbols), rows)
+        return float16_bytes(state.gaussians, names, rows)
     assert state.before is not None
     source = gather_rows(state.before.node_of, delta.births, delta.deaths)
-    return born + float16_bytes(state.gaussians, tuple(delta.symbols), np.flatnonzero(np.isin(source, rows)))
+    return born + float16_bytes(state.gaussians, names, np.flatnonzero(np.isin(source, rows)))
 
 
 def _packet(entry: Entry, data: bytes, state: PlayerState, seconds: float) -> PacketStats:
     _, sections = parse_packet(data, entry.offset)
     sizes = {name: len(section.data) for name, section in sections.items()}
     layout, delta = state.before or state.layout, state.delta
-    rows = np.arange(len(state.gaussians)) if delta is None else active_rows(layout, delta.gates)
+    rows = np.arange(len(state.gaussians)) if delta is None else sent_rows(layout, delta.gates(layout))
     empty = entry.kind == PacketKind.EMPTY
     tables = coded_tables(sections, entry.kind, layout)
     return PacketStats(
         frame=entry.frame, kind=entry.kind.name.lower(), size=entry.size,
         sections={**sizes, "header": entry.size - sum(sizes.values())},
         active_gaussians=0 if empty else len(rows),
-        active_nodes=0 if empty else int(np.count_nonzero(delta.gates)) if delta else len(layout.node_counts),
+        active_nodes=0 if empty else int(np.count_nonzero(delta.gates(layout))) if delta else len(layout.node_counts),
         coded=sum(table.size for table in tables),
         entropy=sum(table.entropy_bits for table in tables) / 8,
         float16_zstd=0 if empty else _plain_bytes(state, rows),

@@ -18,6 +18,7 @@ class Summary:
         frames: number of frames T.
         psnr_first, psnr: dB, frame 0 and the mean of later frames. psnr_slope: dB per 100 frames.
         ssim: mean of later frames. psnr_moving: dB on moving pixels, mean of later frames where something moves.
+        psnr_changed: the same on changed pixels, the bodies without shadows and rims.
         kb_per_frame: bytes of delta and empty packets over their number, 1 KB = 1,000 bytes.
         key_kb: bytes of the first key packet. kb_amortised: all bytes over all frames.
         seconds_first, seconds: frame 0 and the mean of later frames.
@@ -39,6 +40,7 @@ class Summary:
     active: float
     gates: float
     peak_memory_mb: float
+    psnr_changed: float = math.nan
 
 
 def summarise(records: Sequence[FrameRecord]) -> Summary:
@@ -63,12 +65,14 @@ def summarise(records: Sequence[FrameRecord]) -> Summary:
         active=mean(r.active_gaussians / r.num_gaussians for r in later if r.num_gaussians),
         gates=mean(r.active_gates / r.num_gates for r in later if r.num_gates),
         peak_memory_mb=max((r.peak_memory_mb for r in records if math.isfinite(r.peak_memory_mb)), default=math.nan),
+        psnr_changed=mean(mean(r.psnr_changed.values()) for r in later),
     )
 
 
 _COLUMNS: Mapping[str, tuple[str, str]] = {
     "frames": ("T", "{:d}"), "psnr_first": ("PSNR 0", "{:.2f}"), "psnr": ("PSNR", "{:.2f}"),
-    "psnr_slope": ("dB/100", "{:+.2f}"), "psnr_moving": ("moving", "{:.2f}"), "ssim": ("SSIM", "{:.4f}"),
+    "psnr_slope": ("dB/100", "{:+.2f}"), "psnr_moving": ("moving", "{:.2f}"),
+    "psnr_changed": ("changed", "{:.2f}"), "ssim": ("SSIM", "{:.4f}"),
     "kb_per_frame": ("KB/frame", "{:.1f}"), "key_kb": ("key KB", "{:.0f}"), "kb_amortised": ("KB amort.", "{:.1f}"),
     "seconds": ("s/frame", "{:.2f}"), "seconds_first": ("s frame 0", "{:.1f}"), "active": ("active", "{:.1%}"),
     "gates": ("gates", "{:.1%}"), "peak_memory_mb": ("peak MB", "{:.0f}"),

@@ -55,6 +55,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("psnr_first", "PSNR 0, dB", ".2f", True, lambda s, _, __: s.psnr_first),
     Quantity("psnr", "PSNR, dB", ".2f", True, lambda s, _, __: s.psnr),
     Quantity("psnr_moving", "moving, dB", ".2f", True, lambda s, _, __: s.psnr_moving),
+    Quantity("psnr_changed", "changed, dB", ".2f", True, lambda s, _, __: s.psnr_changed),
     Quantity("psnr_slope", "dB/100", "+.2f", True, lambda s, _, __: s.psnr_slope),
     Quantity("ssim", "SSIM", ".4f", True, lambda s, _, __: s.ssim),
     Quantity("ms_ssim", "MS-SSIM", ".4f", True, _per_view("ms_ssim")),

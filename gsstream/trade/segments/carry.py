@@ -1,4 +1,4 @@
-"""Recipes of the leap from key frame to key frame: what a method would send, or everything that helps."""
+"""Recipes of the step from one key frame to the next: the method's own, or one with every gate open."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ from gsstream.recipe.model import Codec, GateTraining, Recipe, Stream
 SENDING = ("confidence", "propagation", "gate", "regularizer", "update")
 
 
-def leap_recipe(resolved: ResolvedRecipe, epochs: int, whole: StreamingMethod[Any] | None) -> ResolvedRecipe:
+def leap_recipe(resolved: ResolvedRecipe, epochs: int, method: StreamingMethod[Any]) -> ResolvedRecipe:
     """A method's own recipe with the epochs of a leap.
 
     Arguments:
         epochs: passes over the training cameras.
-        whole: the whole method in place of parts; None: it is made of parts. One that does not heed epochs keeps its
-            recipe.
+        method: one that does not read epochs keeps its recipe.
     """
-    if whole is not None and "stream.epochs" not in whole.heeds:
+    if not method.reads("stream.epochs"):
         return resolved
     stream = resolved.recipe.stream.model_copy(update={"epochs": epochs})
     return ResolvedRecipe(resolved.recipe.model_copy(update={"stream": stream}), resolved.origins)

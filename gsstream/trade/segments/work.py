@@ -67,10 +67,10 @@ def make_work(
 def _carrying(resolved: ResolvedRecipe, assembly: Assembly, wanted: Wanted) -> ResolvedRecipe:
     """The recipe of a leap. Raises InputError where there are no gates to open."""
     if wanted.start != "open":
-        return leap_recipe(resolved, wanted.key_epochs, assembly.whole)
-    if assembly.whole is not None:
+        return leap_recipe(resolved, wanted.key_epochs, assembly.stepper)
+    if not assembly.stepper.reads("gate"):
         raise InputError(
-            f"--start open: expected a method made of parts, got the whole method {resolved.recipe.whole.name!r}, "
+            f"--start open: expected a method made of parts, got the stepper {resolved.recipe.stepper.name!r}, "
             "which has no gates; use warm or anew"
         )
     return open_leap_recipe(resolved, wanted.key_epochs)

@@ -94,11 +94,13 @@ def sheet_of_stream(
 
 
 def paint_gates(state: PlayerState) -> Gaussians[FloatArray]:
-    """The scene in two colours: grey behind closed gates, orange behind open ones, between them by gate level."""
+    """The scene in two colours: orange what the frame moved or its gates let change, by gate value, grey the rest."""
     gaussians = state.gaussians
     share: FloatArray = np.zeros(len(gaussians), np.float32)
     if state.delta is not None and state.before is not None:
         share = row_gates(state.before, state.delta)
+        if state.scene.moved is not None and not state.delta.edits_rows:
+            share[state.scene.moved.rows] = 1.0
     closed, opened = np.array(_CLOSED), np.array(_OPEN)
     color = closed + share[:, None] * (opened - closed)
     return Gaussians(

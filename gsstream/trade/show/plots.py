@@ -35,6 +35,7 @@ def _active(record: FrameRecord) -> float:
 _PANELS: Sequence[tuple[str, Series, bool, bool]] = (
     ("PSNR, dB", lambda r: mean(r.psnr.values()), False, True),
     ("PSNR on moving pixels, dB", lambda r: mean(r.psnr_moving.values()), False, False),
+    ("PSNR on changed pixels, dB", lambda r: mean(r.psnr_changed.values()), False, False),
     ("KB per delta packet", _kilobytes, True, False),
     ("seconds per frame", _seconds, True, False),
     ("active Gaussians, %", _active, True, False),

@@ -20,7 +20,7 @@ from gsstream.trade.sweep.rows import with_bases
 #: Sections of a recipe that say nothing of frame 0; a section that nobody thought of counts as one that does.
 LATER_KEYS = (
     "schema_version", "method", "seed", "frames", "confidence", "propagation", "gate", "regularizer", "update",
-    "whole", "stream", "gate_training", "codec", "insertion",
+    "stepper", "stream", "gate_training", "codec", "motion", "growth",
 )  # fmt: skip
 
 

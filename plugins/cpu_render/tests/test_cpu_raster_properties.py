@@ -102,11 +102,11 @@ def test_compact_rows_are_the_visible_rows_of_the_dense_gradient() -> None:
         assert (whole[unseen] == 0).all()
 
 
-def test_backward_screen_is_the_means2d_part() -> None:
-    subject = rasterizer()
-    subject.forward(random_splats(80, 4, 4))
+def test_backward_of_the_cache_is_the_means2d_part() -> None:
+    subject, splats = rasterizer(), random_splats(80, 4, 4)
+    subject.forward(splats)
     v_image, _ = upstream(4)
-    assert np.array_equal(subject.backward_screen(v_image), subject.backward(v_image).means2d)
+    assert np.array_equal(subject.backward_cached(splats, v_image)[0], subject.backward(v_image).means2d)
 
 
 def test_nan_upstream_reaches_the_gradient() -> None:

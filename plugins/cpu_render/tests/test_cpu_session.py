@@ -54,7 +54,7 @@ def full_screen_gradient(whole: Scene, view: int, v_image: torch.Tensor) -> Scre
     rasterizer.forward(SplatArrays(*(value.numpy() for _, value in whole.items())))
     visible = torch.zeros(N, dtype=torch.bool)
     visible[torch.from_numpy(rasterizer.visible_rows().astype(np.int64))] = True
-    return ScreenGradient(torch.from_numpy(rasterizer.backward_screen(v_image.numpy())), visible)
+    return ScreenGradient(torch.from_numpy(rasterizer.backward(v_image.numpy()).means2d), visible)
 
 
 def assert_alike(subject: RenderSession, whole: Scene, seed: int, renderer: Renderer | None = None) -> None:

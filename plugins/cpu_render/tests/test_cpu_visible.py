@@ -185,7 +185,7 @@ def test_the_rasteriser_refuses_tiles_that_it_did_not_draw() -> None:
     rasterizer = NumpyRasterizer(*camera(*EVEN), *EVEN)
     everything = np.ones((3, 5), np.bool_)
     with pytest.raises(InputError, match="expected a forward pass of the whole scene before"):
-        rasterizer.drawn_in_cache(None)
+        rasterizer.drawn_in_cache(everything)
     part = everything.copy()
     part[1] = False
     rasterizer.forward(random_splats(N, 0, 4), tile_mask=part)

@@ -10,7 +10,6 @@ import torch
 import torch.nn.functional as F
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.loss import PhotometricTarget, photometric_loss, tile_shape
-from gsstream_cpu_render.loss_torch import photometric_loss as torch_loss
 from gsstream_cpu_render.threads import num_threads, set_num_threads
 from numpy.typing import NDArray
 
@@ -119,9 +118,9 @@ def test_every_instruction_set(isa: str, pair: Callable[..., tuple[Image, Image]
     _native.select_isa(isa)
     for chosen in (None, mask):
         value, gradient = oracle(image, target, 0.2, chosen)
-        result = photometric_loss(image, target, tile_mask=chosen, halo_gradient=True)
+        result = photometric_loss(image, target, tile_mask=chosen)
         assert result.value == pytest.approx(value, abs=1e-6)
-        assert_gradient(result.gradient, gradient)
+        assert_gradient(result.gradient, gradient if chosen is None else gradient * pixels_of(chosen, 37, 75))
 
 
 @pytest.mark.parametrize("size", [(3, 7), (33, 50), (120, 160)])
@@ -141,31 +140,31 @@ def test_masked_sum_and_gradients(seed: int) -> None:
     mask = rng.random(tile_shape(height, width)) < rng.choice([0.05, 0.3, 0.7])
     value, gradient = oracle(image, target, 0.2, mask)
     inside = pixels_of(mask, height, width)
-    plain = photometric_loss(image, target, tile_mask=mask)
-    assert plain.value == pytest.approx(value, abs=1e-6)
-    assert_gradient(plain.gradient, gradient * inside)
-    halo = photometric_loss(image, PhotometricTarget(target), tile_mask=mask.astype(np.uint8), halo_gradient=True)
-    assert_gradient(halo.gradient, gradient)
-    assert plain.gradient is not None
-    assert not plain.gradient[np.broadcast_to(inside == 0, image.shape)].any()
+    for goal, chosen in ((target, mask), (PhotometricTarget(target), mask.astype(np.uint8))):
+        result = photometric_loss(image, goal, tile_mask=chosen)
+        assert result.value == pytest.approx(value, abs=1e-6)
+        assert_gradient(result.gradient, gradient * inside)
+        assert result.gradient is not None
+        assert not result.gradient[np.broadcast_to(inside == 0, image.shape)].any()
 
 
 def test_disjoint_masks_add_up_to_the_dense_loss() -> None:
     rng = np.random.default_rng(7)
     image, target = near_pair(rng, 100, 140)
     mask = rng.random(tile_shape(100, 140)) < 0.5
-    parts = [photometric_loss(image, target, tile_mask=m, halo_gradient=True) for m in (mask, ~mask)]
+    parts = [photometric_loss(image, target, tile_mask=m) for m in (mask, ~mask)]
+    beside = [photometric_loss(image, target, tile_mask=m, around=True).gradient for m in (mask, ~mask)]
     dense = photometric_loss(image, target)
     full = photometric_loss(image, target, tile_mask=np.ones_like(mask))
     assert parts[0].value + parts[1].value == pytest.approx(dense.value, abs=1e-7)
-    assert_gradient(parts[0].gradient + parts[1].gradient, dense.gradient)  # type: ignore[operator]
+    assert_gradient(beside[0] + beside[1], dense.gradient)  # type: ignore[operator]
     assert full.value == dense.value
     np.testing.assert_array_equal(full.gradient, dense.gradient)  # type: ignore[arg-type]
 
 
 def test_empty_mask_costs_nothing() -> None:
     image, target = noise_pair(np.random.default_rng(8), 40, 40)
-    result = photometric_loss(image, target, tile_mask=np.zeros(tile_shape(40, 40), bool), halo_gradient=True)
+    result = photometric_loss(image, target, tile_mask=np.zeros(tile_shape(40, 40), bool))
     assert (result.value, result.l1, result.dssim) == (0.0, 0.0, 0.0)
     assert result.gradient is not None
     assert not result.gradient.any()
@@ -203,7 +202,7 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
     for threads in (1, 2, 3, 7):
         set_num_threads(threads)
         for chosen in (None, mask):
-            r = photometric_loss(image, PhotometricTarget(target), tile_mask=chosen, halo_gradient=True)
+            r = photometric_loss(image, PhotometricTarget(target), tile_mask=chosen)
             assert r.gradient is not None
             seen.append((r.value, r.gradient.tobytes()))
     assert seen[0::2] == seen[:1] * 4
@@ -215,10 +214,10 @@ def test_calls_leave_no_trace_in_later_calls() -> None:
     image, target = near_pair(rng, 64, 64)
     mask = np.zeros(tile_shape(64, 64), bool)
     mask[1, 1] = True
-    first = photometric_loss(image, target, tile_mask=mask, halo_gradient=True)
+    first = photometric_loss(image, target, tile_mask=mask)
     photometric_loss(*noise_pair(rng, 64, 64))
     photometric_loss(*noise_pair(rng, 96, 32))
-    again = photometric_loss(image, target, tile_mask=mask, halo_gradient=True)
+    again = photometric_loss(image, target, tile_mask=mask)
     np.testing.assert_array_equal(first.gradient, again.gradient)  # type: ignore[arg-type]
     assert first.value == again.value
 
@@ -240,18 +239,6 @@ def test_without_gradient_the_value_is_the_same() -> None:
     result = photometric_loss(image, target, gradient=False)
     assert result.gradient is None
     assert result.value == photometric_loss(image, target).value
-
-
-def test_torch_function() -> None:
-    image, target = near_pair(np.random.default_rng(15), 40, 60)
-    x = torch.from_numpy(image.copy()).requires_grad_()
-    mask = torch.rand(tile_shape(40, 60), generator=torch.Generator().manual_seed(0)) < 0.5
-    loss = torch_loss(x, torch.from_numpy(target), tile_mask=mask, dssim_weight=0.3, halo_gradient=True)
-    (3.0 * loss).backward()
-    value, gradient = oracle(image, target, 0.3, mask.numpy())
-    assert loss.item() == pytest.approx(value, abs=1e-6)
-    assert_gradient(x.grad.numpy() / 3.0, gradient)  # type: ignore[union-attr]
-    assert not torch_loss(x.detach(), PhotometricTarget(target)).requires_grad
 
 
 def _wrong(**changes: Any) -> Callable[[], object]:
@@ -327,9 +314,3 @@ def test_around_changes_by_what_the_whole_loss_changes_by() -> None:
     whole = [photometric_loss(x, target).value for x in (image, changed)]
     assert abs(part[1] - part[0]) > 1e-4
     assert part[1] - part[0] == pytest.approx(whole[1] - whole[0], abs=1e-7)
-
-
-def test_around_and_halo_gradient_exclude_each_other() -> None:
-    image = np.zeros((20, 20, 3), np.float32)
-    with pytest.raises(InputError, match="expected at most one"):
-        photometric_loss(image, image, around=True, halo_gradient=True)

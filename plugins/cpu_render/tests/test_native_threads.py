@@ -9,7 +9,8 @@ from collections.abc import Iterator
 
 import pytest
 from gsstream_cpu_render import _native
-from gsstream_cpu_render.threads import copy_peak, fma_peak, num_threads, set_num_threads
+from gsstream_cpu_render.bench import copy_peak, fma_peak
+from gsstream_cpu_render.threads import num_threads, set_num_threads
 
 from gsstream.api import InputError
 

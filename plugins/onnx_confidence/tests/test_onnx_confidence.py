@@ -10,7 +10,8 @@ import pytest
 import torch
 from gsstream_onnx_confidence.estimator import OnnxConfidence
 
-from gsstream.api import InputError, ShapeError
+from gsstream.api import InputError, PluginUnavailable, ShapeError
+from gsstream.cli.main import run_command
 from gsstream.testing.cases import world
 
 onnx = pytest.importorskip("onnx")
@@ -106,3 +107,21 @@ def test_a_file_that_is_no_network_is_refused(tmp_path: Path) -> None:
     (tmp_path / "text.onnx").write_text("hello")
     with pytest.raises(InputError, match="expected an ONNX model"):
         OnnxConfidence(OnnxConfidence.Config(path=str(tmp_path / "text.onnx"))).estimate(world("moving"))
+
+
+def test_without_a_file_there_is_no_part(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(PluginUnavailable, match=r"expected the path of an ONNX file, got none; .*params\.path=FILE"):
+        OnnxConfidence()
+    assert run_command(["check", "onnx"]) == 0
+    out = capsys.readouterr().out
+    assert "⚠ every check (skipped): confidence 'onnx': expected the path of an ONNX file" in out
+    assert out.splitlines()[-1].endswith(" skipped")
+    assert "passed" not in out
+
+
+def test_the_command_checks_a_network_of_ones_own(networks: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = networks / "flow.onnx"
+    assert run_command(["check", "confidence/onnx", "--set", f"path={file}", "--set", "output=flow"]) == 0
+    assert "✓ confidence_view_order" in capsys.readouterr().out
+    assert run_command(["check", "confidence/onnx", "--set", f"path={file}", "--quiet"]) == 1
+    assert "expected an output float32 [1, 1, 20, 20]" in capsys.readouterr().out

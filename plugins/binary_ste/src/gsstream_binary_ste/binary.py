@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal, final
 
 import torch
 from pydantic import Field
 
-from gsstream.api import GateSampler, PartConfig, Traits, check_finite
+from gsstream.api import GateSampler, GateTraits, PartConfig, check_finite
 
 
 @final
@@ -23,6 +24,8 @@ class BinarySteGate(GateSampler):
     at both ends, which is where every binary gate is. So no gate feels the images, only the price of being open, and
     all of them close. ``clamp_gradient`` reproduces that; without it binary gates train.
     """
+
+    source = 'S2GS, ablation "Binary STE"'
 
     class Config(PartConfig):
         temperature: float = Field(
@@ -39,10 +42,15 @@ class BinarySteGate(GateSampler):
             default=False, description="block every gradient through a gate at 0 or 1, as the released clamp does"
         )
 
-    traits = Traits(stochastic=True, differentiable=True, temperature=True)
+    traits = GateTraits(stochastic=True, differentiable=True, temperature=True)
 
-    def claims(self) -> Traits:
+    def claims(self) -> GateTraits:
         return replace(self.traits, stochastic=self.config.noise == "logistic")
+
+    def denials(self) -> Mapping[str, str]:
+        if not self.config.clamp_gradient:
+            return {}
+        return {"check_gate_gradient_flow": "the released clamp blocks every gradient of a 0/1 gate"}
 
     @property
     def num_levels(self) -> int:
@@ -64,7 +72,7 @@ class BinarySteGate(GateSampler):
     def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
         """Gates [M], each exactly 0.0 or 1.0, dtype of the logits; a soft gate of exactly 1/2 is closed."""
         z = logits if noise is None else logits + noise.detach().to(logits.dtype)
-        tau: float = self.config.temperature
+        tau = self.config.temperature
         x = z.detach() / tau
         # The soft gate's slope; s (1 - s) would be exactly 0 from x = 17 on, and an open gate not feel the images.
         # z - z is exactly 0, so the value is exactly 0 or 1.

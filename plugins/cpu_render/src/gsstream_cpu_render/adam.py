@@ -27,7 +27,6 @@ def adam_rows(
     beta2: float = 0.999,
     eps: float = 1e-15,
     rows: Any | None = None,
-    skip_zero_rows: bool = False,
     check_finite: bool = True,
 ) -> None:
     """Update the chosen rows in place; each row's bias is corrected by the number of steps that row has taken.
@@ -39,7 +38,6 @@ def adam_rows(
         lr: a number, [d] rates per column or [n] per row; if n = d, give it as [1, d] or [n, 1].
         beta1, beta2: in [0, 1). eps: >= 0 (1e-15 as in 3D Gaussian splatting).
         rows: None (all), a bool mask [n], or strictly increasing int64 ids.
-        skip_zero_rows: leave rows whose gradient is exactly 0 as they are (their momentum does not move them).
         check_finite: look through the gradient first; a bad value changes nothing.
 
     Raises:
@@ -48,27 +46,7 @@ def adam_rows(
     """
     table = _Table(param, exp_avg, exp_avg_sq)
     steps = native_array("step", step, np.int32, (table.n,), writable=True)
-    _run(table, grad, steps, 1, lr, (beta1, beta2, eps), _rows(rows, table.n), skip_zero_rows, check_finite)
-
-
-def adam_dense(
-    param: Any,
-    grad: Any,
-    exp_avg: Any,
-    exp_avg_sq: Any,
-    step: int,
-    *,
-    lr: Any,
-    beta1: float = 0.9,
-    beta2: float = 0.999,
-    eps: float = 1e-15,
-    check_finite: bool = True,
-) -> None:
-    """Update all rows in place with one step number: ``step`` = 1 for the first update. See ``adam_rows``."""
-    if isinstance(step, bool) or not isinstance(step, int) or step < 1:
-        refuse_value(f"step: expected an integer >= 1 (the number of this update), got {step!r}")
-    table = _Table(param, exp_avg, exp_avg_sq)
-    _run(table, grad, None, step, lr, (beta1, beta2, eps), (None, None), False, check_finite)
+    _run(table, grad, steps, lr, (beta1, beta2, eps), _rows(rows, table.n), check_finite)
 
 
 class _Table:
@@ -91,12 +69,10 @@ class _Table:
 def _run(
     table: _Table,
     grad: Any,
-    steps: NDArray[np.int32] | None,
-    dense_step: int,
+    steps: NDArray[np.int32],
     lr: Any,
     settings: tuple[float, float, float],
     rows: tuple[NDArray[np.int64] | None, NDArray[np.uint8] | None],
-    skip_zero_rows: bool,
     check_finite: bool,
 ) -> None:
     beta1, beta2, eps = settings
@@ -110,8 +86,8 @@ def _run(
     gradient = native_array("grad", grad, np.float32, (count, *table.shape[1:])).reshape(count, table.d)
     common, per_column, per_row = _rates(lr, table.n, table.d)
     bad = _native.adam_update(
-        table.param, gradient, table.exp_avg, table.exp_avg_sq, steps, dense_step, ids, mask,
-        common, per_column, per_row, beta1, beta2, eps, skip_zero_rows, check_finite,
+        table.param, gradient, table.exp_avg, table.exp_avg_sq, steps, ids, mask,
+        common, per_column, per_row, beta1, beta2, eps, check_finite,
     )  # fmt: skip
     if bad >= 0:
         row, column = divmod(bad, table.d)

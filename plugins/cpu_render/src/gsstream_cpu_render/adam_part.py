@@ -18,6 +18,8 @@ from gsstream_cpu_render.checks import native_array, refuse, refuse_value
 class CpuAdam(RowOptimiser):
     """Native and fused: one call per table, threaded where a table is large."""
 
+    source = "Adam (Kingma and Ba 2015)"
+
     def step(
         self,
         values: Mapping[str, torch.Tensor],
@@ -41,7 +43,7 @@ def _step(name: str, value: torch.Tensor, gradient: torch.Tensor, state: AdamSta
     moments = [part.numpy().reshape(rows, -1) for part in (state.exp_avg, state.exp_avg_sq)]
     try:
         bad = _native.adam_update(
-            *table, *moments, state.steps.numpy(), 1, None, None, *rates, *ADAM_BETAS, ADAM_EPS, False, True
+            *table, *moments, state.steps.numpy(), None, None, *rates, *ADAM_BETAS, ADAM_EPS, True
         )
     except (TypeError, ValueError) as error:
         for label, tensor in (("values", value), ("gradient", gradient), ("exp_avg", state.exp_avg)):

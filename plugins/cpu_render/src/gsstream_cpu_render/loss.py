@@ -71,7 +71,6 @@ def photometric_loss(
     dssim_weight: float = 0.2,
     tile_mask: Any | None = None,
     gradient: bool = True,
-    halo_gradient: bool = False,
     around: bool = False,
     out: Float32 | None = None,
 ) -> PhotometricLoss:
@@ -84,9 +83,7 @@ def photometric_loss(
         dssim_weight: w in [0, 1].
         tile_mask: [ceil(H/16), ceil(W/16)] bool or uint8; None means all tiles. The sums are divided by 3 H W as in
             the dense loss, so that losses of disjoint masks add up to it.
-        gradient: compute the gradient.
-        halo_gradient: also write the gradient at pixels of inactive tiles that are seen by windows of active ones.
-            Without it the gradient of inactive tiles is left as it is in ``out`` (zero without ``out``).
+        gradient: compute the gradient. In inactive tiles it is left as it is in ``out`` (zero without ``out``).
         around: sum also over the tiles beside masked ones, whose windows see them; the gradient is written in masked
             tiles alone and is there that of the dense loss.
         out: [H, W, 3] float32 to write the gradient into, if given.
@@ -101,12 +98,9 @@ def photometric_loss(
     known = target if isinstance(target, PhotometricTarget) else None
     goal = native_array("target", target if known is None else known.image, np.float32, image.shape)
     height, width, _ = image.shape
-    active = _mask(tile_mask, height, width)
-    if around and halo_gradient:
-        refuse_value("around and halo_gradient: expected at most one of them; around=True needs no gradient beside")
+    wanted = _mask(tile_mask, height, width)
     # Without a mask there is nothing beside, and the kernel takes the whole image in one go.
-    wanted = _dilated(active) if halo_gradient and tile_mask is not None else active
-    active = _dilated(active) if around and tile_mask is not None else active
+    active = _dilated(wanted) if around and tile_mask is not None else wanted
     if not gradient:
         result = None
     elif out is None:

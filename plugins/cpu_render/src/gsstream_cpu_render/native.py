@@ -8,9 +8,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gsstream_cpu_render import _native
-from gsstream_cpu_render.arrays import SplatGradients, gradient_shapes, new_gradients, require_float32
+from gsstream_cpu_render.arrays import SplatArrays, SplatGradients, gradient_shapes, new_gradients, require_float32
 from gsstream_cpu_render.checks import Float32, refuse_value
 from gsstream_cpu_render.view import NEAR, Background, checked_view
+
+
+def native_scene(splats: SplatArrays) -> Any:
+    """The checked arrays as the one handle that the kernels take; nothing is copied."""
+    return _native.Scene(*splats)
 
 
 class NativeRasterizer:
@@ -74,6 +79,13 @@ class NativeRasterizer:
         }
 
     # ---- checks
+
+    def _expect(self, operation: str) -> None:
+        """Raise InputError unless this operation may follow now; asked before its arguments meet the last pass."""
+        try:
+            self._native.expect(operation)
+        except ValueError as error:
+            refuse_value(str(error))
 
     def _call(self, name: str, *arguments: object) -> int:
         try:

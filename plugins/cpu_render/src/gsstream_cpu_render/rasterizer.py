@@ -20,7 +20,7 @@ from gsstream_cpu_render.arrays import (
     require_splats,
 )
 from gsstream_cpu_render.checks import Float32, native_array, refuse
-from gsstream_cpu_render.native import NativeRasterizer
+from gsstream_cpu_render.native import NativeRasterizer, native_scene
 from gsstream_cpu_render.view import NEAR, Background
 
 
@@ -82,7 +82,7 @@ class NumpyRasterizer(NativeRasterizer):
         splats = require_splats(splats)
         mask = require_mask(tile_mask, self.width, self.height)
         target = self._target(image, transmittance)
-        faults = self._call("forward", *splats, *self._view, mask, *target)
+        faults = self._call("forward", native_scene(splats), *self._view, mask, *target)
         raise_on_faults(faults, splats)
         self._coefficients, self._scene_rows = splats.shN.shape[1] + 1, len(splats.means)
         return target
@@ -105,20 +105,11 @@ class NumpyRasterizer(NativeRasterizer):
         Raises:
             InputError: wrong dtype, shape or layout, or no matching forward.
         """
+        self._expect("backward")
         rows = self._native.visible_count if compact else self._scene_rows
         gradients = self._gradients(rows, out)
         self._call("backward", *self._upstream(v_image, v_alpha), *gradients, compact)
         return gradients
-
-    def backward_screen(self, v_image: Float32) -> Float32:
-        """Gradient of sum(v_image * image) with respect to the 2-D means of all Gaussians: [N, 2], pixels.
-
-        Raises:
-            InputError: wrong dtype, shape or layout, or no matching forward.
-        """
-        v_means2d = np.empty((self._scene_rows, 2), np.float32)
-        self._call("backward_screen", self._upstream(v_image, None)[0], v_means2d)
-        return v_means2d
 
     def visible_rows(self) -> NDArray[np.uint32]:
         """Ascending rows that touch a wanted tile in the last pass (after an active pass: indices into active_ids)."""
@@ -153,6 +144,7 @@ class NumpyRasterizer(NativeRasterizer):
         if not isinstance(active_ids, np.ndarray) or active_ids.dtype != np.uint32 or active_ids.ndim != 1:
             got = f"{getattr(active_ids, 'dtype', type(active_ids).__name__)} {list(np.shape(active_ids))}"
             refuse(f"active_ids: expected uint32 [A], got {got}; convert with ids.astype(np.uint32)")
+        self._expect("freeze")
         self._call("freeze", require_mask(tile_mask, self.width, self.height), np.ascontiguousarray(active_ids))
 
     def forward_active(
@@ -174,9 +166,11 @@ class NumpyRasterizer(NativeRasterizer):
         Raises:
             InputError: wrong dtype, shape or layout, values that are not finite, no `freeze` since the last forward.
         """
+        self._expect("forward_active")
         rows = require_splats(rows, self._native.active_count)
         target = self._target(image, transmittance)
-        raise_on_faults(self._call("forward_active", *rows, self._view.background, *target, touched_only), rows)
+        faults = self._call("forward_active", native_scene(rows), self._view.background, *target, touched_only)
+        raise_on_faults(faults, rows)
         self._coefficients = rows.shN.shape[1] + 1
         return target
 
@@ -188,6 +182,7 @@ class NumpyRasterizer(NativeRasterizer):
         Raises:
             InputError: wrong dtype, shape or layout, or no matching forward_active.
         """
+        self._expect("backward_active")
         gradients = self._gradients(self._native.active_count, out)
         self._call("backward_active", *self._upstream(v_image, v_alpha), *gradients)
         return gradients
@@ -210,13 +205,13 @@ class NumpyRasterizer(NativeRasterizer):
         changed = native_array("changed", changed, np.uint32, ("A",))
         rows = require_splats(rows, len(changed))
         target = self._target(image, transmittance)
-        raise_on_faults(self._call("update", changed, *rows, self._view.background, *target), rows)
+        raise_on_faults(self._call("update", changed, native_scene(rows), self._view.background, *target), rows)
 
     def backward_cached(self, splats: SplatArrays, v_image: Float32) -> tuple[Float32, NDArray[np.bool_]]:
         """Gradient of sum(v_image * image) of the cached scene by its 2-D means [N, 2], and who is visible [N] bool.
 
         Nothing is rendered, and work follows the pixels at which ``v_image`` [H, W, 3] is not zero. Same bits as
-        `backward_screen` of a full forward. A backward of an active pass may still follow.
+        `backward` of a full forward gives. A backward of an active pass may still follow.
 
         Arguments:
             splats: the values the cache was made of (`forward`, then every `update`).
@@ -226,7 +221,7 @@ class NumpyRasterizer(NativeRasterizer):
         """
         splats = require_splats(splats)
         v_means2d, visible = np.empty((len(splats.means), 2), np.float32), np.empty(len(splats.means), np.uint8)
-        self._call("backward_cached", *splats, self._upstream(v_image, None)[0], v_means2d)
+        self._call("backward_cached", native_scene(splats), self._upstream(v_image, None)[0], v_means2d)
         self._call("visible_in_cache", visible)
         return v_means2d, visible.view(np.bool_)
 
@@ -242,6 +237,7 @@ class NumpyRasterizer(NativeRasterizer):
         Raises:
             InputError: wrong dtype or shape, no full forward yet, tiles that are not cached.
         """
+        self._expect("drawn_in_cache")
         drawn = np.empty(self._native.scene_count, np.uint8)
         self._call("drawn_in_cache", require_mask(tile_mask, self.width, self.height), drawn)
         return drawn.view(np.bool_)
@@ -258,6 +254,7 @@ class NumpyRasterizer(NativeRasterizer):
         Raises:
             InputError: no full forward yet, or tiles that are not cached.
         """
+        self._expect("forward_cached")
         target = self._target(image, transmittance)
         self._call("forward_cached", self._view.background, require_mask(tile_mask, self.width, self.height), *target)
         return target

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from typing import final
 
-import numpy as np
 import torch
 from pydantic import Field
 
-from gsstream.api import Cameras, Gaussians, PartConfig, Renderer, RenderOutput, RenderSession, ScreenGradient
+from gsstream.api import Cameras, Gaussians, PartConfig, Renderer, RenderOutput, RenderSession
 from gsstream_cpu_render import _native
-from gsstream_cpu_render.autograd import differentiable, splats_of
-from gsstream_cpu_render.checks import as_array
+from gsstream_cpu_render.autograd import differentiable
 from gsstream_cpu_render.pool import lease
 from gsstream_cpu_render.session import CpuSession, FullPass
 from gsstream_cpu_render.view import Background
@@ -27,6 +25,8 @@ class CpuRenderer(Renderer):
     per camera, and only the blocks which active rows touch are rendered and differentiated: image and gradients have
     the same bits as a render of the whole scene.
     """
+
+    source = "3DGS (Kerbl et al. 2023)"
 
     class Config(PartConfig):
         """Threads: gsstream_cpu_render.threads; instruction set: environment GSSTREAM_ISA."""
@@ -46,17 +46,6 @@ class CpuRenderer(Renderer):
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, background: Background
     ) -> RenderOutput:
         return differentiable(FullPass(lease(cameras, view, background), None), gaussians, None)
-
-    def screen_gradient(
-        self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, image_gradient: torch.Tensor
-    ) -> ScreenGradient:
-        rasterizer = (held := lease(cameras, view, (0.0, 0.0, 0.0))).rasterizer
-        rasterizer.forward(splats_of(gaussians))
-        gradient = rasterizer.backward_screen(as_array("image_gradient", image_gradient.contiguous()))
-        visible = torch.zeros(len(gradient), dtype=torch.bool)
-        visible[torch.from_numpy(rasterizer.visible_rows().astype(np.int64))] = True
-        del held
-        return ScreenGradient(torch.from_numpy(gradient), visible)
 
     def open(
         self,

@@ -1,4 +1,4 @@
-"""Threads of the native kernels, and what this machine can do at most."""
+"""Threads of the native kernels."""
 
 from __future__ import annotations
 
@@ -23,19 +23,3 @@ def set_num_threads(n: int) -> None:
     if isinstance(n, bool) or not isinstance(n, int) or not 1 <= n <= 1024:
         refuse_value(f"set_num_threads: expected an integer from 1 to 1024, got {n!r}")
     _native.set_num_threads(n)
-
-
-def fma_peak(threads: int = 1, seconds: float = 0.2) -> float:
-    """Measure 10^9 float32 operations per second (a multiply-add is two) in registers, over ``seconds`` in (0, 60]."""
-    try:
-        return float(_native.fma_peak(threads, seconds))
-    except ValueError as error:
-        refuse_value(str(error))
-
-
-def copy_peak(threads: int = 1, megabytes: float = 64.0) -> float:
-    """Measure 10^9 bytes per second, read plus written, copying ``megabytes`` (0.001 to 4096) a thread."""
-    try:
-        return float(_native.copy_peak(threads, megabytes))
-    except ValueError as error:
-        refuse_value(str(error))

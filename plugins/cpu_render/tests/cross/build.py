@@ -45,7 +45,7 @@ def build(compiler: str, out: Path) -> Path:
     out.mkdir(parents=True, exist_ok=True)
     common = [compiler, "-std=c++20", "-O3", "-Wall", "-Wextra", f"-I{SOURCES}"]
     objects = []
-    for source in [*sorted(SOURCES.glob("*.cpp")), Path(__file__).with_name("driver.cpp")]:
+    for source in [*sorted(SOURCES.rglob("*.cpp")), Path(__file__).with_name("driver.cpp")]:
         if source.name.endswith(GLUE):
             continue
         target = out / f"{source.name}.o"

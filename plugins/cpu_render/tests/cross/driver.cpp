@@ -11,9 +11,9 @@
 #include <string>
 #include <vector>
 
-#include "adam.hpp"
-#include "photometric.hpp"
-#include "rasterizer.hpp"
+#include "adam/adam.hpp"
+#include "photometric/photometric.hpp"
+#include "raster/rasterizer.hpp"
 
 using namespace gsstream_cpu;
 
@@ -113,7 +113,9 @@ void adam(Output& out, std::vector<float> param, const std::vector<float>& gradi
   job.rows = job.count = param.size() / columns, job.columns = columns;
   job.param = param.data(), job.exp_avg = first.data(), job.exp_avg_sq = second.data(), job.grad = gradient.data();
   job.lr = 0.01, job.beta1 = 0.9, job.beta2 = 0.999, job.eps = 1e-15;
-  for (job.dense_step = 1; job.dense_step <= 3; job.dense_step++) adam_run(job);
+  std::vector<int32_t> steps(job.rows);
+  job.step = steps.data();
+  for (int update = 1; update <= 3; update++) adam_run(job);
   out.put("adam", param), out.put("adam first", first), out.put("adam second", second);
 }
 

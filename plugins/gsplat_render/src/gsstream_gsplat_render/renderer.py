@@ -34,6 +34,8 @@ class GsplatRenderer(Renderer):
     Raises PluginUnavailable on construction when there is no GPU, no gsplat, or no compiled kernels.
     """
 
+    source = "gsplat (Ye et al. 2024)"
+
     class Config(PartConfig):
         device: str = Field(default="cuda", pattern=r"^cuda(:\d+)?$", description="the GPU, e.g. cuda or cuda:1")
 
@@ -47,11 +49,6 @@ class GsplatRenderer(Renderer):
         return GsplatSession(self._kernels, self.config.device, gaussians, None, cameras, background).render(
             view, gaussians
         )
-
-    def screen_gradient(
-        self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, image_gradient: torch.Tensor
-    ) -> ScreenGradient:
-        return screen_gradient(self._kernels, self.config.device, gaussians, cameras, view, image_gradient)
 
     def open(
         self,

@@ -10,18 +10,22 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from gsstream.api import ConfidenceEstimator, FrameContext, PartConfig, Traits
+from gsstream.api import ConfidenceEstimator, ConfidenceTraits, FrameContext, PartConfig, PluginUnavailable
 from gsstream_onnx_confidence.network import run_network
 
 
 @final
 class OnnxConfidence(ConfidenceEstimator):
-    """p = mean over the views that see a Gaussian's centre of the network's change there; z = logit p (ours).
+    """p = mean over the views that see a Gaussian's centre of the network's change there; z = logit p.
 
     A flow of f pixels counts as a change of 1 - exp(-|f| / ``pixels``). Views whose two images are the same bits are
     not shown to the network and count as unchanged. The mean is a vote: a wall behind a moving hand is in
     changed pixels in some views only. Occlusion is not considered.
+
+    Raises PluginUnavailable on construction when no file is given.
     """
+
+    source = "gsstream"
 
     class Config(PartConfig):
         path: str = Field(default="", description="the ONNX file; see the plugin's README for its inputs and outputs")
@@ -34,9 +38,15 @@ class OnnxConfidence(ConfidenceEstimator):
             description="smallest logit, and that of Gaussians no view sees; the largest is its negative",
         )  # fmt: skip
 
-    traits = Traits()
+    def __init__(self, config: PartConfig | None = None) -> None:
+        super().__init__(config)
+        if not self.config.path:
+            raise PluginUnavailable(
+                "confidence 'onnx': expected the path of an ONNX file, got none; set confidence.params.path=FILE in a "
+                "run, or give --set path=FILE to gsstream check"
+            )
 
-    def claims(self) -> Traits:
+    def claims(self) -> ConfidenceTraits:
         return replace(self.traits, floor=self.config.floor)
 
     def estimate(self, context: FrameContext) -> torch.Tensor:

@@ -52,6 +52,8 @@ class Queen(StreamingMethod[QueenState]):
     from what is published, and why: README of this plugin.
     """
 
+    source = "QUEEN (Girish et al. 2024)"
+
     Config = QueenConfig
     heeds = ("stream.epochs",)
 
@@ -98,9 +100,10 @@ class Queen(StreamingMethod[QueenState]):
         delta = self._harden(state.player, active, result)
         step = self._send(state, frame, tools, delta, {"loss": result.loss, "iterations": result.iterations})
         clock.append(time.perf_counter())
+        shifts = None if delta.residual is None else delta.residual.symbols.get("means")
         facts = {
             "dynamic_gaussians": int(dynamic.sum()), "births": len(result.born), "deaths": int(result.gone.sum()),
-            "moved_gaussians": int(result.solution.symbols["means"].any(1).sum()) if delta.residual is not None and "means" in delta.residual.symbols else 0,
+            "moved_gaussians": 0 if shifts is None else int(shifts.any(1).sum()),
             "seconds": dict(zip(("confidence", "optimise", "code"), np.diff(clock).tolist(), strict=True)),
         }  # fmt: skip
         return replace(step, metrics={**step.metrics, **facts})

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import final
 
 import torch
 from pydantic import Field
 
-from gsstream.api import ConfidenceEstimator, FrameContext, PartConfig, Traits
+from gsstream.api import ConfidenceEstimator, ConfidenceTraits, FrameContext, PartConfig
 from gsstream_s2gs.whitened import pulls
 
 
 @final
 class ErrorAware(ConfidenceEstimator):
-    """Change as in ``noise-normalised``, or persistent reducible error (ours; the paper looks at change alone).
+    """Change as in ``noise-normalised``, or persistent reducible error; the paper looks at change alone.
 
     A gated stream keeps the defects of its first frame for ever, because gates open where the recording changes. Here a
     share ``budget`` of the Gaussians that did not change opens too: those on which the render's error in *both* frames
@@ -26,6 +27,8 @@ class ErrorAware(ConfidenceEstimator):
     still, and ``stream.active_threshold`` above the probability of ``floor``, so that this part alone decides who takes
     part and the cost follows its decision.
     """
+
+    source = "gsstream"
 
     class Config(PartConfig):
         threshold: float = Field(
@@ -52,30 +55,29 @@ class ErrorAware(ConfidenceEstimator):
         )
         limit: float = Field(default=50.0, gt=0, le=1e4, description="logits are kept in [-limit, limit] (ours)")
 
-    traits = Traits(needs_renderer=True, finds_motion=True)
+    traits = ConfidenceTraits(needs_renderer=True, finds_motion=True)
 
-    def claims(self) -> Traits:
+    def claims(self) -> ConfidenceTraits:
         # With a budget, what stands still may open for its error; that is the point.
         opened = self.config.error_logit if self.config.budget > 0 else self.config.floor
         floor = max(self.config.floor, opened)
-        return Traits(needs_renderer=True, finds_motion=True, monotone_in_change=self.config.budget == 0, floor=floor)
+        return replace(self.traits, monotone_in_change=self.config.budget == 0, floor=floor)
 
     def estimate(self, context: FrameContext) -> torch.Tensor:
         """Logits [N] float32 in [-limit, limit]. Raises ShapeError when a gradient is not finite."""
         config = self.config
         found = pulls(context, config.least_sigma, config.probes, config.seed, error=config.budget > 0)
-        logits: torch.Tensor = config.gain * (found.change_ratio - config.threshold)
+        logits = config.gain * (found.change_ratio - config.threshold)
         # Below the threshold there is no change to speak of: one defined value, which the active set can tell.
         logits = logits.where(found.change_ratio > config.threshold, torch.full_like(logits, config.floor))
         chosen = self._turn(found.error_ratio, found.change_ratio > config.threshold, context.index)
         logits[chosen] = config.error_logit
-        limit: float = config.limit
-        return logits.clamp(-limit, limit).float()
+        return logits.clamp(-config.limit, config.limit).float()
 
     def _turn(self, error: torch.Tensor, changed: torch.Tensor, index: int) -> torch.Tensor:
         """Rows whose turn it is: every ``turns``-th of the worst, at most ``budget`` of all."""
         count = int(self.config.budget * len(error))
-        turns = int(self.config.turns)
+        turns = self.config.turns
         wanting = torch.where(changed, torch.zeros_like(error), error)
         worst = torch.argsort(wanting, descending=True, stable=True)[: count * turns]
         worst = worst[wanting[worst] > self.config.error_threshold]

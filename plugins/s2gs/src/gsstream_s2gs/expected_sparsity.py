@@ -9,7 +9,7 @@ from typing import Literal, final
 import torch
 from pydantic import Field
 
-from gsstream.api import Hierarchy, PartConfig, Regularizer, ShapeError, Traits, check_shape
+from gsstream.api import Hierarchy, PartConfig, Regularizer, RegularizerTraits, ShapeError, check_shape
 
 
 @final
@@ -24,6 +24,8 @@ class ExpectedSparsity(Regularizer):
     Sums are taken per node and in double precision: with 1e7 Gaussians neither the value nor the gradient of a node
     loses digits.
     """
+
+    source = "S2GS, equation of L_reg"
 
     class Config(PartConfig):
         lambda1: float = Field(
@@ -40,11 +42,11 @@ class ExpectedSparsity(Regularizer):
             description="squared-norm: ||delta o||^2 (paper); half-mean: half the mean over the axes (released code)",
         )
 
-    traits = Traits(
+    traits = RegularizerTraits(
         differentiable=True, reduction="mean", weights=("lambda1", "lambda2"), gate_terms=("sparsity",)
     )
 
-    def claims(self) -> Traits:
+    def claims(self) -> RegularizerTraits:
         return replace(self.traits, reduction=self.config.reduction)
 
     def penalty(

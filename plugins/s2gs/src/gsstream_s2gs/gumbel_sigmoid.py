@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal, final
 
 import torch
 from pydantic import Field
 
-from gsstream.api import GateSampler, PartConfig, Traits, check_finite
+from gsstream.api import GateSampler, GateTraits, PartConfig, check_finite
 
 #: Half the spacing of float32 uniforms: moves the lattice k / 2^24 into the open interval (0, 1), symmetrically.
 HALF_STEP = 2.0**-25
@@ -34,6 +35,8 @@ class GumbelSigmoid(GateSampler):
     after rounding that blocks the gradient of every gate at 0 or 1; see ``noise`` and ``clamp_gradient``.
     """
 
+    source = 'S2GS, "Differentiable Gate Sampling"'
+
     class Config(PartConfig):
         temperature: float = Field(
             default=0.3, ge=0.01, le=100, description="tau, softness of the gate, no unit, 0.01 to 100 (paper: 0.3)"
@@ -53,14 +56,24 @@ class GumbelSigmoid(GateSampler):
             default=False, description="block the gradient where the rounded gate is 0 or 1, as the released clamp does"
         )
 
-    traits = Traits(stochastic=True, differentiable=True, temperature=True)
+    traits = GateTraits(stochastic=True, differentiable=True, temperature=True)
 
-    def claims(self) -> Traits:
+    def claims(self) -> GateTraits:
         return replace(self.traits, stochastic=self.config.noise != "none")
+
+    def denials(self) -> Mapping[str, str]:
+        denied = {}
+        # The logit beyond which a gate is rounded to 0 or 1; the check asks for life in nine tenths of [-1, 1].
+        reach = self.config.temperature * math.log(2 * self.config.levels - 1)
+        if self.config.clamp_gradient and reach < 0.9:
+            denied["check_gate_gradient_flow"] = "the released clamp blocks every gradient of a 0/1 gate"
+        if self.config.noise == "gumbel" and self.config.levels == 1:
+            denied["check_gate_init_calibrated"] = "with one Gumbel draw confidence 0.5 opens 63 % of all gates"
+        return denied
 
     @property
     def num_levels(self) -> int:
-        return int(self.config.levels)
+        return self.config.levels
 
     def init(self, logits: torch.Tensor) -> torch.Tensor:
         """Start from confidence logits [M], limited to the documented bound. Raises ShapeError if one is not finite."""
@@ -83,7 +96,7 @@ class GumbelSigmoid(GateSampler):
         steps = soft.new_tensor(float(self.num_levels))
         hard = torch.round(soft * steps) / steps
         # alpha - alpha is exactly 0, so the value is exactly the level; soft + (hard - soft) would be an ulp off.
-        tau: float = self.config.temperature
+        tau = self.config.temperature
         through = (alpha - alpha.detach()) * (slope(alpha.detach() / tau) / tau)
         if self.config.clamp_gradient:
             through = through * ((hard > 0) & (hard < 1))

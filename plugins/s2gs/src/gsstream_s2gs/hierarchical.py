@@ -7,7 +7,7 @@ from typing import final
 import torch
 from pydantic import Field
 
-from gsstream.api import Hierarchy, PartConfig, Propagation, Traits, check_finite, check_shape, tree_max
+from gsstream.api import Hierarchy, PartConfig, Propagation, PropagationTraits, check_finite, check_shape, tree_max
 
 
 @final
@@ -22,12 +22,16 @@ class HierarchicalMax(Propagation):
     At ties the gradient is shared equally between the tied Gaussians.
     """
 
+    source = 'S2GS, equation for p_j ("HFP")'
+
     class Config(PartConfig):
         empty: float = Field(
             default=-50.0, ge=-1e4, le=1e4, description="logit of a tree without Gaussians, -1e4 to 1e4 (ours)"
         )
 
-    traits = Traits(conservative=True, idempotent=True, differentiable=True, normalised=True, parent_bound=True)
+    traits = PropagationTraits(
+        conservative=True, idempotent=True, differentiable=True, normalised=True, parent_bound=True
+    )
 
     def propagate(self, logits: torch.Tensor, hierarchy: Hierarchy) -> torch.Tensor:
         """[N] logits -> [M] logits. Raises ShapeError for a wrong length, a value that is not finite, or a cycle."""

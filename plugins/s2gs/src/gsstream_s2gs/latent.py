@@ -54,6 +54,8 @@ class LatentResidual(UpdateRule):
     * Higher colour moves more slowly: it costs most bits and explains least between two frames.
     """
 
+    source = "S2GS, latents following QUEEN (Girish et al. 2024)"
+
     class Config(PartConfig):
         means: OffsetCode = Field(default=OffsetCode(), description="centres, in cells of the anchor")
         quats: LatentCode = Field(

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import final
 
 import torch
 from pydantic import Field
 
-from gsstream.api import ConfidenceEstimator, FrameContext, PartConfig, Traits
+from gsstream.api import ConfidenceEstimator, ConfidenceTraits, FrameContext, PartConfig
 from gsstream_s2gs.whitened import pulls
 
 
 @final
 class NoiseNormalised(ConfidenceEstimator):
-    """z_i = gain (r_i - threshold), r_i^2 = sum_v |g_iv|^2 / sum_v E|n_iv|^2 (ours).
+    """z_i = gain (r_i - threshold), r_i^2 = sum_v |g_iv|^2 / sum_v E|n_iv|^2.
 
     g_iv is the view-space gradient that the change of view v between two frames exerts on Gaussian i, the change being
     divided by that camera's noise; n_iv the same of unit noise, measured with seeded draws. So r is about 1 for a scene
@@ -23,6 +24,8 @@ class NoiseNormalised(ConfidenceEstimator):
 
     Energies are summed over views: the vectors of different views live in different image planes.
     """
+
+    source = "gsstream"
 
     class Config(PartConfig):
         threshold: float = Field(
@@ -42,16 +45,15 @@ class NoiseNormalised(ConfidenceEstimator):
         )
         limit: float = Field(default=50.0, gt=0, le=1e4, description="logits are kept in [-limit, limit] (ours)")
 
-    traits = Traits(needs_renderer=True, finds_motion=True, monotone_in_change=True)
+    traits = ConfidenceTraits(needs_renderer=True, finds_motion=True, monotone_in_change=True)
 
-    def claims(self) -> Traits:
-        return Traits(needs_renderer=True, finds_motion=True, monotone_in_change=True, floor=self.config.floor)
+    def claims(self) -> ConfidenceTraits:
+        return replace(self.traits, floor=self.config.floor)
 
     def estimate(self, context: FrameContext) -> torch.Tensor:
         """Logits [N] float32 in [-limit, limit]. Raises ShapeError when a gradient is not finite."""
         config = self.config
         found = pulls(context, config.least_sigma, config.probes, config.seed, error=False)
-        logits: torch.Tensor = config.gain * (found.change_ratio - config.threshold)
+        logits = config.gain * (found.change_ratio - config.threshold)
         logits = logits.where(found.change_ratio > 0, torch.full_like(logits, config.floor))
-        limit: float = config.limit
-        return logits.clamp(-limit, limit).float()
+        return logits.clamp(-config.limit, config.limit).float()

@@ -18,7 +18,7 @@ from gsstream.api import (
     PartConfig,
     PointCloud,
     Structure,
-    Traits,
+    StructureTraits,
     check_finite,
     check_shape,
 )
@@ -38,8 +38,8 @@ class StreamingOctree(Structure):
 
     1. D_max and D_min are the ``distance_quantile`` and its complement of the point-camera distances, first per
        training camera, then over all cameras. Levels: H = round(log_b(D_max / D_min)) + 1, at most ``max_levels``.
-    2. A cube of side S around the points, each side ``padding`` times the largest extent away from them (ours; the
-       released code multiplies coordinates by 1.1, which cuts points off when all lie on one side of the origin).
+    2. A cube of side S around the points, each side ``padding`` times the largest extent away from them. The
+       released code multiplies coordinates by 1.1, which cuts points off when all lie on one side of the origin.
     3. Level l has cells of side s_l = S / 2^(k + l), k = ``root_exponent``; each occupied cell is a candidate with an
        anchor at its centre (paper; released: lower corner) and the mean colour of its points (released: maximum).
     4. A candidate stays if its level is at most clamp(floor(log_b(D_max / d)), 0, H - 1) for more than
@@ -49,6 +49,8 @@ class StreamingOctree(Structure):
     with 0 the M nodes are the R root regions. Nodes of one level are numbered along a Morton curve, so Gaussians
     stored node by node lie near their neighbours. Gaussians 2^20 cells or more from the cube share outermost cells.
     """
+
+    source = "S2GS, streaming octree"
 
     class Config(PartConfig):
         root_exponent: int = Field(
@@ -95,7 +97,7 @@ class StreamingOctree(Structure):
                 )
             return self
 
-    traits = Traits(idempotent=True, local=True)
+    traits = StructureTraits(idempotent=True, local=True)
     auto_rules = OCTREE_RULES
 
     def seed(self, points: PointCloud, cameras: Cameras) -> Anchors:
@@ -147,9 +149,9 @@ class StreamingOctree(Structure):
         if far <= 0:
             return 1
         if near <= 0:
-            return int(self.config.max_levels)
+            return self.config.max_levels
         wanted = round((math.log(far) - math.log(near)) / math.log(self.config.log_base)) + 1
-        return min(int(self.config.max_levels), wanted)
+        return min(self.config.max_levels, wanted)
 
     def _cube(self, xyz: torch.Tensor, far: float) -> tuple[torch.Tensor, float]:
         """Lower corner [3] and side of the root cube, both exact in float32 so that ``build`` sees the same grid."""
@@ -176,7 +178,7 @@ class StreamingOctree(Structure):
             asked = torch.log(far / distance) / math.log(self.config.log_base)
             asked = torch.floor(asked) if self.config.level_rounding == "floor" else torch.round(asked)
             votes += level <= asked.clamp(0, levels - 1)
-        threshold: float = self.config.visible_threshold * len(centers)
+        threshold = self.config.visible_threshold * len(centers)
         return votes > threshold
 
 

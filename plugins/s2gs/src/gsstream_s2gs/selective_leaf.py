@@ -11,8 +11,8 @@ from gsstream.api import (
     Hierarchy,
     PartConfig,
     Propagation,
+    PropagationTraits,
     ShapeError,
-    Traits,
     check_finite,
     check_shape,
     tree_roots,
@@ -21,8 +21,7 @@ from gsstream.api import (
 
 @final
 class SelectiveLeaf(Propagation):
-    """HFP where a region is homogeneous, leaf by leaf where it is not (ours; future work in the paper, section
-    "Root-level Gating Strategy").
+    """HFP where a region is homogeneous, leaf by leaf where it is not.
 
     For a structure whose gates lie below the roots (``structure.gate_level`` 1 or more). A tree whose suspect nodes
     (logit above ``suspect``) are at least a share ``spread`` of its nodes with members moves as one: all its nodes get
@@ -30,6 +29,8 @@ class SelectiveLeaf(Propagation):
     subtree: a still leaf beside a moving one stays closed. When every node is a root this is the maximum over each
     group.
     """
+
+    source = 'gsstream, after future work named in S2GS ("Root-level Gating Strategy")'
 
     class Config(PartConfig):
         suspect: float = Field(
@@ -42,7 +43,9 @@ class SelectiveLeaf(Propagation):
             default=-50.0, ge=-1e4, le=1e4, description="logit of a subtree without Gaussians, -1e4 to 1e4 (ours)"
         )
 
-    traits = Traits(conservative=True, idempotent=True, differentiable=True, normalised=True, parent_bound=True)
+    traits = PropagationTraits(
+        conservative=True, idempotent=True, differentiable=True, normalised=True, parent_bound=True
+    )
 
     def propagate(self, logits: torch.Tensor, hierarchy: Hierarchy) -> torch.Tensor:
         """[N] logits -> [M] logits. Raises ShapeError for a wrong length, a value that is not finite, or a cycle."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from types import MappingProxyType
 from typing import final
 
 import torch
 from pydantic import Field
 
-from gsstream.api import ConfidenceEstimator, FrameContext, PartConfig, Rng, Traits, check_finite
+from gsstream.api import ConfidenceEstimator, ConfidenceTraits, FrameContext, PartConfig, Rng, check_finite
 
 
 @final
@@ -19,14 +20,18 @@ class UniformRandom(ConfidenceEstimator):
     finite. Draws belong to rows: a permutation of the Gaussians gives them other lots.
     """
 
+    source = "S2GS, table of confidence estimators"
+
     class Config(PartConfig):
         seed: int = Field(default=0, ge=0, description="seed of the draws, any integer from 0")
         limit: float = Field(
             default=math.log(1000.0), gt=0, le=50, description="logits are kept in [-limit, limit], 0 to 50 (ours)"
         )
 
-    def claims(self) -> Traits:
-        return Traits(floor=self.config.limit)
+    denied = MappingProxyType({"check_permutation": "lots are drawn row by row, whoever stands in the row"})
+
+    def claims(self) -> ConfidenceTraits:
+        return ConfidenceTraits(floor=self.config.limit)
 
     def estimate(self, context: FrameContext) -> torch.Tensor:
         """Logits [N] float32 in [-limit, limit]. Raises ShapeError when an image is not finite."""

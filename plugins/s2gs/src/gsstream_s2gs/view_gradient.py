@@ -9,7 +9,7 @@ from typing import Literal, final
 import torch
 from pydantic import Field, model_validator
 
-from gsstream.api import ConfidenceEstimator, FrameContext, PartConfig, Rng, Traits, check_finite
+from gsstream.api import ConfidenceEstimator, ConfidenceTraits, FrameContext, PartConfig, Rng, check_finite
 from gsstream_s2gs.normalise import minmax, noise_units, ratio, robust
 
 
@@ -33,6 +33,8 @@ class ViewSpaceGradient(ConfidenceEstimator):
     Released code: m is a sum over views of norms, E the mean per-pixel Euclidean distance, p = m / (m + median):
     ``loss: l2norm``, ``aggregate: sum-of-norms``, ``normalisation: ratio``.
     """
+
+    source = "S2GS, equation for p_i"
 
     class Config(PartConfig):
         loss: Literal["mse", "l2norm"] = Field(
@@ -88,9 +90,9 @@ class ViewSpaceGradient(ConfidenceEstimator):
                 raise ValueError("normalisation noise: expected perturbation 0, got more; use robust, ratio or minmax")
             return self
 
-    traits = Traits(needs_renderer=True, finds_motion=True, monotone_in_change=True)
+    traits = ConfidenceTraits(needs_renderer=True, finds_motion=True, monotone_in_change=True)
 
-    def claims(self) -> Traits:
+    def claims(self) -> ConfidenceTraits:
         # Normalised by its own statistics, a change may look weaker as all others grow: the default is checked to rise.
         rises = self.config.normalisation == "robust"
         return replace(
@@ -156,7 +158,7 @@ class ViewSpaceGradient(ConfidenceEstimator):
 
     def _direction(self, difference: torch.Tensor) -> torch.Tensor:
         """Derivative of sqrt(|d|^2 + eps): d over that root; 0 where render and ground truth agree."""
-        epsilon: float = self.config.distance_epsilon
+        epsilon = self.config.distance_epsilon
         return difference / (difference.square().sum(-1, keepdim=True) + epsilon).sqrt()
 
     def _noise_upstream(self, context: FrameContext, view: int) -> torch.Tensor:
@@ -170,7 +172,7 @@ class ViewSpaceGradient(ConfidenceEstimator):
     def _perturb(self, values: torch.Tensor, index: int) -> torch.Tensor:
         """max(|m| + a std(|m|) n, 0), n standard normal (paper, equation for the noisy VGD; on norms, so that the floor
         at 0 has a meaning)."""
-        strength: float = self.config.perturbation
+        strength = self.config.perturbation
         if strength == 0:
             return values
         generator = Rng(self.config.seed).stream("s2gs/view-gradient/perturbation", index)

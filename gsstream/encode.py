@@ -1,0 +1,99 @@
+"""Encode from Python: frames in, packets out, no folder and no command line.
+
+::
+
+    from gsstream.encode import Encoder, StreamWriter, encoder_for, open_recording
+
+    with open_recording("demo") as source, StreamWriter.open("demo.gss") as writer:
+        encoder = encoder_for("s2gs-fast", source)
+        for index in range(3):
+            writer.append(encoder.encode(source.frame(index)).packet)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.frame import Frame as Frame
+from gsstream.engine.assembly.assemble import Assembly as Assembly
+from gsstream.engine.assembly.assemble import assemble
+from gsstream.engine.frame0.points import gather_points
+from gsstream.engine.run.encoder import Encoder as Encoder
+from gsstream.engine.run.encoder import Listeners as Listeners
+from gsstream.engine.run.recording import open_recording as _open
+from gsstream.method.base import Step as Step
+from gsstream.packet import StreamWriter as StreamWriter
+from gsstream.plugins.catalog import load_catalog
+from gsstream.recipe.load import resolve_recipe
+from gsstream.recipe.model import Recipe as Recipe
+from gsstream.source.base import FrameSource as FrameSource
+from gsstream.source.base import SourceInfo
+
+
+def recipe_for(method: str, settings: Mapping[str, Any] | None = None) -> Recipe:
+    """Return the recipe of a method.
+
+    Arguments:
+        method: a name of ``gsstream methods``.
+        settings: key -> value, as ``--set`` takes them: ``{"stream.epochs": 6}``.
+
+    Raises UnknownName or RecipeError as ``gsstream run`` does.
+    """
+    changes = [("settings", f"{key}={value}") for key, value in (settings or {}).items()]
+    return resolve_recipe(method, load_catalog().recipe_path, (), changes).recipe
+
+
+@contextmanager
+def open_recording(uri: str, recipe: Recipe | None = None) -> Iterator[FrameSource]:
+    """Open a recording, and close it at the end of the block.
+
+    Arguments:
+        uri: "demo", "synthetic:...", a folder: what ``--source`` takes.
+        recipe: its scale and its split; None: everything as recorded.
+
+    Raises SourceError when it cannot be read.
+    """
+    source = _open(uri, recipe or Recipe(), load_catalog())
+    try:
+        yield source
+    finally:
+        source.close()
+
+
+def encoder_for(
+    method: str, source: FrameSource, settings: Mapping[str, Any] | None = None, listeners: Listeners | None = None
+) -> Encoder:
+    """Return an encoder of a recording, before its frame 0.
+
+    Arguments:
+        method: a name of ``gsstream methods``.
+        source: an open recording; its points seed frame 0.
+        settings: as for :func:`recipe_for`.
+        listeners: what is told of the work.
+    """
+    parts = assemble(recipe_for(method, settings), load_catalog())
+
+    def seeds(frame: Frame) -> Any:
+        return gather_points(source.points, frame, parts.recipe.first_frame, encoder.rng)
+
+    encoder = Encoder(parts, source.info, seeds, listeners=listeners)
+    return encoder
+
+
+def encoder_of_rig(
+    method: str, cameras: Cameras, *, fps: float = 30.0, settings: Mapping[str, Any] | None = None, name: str = "rig"
+) -> Encoder:
+    """Return an encoder of images that come from anywhere; frame 0 is seeded by a plane sweep over them.
+
+    Arguments:
+        method: a name of ``gsstream methods``.
+        cameras: the training cameras; frames bring their images in this order.
+        fps: frames per second, for players.
+        settings: as for :func:`recipe_for`.
+        name: what the stream says of its origin.
+    """
+    info = SourceInfo(name, f"rig:{name}", None, fps, cameras, cameras.select([]))
+    return Encoder(assemble(recipe_for(method, settings), load_catalog()), info)

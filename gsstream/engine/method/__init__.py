@@ -1,0 +1,1 @@
+"""The method made of parts, and how any method is called and held to its contract."""

@@ -1,0 +1,42 @@
+"""Coasting: what moved in the last frame goes on moving."""
+
+from __future__ import annotations
+
+from typing import ClassVar, final
+
+import numpy as np
+from pydantic import Field
+
+from gsstream.core.changes import Motion, Scene
+from gsstream.core.context import FrameWork
+from gsstream.core.part import PartConfig
+from gsstream.core.rng import Rng
+from gsstream.motion.base import MotionPart
+from gsstream.motion.groups import changed_groups, displaced_groups, known_groups
+
+
+@final
+class Coasting(MotionPart):
+    """Lets every group that was displaced in the last frame, and lies in what changed now, continue at its velocity.
+
+    The velocity is the mean over the group's displaced rows, which every player computes from the packets so far: a
+    moving group costs about a bit. Where nothing changed nothing moves, so a velocity dies when its body stops.
+    """
+
+    class Config(PartConfig):
+        pixels: float = Field(default=8.0, gt=0, le=1000, description="side of a group, pixels at median distance")
+        shades: int = Field(default=1, ge=1, le=16, description="classes of brightness that split the groups of a cell")
+        votes: float = Field(
+            default=0.5, ge=0, le=1, description="share of its views in which a Gaussian must lie in changed tiles"
+        )
+        share: float = Field(default=0.5, ge=0, le=1, description="share of a group's Gaussians that must lie there")
+
+    source: ClassVar[str] = "gsstream"
+
+    def propose(self, scene: Scene, work: FrameWork, rng: Rng) -> tuple[Motion, ...]:
+        if scene.moved is None:
+            return ()
+        groups = known_groups(scene, work.cameras, self.config.pixels, self.config.shades)
+        moving = displaced_groups(groups, scene) & changed_groups(groups, work, self.config.votes, self.config.share)
+        symbols = np.zeros((int(moving.sum()), 6), np.int32)
+        return (Motion(groups.cell, groups.shades, moving.astype(np.uint8), symbols),)

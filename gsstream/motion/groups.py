@@ -1,0 +1,51 @@
+"""Which groups a motion part works with: their size in pixels, and which of them lie in what changed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.changes import Groups, Scene, groups_for
+from gsstream.core.context import FrameWork
+from gsstream.core.shapes import FloatArray, IntArray
+
+
+def pixel_size(means: FloatArray, cameras: Cameras) -> float:
+    """Return how wide a pixel is at the scene's median distance from the cameras, scene units.
+
+    Arguments:
+        means: [N, 3] centres, N > 0.
+    """
+    widths = [np.linalg.norm(means - at, axis=1) / K[0, 0] for at, K in zip(cameras.centers, cameras.Ks, strict=True)]
+    return float(np.median(np.concatenate(widths)))
+
+
+def known_groups(scene: Scene, cameras: Cameras, pixels: float, shades: int) -> Groups:
+    """Return the groups the scene has had since the last key packet; else cells as wide as ``pixels`` pixels, by shade.
+
+    A cell that is known stays: it was measured on the scene of the last key packet, which a resumed run does not have.
+    """
+    if scene.groups is not None and scene.groups.shades == shades:
+        return scene.groups
+    cell = float(np.float32(max(pixels * pixel_size(scene.gaussians.means, cameras), 1e-6)))
+    return groups_for(scene, cell, shades)
+
+
+def changed_groups(groups: Groups, work: FrameWork, votes: float, share: float) -> IntArray:
+    """Return [G] bool: groups of which at least this share of the rows lie in what changed.
+
+    Arguments:
+        votes: as for ``work.changed_rows``. share: 0 to 1.
+    """
+    changed = work.changed_rows(votes).numpy()
+    total = np.bincount(groups.group_of, minlength=groups.count)
+    hit = np.bincount(groups.group_of[changed], minlength=groups.count)
+    return np.asarray((total > 0) & (hit > 0) & (hit >= share * total))
+
+
+def displaced_groups(groups: Groups, scene: Scene) -> IntArray:
+    """Return [G] bool: groups of which some row was displaced by the last frame."""
+    out = np.zeros(groups.count, bool)
+    if scene.moved is not None:
+        out[groups.group_of[scene.moved.rows]] = True
+    return out

@@ -1,0 +1,128 @@
+"""Rigid groups: every group that lies in what changed gets a rotation and a shift, fitted to the images."""
+
+from __future__ import annotations
+
+from typing import ClassVar, NamedTuple, final
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from gsstream.core.changes import Motion, Scene
+from gsstream.core.changes.motion import Moves, moves_of, transformed
+from gsstream.core.context import FrameWork
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.part import PartConfig
+from gsstream.core.rng import Rng
+from gsstream.core.shapes import FloatArray
+from gsstream.motion.base import MotionPart
+from gsstream.motion.groups import changed_groups, known_groups, pixel_size
+
+BETAS, EPSILON = (0.9, 0.99), 1e-12
+
+
+class Units(NamedTuple):
+    """What counts as one: ``shift`` [scene units] is a pixel, ``turn`` [tan(angle / 2)] moves a group's edge as far."""
+
+    shift: float
+    turn: float
+
+    @property
+    def row(self) -> FloatArray:
+        """[6] units of shift and turn, side by side."""
+        return np.array([self.shift] * 3 + [self.turn] * 3)
+
+
+@final
+class Rigid(MotionPart):
+    """Fits one rigid transform per group, starting from the last frame's, and codes what corrects the prediction.
+
+    A few passes over the training cameras move the groups' six numbers each, with Adam and a falling rate; only the
+    Gaussians of groups that lie in what changed are rendered anew. A group that ends within ``least`` pixels of where
+    it stood is left alone.
+    """
+
+    class Config(PartConfig):
+        pixels: float = Field(default=12.0, gt=0, le=1000, description="side of a group, pixels at median distance")
+        shades: int = Field(default=2, ge=1, le=16, description="classes of brightness that split the groups of a cell")
+        votes: float = Field(
+            default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in changed tiles"
+        )
+        share: float = Field(default=0.5, ge=0, le=1, description="share of a group's Gaussians that must lie there")
+        epochs: int = Field(default=2, ge=1, le=100, description="passes over the training cameras")
+        lr: float = Field(default=0.25, gt=0, le=10, description="first step, pixels per iteration")
+        lr_final: float = Field(default=0.025, gt=0, le=10, description="last step, pixels per iteration")
+        step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
+        least: float = Field(default=0.1, ge=0, le=10, description="motions below this many pixels are dropped")
+
+    source: ClassVar[str] = "gsstream; groups of one rigid motion as in HiCoM"
+
+    def propose(self, scene: Scene, work: FrameWork, rng: Rng) -> tuple[Motion, ...]:
+        config = self.config
+        groups = known_groups(scene, work.cameras, config.pixels, config.shades)
+        able = changed_groups(groups, work, config.votes, config.share)
+        if not able.any():
+            return ()
+        units = _units(scene, work, groups.cell)
+        start = moves_of(scene, groups, able.astype(np.uint8), predicted=True)
+        found = self._fitted(scene, work, start, units, rng)
+        steps = np.float32(config.step * units.shift), np.float32(config.step * units.turn)
+        step = np.array([float(steps[0])] * 3 + [float(steps[1])] * 3)
+        predicted = np.concatenate([start.shift, start.turn], 1)
+        symbols = np.rint((found - predicted) / step).astype(np.int32)
+        total = np.abs((predicted + symbols * step) / units.row).max(1)
+        kept = total >= config.least
+        moving = np.zeros(groups.count, np.uint8)
+        moving[np.flatnonzero(able)[kept]] = 1
+        return (Motion(groups.cell, groups.shades, moving, symbols[kept], float(steps[0]), float(steps[1])),)
+
+    def _fitted(self, scene: Scene, work: FrameWork, start: Moves, units: Units, rng: Rng) -> FloatArray:
+        """[K, 6] shift and turn of the groups that explain the images best."""
+        config, views = self.config, len(work.cameras)
+        rows = torch.from_numpy(start.rows)
+        work.narrow(rows)
+        base = scene.gaussians.rows(start.rows)
+        local = start._replace(rows=np.arange(len(start.rows)))
+        values = np.concatenate([start.shift, start.turn], 1) / units.row
+        first, second = np.zeros_like(values), np.zeros_like(values)
+        total = config.epochs * views
+        order = rng.numpy("motion", work.index)
+        for step in range(total):
+            if step % views == 0:
+                sequence = order.permutation(views)
+            moves = local._replace(shift=values[:, :3] * units.shift, turn=values[:, 3:] * units.turn)
+            moved = transformed(base, moves)
+            leaves = moved.map(lambda value: torch.from_numpy(value).requires_grad_())
+            work.pull(int(sequence[step % views]), leaves)
+            slope = _pulled_back(leaves, moves) * units.row
+            first = BETAS[0] * first + (1 - BETAS[0]) * slope
+            second = BETAS[1] * second + (1 - BETAS[1]) * slope**2
+            rate = config.lr * (config.lr_final / config.lr) ** (step / total)
+            scale = np.sqrt(second / (1 - BETAS[1] ** (step + 1))) + EPSILON
+            values = values - rate * (first / (1 - BETAS[0] ** (step + 1))) / scale
+        return values * units.row
+
+
+def _pulled_back(leaves: Gaussians[torch.Tensor], moves: Moves) -> FloatArray:
+    """[K, 6] gradient with respect to shift and turn, from that of the moved centres and quaternions."""
+    number = len(moves.centre)
+    if leaves.means.grad is None:
+        return np.zeros((number, 6))
+    force = leaves.means.grad.numpy().astype(np.float64)
+    arm = leaves.means.detach().numpy() - (moves.centre + moves.shift)[moves.place]
+    torque = 2 * np.cross(arm, force)
+    if leaves.quats.grad is not None:
+        w, x, y, z = leaves.quats.detach().numpy().astype(np.float64).T
+        a, b, c, d = leaves.quats.grad.numpy().astype(np.float64).T
+        # A small turn v in front of a quaternion q adds (0, v) q to it.
+        torque += np.stack([
+            -a * x + b * w - c * z + d * y, -a * y + b * z + c * w - d * x, -a * z - b * y + c * x + d * w
+        ], 1)  # fmt: skip
+    both = np.concatenate([force, torque], 1)
+    return np.stack([np.bincount(moves.place, both[:, i], number) for i in range(6)], 1)
+
+
+def _units(scene: Scene, work: FrameWork, cell: float) -> Units:
+    pixel = pixel_size(scene.gaussians.means, work.cameras)
+    # Half a cell from the centre, an angle a moves a point by a * cell / 2 = tan(a / 2) * cell.
+    return Units(pixel, pixel / cell)

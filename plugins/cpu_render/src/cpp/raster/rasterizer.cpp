@@ -1,0 +1,267 @@
+#include "raster/rasterizer.hpp"
+
+#include <algorithm>
+#include <cstring>
+#include <iterator>
+#include <stdexcept>
+#include <string>
+
+#include "raster/claim.hpp"
+#include "runtime/parallel.hpp"
+
+namespace gsstream_cpu {
+namespace {
+
+constexpr std::size_t CLEAR_GRAIN = 16384;  // rows
+
+std::size_t chunk_count(std::size_t rows) { return (rows + PROJECT_CHUNK - 1) / PROJECT_CHUNK; }
+
+}  // namespace
+
+Rasterizer::Rasterizer()
+    : isa_(active_isa()),
+      project_kernels_(project_kernels()),
+      project_backward_kernels_(project_backward_kernels()),
+      composite_kernels_(composite_kernels()) {}
+Rasterizer::~Rasterizer() = default;
+
+void Rasterizer::expect(const std::string& operation) const {
+  const auto named = [&](const Rule& rule) { return operation == rule.operation; };
+  const Rule* rule = std::find_if(std::begin(RULES), std::end(RULES), named);
+  if (rule == std::end(RULES)) throw std::invalid_argument("expect: no operation is called '" + operation + "'.");
+  const bool frozen = state_ == State::frozen || state_ == State::active_passed;
+  const char* missing = nullptr;
+  if (rule->needs == State::cached && state_ == State::empty)
+    missing = "a forward pass of the whole scene before, got none. Call forward first.";
+  if (rule->needs == State::passed && state_ != State::passed)
+    missing = "a forward pass before, got none (or another pass since).";
+  if (rule->needs == State::frozen && !frozen)
+    missing = "freeze(tile_mask, active_ids) before, got none since the last forward or update.";
+  if (rule->needs == State::active_passed && state_ != State::active_passed)
+    missing = "a forward_active pass before, got none (or another pass since).";
+  if (missing) throw std::invalid_argument(operation + ": expected " + missing);
+}
+
+void Rasterizer::drop_pass() {
+  if (state_ == State::passed) state_ = State::cached;
+  if (state_ == State::active_passed) state_ = State::frozen;
+}
+
+TileSelection Rasterizer::cached_tiles(const uint8_t* mask, const char* operation) const {
+  expect(operation);
+  TileSelection wanted;
+  wanted.build(camera_.width, camera_.height, mask);
+  if (!cached_selection_.contains(wanted))
+    throw std::invalid_argument(std::string(operation) +
+                                ": tile_mask has tiles that the cached forward pass did not cover. Run forward with a "
+                                "mask that covers them.");
+  return wanted;
+}
+
+// Stage 1. Results are in visible_ (memory order) and records.
+uint32_t Rasterizer::project(const Scene& scene, const TileSelection& selection, Record* records) {
+  const std::size_t chunks = chunk_count(scene.count);
+  if (chunks > chunk_capacity_) {
+    chunks_ = std::make_unique<ProjectChunk[]>(chunks);
+    chunk_capacity_ = chunks;
+  }
+  ProjectJob job{scene.arrays,         scene.count,       camera_,
+                 selection.tiles_x,    selection.tiles_y, selection.blocks.data(),
+                 selection.sum.data(), records,           chunks_.get()};
+  parallel_for(chunks, 1,
+               [&](std::size_t begin, std::size_t end) { project_kernels_.forward[scene.sh_degree](job, begin, end); });
+  uint32_t faults = 0;
+  for (std::size_t c = 0; c < chunks; c++) faults |= chunks_[c].faults;
+  if (!faults) join_chunks(chunks);
+  return faults;
+}
+
+void Rasterizer::join_chunks(std::size_t chunks) {
+  std::vector<std::size_t> first_visible(chunks + 1, 0), first_pair(chunks + 1, 0);
+  for (std::size_t c = 0; c < chunks; c++) {
+    first_visible[c + 1] = first_visible[c] + chunks_[c].visible;
+    first_pair[c + 1] = first_pair[c] + chunks_[c].pairs.size;
+  }
+  visible_.count = first_visible[chunks];
+  visible_.pair_count = first_pair[chunks];
+  if (visible_.pair_count >= FROZEN)
+    throw std::length_error("expected fewer than 2^32-1 (Gaussian, tile) pairs, got " +
+                            std::to_string(visible_.pair_count) +
+                            ". Are the scales in log units of the scene? Render fewer or smaller Gaussians.");
+  visible_.rows.require(visible_.count);
+  visible_.pair_offset.require(visible_.count + 1);
+  visible_.by_depth.require(visible_.count);
+  visible_.pairs.require(visible_.pair_count);
+  visible_.pair_offset[visible_.count] = static_cast<uint32_t>(visible_.pair_count);
+  parallel_for(chunks, 4, [&](std::size_t begin, std::size_t end) {
+    for (std::size_t c = begin; c < end; c++) {
+      const ProjectChunk& chunk = chunks_[c];
+      if (chunk.pairs.size)
+        std::memcpy(&visible_.pairs[first_pair[c]], chunk.pairs.data, chunk.pairs.size * sizeof(Pair));
+      uint32_t pair = static_cast<uint32_t>(first_pair[c]);
+      for (uint32_t i = 0; i < chunk.visible; i++) {
+        const uint32_t slot = static_cast<uint32_t>(first_visible[c]) + i;
+        visible_.rows[slot] = chunk.row[i];
+        visible_.by_depth[slot] = {chunk.depth_bits[i], slot};
+        visible_.pair_offset[slot] = pair;
+        pair += chunk.pair_count[i];
+      }
+    }
+  });
+}
+
+// Stage 3.
+CompositeJob Rasterizer::composite(const TileListsView& lists, const TileSelection& selection, const Target& target,
+                                   uint32_t* contributed, PixelTrace& trace) {
+  const std::size_t pixels = selection.blocks.size() * BLOCKS * BLOCK_PIXELS;
+  CompositeJob job{};
+  job.records = records_.data();
+  job.lists = lists;
+  job.tiles = selection.active.data();
+  job.tile_blocks = selection.blocks.data();
+  job.tiles_x = selection.tiles_x;
+  job.width = camera_.width;
+  job.height = camera_.height;
+  std::copy_n(target.background, 3, job.background);
+  job.image = target.image;
+  job.transmittance = target.transmittance;
+  job.contributed = contributed;
+  job.pixel_transmittance = trace.transmittance.require(pixels);
+  job.pixel_last = trace.last.require(pixels);
+  parallel_for(selection.active.size(), TILE_GRAIN,
+               [&](std::size_t begin, std::size_t end) { composite_kernels_.forward(job, begin, end); });
+  return job;
+}
+
+uint32_t Rasterizer::forward(const Scene& scene, const Camera& camera, const uint8_t* mask, const Target& target) {
+  const Claim claim(busy_);
+  state_ = State::empty;
+  passes_++;
+  camera_ = camera;
+  selection_.build(camera.width, camera.height, mask);
+  const uint32_t faults = project(scene, selection_, records_.require(scene.count));
+  if (faults) return faults;
+  sort_by_depth(visible_.by_depth, sort_scratch_, visible_.count);
+  build_tile_lists(visible_, selection_.blocks.size(), 0, merged_lists_);
+  entry_count_ = merged_lists_.size;
+  cached_lists_.adopt(merged_lists_);
+  job_ = composite(cached_lists_.view(), selection_, target, cached_lists_.contributed.data(), cached_trace_);
+  job_tiles_ = selection_.active.size();
+  cached_visible_.clear(scene.count);
+  for (std::size_t i = 0; i < visible_.count; i++) cached_visible_.insert(visible_.rows[i]);
+  scene_ = scene;
+  scene_count_ = scene.count;
+  cached_selection_ = selection_;
+  std::copy_n(target.background, 3, cached_background_);
+  state_ = State::passed;
+  return 0;
+}
+
+void Rasterizer::freeze(const uint8_t* mask, const uint32_t* active, std::size_t count) {
+  const Claim claim(busy_);
+  TileSelection wanted = cached_tiles(mask, "freeze");
+  set_active(active, count, "freeze: active_ids");
+  selection_ = std::move(wanted);
+  filter_tile_lists(cached_lists_.view(), selection_.blocks, is_active_, frozen_lists_, dropped_blocks_);
+  state_ = State::frozen;
+}
+
+void Rasterizer::set_active(const uint32_t* active, std::size_t count, const char* name) {
+  for (std::size_t i = 0; i < count; i++)
+    if (active[i] >= scene_count_ || (i > 0 && active[i] <= active[i - 1]))
+      throw std::invalid_argument(std::string(name) + " must be strictly ascending rows below " +
+                                  std::to_string(scene_count_) + ", got " + std::to_string(active[i]) + " at index " +
+                                  std::to_string(i) + ". Sort them and drop duplicates.");
+  state_ = State::cached;
+  is_active_.resize(scene_count_, 0);
+  for (uint32_t row : active_rows_)
+    if (row < is_active_.size()) is_active_[row] = 0;
+  active_rows_.assign(active, active + count);
+  for (uint32_t row : active_rows_) is_active_[row] = 1;
+  records_.require_keeping(scene_count_ + count, scene_count_);
+}
+
+// Projects the active rows and leaves their lists over `selection` in active_lists_.
+uint32_t Rasterizer::list_active(const Scene& rows, const TileSelection& selection) {
+  const uint32_t base = static_cast<uint32_t>(scene_count_);
+  const uint32_t faults = project(rows, selection, records_.data() + base);
+  if (faults) return faults;
+  sort_by_depth(visible_.by_depth, sort_scratch_, visible_.count);
+  build_tile_lists(visible_, selection.blocks.size(), base, active_lists_);
+  return 0;
+}
+
+uint32_t Rasterizer::forward_active(const Scene& rows, const Target& target, bool touched_only) {
+  const Claim claim(busy_);
+  expect("forward_active");
+  drop_pass();
+  passes_++;
+  const uint32_t faults = list_active(rows, selection_);
+  if (faults) return faults;
+  if (touched_only) {
+    std::vector<uint32_t> touched = dropped_blocks_;
+    add_touched_blocks(active_lists_, touched);
+    touched_.restrict(selection_, touched);
+  } else {
+    touched_ = selection_;
+  }
+  const TileSelection& wanted = touched_;
+  merge_tile_lists(frozen_lists_, active_lists_, wanted.blocks, records_.data(), static_cast<uint32_t>(scene_count_),
+                   active_rows_, merged_lists_);
+  entry_count_ = merged_lists_.size;
+  job_ = composite(merged_lists_.view(), wanted, target, contributed_.require(entry_count_), trace_);
+  job_tiles_ = wanted.active.size();
+  scene_ = rows;
+  state_ = State::active_passed;
+  return 0;
+}
+
+void Rasterizer::forward_cached(const uint8_t* mask, const Target& target) {
+  const Claim claim(busy_);
+  const TileSelection wanted = cached_tiles(mask, "forward_cached");
+  drop_pass();
+  passes_++;
+  composite(cached_lists_.view(), wanted, target, contributed_.require(cached_lists_.used), trace_);
+}
+
+void Rasterizer::clear_gradients(const GradientArrays& out) const {
+  const std::size_t rest = 3 * static_cast<std::size_t>((scene_.sh_degree + 1) * (scene_.sh_degree + 1) - 1);
+  const std::pair<float*, std::size_t> arrays[] = {{out.means, 3},     {out.quats, 4},   {out.scales, 3},
+                                                   {out.opacities, 1}, {out.means2d, 2}, {out.sh0, 3},
+                                                   {out.shN, rest}};
+  parallel_for(scene_.count, CLEAR_GRAIN, [&](std::size_t begin, std::size_t end) {
+    for (const auto& [data, width] : arrays)
+      if (data && width) std::memset(data + begin * width, 0, (end - begin) * width * sizeof(float));
+  });
+}
+
+// Stages 4 and 5.
+void Rasterizer::differentiate(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out,
+                               bool compact) {
+  const CompositeBackwardJob raster{job_, image_gradient, alpha_gradient,
+                                    moments_.require(visible_.pair_count * MOMENT_STRIDE)};
+  parallel_for(job_tiles_, TILE_GRAIN,
+               [&](std::size_t begin, std::size_t end) { composite_kernels_.backward(raster, begin, end); });
+  if (!compact) clear_gradients(out);
+  const ProjectBackwardJob job{
+      scene_.arrays,   camera_, visible_.count, visible_.rows.data(), visible_.pair_offset.data(),
+      moments_.data(), out,     compact};
+  parallel_for(visible_.count, BACKWARD_GRAIN, [&](std::size_t begin, std::size_t end) {
+    project_backward_kernels_.backward[scene_.sh_degree](job, begin, end);
+  });
+}
+
+void Rasterizer::backward(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out,
+                          bool compact) {
+  const Claim claim(busy_);
+  expect("backward");
+  differentiate(image_gradient, alpha_gradient, out, compact);
+}
+
+void Rasterizer::backward_active(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out) {
+  const Claim claim(busy_);
+  expect("backward_active");
+  differentiate(image_gradient, alpha_gradient, out, false);
+}
+
+}  // namespace gsstream_cpu

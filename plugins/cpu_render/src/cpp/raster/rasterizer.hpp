@@ -1,0 +1,187 @@
+// The rasteriser of one camera: runs the stages, owns their scratch and, in the incremental mode, the cached scene.
+//
+//   full path         forward -> backward
+//   incremental mode  forward (fills the cache) -> freeze -> { forward_active -> backward_active }* -> update -> freeze
+//   ...               at any time after forward: backward_cached, forward_cached
+//
+// The incremental mode gives the same bits as the full path over the same tiles, without any cost that grows with the
+// number of frozen Gaussians. Results do not depend on the number of threads. Not re-entrant: concurrent use of one
+// object throws std::runtime_error.
+#pragma once
+#include <atomic>
+#include <cstddef>
+#include <cstdint>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "runtime/buffer.hpp"
+#include "raster/raster_kernels.hpp"
+#include "raster/raster_types.hpp"
+#include "raster/screen_pass.hpp"
+#include "raster/tile_lists.hpp"
+#include "raster/tile_selection.hpp"
+#include "raster/tile_store.hpp"
+
+namespace gsstream_cpu {
+
+constexpr std::size_t TILE_GRAIN = 2;        // tiles that a thread composites or differentiates at a time
+constexpr std::size_t BACKWARD_GRAIN = 512;  // visible Gaussians; a multiple of every vector width
+
+struct Scene {
+  GaussianArrays arrays{};
+  std::size_t count = 0;
+  int sh_degree = 0;
+};
+
+struct Target {
+  float background[3];
+  float *image, *transmittance;
+};
+
+// What a backward needs of the pixels of its forward, tile by tile.
+struct PixelTrace {
+  Buffer<float> transmittance;
+  Buffer<int32_t> last;
+  std::size_t bytes() const { return transmittance.bytes() + last.bytes(); }
+};
+
+class Rasterizer {
+ public:
+  // What there is to work with. `passed` (a forward whose backward may follow) offers what `cached` does, `frozen` too,
+  // and `active_passed` (a forward_active whose backward may follow) what `frozen` does.
+  enum class State { empty, cached, passed, frozen, active_passed };
+  // What each operation needs and leaves behind. When it fails, forward leaves `empty` and forward_active `frozen`; on
+  // `empty`, forget and shed_scratch do nothing.
+  struct Rule {
+    const char* operation;
+    State needs;
+    const char* leaves;
+  };
+  static constexpr Rule RULES[] = {
+      {"forward", State::empty, "passed"},
+      {"backward", State::passed, "the same"},
+      {"freeze", State::cached, "frozen"},
+      {"forward_active", State::frozen, "active_passed"},
+      {"backward_active", State::active_passed, "the same"},
+      {"update", State::cached, "cached"},
+      {"backward_cached", State::cached, "the same"},
+      {"drawn_in_cache", State::cached, "the same"},
+      {"forward_cached", State::cached, "cached or frozen, without its pass"},
+      {"forget", State::empty, "cached or frozen, without its pass"},
+      {"shed_scratch", State::empty, "cached"},
+  };
+  // Throws std::invalid_argument unless the state offers what the operation needs.
+  void expect(const std::string& operation) const;
+
+  Rasterizer();
+  ~Rasterizer();
+
+  // Forward passes return Fault bits; if any is set nothing was rendered and the cache is as before (active) or empty.
+  // The arrays of `scene` are read again by the matching backward.
+  uint32_t forward(const Scene& scene, const Camera& camera, const uint8_t* mask, const Target& target);
+  // With `touched_only`, only blocks that the active rows touch now or touched in the cache are rendered: all others
+  // would come out as they are in the cache.
+  uint32_t forward_active(const Scene& rows, const Target& target, bool touched_only);
+  // Renders from the cache alone (no projection, no gradients).
+  void forward_cached(const uint8_t* mask, const Target& target);
+
+  // Gradient of the 2-D means [N,2] of the cached scene, from what its forward left: nothing is rendered. Costs follow
+  // the pixels at which the image gradient is not zero. `scene`: the values that the cache was made of.
+  void backward_cached(const Scene& scene, const float* image_gradient, float* means2d_gradient);
+  // out [N]: 1 for the rows of the cached scene that touch a cached tile.
+  void visible_in_cache(uint8_t* out) const;
+  // out [N]: 1 for the rows of the cached scene that added light to a pixel of a wanted tile. Costs follow these tiles,
+  // but for clearing `out`. Border blocks reach beyond the image and are counted whole.
+  void drawn_in_cache(const uint8_t* mask, uint8_t* out);
+
+  // Ends the life of the arrays given to the last forward; no backward may follow.
+  void forget() { drop_pass(); }
+  // out.means null: only out.means2d is written. Outputs have one row per Gaussian (zero where unseen), or with
+  // `compact` one per visible_rows().
+  void backward(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out, bool compact);
+  // Outputs have one row per active row.
+  void backward_active(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out);
+
+  // active: strictly ascending rows of the cached scene.
+  void freeze(const uint8_t* mask, const uint32_t* active, std::size_t count);
+  // Puts new values of some rows (strictly ascending) into the cache and renders anew, into `target`, the tiles that
+  // these rows touched or touch. The cache is then as after a forward of the changed scene. Ends the freeze. Returns
+  // Fault bits; if any is set nothing was changed.
+  uint32_t update(const uint32_t* changed, const Scene& rows, const Target& target);
+  // Lets go of the memory that only a full pass needs. No backward may follow.
+  void shed_scratch();
+
+  // Tiles rendered by the last forward_active.
+  const TileSelection& touched() const { return touched_; }
+  const VisibleSet& visible() const { return visible_; }
+  std::size_t pair_count() const { return visible_.pair_count; }
+  std::size_t entry_count() const { return entry_count_; }
+  std::size_t scene_count() const { return scene_count_; }
+  std::size_t active_count() const { return active_rows_.size(); }
+  int width() const { return camera_.width; }
+  int height() const { return camera_.height; }
+  Isa isa() const { return isa_; }
+  uint64_t passes() const { return passes_; }
+  std::size_t memory_bytes() const;  // cache_bytes() and scratch
+  std::size_t cache_bytes() const;
+
+ private:
+  class Claim;
+
+  // No backward may follow.
+  void drop_pass();
+  // The selection of the caller's mask. Throws std::invalid_argument where the cache does not cover it.
+  TileSelection cached_tiles(const uint8_t* mask, const char* operation) const;
+
+  uint32_t project(const Scene& scene, const TileSelection& selection, Record* records);
+  void join_chunks(std::size_t chunks);
+  void set_active(const uint32_t* active, std::size_t count, const char* name);
+  uint32_t list_active(const Scene& rows, const TileSelection& selection);
+  CompositeJob composite(const TileListsView& lists, const TileSelection& selection, const Target& target,
+                         uint32_t* contributed, PixelTrace& trace);
+  void replace_tiles(const std::vector<uint32_t>& changed_tiles);
+  void differentiate(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out,
+                     bool compact);
+  void clear_gradients(const GradientArrays& out) const;
+
+  const Isa isa_;  // one object uses one set for life: moments are laid out per set
+  const ProjectKernels& project_kernels_;
+  const ProjectBackwardKernels& project_backward_kernels_;
+  const CompositeKernels& composite_kernels_;
+  std::atomic<bool> busy_{false};
+  uint64_t passes_ = 0;
+  State state_ = State::empty;
+
+  Camera camera_{};
+  Scene scene_;  // of the last forward
+  CompositeJob job_{};
+  std::size_t job_tiles_ = 0, entry_count_ = 0;
+  TileSelection selection_;
+  TileSelection touched_;  // of the last active pass
+  std::vector<uint32_t> dropped_blocks_;
+
+  std::unique_ptr<ProjectChunk[]> chunks_;
+  std::size_t chunk_capacity_ = 0;
+  VisibleSet visible_;
+  Buffer<DepthItem> sort_scratch_;
+  Buffer<uint32_t> contributed_;
+  PixelTrace trace_;
+  Buffer<float> moments_;
+  ScreenPass screen_;
+
+  // The cache: records of all Gaussians (then of the active rows), depth-sorted lists of the whole scene, what its
+  // forward left at the pixels, and who is visible.
+  std::size_t scene_count_ = 0;
+  Buffer<Record> records_;
+  TileSelection cached_selection_;
+  float cached_background_[3] = {};
+  TileStore cached_lists_;
+  PixelTrace cached_trace_;
+  RowSet cached_visible_;
+  TileLists frozen_lists_, active_lists_, merged_lists_;  // merged_lists_ also receives the lists of a full pass
+  std::vector<uint32_t> active_rows_;
+  std::vector<uint8_t> is_active_;
+};
+
+}  // namespace gsstream_cpu

@@ -1,0 +1,145 @@
+// The rasteriser's cache after its forward: changing rows, differentiating it, and what memory it takes.
+#include <algorithm>
+#include <stdexcept>
+#include <string>
+
+#include "raster/claim.hpp"
+#include "runtime/parallel.hpp"
+#include "raster/rasterizer.hpp"
+
+namespace gsstream_cpu {
+
+uint32_t Rasterizer::update(const uint32_t* changed, const Scene& rows, const Target& target) {
+  const Claim claim(busy_);
+  expect("update");
+  set_active(changed, rows.count, "update: changed");
+  passes_++;
+  const uint32_t faults = list_active(rows, cached_selection_);
+  if (faults) return faults;
+  std::vector<uint32_t> touched(cached_lists_.tiles());
+  find_active_blocks(cached_lists_.view(), is_active_, touched);
+  add_touched_blocks(active_lists_, touched);
+  replace_tiles(touched);
+  for (uint32_t row : active_rows_) cached_visible_.erase(row);
+  for (std::size_t i = 0; i < visible_.count; i++) cached_visible_.insert(active_rows_[visible_.rows[i]]);
+  // All blocks of a touched tile, so that what its forward leaves is whole again.
+  for (std::size_t tile = 0; tile < touched.size(); tile++) touched[tile] = touched[tile] ? ~0u : 0;
+  touched_.restrict(cached_selection_, touched);
+  composite(cached_lists_.view(), touched_, target, cached_lists_.contributed.data(), cached_trace_);
+  return 0;
+}
+
+// Merges active_lists_ into the cached lists of the changed tiles, by (depth, row), then their records into the cache.
+void Rasterizer::replace_tiles(const std::vector<uint32_t>& changed_tiles) {
+  const uint32_t base = static_cast<uint32_t>(scene_count_);
+  std::vector<TileEntry> entries;
+  std::vector<uint32_t> blocks;
+  const auto row_of = [&](uint32_t record) { return record < base ? record : active_rows_[record - base]; };
+  const auto in_front = [&](uint32_t a, uint32_t b) {
+    const float near = records_[a].depth, far = records_[b].depth;
+    return near != far ? near < far : row_of(a) < row_of(b);
+  };
+  for (std::size_t tile = 0; tile < changed_tiles.size(); tile++) {
+    if (!changed_tiles[tile]) continue;
+    entries.clear();
+    blocks.clear();
+    uint32_t a = active_lists_.offset[tile], c = cached_lists_.begin[tile];
+    const uint32_t a_end = active_lists_.offset[tile + 1], c_end = cached_lists_.end[tile];
+    for (;;) {
+      while (c < c_end && is_active_[cached_lists_.entries[c].record]) c++;
+      if (a == a_end && c == c_end) break;
+      const bool take_active =
+          c == c_end || (a < a_end && in_front(active_lists_.entries[a].record, cached_lists_.entries[c].record));
+      const uint32_t record = take_active ? active_lists_.entries[a].record : cached_lists_.entries[c].record;
+      entries.push_back({row_of(record), FROZEN});
+      blocks.push_back(take_active ? active_lists_.blocks[a++] : cached_lists_.blocks[c++]);
+    }
+    cached_lists_.replace(tile, entries, blocks);
+  }
+  for (std::size_t slot = 0; slot < active_rows_.size(); slot++) records_[active_rows_[slot]] = records_[base + slot];
+}
+
+void Rasterizer::backward_cached(const Scene& scene, const float* image_gradient, float* means2d_gradient) {
+  const Claim claim(busy_);
+  expect("backward_cached");
+  if (scene.count != scene_count_)
+    throw std::invalid_argument("backward_cached: expected the scene of the cached forward pass with " +
+                                std::to_string(scene_count_) + " rows, got " + std::to_string(scene.count) + ".");
+  TileSelection reached, wanted;
+  select_nonzero(image_gradient, camera_.width, camera_.height, reached);
+  wanted.restrict(cached_selection_, reached.blocks);
+  screen_.build(cached_lists_, wanted, scene_count_);
+  CompositeJob job{};
+  job.records = records_.data();
+  job.lists = {cached_lists_.begin.data(), cached_lists_.end.data(), screen_.entries.data(),
+               cached_lists_.blocks.data()};
+  job.tiles = wanted.active.data();
+  job.tile_blocks = wanted.blocks.data();
+  job.tiles_x = wanted.tiles_x;
+  job.width = camera_.width;
+  job.height = camera_.height;
+  std::copy_n(cached_background_, 3, job.background);
+  job.contributed = cached_lists_.contributed.data();
+  job.pixel_transmittance = cached_trace_.transmittance.data();
+  job.pixel_last = cached_trace_.last.data();
+  const CompositeBackwardJob raster{job, image_gradient, nullptr,
+                                    moments_.require(screen_.pair_count * MOMENT_STRIDE)};
+  parallel_for(wanted.active.size(), TILE_GRAIN,
+               [&](std::size_t begin, std::size_t end) { composite_kernels_.backward(raster, begin, end); });
+  std::fill_n(means2d_gradient, 2 * scene_count_, 0.0f);
+  GradientArrays out{};
+  out.means2d = means2d_gradient;
+  const ProjectBackwardJob rows{scene.arrays,           camera_,         screen_.count, screen_.rows.data(),
+                                screen_.offset.data(),  moments_.data(), out,           false};
+  parallel_for(screen_.count, BACKWARD_GRAIN, [&](std::size_t begin, std::size_t end) {
+    project_backward_kernels_.backward[scene.sh_degree](rows, begin, end);
+  });
+}
+
+void Rasterizer::visible_in_cache(uint8_t* out) const {
+  for (std::size_t row = 0; row < scene_count_; row++) out[row] = cached_visible_.contains(static_cast<uint32_t>(row));
+}
+
+void Rasterizer::drawn_in_cache(const uint8_t* mask, uint8_t* out) {
+  const Claim claim(busy_);
+  const TileSelection wanted = cached_tiles(mask, "drawn_in_cache");
+  std::fill_n(out, scene_count_, uint8_t{0});
+  for (uint32_t tile : wanted.active)
+    for (uint32_t e = cached_lists_.begin[tile]; e < cached_lists_.end[tile]; e++)
+      if (cached_lists_.contributed[e] & wanted.blocks[tile]) out[cached_lists_.entries[e].record] = 1;
+}
+
+void Rasterizer::shed_scratch() {
+  const Claim claim(busy_);
+  if (state_ != State::empty) state_ = State::cached;
+  chunks_.reset();
+  chunk_capacity_ = 0;
+  for (Buffer<uint32_t>* buffer : {&visible_.rows, &visible_.pair_offset, &contributed_}) buffer->release();
+  visible_.pairs.release();
+  visible_.by_depth.release();
+  visible_.count = visible_.pair_count = 0;
+  sort_scratch_.release();
+  moments_.release();
+  for (TileLists* lists : {&frozen_lists_, &active_lists_, &merged_lists_}) {
+    lists->tiles = lists->size = 0;
+    lists->offset.release();
+    lists->entries.release();
+    lists->blocks.release();
+  }
+}
+
+std::size_t Rasterizer::cache_bytes() const {
+  return records_.bytes() + cached_lists_.bytes() + cached_trace_.bytes() + cached_visible_.bytes();
+}
+
+std::size_t Rasterizer::memory_bytes() const {
+  std::size_t bytes = cache_bytes() + visible_.bytes() + sort_scratch_.bytes() + contributed_.bytes() + trace_.bytes() +
+                      moments_.bytes() + screen_.bytes() + active_rows_.capacity() * sizeof(uint32_t) +
+                      is_active_.capacity();
+  for (const TileLists* lists : {&frozen_lists_, &active_lists_, &merged_lists_}) bytes += lists->bytes();
+  for (std::size_t c = 0; c < chunk_capacity_; c++)
+    bytes += sizeof(ProjectChunk) + chunks_[c].pairs.capacity * sizeof(Pair);
+  return bytes;
+}
+
+}  // namespace gsstream_cpu

@@ -1,0 +1,252 @@
+"""Encoder: in memory it makes the packets of a run on disk; failing and resuming cost no packet a bit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gsstream.cli.main import run_command
+from gsstream.core.errors import ComponentError, InputError, ShapeError
+from gsstream.core.frame import Frame
+from gsstream.encode import Encoder, Listeners, encoder_for, encoder_of_rig, open_recording
+from gsstream.method.base import Step
+from gsstream.packet import PacketKind, StreamReader, StreamWriter, decode_packet
+from gsstream.play import Playback
+
+#: A body that moves two pixels a frame: motions have something to say.
+WORLD = "synthetic:frames=6&views=4&width=64&height=48&supersample=1"
+TINY: Mapping[str, Any] = {
+    "first_frame.max_iterations": 30, "first_frame.fill_points": 200, "first_frame.max_points": 800, "stream.epochs": 2,
+}  # fmt: skip
+#: Anchor insertion finds nothing in so small a world unless it is easily pleased.
+GROWING: Mapping[str, Any] = {
+    "growth": "anchor-insertion", "growth.error": 0.05, "growth.votes": 0.5, "growth.least_views": 2,
+    "growth.agreement": 0.5, "growth.least_opacity": 0.0, "growth.epochs": 1,
+}  # fmt: skip
+CASES: Mapping[str, Mapping[str, Any]] = {
+    "still": {},
+    "coasting": {"motion": "coasting"},
+    "rigid": {"motion": "rigid", "motion.epochs": 1},
+    "keys": {"motion": "coasting", "codec.key_every": 2},
+    "growing": {**GROWING, "motion": "coasting"},
+    "growing rigid with keys": {**GROWING, "motion": "rigid", "motion.epochs": 1, "codec.key_every": 3},
+}
+
+
+@cache
+def frames(uri: str = WORLD) -> tuple[Frame, ...]:
+    with open_recording(uri) as source:
+        return tuple(source.frame(index) for index in range(source.info.num_frames or 0))
+
+
+def encoder(case: str = "still", listeners: Listeners | None = None) -> Encoder:
+    with open_recording(WORLD) as source:
+        return encoder_for("s2gs-edge", source, {**TINY, **CASES[case]}, listeners)
+
+
+@cache
+def whole(case: str) -> tuple[Step[Any], ...]:
+    """The steps of an undisturbed encoder."""
+    made = encoder(case)
+    return tuple(made.encode(frame) for frame in frames())
+
+
+def packets(steps: tuple[Step[Any], ...] | list[Step[Any]]) -> list[bytes]:
+    return [step.packet.data for step in steps]
+
+
+def write(path: Path, steps: tuple[Step[Any], ...]) -> Path:
+    with StreamWriter.open(path) as writer:
+        for step in steps:
+            writer.append(step.packet)
+    return path
+
+
+def same_bits(ours: Any, theirs: Any) -> None:
+    for (name, a), (_, b) in zip(ours.items(), theirs.items(), strict=True):
+        assert a.tobytes() == b.tobytes(), name
+
+
+@pytest.mark.parametrize("case", ["still", "growing rigid with keys"])
+def test_it_makes_the_packets_of_a_run_on_disk(tmp_path: Path, case: str) -> None:
+    sets = [item for key, value in {**TINY, **CASES[case]}.items() for item in ("--set", f"{key}={value}")]
+    run = ["run", "--source", WORLD, "--method", "s2gs-edge", "--out", str(tmp_path / "o"), "--quiet", "--no-video"]
+    assert run_command([*run, *sets]) == 0
+    with StreamReader(tmp_path / "o" / "stream.gss") as reader:
+        assert [reader.read(entry) for entry in reader.frames] == packets(whole(case))
+
+
+def test_the_cases_are_what_they_say() -> None:
+    """A case in which nothing moves or nobody is born would prove nothing about it."""
+    for case, settings in CASES.items():
+        later = [step.metrics for step in whole(case)[1:]]
+        kinds = [step.status for step in whole(case)]
+        assert any(line["moving_groups"] > 0 for line in later) == ("motion" in settings), case
+        assert any(line["births"] > 0 for line in later) == ("growth" in settings), case
+        assert kinds.count("key") == 1 + (5 // settings.get("codec.key_every", 6)), case
+
+
+@pytest.mark.parametrize("wrong", [0, 1, 3, 5])
+def test_frames_out_of_order_are_refused_and_cost_nothing(wrong: int) -> None:
+    made = encoder()
+    for frame in frames()[:2]:
+        made.encode(frame)
+    before = made.state
+    with pytest.raises(InputError, match=f"frame {wrong}: expected frame 2, frames are encoded in order"):
+        made.encode(frames()[wrong])
+    assert made.state is before
+    assert made.encode(frames()[2]).packet.data == packets(whole("still"))[2]
+
+
+def test_images_that_do_not_fit_are_refused_and_cost_nothing() -> None:
+    made, second = encoder(), frames()[1]
+    made.encode(frames()[0])
+    before = made.state
+    with pytest.raises(ShapeError):
+        made.encode(replace(second, images=second.images[:, :-1]))
+    with pytest.raises(ShapeError):
+        made.encode(replace(second, images=np.full_like(second.images, 2.0)))
+    assert made.state is before
+    assert made.encode(second).packet.data == packets(whole("still"))[1]
+
+
+class BrokenGrowth:
+    """Stands for a growth part that fails after everything else of the frame has worked."""
+
+    def propose(self, *_: Any) -> None:
+        raise RuntimeError("no room")
+
+
+@pytest.mark.parametrize("case", list(CASES))
+@pytest.mark.parametrize("bad", [1, 4])
+def test_a_frame_that_fails_leaves_the_encoder_as_it_was(case: str, bad: int) -> None:
+    """Its last part fails, after rendering and learning; with that part mended the packets are the undisturbed ones."""
+    made, sent = encoder(case), []
+    sound = made.parts
+    for frame in frames():
+        if frame.index == bad:
+            before, player = made.state, made.state.player
+            bits = [value.tobytes() for _, value in player.gaussians.items()]
+            made.parts = replace(sound, growth=BrokenGrowth())
+            for _ in range(2):
+                with pytest.raises(ComponentError, match=f"growth 'BrokenGrowth' .* failed at frame {bad}: RuntimeErr"):
+                    made.encode(frame)
+            assert made.state is before
+            assert [value.tobytes() for _, value in made.state.player.gaussians.items()] == bits
+            made.parts = sound
+        sent.append(made.encode(frame))
+    assert packets(sent) == packets(whole(case))
+
+
+def test_frame_0_that_fails_can_be_made_again() -> None:
+    made = encoder()
+    sound = made.parts
+    made.parts = replace(sound, loss=BrokenGrowth())
+    with pytest.raises(ComponentError) as caught:
+        made.encode(frames()[0])
+    assert (caught.value.slot, caught.value.frame) == ("loss", 0)
+    assert made.state is None
+    made.parts = sound
+    assert made.encode(frames()[0]).packet.data == packets(whole("still"))[0]
+
+
+@pytest.mark.parametrize("case", list(CASES))
+@pytest.mark.parametrize("last", [0, 1, 2, 3, 4])
+def test_going_on_after_a_frame_equals_never_having_stopped(tmp_path: Path, case: str, last: int) -> None:
+    stream = write(tmp_path / "stream.gss", whole(case))
+    made = encoder(case)
+    assert made.resume(stream, lambda index: frames()[index], last) == last
+    same_bits(made.state.player.gaussians, whole(case)[last].state.player.gaussians)
+    sent = [made.encode(frame) for frame in frames()[last + 1 :]]
+    assert packets(sent) == packets(whole(case))[last + 1 :]
+
+
+def test_going_on_asks_for_the_frame_that_the_scene_shows(tmp_path: Path) -> None:
+    stream, asked = write(tmp_path / "stream.gss", whole("keys")), list[int]()
+
+    def image(index: int) -> Frame:
+        asked.append(index)
+        return frames()[index]
+
+    assert encoder("keys").resume(stream, image) == 5
+    assert asked == [5]
+
+
+def test_a_stream_without_a_frame_begins_anew(tmp_path: Path) -> None:
+    stream = write(tmp_path / "stream.gss", ())
+    made = encoder()
+    assert made.resume(stream, lambda index: frames()[index]) is None
+    assert made.encode(frames()[0]).packet.data == packets(whole("still"))[0]
+    assert encoder().resume(write(tmp_path / "b.gss", whole("still")), lambda index: frames()[index], -1) is None
+
+
+def test_listeners_are_told_in_order() -> None:
+    told: list[tuple[str, Any]] = []
+    listeners = Listeners(
+        packet=lambda packet: told.append(("packet", packet.frame)),
+        chosen=lambda parts: told.append(("chosen", len(parts.pending))),
+        progress=lambda *_: told.append(("progress", None)),
+        say=lambda line: told.append(("say", line)),
+    )
+    with open_recording(WORLD) as source:
+        settings = {**TINY, "structure.root_exponent": "auto", "first_frame.trials": 0}
+        made = encoder_for("s2gs-edge", source, settings, listeners)
+    assert told == [], "nothing is done before the first frame"
+    steps = [made.encode(frame) for frame in frames()[:3]]
+    names = [name for name, _ in told if name != "say"]
+    changes = [name for place, name in enumerate(names) if place == 0 or names[place - 1] != name]
+    assert changes == ["chosen", "progress", "packet"]
+    assert ("chosen", 0) in told, "nothing is open any more"
+    assert [frame for name, frame in told if name == "packet"] == [0, 1, 2]
+    assert [step.packet.frame for step in steps] == [0, 1, 2]
+
+
+def test_a_listener_that_fails_is_not_hidden_and_the_frame_can_be_sent_again() -> None:
+    refuse = [True]
+
+    def full(packet: Any) -> None:
+        if packet.frame == 1 and refuse:
+            refuse.clear()
+            raise OSError("no space left on device")
+
+    made = encoder("coasting", Listeners(packet=full))
+    made.encode(frames()[0])
+    before = made.state
+    with pytest.raises(OSError, match="no space left"):
+        made.encode(frames()[1])
+    assert made.state is before
+    sent = [made.encode(frame) for frame in frames()[1:]]
+    assert packets(sent) == packets(whole("coasting"))[1:]
+
+
+def test_a_rig_needs_no_recording(tmp_path: Path) -> None:
+    """Images from anywhere: the seeds are swept from them, and the stream plays."""
+    rig = frames()[0].cameras
+    made = encoder_of_rig("s2gs-edge", rig, fps=25.0, settings={**TINY, "motion": "coasting"}, name="studio")
+    steps = tuple(made.encode(frame) for frame in frames()[:3])
+    assert steps[0].status == "key"
+    with Playback(write(tmp_path / "rig.gss", steps)) as stream:
+        assert (stream.meta.source, stream.meta.fps) == ("studio", 25.0)
+        assert stream.meta.extra["source_uri"] == "rig:studio"
+        assert len(stream.cameras("train")) == len(rig)
+        assert len(stream.cameras("test")) == 0
+        for frame, step in enumerate(steps):
+            same_bits(stream.player_state(frame).gaussians, step.state.player.gaussians)
+    again = encoder_of_rig("s2gs-edge", rig, fps=25.0, settings={**TINY, "motion": "coasting"}, name="studio")
+    assert packets([again.encode(frame) for frame in frames()[:3]]) == packets(steps)
+
+
+def test_what_a_step_says_is_what_a_player_makes_of_its_packet() -> None:
+    player = None
+    for step in whole("growing rigid with keys"):
+        player = decode_packet(player, step.packet.data)
+        same_bits(player.gaussians, step.state.player.gaussians)
+        assert step.packet.kind is PacketKind[step.status.upper()]
+        assert sum(step.metrics["bytes"].values()) == len(step.packet.data)
+        assert step.metrics["num_gaussians"] == len(player.gaussians)

@@ -1,0 +1,113 @@
+"""A player's own memory limit: hostile streams are refused before they are decoded, honest ones play within it."""
+
+from __future__ import annotations
+
+import sys
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_player import make_stream
+
+from gsstream.cli.main import run_command
+from gsstream.core.changes import Delta
+from gsstream.core.errors import InputError
+from gsstream.packet import StreamWriter, decode_packet, encode_delta, encode_key
+from gsstream.player.memory import MemoryLimit
+from gsstream.player.play import play
+from gsstream.player.playback import Playback
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "packet"))
+from packet_scenes import make_delta, make_edit, make_key, make_motions
+
+MB = 1_000_000
+
+
+def many_equal(path: Path, number: int) -> Path:
+    """A stream of few bytes for many Gaussians, as nobody's encoder writes it: one row, announced ``number`` times."""
+    from gsstream.packet import KeyState
+
+    state = make_key(np.random.default_rng(0), 1, 1, 15)
+    scene = state.gaussians.map(lambda a: np.repeat(a, number, axis=0))
+    layout = type(state.layout)(np.int32([number]), np.zeros(number, np.uint8), state.layout.units)
+    with StreamWriter.open(path) as writer:
+        writer.append(encode_key(KeyState(scene, layout, state.meta)))
+    return path
+
+
+def test_a_small_file_that_announces_much_is_refused_cheaply(tmp_path) -> None:
+    path = many_equal(tmp_path / "h.gss", 65_000)
+    assert path.stat().st_size < 5000
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match="about 115 MB; the limit is 20 MB"):
+            Playback(path, max_memory=20 * MB)
+        assert tracemalloc.get_traced_memory()[1] < MB
+    finally:
+        tracemalloc.stop()
+    with Playback(path, max_memory=200 * MB) as playback:
+        assert len(playback.state_at(0)) == 65_000
+
+
+@pytest.mark.parametrize("sh_rest", [0, 3, 15])
+def test_the_estimate_bounds_what_decoding_takes(sh_rest) -> None:
+    """Peaks of key packets, deltas, deltas with births and with motions, each against what was announced for them."""
+    rng = np.random.default_rng(1)
+    state, number = None, 20_000
+    key = make_key(rng, number, number // 8, sh_rest)
+    packets = [encode_key(key)]
+    state = decode_packet(None, packets[0].data)
+    packets.append(encode_delta(make_delta(rng, state.layout, 1.0), state.layout, {}, frame=1))
+    state = decode_packet(state, packets[1].data)
+    packets.append(encode_delta(make_edit(rng, state, births=5000), state.layout, state.decoders, frame=2))
+    state = decode_packet(state, packets[2].data)
+    packets.append(encode_delta(make_motions(rng, state.scene, 2), state.layout, {}, frame=3))
+    state = decode_packet(state, packets[3].data)
+    predicted = make_motions(rng, state.scene, 1).changes
+    packets.append(encode_delta(Delta((*predicted, *make_edit(rng, state, births=5000).changes)), state.layout, {}, frame=4))
+    state = None
+    for packet in packets:
+        smallest = least_limit(packet.data, state)
+        tracemalloc.start()
+        before = tracemalloc.get_traced_memory()[0]
+        following = decode_packet(state, packet.data)
+        peak = tracemalloc.get_traced_memory()[1] - before
+        tracemalloc.stop()
+        held = 0 if state is None else sum(a.nbytes for _, a in state.gaussians.items())
+        assert peak + held <= smallest, (sh_rest, packet.kind, peak / 1e6, smallest / 1e6)
+        state = following
+
+
+def least_limit(data: bytes, state) -> int:
+    """The smallest limit that lets a packet pass, to one part in a hundred."""
+    low, high = 1, 1 << 40
+    while high > low * 1.01 + 1:
+        middle = (low + high) // 2
+        try:
+            MemoryLimit(middle).check_decoding(data, state, 0)
+            high = middle
+        except InputError:
+            low = middle
+    return high
+
+
+def test_pictures_count_too(tmp_path) -> None:
+    stream = make_stream(tmp_path / "s.gss")
+    with pytest.raises(InputError, match="7000 x 4500 pixels takes about 1,606 MB; the limit is 1,000 MB"):
+        MemoryLimit(1000 * MB).check_pictures(7000, 4500)
+    play(stream, tmp_path / "p", max_memory=2 * MB)
+    with pytest.raises(InputError, match="drawing"):
+        play(stream, tmp_path / "p.gif", frames=[0, 1, 2, 3, 4] * 40, max_memory=2 * MB)
+
+
+@pytest.mark.parametrize("command", ["play", "export"])
+def test_the_option_of_the_commands(command, tmp_path, capsys) -> None:
+    stream = make_stream(tmp_path / "s.gss")
+    arguments = [command, str(stream), "--out", str(tmp_path / "o")]
+    assert run_command([*arguments, "--max-memory", "1KB"]) == 2
+    assert "the limit is 0.001 MB" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+    assert run_command([*arguments, "--max-memory", "5 parsecs"]) == 2
+    assert "--max-memory 5 parsecs" in capsys.readouterr().err
+    assert run_command([*arguments, "--max-memory", "50MB"]) == 0

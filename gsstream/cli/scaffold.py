@@ -51,7 +51,7 @@ def files(name: str, kind: str) -> Mapping[str, str]:
     words = "".join(word.capitalize() for word in re.split("[-_]", name) if word)
     cls = words if words.endswith(kind.capitalize()) else words + kind.capitalize()
     # The example is one that the contract kit is proven on; it is read as text, so that nothing heavy is imported.
-    example = Path(gsstream.__file__).parent / "testing" / "examples" / f"{kind}.py"
+    example = Path(gsstream.__file__).parent / "testing" / kind / "example.py"
     part = example.read_text(encoding="utf-8").replace(f"Example{kind.capitalize()}", cls)
     summary = part.splitlines()[0].strip('"')
     values = {"name": name, "kind": kind, "package": package, "cls": cls, "summary": summary, "module": kind}

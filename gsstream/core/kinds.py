@@ -1,8 +1,9 @@
 """The kinds of parts, in one table. Whoever needs a list of kinds, slots or contracts derives it from here.
 
-A new kind is one entry here, a room with its contract class, and a room in ``gsstream.testing``: its checks, an example
-that new plugins start from and, where ``behaviour`` is set, what the common checks need to know of it. A kind that is a
-slot also gets a field of its name in ``recipe.model.Recipe`` and ``engine.assembly.assemble.Assembly``.
+A new kind is one entry here, a room with its contract class, and a room of its name in ``gsstream.testing``:
+``checks``, an ``example`` that new plugins start from (``use``), and ``behaviour``, what the common checks need to know
+of it. A kind that is a slot also gets a field of its name in ``recipe.model.Recipe`` and
+``engine.assembly.assemble.Assembly``.
 """
 
 from __future__ import annotations

@@ -68,10 +68,10 @@ class Mapping:
 
 
 def reconstruct(
-    images: FloatArray, *, model: str = "SIMPLE_RADIAL", shared: bool = True, held: Sequence[int] = (),
-    timeout: float = 1800.0,
+    images: Sequence[FloatArray] | FloatArray, *, model: str = "SIMPLE_RADIAL", shared: bool = True,
+    held: Sequence[int] = (), timeout: float = 1800.0,
 ) -> Mapping:  # fmt: skip
-    """Map [C, H, W, 3] images in [0, 1] of one instant.
+    """Map C images [H, W, 3] in [0, 1] of one instant; of different sizes, unless they share a lens.
 
     Arguments:
         model: lens model, a key of LENSES.

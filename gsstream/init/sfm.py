@@ -6,6 +6,7 @@ import importlib.util
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -51,8 +52,8 @@ def triangulate_points(
     return PointCloud(xyz.astype(np.float32), colors, f"triangulated from {len(cameras)} training images")
 
 
-def write_images(folder: Path, images: FloatArray) -> None:
-    """Write [C, H, W, 3] images in [0, 1] where the pycolmap process looks for them, numbered."""
+def write_images(folder: Path, images: Iterable[FloatArray]) -> None:
+    """Write C images [H, W, 3] in [0, 1] where the pycolmap process looks for them, numbered."""
     (folder / "images").mkdir()
     for i, image in enumerate(images):
         pixels = np.round(image * 255).astype(np.uint8)

@@ -25,7 +25,7 @@ from gsstream.init.mapping import Lens, Mapping, reconstruct, triangulate
 from gsstream.init.thinning import thin_points
 from gsstream.scene.raw import RawCamera, find_cameras, first_frames
 from gsstream.scene.undistort import Undistortion, undistortion
-from gsstream.source.calibration import CALIBRATION_FILE, SCHEMA, read_calibration
+from gsstream.source.calibration import CALIBRATION_FILE, SCHEMA, cut_to, read_calibration
 
 Say = Callable[[str], None]
 
@@ -39,7 +39,8 @@ class PrepareOptions:
         model: lens model of structure from motion (a key of ``init.mapping.LENSES``).
         each: every camera has a lens of its own; else all share one where all pictures have one size.
         frames: at most so many frames; None: all.
-        width: pictures are shrunk to this width; None: that of the smallest camera.
+        width: pictures are shrunk to this width; None: that of the smallest camera. Pictures of other shapes are
+            shrunk evenly and cut around their middle.
         max_points: points kept.
         max_error: points with a larger mean reprojection error are dropped, pixels.
         fps: frames per second of the recording, when it is not given elsewhere.
@@ -80,14 +81,16 @@ def prepare(raw: Path, out: Path, options: PrepareOptions, say: Say) -> Prepared
         raise OutputError(f"{out} exists and is not an empty folder; choose another --out")
     cameras = find_cameras(raw)
     names = tuple(camera.name for camera in cameras)
-    known = read_calibration(raw) if (raw / CALIBRATION_FILE).exists() else None
+    known = read_calibration(raw, to_size=True) if (raw / CALIBRATION_FILE).exists() else None
     test = options.test if options.test is not None else known.test.ids if known else ()
     for name in test:
         if name not in names:
             raise InputError(f"--test: no camera {name!r}{suggest(name, names)}")
     say(f"{len(cameras)} cameras, {len(test)} of them for testing only; {'known' if known else 'unknown'} poses")
+    say("reading frame 0")
     images = first_frames(cameras)
     poses = None if known is None else _joined(known.train, known.test)
+    say(f"matching features of {len(cameras)} pictures; minutes for tens of cameras, longer for large pictures")
     mapping = _map(cameras, images, poses, test, options)
     kept = [i for i, there in enumerate(mapping.registered) if there]
     if sum(names[i] not in test for i in kept) < 2:
@@ -114,27 +117,41 @@ def _map(
     cameras: list[RawCamera], images: list[FloatArray], known: Cameras | None, test: Sequence[str],
     options: PrepareOptions,
 ) -> Mapping:  # fmt: skip
-    sizes = {camera.size for camera in cameras}
-    if len(sizes) > 1:
-        listed = ", ".join(f"{w} x {h}" for w, h in sorted(sizes))
-        raise InputError(f"the cameras' pictures differ in size ({listed}); bring them to one size first")
-    stack = np.stack(images)
+    one_size = len({camera.size for camera in cameras}) == 1
     held = [i for i, camera in enumerate(cameras) if camera.name in test]
     if known is None:
-        return reconstruct(stack, model=options.model, shared=not options.each, held=held)
+        # Pictures of different sizes come from different lenses.
+        shared = one_size and not options.each
+        return reconstruct(images, model=options.model, shared=shared, held=held)
     training = [i for i in range(len(cameras)) if i not in held]
-    found = triangulate(stack[training], known.select(training))
+    cut = [
+        images[i] if one_size else _given(cameras[i], known, i).apply(images[i]) for i in training
+    ]
+    found = triangulate(np.stack(cut), known.select(training))
     # The test cameras' poses are given; nothing of theirs is used.
     error, seen = np.full(len(cameras), np.nan), np.zeros(len(cameras), np.int64)
     error[training], seen[training] = found.camera_error, found.camera_points
     lenses = [found.lenses[0]] * len(cameras)
-    for i, K in enumerate(known.Ks):
-        lenses[i] = replace(lenses[i], params=(K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    for i, camera in enumerate(cameras):
+        lenses[i] = _raw_lens(camera, known, i)
     return replace(found, viewmats=known.viewmats, lenses=tuple(lenses), camera_error=error, camera_points=seen)
 
 
+def _given(camera: RawCamera, known: Cameras, i: int) -> Undistortion:
+    """How a picture of a given pinhole camera is brought to the size of the rig; ``known.Ks`` are those of the rig."""
+    lens = _raw_lens(camera, known, i)
+    return undistortion(lens, camera.size, (known.width, known.height))
+
+
+def _raw_lens(camera: RawCamera, known: Cameras, i: int) -> Lens:
+    """The given pinhole of a camera in pixels of its own pictures."""
+    back = np.linalg.inv(cut_to(np.eye(3), camera.size, (known.width, known.height)))
+    K = back @ known.Ks[i]
+    return Lens("PINHOLE", (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+
+
 def _target(cameras: list[RawCamera], options: PrepareOptions) -> tuple[int, int]:
-    width, height = cameras[0].size
+    width, height = (min(camera.size[axis] for camera in cameras) for axis in (0, 1))
     if options.width is None or options.width == width:
         return width, height
     if not 0 < options.width < width:
@@ -147,16 +164,17 @@ def _pinholes(
 ) -> list[tuple[FloatArray, Undistortion | None]]:
     """(K, how to undistort) per camera; None: its pictures are taken over as they are."""
     target = _target(cameras, options)
-    made: dict[Lens, Undistortion] = {}
+    made: dict[tuple[Lens, tuple[int, int]], Undistortion] = {}
     out: list[tuple[FloatArray, Undistortion | None]] = []
     for camera, index in zip(cameras, kept, strict=True):
         lens = mapping.lenses[index]
         if not lens.distorts and target == camera.size:
             out.append((lens.K, None))
             continue
-        if lens not in made:
-            made[lens] = undistortion(lens, camera.size, target)
-        out.append((made[lens].K, made[lens]))
+        key = (lens, camera.size)
+        if key not in made:
+            made[key] = undistortion(lens, camera.size, target)
+        out.append((made[key].K, made[key]))
     return out
 
 

@@ -75,7 +75,7 @@ def first_frames(cameras: list[RawCamera]) -> list[FloatArray]:
 
 
 def _declared(folder: Path) -> dict[str, tuple[Path, ...]]:
-    calibration = read_calibration(folder)
+    calibration = read_calibration(folder, to_size=True)
     ids = (*calibration.train.ids, *calibration.test.ids)
     return {
         name: tuple(folder / frame_path(calibration.patterns[name], t) for t in range(calibration.num_frames))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from gsstream.core.errors import InputError
 from gsstream.core.shapes import FloatArray
 from gsstream.init.mapping import Lens, lens_places
+from gsstream.source.calibration import cut_to
 
 #: How far the pinhole's field of view may be narrowed until no pixel lies outside of the raw picture.
 ZOOMS = np.geomspace(0.7, 3.0, 60)
@@ -45,14 +47,13 @@ def undistortion(lens: Lens, size: tuple[int, int], target: tuple[int, int]) -> 
     """The widest pinhole of ``target`` pixels, with the lens's principal point, that sees only what the lens saw.
 
     Arguments:
-        size, target: (width, height) of the raw and of the pinhole pictures.
+        size, target: (width, height) of the raw and of the pinhole pictures; of another shape, they are cut evenly.
 
     Raises InputError when no pinhole up to three times the lens's focal length is covered (a wrong lens model).
     """
-    scale = np.diag([target[0] / size[0], target[1] / size[1], 1.0])
-    base = scale @ lens.K
+    base = cut_to(lens.K, size, target)
     K = _widest(lens, base, size, target) if lens.distorts else base
-    factor = -(-size[0] // target[0])
+    factor = math.ceil(1 / cut_to(np.eye(3), size, target)[0, 0] - 1e-9)
     width, height = factor * target[0], factor * target[1]
     x, y = np.meshgrid((np.arange(width) + 0.5) / factor, (np.arange(height) + 0.5) / factor)
     rays = _rays(np.stack([x.ravel(), y.ravel()], axis=1), K)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +96,8 @@ def read_points(path: Path, kind: PointKind) -> PointCloud:
     prefix = "" if kind == "recording" else "sparse_"
     try:
         with np.load(path, allow_pickle=False) as arrays:
+            if not isinstance(arrays, np.lib.npyio.NpzFile):
+                raise ValueError("it holds a single array (.npy)")
             names = list(arrays.files)
             missing = [n for n in (f"{prefix}xyz", f"{prefix}rgb") if n not in names]
             if missing:
@@ -102,17 +105,20 @@ def read_points(path: Path, kind: PointKind) -> PointCloud:
             xyz, rgb = arrays[f"{prefix}xyz"], arrays[f"{prefix}rgb"]
     except SourceError:
         raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, TypeError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
         raise SourceError(f"{path}: cannot be read as a numpy archive: {error}; write it with numpy.savez") from error
-    if xyz.ndim != 2 or xyz.shape[1] != 3 or rgb.shape != xyz.shape or rgb.dtype != np.uint8:
+    shaped = xyz.ndim == 2 and xyz.shape[1] == 3 and rgb.shape == xyz.shape
+    if not shaped or rgb.dtype != np.uint8 or xyz.dtype.kind not in "fiu":
         raise SourceError(
             f"{path}: expected {prefix}xyz [P, 3] float and {prefix}rgb [P, 3] uint8, "
-            f"got {list(xyz.shape)} and {list(rgb.shape)} {rgb.dtype}"
+            f"got {list(xyz.shape)} {xyz.dtype} and {list(rgb.shape)} {rgb.dtype}"
         )
+    with np.errstate(over="ignore"):  # what does not fit into float32 becomes infinite and is refused
+        xyz = xyz.astype(np.float32)
     if not np.isfinite(xyz).all():
         raise SourceError(f"{path}: {int((~np.isfinite(xyz)).any(1).sum())} of {len(xyz)} points are not finite")
     colors = rgb.astype(np.float32) / np.float32(255)
-    return PointCloud(xyz.astype(np.float32), colors, f"{path.name} ({kind})")
+    return PointCloud(xyz, colors, f"{path.name} ({kind})")
 
 
 def _check_files(folder: Path, calibration: Calibration) -> None:
@@ -129,6 +135,7 @@ def _check_rig_files(folder: Path, cameras: Cameras, calibration: Calibration) -
                 f"{folder}: camera {camera_id!r}: {calibration.num_frames} frames are declared, but 'frames' "
                 f"{pattern!r} names a single image; use a pattern such as %06d"
             )
+        _check_span(folder, camera_id, pattern, calibration.num_frames)
         paths = [folder / frame_path(pattern, t) for t in range(calibration.num_frames)]
         missing = [p for p in paths if not p.is_file()]
         if len(missing) == len(paths):
@@ -138,3 +145,15 @@ def _check_rig_files(folder: Path, cameras: Cameras, calibration: Calibration) -
                 f"{folder}: camera {camera_id!r}: {len(missing)} of {len(paths)} frames are missing, the first is "
                 f'{missing[0]}; restore them or lower "frames" in cameras.json'
             )
+
+
+def _check_span(folder: Path, camera_id: str, pattern: str, count: int) -> None:
+    """The first and the last image first: a count of millions is answered at once, without a list of names."""
+    for index in (0, count - 1):
+        path = folder / frame_path(pattern, index)
+        try:
+            there = path.is_file()
+        except OSError as error:
+            raise SourceError(f"{folder}: camera {camera_id!r}: {str(path)[:100]}...: {error.strerror}") from error
+        if not there and count > 100_000:
+            raise FilesMissing(f"{folder}: camera {camera_id!r}: {count} frames are declared, but {path} is missing")

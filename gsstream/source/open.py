@@ -15,6 +15,7 @@ _KNOWN = (
     "'demo' (a small recording inside the package), "
     "'synthetic:' with options such as 'synthetic:frames=40&views=8' (an analytic scene of any length), "
     "'watch:DIR' (a folder that is still being written), "
+    "'disturbed:KEY=VALUE,...:' before any of them (an experiment), "
     f"or the path of a folder, read by its layout or as you say: folder:DIR, {':DIR, '.join(LAYOUTS)}:DIR"
 )
 
@@ -24,7 +25,7 @@ def open_source(uri: str, scale: float = 1.0) -> FrameSource:
 
     Arguments:
         uri: ``demo``, ``synthetic:key=value&...``, ``watch:DIR?key=value&...``, the path of a folder in a known layout,
-            or LAYOUT:DIR.
+            LAYOUT:DIR, or ``disturbed:key=value,...:`` before any of these.
         scale: images are shrunk by this factor in (0, 1] on reading.
 
     Raises SourceError for an unknown uri, naming what exists, and for a faulty recording.
@@ -40,6 +41,8 @@ def open_source(uri: str, scale: float = 1.0) -> FrameSource:
         from gsstream.source.watch import WatchSource
 
         return WatchSource.from_query(rest, scale=scale)
+    if separator and scheme == "disturbed":
+        return _disturbed(rest, scale, uri)
     named = scheme if separator and scheme in (*LAYOUTS, "folder") else None
     folder = Path(rest if named else uri)
     # An empty text is the current folder to Path, and never what was meant.
@@ -51,6 +54,22 @@ def open_source(uri: str, scale: float = 1.0) -> FrameSource:
     if layout == "folder":
         return MultiviewSource(folder, scale=scale, uri=uri)
     return RecordedSource(read_layout(layout, folder), scale=scale, uri=uri)
+
+
+def _disturbed(rest: str, scale: float, uri: str) -> FrameSource:
+    """``disturbed:KEY=VALUE,...:URI``. Raises SourceError for an unknown key, and what opening URI raises."""
+    from gsstream.source.disturbed import DisturbedSource, parse_disturbances
+
+    text, colon, inner = rest.partition(":")
+    if not colon:
+        raise SourceError(f"source {uri[:200]!r}: expected disturbed:KEY=VALUE,...:URI, e.g. disturbed:gain=0.8:demo")
+    options, seed = parse_disturbances(text)
+    source = open_source(inner, scale)
+    try:
+        return DisturbedSource(source, options, seed, uri)
+    except SourceError:
+        source.close()
+        raise
 
 
 def _nerfstudio(rest: str, scale: float, uri: str) -> FrameSource:

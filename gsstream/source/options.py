@@ -1,4 +1,4 @@
-"""DataOptions: the section ``data`` of a recipe. Imports nothing heavy, because recipes do not."""
+"""DataOptions: the section ``data`` of a recipe, and disturbances. Imports nothing heavy, because recipes do not."""
 
 from __future__ import annotations
 
@@ -10,30 +10,14 @@ from gsstream.core.storage import Storage
 
 Leak = Literal["none", "points", "training"]
 LostAs = Literal["hold", "black"]
+BadImage = Literal["stop", "repeat", "drop"]
 
 
-class DataOptions(BaseModel):
-    """Section ``data`` of a recipe: the split, and disturbances for experiments."""
+class Disturbances(BaseModel):
+    """What an experiment does to a recording on purpose; the options of ``disturbed:KEY=VALUE,...:URI``."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
-    test_cameras: tuple[str, ...] | None = Field(
-        default=None, description="cameras that only judge, by id; null: the recording's own split; []: none"
-    )
-    train_cameras: tuple[str, ...] | None = Field(
-        default=None, description="cameras that train, by id; null: all that do not test"
-    )
-    train_views: int | None = Field(
-        default=None, ge=2, description="keep this many training cameras, far from each other; null: all"
-    )
-    leak: Leak = Field(
-        default="none",
-        description="what test cameras may give: none; points: seeds of frame 0 (the paper's released code); "
-        "training: they train, too (some published numbers)",
-    )
-    time_offset: tuple[str, ...] = Field(
-        default=(), description='"ID=FRAMES" per camera: its frame t + FRAMES stands for frame t, e.g. ["c3=2"]'
-    )
     gain: float = Field(default=1.0, gt=0, le=4, description="factor on all images, clipped to [0, 1]")
     gain_amplitude: float = Field(
         default=0.0, ge=0, lt=1, description="the factor of frame t lies in gain * (1 -/+ this) (paper: 0.2 to 0.5)"
@@ -56,6 +40,32 @@ class DataOptions(BaseModel):
         default="hold", description="a lost image is: hold: the camera's last one; black: a black one"
     )
 
+
+class DataOptions(Disturbances):
+    """Section ``data`` of a recipe: the split, corrections, and disturbances for experiments."""
+
+    test_cameras: tuple[str, ...] | None = Field(
+        default=None, description="cameras that only judge, by id; null: the recording's own split; []: none"
+    )
+    train_cameras: tuple[str, ...] | None = Field(
+        default=None, description="cameras that train, by id; null: all that do not test"
+    )
+    train_views: int | None = Field(
+        default=None, ge=2, description="keep this many training cameras, far from each other; null: all"
+    )
+    leak: Leak = Field(
+        default="none",
+        description="what test cameras may give: none; points: seeds of frame 0 (the paper's released code); "
+        "training: they train, too (some published numbers)",
+    )
+    time_offset: tuple[str, ...] = Field(
+        default=(), description='"ID=FRAMES" per camera: its frame t + FRAMES stands for frame t, e.g. ["c3=2"]'
+    )
+    bad_image: BadImage = Field(
+        default="stop",
+        description="an image after frame 0 that cannot be read: stop: the run ends with its name; repeat: the "
+        "camera's last image stands in; drop: the whole frame becomes an empty packet",
+    )
     images: Storage = Field(
         default="float32",
         description="how training images wait in memory (decoded ahead, and those of the last frame); values are "

@@ -1,13 +1,15 @@
-"""A recording seen through ``DataOptions``: another split, shifted clocks, changed light, noise, lost images."""
+"""A recording seen through ``DataOptions``: another split, shifted clocks, bad images, changed light, noise, losses."""
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.errors import SourceError
+from gsstream.core.errors import EndOfRecording, SourceError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
@@ -23,6 +25,7 @@ from gsstream.source.base import (
     check_index,
 )
 from gsstream.source.options import DataOptions
+from gsstream.source.sync import RecordingWarning
 from gsstream.source.transforms import (
     choose_split,
     gain_at,
@@ -100,11 +103,20 @@ class TransformedSource:
             cameras = cameras if there.issuperset(cameras.ids) else cameras.select([])
             images = images[: len(cameras)]
         effort = min((frame.effort for frame in cache.values()), default=1.0)
+        bad = False
         for row, name in enumerate(cameras.ids):
             shown = self._last_shown(name, index) if split == "train" else index
-            images[row] = 0 if shown is None else self._image(name, shown, split, cache)
+            if shown is not None:
+                images[row], read = self._whole(name, shown, split, cache)
+                bad |= read != shown
+            else:
+                images[row] = 0
             if split == "train":
                 images[row] = rounded(images[row], self._options.images)
+        if bad and split == "test":  # nothing is measured against an image of another time
+            cameras, images = cameras.select([]), images[:0]
+        if bad and split == "train" and self._options.bad_image == "drop":
+            effort = 0.0
         return Frame(index, index / self._info.fps, images, cameras, effort)
 
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
@@ -113,10 +125,13 @@ class TransformedSource:
         Sources that know who took part in which point leave those points out; the points of others are withheld (None)
         when a camera that they count as training is a test camera here. ``leak`` lifts both.
         """
-        held_out = self._info.test.ids if self._options.leak == "none" else ()
+        return self.points_without(self._info.test.ids if self._options.leak == "none" else (), kind)
+
+    def points_without(self, cameras: Sequence[str], kind: PointKind = "recording") -> PointCloud | None:
+        """The points in which none of these cameras took part, or may have taken part; None when none are left."""
         if isinstance(self._source, AttributedPoints):
-            return self._source.points_without(held_out, kind)
-        taken = any(self._home[name] == "train" for name in held_out)
+            return self._source.points_without(cameras, kind)
+        taken = any(self._home[name] == "train" for name in cameras)
         return None if taken else self._source.points(kind)
 
     def interrupt(self) -> None:
@@ -135,6 +150,22 @@ class TransformedSource:
                 return None
             index -= 1
         return index
+
+    def _whole(
+        self, name: str, index: int, split: Split, cache: dict[tuple[int, Split], Frame]
+    ) -> tuple[FloatArray, int]:
+        """A camera's image of a frame, or where it cannot be read its last one before that, and whose frame it is."""
+        while True:
+            try:
+                return self._image(name, index, split, cache), index
+            except EndOfRecording:
+                raise
+            except SourceError as error:
+                if self._options.bad_image == "stop" or index == 0:
+                    raise
+                what = "the camera's last image stands in" if self._options.bad_image == "repeat" else "it is left out"
+                warnings.warn(f"frame {index}, camera {name!r}: {error}; {what}", RecordingWarning, stacklevel=2)
+                index -= 1
 
     def _image(self, name: str, index: int, split: Split, cache: dict[tuple[int, Split], Frame]) -> FloatArray:
         options = self._options

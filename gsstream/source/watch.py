@@ -5,13 +5,13 @@ from __future__ import annotations
 import threading
 import time
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 from urllib.parse import parse_qsl
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ValidationError
 
 from gsstream.core.errors import EndOfRecording, SourceError, suggest
 from gsstream.core.frame import Frame, PointCloud
@@ -20,35 +20,7 @@ from gsstream.source.base import PointKind, SourceInfo, Split
 from gsstream.source.calibration import CALIBRATION_FILE, Calibration, frame_path, read_calibration
 from gsstream.source.images import read_image
 from gsstream.source.multiview import POINTS_FILE, read_points, scaled_size
-
-
-class WatchOptions(BaseModel):
-    """Options of ``watch:DIR?key=value&...``; times in seconds."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    ready: Literal["stable", "rename"] = Field(
-        default="stable",
-        description="when a file counts as written: stable: unchanged for 'settle', or something newer of its camera "
-        "exists; rename: as soon as it exists (the writer renames finished files into place)",
-    )
-    settle: float = Field(default=0.2, ge=0, le=60, description="time a file must stay unchanged (ready=stable)")
-    poll: float = Field(default=0.05, gt=0, le=10, description="time between two looks at the folder")
-    behind: Literal["block", "drop", "hurry"] = Field(
-        default="block",
-        description="when more than 'queue' complete frames wait: block: encode every frame, the disk is the queue; "
-        "drop: skip to the newest, skipped frames become empty packets; hurry: fewer epochs, in proportion",
-    )
-    queue: int = Field(default=4, ge=1, le=100_000, description="complete frames that may wait before 'behind' acts")
-    least_effort: float = Field(default=0.2, gt=0, le=1, description="smallest share of the epochs (behind=hurry)")
-    missing: Literal["wait", "hold", "drop"] = Field(
-        default="wait",
-        description="a camera whose image does not come: wait: until 'timeout', then the stream ends; "
-        "hold: after 'grace' its last image stands in; drop: after 'grace' the frame becomes an empty packet",
-    )
-    grace: float = Field(default=2.0, ge=0, le=3600, description="wait for late cameras, counted from the others")
-    timeout: float = Field(default=30.0, gt=0, le=86_400, description="nothing came for so long: the recording ends")
-    end: str = Field(default="END", min_length=1, description="name of the file that says that nothing more will come")
+from gsstream.source.watch_options import WatchOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,8 +236,19 @@ class WatchSource:
             return False
         if all(self._path(name, index + 1).exists() for name in absent):
             return True  # they have moved on: this image will not come
-        newest = max(self._path(name, index).stat().st_mtime for name in whole)
-        return max(waited, time.time() - newest) >= self._options.grace
+        # Times of files are those of the writer's clock, which may be ahead of ours or behind: they are compared with
+        # each other, never with the time here.
+        newest, later = (self._newest_of(whole, frame) for frame in (index, index + 1))
+        passed = 0.0 if newest is None or later is None else later - newest
+        return max(waited, passed) >= self._options.grace
+
+    def _newest_of(self, names: set[str], index: int) -> float | None:
+        """Time of the newest image of a frame, by the writer's clock; None: none of them is there (any more)."""
+        times = []
+        for name in names:
+            with suppress(FileNotFoundError):
+                times.append(self._path(name, index).stat().st_mtime)
+        return max(times, default=None)
 
     def _end(self, index: int, absent: list[str], ended: bool) -> None:
         """Nothing more will come: say why when it is not what the writer announced, and raise EndOfRecording."""

@@ -1,7 +1,10 @@
-"""Calling a part the way the engine does: every output of every method, by name."""
+"""What the common checks have to know of a kind: how the engine calls such a part, and what its outputs mean."""
 
 from __future__ import annotations
 
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -14,39 +17,36 @@ from gsstream.testing.registry import kind_of
 Outputs = dict[str, torch.Tensor]
 
 
+@dataclass(frozen=True)
+class Behaviour:
+    """How the common checks treat a kind; each kind with ``PartKind.behaviour`` has one in its room.
+
+    Arguments:
+        outputs: every output of every method on a world, tensor by tensor.
+        poison: put a value into something that the part reads, in place.
+        keeps_precision: outputs have the precision of the logits given; otherwise they are float32.
+        by_gaussian: outputs have a row per Gaussian, which moves with it.
+        no_order: outputs whose names begin so are not compared after a permutation: the kind has a check of its own.
+        hands_on: may hand on a value that is not finite, because it shows in the loss.
+    """
+
+    outputs: Callable[[Any, World], Outputs]
+    poison: Callable[[World, float], None]
+    keeps_precision: bool = True
+    by_gaussian: bool = False
+    no_order: str | None = None
+    hands_on: bool = False
+
+
+def behaviour_of(part: Part) -> Behaviour:
+    """The behaviour of the part's kind."""
+    found: Behaviour = importlib.import_module(f"gsstream.testing.{kind_of(part)}.behaviour").BEHAVIOUR
+    return found
+
+
 def outputs(part: Part, world: World) -> Outputs:
     """What ``part`` makes of a world, tensor by tensor."""
-    return _DRIVERS[kind_of(part)](part, world)
-
-
-def _structure(part: Any, world: World) -> Outputs:
-    found: Outputs = {}
-    if len(world.points):
-        anchors = part.seed(world.points, world.cameras)
-        for name in ("positions", "colors", "levels", "cell_sizes", "origin"):
-            found[f"seed().{name}"] = getattr(anchors, name)
-    forest = part.build(world.gaussians, world.anchors)
-    return {**found, "build().node_of": forest.node_of, "build().parent": forest.parent, "build().level": forest.level}
-
-
-def _confidence(part: Any, world: World) -> Outputs:
-    return {"estimate()": part.estimate(world)}
-
-
-def _propagation(part: Any, world: World) -> Outputs:
-    return {"propagate()": part.propagate(world.logits, world.hierarchy)}
-
-
-def _gate(part: GateSampler, world: World) -> Outputs:
-    logits = part.init(world.logits)
-    noise = draw(part, len(world.logits))
-    found = {
-        "init()": logits,
-        "sample(None)": part.sample(logits, None),
-        "open_probability()": part.open_probability(logits),
-        "bound()": part.bound(logits),
-    }
-    return found if noise is None else {**found, "sample(noise)": part.sample(logits, noise)}
+    return behaviour_of(part).outputs(part, world)
 
 
 def draw(part: GateSampler, number: int, seed: int = 7) -> torch.Tensor | None:
@@ -54,21 +54,6 @@ def draw(part: GateSampler, number: int, seed: int = 7) -> torch.Tensor | None:
     return part.noise(number, torch.Generator().manual_seed(seed))
 
 
-def _regularizer(part: Any, world: World) -> Outputs:
-    opened = torch.sigmoid(_per_node(world))
-    terms = part.penalty(opened, world.residual, world.hierarchy, len(world.logits))
-    return {f"penalty()[{name!r}]": value for name, value in terms.items()}
-
-
-def _per_node(world: World) -> torch.Tensor:
-    """[M] one logit per node, whatever the order of the Gaussians."""
-    return torch.linspace(-2, 2, world.hierarchy.num_nodes).to(world.logits.dtype)
-
-
-_DRIVERS = {
-    "structure": _structure,
-    "confidence": _confidence,
-    "propagation": _propagation,
-    "gate": _gate,
-    "regularizer": _regularizer,
-}
+def poison_logits(world: World, value: float) -> None:
+    """Spoil the logit of one Gaussian."""
+    world.logits[5] = value

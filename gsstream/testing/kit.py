@@ -3,38 +3,25 @@
 from __future__ import annotations
 
 import functools
+import importlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from gsstream.core.kinds import PART_KINDS
 from gsstream.core.part import Part
 from gsstream.method.base import StreamingMethod
 from gsstream.testing import stepping
-from gsstream.testing.checks import (
-    auto,
-    common,
-    confidence,
-    gate,
-    loss,
-    method,
-    optimiser,
-    packet,
-    propagation,
-    regularizer,
-    renderer,
-    source,
-    structure,
-    update,
-)
+from gsstream.testing.packet.checks import PacketCodec
 from gsstream.testing.recording import SourceUnderTest
 from gsstream.testing.registry import CHECKS, LEAST_REASON, Check, Skip, checks_for, denied_by, kind_of
 
 Status = Literal["passed", "failed", "expected failure", "skipped"]
-#: Importing these modules fills the registry; the order is that of the reports.
-MODULES = (
-    common, auto, structure, confidence, propagation, gate, regularizer, update, renderer, loss, optimiser, source,
-    method, packet,
-)  # fmt: skip
+#: Rooms of checks: for parts of all kinds, for each kind, for packets. Importing them fills the registry, in the order
+#: of the reports.
+ROOMS = ("common", *PART_KINDS, "packet")
+for _room in ROOMS:
+    importlib.import_module(f"gsstream.testing.{_room}.checks")
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,9 +104,9 @@ def run_method_checks(name: str, expected_failures: Mapping[str, str] | None = N
     return run_subject("method", stepping.MethodUnderTest(name), expected_failures)
 
 
-def run_packet_checks(codec: packet.PacketCodec | None = None) -> list[CheckResult]:
+def run_packet_checks(codec: PacketCodec | None = None) -> list[CheckResult]:
     """Make the checks of the packet format."""
-    return run_subject("packet", codec or packet.PacketCodec())
+    return run_subject("packet", codec or PacketCodec())
 
 
 def run_subject(kind: str, subject: Any, expected: Mapping[str, str] | None = None) -> list[CheckResult]:

@@ -63,7 +63,7 @@ OPTIONS = {
         "--first-frame", "--workers", "--quiet",
     ],
     "gsstream report": ["FOLDER", "--out", "--data", "--sheets"],
-    "gsstream check": ["NAME", "--quiet", "--source"],
+    "gsstream check": ["NAME", "--quiet", "--set", "--source"],
     "gsstream new-plugin": ["NAME", "--kind", "--out"],
     "gsstream bench": [],
     "gsstream bench render": [

@@ -21,16 +21,16 @@ from gsstream.residual.additive import Additive
 from gsstream.source.open import open_source
 from gsstream.structure.flat import Flat
 from gsstream.testing import SourceUnderTest, parametrize_with_checks, run_checks
-from gsstream.testing.examples.confidence import ExampleConfidence
-from gsstream.testing.examples.gate import ExampleGate
-from gsstream.testing.examples.loss import ExampleLoss
-from gsstream.testing.examples.propagation import ExamplePropagation
-from gsstream.testing.examples.regularizer import ExampleRegularizer
-from gsstream.testing.examples.source import ExampleSource
-from gsstream.testing.examples.stepper import ExampleStepper
-from gsstream.testing.examples.structure import ExampleStructure
-from gsstream.testing.examples.update import ExampleUpdate
+from gsstream.testing.confidence.example import ExampleConfidence
+from gsstream.testing.gate.example import ExampleGate
 from gsstream.testing.kit import all_checks, summary
+from gsstream.testing.loss.example import ExampleLoss
+from gsstream.testing.propagation.example import ExamplePropagation
+from gsstream.testing.regularizer.example import ExampleRegularizer
+from gsstream.testing.source.example import ExampleSource
+from gsstream.testing.structure.example import ExampleStructure
+from gsstream.testing.update.example import ExampleUpdate
+from gsstream.testing.stepper.example import ExampleStepper
 
 BUILTIN = [
     Flat(), Uniform(), Uniform(Uniform.Config(logit=-50)), GroupMax(), AlwaysOpen(), NoRegularizer(), Additive(),

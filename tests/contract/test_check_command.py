@@ -83,3 +83,13 @@ def test_a_wrong_name_offers_the_nearest(capsys: pytest.CaptureFixture[str]) -> 
     assert "did you mean 'group-max'?" in capsys.readouterr().err
     assert run_command(["check", "doors/group-max"]) == 2
     assert "no kind of part named 'doors'" in capsys.readouterr().err
+
+
+def test_settings_of_the_part_that_is_checked(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["check", "confidence/uniform", "--set", "logit=-50", "--quiet"]) == 0
+    assert run_command(["check", "confidence/uniform", "--set", "logit=99"]) == 2
+    assert "logit" in capsys.readouterr().err
+    assert run_command(["check", "confidence/uniform", "--set", "logits=1"]) == 2
+    assert "logits" in capsys.readouterr().err
+    assert run_command(["check", "reference", "--set", "x=1"]) == 2
+    assert "--set gives settings to one part" in capsys.readouterr().err

@@ -6,9 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from saboteurs import INSTALLED, METHOD_SABOTEURS, PACKET_SABOTEURS, SABOTEURS
 
 from gsstream.testing.kit import CheckResult, all_checks, run_checks, run_method_checks, run_packet_checks, run_subject
-from gsstream.testing.saboteurs import INSTALLED, METHOD_SABOTEURS, PACKET_SABOTEURS, SABOTEURS
 from gsstream.testing.stepping import MethodUnderTest
 
 
@@ -58,7 +58,7 @@ assert torch
 
 @hookimpl
 def gsstream_components():
-    target = "gsstream.testing.examples.gate:ExampleGate"
+    target = "gsstream.testing.gate.example:ExampleGate"
     return [ComponentSpec(kind="gate", name="heavy", target=target, summary="declared by a module that imports torch")]
 """
 
@@ -66,7 +66,7 @@ def gsstream_components():
 def test_a_plugin_whose_declaration_imports_torch_fails_exactly_that(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from gsstream.testing.examples.gate import ExampleGate
+    from gsstream.testing.gate.example import ExampleGate
 
     (tmp_path / "gsstream_heavy_plugin.py").write_text(HEAVY)
     info = tmp_path / "gsstream_heavy-0.1.dist-info"

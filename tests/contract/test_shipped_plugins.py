@@ -1,4 +1,4 @@
-"""``gsstream check`` of everything this repository ships ends well: what a part cannot keep, it denies with a reason."""
+"""``gsstream check`` of all that this repository ships ends well: what a part cannot keep, it denies with a reason."""
 
 from __future__ import annotations
 

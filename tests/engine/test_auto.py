@@ -28,7 +28,7 @@ from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import load_recipe, resolve_recipe
 from gsstream.recipe.save import save_resolved
 from gsstream.structure.flat import Flat
-from gsstream.testing.checks.auto import extreme_scenes
+from gsstream.testing.common.auto import extreme_scenes
 
 FACTS = extreme_scenes()[0]
 

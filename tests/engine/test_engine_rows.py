@@ -15,7 +15,7 @@ from gsstream.engine.state.follow import follow
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.optimiser.adam import ReferenceAdam
 from gsstream.packet import decode_packet, encode_delta, encode_key
-from gsstream.testing.checks.packet import tiny_key
+from gsstream.testing.packet.checks import tiny_key
 
 
 def scene(number: int, seed: int = 0) -> Gaussians:

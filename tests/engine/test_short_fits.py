@@ -22,7 +22,7 @@ from gsstream.packet import StreamMeta
 from gsstream.structure.base import Anchors
 from gsstream.structure.flat import Flat
 from gsstream.testing.cases import rig
-from gsstream.testing.checks.auto import extreme_scenes
+from gsstream.testing.common.auto import extreme_scenes
 
 
 @given(count=st.integers(0, 500), share=st.floats(0.001, 0.999), folds=st.integers(1, 8))

@@ -22,7 +22,7 @@ from gsstream.engine.auto.trials import usual_values
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.structure.flat import Flat
-from gsstream.testing.checks.auto import extreme_scenes
+from gsstream.testing.common.auto import extreme_scenes
 
 FACTS = extreme_scenes()[0]
 LADDER = tuple(range(10))

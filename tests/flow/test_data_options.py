@@ -1,4 +1,4 @@
-"""Runs under ``data.*``: the stream carries the options; resuming and evaluating see the same disturbed data."""
+"""Runs on disturbed recordings and under ``data.*``: resuming and evaluating see the same data."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from flow_runs import arguments, broken_off_in, encode, metrics
 from gsstream.cli.main import run_command
 from gsstream.source.open import open_source
 
-DISTURBED = {"data__gain_amplitude": 0.3, "data__noise_sigma": 8, "data__lost_share": 0.4, "data__train_views": 2}
+DISTURBED = "disturbed:gain_amplitude=0.3,noise_sigma=8,lost_share=0.4"
 
 
 def test_a_disturbed_run_resumes_to_the_same_bytes_and_is_judged_on_what_it_saw(
@@ -18,7 +18,8 @@ def test_a_disturbed_run_resumes_to_the_same_bytes_and_is_judged_on_what_it_saw(
 ) -> None:
     world = "synthetic:frames=5&views=3&width=64&height=48&supersample=1"
     name = open_source(world).info.test.ids[0]
-    options = {**DISTURBED, "data__time_offset": f'["{name}=1"]'}
+    options = {"data__train_views": 2, "data__time_offset": f'["{name}=1"]'}
+    world = f"{DISTURBED}:{world}"
     once = encode(tmp_path / "whole", source=world, method="s2gs-edge", **options)
     assert len(metrics(tmp_path / "whole")) == 4  # the offset costs one frame
 

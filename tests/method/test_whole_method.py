@@ -25,8 +25,8 @@ from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe
 from gsstream.source.open import open_source
-from gsstream.testing.examples.stepper import ExampleStepper
 from gsstream.testing.stepping import SOURCE, MethodUnderTest
+from gsstream.testing.stepper.example import ExampleStepper
 
 Follow: Any = ExampleStepper  # final: only what is wrong on purpose may inherit from it
 

@@ -27,7 +27,7 @@ from gsstream.metrics import psnr
 from gsstream.optimiser.adam import ReferenceAdam
 from gsstream.optimiser.base import MAX_GRADIENT, AdamState, RowOptimiser
 from gsstream.source.open import open_source
-from gsstream.testing.checks.method import SOURCE, MethodUnderTest
+from gsstream.testing.stepper.checks import SOURCE, MethodUnderTest
 
 
 @functools.cache

@@ -177,9 +177,76 @@ def test_what_cannot_be_prepared_is_said(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="cameras found: 1; expected at least two"):
         find_cameras(tmp_path / "raw")
     save(tmp_path / "raw" / "other.png", np.zeros((8, 9, 3)))
-    with pytest.raises(InputError, match=r"differ in size \(8 x 8, 9 x 8\)"):
+    with pytest.raises(InputError, match="structure from motion"):
         prepare(tmp_path / "raw", tmp_path / "scene", PrepareOptions(), quiet)
     with pytest.raises(InputError, match="--test: no camera 'anything'"):
         prepare(tmp_path / "raw", tmp_path / "scene", PrepareOptions(test=("anything",)), quiet)
     with pytest.raises(InputError, match="not an empty folder"):
         prepare(tmp_path / "raw", tmp_path / "raw", PrepareOptions(), quiet)
+
+
+def declared(raw: Path, world: str = WORLD, edit=lambda entry: None) -> None:
+    """cameras.json of a world beside its raw pictures."""
+    rig, cameras = open_source(world).info, []
+    for split, part in (("train", rig.train), ("test", rig.test)):
+        for name, K, w2c in zip(part.ids, part.Ks, part.viewmats, strict=True):
+            entry = {"id": name, "split": split, "width": 240, "height": 180, "K": K.tolist(), "w2c": w2c.tolist(),
+                     "frames": f"{name}/shot%d.png"}  # fmt: skip
+            edit(entry)
+            cameras.append(entry)
+    data = {"schema": "opencv-multiview-1", "name": "raw", "fps": 25, "frames": 2, "cameras": cameras}
+    (raw / "cameras.json").write_text(json.dumps(data))
+
+
+@pytest.mark.sfm
+@needs_pycolmap
+def test_cameras_of_other_sizes_are_brought_to_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A camera with twice the pixels and 20 more on either side must come out as the one that it was made from."""
+    from PIL import Image
+
+    raw, rig = raw_pictures(tmp_path / "raw"), open_source(WORLD).info
+    odd = [rig.train.ids[1], rig.test.ids[0]]
+    for name in odd:
+        for path in (raw / name).iterdir():
+            doubled = np.asarray(Image.open(path)).repeat(2, 0).repeat(2, 1)
+            Image.fromarray(np.pad(doubled, ((0, 0), (20, 20), (0, 0)), mode="edge")).save(path)
+
+    def larger(entry):
+        if entry["id"] in odd:
+            entry |= {"width": 520, "height": 360}
+            entry["K"] = [[2 * v for v in row] for row in entry["K"][:2]] + [entry["K"][2]]
+            entry["K"][0][2] += 20
+
+    declared(raw, edit=larger)
+    assert run_command(["run", "--source", str(raw), "--method", "hold", "--out", str(tmp_path / "run")]) == 2
+    assert "gsstream scene prepare" in capsys.readouterr().err
+    said = []
+    prepare(raw, tmp_path / "scene", PrepareOptions(), said.append)
+    assert any("minutes" in line for line in said), "what takes long is said before it begins"
+    scene, world = open_source(str(tmp_path / "scene")), open_source(WORLD)
+    assert np.allclose(scene.info.train.Ks, rig.train.Ks, rtol=1e-9)
+    assert np.allclose(scene.info.test.Ks, rig.test.Ks, rtol=1e-9)
+    for split in ("train", "test"):
+        assert np.abs(scene.frame(1, split).images - world.frame(1, split).images).max() < 1.5 / 255
+
+
+@pytest.mark.sfm
+@needs_pycolmap
+def test_unknown_cameras_of_other_sizes_are_placed(tmp_path: Path) -> None:
+    from PIL import Image
+
+    raw, truth = raw_pictures(tmp_path / "raw", 1, LARGE), open_source(LARGE).info
+    name = truth.train.ids[3]
+    for path in (raw / name).iterdir():
+        image = Image.open(path)
+        image.resize((480, 360), Image.Resampling.BICUBIC).save(path)
+    made = prepare(raw, tmp_path / "scene", PrepareOptions(test=("test",), model="PINHOLE", frames=1), quiet)
+    assert name not in made.left_out
+    assert (made.rig.width, made.rig.height) == (320, 240)
+    assert open_source(str(tmp_path / "scene")).frame(0).images.shape[1:] == (240, 320, 3)
+    kept = [i for i, camera in enumerate(truth.train.ids) if camera in made.rig.ids]
+    gaps, real = (
+        np.linalg.norm(rig.centers[:, None] - rig.centers[None], axis=2)
+        for rig in (made.rig.select([made.rig.ids.index(truth.train.ids[i]) for i in kept]), truth.train.select(kept))
+    )
+    assert np.abs(gaps / gaps.max() - real / real.max()).max() < 0.03

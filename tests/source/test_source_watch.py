@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import threading
 import time
@@ -101,3 +102,34 @@ def test_frame_0_needs_every_camera(folder: Path) -> None:
 def test_wrong_options_are_named(uri: str, message: str) -> None:
     with pytest.raises(SourceError, match=message):
         open_source(uri.format(DEMO_FOLDER))
+
+
+@pytest.mark.parametrize("skew", [-3600.0, -5.0, 0.0, 5.0])
+def test_a_writer_with_another_clock_has_its_grace(folder: Path, skew: float) -> None:
+    """A camera that is late by less than the grace is waited for, whatever time the writer's machine believes it is."""
+    live = open_source(f"watch:{folder}?missing=hold&grace=8&settle=0", 0.25)
+    name = live.info.train.ids[0]
+    for path in [*folder.glob("*/00000[1-9].jpg"), *folder.glob("*/00001*.jpg")]:
+        index = int(path.stem)
+        if index > 1:
+            path.unlink()
+        else:
+            os.utime(path, (time.time() + skew, time.time() + skew))
+    late = folder / name / "000001.jpg"
+    late.rename(folder / "late.jpg")
+    threading.Timer(0.7, lambda: (folder / "late.jpg").rename(late)).start()
+    frame = live.frame(1)
+    assert np.array_equal(frame.images, open_source("demo", 0.25).frame(1).images), "nothing was held"
+
+
+def test_grace_is_counted_by_the_files_when_the_run_lags_behind(folder: Path) -> None:
+    """The writer has gone on for longer than the grace: nobody waits for what will not come."""
+    live = open_source(f"watch:{folder}?missing=hold&grace=100", 0.25)
+    (folder / live.info.train.ids[0] / "000001.jpg").unlink()
+    (folder / live.info.train.ids[0] / "000002.jpg").unlink()
+    for path in folder.glob("*/*.jpg"):
+        os.utime(path, (1e9 + 200 * int(path.stem),) * 2)
+    began = time.monotonic()
+    frame = live.frame(1)
+    assert time.monotonic() - began < 50
+    assert np.array_equal(frame.images[0], live.frame(0).images[0])

@@ -20,7 +20,7 @@ from gsstream_s2gs.octree import StreamingOctree
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsstream.testing.checks.auto import extreme_scenes
+from gsstream.testing.common.auto import extreme_scenes
 
 FACTS = extreme_scenes()[0]
 SETTINGS = StreamingOctree().config

@@ -1,0 +1,75 @@
+"""``disturbed:KEY=VALUE,...:URI``: a recording that is disturbed on purpose, for experiments and tests.
+
+::
+
+    gsstream run --source disturbed:noise_sigma=20,seed=1:demo ...
+    gsstream run --source disturbed:lost_cameras=cam03@10-20+cam05@3-4,lost_as=black:FOLDER ...
+
+A stream names the whole URI as its recording, so that evaluating and resuming see the same disturbed images.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import Any
+
+from pydantic import ValidationError
+
+from gsstream.core.errors import SourceError, suggest
+from gsstream.source.base import FrameSource, SourceInfo
+from gsstream.source.options import DataOptions, Disturbances
+from gsstream.source.transformed import TransformedSource
+
+_KEYS = ("seed", *Disturbances.model_fields)
+
+
+def parse_disturbances(text: str) -> tuple[DataOptions, int]:
+    """Options and seed from ``"KEY=VALUE,..."``. Raises SourceError naming an unknown key or an impossible value."""
+    values: dict[str, Any] = {}
+    for part in text.split(",") if text else ():
+        key, equals, value = part.partition("=")
+        if not equals or key not in _KEYS:
+            near = suggest(key, _KEYS) if equals else ""
+            raise SourceError(f"disturbed source: expected KEY=VALUE,..., got {part!r}{near}; keys: {', '.join(_KEYS)}")
+        if key in values:
+            raise SourceError(f"disturbed source: {key!r} is given twice")
+        values[key] = _losses(value) if key == "lost_cameras" else value
+    seed = str(values.pop("seed", "0"))
+    if not re.fullmatch(r"\d{1,9}", seed):
+        raise SourceError(f"disturbed source: seed: expected a whole number from 0, got {seed!r}")
+    try:
+        return DataOptions.model_validate(values), int(seed)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = str(first["loc"][0])
+        meaning = Disturbances.model_fields[key].description
+        raise SourceError(f"disturbed source: {key} = {first['input']!r}: {first['msg']} ({meaning})") from error
+
+
+def _losses(text: str) -> tuple[str, ...]:
+    """``"cam03@10-20+cam05@3-4"`` as the entries of ``lost_cameras``: frames 10 to 19 of cam03, 3 of cam05."""
+    entries = []
+    for part in text.split("+"):
+        match = re.fullmatch(r"(.+)@(\d{1,9})-(\d{1,9})", part)
+        if match is None:
+            raise SourceError(f"disturbed source: lost_cameras: expected ID@A-B+..., e.g. cam03@10-20, got {part!r}")
+        entries.append(f"{match[1]}={match[2]}:{match[3]}")
+    return tuple(entries)
+
+
+class DisturbedSource(TransformedSource):
+    """A recording under disturbances that its own URI names.
+
+    Arguments:
+        source: the recording itself. uri: how the user asked for it, disturbances included.
+    """
+
+    def __init__(self, source: FrameSource, options: DataOptions, seed: int, uri: str) -> None:
+        super().__init__(source, options, seed)
+        self._uri = uri
+
+    @property
+    def info(self) -> SourceInfo:
+        """That of the recording, under the URI that brings the disturbances back."""
+        return replace(self._info, uri=self._uri)

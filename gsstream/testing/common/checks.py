@@ -1,0 +1,238 @@
+"""What all parts promise: settings, freezing, declaration; and of the five kinds purity, shapes and equivariance."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import inspect
+import json
+import os
+import pickle
+import random
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ValidationError
+
+from gsstream.core.errors import InputError
+from gsstream.core.kinds import CONTRACTS
+from gsstream.core.part import Part
+from gsstream.gate.base import GateSampler
+from gsstream.testing.cases import World, fingerprint, world
+from gsstream.testing.common import auto as auto
+from gsstream.testing.compare import ROUNDING, all_equal, finite
+from gsstream.testing.drive import behaviour_of, draw, outputs
+from gsstream.testing.recording import SourceUnderTest
+from gsstream.testing.registry import BEHAVED, LEAST_REASON, Skip, check, checks_for, kind_of
+
+ALL = tuple(CONTRACTS)
+
+
+@check("common", kinds=ALL)
+def check_config_round_trip(part: Part) -> None:
+    """Settings survive JSON; unknown keys are refused by name; every setting is described; the schema exports."""
+    model = type(part.config)
+    again = model.model_validate(json.loads(part.config.model_dump_json()))
+    assert again == part.config, f"settings changed on the way through JSON: expected {part.config!r}, got {again!r}"
+    try:
+        model.model_validate({**part.config.model_dump(), "no_such_setting": 1})
+    except ValidationError as error:
+        assert "no_such_setting" in str(error), f"the error does not name the unknown key: {error}"
+    else:
+        raise AssertionError(f"{model.__qualname__} accepts the unknown key 'no_such_setting'")
+    bare = [name for name, field in _fields(model) if not field.description]
+    assert not bare, f"settings without a description: {', '.join(bare)}"
+    assert json.dumps(model.model_json_schema()), "the JSON schema does not export"
+
+
+def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, field in model.model_fields.items():
+        yield prefix + name, field
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from _fields(field.annotation, f"{prefix}{name}.")
+
+
+@check("common", kinds=ALL)
+def check_frozen_and_final(part: Part) -> None:
+    """No attribute can be set, the class is final, repr shows the settings, copies and pickles are equal."""
+    cls = type(part)
+    for name in ("config", "scratch"):
+        try:
+            setattr(part, name, getattr(part, name, None))
+        except AttributeError:
+            continue
+        raise AssertionError(f"attribute {name!r} of {cls.__name__} can be set: state belongs into arguments")
+    assert vars(cls).get("__final__"), f"{cls.__name__} is not marked @final: change behaviour by wrapping"
+    assert repr(part.config) in repr(part), f"repr does not show the settings: {part!r}"
+    for how, twin in (("deepcopy", copy.deepcopy(part)), ("pickle", pickle.loads(pickle.dumps(part)))):
+        assert twin == part, f"{how} gives another part: expected {part!r}, got {twin!r}"
+
+
+@check("common", kinds=ALL)
+def check_docstring(part: Part) -> None:
+    """The class says what it is, in a docstring of its own."""
+    text = inspect.cleandoc(vars(type(part)).get("__doc__") or "")
+    assert text, f"{type(part).__name__} has no docstring of its own"
+
+
+@check("common", kinds=ALL)
+def check_citation(part: Part) -> None:
+    """The class attribute ``source`` says where the idea is from: a citation, or who had it first."""
+    cited = type(part).source
+    assert isinstance(cited, str) and cited.strip(), (
+        f"{type(part).__name__}.source: expected a citation, e.g. 'S2GS, section 3.2', or the name of your "
+        f"distribution; got {cited!r}"
+    )
+
+
+@check("common", kinds=ALL)
+def check_denials(part: Part) -> None:
+    """What the part denies are checks that are made on its kind, each with a reason of at least 20 characters."""
+    made = {entry.name for entry in checks_for(kind_of(part))}
+    for name, reason in part.denials().items():
+        assert name in made, f"denied: no check named {name!r} is made on a {kind_of(part)}"
+        assert isinstance(reason, str) and len(reason.strip()) >= LEAST_REASON, (
+            f"denied[{name!r}]: expected a reason of at least {LEAST_REASON} characters, got {reason!r}"
+        )
+
+
+@check("common", kinds=(*ALL, "source"))
+def check_cheap_spec(part: Part | SourceUnderTest) -> None:
+    """The plugin that declares the part imports without torch, and its target is this class."""
+    cls: Any = part.target if isinstance(part, SourceUnderTest) else type(part)
+    target = f"{cls.__module__}:{cls.__name__}"
+    from gsstream.plugins.catalog import load_catalog
+
+    entries = load_catalog().entries
+    owners = [e.plugin for e in entries.values() if getattr(e.spec, "target", None) == target]
+    if not owners:
+        raise Skip(f"no installed plugin declares {target}")
+    module = _plugin_module(owners[0])
+    heavy = _imports_torch(module, os.pathsep.join(filter(None, sys.path)))
+    assert not heavy, f"importing {module}, which declares {cls.__name__}, imports torch: {heavy}"
+
+
+def _plugin_module(plugin: str) -> str:
+    from importlib.metadata import entry_points
+
+    points = [point for point in entry_points(group="gsstream") if point.name == plugin]
+    return points[0].module if points else "gsstream.plugins.builtin"
+
+
+@functools.cache
+def _imports_torch(module: str, path: str) -> str:
+    code = (
+        f"import sys, importlib; importlib.import_module({module!r}); "
+        "sys.exit('torch is loaded' if 'torch' in sys.modules else 0)"
+    )
+    environment = {**os.environ, "PYTHONPATH": path}
+    command = [sys.executable, "-c", code]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    return result.stderr.strip() if result.returncode else ""
+
+
+@check("common", kinds=BEHAVED)
+def check_pure(part: Part) -> None:
+    """The same inputs give the same bits twice; inputs are left as they were; no .grad is left behind."""
+    case = world("moving")
+    before = fingerprint(case)
+    first = outputs(part, case)
+    assert fingerprint(case) == before, f"{type(part).__name__} changed its inputs"
+    all_equal("second call with the same inputs", outputs(part, case), first)
+    tensors = [value for _, value in case.gaussians.items()] + [case.logits, case.residual]
+    assert all(value.grad is None for value in tensors), "a .grad was left behind on an input"
+
+
+@check("common", kinds=BEHAVED)
+def check_rng_isolated(part: Part) -> None:
+    """The global generators of torch, numpy and python are untouched; a generator's seed alone decides the noise."""
+    state = torch.get_rng_state(), np.random.get_state()[1].copy(), random.getstate()  # type: ignore[index]
+    outputs(part, world("moving"))
+    changed = [
+        name
+        for name, same in (
+            ("torch", torch.equal(state[0], torch.get_rng_state())),
+            ("numpy", np.array_equal(state[1], np.random.get_state()[1])),  # type: ignore[index]
+            ("python", state[2] == random.getstate()),
+        )
+        if not same
+    ]
+    assert not changed, f"global generators used: {', '.join(changed)}; draw from the generator that is given"
+    if isinstance(part, GateSampler) and part.claims().stochastic:
+        one, same, other = (draw(part, 64, seed) for seed in (1, 1, 2))
+        assert one is not None and same is not None and other is not None, "claims to be stochastic, but noise is None"
+        assert torch.equal(one, same), "two generators of the same seed give different noise"
+        assert not torch.equal(one, other), "generators of different seeds give the same noise"
+
+
+@check("common", kinds=BEHAVED)
+def check_dtype_and_device(part: Part) -> None:
+    """float32 and, where logits are an input, float64 are kept; outputs stay on the input's device."""
+    for case in (world("cloud"), world("cloud").double()):
+        for name, value in outputs(part, case).items():
+            assert value.device == case.logits.device, f"{name}: expected {case.logits.device}, got {value.device}"
+            if value.dtype.is_floating_point:
+                want = case.logits.dtype if behaviour_of(part).keeps_precision else torch.float32
+                assert value.dtype == want, f"{name}: expected {want}, got {value.dtype} from {case.logits.dtype} input"
+
+
+@check("common", kinds=BEHAVED)
+def check_empty_and_one(part: Part) -> None:
+    """No Gaussians, one, and two identical ones work; nothing is NaN."""
+    for name in ("empty", "one", "two identical"):
+        try:
+            found = outputs(part, world(name))
+        except Exception as error:
+            raise AssertionError(f"world {name!r}: raised {type(error).__name__}: {error}") from error
+        for output, value in found.items():
+            if value.dtype.is_floating_point:
+                finite(f"world {name!r}: {output}", value)
+
+
+@check("common", kinds=BEHAVED)
+def check_rejects_nonfinite(part: Part) -> None:
+    """NaN and Inf are refused with a message, or come out again; they are never silently repaired."""
+    for bad in (float("nan"), float("inf")):
+        clean, spoilt, other = (_poisoned(part, value) for value in (9.0, bad, -9.0))
+        try:
+            got = outputs(part, spoilt)
+        except InputError as error:
+            text = str(error)
+            assert "finite" in text or "nan" in text or "inf" in text, f"the message does not say why: {text}"
+            continue
+        if all(bool((~torch.isfinite(value)).any()) for value in got.values() if value.dtype.is_floating_point):
+            # Seams called once per iteration may hand it on: it shows in the loss.
+            assert behaviour_of(part).hands_on or not got, f"{bad} was passed on; expected an InputError naming it"
+            continue
+        ignored = _same(outputs(part, clean), outputs(part, other))
+        assert ignored, f"{bad} in the input was repaired silently; expected an InputError naming the argument"
+
+
+def _same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bool:
+    return all(torch.equal(value, second[name]) for name, value in first.items())
+
+
+def _poisoned(part: Part, value: float) -> World:
+    """The cloud with one value of what the part reads replaced."""
+    case = world("cloud")
+    behaviour_of(part).poison(case, value)
+    return case
+
+
+@check("common", kinds=BEHAVED)
+def check_permutation(part: Part) -> None:
+    """Permuting the Gaussians permutes what there is per Gaussian and changes nothing else."""
+    case = world("cloud")
+    order = torch.randperm(len(case.logits), generator=torch.Generator().manual_seed(3))
+    first, second = outputs(part, case), outputs(part, case.permuted(order))
+    behaviour = behaviour_of(part)
+    for name in list(first):
+        if behaviour.no_order is not None and name.startswith(behaviour.no_order):
+            del first[name], second[name]
+        elif behaviour.by_gaussian:
+            first[name] = first[name][order]
+    all_equal("permuted Gaussians", second, first, 1e-4, f"{ROUNDING}; splats at equal depth may swap")

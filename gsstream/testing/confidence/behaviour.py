@@ -1,0 +1,24 @@
+"""Confidence estimators, for the common checks."""
+
+from __future__ import annotations
+
+from gsstream.confidence.base import ConfidenceEstimator
+from gsstream.testing.cases import World
+from gsstream.testing.drive import Behaviour, Outputs
+
+#: A pixel that every camera of the cloud covers.
+SPOT = (10, 10)
+
+
+def outputs(part: ConfidenceEstimator, world: World) -> Outputs:
+    """Logits per Gaussian."""
+    return {"estimate()": part.estimate(world)}
+
+
+def poison(world: World, value: float) -> None:
+    """Spoil one pixel of every image of the frame."""
+    for image in world.now:
+        image[SPOT] = value
+
+
+BEHAVIOUR = Behaviour(outputs, poison, keeps_precision=False, by_gaussian=True)

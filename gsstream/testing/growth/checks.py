@@ -1,0 +1,59 @@
+"""What every growth part promises, on a frame of 32 x 24 pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsstream.core.changes import Rows, apply_rows
+from gsstream.growth.base import Growth
+from gsstream.packet.changes.rows import encode_rows_change
+from gsstream.testing.cases import fingerprint
+from gsstream.testing.registry import check
+from gsstream.testing.working import at_work, check_closed_loop
+
+
+def _proposed(part: Growth, *, changed: bool = True) -> Rows | None:
+    case = at_work(changed=changed)
+    rows = part.propose(case.scene, case.work, case.rng)
+    assert rows is None or isinstance(rows, Rows), f"propose(): expected Rows or None, got {type(rows).__name__}"
+    return rows
+
+
+@check("growth")
+def check_growth_fits(part: Growth) -> None:
+    """What is proposed can be written and applied: rows that exist leave, those that join have a node and a unit."""
+    scene, rows = at_work().scene, _proposed(part)
+    if rows is None:
+        return
+    encode_rows_change(rows, scene.layout)
+    after = apply_rows(scene, rows)
+    born = 0 if rows.births is None else len(rows.births)
+    wanted = len(scene.gaussians) - len(rows.deaths) + born
+    assert len(after.gaussians) == wanted, f"expected {wanted} Gaussians afterwards, got {len(after.gaussians)}"
+    for name, value in after.gaussians.items():
+        bad = int((~np.isfinite(value)).sum())
+        assert bad == 0, f"{name}: expected finite values, got {bad} that are not"
+
+
+@check("growth")
+def check_growth_pure(part: Growth) -> None:
+    """The scene stays as it was, and the same frame gives the same rows again."""
+    case = at_work()
+    before = fingerprint((case.scene.gaussians, case.scene.layout))
+    first = part.propose(case.scene, case.work, case.rng)
+    assert fingerprint((case.scene.gaussians, case.scene.layout)) == before, "the scene was changed"
+    assert fingerprint(first) == fingerprint(_proposed(part)), "the second call gives other rows than the first"
+
+
+@check("growth")
+def check_growth_ends(part: Growth) -> None:
+    """Where no tile of any view changed, nothing is born: births do not go on by themselves."""
+    rows = _proposed(part, changed=False)
+    born = 0 if rows is None or rows.births is None else len(rows.births)
+    assert born == 0, f"nothing changed: expected no births, got {born}"
+
+
+@check("growth")
+def check_growth_closed_loop(part: Growth) -> None:
+    """A method with this part: a player reaches the encoder's state bit by bit, a second run writes the same bytes."""
+    check_closed_loop("growth", part)

@@ -1,0 +1,68 @@
+"""What every motion part promises, on a frame of 32 x 24 pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsstream.core.changes import Motion, apply_motion
+from gsstream.motion.base import MotionPart
+from gsstream.packet.base import Section
+from gsstream.packet.changes.motion import decode_motions, encode_motions
+from gsstream.testing.cases import fingerprint
+from gsstream.testing.registry import check
+from gsstream.testing.working import at_work, check_closed_loop
+
+
+def _proposed(part: MotionPart, *, changed: bool = True) -> tuple[Motion, ...]:
+    case = at_work(changed=changed)
+    motions = part.propose(case.scene, case.work, case.rng)
+    assert isinstance(motions, tuple), f"propose(): expected a tuple of Motion, got {type(motions).__name__}"
+    for motion in motions:
+        assert isinstance(motion, Motion), f"propose(): expected Motion, got {type(motion).__name__}"
+    return motions
+
+
+@check("motion")
+def check_motion_fits(part: MotionPart) -> None:
+    """What is proposed fits the scene, one after the other, and leads to finite positions and quaternions."""
+    scene = at_work().scene
+    for motion in _proposed(part):
+        scene, rows = apply_motion(scene, motion)
+        for name in ("means", "quats"):
+            bad = int((~np.isfinite(getattr(scene.gaussians, name)[rows])).sum())
+            assert bad == 0, f"{name}: expected finite values, got {bad} that are not"
+
+
+@check("motion")
+def check_motion_is_what_is_sent(part: MotionPart) -> None:
+    """Written and read again it is the same motion: nothing of it gets lost in the packet."""
+    scene, motions = at_work().scene, tuple(motion for motion in _proposed(part) if not motion.is_empty)
+    if not motions:
+        return
+    ((_, data),) = encode_motions(motions)
+    for sent, got in zip(motions, decode_motions(Section(data, 0), scene), strict=True):
+        assert fingerprint(sent) == fingerprint(got), f"expected {sent!r}, a player reads {got!r}"
+
+
+@check("motion")
+def check_motion_pure(part: MotionPart) -> None:
+    """The scene stays as it was, and the same frame gives the same motions again."""
+    case = at_work()
+    before = fingerprint((case.scene.gaussians, case.scene.layout, case.scene.moved))
+    first = part.propose(case.scene, case.work, case.rng)
+    assert fingerprint((case.scene.gaussians, case.scene.layout, case.scene.moved)) == before, "the scene was changed"
+    assert fingerprint(first) == fingerprint(_proposed(part)), "the second call gives other motions than the first"
+
+
+@check("motion")
+def check_motion_rests(part: MotionPart) -> None:
+    """Where no tile of any view changed, no group moves: a velocity dies when its body stops."""
+    for motion in _proposed(part, changed=False):
+        moving = int(np.count_nonzero(motion.moving))
+        assert moving == 0, f"nothing changed: expected no moving group, got {moving} of {len(motion.moving)}"
+
+
+@check("motion")
+def check_motion_closed_loop(part: MotionPart) -> None:
+    """A method with this part: a player reaches the encoder's state bit by bit, a second run writes the same bytes."""
+    check_closed_loop("motion", part)

@@ -1,0 +1,1 @@
+"""What packets promise."""

@@ -1,0 +1,24 @@
+"""Regularizers, for the common checks."""
+
+from __future__ import annotations
+
+import torch
+
+from gsstream.regularizer.base import Regularizer
+from gsstream.testing.cases import World
+from gsstream.testing.drive import Behaviour, Outputs
+
+
+def outputs(part: Regularizer, world: World) -> Outputs:
+    """Every term. Nodes have the same probabilities whatever the order of the Gaussians."""
+    opened = torch.sigmoid(torch.linspace(-2, 2, world.hierarchy.num_nodes).to(world.logits.dtype))
+    terms = part.penalty(opened, world.residual, world.hierarchy, len(world.logits))
+    return {f"penalty()[{name!r}]": value for name, value in terms.items()}
+
+
+def poison(world: World, value: float) -> None:
+    """Spoil one coordinate of one residual."""
+    world.residual[5, 0] = value
+
+
+BEHAVIOUR = Behaviour(outputs, poison, hands_on=True)

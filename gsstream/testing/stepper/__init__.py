@@ -1,0 +1,1 @@
+"""What every method promises, whatever steps it from frame to frame."""

@@ -1,0 +1,74 @@
+"""A frame at work, for parts that act inside one: the third frame of a tiny recording, some Gaussians on the move."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+
+from gsstream.core.changes import Scene
+from gsstream.core.part import Part
+from gsstream.core.rng import Rng
+from gsstream.engine.step.active.change import Change, detect_change
+from gsstream.engine.step.context import FrameView
+from gsstream.method.base import Step
+from gsstream.source.open import open_source
+from gsstream.testing.stepping import SOURCE, MethodUnderTest
+
+#: Sigmas beyond which tiles count as changed.
+THRESHOLD = 6.0
+
+
+class AtWork(NamedTuple):
+    """What a part is given: the decoded scene, the frame it works on, random streams."""
+
+    scene: Scene
+    work: FrameView
+    rng: Rng
+
+
+@functools.lru_cache(maxsize=1)
+def _before() -> tuple[MethodUnderTest, Step[Any]]:
+    """A dense method, and its step of frame 1: some rows were displaced."""
+    method = MethodUnderTest("dense")
+    return method, method.chain()[1]
+
+
+def at_work(*, changed: bool = True) -> AtWork:
+    """Return frame 2 of a tiny recording, to be worked on.
+
+    Arguments:
+        changed: as the images say; False: no tile of any view counts as changed.
+    """
+    method, step = _before()
+    state, frame = step.state, open_source(SOURCE).frame(2)
+    change = detect_change(state.previous, frame, THRESHOLD)
+    assert change is not None
+    if not changed:
+        change = Change(torch.zeros_like(change.tiles), change.height, change.width)
+    frame = replace(frame, cameras=state.previous.cameras)
+    view = FrameView(method.parts, state.gaussians, state.hierarchy, frame, state.previous, state.exposure, change)
+    return AtWork(state.player.scene, view, Rng(method.seed))
+
+
+def method_with(slot: str, part: Part) -> MethodUnderTest:
+    """Return a dense method that has this part in its slot; its frames are encoded when they are asked for."""
+    method = MethodUnderTest("dense")
+    changed: dict[str, Any] = {slot: part}
+    method.parts = replace(method.parts, **changed)
+    return method
+
+
+def check_closed_loop(slot: str, part: Part) -> None:
+    """Raise AssertionError unless a player reaches the encoder's state bit by bit, and a second run its bytes."""
+    method = method_with(slot, part)
+    player, first = None, method.chain()
+    for step in first:
+        player = method.play(player, step.packet.data)
+        for name, value in step.state.player.gaussians.items():
+            same = getattr(player.gaussians, name).tobytes() == value.tobytes()
+            assert same, f"frame {player.frame}: the player's {name} is not the encoder's"
+    for one, other in zip(first, method.chain(), strict=True):
+        assert one.packet.data == other.packet.data, f"frame {one.packet.frame}: a second run writes other bytes"

@@ -48,7 +48,7 @@ export function pivotOf(views) {
   }
   const columns = [0, 1, 2].map((k) => [matrix[k], matrix[3 + k], matrix[6 + k]]);
   const determinant = dot(columns[0], cross(columns[1], columns[2]));
-  const up = unit(views.reduce((sum, view) => add(sum, view.down, -1), [0, 0, 0]));
+  const up = upOf(views);
   if (determinant < 1e-4 * views.length ** 3) {
     // Parallel axes, or one camera: the distance is open, and three focal lengths of it are a guess.
     const middle = views.reduce((sum, view) => add(sum, view.eye, 1 / views.length), [0, 0, 0]);
@@ -59,6 +59,22 @@ export function pivotOf(views) {
     return dot(changed[0], cross(changed[1], changed[2])) / determinant;
   };
   return { point: [solve(0), solve(1), solve(2)], up };
+}
+
+/**
+ * The direction across the cameras' x axes, which are level unless a camera is rolled; their mean up direction would lean
+ * towards the side from which half a circle looks down. It is taken where the x axes are parallel.
+ */
+function upOf(views) {
+  const mean = unit(views.reduce((sum, view) => add(sum, view.down, -1), [0, 0, 0]));
+  let up = mean;
+  // Power iteration: what is left of a vector after its parts along the x axes are taken away.
+  for (let i = 0; i < 200; i += 1) {
+    const along = views.reduce((sum, { right }) => add(sum, right, dot(right, up) / views.length), [0, 0, 0]);
+    up = unit(add(up, along, -1));
+  }
+  const share = views.reduce((sum, { right }) => sum + dot(right, up) ** 2, 0) / views.length;
+  return share < 0.02 && dot(up, mean) > 0.5 ? up : mean;
 }
 
 function turned(vector, axis, angle) {

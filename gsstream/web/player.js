@@ -2,6 +2,7 @@
 
 import { PacketBuffer } from "./buffer.js";
 import { cameraOf, pivotOf, viewsOf } from "./camera.js";
+import { KIND } from "./container.js";
 import { decodePacket } from "./decode.js";
 import { PacketError } from "./errors.js";
 import { Renderer } from "./renderer.js";
@@ -229,12 +230,13 @@ export class Player extends EventTarget {
 
   _decode(packet) {
     const started = performance.now();
-    const known = packet.header.kind === 1 ? this.snapshots.get(packet) : null;
+    const known = packet.header.kind === KIND.key ? this.snapshots.get(packet) : null;
     this.state = known ?? decodePacket(this.state, packet.data, packet.offset);
-    if (!known && packet.header.kind === 1) this.snapshots.keep(packet, this.state);
+    if (!known && packet.header.kind === KIND.key) this.snapshots.keep(packet, this.state);
     this.renderer.update(this.state);
     this.statistics.decode = performance.now() - started;
     this.statistics.bytes = packet.data.length;
+    this.statistics.key = packet.header.kind === KIND.key;
     if (this.view === null) this._ready();
     if (this._opened) {
       this._opened.resolve();

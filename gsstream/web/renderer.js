@@ -63,7 +63,7 @@ export class Renderer {
     this._sendPositions();
     this.uploaded = this.textures.flush();
     const axis = Array.from(camera.viewmat.slice(8, 12));
-    if (exact) this.sorter.sortNow(axis, camera.near);
+    if (exact) this.sorter.sortNow(axis, camera.near, this.slots.slotOf);
     else this.sorter.request(axis, camera.near);
     this._fitTarget();
     this._drawSplats(camera);

@@ -44,12 +44,12 @@ export class SortQueue {
     }
   }
 
-  /** The exact order of a view at once, on this thread: for pictures that are to be measured. */
-  sortNow(axis, near) {
+  /** The exact order of a view at once, on this thread, equal depths as in `list`: for pictures that are measured. */
+  sortNow(axis, near, list) {
     const sorter = new DepthSorter();
     sorter.reset(this.mirror.capacity);
     sorter.positions.set(this.mirror.positions);
-    this.order = sorter.sort(axis, near);
+    this.order = sorter.sort(axis, near, list);
   }
 
   dispose() {

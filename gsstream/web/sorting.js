@@ -22,14 +22,17 @@ export class DepthSorter {
 
   /**
    * The slots with depth above `near`, farthest first, as a new Uint32Array. `axis`: the four numbers of the row of
-   * the world-to-camera matrix that gives the depth.
+   * the world-to-camera matrix that gives the depth. Of equal depths the first counts as nearer, by slot, or by its place
+   * in `list` where one is given: copies of a Gaussian lie at the very same place.
    */
-  sort([x, y, z, offset], near) {
+  sort([x, y, z, offset], near, list = null) {
     const { positions, keys, slots } = this;
     const depth = this.depth;
     const bits = new Uint32Array(depth.buffer);
     let number = 0;
-    for (let slot = 0, at = 0; at < positions.length; slot += 1, at += 3) {
+    for (let i = (list ? list.length : positions.length / 3) - 1; i >= 0; i -= 1) {
+      const slot = list ? list[i] : i;
+      const at = 3 * slot;
       const value = x * positions[at] + y * positions[at + 1] + z * positions[at + 2] + offset;
       if (value > near) {
         depth[0] = value;

@@ -10,6 +10,7 @@ export class Statistics {
     this.drawn = 0;
     this.uploaded = 0;
     player.addEventListener("frame", () => {
+      if (player.statistics.key) return;
       this.frames = [...this.frames.slice(-59), player.statistics.bytes];
       this.decoding = [...this.decoding.slice(-59), player.statistics.decode];
     });
@@ -34,7 +35,7 @@ export class Statistics {
     return [
       `frame ${player.frame} of ${player.first} to ${player.last}`,
       `${player.state.number.toLocaleString("en")} Gaussians`,
-      `${(bytes / 1000).toFixed(1)} KB a frame, ${((bytes * 8 * player.fps) / 1e6).toFixed(2)} Mbit/s`,
+      `${(bytes / 1000).toFixed(1)} KB a frame between key packets, ${((bytes * 8 * player.fps) / 1e6).toFixed(2)} Mbit/s`,
       `${(player.buffer.received / 1e6).toFixed(2)} MB loaded, ${player.buffer.secondsAfter(player.frame).toFixed(1)} s ahead`,
       `decoding ${mean(this.decoding).toFixed(1)} ms, sorting ${player.renderer.sorter.milliseconds.toFixed(1)} ms`,
       `${(this.uploaded / 1000).toFixed(0)} KB to the graphics a picture, ${this.drawn.toFixed(0)} pictures/s`,

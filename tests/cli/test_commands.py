@@ -26,6 +26,7 @@ CHEAP = [
     ["export", "--help"],
     ["manifest", "--help"],
     ["view", "--help"],
+    ["package", "--help"],
     ["sweep", "--help"],
     ["tune", "--help"],
     ["report", "--help"],
@@ -48,6 +49,7 @@ OPTIONS = {
     "gsstream export": ["STREAM", "--out", "--format", "--frames", "--max-memory"],
     "gsstream manifest": ["STREAM", "--out"],
     "gsstream view": ["STREAM", "--port", "--host"],
+    "gsstream package": ["STREAM", "--out", "--rendition"],
     "gsstream run-segments": [
         "--source", "--out", "--segments", "--method", "--recipe", "--set", "--frames", "--scale", "--start",
         "--key-epochs", "--first-frame", "--workers", "--threads", "--ray", "--resume", "--overwrite", "--no-video",

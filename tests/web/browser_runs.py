@@ -6,8 +6,10 @@ import contextlib
 import json
 import os
 import shutil
+import socket
 import subprocess
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -24,9 +26,9 @@ needs_browser = pytest.mark.skipif(NODE is None or CHROMIUM is None, reason="nod
 
 
 class Handler(SimpleHTTPRequestHandler):
-    """A static server. ``faults`` of the server: ranges, cut_after, status, stop_after (requests)."""
+    """A static server. ``faults``: ranges (false: always 200), cut_after (bytes), status, gone_after (files)."""
 
-    extensions_map = SimpleHTTPRequestHandler.extensions_map | {".js": "text/javascript", ".gss": "application/octet-stream"}
+    extensions_map = SimpleHTTPRequestHandler.extensions_map | {".js": "text/javascript"}
 
     def log_message(self, *_: object) -> None:
         """Say nothing."""
@@ -34,8 +36,14 @@ class Handler(SimpleHTTPRequestHandler):
     def do_GET(self) -> None:
         faults = self.server.faults  # type: ignore[attr-defined]
         self.server.requests.append((self.path, self.headers.get("Range")))  # type: ignore[attr-defined]
+        if self.path == "/mended":
+            faults.clear()
         if not self.path.split("?")[0].endswith(".gss"):
             super().do_GET()
+            return
+        faults["served"] = faults.get("served", 0) + 1
+        if faults["served"] > faults.get("gone_after", 1 << 30):
+            self.connection.close()
             return
         data = Path(self.translate_path(self.path))
         if not data.is_file() or faults.get("status"):
@@ -66,7 +74,11 @@ class Handler(SimpleHTTPRequestHandler):
         with contextlib.suppress(OSError):
             self.wfile.write(part if cut is None else part[:cut])
             if cut is not None and len(part) > cut:
-                self.connection.close()
+                # What was sent is read before the connection ends: a browser drops what it has not handed on by then.
+                self.wfile.flush()
+                time.sleep(0.3)
+                self.connection.shutdown(socket.SHUT_WR)
+                self.close_connection = True
 
 
 @contextlib.contextmanager
@@ -84,7 +96,9 @@ def serving(folder: Path, **faults: Any) -> Iterator[tuple[str, ThreadingHTTPSer
         thread.join()
 
 
-def in_browser(steps: Sequence[Sequence[Any]], folder: Path, *, flags: Sequence[str] = (), size=(640, 400)) -> list[Any]:
+def in_browser(
+    steps: Sequence[Sequence[Any]], folder: Path, *, flags: Sequence[str] = (), size=(640, 400)
+) -> list[Any]:
     """Carry out steps (see scenario.mjs) and return what each gave; the page must not report an error."""
     results, messages = try_in_browser(steps, folder, flags=flags, size=size)
     assert messages == []

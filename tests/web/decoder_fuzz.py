@@ -2,8 +2,8 @@
 
 Usage: python tests/web/decoder_fuzz.py --count 20000 --seed 1
 
-Every case must end in a PacketError with a byte inside the file, or in the very frames that Python plays; none may hang or
-take memory without bound. Cases are those of tests/packet/fuzz.py and follow from (seed, number) alone.
+Every case must end in a PacketError with a byte inside the file, or in the very frames that Python plays; none may hang
+or take memory without bound. Cases are those of tests/packet/fuzz.py and follow from (seed, number) alone.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent / "packet"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "packet"))
 from fuzz_cases import Base, bases, mutate
 from moving_scenes import moving_packets
 from node_runs import play_in_node

@@ -1,4 +1,4 @@
-"""Streams in which every kind of change stands: motions of groups, residuals, births and deaths, one after the other."""
+"""Streams in which every kind of change stands: motions of groups, residuals, births and deaths, one after another."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ def make_meta() -> StreamMeta:
     viewmats[:, 2, 3] = [2.0, np.pi]
     K = np.array([[50.0, 0, 16], [0, 51.0, 12], [0, 0, 1]])
     rig = Cameras(("left", "held-out"), viewmats, np.tile(K, (2, 1, 1)), 32, 24, 0.02)
-    return StreamMeta("dense", "unit test", {"method": "dense"}, rig.select([0]), rig.select([1]), 30.0, (0.1, 0.2, 0.3))
+    train, test = rig.select([0]), rig.select([1])
+    return StreamMeta("dense", "unit test", {"method": "dense"}, train, test, 30.0, (0.1, 0.2, 0.3))
 
 
 def make_motion(rng: np.random.Generator, scene: Scene, cell: float, shades: int) -> Motion:

@@ -1,0 +1,126 @@
+"""``gsstream package``: what it writes, what it leaves alone, what it refuses."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from moving_scenes import moving_packets
+
+from gsstream.cli.main import run_command
+from gsstream.core.errors import InputError, OutputError, PacketError
+from gsstream.packet import StreamReader, StreamWriter
+from gsstream.serve.package import package
+
+WEB = Path(__file__).parents[2] / "gsstream" / "web"
+
+
+def write(path: Path, **settings: int) -> Path:
+    with StreamWriter.open(path) as writer:
+        for packet in moving_packets(**{"seed": 4, "frames": 6, "number": 30, "key_at": 3, **settings}):
+            writer.append(packet)
+    return path
+
+
+def segments(folder: Path) -> list[str]:
+    manifest = json.loads((folder / "stream.json").read_text())
+    return [s["file"] for entry in (manifest, *manifest["renditions"]) for s in entry["segments"]]
+
+
+def test_segments_hold_the_bytes_of_the_stream(tmp_path):
+    stream = write(tmp_path / "s.gss")
+    done = package(stream, tmp_path / "site")
+    assert done.segments == 2
+    data = stream.read_bytes()
+    with StreamReader(stream) as reader:
+        bodies = b"".join(data[e.offset : e.offset + e.size] for e in reader.frames)
+    names = segments(tmp_path / "site")
+    assert b"".join((tmp_path / "site" / name).read_bytes()[16:] for name in names) == bodies
+    assert sorted(p.name for p in (tmp_path / "site" / "segments").iterdir()) == sorted(Path(n).name for n in names)
+
+
+def test_the_page_finds_every_module_that_it_names(tmp_path):
+    package(write(tmp_path / "s.gss"), tmp_path / "site")
+    for file in (tmp_path / "site").rglob("*.js"):
+        for name in re.findall(r'(?:from|import|URL\()\s*\(?"(\.[^"]+)"', file.read_text()):
+            assert (file.parent / name).is_file(), f"{file.name} imports {name}"
+    assert 'import(new URL("./element.js"' in (tmp_path / "site" / "index.html").read_text()
+    assert (tmp_path / "site" / "vendor" / "fzstd-LICENSE").is_file()
+
+
+def test_nothing_of_the_player_is_fetched_from_elsewhere():
+    for file in [*WEB.rglob("*.js"), *WEB.rglob("*.html")]:
+        text = file.read_text()
+        if "vendor" not in file.parts:
+            assert not re.findall(r"https?://", text), file.name
+
+
+def test_packaging_again_replaces_the_segments_and_nothing_else(tmp_path):
+    package(write(tmp_path / "a.gss"), tmp_path / "site")
+    before = segments(tmp_path / "site")
+    (tmp_path / "site" / "notes.txt").write_text("mine")
+    (tmp_path / "site" / "segments" / "mine.gss").write_bytes(b"mine")
+    package(write(tmp_path / "b.gss", seed=5), tmp_path / "site")
+    after = segments(tmp_path / "site")
+    assert not set(before) & set(after)
+    left = {f"segments/{p.name}" for p in (tmp_path / "site" / "segments").iterdir()}
+    assert left == {*after, "segments/mine.gss"}
+    assert (tmp_path / "site" / "notes.txt").read_text() == "mine"
+
+
+def test_a_manifest_cannot_make_it_remove_files_elsewhere(tmp_path):
+    stream = write(tmp_path / "a.gss")
+    package(stream, tmp_path / "site")
+    victim = write(tmp_path / "victim.gss", seed=6)
+    manifest = json.loads((tmp_path / "site" / "stream.json").read_text())
+    manifest["segments"].append({"frames": [9, 9], "file": "../victim.gss", "bytes": 1})
+    manifest["segments"].append({"frames": [9, 9], "file": "segments/../../victim.gss", "bytes": 1})
+    (tmp_path / "site" / "stream.json").write_text(json.dumps(manifest))
+    package(stream, tmp_path / "site")
+    assert victim.exists()
+
+
+def test_a_folder_with_something_else_is_left_alone(tmp_path):
+    stream = write(tmp_path / "s.gss")
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "precious.txt").write_text("mine")
+    with pytest.raises(OutputError, match="no package"):
+        package(stream, tmp_path / "site")
+    assert [p.name for p in (tmp_path / "site").iterdir()] == ["precious.txt"]
+    with pytest.raises(OutputError):
+        package(stream, stream)
+
+
+def test_renditions_must_have_the_same_frames(tmp_path):
+    main = write(tmp_path / "main.gss")
+    small = write(tmp_path / "small.gss", number=10)
+    short = write(tmp_path / "short.gss", frames=5)
+    done = package(main, tmp_path / "site", renditions=[small])
+    manifest = json.loads((tmp_path / "site" / "stream.json").read_text())
+    assert done.segments == 4
+    assert [(r["name"], r["gaussians"]) for r in (manifest, *manifest["renditions"])] == [("main", 30), ("small", 10)]
+    with pytest.raises(InputError, match="expected frames 6"):
+        package(main, tmp_path / "other", renditions=[short])
+
+
+def test_a_damaged_stream_is_not_packaged(tmp_path):
+    stream = write(tmp_path / "s.gss")
+    data = bytearray(stream.read_bytes())
+    data[len(data) // 2] ^= 1
+    stream.write_bytes(bytes(data))
+    with pytest.raises(PacketError):
+        package(stream, tmp_path / "site")
+    assert not (tmp_path / "site" / "stream.json").exists()
+
+
+def test_the_command_says_how_to_look(tmp_path, capsys):
+    stream = write(tmp_path / "s.gss")
+    shutil.copy(stream, tmp_path / "second.gss")
+    command = ["package", str(stream), "--out", str(tmp_path / "site"), "--rendition", str(tmp_path / "second.gss")]
+    assert run_command(command) == 0
+    out = capsys.readouterr().out
+    assert "2 segments" in out, "equal segments are one file"
+    assert "http.server" in out

@@ -1,0 +1,255 @@
+"""The page in a real browser: pictures against the Python player, playing, and servers that fail."""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser_runs import in_browser, needs_browser, serving, try_in_browser
+from moving_scenes import make_meta, moving_packets
+
+from gsstream.cli.main import run_command
+from gsstream.packet import StreamWriter
+from gsstream.packet.base import file_header
+from gsstream.player.playback import Playback
+from gsstream.player.render import PlayerRenderer, render, to_bytes
+from gsstream.player.software import render_numpy
+from gsstream.serve.package import package
+
+pytestmark = needs_browser
+PLAYER = "document.querySelector('gsstream-player')?.player"
+ROOT = "document.querySelector('gsstream-player').shadowRoot"
+MESSAGE = f"{ROOT}.querySelector('.message').textContent"
+READY = ["until", f"{PLAYER}?.state && {PLAYER}._target === null"]
+SIZE = (120, 90)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """A packaged stream of 12 frames and two segments, and the stream itself beside the page."""
+    folder = tmp_path_factory.mktemp("site")
+    stream = folder.parent / f"{folder.name}.gss"
+    with StreamWriter.open(stream) as writer:
+        for packet in moving_packets(seed=3, frames=12, number=80, nodes=20, key_at=7):
+            writer.append(packet)
+    package(stream, folder)
+    shutil.copy(stream, folder / "stream.gss")
+    return folder
+
+
+def psnr(first: np.ndarray, second: np.ndarray) -> float:
+    error = np.mean((first.astype(np.float64) - second) ** 2)
+    return float(10 * np.log10(255**2 / max(error, 1e-9)))
+
+
+def pictures(encoded: list[str], width: int, height: int) -> list[np.ndarray]:
+    return [np.frombuffer(base64.b64decode(t), np.uint8).reshape(height, width, 4)[..., :3] for t in encoded]
+
+
+def test_pictures_of_a_run_are_those_of_the_python_player(tmp_path):
+    source = "synthetic:frames=6&views=3&width=64&height=48"
+    settings = ["--set", "first_frame.max_iterations=60", "--set", "first_frame.fill_points=400"]
+    run = ["run", "--source", source, "--out", str(tmp_path / "run"), "--method", "s2gs-fast", *settings]
+    assert run_command([*run, "--quiet", "--no-video"]) == 0
+    stream = tmp_path / "run" / "stream.gss"
+    package(stream, tmp_path / "site")
+    frames = [0, 1, 2, 4, 5]
+    with serving(tmp_path / "site") as (url, _), Playback(stream) as playback:
+        rig = playback.cameras("test")
+        steps = [["go", f"{url}/index.html"], READY, *(["picture", f, rig.width, rig.height] for f in frames)]
+        got = pictures(in_browser(steps, tmp_path, size=SIZE)[2:], rig.width, rig.height)
+        for frame, picture in zip(frames, got, strict=True):
+            scene = playback.state_at(frame)
+            expected = to_bytes(render(scene, rig, 0, playback.meta.background, PlayerRenderer("numpy", render_numpy)))
+            assert expected.std() > 10, "a picture of nothing tests little"
+            assert psnr(expected, picture) >= 45, frame
+
+
+@pytest.mark.parametrize("sh_rest", [0, 3, 8, 15])
+def test_every_degree_of_colour_and_every_kind_of_change_is_drawn_as_in_python(tmp_path, sh_rest):
+    stream = tmp_path / "s.gss"
+    with StreamWriter.open(stream) as writer:
+        for packet in moving_packets(seed=9, frames=9, number=300, sh_rest=sh_rest, key_at=6):
+            writer.append(packet)
+    package(stream, tmp_path / "site")
+    # To and fro: what a seek leaves behind in the textures would be seen.
+    frames = [8, 2, 5, 6]
+    rig = make_meta().test
+    with serving(tmp_path / "site") as (url, _), Playback(stream) as playback:
+        steps = [["go", f"{url}/index.html"], READY, *(["picture", f, rig.width, rig.height] for f in frames)]
+        got = pictures(in_browser(steps, tmp_path, size=SIZE)[2:], rig.width, rig.height)
+        for frame, picture in zip(frames, got, strict=True):
+            scene = playback.state_at(frame)
+            expected = render_numpy(*(a for _, a in scene.items()), rig.viewmats[0], rig.Ks[0], rig.width, rig.height,
+                                    playback.meta.background, near=rig.near)  # fmt: skip
+            assert psnr(to_bytes(expected), picture) >= 45, frame
+
+
+def test_playing_seeking_keys_and_views(site, tmp_path):
+    steps = [
+        ["go", "URL/index.html?autoplay=1&loop=false&speed=4"],
+        ["until", f"{PLAYER}?.frame === 11 && !{PLAYER}.playing"],
+        ["evaluate", f"{PLAYER}.seek(3), {ROOT}.querySelector('canvas').focus()"],
+        ["until", f"{PLAYER}.frame === 3"], ["key", "ArrowRight"], ["until", f"{PLAYER}.frame === 4"],
+        ["key", "2"], ["evaluate", f"{PLAYER}.view.id"], ["key", "1"], ["evaluate", f"{PLAYER}.view.id"],
+        ["evaluate", f"{PLAYER}.view.eye"], ["drag", 60, 30, 20, 0], ["evaluate", f"{PLAYER}.view.eye"],
+        ["wheel", 60, 30, -200], ["pause", 200], ["evaluate", f"{PLAYER}.view.eye"],
+        ["key", "g"], ["evaluate", f"{PLAYER}.marks"],
+        ["evaluate", f"{ROOT}.querySelector('.camera').options.length"],
+    ]  # fmt: skip
+    with serving(site) as (url, _):
+        results = in_browser(_at(url, steps), tmp_path, size=(200, 100))
+    second, first, before, after, nearer, marks, cameras = (results[i] for i in (7, 9, 10, 12, 15, 17, 18))
+    assert (second, first) == ("left", "held-out")
+    assert before != after != nearer
+    assert marks is True
+    assert cameras == 2
+
+
+def _at(url: str, steps: list) -> list:
+    return [[item.replace("URL", url) if isinstance(item, str) else item for item in step] for step in steps]
+
+
+@pytest.mark.parametrize(
+    ("name", "faults"),
+    [
+        ("stream.json", {}),
+        ("stream.json", {"cut_after": 3000}),
+        ("stream.gss", {}),
+        ("stream.gss", {"ranges": False}),
+        ("stream.gss", {"cut_after": 3000}),
+    ],
+)
+def test_every_frame_is_reached_whatever_the_server_does(site, tmp_path, name, faults):
+    """Ranges, none (200 for 206), and connections that break again and again."""
+    steps = [
+        ["go", f"URL/index.html?src={name}"], READY, ["evaluate", f"{PLAYER}.seek(11)"],
+        ["until", f"{PLAYER}.frame === 11", 30],
+        ["evaluate", f"{PLAYER}.seek(8)"], ["until", f"{PLAYER}.frame === 8", 30],
+        ["evaluate", f"[{PLAYER}.first, {PLAYER}.last, {PLAYER}.problem]"],
+    ]  # fmt: skip
+    with serving(site, **faults) as (url, server):
+        results, _ = try_in_browser(_at(url, steps), tmp_path, size=SIZE)
+    assert results[-1] == [0, 11, None]
+    asked = [wanted for path, wanted in server.requests if path == "/stream.gss"]
+    assert (name == "stream.gss") == bool(asked)
+
+
+def test_a_seek_in_a_file_with_an_index_fetches_the_last_segment_first(site, tmp_path):
+    steps = [
+        ["go", "URL/index.html?src=stream.gss"], READY, ["evaluate", f"{PLAYER}.buffer.parts.length"],
+    ]  # fmt: skip
+    with serving(site) as (url, server):
+        results = in_browser(_at(url, steps), tmp_path, size=SIZE)
+        ranges = [wanted for path, wanted in server.requests if path == "/stream.gss"]
+    assert results[-1] == 2
+    assert ranges[0] == "bytes=-12"
+    assert all(wanted.startswith("bytes=") for wanted in ranges)
+
+
+def test_what_is_wrong_is_said_in_one_sentence(site, tmp_path):
+    sound = (site / "stream.gss").read_bytes()
+    newer = bytearray(sound)
+    newer[8] += 1
+    newer[12:16] = zlib.crc32(newer[:12]).to_bytes(4, "little")
+    for name, data in {
+        "none.gss": b"<!doctype html>", "empty.gss": b"", "newer.gss": bytes(newer),
+    }.items():  # fmt: skip
+        (site / name).write_bytes(data)
+    manifest = json.loads((site / "stream.json").read_text())
+    (site / "newer.json").write_text(json.dumps({**manifest, "format": "gsstream 99.0"}))
+    (site / "other.json").write_text("[]")
+    expected = {
+        "absent.gss": "404", "absent.json": "404", "none.gss": "not a gsstream file",
+        "empty.gss": "not a gsstream file", "newer.gss": "newer than this player", "newer.json": "99.0",
+        "other.json": "no manifest",
+    }  # fmt: skip
+    steps = []
+    for name in expected:
+        said = f"{PLAYER} && {MESSAGE} !== 'Loading …' && {MESSAGE}"
+        steps += [["go", f"URL/index.html?src={name}"], ["until", said]]
+        steps += [["evaluate", MESSAGE]]
+    with serving(site) as (url, _):
+        results, _ = try_in_browser(_at(url, steps), tmp_path, size=SIZE)
+    for (name, words), text in zip(expected.items(), results[2::3], strict=True):
+        assert words in text, name
+        assert "\n" not in text
+
+
+@pytest.mark.parametrize("name", ["damaged.gss", "cut.gss"])
+def test_what_is_sound_is_played(site, tmp_path, name):
+    sound = (site / "stream.gss").read_bytes()
+    damaged = bytearray(sound)
+    damaged[len(sound) // 3] ^= 255
+    (site / name).write_bytes(bytes(damaged) if name == "damaged.gss" else sound[: len(sound) // 3])
+    with Playback(site / name) as playback:
+        frames = 0
+        try:
+            for frame in playback.frames:
+                playback.state_at(frame)
+                frames += 1
+        except ValueError:
+            pass
+    steps = [
+        ["go", f"URL/index.html?src={name}&autoplay=1&loop=false"],
+        ["until", f"{PLAYER}?.state && {PLAYER}.frame >= {frames - 1} && !{PLAYER}.playing", 30],
+        ["evaluate", f"{PLAYER}.frame"], ["evaluate", f"{PLAYER}.problem !== null"],
+    ]  # fmt: skip
+    with serving(site) as (url, _):
+        results, _ = try_in_browser(_at(url, steps), tmp_path, size=SIZE)
+    assert 0 < frames < 7
+    # Of the damaged file the second segment is sound, which is said; a file that just ends is one being written.
+    assert results[-2:] == ([11, True] if name == "damaged.gss" else [frames - 1, False])
+
+
+def test_a_server_that_stops_is_told_and_what_is_loaded_plays_on(site, tmp_path):
+    """The second segment never comes; once the server is back, playing goes on."""
+    steps = [
+        ["go", "URL/index.html"], READY, ["evaluate", f"{PLAYER}.seek(9)"], ["until", f"{PLAYER}.problem", 30],
+        ["evaluate", MESSAGE], ["evaluate", f"{PLAYER}.seek(5)"], ["until", f"{PLAYER}.frame === 5"],
+        ["evaluate", "fetch('mended')"], ["evaluate", f"{PLAYER}.play()"], ["until", f"{PLAYER}.frame >= 9"],
+    ]  # fmt: skip
+    with serving(site, gone_after=1) as (url, _):
+        results, _ = try_in_browser(_at(url, steps), tmp_path, size=SIZE)
+    assert "connection" in results[4]
+
+
+def test_a_browser_without_webgl_says_so(site, tmp_path):
+    shown = "document.querySelector('gsstream-player')?.shadowRoot"
+    steps = [["go", "URL/index.html"], ["until", shown], ["evaluate", MESSAGE]]
+    with serving(site) as (url, _):
+        (*_, text), _ = try_in_browser(_at(url, steps), tmp_path, flags=["--disable-3d-apis"], size=SIZE)
+    assert "WebGL2" in text
+
+
+def test_the_page_works_in_a_frame_of_another_page(site, tmp_path):
+    (site / "outer.html").write_text("<!doctype html><iframe src='index.html' width=100 height=80></iframe>")
+    inner = "document.querySelector('iframe')?.contentDocument?.querySelector('gsstream-player')?.player?.state"
+    with serving(site) as (url, _):
+        in_browser(_at(url, [["go", "URL/outer.html"], ["until", inner]]), tmp_path, size=SIZE)
+
+
+def test_the_page_is_small():
+    import gzip
+
+    folder = Path(__file__).parents[2] / "gsstream" / "web"
+    files = [p for p in folder.rglob("*") if p.is_file() and "vendor" not in p.parts]
+    assert len(files) > 20
+    assert sum(len(gzip.compress(p.read_bytes())) for p in files) <= 60_000
+
+
+def test_a_segment_is_a_stream_of_its_own(site):
+    manifest = json.loads((site / "stream.json").read_text())
+    with Playback(site / "stream.gss") as whole:
+        for segment in manifest["segments"]:
+            assert (site / segment["file"]).read_bytes().startswith(file_header())
+            with Playback(site / segment["file"]) as part:
+                assert [part.frames[0], part.frames[-1]] == segment["frames"]
+                for frame in part.frames:
+                    pairs = zip(part.state_at(frame).items(), whole.state_at(frame).items(), strict=True)
+                    assert all(a.tobytes() == b.tobytes() for (_, a), (_, b) in pairs)

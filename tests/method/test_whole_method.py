@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from gsstream.cli.main import run_command
-from gsstream.core.changes import Delta
+from gsstream.core.changes import Delta, Displacement, Groups
 from gsstream.core.errors import ComponentError, RecipeError
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.fit.exposure import Exposure
-from gsstream.engine.step.frame_step import RepeatedFrameWarning
+from gsstream.engine.method.held import RepeatedFrameWarning
 from gsstream.method.base import StreamingMethod
 from gsstream.method.hold import Hold, HoldState
 from gsstream.method.packets import send_delta
@@ -47,15 +47,29 @@ def spoilt(wrong) -> StreamingMethod:
     return type("Wrong", (Spoilt,), {"spoil": lambda _, step: wrong(step)})()
 
 
+def with_scene(step, **changes):
+    player = step.state.player
+    return replace(step, state=HoldState(replace(player, scene=replace(player.scene, **changes))))
+
+
 def drift(step):
     gaussians = step.state.player.gaussians
-    moved = replace(gaussians, means=gaussians.means + np.float32(0.25))
-    return replace(step, state=HoldState(replace(step.state.player, gaussians=moved)))
+    return with_scene(step, gaussians=replace(gaussians, means=gaussians.means + np.float32(0.25)))
 
 
 def lose_one(step):
-    player = step.state.player
-    return replace(step, state=HoldState(replace(player, gaussians=player.gaussians.rows(slice(1, None)))))
+    return with_scene(step, gaussians=step.state.player.gaussians.rows(slice(1, None)))
+
+
+def remember(step):
+    """Claims that a row moved, where players have forgotten it: the next motion would be predicted from it."""
+    one = np.ones((1, 3), np.float32)
+    return with_scene(step, moved=Displacement(np.array([0]), one, one))
+
+
+def regroup(step):
+    number = len(step.state.player.gaussians)
+    return with_scene(step, groups=Groups(1.0, 1, np.zeros(number, np.int32), 1))
 
 
 def stand_still(step):
@@ -68,8 +82,7 @@ def keep_decoder(step):
 
 
 def other_layout(step):
-    layout = replace(step.state.player.layout, cell_sizes=np.array([9.0], np.float32))
-    return replace(step, state=HoldState(replace(step.state.player, layout=layout)))
+    return with_scene(step, layout=replace(step.state.player.layout, units=np.array([9.0], np.float32)))
 
 
 def misname(step):
@@ -83,7 +96,9 @@ def misname(step):
         (lose_one, "means has the shape ["),
         (stand_still, "frame 0 instead of 1"),
         (keep_decoder, "packet: decoders"),
-        (other_layout, "packet: layout: cell_sizes"),
+        (other_layout, "packet: layout: units"),
+        (remember, "packet: scene: moved"),
+        (regroup, "packet: scene: groups"),
         (misname, "expected a packet of frame 1 of the kind it says, 'delta'; got 'empty' of frame 1"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
@@ -94,12 +109,12 @@ def test_a_state_that_players_do_not_have_is_an_error(wrong, message: str) -> No
     with pytest.raises(ComponentError) as caught:
         subject.step(start.state, open_source(SOURCE).frame(1))
     assert message in str(caught.value)
-    assert (caught.value.slot, caught.value.part, caught.value.frame) == ("whole", "Wrong", 1)
+    assert (caught.value.slot, caught.value.part, caught.value.frame) == ("stepper", "Wrong", 1)
 
 
 def test_a_packet_of_another_frame_is_an_error() -> None:
     def repeat(step):
-        packet, player = send_delta(step.state.player, Delta(np.zeros(len(step.state.player.layout.node_counts)), 1))
+        packet, player = send_delta(step.state.player, Delta())
         return replace(step, packet=packet, state=HoldState(player))
 
     subject = MethodUnderTest("dense", spoilt(repeat))
@@ -114,7 +129,7 @@ def test_what_a_method_raises_is_reported_with_its_name() -> None:
 
     subject = MethodUnderTest("dense", spoilt(fail))
     start = subject.begin(open_source(SOURCE).frame(0))
-    with pytest.raises(ComponentError, match=r"whole 'Wrong' .* failed at frame 1: RuntimeError: out of ideas"):
+    with pytest.raises(ComponentError, match=r"stepper 'Wrong' .* failed at frame 1: RuntimeError: out of ideas"):
         subject.step(start.state, open_source(SOURCE).frame(1))
 
 
@@ -200,7 +215,7 @@ def refusal(*sets: str, method: str = "hold") -> list[str]:
 
 
 def test_keys_that_a_whole_method_does_not_read_are_refused() -> None:
-    why = "the whole method 'hold' does not read it; its own settings: gsstream plugins show whole/hold"
+    why = "the stepper 'hold' does not read it; its own settings: gsstream plugins show stepper/hold"
     assert refusal("structure.resolution=64", "gate_training.lr=0.5", "stream.epochs=3", "update.sh0.lr=1.0") == [
         "4 problems in the recipe:",
         f"  --set structure.resolution=64: structure.params: {why}",
@@ -212,21 +227,21 @@ def test_keys_that_a_whole_method_does_not_read_are_refused() -> None:
     catalog = load_catalog()
     sets = [("--set", text) for text in ("renderer=reference", "stream.epochs=20", "structure.resolution=1024")]
     assembly = assemble(resolve_recipe("hold", catalog.recipe_path, (), sets), catalog)
-    assert isinstance(assembly.whole, Hold)
+    assert isinstance(assembly.part("stepper"), Hold)
     assert assemble(assembly.recipe, catalog).recipe == assembly.recipe
 
 
 def test_settings_of_a_whole_method() -> None:
-    assert refusal("whole.speed=3") == ["--set whole.speed=3: unknown key 'whole.params.speed'; none are registered"]
-    assert "whole.name: no whole named 'hodl'; did you mean 'hold'?" in refusal("whole=hodl")[0]
-    wanted = "whole.params needs a named whole method, but whole.name is 'none'"
-    assert wanted in refusal("whole.speed=3", method="dense")[0]
+    assert refusal("stepper.speed=3") == ["--set stepper.speed=3: unknown key 'stepper.params.speed'; none are registered"]
+    assert "stepper.name: no stepper named 'hodl'; did you mean 'hold'?" in refusal("stepper=hodl")[0]
+    wanted = "unknown key 'stepper.params.speed'; none are registered"
+    assert wanted in refusal("stepper.speed=3", method="dense")[0]
 
 
 def test_any_recipe_may_name_one(tmp_path: Path) -> None:
     """``--set whole=NAME`` is enough to run a part that ships no recipe."""
     command = [text if text != "hold" else "dense" for text in RUN]
-    assert run_command([*command, "--set", "whole=hold", "--out", str(tmp_path / "o")]) == 0
+    assert run_command([*command, "--set", "stepper=hold", "--out", str(tmp_path / "o")]) == 0
     with Playback(tmp_path / "o" / "stream.gss") as playback:
         assert [playback.entry(f).kind for f in playback.frames] == [PacketKind.KEY, *[PacketKind.EMPTY] * 3]
 
@@ -255,7 +270,7 @@ def test_resuming_with_other_settings_is_refused(tmp_path: Path, capsys: pytest.
 
 def test_the_benchmark_of_the_parts_refuses_a_whole_method(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(["bench", "frame", "--method", "hold", "--quick"]) == 2
-    assert "expected a method made of parts, got the whole method 'hold'" in capsys.readouterr().err
+    assert "expected a method made of parts, got the stepper 'hold'" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")
@@ -275,7 +290,7 @@ class TestTools:
         matrix = torch.eye(3) + 0.1 * torch.randn(3, 3, 3, generator=generator)
         offset = 0.1 * torch.randn(3, 3, generator=generator)
         extra = {**player.meta.extra, "exposure": {"matrix": matrix.tolist(), "offset": offset.tolist()}}
-        work = subject.tools().open(replace(player, meta=replace(player.meta, extra=extra)), before, now)
+        work = subject.encoder()._tools().open(replace(player, meta=replace(player.meta, extra=extra)), before, now)
         image = torch.rand(24, 32, 3, generator=generator, requires_grad=True)
         value = work.backward(1, image)
         loss = subject.parts.loss
@@ -288,7 +303,7 @@ class TestTools:
 
     def test_a_tile_mask_limits_the_loss(self, begun) -> None:
         subject, player, before, now = begun
-        work = subject.tools().open(player, before, now)
+        work = subject.encoder()._tools().open(player, before, now)
         mask = torch.zeros(2, 2, dtype=torch.bool)
         mask[0, 1] = True
         image = torch.rand(24, 32, 3, generator=torch.Generator().manual_seed(3), requires_grad=True)
@@ -300,5 +315,5 @@ class TestTools:
 
     def test_a_frame_that_is_worth_less_has_fewer_epochs(self, begun) -> None:
         subject, _, _, now = begun
-        tools = replace(subject.tools(), parts=replace(subject.parts, recipe=Recipe()))
+        tools = replace(subject.encoder()._tools(), parts=replace(subject.parts, recipe=Recipe()))
         assert [tools.epochs(replace(now, effort=e)) for e in (1.0, 0.5, 0.01)] == [20, 10, 1]

@@ -1,4 +1,4 @@
-"""From one depth map per view to points that several views agree on (ours)."""
+"""From one depth map per view to points that several views agree on."""
 
 from __future__ import annotations
 

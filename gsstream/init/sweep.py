@@ -1,6 +1,6 @@
 """Plane-sweep stereo for every training view: where along each pixel's ray do the neighbours agree?
 
-Ours, from standard pieces: fronto-parallel plane sweep (Collins, CVPR 1996), window NCC, which no camera gain or offset
+Built from standard pieces: fronto-parallel plane sweep (Collins, CVPR 1996), window NCC, which no camera gain or offset
 disturbs, mean of the two best neighbours against occlusion, and semi-global aggregation (Hirschmueller, PAMI 2008).
 """
 

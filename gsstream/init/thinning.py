@@ -1,4 +1,4 @@
-"""Thin a cloud: averages over voxels, finer where the colour varies. Deterministic (ours)."""
+"""Thin a cloud: averages over voxels, finer where the colour varies. Deterministic."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a packet is: kinds, sections, limits, the fixed header and its check. Ours; normative text: packet-format.md."""
+"""What a packet is: kinds, sections, limits, the fixed header and its check. Normative text: packet-format.md."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Positions of a key packet: on a grid as fine as each Gaussian is small, coded as a cell and bits within it.
 
 The step of a Gaussian follows from its decoded scales, which the reader has first; nothing is sent for it. Gaussians
-are stored along a space-filling curve, so the cell of one predicts the next. Ours.
+are stored along a space-filling curve, so the cell of one predicts the next.
 """
 
 from __future__ import annotations

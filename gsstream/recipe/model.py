@@ -45,20 +45,20 @@ class FirstFrame(Section):
     epochs: int = Field(default=250, ge=0, description="passes over the training cameras (paper: 250)")
     max_iterations: int = Field(default=4000, ge=0, description="upper bound on epochs * cameras (released code: 4000)")
     sh_degree: Degree = Field(
-        default=2, description="degree of the spherical harmonics (paper's code: 2); auto: the scene decides (ours)"
+        default=2, description="degree of the spherical harmonics (paper's code: 2); auto: the scene decides"
     )
     points: Literal["auto", "recording", "sparse", "sfm", "sweep"] = Field(
         default="auto",
         description="auto: the recording's points, else sweep; sparse: the recording's thinned set; "
-        "sfm: triangulation; sweep: points that several views agree on (plane sweep, ours)",
+        "sfm: triangulation; sweep: points that several views agree on (plane sweep)",
     )
     max_points: int = Field(default=12_000, ge=1, description="points kept before the structure seeds anchors")
     pixels_per_seed: float = Field(
         default=64.0, ge=0,
         description="at most one seed per this many training pixels (points and fill seeds each): more seeds than the "
-        "images can pin down overfit the training views (ours)",
+        "images can pin down overfit the training views",
     )  # fmt: skip
-    fill_points: int = Field(default=5_000, ge=0, description="random seeds in uncovered common view volume (ours)")
+    fill_points: int = Field(default=5_000, ge=0, description="random seeds in uncovered common view volume")
     lr_means: float = Field(default=1.6e-4, ge=0, description="learning rate of centres, fraction of the rig's extent")
     lr_means_final: float = Field(default=1.6e-6, ge=0, description="the same at the last iteration (log-linear)")
     densify_from: int = Field(default=300, ge=0, description="first iteration of densification and pruning")
@@ -68,12 +68,12 @@ class FirstFrame(Section):
     )
     max_gaussians: int = Field(default=60_000, ge=1, description="upper bound on the number of Gaussians")
     exposure: bool = Field(
-        default=False, description="fit an affine colour map per training camera while optimising frame 0 (ours)"
+        default=False, description="fit an affine colour map per training camera while optimising frame 0"
     )
     trials: int = Field(
         default=16, ge=0, le=1000,
         description="where the recipe says auto: most short fits of frame 0, judged on training cameras that are left "
-        "out of them, by which values are compared; 0: rules alone (ours)",
+        "out of them, by which values are compared; 0: rules alone",
     )  # fmt: skip
     trial_epochs: int = Field(default=30, ge=1, description="passes over the cameras of such a short fit")
     trial_cameras: float = Field(
@@ -109,11 +109,11 @@ class Stream(Section):
     )  # fmt: skip
     release_closed: bool = Field(
         default=False,
-        description="after each pass over the cameras, rows whose gate has closed leave the optimisation (ours)",
+        description="after each pass over the cameras, rows whose gate has closed leave the optimisation",
     )
     rate_weight: float = Field(
         default=0.0, ge=0, le=1,
-        description="weight in the loss of the residual's estimated bits per pixel of one view; 0: none (ours)",
+        description="weight in the loss of the residual's estimated bits per pixel of one view; 0: none",
     )  # fmt: skip
     on_error: Literal["raise", "repeat"] = Field(
         default="raise",
@@ -148,7 +148,7 @@ class Codec(Section):
     trim: float = Field(
         default=0.0, ge=0, lt=1,
         description="share of each delta packet's bytes given up, the symbols and gates that explain least per bit; "
-        "not read under a budget of size, which trims as far as it must (ours)",
+        "not read under a budget of size, which trims as far as it must",
     )  # fmt: skip
     fsync: bool = Field(default=False, description="force every packet to disk before the next frame starts")
 

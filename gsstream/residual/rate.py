@@ -1,7 +1,7 @@
 """What a residual will cost, estimated smoothly: bits of a Laplace model per latent channel, fitted to the latents.
 
 The packet codes every channel by a histogram of its own symbols; a discretised Laplace of the channel's own spread is
-its smooth stand-in (the factorised model of learned compression, Balle et al. 2018, without learned parameters). Ours.
+its smooth stand-in (the factorised model of learned compression, Balle et al. 2018, without learned parameters).
 """
 
 from __future__ import annotations

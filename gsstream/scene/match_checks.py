@@ -1,4 +1,4 @@
-"""Calibration against the pictures: matched features must lie on each other's epipolar lines (ours)."""
+"""Calibration against the pictures: matched features must lie on each other's epipolar lines."""
 
 from __future__ import annotations
 

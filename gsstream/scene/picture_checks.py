@@ -1,4 +1,4 @@
-"""What each camera's pictures give away: blank, frozen, repeated, of another camera, jumping in brightness (ours)."""
+"""What each camera's pictures give away: blank, frozen, repeated, of another camera, jumping in brightness."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``gsstream scene prepare``: from raw synchronised recordings to a scene that a run can take (ours).
+"""``gsstream scene prepare``: from raw synchronised recordings to a scene that a run can take.
 
 Poses by structure from motion on frame 0, or the given ones; pinhole pictures of one size; points thinned to what the
 cameras look at. Test cameras take no part in poses, lenses and points of the others.

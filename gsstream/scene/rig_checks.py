@@ -1,4 +1,4 @@
-"""What a calibration alone gives away: intrinsics, placement, axes, overlap. Nothing is decoded (ours)."""
+"""What a calibration alone gives away: intrinsics, placement, axes, overlap. Nothing is decoded."""
 
 from __future__ import annotations
 

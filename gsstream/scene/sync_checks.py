@@ -1,4 +1,4 @@
-"""Is what moves at one place in all cameras at a time? A visual hull of motion, one camera left out at a time (ours).
+"""Is what moves at one place in all cameras at a time? A visual hull of motion, one camera left out at a time.
 
 Where most other cameras see motion, something moves, and the camera that was left out must see motion there too. If it
 does so better some frames earlier or later, its clock is off; if it does so with another camera's pose, the two are

@@ -1,4 +1,4 @@
-"""``gsstream scene validate``: everything that can be known to be wrong with a scene before a run (ours).
+"""``gsstream scene validate``: everything that can be known to be wrong with a scene before a run.
 
 The checks go from cheap to dear and stop at the first stage with an error, so that one fault gives one message and not
 its consequences too.

@@ -1,4 +1,4 @@
-"""Conversions between camera conventions. Ours: world to camera, OpenCV axes, pixel origin at the image corner."""
+"""Conversions to gsstream's convention of cameras: world to camera, OpenCV axes, pixel origin at the corner."""
 
 from __future__ import annotations
 

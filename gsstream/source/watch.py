@@ -1,4 +1,4 @@
-"""A recording that is still being written: follow a folder of images, frame by frame, until its end is clear (ours)."""
+"""A recording that is still being written: follow a folder of images, frame by frame, until its end is clear."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The search among choices that were tried: one key after the other, along its ladder, while it gets better. Ours.
+"""The search among choices that were tried: one key after the other, along its ladder, while it gets better.
 
 It sees only ``Assembly -> Trial`` (``engine.auto.short_fits``), so it is tested without making one.
 """

@@ -1,4 +1,4 @@
-"""How much of a colour depends on where one looks from: do harmonics predict what a left-out camera sees? Ours."""
+"""How much of a colour depends on where one looks from: do harmonics predict what a left-out camera sees?"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A trial: frame 0 as a run makes it, packet and all, with fewer passes and without the cameras that judge it. Ours.
+"""A trial: frame 0 as a run makes it, packet and all, with fewer passes and without the cameras that judge it.
 
 It is made once for every fold, each without other cameras: three cameras have liked one of two scenes as much as the
 other, and three others told them apart by 0.4 dB (docs/results/auto.md).

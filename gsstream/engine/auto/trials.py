@@ -1,4 +1,4 @@
-"""``auto`` tried out: short frames 0 without some of the training cameras, judged on those. Ours.
+"""``auto`` tried out: short frames 0 without some of the training cameras, judged on those.
 
 A rule knows the cameras and the seeds, not what they are worth: how many Gaussians a scene can pin down shows in a
 camera that nobody fitted. So the rules say where to begin and which way to look (``engine.auto.rules``), trials say how

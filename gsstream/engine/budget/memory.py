@@ -1,4 +1,4 @@
-"""A memory budget before the run: what it needs at least, how many Gaussians and how large a cache fit. Ours.
+"""A memory budget before the run: what it needs at least, how many Gaussians and how large a cache fit.
 
 Constants, not what the process has now, so that a resumed run computes the same limits.
 """

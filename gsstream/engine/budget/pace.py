@@ -1,4 +1,4 @@
-"""Holding a plan inside the optimiser: how many passes the clock still allows, and what a residual may weigh. Ours."""
+"""Holding a plan inside the optimiser: how many passes the clock still allows, and what a residual may weigh."""
 
 from __future__ import annotations
 

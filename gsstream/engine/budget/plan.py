@@ -1,4 +1,4 @@
-"""What one frame is to spend: a pure function of the budget, the recipe and what earlier frames cost. Ours.
+"""What one frame is to spend: a pure function of the budget, the recipe and what earlier frames cost.
 
 Order in which quality is given up. Size: weight of the rate, then coarser steps, then symbols and gates of the finished
 packet (:mod:`gsstream.engine.budget.trim`). Time: passes, then what counts as changed.

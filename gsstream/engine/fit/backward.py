@@ -1,4 +1,4 @@
-"""Backward passes from gradients that are already known, as every frame makes them. Ours."""
+"""Backward passes from gradients that are already known, as every frame makes them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exposure: an affine colour map per training camera, fitted while frame 0 is optimised (ours).
+"""Exposure: an affine colour map per training camera, fitted while frame 0 is optimised.
 
 Rigs are rarely colour-matched. Without this the Gaussians explain the differences between cameras with floaters and
 view-dependent colour, and held-out views pay. The mean map is held at identity, so a camera nobody fitted (the

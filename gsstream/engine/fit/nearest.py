@@ -1,4 +1,4 @@
-"""Nearest points in space, by a k-d tree: exact, and as long as the cloud in time and memory, not its square. Ours."""
+"""Nearest points in space, by a k-d tree: exact, and as long as the cloud in time and memory, not its square."""
 
 from __future__ import annotations
 

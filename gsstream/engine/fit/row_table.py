@@ -48,7 +48,7 @@ class RowTable:
         """Apply a topology edit to every leaf and its moments; ``values`` replaces the edited leaves' contents.
 
         A fresh row has no moments, and the count of the row it came of: its first step is then three times as long as
-        one with a count of its own, and frame 0 is 0.4 dB better for it (ours, measured).
+        one with a count of its own, and frame 0 is 0.4 dB better for it (measured).
         """
         for name, leaf in self.leaves.items():
             content = leaf.detach()[edit.source] if values is None else values[name].clone()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import signal
 import threading
 import time
@@ -20,7 +19,7 @@ from gsstream.engine.budget.memory import within_memory
 from gsstream.engine.frame0.points import gather_points, with_test_views
 from gsstream.engine.run.encoder import Encoder, Listeners
 from gsstream.engine.run.measure import HeldOut
-from gsstream.engine.run.metrics_log import last_written, trim_metrics
+from gsstream.engine.run.metrics_log import append_metrics, last_written, trim_metrics
 from gsstream.engine.run.progress import RunProgress
 from gsstream.method.base import Step
 from gsstream.metrics import EnergyMeter
@@ -127,8 +126,7 @@ class _Run:
             metrics["joules"] = {name: value - joules[name] for name, value in self.energy.read().items()}
         if self.held_out and len(test.cameras):
             metrics |= self.held_out.measure(step.state, self.encoder.at_near(test))
-        with (self.out / METRICS).open("a", encoding="utf-8") as log:
-            log.write(json.dumps(metrics) + "\n")
+        append_metrics(self.out / METRICS, metrics)
         self.progress.frame(metrics)
 
     def _seeds(self, frame: Frame) -> PointCloud:
@@ -145,8 +143,9 @@ class _Run:
         """Go on after what the folder holds; the last frame of that, or None to begin anew."""
         stream, log = self.out / STREAM, self.out / METRICS
         planned = self.encoder.controller.budget.limits_frames
-        # The controller plans by what metrics.jsonl says, so frames that are missing there are encoded again.
-        wanted = last_written(log) if planned else None
+        # A kill between a packet and its line leaves a frame that no table would count, and that a budget would plan
+        # without: such frames are encoded again, to the same bytes. A run without any line goes on from its packets.
+        wanted = last_written(log) if planned or log.exists() else None
         last = self.encoder.resume(stream, lambda index: self.source.frame(index, "train"), wanted)
         self.encoder.controller.remember(trim_metrics(log, -1 if last is None else last))
         if last is None and planned:

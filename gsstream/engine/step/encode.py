@@ -19,7 +19,7 @@ def encode_frame(delta: Delta, before: PlayerState, problem: Problem, solution: 
     packet = encode(delta, before, problem.frame)
     whole = Fitted(delta, packet, len(packet.data))
     budget = None if problem.allowance is None else problem.allowance.plan.max_bytes
-    limit = budget or max(int((1 - trim) * whole.untrimmed), len(encode_empty(frame=problem.frame).data))
+    limit = budget or _share(delta, before, problem.frame, whole.untrimmed, trim)
     if whole.untrimmed <= limit:
         return whole
     curvature = {}
@@ -28,7 +28,15 @@ def encode_frame(delta: Delta, before: PlayerState, problem: Problem, solution: 
         curvature = {n: rows_of(solution.curvature[n].numpy(), rows, sent) for n in delta.residual.symbols}
     found = fit(delta, packet, curvature, before.layout, lambda some: encode(some, before, problem.frame), limit)
     # A share is no limit: of a packet that is mostly headers it would take everything, and the change with it.
-    return whole if budget is None and found.delta.is_empty else found
+    lost = found.delta.is_empty or found.delta.edits_rows != delta.edits_rows
+    return whole if budget is None and lost else found
+
+
+def _share(delta: Delta, before: PlayerState, frame: int, size: int, trim: float) -> int:
+    """Bytes left of ``size`` when the residual gives up the share ``trim``; motions and births give up nothing."""
+    others = delta.with_residual(None)
+    fixed = 0 if others.is_empty else len(encode(others, before, frame).data)
+    return max(fixed + int((1 - trim) * (size - fixed)), len(encode_empty(frame=frame).data))
 
 
 def encode(delta: Delta, before: PlayerState, frame: int) -> EncodedPacket:

@@ -18,14 +18,14 @@ def rig(ids: tuple[str, ...], size: int) -> Cameras:
 
 
 class ExampleSource:
-    """Opened as ``NAME:ANYTHING``; replace what is drawn in ``image`` by what you read (ours)."""
+    """Opened as ``NAME:ANYTHING``; replace what is drawn in ``image`` by what you read."""
 
     def __init__(self, uri: str, scale: float) -> None:
         if not 0 < scale <= 1 or (scale * SIZE) % 1:
             raise SourceError(f"{uri}: scale {scale} gives no whole number of pixels; expected 1, 0.5 or 0.25")
         self.size = int(scale * SIZE)
         train, test = rig(("left", "middle", "right"), self.size), rig(("test",), self.size)
-        self.info = SourceInfo("square", uri, FRAMES, 30.0, train, test, "ours, free for any use")
+        self.info = SourceInfo("square", uri, FRAMES, 30.0, train, test, "made here, free for any use")
 
     def image(self, index: int, camera: str) -> np.ndarray:
         """Return [H, W, 3] float32 in [0, 1]; here every camera sees the same."""

@@ -2,7 +2,7 @@
 
 Counted, not estimated: Gaussians in view and live pixel pairs (a Gaussian and a pixel it adds light to) come from a
 plain front-to-back pass of our own, independent of every renderer under test. The cost of each is the least that the
-formulas ask for (ours; docs: gsstream bench render --help): a pair takes 34 floating-point operations forward and 80
+formulas ask for (docs: gsstream bench render --help): a pair takes 34 floating-point operations forward and 80
 backward, a Gaussian in view about 700 and 1400 (projection, harmonics of degree 2); every row is read once each way and
 its gradient written once. Arithmetic and memory times are added: the floor of a machine that does not overlap them.
 """

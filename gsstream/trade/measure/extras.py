@@ -31,7 +31,7 @@ EXTRAS: Mapping[str, ViewMetric] = {"ms_ssim": _ms_ssim, "flip": _flip, "flicker
 VARIANTS: Mapping[str, str] = {
     "ms_ssim": f"{MS_SSIM_VARIANT}; not defined below {_MS_SSIM_SIDE} pixels",
     "flip": FLIP_VARIANT,
-    "flicker": "mean absolute change of still pixels between decoded frames, levels of 8 bits (ours)",
+    "flicker": "mean absolute change of still pixels between decoded frames, levels of 8 bits",
 }
 
 

@@ -30,7 +30,7 @@ def open_leap_recipe(resolved: ResolvedRecipe, epochs: int) -> ResolvedRecipe:
     """Return a recipe of parts with every gate open, every attribute free and no limit on bytes or time.
 
     The delta of a leap is never sent: the key packet that follows holds the whole scene, whatever changed. So few open
-    gates and coarse latents save nothing here, and lose quality (ours; docs/results/segments.md has what it costs).
+    gates and coarse latents save nothing here, and lose quality (docs/results/segments.md has what it costs).
     """
     plain = Recipe()
     changed: dict[str, Any] = {slot: getattr(plain, slot) for slot in SENDING}

@@ -17,7 +17,8 @@ from gsstream_cpu_render.view import Background
 
 MOST_IDLE = 32
 
-_lock = threading.Lock()
+#: Taken twice by one thread when the collector, called while it is held, finds a lease that nobody holds any more.
+_lock = threading.RLock()
 _idle: list[Any] = []
 
 

@@ -2,7 +2,7 @@
 
 Semantics (those of gsstream's reference renderer): near plane, 0.3 px^2 blur, alpha cut at 1/255 and clamped at
 0.999, a Gaussian counts while the transmittance before it exceeds 1e-4, Jacobian limited to 1.3 fields of view, colour
-max(0, 0.5 + harmonics). Results are bit-identical for any number of threads. Source: ours, after EWA splatting
+max(0, 0.5 + harmonics). Results are bit-identical for any number of threads. After EWA splatting
 (Zwicker et al. 2001) and 3D Gaussian Splatting (Kerbl et al. 2023); derivation of the tile test in the C++ files.
 """
 

@@ -27,7 +27,7 @@ class FixedThreshold(Propagation):
             default=0.8, gt=0, lt=1, description="Gaussians below this probability are ignored, 0 to 1 (paper: >= 0.5)"
         )
         floor: float = Field(
-            default=-50.0, ge=-1e4, le=-10, description="logit that stands for probability 0, -1e4 to -10 (ours)"
+            default=-50.0, ge=-1e4, le=-10, description="logit that stands for probability 0, -1e4 to -10"
         )
 
     traits = PropagationTraits(idempotent=True, differentiable=True, parent_bound=True)

@@ -68,7 +68,7 @@ class BirthSettings(PartConfig):
     gradient: float = Field(
         default=1.25e-3, gt=0, le=10, description="mean screen gradient that asks for a birth, half image widths, to 10"
     )
-    most: int = Field(default=1000, ge=0, le=1_000_000, description="births per frame at most, to 1000000 (ours)")
+    most: int = Field(default=1000, ge=0, le=1_000_000, description="births per frame at most, to 1000000")
     prune_opacity: float = Field(
         default=0.005, ge=0, lt=1, description="dynamic and new Gaussians below this opacity leave, 0 to 1 (3DGS)"
     )
@@ -101,7 +101,7 @@ class QueenConfig(PartConfig):
         default=1e-3, ge=0, le=1e6, description="gradient difference above which a Gaussian is dynamic, to 1e6"
     )
     rows: Literal["all", "dynamic"] = Field(
-        default="all", description="which Gaussians are trained; all: published; dynamic: only those (ours)"
+        default="all", description="which Gaussians are trained; all: published; dynamic: only those"
     )
 
     @model_validator(mode="after")

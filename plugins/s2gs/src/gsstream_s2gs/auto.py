@@ -1,4 +1,4 @@
-"""What a scene asks of the octree and of the residuals: the rules behind ``auto``. Ours; docs/results/auto.md.
+"""What a scene asks of the octree and of the residuals: the rules behind ``auto``. See docs/results/auto.md.
 
 Pure functions of a scene's facts and of what was chosen before. Their constants were set on two recordings.
 """

@@ -32,28 +32,28 @@ class ErrorAware(ConfidenceEstimator):
 
     class Config(PartConfig):
         threshold: float = Field(
-            default=4.0, gt=0, le=1000, description="change at which p = 0.5, in units of the noise, up to 1000 (ours)"
+            default=4.0, gt=0, le=1000, description="change at which p = 0.5, in units of the noise, up to 1000"
         )
-        gain: float = Field(default=1.0, gt=0, le=100, description="logit per unit of change, 0 to 100 (ours)")
+        gain: float = Field(default=1.0, gt=0, le=100, description="logit per unit of change, 0 to 100")
         budget: float = Field(
-            default=0.02, ge=0, le=1, description="share of Gaussians that may open for error alone, 0 to 1 (ours)"
+            default=0.02, ge=0, le=1, description="share of Gaussians that may open for error alone, 0 to 1"
         )
-        turns: int = Field(default=4, ge=1, le=1000, description="frames after which a candidate's turn returns (ours)")
+        turns: int = Field(default=4, ge=1, le=1000, description="frames after which a candidate's turn returns")
         error_threshold: float = Field(
-            default=4.0, gt=0, le=1e6, description="least error of a candidate, in units of the noise (ours)"
+            default=4.0, gt=0, le=1e6, description="least error of a candidate, in units of the noise"
         )
         error_logit: float = Field(
-            default=1.0, ge=-10, le=50, description="logit of Gaussians that open for error, -10 to 50 (ours)"
+            default=1.0, ge=-10, le=50, description="logit of Gaussians that open for error, -10 to 50"
         )
         least_sigma: float = Field(
-            default=0.4 / 255, gt=0, le=1, description="least noise of a camera, image units (ours)"
+            default=0.4 / 255, gt=0, le=1, description="least noise of a camera, image units"
         )
-        probes: int = Field(default=2, ge=1, le=64, description="noise draws per view, 1 to 64 (ours)")
+        probes: int = Field(default=2, ge=1, le=64, description="noise draws per view, 1 to 64")
         seed: int = Field(default=0, ge=0, description="seed of the noise draws, any integer from 0")
         floor: float = Field(
-            default=-math.log(1000.0), ge=-50, le=0, description="logit of everybody else where nothing changes (ours)"
+            default=-math.log(1000.0), ge=-50, le=0, description="logit of everybody else where nothing changes"
         )
-        limit: float = Field(default=50.0, gt=0, le=1e4, description="logits are kept in [-limit, limit] (ours)")
+        limit: float = Field(default=50.0, gt=0, le=1e4, description="logits are kept in [-limit, limit]")
 
     traits = ConfidenceTraits(needs_renderer=True, finds_motion=True)
 

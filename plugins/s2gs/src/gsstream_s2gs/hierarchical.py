@@ -26,7 +26,7 @@ class HierarchicalMax(Propagation):
 
     class Config(PartConfig):
         empty: float = Field(
-            default=-50.0, ge=-1e4, le=1e4, description="logit of a tree without Gaussians, -1e4 to 1e4 (ours)"
+            default=-50.0, ge=-1e4, le=1e4, description="logit of a tree without Gaussians, -1e4 to 1e4"
         )
 
     traits = PropagationTraits(

@@ -29,21 +29,21 @@ class NoiseNormalised(ConfidenceEstimator):
 
     class Config(PartConfig):
         threshold: float = Field(
-            default=4.0, gt=0, le=1000, description="r at which p = 0.5, in units of the noise, up to 1000 (ours)"
+            default=4.0, gt=0, le=1000, description="r at which p = 0.5, in units of the noise, up to 1000"
         )
-        gain: float = Field(default=1.0, gt=0, le=100, description="logit per unit of r, 0 to 100 (ours)")
+        gain: float = Field(default=1.0, gt=0, le=100, description="logit per unit of r, 0 to 100")
         least_sigma: float = Field(
             default=0.4 / 255, gt=0, le=1,
-            description="least noise of a camera, image units; 0.4/255 is 8-bit rounding of two frames (ours)",
+            description="least noise of a camera, image units; 0.4/255 is 8-bit rounding of two frames",
         )  # fmt: skip
         probes: int = Field(
-            default=2, ge=1, le=64, description="noise draws per view, 1 to 64; each costs one backward pass (ours)"
+            default=2, ge=1, le=64, description="noise draws per view, 1 to 64; each costs one backward pass"
         )
         seed: int = Field(default=0, ge=0, description="seed of the noise draws, any integer from 0")
         floor: float = Field(
-            default=-math.log(1000.0), ge=-50, le=0, description="logit where nothing changes, -50 to 0 (ours)"
+            default=-math.log(1000.0), ge=-50, le=0, description="logit where nothing changes, -50 to 0"
         )
-        limit: float = Field(default=50.0, gt=0, le=1e4, description="logits are kept in [-limit, limit] (ours)")
+        limit: float = Field(default=50.0, gt=0, le=1e4, description="logits are kept in [-limit, limit]")
 
     traits = ConfidenceTraits(needs_renderer=True, finds_motion=True, monotone_in_change=True)
 

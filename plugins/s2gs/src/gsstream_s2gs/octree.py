@@ -61,7 +61,7 @@ class StreamingOctree(Structure):
         )
         max_levels: int = Field(
             default=10, ge=1, le=21,
-            description="upper bound on the number of levels H, 1 to 21; root_exponent + max_levels <= 22 (ours)",
+            description="upper bound on the number of levels H, 1 to 21; root_exponent + max_levels <= 22",
         )  # fmt: skip
         distance_quantile: float = Field(
             default=0.999, gt=0.5, le=1, description="quantile of distances taken as D_max, 0.5 to 1 (released)"
@@ -76,10 +76,10 @@ class StreamingOctree(Structure):
             default="center", description="place of an anchor in its cell; center: paper; corner: released code"
         )
         color: Literal["mean", "max"] = Field(
-            default="mean", description="colour of a cell from its points; mean: ours; max: released code"
+            default="mean", description="colour of a cell from its points; mean: gsstream's own; max: released code"
         )
         padding: float = Field(
-            default=0.05, ge=0, le=10, description="margin around the points, fraction of their extent, 0 to 10 (ours)"
+            default=0.05, ge=0, le=10, description="margin around the points, fraction of their extent, 0 to 10"
         )
         gate_level: int = Field(
             default=0, ge=0, le=20, description="level at which Gaussians share a gate, 0 (root regions, paper) to 20"

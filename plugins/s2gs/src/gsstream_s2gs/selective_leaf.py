@@ -34,13 +34,13 @@ class SelectiveLeaf(Propagation):
 
     class Config(PartConfig):
         suspect: float = Field(
-            default=1.0, ge=-50, le=50, description="logit above which a node counts as suspect, -50 to 50 (ours)"
+            default=1.0, ge=-50, le=50, description="logit above which a node counts as suspect, -50 to 50"
         )
         spread: float = Field(
-            default=0.5, gt=0, le=1, description="share of suspect nodes from which a tree moves as one, 0 to 1 (ours)"
+            default=0.5, gt=0, le=1, description="share of suspect nodes from which a tree moves as one, 0 to 1"
         )
         empty: float = Field(
-            default=-50.0, ge=-1e4, le=1e4, description="logit of a subtree without Gaussians, -1e4 to 1e4 (ours)"
+            default=-50.0, ge=-1e4, le=1e4, description="logit of a subtree without Gaussians, -1e4 to 1e4"
         )
 
     traits = PropagationTraits(

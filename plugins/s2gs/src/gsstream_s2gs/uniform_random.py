@@ -25,7 +25,7 @@ class UniformRandom(ConfidenceEstimator):
     class Config(PartConfig):
         seed: int = Field(default=0, ge=0, description="seed of the draws, any integer from 0")
         limit: float = Field(
-            default=math.log(1000.0), gt=0, le=50, description="logits are kept in [-limit, limit], 0 to 50 (ours)"
+            default=math.log(1000.0), gt=0, le=50, description="logits are kept in [-limit, limit], 0 to 50"
         )
 
     denied = MappingProxyType({"check_permutation": "lots are drawn row by row, whoever stands in the row"})

@@ -41,12 +41,12 @@ class ViewSpaceGradient(ConfidenceEstimator):
             default="mse", description="E; mse: paper; l2norm: mean Euclidean distance of pixel colours (released code)"
         )
         distance_epsilon: float = Field(
-            default=1e-12, gt=0, le=1, description="inside the root of l2norm, image units^2; no 0/0 (ours)"
+            default=1e-12, gt=0, le=1, description="inside the root of l2norm, image units^2; no 0/0"
         )
         aggregate: Literal["mean-vector", "sum-of-norms", "mean-of-norms"] = Field(
             default="mean-vector",
             description="over views; mean-vector: norm of the mean gradient (paper); sum-of-norms: released; "
-            "mean-of-norms: mean norm over the views that see the Gaussian (ours)",
+            "mean-of-norms: mean norm over the views that see the Gaussian",
         )
         units: Literal["ndc", "pixel"] = Field(
             default="ndc", description="gradients per half image (pixel gradient * (W/2, H/2), released) or per pixel"
@@ -54,20 +54,20 @@ class ViewSpaceGradient(ConfidenceEstimator):
         normalisation: Literal["robust", "ratio", "minmax", "noise"] = Field(
             default="robust",
             description="robust: paper; ratio: ln(m / median), released; minmax: paper's ablation; "
-            "noise: m in units of what camera noise alone would give, minus noise_threshold (ours)",
+            "noise: m in units of what camera noise alone would give, minus noise_threshold",
         )
         epsilon: float = Field(
             default=2e-4, ge=0, le=1e6, description="added to the MAD (robust); paper: 2e-4, in units of |m|"
         )
         epsilon_mode: Literal["absolute", "relative"] = Field(
-            default="absolute", description="absolute: paper; relative: epsilon * (median + MAD) (ours)"
+            default="absolute", description="absolute: paper; relative: epsilon * (median + MAD)"
         )
         noise_threshold: float = Field(
-            default=3.0, ge=0, le=100, description="(noise) multiple of the noise where z is 0, to 100 (ours)"
+            default=3.0, ge=0, le=100, description="(noise) multiple of the noise where z is 0, to 100"
         )
         noise_minimum: float = Field(
             default=0.4 / 255, gt=0, le=1,
-            description="(noise) least noise of a camera, image units; 0.4/255 is 8-bit rounding of two frames (ours)",
+            description="(noise) least noise of a camera, image units; 0.4/255 is 8-bit rounding of two frames",
         )  # fmt: skip
         perturbation: float = Field(
             default=0.0, ge=0, le=100,
@@ -75,9 +75,9 @@ class ViewSpaceGradient(ConfidenceEstimator):
         )  # fmt: skip
         seed: int = Field(default=0, ge=0, description="seed of perturbation and noise probes")
         floor: float = Field(
-            default=-math.log(1000.0), ge=-50, le=0, description="logit where nothing changes, -50 to 0 (ours)"
+            default=-math.log(1000.0), ge=-50, le=0, description="logit where nothing changes, -50 to 0"
         )
-        limit: float = Field(default=50.0, gt=0, le=1e4, description="logits are kept in [-limit, limit] (ours)")
+        limit: float = Field(default=50.0, gt=0, le=1e4, description="logits are kept in [-limit, limit]")
 
         @model_validator(mode="after")
         def _combinations(self) -> ViewSpaceGradient.Config:

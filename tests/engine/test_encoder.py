@@ -20,13 +20,13 @@ from gsstream.packet import PacketKind, StreamReader, StreamWriter, decode_packe
 from gsstream.play import Playback
 
 #: A body that moves two pixels a frame: motions have something to say.
-WORLD = "synthetic:frames=6&views=4&width=64&height=48&supersample=1"
+WORLD = "synthetic:frames=6&views=3&width=32&height=24&supersample=1"
 TINY: Mapping[str, Any] = {
-    "first_frame.max_iterations": 30, "first_frame.fill_points": 200, "first_frame.max_points": 800, "stream.epochs": 2,
+    "first_frame.max_iterations": 12, "first_frame.max_points": 250, "first_frame.fill_points": 0, "stream.epochs": 1,
 }  # fmt: skip
 #: Anchor insertion finds nothing in so small a world unless it is easily pleased.
 GROWING: Mapping[str, Any] = {
-    "growth": "anchor-insertion", "growth.error": 0.05, "growth.votes": 0.5, "growth.least_views": 2,
+    "growth": "anchor-insertion", "growth.per_frame": 24, "growth.error": 0.02, "growth.votes": 0.5, "growth.least_views": 2,
     "growth.agreement": 0.5, "growth.least_opacity": 0.0, "growth.epochs": 1,
 }  # fmt: skip
 CASES: Mapping[str, Mapping[str, Any]] = {
@@ -124,18 +124,17 @@ class BrokenGrowth:
 
 
 @pytest.mark.parametrize("case", list(CASES))
-@pytest.mark.parametrize("bad", [1, 4])
-def test_a_frame_that_fails_leaves_the_encoder_as_it_was(case: str, bad: int) -> None:
+def test_a_frame_that_fails_leaves_the_encoder_as_it_was(case: str) -> None:
     """Its last part fails, after rendering and learning; with that part mended the packets are the undisturbed ones."""
     made, sent = encoder(case), []
     sound = made.parts
     for frame in frames():
-        if frame.index == bad:
+        if frame.index in (1, 4):
             before, player = made.state, made.state.player
             bits = [value.tobytes() for _, value in player.gaussians.items()]
             made.parts = replace(sound, growth=BrokenGrowth())
             for _ in range(2):
-                with pytest.raises(ComponentError, match=f"growth 'BrokenGrowth' .* failed at frame {bad}: RuntimeErr"):
+                with pytest.raises(ComponentError, match=f"'BrokenGrowth' .* failed at frame {frame.index}: RuntimeErr"):
                     made.encode(frame)
             assert made.state is before
             assert [value.tobytes() for _, value in made.state.player.gaussians.items()] == bits
@@ -157,14 +156,14 @@ def test_frame_0_that_fails_can_be_made_again() -> None:
 
 
 @pytest.mark.parametrize("case", list(CASES))
-@pytest.mark.parametrize("last", [0, 1, 2, 3, 4])
-def test_going_on_after_a_frame_equals_never_having_stopped(tmp_path: Path, case: str, last: int) -> None:
+def test_going_on_after_a_frame_equals_never_having_stopped(tmp_path: Path, case: str) -> None:
     stream = write(tmp_path / "stream.gss", whole(case))
-    made = encoder(case)
-    assert made.resume(stream, lambda index: frames()[index], last) == last
-    same_bits(made.state.player.gaussians, whole(case)[last].state.player.gaussians)
-    sent = [made.encode(frame) for frame in frames()[last + 1 :]]
-    assert packets(sent) == packets(whole(case))[last + 1 :]
+    for last in range(5):
+        made = encoder(case)
+        assert made.resume(stream, lambda index: frames()[index], last) == last
+        same_bits(made.state.player.gaussians, whole(case)[last].state.player.gaussians)
+        sent = [made.encode(frame) for frame in frames()[last + 1 :]]
+        assert packets(sent) == packets(whole(case))[last + 1 :], f"resumed after frame {last}"
 
 
 def test_going_on_asks_for_the_frame_that_the_scene_shows(tmp_path: Path) -> None:

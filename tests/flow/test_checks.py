@@ -225,8 +225,9 @@ def test_what_one_part_refuses_of_another_is_said_with_its_place(tmp_path: Path)
 def test_a_residual_beyond_32_bits_is_refused(tmp_path: Path) -> None:
     """Rounded to an integer it would wrap around; what was learned would not be what is sent."""
     parts = assembly("frame")
-    huge = parts.update.config.means.model_copy(update={"step": 1e-12, "lr": 0.1})
-    update = type(parts.update)(parts.update.config.model_copy(update={"means": huge}))
+    usual = parts.part("update")
+    huge = usual.config.means.model_copy(update={"step": 1e-12, "lr": 0.1})
+    update = type(usual)(usual.config.model_copy(update={"means": huge}))
     error = failure(replace(parts, update=update), tmp_path)
     assert "means after the last iteration" in str(error)
     assert "expected finite values from -0.00214748 to 0.00214748" in str(error)

@@ -11,6 +11,7 @@ from flow_runs import Witness, demo_copy, encode, metrics
 from gsstream_cpu_render.renderer import CpuRenderer
 from gsstream_cpu_render.session import CpuSession
 
+from gsstream.core.context import ScreenGradient
 from gsstream.engine.step import frame_step as step_module
 from gsstream.packet import StreamReader
 from gsstream.render.base import ScatterSession
@@ -31,7 +32,16 @@ def test_threshold_zero_is_the_dense_path(tmp_path: Path, monkeypatch: pytest.Mo
     encode(tmp_path / "ours", source=world, method="s2gs-edge", stream__change_threshold=0)
     lines = metrics(tmp_path / "ours")
     assert [line["candidate_gaussians"] for line in lines[1:]] == [lines[1]["num_gaussians"]] * 3
-    monkeypatch.setattr(CpuRenderer, "open", lambda *arguments: ScatterSession(*arguments))
+    opened = CpuRenderer.open
+
+    class Plain(ScatterSession):
+        """Renders everything every time; only the gradient of the 2-D means is the native session's own."""
+
+        def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
+            native = opened(self._renderer, self._gaussians, None, self._cameras, self._background)
+            return native.screen_gradient(view, image_gradient)
+
+    monkeypatch.setattr(CpuRenderer, "open", lambda *arguments: Plain(*arguments))
     encode(tmp_path / "plain", source=world, method="s2gs-edge", stream__change_threshold=0)
     assert deltas(tmp_path / "ours") == deltas(tmp_path / "plain")
 

@@ -199,8 +199,9 @@ def test_show_lists_every_setting_with_its_default(capsys: pytest.CaptureFixture
     (row,) = [line for line in out.splitlines() if line.startswith("resolution ")]
     assert "integer >= 1, <= 65536" in row
     assert " 1024 " in row
-    nested = run(capsys, "plugins", "show", "update/additive")[1]
-    assert [line.split()[0] for line in nested.splitlines()[4:6]] == ["means.step", "means.lr"]
+    nested = [line.split()[:1] for line in run(capsys, "plugins", "show", "update/additive")[1].splitlines()]
+    first = nested.index(["SETTING"]) + 1
+    assert nested[first : first + 2] == [["means.step"], ["means.lr"]]
 
 
 def test_methods_show_names_parts_and_their_origin(capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,19 +14,17 @@ ROOT = Path(__file__).parents[1]
 LIBRARY = sorted((ROOT / "gsstream").rglob("*.py"))
 
 #: The words with which a function may say what it does. A new one is added here when a sentence needs it.
-VERBS = frozenset(
-    """
-    Add Advance Append Apply Ask Average Begin Build Call Cancel Change Check Choose Clone Close Collect Come Compare
-    Composite Compute Concatenate Continue Convert Copy Count Cut Decode Decorate Discover Do Draw Drop Encode End Enter
-    Evaluate Fill Find Fit Fold Forget Freeze Give Go Group Grow Hold Import Join Judge Keep Kill Lay Leave Let List
-    Look Make Map Match Measure Minimise Move Name Note Open Parse Place Plan Play Precompute Print Project Propose Pull
-    Put Raise Read Reconstruct Record Refuse Register Release Remove Render Reorder Replace Resolve Return Run Save Say
-    See Select Send Shift Show Sort Split Stack Start Stop Sum Summarise Take Tell Time Triangulate Try Turn Update Use
-    Validate Verify Wait Walk Write Yield
-""".split()
-)  # noqa: SIM905
+VERBS = """
+Add Advance Append Apply Ask Average Begin Build Call Cancel Change Check Choose Clone Close Collect Come Compare
+Composite Compute Concatenate Continue Convert Copy Count Cut Decode Decorate Discover Do Draw Drop Encode End
+Enter Evaluate Fill Find Fit Fold Forget Freeze Give Go Group Grow Hold Import Join Judge Keep Kill Lay Leave Let
+List Look Make Map Match Measure Merge Minimise Move Name Note Open Parse Place Plan Play Precompute Print Project
+Propose Pull Put Quantise Raise Ray-cast Read Reconstruct Record Refuse Register Release Remove Render Reorder
+Replace Resolve Return Run Save Say See Select Send Shift Show Sort Split Stack Start Stop Sum Summarise Take Tell
+Time Triangulate Try Turn Update Use Validate Verify Wait Walk Write Yield
+"""
 #: The start of a noun phrase that describes a class or a property fully: a capital, a shape, a name, a number, a quote.
-NOUN_PHRASE = re.compile(r"""[A-Z\[(`"0-9]|[a-z]_""")
+NOUN_PHRASE = re.compile(r"""[A-Z\[(`"0-9]""")
 #: Rooms whose functions with three or more parameters name their arguments.
 EXPLAINED = ("engine", "method", "motion", "growth", "residual", "core/changes", "encode.py", "blocks.py", "play.py")
 MANY = 3
@@ -83,7 +81,7 @@ def starts_well(one: Documented) -> bool:
     """Functions begin with a verb, checks of the kit state what must be true, classes and properties what they are."""
     line = one.doc.splitlines()[0]
     if does_something(one) and not one.name.startswith("check_"):
-        return line.split()[0].rstrip(",") in VERBS
+        return line.split()[0].rstrip(",") in VERBS.split()
     return NOUN_PHRASE.match(line) is not None
 
 
@@ -109,10 +107,10 @@ def test_functions_begin_with_a_verb_and_nouns_with_a_phrase() -> None:
 
 
 @pytest.mark.parametrize("room", EXPLAINED)
-def test_functions_of_many_parameters_have_a_section_of_arguments(room: str) -> None:
+def test_functions_of_many_parameters_name_them_all(room: str) -> None:
     inside = [one for one in EVERYTHING if one.path.startswith(f"gsstream/{room}")]
     many = [one for one in inside if does_something(one) and len(one.parameters) >= MANY]
-    assert [one.place for one in many if "Arguments:" not in one.doc] == []
+    assert [f"{one.place}: {left}" for one in many if (left := undocumented_arguments(one))] == []
     assert inside or room.endswith(".py"), "the room was not found"
 
 

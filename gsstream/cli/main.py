@@ -97,8 +97,10 @@ app.add_typer(scene.app, name="scene")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run one command and exit: 0 done, 2 something given is wrong, 130 interrupted, 129 and 143 ended by a signal,
-    1 everything else."""
+    """Run one command and exit.
+
+    Exit codes: 0 done, 2 something given is wrong, 130 interrupted, 129 and 143 ended by a signal, 1 everything else.
+    """
     sys.exit(run_command(sys.argv[1:] if argv is None else argv))
 
 

@@ -15,8 +15,9 @@ AUTO = "auto"
 
 @dataclass(frozen=True, slots=True)
 class SceneFacts:
-    """What the training views and the seeds of frame 0 say about a scene. No field has a unit of length: a scene that
-    is scaled keeps its facts.
+    """What the training views and the seeds of frame 0 say about a scene.
+
+    No field has a unit of length: a scene that is scaled keeps its facts.
 
     Arguments:
         cameras: training cameras, at least 1.
@@ -55,8 +56,12 @@ class SceneFacts:
 class Choice:
     """A value, and in one line why this one.
 
-    ``ladder``: values worth trying instead, in an order along which a scene is expected to get better up to a point and
-    worse from there; ``value`` is one of them. Empty: what a short fit of frame 0 cannot tell (``engine.auto.trials``).
+    Arguments:
+        value: what was chosen.
+        why: the reason, in one line.
+        ladder: candidate values in an order along which the quality of a scene is expected to rise to one maximum and
+            to fall from there on; ``value`` is one of them. Empty for settings that a short fit of frame 0 cannot
+            judge (``engine.auto.trials``).
     """
 
     value: Any

@@ -64,8 +64,11 @@ class Cameras:
         return replace(self, Ks=factor @ self.Ks, width=width, height=height)
 
     def validate(self) -> None:
-        """Raise ShapeError for NaN poses, reflected or scaled rotations, intrinsics that are not invertible or have
-        skew, last rows that are not those of a pinhole camera, repeated names."""
+        """Raise ShapeError for cameras that are no pinhole rig.
+
+        That is for NaN poses, reflected or scaled rotations, intrinsics that are not invertible or have skew, last rows
+        that are not those of a pinhole camera, repeated names.
+        """
         c = len(self)
         if not 0 < self.near < np.inf:
             raise ShapeError(f"near plane: expected a positive distance in scene units, got {self.near}")

@@ -34,8 +34,10 @@ class Frame:
     effort: float = 1.0
 
     def validate(self) -> None:
-        """Raise ShapeError when images disagree with the cameras, or naming camera, frame and first bad pixel when a
-        value is not finite or outside [0, 1]."""
+        """Raise ShapeError when images disagree with the cameras, or hold a value that no image may have.
+
+        The message names camera, frame and first pixel of a value that is not finite or outside [0, 1].
+        """
         check_shape("images", self.images, (len(self.cameras), self.cameras.height, self.cameras.width, 3))
         for camera, image in zip(self.cameras.ids, self.images, strict=True):
             # Each is NaN when a pixel is, and a comparison with NaN is false.

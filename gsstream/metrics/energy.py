@@ -78,7 +78,7 @@ class Rapl:
         return {name: value / 1e6 for name, value in self._sum.items()}
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing: these counters hold no handle."""
 
 
 def _rapl(sysfs: Path, reasons: list[str]) -> Rapl | None:
@@ -127,7 +127,7 @@ class Ina3221:
                 return
 
     def read(self) -> Mapping[str, float]:
-        """Raises OSError when the sensor stopped answering: a gap would read as no power."""
+        """Return joules by rail. Raises OSError when the sensor stopped answering: a gap would read as no power."""
         if self._error is not None:
             raise self._error
         self._sample()

@@ -43,6 +43,8 @@ def changed_groups(groups: Groups, work: FrameWork, votes: float, share: float) 
     """Return [G] bool: groups of which at least this share of the rows lie in what changed.
 
     Arguments:
+        groups: G groups of the rows of the scene.
+        work: the frame.
         votes: as for ``work.changed_rows``. share: 0 to 1.
     """
     changed = work.changed_rows(votes).numpy()

@@ -57,8 +57,9 @@ Memory = Annotated[int, BeforeValidator(_bytes, json_schema_input_type=Annotated
 
 
 class Budget(BaseModel):
-    """Limits of every frame after the first, and of the process. The controller stays inside where it can and says
-    where it cannot (docs/howto/budget.md).
+    """Limits of every frame after the first, and of the process.
+
+    The controller stays inside where it can and says where it cannot (docs/howto/budget.md).
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)

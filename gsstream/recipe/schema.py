@@ -21,8 +21,10 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 @dataclass(frozen=True, slots=True)
 class PartSchema:
-    """A part as a schema sees it: what it is, its settings (None: its plugin could not be imported), and which of them
-    the scene may decide."""
+    """A part as a schema sees it: what it is, its settings, and which of them the scene may decide.
+
+    The settings are None where the plugin could not be imported.
+    """
 
     summary: str
     config: type[PartConfig] | None

@@ -6,7 +6,7 @@ import torch
 
 
 def activate_scales(scales: torch.Tensor) -> torch.Tensor:
-    """Log standard deviations -> standard deviations, scene units."""
+    """Return standard deviations, scene units, given their logarithms."""
     return scales.exp()
 
 

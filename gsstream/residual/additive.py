@@ -20,7 +20,7 @@ class DirectCode(PartConfig):
 
 @final
 class Additive(UpdateRule):
-    """theta_t = theta_{t-1} + g * delta in raw parameter space."""
+    """Adds the residual as it is: theta_t = theta_{t-1} + g * delta in raw parameter space."""
 
     source = "gsstream"
 

@@ -1,8 +1,8 @@
 """UpdateRule: which attributes change, in which latent space, at which quantisation step.
 
-An internal seam, not yet a public component kind. Training applies a change by ``residual.joint`` (torch, with its
-gradient written out), encoder and player by ``core.delta.apply_delta`` (numpy, from the integers that are sent);
-``check_update_closed_loop`` of the contract kit holds the two together.
+The interface may change with a minor version. Training applies a residual by ``residual.joint`` (torch, with its
+gradient written out), encoder and player by ``core.changes.apply_residual`` (numpy, from the integers that are sent);
+``check_update_closed_loop`` of the contract kit compares the two.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.part import Part
 
-#: Largest magnitude of a symbol: the last up to which float32, in which symbols are decoded, tells neighbours apart.
+#: Largest magnitude of a symbol: up to it float32, in which symbols are decoded, represents every integer exactly.
 MAX_SYMBOL = 1 << 24
 
 
@@ -26,7 +26,7 @@ class AttributeCode:
     """How the residual of one attribute is represented.
 
     Arguments:
-        step: quantisation step in latent units (position: fraction of the anchor's cell).
+        step: quantisation step in latent units (position: fraction of the Gaussian's unit).
         lr: Adam learning rate of the latents, latent units per iteration.
         latent: number of latent channels; 0 means identity (one latent per feature, no decoder).
         decoder_lr: Adam learning rate of the linear decoder.
@@ -41,7 +41,10 @@ class AttributeCode:
 
 
 class UpdateRule(Part):
-    """a_t = a_{t-1} + g * (quantised latents) W, on raw attributes; position residuals in units of the cell."""
+    """Which attributes a residual may change, and how: a_t = a_{t-1} + g * (quantised latents) W, on raw attributes.
+
+    Position residuals are measured in the unit of each Gaussian.
+    """
 
     @abstractmethod
     def codes(self) -> Mapping[str, AttributeCode]:

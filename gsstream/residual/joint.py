@@ -109,6 +109,8 @@ def decode_joint(code: JointCode, latents: torch.Tensor, matrix: torch.Tensor, u
     """Return the latents [A, L] as the decoder will have them, and what they decode to.
 
     Arguments:
+        code: columns of the attributes.
+        latents: [A, L].
         matrix: [L, D] of :meth:`JointCode.join_decoders`. units: [A] cell of each anchor, scene units.
     """
     quantised = torch.round(latents / code.steps).mul_(code.steps)

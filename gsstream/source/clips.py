@@ -83,7 +83,7 @@ class ImageClip:
         return read_image(self._files[index], self._size, target, "the first image of its camera has")
 
     def close(self) -> None:
-        """Nothing stays open between reads."""
+        """Do nothing: no file stays open between reads."""
 
 
 def _size_of(path: Path) -> tuple[int, int]:

@@ -104,6 +104,8 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
     """Import every named part, check its parameters against its own Config, and build it.
 
     Arguments:
+        resolved: a recipe, with the provenance of its values or without.
+        catalog: of the parts that are installed.
         checks: off, frame or step; None: what the environment says (``engine.assembly.checks``).
 
     Raises:

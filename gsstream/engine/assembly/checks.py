@@ -103,6 +103,9 @@ class Look:
         One pass without temporary memory when all is well.
 
         Arguments:
+            what: is looked at, for the error.
+            value: any tensor.
+            limits: least and largest value allowed; None: any finite one.
             rows: [A] rows of the scene that ``value`` [A, ...] is about, so that the Gaussian can be named.
         """
         if self.level is not Checks.OFF:

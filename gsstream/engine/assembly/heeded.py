@@ -22,6 +22,7 @@ def unheeded(
     """Yield the paths of keys that differ from their default though the method does not read them.
 
     Arguments:
+        method: the live method.
         recipe: with every part's parameters written out.
         parts: slot -> live part.
         pending: paths of keys that the scene is to decide.

@@ -31,6 +31,7 @@ def colour_gain(images: FloatArray, cameras: Cameras, xyz: FloatArray) -> tuple[
     cameras cannot be judged and gains 0.
 
     Arguments:
+        cameras: training cameras.
         images: [C, H, W, 3] in [0, 1]. xyz: [P, 3] seeds, scene units.
     """
     colours, seen = _samples(images, cameras, xyz)

@@ -52,6 +52,7 @@ def settle(parts: Assembly, facts: Callable[[], SceneFacts], known: Mapping[str,
     """Return the assembly with every ``auto`` replaced by a value.
 
     Arguments:
+        parts: the live parts of the recipe.
         facts: asked only when a rule has to choose.
         known: key -> choices that stand already (a stream's, whose frame 0 is taken over).
 

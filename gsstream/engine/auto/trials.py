@@ -33,6 +33,8 @@ def choose(
     Rules choose first; where frame 0 is made here and training cameras can be spared, trials go on from there.
 
     Arguments:
+        parts: the live parts of the recipe.
+        meta: what a key packet says about the run.
         points: the seeds, made when they are asked for.
         frame: training images of frame 0.
         first: the frame 0 of another stream that is taken over, whose choices stand.

@@ -79,7 +79,8 @@ class Pace:
             return
         now, plan = self._timed.clock(), self._timed.plan
         self._iteration_began = now
-        # What came before took every view once, forwards and backwards: without a past it stands for a pass.
+        # The phases before the passes render every view once, forwards and backwards. Without earlier frames to go by,
+        # their time is the estimate of a pass.
         before = now - self._timed.started
         self._each = before if plan.each is None else each_with(plan.each, plan.candidates, candidates)
         self.epochs = epochs_within(self._left(now), self._each, self._most)
@@ -139,6 +140,9 @@ class Pace:
 
     def _usual(self) -> list[float]:
         """Seconds of the iterations of the last pass.
+
+        The first iteration of the frame is left out: it includes work that is done once per frame, and a pass that is
+        thought to be that slow would end the frame at once.
 
         Without the frame's first, which pays for what is made ready once: as typical it would end the frame there.
         """

@@ -111,6 +111,7 @@ def plan(budget: Budget, stream: Stream, history: Sequence[Past]) -> FramePlan:
     """Return what the next frame is to spend.
 
     Arguments:
+        budget: limits of a frame.
         stream: the recipe's settings, from which the controller departs.
         history: earlier frames that were optimised, oldest first.
     """
@@ -187,7 +188,10 @@ def _around(recent: Sequence[Past]) -> tuple[float, float]:
 
 
 def _threshold(budget: Budget, stream: Stream, recent: Sequence[Past]) -> float:
-    """Higher after two frames in which too few passes fitted into the time, else back towards the recipe's."""
+    """Return the next frame's threshold of change.
+
+    It rises after two frames in which too few passes fitted into the time, and else falls back towards the recipe's.
+    """
     usual = stream.change_threshold
     if budget.time is None or not recent:
         return usual

@@ -15,6 +15,9 @@ def spent(
     """Return the entry ``budget`` of a frame, before its limits and the cost of the whole frame are added.
 
     Arguments:
+        allowance: what the frame was allowed.
+        pace: what its passes were held to.
+        fitted: its packet, and what fitting it gave up.
         stream: the recipe's own settings, from which the plan departed.
         epochs: passes made.
     """

@@ -76,6 +76,8 @@ def children(
     """Return copies of Gaussians, those that are halves of a split drawn from their parent and made smaller (3DGS).
 
     Arguments:
+        gaussians: N rows, raw values.
+        generator: of the positions of halves.
         parents: [P] rows that are copied.
         halves: [P] bool, copies that are one half of a split parent; the others are as their parent is.
     """

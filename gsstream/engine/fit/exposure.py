@@ -50,6 +50,7 @@ class ExposureFit:
         """Make one Adam step of camera ``view``.
 
         Arguments:
+            view: index of a training camera.
             image, gradient: [H, W, 3] uncorrected render, and the loss gradient with respect to the corrected one.
             lr: learning rate of the matrix entries; offsets use 0.4 of it.
             pull: weight of the quadratic pull towards identity.

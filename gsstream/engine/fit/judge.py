@@ -34,6 +34,7 @@ class Judge:
         """Judge a render and pull the loss back into whatever it was rendered from.
 
         Arguments:
+            view: index of a training camera.
             image: [H, W, 3] scene colours, with a graph.
             tiles: the only tiles that what is optimised can change (``RenderOutput.tiles``); None: all.
 

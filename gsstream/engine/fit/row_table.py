@@ -47,6 +47,10 @@ class RowTable:
     def edit(self, edit: TopologyEdit, values: Mapping[str, torch.Tensor] | None = None) -> None:
         """Apply a topology edit to every leaf and its moments; ``values`` replaces the edited leaves' contents.
 
+        A new row starts without Adam's moments but keeps the step count of the row it was copied from. So the bias
+        correction is off for it and its first step is about three times as large; frame 0 is 0.4 dB better for it
+        (measured).
+
         A fresh row has no moments, and the count of the row it came of: its first step is then three times as long as
         one with a count of its own, and frame 0 is 0.4 dB better for it (measured).
         """

@@ -22,7 +22,7 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import blaming
 from gsstream.engine.assembly.pending import refuse_pending
 from gsstream.engine.fit.exposure import Exposure
-from gsstream.engine.frame0.root import Progress, initial_gaussians, optimise_root, sort_by_node
+from gsstream.engine.frame0.optimise import Progress, initial_gaussians, optimise_first_frame, sort_by_node
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.init.thinning import thin_points
 from gsstream.packet import EncodedPacket, KeyState, PlayerState, StreamMeta, decode_packet, encode_key, quantise_key
@@ -35,6 +35,9 @@ def begin(
     """Reconstruct frame 0 and write it as a key packet.
 
     Arguments:
+        parts: the live parts of the recipe.
+        rng: random streams by name and frame.
+        progress: told about the iterations.
         points: seeds (never derived from test cameras).
         frame: training images of frame 0.
         meta: what the key packet says about the run; the exposure fit is added to it.
@@ -45,7 +48,7 @@ def begin(
     anchors = seeded(parts, points, frame)
     clock.append(time.perf_counter())
     start = initial_gaussians(anchors, parts.recipe.first_frame)
-    root = optimise_root(start, anchors.levels, frame, parts, rng, progress)
+    root = optimise_first_frame(start, anchors.levels, frame, parts, rng, progress)
     clock.append(time.perf_counter())
     # Positions are float32 in the packet too, so the hierarchy of the decoded scene is the one built here.
     decoded = quantise_key(root.gaussians.map(lambda t: t.numpy())).map(torch.from_numpy)

@@ -26,6 +26,9 @@ def refresh(parts: Assembly, step: Step, frame: Frame, tools: RunTools) -> Step:
     A key packet that the budget refuses stays due: the next frame tries again. Pure, like a frame step.
 
     Arguments:
+        parts: the live parts of the recipe.
+        step: the frame as it was encoded.
+        frame: its training images.
         tools: what a key packet tells about the run, and what the budget says of one.
     """
     every, state = parts.recipe.codec.key_every, step.state

@@ -112,14 +112,24 @@ def difference_between(player: PlayerState, claimed: PlayerState) -> str:
 
 
 def _history_difference(player: PlayerState, claimed: PlayerState) -> str:
-    """What differs in what later motions are predicted from."""
-    for name, fields in (("moved", ("rows", "shift", "turn")), ("groups", ("group_of",))):
+    """Say what differs in what later motions are predicted from; empty when nothing does."""
+    for name, fields in (("moved", ("rows", "shift", "turn")), ("groups", ("cell", "shades", "count", "group_of"))):
         want, got = getattr(player.scene, name), getattr(claimed.scene, name)
-        if (want is None) != (got is None):
+        if want is None and got is None:
+            continue
+        if want is None or got is None:
             return f"scene: {name}"
-        if want is not None and any(getattr(want, f).tobytes() != getattr(got, f).tobytes() for f in fields):
-            return f"scene: {name}"
+        for field in fields:
+            if not _same(getattr(want, field), getattr(got, field)):
+                return f"scene: {name}, {field}"
     return ""
+
+
+def _same(want: float | np.ndarray[Any, Any], got: float | np.ndarray[Any, Any]) -> bool:
+    """Say whether two numbers are equal, or two arrays bit by bit."""
+    if isinstance(want, np.ndarray) and isinstance(got, np.ndarray):
+        return want.tobytes() == got.tobytes()
+    return bool(np.array_equal(want, got))
 
 
 def _facts(player: PlayerState, step: Step[Any]) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from gsstream.engine.budget.controller import Controller
 from gsstream.engine.budget.pace import CLOCKS
 from gsstream.engine.frame0.begin import cloud_of
 from gsstream.engine.frame0.points import gather_points
-from gsstream.engine.frame0.root import Progress
+from gsstream.engine.frame0.optimise import Progress
 from gsstream.engine.keys.resume import check_stream, ended, since_key
 from gsstream.engine.method.held import begin_held, step_held
 from gsstream.engine.run.threads import one_torch_thread
@@ -111,6 +111,7 @@ class Encoder:
         """Go on after the last sound packet of a stream that this method wrote; return that frame's index.
 
         Arguments:
+            stream: file that this method wrote.
             image: frame index -> its training images.
             last: go on after this frame, whatever the stream holds beyond it.
 

@@ -45,7 +45,9 @@ def last_written(path: Path) -> int:
 
 
 def trim_metrics(path: Path, last: int) -> list[dict[str, Any]]:
-    """Drop lines of frames that the stream does not hold (a kill can fall between packet and line); those that stay.
+    """Drop the lines of frames that the stream does not hold, and return the lines that are kept.
+
+    A kill can fall between a packet and its line.
 
     The file is replaced at once: a kill leaves it as it was or as it is to be.
     """

@@ -170,6 +170,7 @@ def prepare_output(out: Path, *, resume: bool = False, overwrite: bool = False) 
     """Make sure a run may write to ``out``; create it when missing.
 
     Arguments:
+        out: folder of the run.
         resume: continue the run that ``out`` holds.
         overwrite: delete the ``RUN_FILES`` and ``MADE_FILES`` of the run that ``out`` holds; anything else stays, and
             where there is no run, everything does.

@@ -23,6 +23,8 @@ def open_recording(uri: str, recipe: Recipe, catalog: Catalog) -> FrameSource:
     """Open ``uri`` at the scale, with the split and through the transforms that a recipe asks for.
 
     Arguments:
+        recipe: its scale and section ``data``.
+        catalog: of the sources that are installed.
         uri: "demo", "synthetic:...", a folder, or "NAME:..." where NAME is a part of the kind "source".
 
     Raises:

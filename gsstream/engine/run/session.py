@@ -58,6 +58,8 @@ def run(
     """Encode a recording into ``out`` (stream.gss, metrics.jsonl, recipe.yaml).
 
     Arguments:
+        parts: the live parts of the recipe.
+        quiet: show no progress.
         source: an open recording (``engine.run.recording.open_recording``) at the recipe's scale; the caller closes it.
         out: a prepared output folder.
         resume: continue the run that ``out`` holds; the recipe must be the same.

@@ -13,6 +13,8 @@ def encode_frame(delta: Delta, before: PlayerState, problem: Problem, solution: 
     """Return the delta and its packet, made to fit the frame's allowance of bytes, else less the share ``trim``.
 
     Arguments:
+        problem: what the optimisation was given.
+        solution: what it found.
         delta: what the frame is to change. before: what players have before it.
         trim: share of the bytes to be given up where no size is asked for, 0 to 1.
     """
@@ -27,7 +29,8 @@ def encode_frame(delta: Delta, before: PlayerState, problem: Problem, solution: 
         rows, sent = solution.rows.numpy(), sent_rows(before.layout, delta.residual.gates)
         curvature = {n: rows_of(solution.curvature[n].numpy(), rows, sent) for n in delta.residual.symbols}
     found = fit(delta, packet, curvature, before.layout, lambda some: encode(some, before, problem.frame), limit)
-    # A share is no limit: of a packet that is mostly headers it would take everything, and the change with it.
+    # Where only a share is asked for, a packet is not trimmed to nothing: one that is mostly headers would lose all of
+    # its change for a few bytes.
     lost = found.delta.is_empty or found.delta.edits_rows != delta.edits_rows
     return whole if budget is None and lost else found
 

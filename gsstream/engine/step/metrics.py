@@ -19,6 +19,9 @@ def step_metrics(
     """Return the numbers of a frame.
 
     Arguments:
+        delta: what was sent.
+        after: the state after the frame.
+        packet: that holds it.
         solution: what the optimisation found; None in a frame without one.
         candidates: Gaussians that took part.
     """

@@ -19,7 +19,7 @@ from gsstream.residual.base import coarser, init_latents
 from gsstream.residual.joint import add_joint, decode_joint, join_features, joint_code, pull_back_joint
 from gsstream.residual.rate import rate_gradient
 
-#: Leaving costs a freeze of every view, so at least a tenth of the rows must go.
+#: Rows leave only when at least a tenth of them can: each time, every view has to be frozen anew.
 WORTH_LEAVING = 0.9
 
 

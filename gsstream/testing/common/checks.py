@@ -171,7 +171,7 @@ def check_rng_isolated(part: Part) -> None:
 
 @check("common", kinds=BEHAVED)
 def check_dtype_and_device(part: Part) -> None:
-    """float32 and, where logits are an input, float64 are kept; outputs stay on the input's device."""
+    """Outputs stay float32, or float64 where logits are an input of that type, and on the input's device."""
     for case in (world("cloud"), world("cloud").double()):
         for name, value in outputs(part, case).items():
             assert value.device == case.logits.device, f"{name}: expected {case.logits.device}, got {value.device}"

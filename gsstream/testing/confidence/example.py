@@ -13,7 +13,7 @@ from gsstream.api import ConfidenceEstimator, ConfidenceTraits, FrameContext, Pa
 
 @final
 class ExampleConfidence(ConfidenceEstimator):
-    """z = gain * (|m| / max|m| - 1/2), |m| the mean over views of the screen gradient's norm.
+    """Compares two frames: z = gain * (|m| / max|m| - 1/2), |m| the mean over views of the screen gradient's norm.
 
     The gradient is that of half the squared difference of the two frames. Where nothing pulls, z is ``floor``.
     """

@@ -12,7 +12,9 @@ from gsstream.api import GateSampler, GateTraits, PartConfig, check_finite
 
 @final
 class ExampleGate(GateSampler):
-    """g = 1 where z + n > 0, else 0, with n ~ Logistic(0, 1) while training: P(g = 1) = sigmoid(z).
+    """Opens a gate by chance while training: g = 1 where z + n > 0, else 0, with n ~ Logistic(0, 1).
+
+    So P(g = 1) = sigmoid(z).
 
     The gradient is that of sigmoid((z + n) / temperature), straight through the step.
     """

@@ -12,7 +12,7 @@ from gsstream.api import Hierarchy, PartConfig, Propagation, PropagationTraits, 
 
 @final
 class ExamplePropagation(Propagation):
-    """z_node = max of z_i over the node's tree."""
+    """Gives every node the largest logit of its tree: z_node = max of z_i."""
 
     source = "gsstream, after the propagation of S2GS"
 

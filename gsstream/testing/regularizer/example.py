@@ -13,7 +13,7 @@ from gsstream.api import Hierarchy, PartConfig, Regularizer, RegularizerTraits, 
 
 @final
 class ExampleRegularizer(Regularizer):
-    """mean over Gaussians of pi (gates + motion |r|^2), pi the open probability of the Gaussian's node."""
+    """Prices open gates: the mean over Gaussians of pi (gates + motion |r|^2), pi the node's open probability."""
 
     source = "gsstream"
 

@@ -30,7 +30,7 @@ def _built(part: Structure, case: World) -> Hierarchy:
 
 @check("structure")
 def check_structure_partition(part: Structure) -> None:
-    """node_of is int64 in [0, M); every node has a member or a child."""
+    """Every Gaussian has a node, int64 in [0, M); every node has a member or a child."""
     for name in WORLDS:
         case = world(name)
         forest = _built(part, case)

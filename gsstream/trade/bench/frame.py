@@ -23,14 +23,14 @@ from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.assembly.pending import refuse_pending
-from gsstream.engine.frame0.begin import begin_from
+from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.state.stream_state import Step, StreamState
-from gsstream.engine.step.frame_step import frame_step
 from gsstream.metrics import peak_memory_mb, psnr
 from gsstream.packet import KeyState, PlayerState, StreamMeta, decode_packet, encode_key
 from gsstream.plugins.catalog import Catalog
 from gsstream.recipe.model import ComponentRef, Recipe
 from gsstream.render.base import TILE
+from gsstream.source.base import SourceInfo
 from gsstream.trade.bench.scene import (
     OBJECT_CENTER,
     OBJECT_RADIUS,
@@ -185,7 +185,7 @@ def _case(plan: FramePlan, parts: Assembly, static: int, ball: _Ball) -> _Case:
     player = _first_player(parts, _scene(plan, static), rig)
     before = _draw(parts, player.gaussians, rig)
     noise = Rng(plan.seed).numpy("bench noise")
-    state = begin_from(parts, player, Frame(0, 0.0, before, rig), player.meta, Rng(plan.seed)).state
+    state: StreamState = _encoder(parts, rig, player).encode(Frame(0, 0.0, before, rig)).state
     # Stored in the method's own order the scene is rounded anew: what stands still must look as it did.
     before = _draw(parts, state.player.gaussians, rig)
     state = replace(state, previous=Frame(0, 0.0, _noisy(before, noise), rig))
@@ -195,6 +195,11 @@ def _case(plan: FramePlan, parts: Assembly, static: int, ball: _Ball) -> _Case:
         "gaussians": len(inside), "moving": int(inside.sum()), "changed_tiles": round(_changed_share(before, after), 5),
     }  # fmt: skip
     return _Case(state, Frame(1, 1 / 30, _noisy(after, noise), rig), after, facts)
+
+
+def _encoder(parts: Assembly, rig: Cameras, first: PlayerState | None = None) -> Encoder:
+    info = SourceInfo("synthetic", "bench", None, 30.0, rig, rig.select([]))
+    return Encoder(parts, info, first_frame=first)
 
 
 def _scene(plan: FramePlan, static: int) -> Gaussians[FloatArray]:
@@ -260,8 +265,10 @@ def _timed(
     for round_ in range(plan.warm_up + plan.repetitions):
         for name, parts in assemblies.items():
             state = under_way(parts, cases[name].state, last.get(name))
+            encoder = _encoder(parts, cases[name].frame.cameras)
+            encoder.state = state
             started, worked = time.perf_counter(), time.process_time()
-            last[name] = frame_step(parts, state, cases[name].frame, Rng(plan.seed)).step
+            last[name] = encoder.encode(cases[name].frame)
             elapsed, spent = time.perf_counter() - started, time.process_time() - worked
             if round_ < plan.warm_up:
                 continue

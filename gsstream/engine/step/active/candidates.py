@@ -24,6 +24,7 @@ def candidates(
     """Return the rows [A] int64, ascending, that take part in a frame.
 
     Arguments:
+        hierarchy: node of each Gaussian.
         changed: [N] bool of :func:`changed_rows`.
         open_probability: [M] probability that a node's gate is not zero.
         threshold: rows whose gate opens with at most this probability are left out.
@@ -37,6 +38,8 @@ def changed_rows(
     """Return [N] bool: Gaussians seen in a changed tile, with at least this share of votes; all without a ``change``.
 
     Arguments:
+        change: changed tiles of every view; None where change is not detected.
+        cameras: training cameras.
         means: [N, 3] centres of the session's scene.
         session: asked which Gaussians are visible in which tiles.
         least_votes: 0 to 1.
@@ -58,6 +61,8 @@ def released(gates: torch.Tensor, num_levels: int, hierarchy: Hierarchy, waiting
     A closed gate draws its rows as they were, so nothing that is seen changes.
 
     Arguments:
+        num_levels: gate values that are not zero.
+        hierarchy: node of each of the A rows.
         gates: [M] deterministic gates as they are now.
         waiting: [A] bool, rows of units that do not take part yet: they had no say and stay. None: no row waits.
     """

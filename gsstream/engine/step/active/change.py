@@ -80,6 +80,8 @@ def detect_change(previous: Frame, frame: Frame, threshold: float) -> Change | N
     """Compare two frames view by view.
 
     Arguments:
+        previous: the images that the scene shows.
+        frame: the images of this frame.
         threshold: multiple of the robust spread of block differences; 0 switches the detection off (None).
     """
     if threshold == 0:

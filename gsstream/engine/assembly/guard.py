@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from inspect import getattr_static
 from typing import Any, TypeVar, cast
 
 from gsstream.core.errors import GsstreamError, InputError, ShapeError
@@ -63,12 +64,19 @@ class Guarded:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        value = getattr(self._subject, name)
+        value = self._value(name)
         if not callable(value) or isinstance(value, type):
             return value
         call = self._guarding(name, value)
         self.__dict__[name] = call
         return call
+
+    def _value(self, name: str) -> Any:
+        """An attribute of the part; what a property of it raises is the part's failure like any other."""
+        if getattr_static(self._subject, name, None) is None:
+            return getattr(self._subject, name)  # there is none: an AttributeError, unless the part makes it up
+        with blaming(self._slot, self._part, self._where):
+            return getattr(self._subject, name)
 
     def _guarding(self, name: str, method: Callable[..., Any]) -> Callable[..., Any]:
         slot, part, where, kind = self._slot, self._part, self._where, self._kind
@@ -78,8 +86,8 @@ class Guarded:
         def call(*args: Any, **kwargs: Any) -> Any:
             with blaming(slot, part, where):
                 result = method(*args, **kwargs)
-            if look is not None:
-                look(looking, args, result)
+                if look is not None:
+                    look(looking, args, result)
             return Guarded.session(result, self) if isinstance(result, RenderSession) else result
 
         return call

@@ -40,6 +40,9 @@ def _motion(look: Look, args: tuple[Any, ...], result: object) -> None:
 def _growth(look: Look, args: tuple[Any, ...], result: object) -> None:
     if result is not None and not isinstance(result, Rows):
         raise look.fault(f"propose(): expected Rows or None, got {type(result).__name__}")
+    if result is not None and result.births is not None:
+        for name, value in result.births.gaussians.items():
+            look.values(f"births: {name}", torch.as_tensor(value))
 
 
 def _image(look: Look, args: tuple[Any, ...], result: Any) -> None:

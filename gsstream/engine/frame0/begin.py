@@ -48,13 +48,13 @@ def begin(
     anchors = seeded(parts, points, frame)
     clock.append(time.perf_counter())
     start = initial_gaussians(anchors, parts.recipe.first_frame)
-    root = optimise_first_frame(start, anchors.levels, frame, parts, rng, progress)
+    found = optimise_first_frame(start, anchors.levels, frame, parts, rng, progress)
     clock.append(time.perf_counter())
     # Positions are float32 in the packet too, so the hierarchy of the decoded scene is the one built here.
-    decoded = quantise_key(root.gaussians.map(lambda t: t.numpy())).map(torch.from_numpy)
-    hierarchy, levels, decoded = arrange(parts, decoded, root.levels, anchors)
+    decoded = quantise_key(found.gaussians.map(lambda t: t.numpy())).map(torch.from_numpy)
+    hierarchy, levels, decoded = arrange(parts, decoded, found.levels, anchors)
     layout = make_layout(hierarchy, levels, anchors)
-    state, packet = key_state(parts, decoded, layout, hierarchy, frame, meta, root.exposure, anchors.origin, rng)
+    state, packet = key_state(parts, decoded, layout, hierarchy, frame, meta, found.exposure, anchors.origin, rng)
     clock.append(time.perf_counter())
     metrics: dict[str, Any] = {
         "bytes": dict(packet.sizes),
@@ -62,7 +62,7 @@ def begin(
         "active_gaussians": len(decoded),
         "num_gates": len(layout.node_counts),
         "active_gates": 0,
-        "iterations": root.iterations,
+        "iterations": found.iterations,
         "seconds": dict(zip(("seed", "optimise", "code"), np.diff(clock).tolist(), strict=True)),
     }
     return Step(state, packet, "key", metrics)

@@ -23,7 +23,7 @@ from gsstream.packet import StreamMeta, quantise_key
 def refresh(parts: Assembly, step: Step, frame: Frame, tools: RunTools) -> Step:
     """Return ``step``, or when the recipe asks for a key packet at this frame, the step that writes one instead of it.
 
-    A key packet that the budget refuses stays due: the next frame tries again. Pure, like a frame step.
+    A key packet that the budget refuses, or whose frame is skipped, stays due: the next frame tries again. Pure, like a frame step.
 
     Arguments:
         parts: the live parts of the recipe.
@@ -34,7 +34,8 @@ def refresh(parts: Assembly, step: Step, frame: Frame, tools: RunTools) -> Step:
     every, state = parts.recipe.codec.key_every, step.state
     if step.status == "key" or not every or state.player.frame - state.key_frame < every:
         return step
-    refused = tools.refuse_key(len(state.gaussians))
+    # A skipped frame is an empty packet: nothing of it may fail, and a key packet costs what was to be saved.
+    refused = "the frame is skipped" if frame.effort == 0 else tools.refuse_key(len(state.gaussians))
     if refused is not None:
         return _postponed(step, refused)
     started = time.perf_counter()

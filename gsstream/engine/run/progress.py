@@ -38,7 +38,7 @@ class RunProgress:
         if self._bar:
             self._bar.stop()
 
-    def root(self, iteration: int, iterations: int, loss: float, count: int) -> None:
+    def first_frame(self, iteration: int, iterations: int, loss: float, count: int) -> None:
         """Show an iteration of frame 0.
 
         Arguments:

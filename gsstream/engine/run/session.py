@@ -87,7 +87,7 @@ class _Run:
         self.held_out = HeldOut(parts.renderer, parts.recipe.background) if measure else None
         self.progress = RunProgress(self.total, quiet)
         listeners = Listeners(
-            packet=lambda packet: self.writer.append(packet), chosen=self._chosen, progress=self.progress.root,
+            packet=lambda packet: self.writer.append(packet), chosen=self._chosen, progress=self.progress.first_frame,
             say=self.progress.say,
         )  # fmt: skip
         self.encoder = Encoder(parts, source.info, self._seeds, first_frame=first_frame, listeners=listeners)

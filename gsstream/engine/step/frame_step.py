@@ -106,6 +106,7 @@ def still(state: StreamState, frame: Frame, clock: PhaseClock) -> Outcome:
     with clock.phase("code"):
         packet = encode_empty(frame=frame.index)
         after = replace(state, player=decode_packet(state.player, packet.data))
-    metrics = step_metrics(Delta(), after, packet, None, 0)
+    # No part is asked anything here, nor is what the renderer keeps counted: this is what follows when a part failed.
+    metrics = step_metrics(Delta(), replace(after, session=None), packet, None, 0)
     return Outcome(Step(after, packet, "empty", {**metrics, "changed_tiles": 0.0, "seconds": clock.seconds}))
 

@@ -7,6 +7,7 @@ import torch
 from gsstream.core.changes import Delta, apply_delta
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.assembly.guard import blaming
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.context import FrameView
 from gsstream.growth.none import NoGrowth
@@ -22,10 +23,13 @@ def grown(parts: Assembly, state: StreamState, delta: Delta, view: FrameView, rn
         view: the frame as parts see it.
         rng: random streams by name and frame.
 
-    Raises ComponentError when the part fails, ShapeError when what it proposes does not fit the scene.
+    Raises ComponentError when the part fails, or proposes what does not fit the scene.
     """
     if isinstance(parts.part("growth"), NoGrowth):
         return delta  # nobody looks at the scene after the residual, so it need not be made
     after = apply_delta(state.player.scene, delta)
     rows = parts.growth.propose(after, view.on(after.gaussians.map(torch.from_numpy)), rng)
+    with blaming("growth", parts.part("growth"), parts.where):
+        if rows is not None:
+            apply_delta(after, Delta((rows,)))
     return delta.with_rows(rows)

@@ -12,9 +12,11 @@ from gsstream.core.changes.motion import apply_motion
 from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.assembly.guard import blaming
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.active.change import Change
 from gsstream.engine.step.context import FrameView
+from gsstream.packet.changes.motion import encode_motions
 
 
 class Moved(NamedTuple):
@@ -35,7 +37,7 @@ def moved(parts: Assembly, state: StreamState, frame: Frame, change: Change | No
         change: what changed in them; None: everything counts as changed.
         rng: random streams by name and frame.
 
-    Raises ComponentError when the part fails, ShapeError when its motions do not fit the scene.
+    Raises ComponentError when the part fails, or proposes motions that do not fit the scene or cannot be sent.
     """
     scene = state.player.scene
     view = FrameView(
@@ -45,9 +47,11 @@ def moved(parts: Assembly, state: StreamState, frame: Frame, change: Change | No
     if not motions:
         return Moved((), scene, view)
     touched = np.zeros(0, np.int64)
-    for motion in motions:
-        scene, rows = apply_motion(scene, motion)
-        touched = np.union1d(touched, rows)
+    with blaming("motion", parts.part("motion"), parts.where):
+        encode_motions(motions)  # what cannot be sent is refused before anything is learned on it
+        for motion in motions:
+            scene, rows = apply_motion(scene, motion)
+            touched = np.union1d(touched, rows)
     gaussians = scene.gaussians.map(torch.from_numpy)
     # The session goes on to the moved scene with what stands still in it; state.session must stay as it is until the
     # frame has succeeded, which a session that committed does (it only has to fill its caches again).

@@ -1,0 +1,193 @@
+"""The first frame: from anchors to Gaussians that a stream can start from.
+
+The schedule is 3DGS's (Kerbl et al. 2023) with gradient-driven densification and opacity pruning; the exposure fit, the
+opacity and scale penalties and the near plane are gsstream's own; held-out quality is why they are there
+(docs/results/index.md).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from gsstream.core.errors import InputError
+from gsstream.core.frame import Frame
+from gsstream.core.gaussians import ATTRIBUTES, Gaussians
+from gsstream.core.rng import Rng
+from gsstream.core.topology import TopologyEdit
+from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.assembly.checks import VARIABLE, Look
+from gsstream.engine.fit import schedule
+from gsstream.engine.fit.densify import DensifyStatistics, grow_and_prune
+from gsstream.engine.fit.exposure import Exposure, ExposureFit
+from gsstream.engine.fit.judge import Judge
+from gsstream.engine.fit.nearest import neighbour_distance
+from gsstream.engine.fit.row_table import RowTable
+from gsstream.recipe.model import FirstFrame
+from gsstream.render.activations import logit, rgb_to_sh0
+from gsstream.structure.base import Anchors
+
+CENTER_EVERY = 50
+Progress = Callable[[int, int, float, int], None]
+
+
+@dataclass(frozen=True)
+class Reconstructed:
+    """Optimised frame 0. ``levels`` [N] is aligned with the Gaussians."""
+
+    gaussians: Gaussians[torch.Tensor]
+    levels: torch.Tensor
+    exposure: Exposure | None
+    iterations: int
+
+
+def initial_gaussians(anchors: Anchors, settings: FirstFrame) -> Gaussians[torch.Tensor]:
+    """Return one isotropic Gaussian per anchor, as wide as the distance to its three nearest neighbours (3DGS)."""
+    count = len(anchors.positions)
+    if count == 0:
+        raise InputError("the structure placed no anchors: expected at least 1 Gaussian to start from, got 0")
+    spacing = neighbour_distance(anchors.positions).clamp(1e-6, 1e6)
+    quats = torch.zeros(count, 4)
+    quats[:, 0] = 1
+    return Gaussians(
+        means=anchors.positions.float().clone(),
+        quats=quats,
+        scales=spacing.log()[:, None].repeat(1, 3),
+        opacities=torch.full((count,), logit(schedule.OPACITY)),
+        sh0=rgb_to_sh0(anchors.colors.float()),
+        shN=torch.zeros(count, (settings.degree + 1) ** 2 - 1, 3),
+    )
+
+
+def first_rates(settings: FirstFrame, extent: float) -> dict[str, float]:
+    """Return the learning rate of every attribute at the start of frame 0.
+
+    Arguments:
+        settings: section ``first_frame`` of the recipe.
+        extent: of the cameras, scene units.
+    """
+    s = settings
+    rates = {"means": s.lr_means * extent, "quats": schedule.LR_QUATS, "scales": schedule.LR_SCALES}
+    return {**rates, "opacities": schedule.LR_OPACITIES, "sh0": schedule.LR_SH0, "shN": schedule.LR_SHN}
+
+
+def optimise_first_frame(
+    start: Gaussians[torch.Tensor],
+    levels: torch.Tensor,
+    frame: Frame,
+    parts: Assembly,
+    rng: Rng,
+    progress: Progress,
+) -> Reconstructed:
+    """Fit frame 0 on its training images.
+
+    Arguments:
+        levels: [N] int64 octree level of each.
+        parts: the live parts of the recipe.
+        rng: random streams by name and frame.
+        start: [N] initial Gaussians; ``levels`` [N] their octree levels.
+        frame: training images of frame 0.
+        progress: called with (iteration, iterations, smoothed loss, number of Gaussians).
+    """
+    run = _FirstFrameRun(start, levels, frame, parts, rng)
+    for iteration in range(1, run.iterations + 1):
+        value = run.step(iteration)
+        progress(iteration, run.iterations, value, len(run.levels))
+    exposure = run.exposure.centered().exposure if run.exposure else None
+    found = run.gaussians().map(torch.Tensor.detach)
+    parts.where.enter(frame.index)
+    look = Look(parts.checks, "first frame", run.table, parts.where)
+    for name, values in found.items():
+        look.values(f"{name} after the last iteration ({VARIABLE}=step finds the first)", values)
+    return Reconstructed(found, run.levels, exposure, run.iterations)
+
+
+class _FirstFrameRun:
+    """The moving state of the optimisation of frame 0; lives only inside :func:`optimise_first_frame`."""
+
+    def __init__(
+        self, start: Gaussians[torch.Tensor], levels: torch.Tensor, frame: Frame, parts: Assembly, rng: Rng
+    ) -> None:
+        self.parts, self.settings, self.recipe, self.frame = parts, parts.recipe.first_frame, parts.recipe, frame
+        self.renderer, self.levels = parts.renderer, levels
+        self.views = len(frame.cameras)
+        self.extent = frame.cameras.extent
+        self.iterations = min(self.settings.epochs * self.views, self.settings.max_iterations)
+        # The name of the stream of older versions, so that a seed gives the same frame 0.
+        self.generator = rng.stream("root", frame.index)
+        self.table = RowTable(dict(start.items()), first_rates(self.settings, self.extent), parts.optimiser)
+        self.judge = Judge(parts.loss, parts.recipe.loss.dssim, frame.images, None)
+        self.exposure = ExposureFit.start(self.views) if self.settings.exposure else None
+        self.statistics = DensifyStatistics.zeros(len(start))
+        self.order: list[int] = []
+        self.smooth = math.nan
+
+    def gaussians(self) -> Gaussians[torch.Tensor]:
+        return Gaussians(**{name: self.table[name] for name in ATTRIBUTES})
+
+    def step(self, iteration: int) -> float:
+        s = self.settings
+        view, self.parts.where.iteration = self._next_view(), iteration
+        last = schedule.DENSIFY_UNTIL * self.iterations
+        densify = s.densify_from <= iteration + s.densify_every and iteration <= last
+        rows = self.gaussians()
+        probe = torch.zeros(len(rows), 2, requires_grad=True) if densify else None
+        session = self.renderer.open(rows, None, self.frame.cameras, self.recipe.background)
+        value = self._backward(view, session.render(view, rows, probe=probe).image)
+        fraction = iteration / self.iterations
+        self.table.set_lr("means", self.extent * _log_linear(s.lr_means, s.lr_means_final, fraction))
+        self.table.step()
+        if probe is not None and probe.grad is not None:
+            size = torch.tensor([self.frame.cameras.width / 2, self.frame.cameras.height / 2])
+            self.statistics = self.statistics.add(probe.grad * size)
+            if iteration >= s.densify_from and iteration % s.densify_every == 0:
+                self._densify()
+        self.smooth = value if math.isnan(self.smooth) else 0.98 * self.smooth + 0.02 * value
+        return self.smooth
+
+    def _backward(self, view: int, image: torch.Tensor) -> float:
+        """Loss, its gradient into the leaves, and the exposure step."""
+        self.judge.exposure = self.exposure.exposure if self.exposure else None
+        value, gradient = self.judge.backward(view, image)
+        self._penalise()
+        if self.exposure:
+            self.exposure = self.exposure.step(view, image.detach(), gradient, lr=0.005, pull=1e-3)
+            if sum(self.exposure.steps) % CENTER_EVERY == 0:
+                self.exposure = self.exposure.centered()
+        return value
+
+    def _penalise(self) -> None:
+        """Gradients of the mean opacity and the mean scale, added by hand: they need no graph."""
+        count = max(1, len(self.levels))
+        opacities, scales = self.table["opacities"], self.table["scales"]
+        if opacities.grad is not None:
+            p = opacities.detach().sigmoid()
+            opacities.grad.add_(p * (1 - p), alpha=schedule.OPACITY_PENALTY / count)
+        if scales.grad is not None:
+            scales.grad.add_(scales.detach().exp(), alpha=schedule.SCALE_PENALTY / (3 * count * self.extent))
+
+    def _densify(self) -> None:
+        gaussians = self.gaussians().map(torch.Tensor.detach)
+        edit, values = grow_and_prune(gaussians, self.statistics, self.settings, self.extent, self.generator)
+        self.table.edit(edit, values)
+        self.levels = self.levels[edit.source]
+        self.statistics = DensifyStatistics.zeros(len(self.levels))
+
+    def _next_view(self) -> int:
+        if not self.order:
+            self.order = torch.randperm(self.views, generator=self.generator).tolist()
+        return self.order.pop()
+
+
+def _log_linear(first: float, last: float, fraction: float) -> float:
+    if first <= 0 or last <= 0:
+        return first + (last - first) * fraction
+    return math.exp(math.log(first) * (1 - fraction) + math.log(last) * fraction)
+
+
+def sort_by_node(node_of: torch.Tensor) -> TopologyEdit:
+    """Return the permutation that stores Gaussians node by node (stable)."""
+    return TopologyEdit.permute(torch.argsort(node_of, stable=True))

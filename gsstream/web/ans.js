@@ -88,9 +88,9 @@ export class AnsDecoder {
       // state = (state >> 24) * width + rest: the low half by integer products, the high half in exact pieces.
       const rest = quantile - begin;
       const small = (high & 0xffff) * width * 256 + ((low >>> 24) * width + rest);
-      const big = (high >>> 16) * width + Math.floor(small / 16777216);
+      const big = (high >>> 16) * width + Math.floor(small * 2 ** -24);
       low = (Math.imul((high << 8) | (low >>> 24), width) + rest) | 0;
-      high = Math.floor(big / 256) | 0;
+      high = Math.floor(big * 2 ** -8) | 0;
       if (high === 0 && left > 0) {
         left -= 1;
         high = low;

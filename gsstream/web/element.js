@@ -128,7 +128,8 @@ export class PlayerElement extends HTMLElement {
       player.speed = Number(parts.speed.value);
     };
     parts.camera.onchange = () => player.look(parts.camera.selectedIndex);
-    parts.rendition.onchange = () => player.choose(parts.rendition.selectedIndex);
+    // What goes wrong is told by the event `problem`.
+    parts.rendition.onchange = () => player.choose(parts.rendition.selectedIndex).catch(() => {});
     parts.marks.onclick = () => this._marks();
     parts.statistics.onclick = () => this._statistics();
     parts.full.onclick = () => this._full();

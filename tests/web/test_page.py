@@ -152,6 +152,29 @@ def test_a_seek_in_a_file_with_an_index_fetches_the_last_segment_first(site, tmp
     assert all(wanted.startswith("bytes=") for wanted in ranges)
 
 
+def test_another_rendition_shows_the_same_frame(tmp_path):
+    streams = [tmp_path / "full.gss", tmp_path / "small.gss"]
+    for path, number in zip(streams, (80, 20), strict=True):
+        with StreamWriter.open(path) as writer:
+            for packet in moving_packets(seed=3, frames=8, number=number, nodes=10, key_at=5):
+                writer.append(packet)
+    package(streams[0], tmp_path / "site", renditions=streams[1:])
+    choose = f"{ROOT}.querySelector('.rendition')"
+    steps = [
+        ["go", "URL/index.html"], READY, ["evaluate", f"{PLAYER}.seek(6)"], ["until", f"{PLAYER}.frame === 6"],
+        ["evaluate", f"{PLAYER}.state.number"], ["evaluate", f"{choose}.hidden"],
+        ["evaluate", f"{choose}.selectedIndex = 1, {choose}.onchange()"], ["until", f"{PLAYER}.frame === 6"],
+        ["evaluate", f"{PLAYER}.state.number"], ["picture", 7, 32, 24],
+    ]  # fmt: skip
+    with serving(tmp_path / "site") as (url, _):
+        results = in_browser(_at(url, steps), tmp_path, size=SIZE)
+    with Playback(streams[0]) as full, Playback(streams[1]) as small:
+        assert (results[4], results[5], results[8]) == (len(full.state_at(6)), False, len(small.state_at(6)))
+        expected = render(small.state_at(7), small.cameras("test"), 0, small.meta.background)
+    (got,) = pictures(results[9:], 32, 24)
+    assert psnr(to_bytes(expected), got) >= 45
+
+
 def test_what_is_wrong_is_said_in_one_sentence(site, tmp_path):
     sound = (site / "stream.gss").read_bytes()
     newer = bytearray(sound)

@@ -50,13 +50,16 @@ class Cameras:
         return float(1.1 * radius) if radius > 0 else 1.0
 
     def select(self, index: Sequence[int]) -> Cameras:
-        """The sub-rig with these camera indices."""
+        """Return the part of the rig that has these camera indices, in their order."""
         index = list(index)
         ids = tuple(self.ids[i] for i in index)
         return replace(self, ids=ids, viewmats=self.viewmats[index], Ks=self.Ks[index])
 
     def scaled(self, width: int, height: int) -> Cameras:
-        """The same rig at another image size; intrinsics scale with it (exact for pixel-corner origins)."""
+        """Return the same rig at another image size.
+
+        Intrinsics scale with it, exactly, because pixel coordinates count from the corner of the image.
+        """
         factor = np.diag([width / self.width, height / self.height, 1.0])
         return replace(self, Ks=factor @ self.Ks, width=width, height=height)
 

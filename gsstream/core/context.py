@@ -42,19 +42,19 @@ class FrameContext(Protocol):
         """The V training cameras."""
 
     def image(self, view: int) -> torch.Tensor:
-        """[H, W, 3] ground truth of frame t."""
+        """Return [H, W, 3]: what a camera recorded in frame t, in [0, 1]."""
 
     def previous_image(self, view: int) -> torch.Tensor:
-        """[H, W, 3] ground truth of frame t-1."""
+        """Return [H, W, 3]: what a camera recorded in the frame that ``gaussians`` shows, in [0, 1]."""
 
     def previous_render(self, view: int) -> torch.Tensor:
-        """[H, W, 3] render of ``gaussians``, no gradient."""
+        """Return [H, W, 3]: ``gaussians`` as a camera would record them, without a gradient."""
 
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
         """Pull an upstream gradient [H, W, 3] back to the 2-D means of ``gaussians`` in one backward pass."""
 
     def noise_sigma(self, view: int) -> float:
-        """Robust standard deviation of the camera's noise between two frames, in [0, 1] image units."""
+        """Return the robust standard deviation of a camera's noise between two frames, in [0, 1] image units."""
 
 
 class FrameWork(FrameContext, Protocol):
@@ -79,7 +79,7 @@ class FrameWork(FrameContext, Protocol):
         """Return [H, W] bool: pixels in the tiles of a view that changed; all where change is not detected."""
 
     def narrow(self, rows: torch.Tensor) -> None:
-        """From now on only the rows [A] int64, ascending, move; all others are frozen."""
+        """Freeze all rows but [A] int64, ascending: from now on only these move."""
 
     def pull(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
         """Render a view with these values of the rows that move, and compare it with what its camera recorded.

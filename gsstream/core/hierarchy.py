@@ -34,7 +34,7 @@ class Hierarchy:
         return int(self.node_of.shape[0])
 
     def rows(self, index: Any) -> Hierarchy:
-        """The same forest seen by a subset of the Gaussians."""
+        """Return the same forest seen by a subset of the Gaussians."""
         return Hierarchy(self.node_of[index], self.parent, self.level)
 
     def validate(self) -> None:
@@ -57,7 +57,9 @@ class Hierarchy:
 
 
 def tree_roots(parent: torch.Tensor) -> torch.Tensor:
-    """[M] root of each node, by pointer jumping: log2(M) gathers instead of one per level.
+    """Return [M]: the root of each node.
+
+    Pointer jumping takes log2(depth) gathers instead of one per level.
 
     Raises:
         ShapeError: some node ends in a circle instead of at a root.
@@ -72,7 +74,7 @@ def tree_roots(parent: torch.Tensor) -> torch.Tensor:
 
 
 def tree_max(values: torch.Tensor, hierarchy: Hierarchy, empty: float) -> torch.Tensor:
-    """[M] the largest of ``values`` [N] over the members of each node's whole tree, given to every node of the tree.
+    """Return [M]: the largest value in each node's whole tree, the same for every node of a tree.
 
     Differentiable; at ties the gradient is shared equally between the tied members.
 

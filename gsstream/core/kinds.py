@@ -39,7 +39,7 @@ class PartKind:
     use: str | None = "--set <kind>=<name> --source demo"
 
     def contract_class(self) -> type[Any]:
-        """The contract itself, imported. Raises TypeError for a kind without one."""
+        """Import and return the contract itself. Raises TypeError for a kind without one."""
         if self.contract is None:
             raise TypeError(f"the kind {self.name!r} has no contract class to inherit from")
         module, _, name = self.contract.partition(":")

@@ -32,7 +32,7 @@ def check_camera_ids(ids: Iterable[str]) -> None:
 
 
 def name_fault(name: str) -> str | None:
-    """What keeps a text from being the name of one file or folder, as a clause; None: nothing does."""
+    """Say, as a clause, what keeps a text from being the name of one file or folder; None: nothing does."""
     if not name:
         return "it is empty"
     if name in (".", ".."):
@@ -52,7 +52,7 @@ def name_fault(name: str) -> str | None:
 
 
 def child(folder: Path, name: str) -> Path:
-    """``folder / name``, which lies directly in the folder whatever the name is.
+    """Return ``folder / name``, which lies directly in the folder whatever the name is.
 
     Raises OutputError when the name could lead elsewhere. This is the last check before a file is written; ids are
     already checked where they are read.

@@ -71,11 +71,11 @@ class Part(ABC):  # noqa: B024 - each kind adds what is abstract
         object.__setattr__(self, "config", self.Config() if config is None else config)
 
     def claims(self) -> Traits:
-        """The traits of this part as it is configured; override where a setting changes a claim."""
+        """Return the traits of this part as it is configured; override where a setting changes a claim."""
         return self.traits
 
     def denials(self) -> Mapping[str, str]:
-        """``denied`` of this part as it is configured; override where a setting breaks a promise."""
+        """Return ``denied`` of this part as it is configured; override where a setting breaks a promise."""
         return self.denied
 
     def __setattr__(self, name: str, value: object) -> None:

@@ -22,16 +22,16 @@ class Rng:
     seed: int
 
     def key(self, name: str, frame: int) -> int:
-        """A 63-bit key for (seed, name, frame), stable across machines and versions."""
+        """Return a key of 63 bits for (seed, name, frame), stable across machines and versions."""
         digest = hashlib.blake2b(f"{self.seed}/{name}/{frame}".encode(), digest_size=8).digest()
         return int.from_bytes(digest, "little") >> 1
 
     def stream(self, name: str, frame: int = 0) -> torch.Generator:
-        """A fresh CPU torch generator for this name and frame."""
+        """Return a fresh CPU torch generator for this name and frame."""
         import torch
 
         return torch.Generator(device="cpu").manual_seed(self.key(name, frame))
 
     def numpy(self, name: str, frame: int = 0) -> np.random.Generator:
-        """A fresh numpy generator for this name and frame."""
+        """Return a fresh numpy generator for this name and frame."""
         return np.random.default_rng(self.key(name, frame))

@@ -27,7 +27,12 @@ IntArray = np.ndarray[Any, np.dtype[np.integer[Any]]]
 
 
 def check_shape(name: str, array: Any, expected: Sequence[int | str]) -> dict[str, int]:
-    """Check ``array.shape`` against ``expected``; letters bind to sizes.
+    """Check the shape of an array; letters of the expected shape bind to sizes.
+
+    Arguments:
+        name: of the array, for the error.
+        array: anything with a ``shape``.
+        expected: sizes, letters that bind to sizes, or ``...``.
 
     Returns the bound letters. Raises ShapeError naming the array, what was expected and what came.
     """

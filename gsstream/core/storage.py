@@ -13,7 +13,7 @@ Storage = Literal["float32", "float16", "uint8"]
 
 
 def packed(images: FloatArray, storage: Storage) -> Any:
-    """Images [..., 3] float32 in [0, 1] -> an array of the kind ``storage`` of the same shape.
+    """Return images [..., 3] float32 in [0, 1] as an array of the kind ``storage``, of the same shape.
 
     Largest error after :func:`unpacked`: 2^-12 (float16), 1/510 (uint8; none for recordings of 8 bits read at their
     size). Doing it again changes nothing.
@@ -37,12 +37,12 @@ def packed(images: FloatArray, storage: Storage) -> Any:
 
 
 def unpacked(images: Any) -> FloatArray:
-    """Inverse of :func:`packed`: float32, whatever came; float32 itself is passed on as it is."""
+    """Return the float32 images of which :func:`packed` made this array; float32 itself is passed on as it is."""
     if images.dtype == np.uint8:
         return np.asarray(np.divide(images, np.float32(255), dtype=np.float32))
     return np.asarray(images, np.float32)
 
 
 def rounded(images: FloatArray, storage: Storage) -> FloatArray:
-    """The values that are left after ``storage``."""
+    """Return the values that are left of images once they were stored as ``storage``."""
     return images if storage == "float32" else unpacked(packed(images, storage))

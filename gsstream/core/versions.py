@@ -6,7 +6,7 @@ import re
 
 
 def version_problem(what: str, written: str, spoken: str) -> str | None:
-    """Why something written for version ``written`` cannot be used here, or None when it can.
+    """Say why something written for another version cannot be used here; None when it can.
 
     Arguments:
         what: the noun of the sentence, e.g. ``"component API"``.

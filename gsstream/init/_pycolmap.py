@@ -6,6 +6,7 @@ system's one, the two mix and the next compression corrupts the heap. Loaded fir
 
 from __future__ import annotations
 
+import os
 import zlib  # noqa: F401  must precede pycolmap, see above
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,8 @@ def triangulate(folder: Path) -> None:
     """Triangulate SIFT matches of ``folder/images/*.png`` with the known poses of ``folder/rig.npz``.
 
     Writes ``folder/points.npz``: xyz [P, 3] float64, rgb [P, 3] uint8, error [P] pixels, track [P] views.
-    Deterministic: one thread and fixed seeds everywhere. SIFT only: the wheel's learned features end the process.
+    Deterministic: fixed seeds, features in the order of names, one thread for all else. SIFT only: the wheel's learned
+    features end the process.
     """
     database = extract(folder, most=8192)
     with np.load(folder / RIG) as rig, pycolmap.Database.open(database) as db:
@@ -44,19 +46,48 @@ def triangulate(folder: Path) -> None:
 
 
 def extract(folder: Path, most: int, mode: str = "PER_IMAGE", model: str = "SIMPLE_RADIAL") -> Path:
-    """SIFT features of ``folder/images``, at most ``most`` per image; the path of the new database."""
+    """SIFT features of ``folder/images``, at most ``most`` per image; the path of the new database.
+
+    Images are worked on at the same time, so they are finished in any order; the database that is returned has them in
+    the order of their names, and so the same input gives the same numbers whatever the machine.
+    """
     pycolmap.set_random_seed(0)
-    database = folder / "database.db"
+    scratch, database = folder / "features.db", folder / "database.db"
     extraction, reader = pycolmap.FeatureExtractionOptions(), pycolmap.ImageReaderOptions()
-    extraction.num_threads, extraction.use_gpu = 1, False
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    extraction.num_threads, extraction.use_gpu = cores, False
     # Small images hold little contrast per octave; the stock threshold finds too few points below 640 pixels.
     extraction.sift.peak_threshold, extraction.sift.max_num_features = 0.002, most
     reader.camera_model = model
     pycolmap.extract_features(
-        database, folder / IMAGES, camera_mode=getattr(pycolmap.CameraMode, mode), reader_options=reader,
+        scratch, folder / IMAGES, camera_mode=getattr(pycolmap.CameraMode, mode), reader_options=reader,
         extraction_options=extraction,
     )  # fmt: skip
+    _in_order(scratch, database)
     return database
+
+
+def _in_order(source: Path, target: Path) -> None:
+    """Copy cameras, images and features into a new database, numbered in the order of the images' names."""
+    cameras: dict[int, Any] = {}
+    rigs: dict[int, int] = {}
+    with pycolmap.Database.open(source) as old, pycolmap.Database.open(target) as new:
+        for image in sorted(old.read_all_images(), key=lambda image: image.name):
+            if image.camera_id not in cameras:
+                camera = old.read_camera(image.camera_id)
+                camera.camera_id = pycolmap.INVALID_CAMERA_ID
+                camera.camera_id = new.write_camera(camera)
+                rig = pycolmap.Rig()
+                rig.add_ref_sensor(camera.sensor_id)
+                cameras[image.camera_id], rigs[image.camera_id] = camera, new.write_rig(rig)
+            own = pycolmap.Image(name=image.name, camera_id=cameras[image.camera_id].camera_id)
+            own.image_id = number = new.write_image(own)
+            frame = pycolmap.Frame()
+            frame.rig_id = rigs[image.camera_id]
+            frame.add_data_id(own.data_id)
+            new.write_frame(frame)
+            new.write_keypoints(number, old.read_keypoints(image.image_id))
+            new.write_descriptors(number, old.read_descriptors(image.image_id))
 
 
 def match_all(database: Path) -> None:

@@ -59,29 +59,14 @@ class FirstFrame(Section):
         "images can pin down overfit the training views (ours)",
     )  # fmt: skip
     fill_points: int = Field(default=5_000, ge=0, description="random seeds in uncovered common view volume (ours)")
-    fill_min_views: int = Field(default=3, ge=1, description="a fill seed must be seen by this many training cameras")
-    fill_min_distance: float = Field(
-        default=0.3, ge=0, description="least distance of a fill seed to any camera, fraction of the rig's extent"
-    )
-    opacity: float = Field(default=0.1, gt=0, lt=1, description="initial opacity")
     lr_means: float = Field(default=1.6e-4, ge=0, description="learning rate of centres, fraction of the rig's extent")
     lr_means_final: float = Field(default=1.6e-6, ge=0, description="the same at the last iteration (log-linear)")
-    lr_quats: float = Field(default=0.001, ge=0, description="learning rate of raw quaternions")
-    lr_scales: float = Field(default=0.005, ge=0, description="learning rate of log scales")
-    lr_opacities: float = Field(default=0.05, ge=0, description="learning rate of opacity logits")
-    lr_sh0: float = Field(default=0.0025, ge=0, description="learning rate of degree-0 colour")
-    lr_shN: float = Field(default=0.000125, ge=0, description="learning rate of higher colour coefficients")
     densify_from: int = Field(default=300, ge=0, description="first iteration of densification and pruning")
-    densify_until: float = Field(default=0.6, ge=0, le=1, description="last, as a fraction of all iterations")
     densify_every: int = Field(default=100, ge=1, description="iterations between two densifications")
     densify_gradient: float = Field(
         default=3e-4, gt=0, description="mean screen gradient (half-width units) above which a Gaussian is densified"
     )
     max_gaussians: int = Field(default=60_000, ge=1, description="upper bound on the number of Gaussians")
-    prune_opacity: float = Field(default=0.01, ge=0, lt=1, description="Gaussians below this opacity are removed")
-    max_scale: float = Field(default=0.3, gt=0, description="Gaussians wider than this fraction of the rig's extent go")
-    scale_penalty: float = Field(default=0.1, ge=0, description="weight of the mean scale, in rig extents (ours)")
-    opacity_penalty: float = Field(default=0.01, ge=0, description="weight of the mean opacity (ours)")
     exposure: bool = Field(
         default=False, description="fit an affine colour map per training camera while optimising frame 0 (ours)"
     )

@@ -30,12 +30,13 @@ REPAIRS: tuple[tuple[str, str, Repair], ...] = (
 )  # fmt: skip
 
 
-def check_matches(cameras: Cameras, pairs: list[PairMatches]) -> list[Finding]:
+def check_matches(cameras: Cameras, pairs: list[PairMatches], *, rig_only: bool = False) -> list[Finding]:
     """Judge every camera by the matches with all others.
 
     Arguments:
         cameras: at the size of the images that were matched.
         pairs: verified matches of a pose-free geometry; pairs with fewer than 30 matches are not counted.
+        rig_only: only say what is wrong with the rig as a whole.
     """
     pairs = [pair for pair in pairs if len(pair.first) >= LEAST_MATCHES]
     limit = max(1.0, TOLERANCE * cameras.width)
@@ -50,6 +51,8 @@ def check_matches(cameras: Cameras, pairs: list[PairMatches]) -> list[Finding]:
         return []
     if 2 * len(bad) > len(involved) - 1:
         return _whole_rig(cameras, pairs, limit)
+    if rig_only:
+        return []
     return _swapped(cameras, pairs, bad, limit) or _each(cameras, pairs, bad, limit)
 
 

@@ -7,7 +7,7 @@ swapped.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.init.geometry import BoolArray, depth_range, focus_point, inside, project
 from gsstream.metrics.noise import noise_sigma
 from gsstream.scene.findings import Finding, error
+from gsstream.scene.match_checks import REPAIRS
 from gsstream.scene.picture_checks import Thumbnails
 
 GRID = 36
@@ -46,13 +47,9 @@ def check_sync(thumbs: Thumbnails) -> list[Finding]:
     if len(cameras) < 5 or len(thumbs.images) < 2 * REACH + 2:
         return []
     motion = _motion(thumbs)
-    votes = np.stack([motion.at(c, c) for c in range(len(cameras))], axis=2).astype(np.int16)
+    votes = _votes(motion)
     total, seen = votes.sum(2), motion.seen.sum(1)
-    scores = []
-    for c in range(len(cameras)):
-        others, watched = total - votes[:, :, c], seen - motion.seen[:, c]
-        scores.append(_scores(_hull(others, watched), motion, c))
-    table = np.array(scores)
+    table = _table(motion, votes)
     out_of_place = [c for c in range(len(cameras)) if 0 <= table[c, REACH] < AGREE and motion.masks[:, c].any()]
     if swapped := _swapped(motion, cameras, out_of_place, total, seen, votes):
         return swapped
@@ -66,8 +63,43 @@ def check_sync(thumbs: Thumbnails) -> list[Finding]:
                 f"{'late' if late > 0 else 'early'}: what moves is at another place than in the other cameras. Shift "
                 f"its frames by {-late:+d}, or run with data.time_offset={cameras.ids[c]}={late}"
             )))  # fmt: skip
+    if found and (better := _better_poses(thumbs, table)):
+        return better
     # A clock is off against a majority. Where half of the cameras seem to be, motion is too little or too slow to tell.
     return found if 2 * len(found) < len(cameras) else []
+
+
+def _votes(motion: _Motion) -> IntArray:
+    """[T, V, C] 1 where a camera sees motion in a voxel."""
+    return np.stack([motion.at(c, c) for c in range(motion.masks.shape[1])], axis=2).astype(np.int16)
+
+
+def _table(motion: _Motion, votes: IntArray) -> FloatArray:
+    """[C, 2 REACH + 1] scores of every camera against the hull of the others."""
+    total, seen = votes.sum(2), motion.seen.sum(1)
+    return np.array([
+        _scores(_hull(total - votes[:, :, c], seen - motion.seen[:, c]), motion, c) for c in range(votes.shape[2])
+    ])  # fmt: skip
+
+
+def _better_poses(thumbs: Thumbnails, table: FloatArray) -> list[Finding]:
+    """Whether poses of another convention put what moves at one place without touching a clock."""
+    on_time = _on_time(table)
+    for what, cure, repair in REPAIRS:
+        poses = np.stack([repair(pose) for pose in thumbs.cameras.viewmats])
+        motion = _motion(replace(thumbs, cameras=replace(thumbs.cameras, viewmats=poses)))
+        if _on_time(_table(motion, _votes(motion))) > max(AGREE, on_time + MARGIN):
+            return [error("axes", (
+                f"what moves is at one place in all cameras if the poses are {what}, and at several places as they are "
+                f"given: {cure}. Clocks were judged by poses that do not fit"
+            ))]  # fmt: skip
+    return []
+
+
+def _on_time(table: FloatArray) -> float:
+    """Mean score of the cameras as they are; 0 where fewer than half of them can be judged."""
+    known = table[table[:, REACH] >= 0, REACH]
+    return float(known.mean()) if 2 * len(known) >= len(table) else 0.0
 
 
 def _motion(thumbs: Thumbnails) -> _Motion:

@@ -91,7 +91,11 @@ def _stages(source: FrameSource, open_scene: Open, frames: int, features: bool) 
     yield check_blank(thumbs)
     yield check_same(thumbs)
     yield check_change(thumbs)
-    yield check_sync(thumbs)
+    clocks = check_sync(thumbs)
+    if clocks and features:
+        # Poses that are wrong as a whole also put what moves at different places: the clocks may be right.
+        yield [finding for finding in _matched(rig, *first, rig_only=True) if finding.severity == "error"]
+    yield clocks
     if features:
         yield _matched(rig, *first)
 
@@ -105,7 +109,7 @@ def _thumbnails(source: FrameSource, open_scene: Open, rig: Cameras, frames: int
         small.close()
 
 
-def _matched(rig: Cameras, train: Frame, test: Frame) -> list[Finding]:
+def _matched(rig: Cameras, train: Frame, test: Frame, *, rig_only: bool = False) -> list[Finding]:
     if importlib.util.find_spec("pycolmap") is None:
         return [note("epipolar", "the calibration was not compared with the pictures: pip install 'gsstream[sfm]'")]
     images = np.concatenate([train.images, test.images])
@@ -116,6 +120,6 @@ def _matched(rig: Cameras, train: Frame, test: Frame) -> list[Finding]:
     # The crop keeps the image corner, so only the size changes before the scale does.
     cameras = replace(rig, width=width * factor, height=height * factor).scaled(width, height)
     try:
-        return check_matches(cameras, match_images(images))
+        return check_matches(cameras, match_images(images), rig_only=rig_only)
     except InputError as fault:
         return [note("epipolar", f"the calibration was not compared with the pictures: {fault}")]

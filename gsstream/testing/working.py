@@ -19,6 +19,8 @@ from gsstream.testing.stepping import SOURCE, MethodUnderTest
 
 #: Sigmas beyond which tiles count as changed.
 THRESHOLD = 6.0
+#: Index that the frame at work is given: none of those in which a chain is encoded.
+INDEX = 7
 
 
 class AtWork(NamedTuple):
@@ -48,9 +50,9 @@ def at_work(*, changed: bool = True) -> AtWork:
     assert change is not None
     if not changed:
         change = Change(torch.zeros_like(change.tiles), change.height, change.width)
-    frame = replace(frame, cameras=state.previous.cameras)
+    frame = replace(frame, index=INDEX, cameras=state.previous.cameras)
     view = FrameView(method.parts, state.gaussians, state.hierarchy, frame, state.previous, state.exposure, change)
-    return AtWork(state.player.scene, view, Rng(method.seed))
+    return AtWork(state.player.scene, view, Rng(method.parts.recipe.seed))
 
 
 def method_with(slot: str, part: Part) -> MethodUnderTest:

@@ -321,7 +321,8 @@ class TestDelta:
             apply_delta(Scene(make(5), self.layout()), self.delta(**changes))
 
     @pytest.mark.parametrize("kinds", [
-        (Residual, Motion), (Rows, Motion), (Rows, Residual), (Residual, Residual), (Rows, Rows), (Motion, Rows, Motion),
+        (Residual, Motion), (Rows, Motion), (Rows, Residual), (Residual, Residual), (Rows, Rows),
+        (Motion, Rows, Motion),
     ])  # fmt: skip
     def test_changes_in_another_order_are_refused(self, kinds: tuple[type, ...]) -> None:
         some = {

@@ -80,3 +80,26 @@ def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     source = SyntheticSource.from_query("width=16&height=16&views=3")
     with pytest.raises(InputError, match=r"pip install 'gsstream\[sfm\]'"):
         sfm.triangulate_points(source.frame(0).images, source.info.train)
+
+
+@pytest.mark.sfm
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system does not choose processors")
+def test_the_number_of_processors_changes_no_bit() -> None:
+    """Images of different sizes of work finish in another order than they began; the database must not show it."""
+    pytest.importorskip("pycolmap")
+    from gsstream.init.mapping import reconstruct
+    from gsstream.source.open import open_source
+
+    images = open_source("synthetic:width=240&height=180&views=5&frames=1&static=true").frame(0).images
+    large = [np.kron(images[0], np.ones((3, 3, 1), np.float32)), *images[1:]]  # the first takes longest
+    before, found = os.sched_getaffinity(0), []
+    try:
+        for cores in (before, {min(before)}, before):
+            os.sched_setaffinity(0, cores)
+            found.append(reconstruct(large, model="PINHOLE", shared=False))
+    finally:
+        os.sched_setaffinity(0, before)
+    for other in found[1:]:
+        assert other.xyz.tobytes() == found[0].xyz.tobytes()
+        assert other.viewmats.tobytes() == found[0].viewmats.tobytes()
+    assert len(found[0].xyz) > 5

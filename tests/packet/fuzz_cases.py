@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from packet_scenes import decode_all, make_packets
+from packet_scenes import decode_all, make_moving_packets, make_packets
 
 from gsstream.core.gaussians import Gaussians
 from gsstream.packet import EncodedPacket, PacketKind
@@ -30,7 +30,7 @@ class Base:
 
 
 def bases() -> list[Base]:
-    """Streams with every packet kind; no view-dependent colour, one Gaussian, births and deaths, an index each."""
+    """Streams with every kind of packet and change, also without view-dependent colour and of one Gaussian."""
     settings = [
         {"seed": 21, "frames": 5, "key_at": 3, "number": 8, "nodes": 4, "sh_rest": 0},
         {"seed": 22, "frames": 4, "key_at": 9, "number": 40, "nodes": 12, "sh_rest": 3},
@@ -38,7 +38,12 @@ def bases() -> list[Base]:
         {"seed": 24, "frames": 4, "key_at": 9, "number": 300, "nodes": 90, "sh_rest": 0},
         {"seed": 25, "frames": 5, "key_at": 9, "number": 30, "nodes": 9, "sh_rest": 3, "edits": (1, 3)},
     ]
-    return [_base(make_packets(**kwargs)) for kwargs in settings]
+    moving = [
+        {"seed": 26, "number": 30, "nodes": 9, "sh_rest": 0},
+        {"seed": 27, "number": 3, "nodes": 2, "sh_rest": 3},
+    ]
+    packets = [make_packets(**kwargs) for kwargs in settings] + [make_moving_packets(**kwargs) for kwargs in moving]
+    return [_base(some) for some in packets]
 
 
 def _base(packets: list[EncodedPacket]) -> Base:
@@ -104,6 +109,8 @@ def _sections(rng: np.random.Generator, base: Base) -> bytes:
         return _damage(rng, base)
     names = list(sections)
     target = names[int(rng.integers(len(names)))]
+    if "motion" in sections and rng.random() < 0.5:
+        target = "motion"
     changed = [(n, _payload(rng, n, s.data) if n == target else s.data) for n, s in sections.items()]
     packets[at] = build_packet(header.kind, header.frame, changed)
     return _join(packets)
@@ -113,7 +120,20 @@ def _payload(rng: np.random.Generator, name: str, data: bytes) -> bytes:
     # Compressed text is opened first: a flipped bit in a zstandard frame would never reach the reader of the text.
     if name == "meta" and rng.random() < 0.8:
         return compress(_scramble(rng, decompress(data, 1 << 24)))
+    if name == "motion" and rng.random() < 0.5:
+        return _heads(rng, data)
     return _scramble(rng, data) if rng.random() < 0.95 else rng.bytes(int(rng.integers(40)))
+
+
+def _heads(rng: np.random.Generator, data: bytes) -> bytes:
+    """Flags, shades and steps of the first motion replaced by others that could be, and by some that could not."""
+    at = 1 if data[0] == 1 else 1 + next(i for i, byte in enumerate(data[1:], 1) if byte < 128)
+    steps = rng.choice([0.0, 1e-30, 0.01, 1.0, 1e8, 1e9, -1.0, np.nan, np.inf], 3, p=[0.02, *[0.23] * 4, *[0.015] * 4])
+    head = struct.pack("<BBfff", int(rng.integers(5)), int(rng.integers(18)), *steps.tolist())
+    for start, end in ((0, 1), (1, 2), (2, 6), (6, 10), (10, 14)):
+        if rng.random() < 0.4:
+            data = data[: at + start] + head[start:end] + data[at + end :]
+    return data
 
 
 def _lying_sections(rng: np.random.Generator, base: Base) -> bytes:

@@ -115,8 +115,8 @@ def make_motions(rng: np.random.Generator, scene: Scene, number: int, **said: bo
 
 
 def make_moving_packets(seed: int = 0, **sizes: int) -> list[EncodedPacket]:
-    """Key, then frames that move: from rest, predicted, corrected with a residual, still, formed anew, two at once, with
-    births after the motion, predicted with what was born.
+    """Key, then frames that move: from rest, predicted, corrected with a residual, still, of groups formed anew, two
+    motions at once, with births after the motion, predicted with what was born.
     """
     rng = np.random.default_rng(seed)
     state = decode_packet(None, encode_key(make_key(rng, **sizes)).data)
@@ -146,6 +146,19 @@ def make_moving_packets(seed: int = 0, **sizes: int) -> list[EncodedPacket]:
     add(Delta((moved(), *make_edit(rng, state).changes)))
     add(Delta((moved(),)))
     return packets
+
+
+def begin(rng: np.random.Generator, number: int = 40, nodes: int = 12, reach: float = 1.0) -> PlayerState:
+    """The state after a key packet; ``reach`` scales where the Gaussians are."""
+    key = make_key(rng, number, nodes)
+    means = (key.gaussians.means * np.float32(reach)).astype(np.float32)
+    key = replace(key, gaussians=replace(key.gaussians, means=means))
+    return decode_packet(None, encode_key(key).data)
+
+
+def follow(state: PlayerState, delta: Delta) -> PlayerState:
+    """What players have after the packet of a delta."""
+    return decode_packet(state, encode_delta(delta, state.layout, state.decoders, frame=state.frame + 1).data)
 
 
 def make_packets(

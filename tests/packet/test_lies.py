@@ -75,8 +75,9 @@ def test_impossible_attribute_headers_are_refused(mode, channels, step):
     state = make_key(rng, 10, 4)
     packet = encode_delta(make_delta(rng, state.layout, 1.0, 1, latent=False), state.layout, {}, frame=1)
     old = parse_packet(packet.data)[1]["means"].data
+    lie = replaced(packet, "means", struct.pack("<BBf", mode, channels, step) + old[6:])
     with pytest.raises(PacketError):
-        decode_delta(replaced(packet, "means", struct.pack("<BBf", mode, channels, step) + old[6:]), Scene(state.gaussians, state.layout), {})
+        decode_delta(lie, Scene(state.gaussians, state.layout), {})
 
 
 def test_huge_residuals_cannot_overflow_the_scene():

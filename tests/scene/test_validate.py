@@ -93,3 +93,40 @@ def test_what_a_fault_is_follows_from_its_kind_and_not_from_its_words() -> None:
 
     assert fails(FilesMissing("reworded")) == ["files"]
     assert fails(SourceError("3 frames are missing from what I think")) == ["calibration"]
+
+
+@pytest.mark.sfm
+@needs_pycolmap
+def test_wrong_poses_are_not_taken_for_wrong_clocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Camera-to-world in place of world-to-camera also puts what moves at different places; shifting frames would spoil
+    a recording that is in step."""
+    from gsstream.scene import validate as module
+    from gsstream.scene.findings import error
+
+    write_good(tmp_path / "good")
+    folder = spoiled(tmp_path / "good", tmp_path / "bad", next(b for b in BAD if b.name == "camera-to-world"))
+    # Whatever the hull of motion makes of these poses: here it blames a clock, as it does on the demo.
+    monkeypatch.setattr(module, "check_sync", lambda _: [error("sync", "camera 'cam00' is 3 frames late")])
+    found = findings(folder)
+    assert [finding.code for finding in found] == ["epipolar"]
+    assert "invert w2c" in found[0].message
+    assert [finding.code for finding in findings(tmp_path / "good")] == ["sync"], "with sound poses it is heard"
+
+
+def test_the_demo_with_inverted_poses_is_told_so_without_features(tmp_path: Path) -> None:
+    """Its pictures are too small for features; motion alone must not send its user to the clocks."""
+    import shutil
+
+    import numpy as np
+
+    from gsstream.source.open import DEMO_FOLDER
+
+    shutil.copytree(DEMO_FOLDER, tmp_path / "c2w")
+    path = tmp_path / "c2w" / "cameras.json"
+    data = json.loads(path.read_text())
+    for camera in data["cameras"]:
+        camera["w2c"] = np.linalg.inv(np.array(camera["w2c"])).tolist()
+    path.write_text(json.dumps(data))
+    found = validate(lambda scale: open_source(str(tmp_path / "c2w"), scale), features=False)
+    assert [finding.code for finding in found] == ["axes"]
+    assert "invert w2c" in found[0].message

@@ -102,3 +102,13 @@ def test_absurd_points_are_refused(what: str, tmp_path: Path) -> None:
     (tmp_path / "p.npz").write_bytes(POINTS[what])
     with pytest.raises(SourceError, match=r"p\.npz"):
         read_points(tmp_path / "p.npz", "recording")
+
+
+def test_a_shape_that_lies_is_refused(tmp_path: Path) -> None:
+    from gsstream.source.layouts.llff import _load
+
+    header = "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000000, 17), }"
+    text = header.encode().ljust(118) + b"\n"
+    (tmp_path / "poses_bounds.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text)
+    with pytest.raises(SourceError, match="poses_bounds"):
+        _load(tmp_path / "poses_bounds.npy")

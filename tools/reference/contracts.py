@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import sys
 from typing import Any
 
 from tools.reference.text import NOTE, ROOT, cell, signature
@@ -12,15 +13,20 @@ from tools.reference.text import NOTE, ROOT, cell, signature
 def checks() -> str:
     """Every check of the contract kit, the claim that calls for it, and the saboteur that proves it can fail."""
     from gsstream.testing.kit import all_checks
-    from gsstream.testing.saboteurs import saboteur_of
+
+    folder = str(ROOT / "tests" / "contract")
+    sys.path.insert(0, folder)
+    try:
+        saboteur_of = importlib.import_module("saboteurs").saboteur_of
+    finally:
+        sys.path.remove(folder)
 
     lines = [NOTE, "# Checks of the contract kit", ""]
     lines += [
         "What every part promises. `gsstream check NAME` makes the checks of a part, a plugin or a method;",
         "`gsstream.testing.parametrize_with_checks` makes one test of each. A check with a claim is made on parts",
-        "whose traits claim it, and is otherwise skipped and counted. Each check has a saboteur: a "
-        "part that is wrong in one",
-        "way and fails this check alone.",
+        "whose traits claim it, and is otherwise skipped and counted. Each check has a saboteur: a part that is wrong",
+        "in one way and fails this check alone (`tests/contract/test_saboteurs.py`).",
         "",
     ]
     kinds = list(dict.fromkeys(entry.kind for entry in all_checks()))
@@ -92,8 +98,8 @@ def hooks() -> str:
     lines += ["## Rules of `auto`", "", usage]
     lines += ["([how](../howto/auto.md)). What a rule is told:", "", "```", rules, "```", ""]
     lines += ["## Traits", "", "What a part claims, `traits = GateTraits(...)`; each claim calls for checks.", ""]
-    for kind in PART_KINDS.values():
-        record = Traits if kind.contract is None else type(kind.contract_class().traits)
+    for part_kind in PART_KINDS.values():
+        record = Traits if part_kind.contract is None else type(part_kind.contract_class().traits)
         if record is not Traits:
             lines += [f"### {record.__name__}", "", "```", inspect.getdoc(record) or "", "```", ""]
     return "\n".join(lines)

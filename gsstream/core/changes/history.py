@@ -34,7 +34,13 @@ class Displacement:
 def displacement(
     before: Gaussians[FloatArray], after: Gaussians[FloatArray], rows: IntArray
 ) -> Displacement | None:
-    """Measure what a frame did to ``rows`` [A], ascending, all that it may have touched; None when nothing moved."""
+    """Measure how far a frame moved and turned rows; None when nothing moved.
+
+    Arguments:
+        before: scene of the frame before, raw values.
+        after: scene after motions and residual, the same N rows.
+        rows: [A] int64, ascending, all that the frame may have touched.
+    """
     with np.errstate(over="ignore"):  # beyond float32 it is infinite; a motion predicted from that is refused
         shift = after.means[rows] - before.means[rows]
     turn = turn_between(before.quats[rows], after.quats[rows])

@@ -101,6 +101,12 @@ def groups_for(scene: Scene, cell: float, shades: int, regroup: bool = False) ->
 
     Rows are of one group when their centres lie in one cell of a regular grid and their colours in one class of
     brightness. Groups are numbered by cell (x, then y, then z), then brightness.
+
+    Arguments:
+        scene: decoded, as both ends have it.
+        cell: side of a cell, scene units; a float32 above 0.
+        shades: number of classes of brightness, 1 to 16.
+        regroup: form the groups anew, even if the scene knows some of this cell and these shades.
     """
     known = scene.groups
     if known is not None and not regroup and known.cell == cell and known.shades == shades:
@@ -119,6 +125,12 @@ def moves_of(scene: Scene, groups: Groups, moving: IntArray, predicted: bool) ->
     """Return the moving rows and the predicted transform of their groups, before any correction.
 
     Means over rows are float64 sums in the order of rows, divided by their number.
+
+    Arguments:
+        scene: decoded, as both ends have it.
+        groups: G groups of its rows.
+        moving: [G] uint8, 1 for the K groups that move.
+        predicted: start from the mean displacement of a group's rows in the last frame, else from rest.
     """
     which = np.flatnonzero(moving)
     rank = np.full(groups.count, -1, np.int64)

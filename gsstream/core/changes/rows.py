@@ -83,20 +83,38 @@ def apply_rows(scene: Scene, rows: Rows) -> Scene:
 
 
 def own_nodes(gaussians: Gaussians[FloatArray], unit_of: IntArray, num_nodes: int) -> Births:
-    """Births that each bring a root node of their own (no grouping); ``num_nodes`` is M before them."""
+    """Return births that each bring a root node of their own, so that they share a gate with nobody.
+
+    Arguments:
+        gaussians: B rows, raw values.
+        unit_of: [B] uint8, which of the layout's units each has.
+        num_nodes: M, nodes before the births.
+    """
     nodes = num_nodes + np.arange(len(gaussians), dtype=np.int64)
     return Births(gaussians, nodes, np.asarray(unit_of, np.uint8), nodes)
 
 
 def in_nodes(gaussians: Gaussians[FloatArray], nodes: IntArray, unit_of: IntArray) -> Births:
-    """Births into existing nodes, given in any order: copies stay in the node of what they were copied from."""
+    """Return births into existing nodes; a copy stays in the node of what it was copied from.
+
+    Arguments:
+        gaussians: B rows, raw values, in any order.
+        nodes: [B] int64 node of each, 0 to M - 1.
+        unit_of: [B] uint8, which of the layout's units each has.
+    """
     order = np.argsort(nodes, kind="stable")
     units = np.asarray(unit_of, np.uint8)[order]
     return Births(gaussians.rows(order), np.asarray(nodes, np.int64)[order], units, np.zeros(0, np.int64))
 
 
 def gather_rows(node_of: IntArray, births: Births | None, deaths: IntArray) -> IntArray:
-    """[N'] int64: which row (of ``node_of``) each row of the scene afterwards was before; N + j is birth j."""
+    """Return [N'] int64: which row each row of the scene afterwards was before; N + j is birth j.
+
+    Arguments:
+        node_of: [N] node of each row before, ascending.
+        births: rows that join, or None.
+        deaths: [D] rows that leave, ascending.
+    """
     kept = np.delete(np.arange(len(node_of), dtype=np.int64), deaths)
     if births is None or not len(births):
         return kept
@@ -105,7 +123,14 @@ def gather_rows(node_of: IntArray, births: Births | None, deaths: IntArray) -> I
 
 
 def next_counts(node_counts: IntArray, node_of: IntArray, births: Births | None, deaths: IntArray) -> IntArray:
-    """[M + K] int32 Gaussians of each node after births and deaths."""
+    """Return [M + K] int32: Gaussians of each node after births and deaths.
+
+    Arguments:
+        node_counts: [M] Gaussians of each node before.
+        node_of: [N] node of each row before.
+        births: rows that join, with K new nodes; or None.
+        deaths: [D] rows that leave, ascending.
+    """
     counts = np.asarray(node_counts, np.int64) - np.bincount(node_of[deaths], minlength=len(node_counts))
     if births is not None:
         counts = np.concatenate([counts, np.zeros(len(births.parents), np.int64)])
@@ -114,13 +139,26 @@ def next_counts(node_counts: IntArray, node_of: IntArray, births: Births | None,
 
 
 def join_rows(old: Table, born: Table | None, source: IntArray) -> Table:
-    """Rows of an attribute after births and deaths; ``source`` is :func:`gather_rows`."""
+    """Return the rows of one attribute after births and deaths.
+
+    Arguments:
+        old: [N, ...] rows before.
+        born: [B, ...] rows that join, or None.
+        source: [N'] what :func:`gather_rows` returned.
+    """
     joined: Table = (old if born is None else np.concatenate([old, born]))[source]
     return joined
 
 
 def check_births(births: Births, num_nodes: int, num_units: int, shapes: Sequence[tuple[str, int]]) -> None:
-    """Raise ShapeError unless the births fit a scene of M nodes and H units; ``shapes`` name attributes and widths."""
+    """Raise ShapeError unless the births fit a scene of M nodes and H units.
+
+    Arguments:
+        births: rows that join.
+        num_nodes: M.
+        num_units: H.
+        shapes: (attribute, number of values per row) of the scene.
+    """
     number, new = len(births.nodes), len(births.parents)
     if len(births.gaussians) != number or len(births.unit_of) != number:
         raise ShapeError(

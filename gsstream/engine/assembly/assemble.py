@@ -90,7 +90,7 @@ class Assembly:
             object.__setattr__(self, slot, guard(slot, getattr(self, slot), self.where, self.checks))
 
     def part(self, slot: str) -> Part:
-        """The part of a slot itself, without its guard."""
+        """Return the part of a slot itself, without its guard."""
         part: Part = plain(getattr(self, slot))
         return part
 
@@ -157,14 +157,14 @@ def _written_out(slot: str, ref: ComponentRef, part: Part, pending: list[KeyPath
 
 
 def value_at(params: Any, key: str) -> Any:
-    """The value under a dotted key; None where there is none."""
+    """Return the value under a dotted key; None where there is none."""
     for name in key.split("."):
         params = params.get(name) if isinstance(params, Mapping) else None
     return params
 
 
 def with_values(params: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """``params`` with the values under dotted keys; None takes a key away."""
+    """Return ``params`` with the values under dotted keys; the value None takes a key away."""
     out: dict[str, Any] = copy.deepcopy(dict(params))
     for key, value in values.items():
         *above, name = key.split(".")

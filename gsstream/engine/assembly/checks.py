@@ -67,6 +67,12 @@ class Look:
         """Raise ComponentError unless ``value`` is a finite floating point tensor of this shape, within ``limits``.
 
         Type and shape are always looked at; numbers once per frame, and with the level "step" in every iteration.
+
+        Arguments:
+            what: the call, for the error: ``"estimate()"``.
+            value: what it returned.
+            shape: that it must have.
+            limits: least and largest value allowed; None: any finite one.
         """
         if not isinstance(value, torch.Tensor) or not value.dtype.is_floating_point:
             got = str(value.dtype) if isinstance(value, torch.Tensor) else type(value).__name__
@@ -78,12 +84,12 @@ class Look:
             self.values(what, value, limits=limits)
 
     def looks(self, least: Checks) -> bool:
-        """Whether the level is at least this one."""
+        """Say whether the level is at least this one."""
         order = list(Checks)
         return order.index(self.level) >= order.index(least)
 
     def step_values(self, what: str, values: Mapping[str, torch.Tensor]) -> None:
-        """With the level "step", look at each of several tensors (:meth:`values`); their names follow ``what``."""
+        """Check each of several tensors with the level "step"; their names follow ``what`` in errors."""
         if self.level is Checks.STEP:
             for name, tensor in values.items():
                 self.values(f"{what} {name}", tensor)
@@ -112,16 +118,21 @@ class Look:
                 raise self.fault(f"penalty {name!r}: expected one finite number, got {got}")
 
     def fault(self, message: str) -> Exception:
-        """The error about this part, here and now."""
+        """Return the error about this part, here and now."""
         return fault(message, self.slot, self.part, self.where)
 
 
 def wrong_value(
     value: torch.Tensor, limits: tuple[float, float] | None = None, rows: torch.Tensor | None = None
 ) -> str:
-    """Say which number is not finite or not within ``limits``; empty when all are.
+    """Say which number is not finite or not within the limits; empty when all are.
 
     ``rows`` as in :meth:`Look.values`.
+
+    Arguments:
+        value: any tensor.
+        limits: least and largest value allowed; None: any finite one.
+        rows: as in :meth:`Look.values`.
     """
     if value.numel() == 0:
         return ""

@@ -22,8 +22,16 @@ SESSION = "session"
 def blaming(slot: str, part: object, where: Where) -> Iterator[None]:
     """Turn what a part raises into a ComponentError with slot, part, distribution, frame and iteration.
 
+    A ShapeError is turned, too: it says that this part refuses what another part gave it. Of a renderer so is every
+    InputError, because a renderer is given nothing but arrays. Other errors of gsstream pass unchanged.
+
     So does what the part refuses of another's: a ShapeError, and of a renderer every InputError, because it is given
     nothing but arrays. Other errors of gsstream pass unchanged.
+
+    Arguments:
+        slot: of the part.
+        part: the part itself.
+        where: frame and iteration at the moment of the call.
     """
     try:
         yield
@@ -47,7 +55,7 @@ class Guarded:
 
     @classmethod
     def session(cls, session: RenderSession, guarded: Guarded) -> Guarded:
-        """A session of a guarded renderer, blamed under the renderer's name."""
+        """Return a session of a guarded renderer, behind a guard that names the renderer."""
         made = cls(guarded._slot, guarded._part, guarded._where, guarded._level, SESSION)
         made._subject = session
         return made
@@ -87,7 +95,14 @@ class Guarded:
 
 
 def guard(slot: str, part: T, where: Where, level: Checks) -> T:
-    """Return the part behind a guard; one that is guarded already gets this place and this level."""
+    """Return the part behind a guard; one that is guarded already gets this place and this level.
+
+    Arguments:
+        slot: of the part.
+        part: a live part, guarded or not.
+        where: the place that errors name, shared by all parts of a run.
+        level: how closely results are looked at.
+    """
     return cast(T, Guarded(slot, plain(part), where, level))
 
 

@@ -28,7 +28,7 @@ Try = Callable[[Assembly, Trial | None], Trial]
 def try_out(
     parts: Assembly, usual: Mapping[str, Any], trial: Try, say: Callable[[str], None]
 ) -> Assembly:
-    """The assembly with the choices that have a ladder moved to where short fits are best.
+    """Return the assembly with every choice that has a ladder moved to where short fits are best.
 
     It starts from the rules' choice or from the usual values, whichever is better. One key after the other, those
     that were chosen last first (they correct what the others left), a value goes up its ladder, or else down, while

@@ -23,7 +23,7 @@ SMALL = 1e-3
 
 
 def colour_gain(images: FloatArray, cameras: Cameras, xyz: FloatArray) -> tuple[float, float, float]:
-    """dB by which degrees 1, 2 and 3 predict a left-out camera's colour of a seed better than degree 0.
+    """Return, in dB, how much better degrees 1 to 3 predict a left-out camera's colour of a seed than degree 0.
 
     Each seed's colours in the cameras that see it are fitted by harmonics of the viewing direction, with a prior
     towards no dependence; the error is that of each camera predicted from the others (closed form of ridge regression).
@@ -48,7 +48,7 @@ def colour_gain(images: FloatArray, cameras: Cameras, xyz: FloatArray) -> tuple[
 
 
 def can_judge(degree: int, cameras: int) -> bool:
-    """Whether a degree has fewer coefficients than there are cameras: with one left out, the others still fix them."""
+    """Say whether a degree has fewer coefficients than there are cameras when one of them is left out."""
     return (degree + 1) ** 2 < cameras
 
 

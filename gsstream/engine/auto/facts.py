@@ -18,7 +18,7 @@ MOST_NEIGHBOURS = 500
 
 
 def scene_facts(points: PointCloud, frame: Frame) -> SceneFacts:
-    """The facts that rules of ``auto`` choose by. Test cameras have no part in them.
+    """Return the facts that rules of ``auto`` choose by. Test cameras have no part in them.
 
     Raises InputError without points or training cameras.
     """

@@ -32,7 +32,7 @@ DEGREE = "first_frame.sh_degree"
 
 
 def sh_degree(facts: SceneFacts) -> Choice:
-    """The least degree of harmonics after which no further one helps a camera that was left out (ours).
+    """Return the least degree of harmonics after which no further one helps a camera that was left out.
 
     With too few cameras to judge the usual degree, that one.
     """
@@ -49,7 +49,7 @@ def sh_degree(facts: SceneFacts) -> Choice:
 
 
 def settle(parts: Assembly, facts: Callable[[], SceneFacts], known: Mapping[str, Choice]) -> Assembly:
-    """The assembly with every ``auto`` replaced by a value.
+    """Return the assembly with every ``auto`` replaced by a value.
 
     Arguments:
         facts: asked only when a rule has to choose.
@@ -70,7 +70,7 @@ def settle(parts: Assembly, facts: Callable[[], SceneFacts], known: Mapping[str,
 
 
 def stream_extra(path: Path) -> Mapping[str, Any] | None:
-    """What the first key packet of a stream says about its run; None when it is not complete."""
+    """Return what the first key packet of a stream says about its run; None when it is not complete."""
     if not path.exists() or path.stat().st_size < FILE_HEADER.size:
         return None
     with StreamReader(path) as reader:
@@ -80,7 +80,7 @@ def stream_extra(path: Path) -> Mapping[str, Any] | None:
 
 
 def recall(parts: Assembly, extra: Mapping[str, Any]) -> Assembly:
-    """The assembly with the choices that a stream records; ``extra`` is that of its key packet.
+    """Return the assembly with the choices that a stream records; ``extra`` is that of its key packet.
 
     Also for a recipe that gives these values itself: the record goes on in later key packets.
 
@@ -97,26 +97,26 @@ def recall(parts: Assembly, extra: Mapping[str, Any]) -> Assembly:
 
 
 def taken_over(first: PlayerState) -> dict[str, Choice]:
-    """What stands already when frame 0 is another stream's: its own choices, and its degree of harmonics."""
+    """Return the choices that stand already when frame 0 is another stream's, its degree of harmonics included."""
     known = recorded(first.meta.extra)
     degree = first.gaussians.sh_degree
     return {DEGREE: Choice(degree, "the frame 0 that is taken over has this degree"), **known}
 
 
 def record(parts: Assembly) -> dict[str, Any]:
-    """What a key packet and the metrics say about the choices: key -> value and why; empty when nothing was chosen."""
+    """Return what a key packet and the metrics say about the choices: key -> value and reason; empty without any."""
     if not parts.chosen:
         return {}
     return {"auto": {key: {"value": c.value, "why": c.why} for key, c in parts.chosen.items()}}
 
 
 def lines(parts: Assembly) -> list[str]:
-    """What a run says about the choices."""
+    """Return the lines in which a run tells a person what was chosen."""
     return [f"auto: {key} = {choice.value} ({choice.why})" for key, choice in parts.chosen.items()]
 
 
 def recorded(extra: Mapping[str, Any]) -> dict[str, Choice]:
-    """Inverse of :func:`record`."""
+    """Return the choices of which :func:`record` made this value."""
     return {key: Choice(entry["value"], entry["why"]) for key, entry in extra.get("auto", {}).items()}
 
 
@@ -137,7 +137,12 @@ def _part(parts: Assembly, slot: str) -> Part:
 
 
 def put(parts: Assembly, path: KeyPath, choice: Choice) -> Assembly:
-    """The assembly with one value in its place: in the part, in the recipe, and with its provenance.
+    """Return the assembly with one value in its place: in the part, in the recipe, and with its provenance.
+
+    Arguments:
+        parts: the assembly before.
+        path: of the key that was ``auto``.
+        choice: the value, and why.
 
     Raises ComponentError for a value that the part does not accept.
     """

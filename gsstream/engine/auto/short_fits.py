@@ -56,21 +56,26 @@ class Trial:
         return self.psnr - HALVED * math.log2(self.size)
 
     def gain(self, other: Trial) -> float:
-        """What this scores more than another in the folds that both have, dB; negative: less."""
+        """Return what this scores more than another in the folds that both have, dB; negative: less."""
         shared = min(len(self.folds), len(other.folds))
         mine, theirs = (replace(trial, folds=trial.folds[:shared]) for trial in (self, other))
         return mine.score - theirs.score
 
     def beats(self, other: Trial, margin: float = 0.0) -> bool:
-        """Whether it gains more than ``margin``; one that was given up beats nothing with more folds."""
+        """Say whether it gains more than ``margin``; one that was given up beats nothing with more folds."""
         return len(self.folds) >= len(other.folds) and self.gain(other) > margin
 
 
 def left_out(count: int, share: float, folds: int) -> list[list[int]]:
-    """Which of ``count`` training cameras trials do without, fold by fold.
+    """Return which training cameras the trials do without, fold by fold.
 
     Each fold leaves out about that share, at least one, evenly spread; no camera is in two of them. There are as many
     folds as are asked for, or as there are cameras for; none when there are too few cameras to spare one.
+
+    Arguments:
+        count: number of training cameras.
+        share: share of them that a fold leaves out, 0 to 1.
+        folds: number of folds asked for.
     """
     if count < LEAST_CAMERAS:
         return []
@@ -131,7 +136,7 @@ def _judged(parts: Assembly, gaussians: Gaussians[torch.Tensor], judges: Frame) 
 
 
 def colour_matched(image: FloatArray, target: FloatArray) -> FloatArray:
-    """``image`` [H, W, 3] under the affine colour map that brings it nearest to ``target``, clipped to [0, 1]."""
+    """Return ``image`` [H, W, 3] under the affine colour map that brings it nearest to ``target``, in [0, 1]."""
     pixels = np.concatenate([image.reshape(-1, 3), np.ones((image[..., 0].size, 1))], 1, dtype=np.float64)
     colours = np.linalg.lstsq(pixels, target.reshape(-1, 3).astype(np.float64), rcond=None)[0]
     return (pixels @ colours).clip(0, 1).astype(np.float32).reshape(image.shape)

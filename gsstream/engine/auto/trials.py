@@ -28,7 +28,7 @@ def choose(
     first: PlayerState | None,
     say: Callable[[str], None],
 ) -> Assembly:
-    """The assembly with every ``auto`` replaced by what this scene decides.
+    """Return the assembly with every ``auto`` replaced by what this scene decides.
 
     Rules choose first; where frame 0 is made here and training cameras can be spared, trials go on from there.
 
@@ -48,7 +48,7 @@ def choose(
 
 
 def usual_values(parts: Assembly) -> dict[str, Any]:
-    """What stands in the parts where the recipe says ``auto``, by key: the defaults."""
+    """Return the defaults of the parts where the recipe says ``auto``, by key."""
     usual: dict[str, Any] = {DEGREE: USUAL_DEGREE}
     for slot, *inner in parts.pending:
         if slot != "first_frame":

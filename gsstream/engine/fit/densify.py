@@ -8,6 +8,7 @@ import torch
 
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.topology import TopologyEdit
+from gsstream.engine.fit.schedule import MAX_SCALE, PRUNE_OPACITY
 from gsstream.recipe.model import FirstFrame
 from gsstream.render.activations import activate_opacities, activate_scales, rotation_matrices
 
@@ -48,7 +49,7 @@ def grow_and_prune(
     Returns the edit and the new contents of every attribute. The population never exceeds ``settings.max_gaussians``.
     """
     largest = activate_scales(gaussians.scales).amax(1)
-    keep = (activate_opacities(gaussians.opacities) > settings.prune_opacity) & (largest < settings.max_scale * extent)
+    keep = (activate_opacities(gaussians.opacities) > PRUNE_OPACITY) & (largest < MAX_SCALE * extent)
     budget = max(0, settings.max_gaussians - int(keep.sum()))
     score = torch.where(keep, statistics.mean, torch.zeros_like(largest))
     hot = (score > settings.densify_gradient).nonzero()[:, 0]

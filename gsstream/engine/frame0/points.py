@@ -10,6 +10,7 @@ import numpy as np
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.rng import Rng
+from gsstream.engine.fit.schedule import FILL_MIN_DISTANCE, FILL_MIN_VIEWS
 from gsstream.init.seeding import fill_volume, photo_consistent_seeds, thin_points
 from gsstream.recipe.model import FirstFrame
 from gsstream.source.base import FrameSource, PointKind
@@ -41,8 +42,8 @@ def gather_points(
         frame.images,
         frame.cameras,
         min(settings.fill_points, limit),
-        min_views=settings.fill_min_views,
-        min_distance=settings.fill_min_distance * frame.cameras.extent,
+        min_views=FILL_MIN_VIEWS,
+        min_distance=FILL_MIN_DISTANCE * frame.cameras.extent,
         rng=rng.numpy("fill", frame.index),
     )
     return join(cloud, fill)

@@ -20,6 +20,7 @@ from gsstream.core.rng import Rng
 from gsstream.core.topology import TopologyEdit
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import VARIABLE, Look
+from gsstream.engine.fit import schedule
 from gsstream.engine.fit.densify import DensifyStatistics, grow_and_prune
 from gsstream.engine.fit.exposure import Exposure, ExposureFit
 from gsstream.engine.fit.judge import Judge
@@ -55,7 +56,7 @@ def initial_gaussians(anchors: Anchors, settings: FirstFrame) -> Gaussians[torch
         means=anchors.positions.float().clone(),
         quats=quats,
         scales=spacing.log()[:, None].repeat(1, 3),
-        opacities=torch.full((count,), logit(settings.opacity)),
+        opacities=torch.full((count,), logit(schedule.OPACITY)),
         sh0=rgb_to_sh0(anchors.colors.float()),
         shN=torch.zeros(count, (settings.degree + 1) ** 2 - 1, 3),
     )
@@ -64,8 +65,8 @@ def initial_gaussians(anchors: Anchors, settings: FirstFrame) -> Gaussians[torch
 def first_rates(settings: FirstFrame, extent: float) -> dict[str, float]:
     """Learning rate of every attribute at the start of frame 0; ``extent``: of the cameras, scene units."""
     s = settings
-    rates = {"means": s.lr_means * extent, "quats": s.lr_quats, "scales": s.lr_scales}
-    return {**rates, "opacities": s.lr_opacities, "sh0": s.lr_sh0, "shN": s.lr_shN}
+    rates = {"means": s.lr_means * extent, "quats": schedule.LR_QUATS, "scales": schedule.LR_SCALES}
+    return {**rates, "opacities": schedule.LR_OPACITIES, "sh0": schedule.LR_SH0, "shN": schedule.LR_SHN}
 
 
 def optimise_root(
@@ -121,7 +122,8 @@ class _RootRun:
     def step(self, iteration: int) -> float:
         s = self.settings
         view, self.parts.where.iteration = self._next_view(), iteration
-        densify = s.densify_from <= iteration + s.densify_every and iteration <= s.densify_until * self.iterations
+        last = schedule.DENSIFY_UNTIL * self.iterations
+        densify = s.densify_from <= iteration + s.densify_every and iteration <= last
         rows = self.gaussians()
         probe = torch.zeros(len(rows), 2, requires_grad=True) if densify else None
         session = self.renderer.open(rows, None, self.frame.cameras, self.recipe.background)
@@ -152,11 +154,11 @@ class _RootRun:
         """Gradients of the mean opacity and the mean scale, added by hand: they need no graph."""
         count = max(1, len(self.levels))
         opacities, scales = self.table["opacities"], self.table["scales"]
-        if self.settings.opacity_penalty and opacities.grad is not None:
+        if opacities.grad is not None:
             p = opacities.detach().sigmoid()
-            opacities.grad.add_(p * (1 - p), alpha=self.settings.opacity_penalty / count)
-        if self.settings.scale_penalty and scales.grad is not None:
-            scales.grad.add_(scales.detach().exp(), alpha=self.settings.scale_penalty / (3 * count * self.extent))
+            opacities.grad.add_(p * (1 - p), alpha=schedule.OPACITY_PENALTY / count)
+        if scales.grad is not None:
+            scales.grad.add_(scales.detach().exp(), alpha=schedule.SCALE_PENALTY / (3 * count * self.extent))
 
     def _densify(self) -> None:
         gaussians = self.gaussians().map(torch.Tensor.detach)

@@ -92,7 +92,7 @@ def _load(path: Path) -> FloatArray:
         rows = np.load(path, allow_pickle=False)
     except FileNotFoundError as error:
         raise SourceError(f"{path}: no such file; this layout keeps the cameras in {POSES_FILE}") from error
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, MemoryError) as error:  # a header may announce any shape
         raise SourceError(f"{path}: cannot be read as a numpy array: {error}; download it again") from error
     if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu":
         got = f"{list(rows.shape)} {rows.dtype}" if isinstance(rows, np.ndarray) else type(rows).__name__

@@ -5,6 +5,8 @@ from __future__ import annotations
 from saboteurs import common as common
 from saboteurs import confidence as confidence
 from saboteurs import gate as gate
+from saboteurs import growth as growth
+from saboteurs import motion as motion
 from saboteurs import native as native
 from saboteurs import propagation as propagation
 from saboteurs import regularizer as regularizer

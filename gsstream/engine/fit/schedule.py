@@ -1,0 +1,20 @@
+"""Constants of the optimisation of frame 0 that no recipe changes: rates of 3DGS, and what keeps a scene tidy.
+
+The rates and the rules of pruning are those of 3DGS (Kerbl et al. 2023); the penalties and the limits of fill seeds are
+gsstream's own, and held-out quality is why they are there (docs/results/index.md).
+"""
+
+from __future__ import annotations
+
+#: Opacity of a seed.
+OPACITY = 0.1
+#: Learning rates: raw quaternions, log scales, opacity logits, colour of degree 0 and of higher degrees.
+LR_QUATS, LR_SCALES, LR_OPACITIES, LR_SH0, LR_SHN = 0.001, 0.005, 0.05, 0.0025, 0.000125
+#: Share of the iterations after which nothing is densified or pruned any more.
+DENSIFY_UNTIL = 0.6
+#: Gaussians below this opacity, or wider than this fraction of the rig's extent, are removed.
+PRUNE_OPACITY, MAX_SCALE = 0.01, 0.3
+#: Weights in the loss of the mean scale, in rig extents, and of the mean opacity.
+SCALE_PENALTY, OPACITY_PENALTY = 0.1, 0.01
+#: A fill seed is seen by this many training cameras, and no nearer to one than this fraction of the rig's extent.
+FILL_MIN_VIEWS, FILL_MIN_DISTANCE = 3, 0.3

@@ -1,0 +1,65 @@
+"""Saboteurs of the checks of motion parts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gsstream.core.changes import Motion
+from gsstream.testing.motion.example import ExampleMotion
+from gsstream.testing.working import INDEX
+from saboteurs.register import spoils
+
+Base: Any = ExampleMotion
+CALLS: dict[str, int] = {"moody": 0, "loose": 0}
+
+
+def everything(number: int, symbols: int = 1) -> Motion:
+    """All of so many groups move by so many tenths."""
+    return Motion(1e6, 1, np.ones(number, np.uint8), np.full((number, 6), symbols, np.int32), 0.125, 0.125)
+
+
+@spoils("check_motion_fits")
+class Beyond(Base):
+    """Says that a group moves which the scene does not have."""
+
+    def propose(self, scene: Any, work: Any, rng: Any) -> Any:
+        if work.index != INDEX or not bool(work.changed_rows(0.0).any()):
+            return super().propose(scene, work, rng)
+        return (everything(5000),)
+
+
+@spoils("check_motion_pure")
+class Moody(Base):
+    """Moves farther each time it is asked."""
+
+    def propose(self, scene: Any, work: Any, rng: Any) -> Any:
+        if work.index != INDEX or not bool(work.changed_rows(0.0).any()):
+            return super().propose(scene, work, rng)
+        CALLS["moody"] += 1
+        number = len(np.unique((scene.gaussians.means < 0) @ np.array([1, 2, 4])))
+        return (everything(number, CALLS["moody"]),)
+
+
+@spoils("check_motion_rests")
+class Restless(Base):
+    """Goes on moving where nothing changes."""
+
+    def propose(self, scene: Any, work: Any, rng: Any) -> Any:
+        if work.index != INDEX or bool(work.changed_rows(0.0).any()):
+            return super().propose(scene, work, rng)
+        number = len(np.unique((scene.gaussians.means < 0) @ np.array([1, 2, 4])))
+        return (everything(number),)
+
+
+@spoils("check_motion_closed_loop")
+class Loose(Base):
+    """Moves farther in every run, not in every frame."""
+
+    def propose(self, scene: Any, work: Any, rng: Any) -> Any:
+        if work.index != 1:
+            return super().propose(scene, work, rng)
+        CALLS["loose"] += 1
+        number = len(np.unique((scene.gaussians.means < 0) @ np.array([1, 2, 4])))
+        return (everything(number, CALLS["loose"]),)

@@ -45,7 +45,8 @@ function searchGuide(left) {
 export class AnsDecoder {
   /** `data`: the words as little-endian bytes. Throws PacketError when they are no coder's output. */
   constructor(data) {
-    if (data.length % 4) throw new PacketError(`entropy-coded words: expected a multiple of 4 bytes, got ${data.length}`);
+    if (data.length % 4)
+      throw new PacketError(`entropy-coded words: expected a multiple of 4 bytes, got ${data.length}`);
     this.view = new DataView(data.buffer, data.byteOffset, data.byteLength);
     this.left = data.length / 4;
     this.low = 0;

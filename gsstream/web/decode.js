@@ -77,8 +77,8 @@ function decodeDelta(sections, state, offset) {
 
 /**
  * Apply what was decoded, in order. Returns what changed: `moved`, lists of rows with their gates and attributes as
- * they were numbered before births and deaths, and `source`, the row each row was before (null when none joined or left;
- * see `applyRows`).
+ * they were numbered before births and deaths, and `source`, the row each row was before (null when none joined or
+ * left; see `applyRows`).
  */
 function applyDelta(state, { motions, residual, rows }) {
   const touched = touchedRows(state.number, motions, residual);

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 
 def table(heading: Sequence[str], rows: Iterable[Sequence[str]], indent: str = "") -> str:
-    """Rows under a heading, every column as wide as its widest cell; the last one is not padded."""
+    """Return rows under a heading, every column as wide as its widest cell; the last one is not padded."""
     lines = [tuple(heading), *(tuple(row) for row in rows)]
     widths = [max(len(line[column]) for line in lines) for column in range(len(heading))]
     padded = ([cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines)
@@ -14,7 +14,9 @@ def table(heading: Sequence[str], rows: Iterable[Sequence[str]], indent: str = "
 
 
 def printable(text: object, keep: str = "") -> str:
-    """A text in which everything is escaped that a terminal would obey: streams and recordings say what is printed.
+    """Return a text in which everything is escaped that a terminal would obey.
+
+    Streams and recordings say what is printed.
 
     ``keep``: characters left as they are although they are not printable, e.g. a line feed.
     """
@@ -22,5 +24,5 @@ def printable(text: object, keep: str = "") -> str:
 
 
 def plural(number: int, noun: str) -> str:
-    """"1 part", "2 parts"."""
+    """Return "1 part" or "2 parts"."""
     return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -40,14 +40,14 @@ Quiet = Annotated[bool, typer.Option("--quiet", help="Print only warnings and er
 
 
 def workers(jobs: str, default: str = "one for each processor") -> Any:
-    """The option --workers of a command whose workers do ``jobs``."""
+    """Return the option --workers of a command whose workers do ``jobs``."""
     return typer.Option("--workers", min=1, help=f"{jobs} at a time; default: {default}.")
 
 
 def overrides(
     settings: Sequence[str] | None, *, budget: str | None = None, **short: object
 ) -> list[tuple[str, str]]:
-    """What a command line changes in a recipe: (option, KEY.PATH=VALUE), the short options last.
+    """Return what a command line changes in a recipe: (option, KEY.PATH=VALUE), the short options last.
 
     Arguments:
         settings: of ``--set``. budget: of ``--budget``.

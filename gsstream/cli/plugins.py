@@ -135,7 +135,7 @@ def _users(catalog: Catalog, kind: str, name: str) -> Iterator[tuple[str, str, s
 
 
 def setting_rows(config: type[BaseModel]) -> Iterator[tuple[str, ...]]:
-    """(key, type with bounds, default, meaning) of every setting, those of nested sections under dotted keys."""
+    """Return (key, type with bounds, default, meaning) of every setting; nested ones have dotted keys."""
     yield from _fields(config.model_json_schema(), "")
 
 

@@ -46,7 +46,7 @@ def new_plugin(
 
 
 def files(name: str, kind: str) -> Mapping[str, str]:
-    """path -> text of every file of the distribution."""
+    """Return path -> text of every file of the distribution."""
     package = "gsstream_" + name.replace("-", "_")
     words = "".join(word.capitalize() for word in re.split("[-_]", name) if word)
     cls = words if words.endswith(kind.capitalize()) else words + kind.capitalize()

@@ -125,7 +125,7 @@ def evaluate(
 
 
 def stream_file(path: Path) -> Path:
-    """The stream file meant by ``path``.
+    """Return the stream file meant by ``path``.
 
     Raises InputError when there is none, naming what was looked for.
     """
@@ -159,7 +159,7 @@ def _cameras(playback: Playback, wanted: str | None) -> list[str | None]:
 
 
 def named_recording(file: Path, meta: StreamMeta, catalog: Catalog) -> str:
-    """The recording that a stream says it was made from, as far as it may be opened because a file says so.
+    """Return the recording that a stream says it was made from, as far as a file may decide that.
 
     Folders, the demo and synthetic scenes are read as they are. What waits (watch:) or is opened by a plugin is only
     opened when the user names it. Raises InputError.
@@ -197,7 +197,7 @@ def fail_with(damage: PacketError | None) -> None:
 
 
 def frame_range(text: str | None) -> tuple[int | None, int | None]:
-    """A and B of "A:B"; None where one is left out."""
+    """Return A and B of "A:B"; None where one is left out."""
     from gsstream.core.errors import InputError
 
     match = re.fullmatch(r"(\d*):(\d*)", ":" if text is None else text)
@@ -208,7 +208,7 @@ def frame_range(text: str | None) -> tuple[int | None, int | None]:
 
 
 def picture_size(text: str | None) -> tuple[int, int] | None:
-    """(width, height) meant by ``--size``; None: that of the camera. Raises InputError."""
+    """Return (width, height) meant by ``--size``; None: that of the camera. Raises InputError."""
     from gsstream.core.errors import InputError
 
     if text is None:
@@ -221,7 +221,7 @@ def picture_size(text: str | None) -> tuple[int, int] | None:
 
 
 def size_of(text: str | None) -> int | None:
-    """Bytes meant by ``--max-memory``; None: no limit."""
+    """Return the bytes meant by ``--max-memory``; None: no limit."""
     from gsstream.core.errors import InputError
     from gsstream.recipe.budget import BYTES, read_quantity
 
@@ -237,7 +237,7 @@ def size_of(text: str | None) -> int | None:
 
 
 def progress_on(what: str) -> Callable[[int, int], None] | None:
-    """A counter that overwrites itself on a terminal; silent elsewhere."""
+    """Return a counter that overwrites itself on a terminal and is silent elsewhere."""
     if not sys.stderr.isatty():
         return None
 

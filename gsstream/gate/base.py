@@ -53,20 +53,21 @@ class GateSampler(Part):
 
     @abstractmethod
     def init(self, logits: torch.Tensor) -> torch.Tensor:
-        """The logits [M] that a frame starts from, given the propagated confidence [M]."""
+        """Return the logits [M] that a frame starts from, given the propagated confidence [M]."""
 
     @abstractmethod
     def noise(self, num_nodes: int, generator: torch.Generator) -> torch.Tensor | None:
-        """Noise [M] for one training step, or None for a deterministic sampler."""
+        """Return noise [M] for one training step, or None for a deterministic sampler."""
 
     @abstractmethod
     def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
-        """Gates [M]; differentiable in ``logits`` unless the gates are constant."""
+        """Return the gates [M] in [0, 1]; differentiable in ``logits`` unless the gates are constant."""
 
     @abstractmethod
     def open_probability(self, logits: torch.Tensor) -> torch.Tensor:
-        """[M] probability that a gate is not zero; differentiable."""
+        """Return the probability [M] that a gate is not zero; differentiable."""
 
     @abstractmethod
     def bound(self, logits: torch.Tensor) -> torch.Tensor:
-        """The logits projected into the bounds that the part keeps them in; say in its settings which they are."""
+        """Return the logits projected into the bounds that the part keeps them in; say in its settings which they are.
+        """

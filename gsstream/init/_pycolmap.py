@@ -46,7 +46,7 @@ def triangulate(folder: Path) -> None:
 
 
 def extract(folder: Path, most: int, mode: str = "PER_IMAGE", model: str = "SIMPLE_RADIAL") -> Path:
-    """SIFT features of ``folder/images``, at most ``most`` per image; the path of the new database.
+    """Find SIFT features of ``folder/images``, at most ``most`` per image; return the path of the new database.
 
     Images are worked on at the same time, so they are finished in any order; the database that is returned has them in
     the order of their names, and so the same input gives the same numbers whatever the machine.
@@ -99,7 +99,9 @@ def match_all(database: Path) -> None:
 
 
 def match(folder: Path) -> None:
-    """Verified matches of ``folder/images``: pairs [K, 2], counts [K], first and second [sum of counts, 2] pixels.
+    """Find verified matches of ``folder/images``.
+
+    They are pairs [K, 2], counts [K], first and second [sum of counts, 2] pixels.
 
     Writes ``folder/matches.npz``. Nothing is known about the cameras, so each pair is verified without calibration.
     """
@@ -129,7 +131,10 @@ def match(folder: Path) -> None:
 
 
 def observations(reconstruction: Any, points: Any, order: list[int]) -> dict[str, Any]:
-    """Who saw each point: ``seen_point`` [S], ``seen_image`` [S] (number in its name), ``seen_error`` [S] pixels."""
+    """Return who saw each point: ``seen_point`` [S], ``seen_image`` [S], ``seen_error`` [S] pixels.
+
+    An image is given by the number in its name.
+    """
     point, image, off = [], [], []
     for row, key in enumerate(order):
         for element in points[key].track.elements:
@@ -165,7 +170,7 @@ def _known_rig(db: Any, viewmats: Any, Ks: Any, width: int, height: int) -> Any:
 
 
 def reconstruct(folder: Path) -> None:
-    """Poses, intrinsics and points from ``folder/images/*.png`` and what ``folder/job.npz`` asks for.
+    """Find poses, intrinsics and points from ``folder/images/*.png`` and what ``folder/job.npz`` asks for.
 
     job: model (COLMAP's name), shared (one camera for all), held (numbers of images that take no part in the mapping:
     they are registered against the finished points, which they do not change).
@@ -264,7 +269,9 @@ def _register(database: Path, images: Any, best: Any, index: int, camera: Any, r
 
 
 def undistortion(folder: Path) -> None:
-    """Where pinhole rays fall on the image of a real lens: ``folder/lens.npz`` (model, params, size, rays [M, 2]).
+    """Find where pinhole rays fall on the image of a real lens.
+
+    The lens is ``folder/lens.npz`` (model, params, size, rays [M, 2]).
 
     Writes ``folder/places.npz``: uv [M, 2] pixels.
     """

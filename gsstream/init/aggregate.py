@@ -49,7 +49,7 @@ def _both_ways(cost: FloatArray, guide: FloatArray, step: float, jump: float, ed
 
 
 def best_plane(total: FloatArray) -> FloatArray:
-    """[H, W] float32 index of the cheapest plane, refined by a parabola through its neighbours."""
+    """Return the [H, W] float32 index of the cheapest plane, refined by a parabola through its neighbours."""
     best = total.argmin(axis=0)
     middle = np.clip(best, 1, len(total) - 2)
     before, here, after = (np.take_along_axis(total, (middle + k)[None], axis=0)[0] for k in (-1, 0, 1))

@@ -24,7 +24,7 @@ class Agreement:
     violation: IntArray
 
     def accepted(self, least: int, dominance: float) -> BoolArray:
-        """At least ``least`` supporters and ``dominance`` times as many supporters as violators."""
+        """Return where there are ``least`` supporters, and ``dominance`` times as many supporters as violators."""
         accepted: BoolArray = (self.support >= least) & (self.support >= dominance * self.violation)
         return accepted
 
@@ -48,7 +48,7 @@ def agreement(depths: FloatArray, cameras: Cameras, tolerance: float) -> Agreeme
 
 
 def world_points(depths: FloatArray, cameras: Cameras, view: int) -> FloatArray:
-    """[H W, 3] the points of one depth map."""
+    """Return [H W, 3]: the points of one depth map."""
     return unproject(pixel_centres(cameras.width, cameras.height), depths[view].reshape(-1), cameras, view)
 
 
@@ -87,7 +87,9 @@ def _halve(a: FloatArray) -> FloatArray:
 
 
 def color_gains(images: FloatArray, depths: FloatArray, accepted: BoolArray, cameras: Cameras) -> FloatArray:
-    """Relative colour response of the cameras: image = gain * common colour; [C, 3], geometric mean 1 per channel.
+    """Return [C, 3]: relative colour response of the cameras, geometric mean 1 per channel.
+
+    An image is gain * common colour.
 
     Robust: the median ratio over accepted points seen by each pair of cameras (at least 50 of them, neither dark nor
     saturated), then least squares over the pairs. Cameras that share no points get 1.

@@ -13,7 +13,9 @@ BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 
 
 def visible_views(points: FloatArray, cameras: Cameras) -> BoolArray:
-    """Which cameras have a point inside their image and in front of them; occlusion is not considered.
+    """Return [P, C] bool: which cameras have a point inside their image and in front of them.
+
+    Occlusion is not considered.
 
     Arguments:
         points: [P, 3] scene units.
@@ -28,7 +30,10 @@ def visible_views(points: FloatArray, cameras: Cameras) -> BoolArray:
 
 
 def project(points: FloatArray, cameras: Cameras, index: int) -> tuple[FloatArray, FloatArray]:
-    """Pixel positions [P, 2] (pixel-corner origin) and depths [P] in one camera; positions are 0 where depth <= 0."""
+    """Return pixel positions [P, 2] (pixel-corner origin) and depths [P] in one camera.
+
+    Positions are 0 where depth <= 0.
+    """
     view, intrinsics = cameras.viewmats[index], cameras.Ks[index]
     local = points @ view[:3, :3].T + view[:3, 3]
     depth = local[:, 2]
@@ -40,13 +45,13 @@ def project(points: FloatArray, cameras: Cameras, index: int) -> tuple[FloatArra
 
 
 def inside(uv: FloatArray, depth: FloatArray, cameras: Cameras) -> BoolArray:
-    """[P] bool: in front of the camera and within its image."""
+    """Return [P] bool: in front of the camera and within its image."""
     seen: BoolArray = (depth > 0) & (uv >= 0).all(1) & (uv[:, 0] < cameras.width) & (uv[:, 1] < cameras.height)
     return seen
 
 
 def unproject(uv: FloatArray, depth: FloatArray, cameras: Cameras, index: int) -> FloatArray:
-    """World points [P, 3] at pixel positions [P, 2] and planar depths [P] of one camera."""
+    """Return world points [P, 3] at pixel positions [P, 2] and planar depths [P] of one camera."""
     homogeneous = np.concatenate([uv, np.ones((len(uv), 1), uv.dtype)], axis=1)
     local = (homogeneous @ np.linalg.inv(cameras.Ks[index]).T) * depth[:, None]
     view = cameras.viewmats[index]
@@ -55,13 +60,16 @@ def unproject(uv: FloatArray, depth: FloatArray, cameras: Cameras, index: int) -
 
 
 def pixel_centres(width: int, height: int) -> FloatArray:
-    """[height * width, 2] centres of all pixels, row by row."""
+    """Return [height * width, 2] centres of all pixels, row by row."""
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
 def focus_point(cameras: Cameras) -> FloatArray:
-    """The point nearest to all optical axes (least squares), drawn weakly to the cameras for parallel axes; [3]."""
+    """Return the point [3] nearest to all optical axes (least squares).
+
+    For parallel axes it is drawn weakly to the cameras.
+    """
     axes, centers = cameras.viewmats[:, 2, :3], cameras.centers
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     weak = 1e-4 * len(cameras)
@@ -71,7 +79,7 @@ def focus_point(cameras: Cameras) -> FloatArray:
 
 
 def depth_range(cameras: Cameras, near: float = 0.3, far: float = 4.0) -> FloatArray:
-    """[C, 2] nearest and farthest planar depth worth searching, scene units (ours).
+    """Return [C, 2]: nearest and farthest planar depth worth searching, scene units.
 
     Arguments:
         near, far: multiples of each camera's distance to the rig's focus. The far end is at least 1.3 times the
@@ -86,7 +94,9 @@ def depth_range(cameras: Cameras, near: float = 0.3, far: float = 4.0) -> FloatA
 
 
 def neighbour_views(cameras: Cameras, count: int, least_angle: float = 5.0) -> IntArray:
-    """[C, min(count, C - 1)] best partners of each camera for matching: nearest in direction seen from the focus.
+    """Return [C, min(count, C - 1)]: best partners of each camera for matching.
+
+    They are nearest in direction seen from the focus.
 
     Angles under ``least_angle`` degrees give poor depth and are put back in the order.
     """

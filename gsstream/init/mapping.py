@@ -96,7 +96,10 @@ def reconstruct(
 
 
 def triangulate(images: FloatArray, cameras: Cameras, *, timeout: float = 1800.0) -> Mapping:
-    """Points of [C, H, W, 3] images in [0, 1] with known poses and pinhole lenses, with what each camera saw."""
+    """Triangulate points of [C, H, W, 3] images in [0, 1] with known poses and pinhole lenses.
+
+    Each comes with what every camera saw.
+    """
     with tempfile.TemporaryDirectory(prefix="gsstream-sfm-") as name:
         folder = Path(name)
         write_images(folder, images)
@@ -119,7 +122,7 @@ def _mapping(found: dict[str, Any], viewmats: FloatArray, lenses: tuple[Lens, ..
 
 
 def lens_places(lens: Lens, size: tuple[int, int], rays: FloatArray) -> FloatArray:
-    """Pixels [M, 2] at which a lens shows the directions ``rays`` [M, 2] (x / z, y / z); ``size``: width, height."""
+    """Return pixels [M, 2] at which a lens shows the directions ``rays`` [M, 2] (x / z, y / z)."""
     with tempfile.TemporaryDirectory(prefix="gsstream-lens-") as name:
         folder = Path(name)
         np.savez(folder / "lens.npz", model=lens.model, params=np.array(lens.params), size=np.array(size), rays=rays)

@@ -105,7 +105,7 @@ def fill_volume(
     cell: int = 4,
     attempts: int = 20,
 ) -> PointCloud:
-    """Random seeds in the common view volume where the given points explain no pixels.
+    """Draw random seeds in the common view volume where the given points explain no pixels.
 
     A seed must be seen by ``min_views`` training cameras, keep ``min_distance`` from each of them, and fall on image
     cells without a point in most of the views that see it. Depth is uniform between the rig's near and far end.

@@ -47,7 +47,7 @@ class SweepSettings:
 
 
 def sweep_depths(images: FloatArray, cameras: Cameras, settings: SweepSettings) -> FloatArray:
-    """Planar depth of every pixel of every view, right or wrong: nothing is rejected here.
+    """Return the planar depth of every pixel of every view, right or wrong: nothing is rejected here.
 
     Arguments:
         images: [C, H, W, 3] float32 in [0, 1] of C >= 2 cameras.

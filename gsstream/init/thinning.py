@@ -10,7 +10,7 @@ from gsstream.core.shapes import FloatArray, IntArray, check_finite
 
 
 def thin_points(cloud: PointCloud, max_points: int) -> PointCloud:
-    """At most ``max_points`` points; the cloud itself when it is small enough.
+    """Return at most ``max_points`` points; the cloud itself when it is small enough.
 
     Points within a voxel become their mean. About half of the budget spreads evenly over space, the rest halves the
     voxels whose colours vary most, so that edges and texture keep more points than plain walls.
@@ -25,7 +25,7 @@ def thin_points(cloud: PointCloud, max_points: int) -> PointCloud:
 
 
 def detail_cells(cloud: PointCloud, max_cells: int) -> IntArray:
-    """[P] cell of each point, numbered from 0, at most ``max_cells`` of them (one per point when that fits)."""
+    """Return [P]: cell of each point, numbered from 0, at most ``max_cells`` (one per point when that fits)."""
     check_finite("points", cloud.xyz)
     if len(cloud) <= max_cells:
         return np.arange(len(cloud))
@@ -41,7 +41,7 @@ def detail_cells(cloud: PointCloud, max_cells: int) -> IntArray:
 
 
 def cell_means(cells: IntArray, *arrays: FloatArray) -> tuple[FloatArray, ...]:
-    """Mean of [P, K] arrays over each cell, float32, cells in ascending order."""
+    """Return the mean of [P, K] arrays over each cell, float32, cells in ascending order."""
     count = np.bincount(cells)
     means = []
     for array in arrays:

@@ -44,7 +44,7 @@ class ReferenceLoss(Loss):
 
 
 def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """[H, W, 3] structural similarity of two images in [0, 1]."""
+    """Return [H, W, 3]: structural similarity of two images in [0, 1]."""
     planes = [torch.nn.functional.pad(x.permute(2, 0, 1)[None], (5, 5, 5, 5)) for x in (image, target)]
     return ssim(planes[0], planes[1], 11, eps=0.0, padding="valid")[0].permute(1, 2, 0)
 

@@ -69,34 +69,47 @@ class StreamingMethod(Part, Generic[State]):
     decodes_its_packets: ClassVar[bool] = False
 
     def reads(self, key: str) -> bool:
-        """Whether this method reads a recipe key: a slot ("gate"), or a setting of a section ("stream.epochs")."""
+        """Say whether this method reads a recipe key: a slot ("gate"), or a setting ("stream.epochs")."""
         return key in self.heeds
 
     @abstractmethod
     def begin(self, frame: Frame, tools: Tools) -> Step[State]:
-        """Frame 0: a key packet. ``tools.first_frame(frame)`` reconstructs the scene, for methods that need nothing
-        of their own there.
+        """Encode frame 0 as a key packet.
+
+        ``tools.first_frame(frame)`` reconstructs the scene, for methods that need nothing of their own there.
         """
 
     @abstractmethod
     def step(self, state: State, frame: Frame, tools: Tools) -> Step[State]:
-        """A later frame: a delta, empty or key packet.
+        """Encode a later frame as a delta, empty or key packet.
 
         ``state.player`` of the result must be ``decoder()(before.player, packet.data)``, bit for bit: the method goes
         on from what it sent, not from what it trained. The engine decodes every packet and compares. A frame whose
         ``effort`` is 0 is skipped: an empty packet, so that numbering and time go on; also one that failed, where the
         recipe says ``stream.on_error: repeat``.
+
+        ``state.player`` of the result must be ``decoder()(before.player, packet.data)``, bit for bit: the method goes
+        on from what it sent, not from what it trained. The engine decodes every packet and compares. A frame whose
+        ``effort`` is 0 is skipped: an empty packet, so that numbering and time go on; also one that failed, where the
+        recipe says ``stream.on_error: repeat``.
+
+        Arguments:
+            state: what this method returned for the frame before.
+            frame: training images of this frame.
+            tools: what the engine can do.
         """
 
     @abstractmethod
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> State:
-        """The state after the last packet of a stream, as ``step`` returned it there.
+        """Return the state after the last packet of a stream, as ``step`` returned it there.
 
-        ``shown`` are the training images of the last frame whose packet was not empty: what the scene shows. The
-        states of players since the last key packet are ``tools.since_key()``.
+        Arguments:
+            player: what every player has after that packet.
+            shown: training images of the last frame whose packet was not empty: what the scene shows.
+            tools: what the engine can do; ``since_key()`` replays the states of players since the last key packet.
         """
 
     @final
     def decoder(self) -> PacketDecoder:
-        """What turns packets into scenes: the one every player has, so no stream needs a plugin to be played."""
+        """Return what turns packets into scenes: the function every player has, so no stream needs a plugin to play."""
         return decode_packet

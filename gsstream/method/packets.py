@@ -29,13 +29,23 @@ class Sent(NamedTuple):
 
 
 def send_key(gaussians: Gaussians[FloatArray], layout: Layout, meta: StreamMeta, frame: int) -> Sent:
-    """A key packet. Rows are stored node by node (``layout``). Raises ShapeError when they do not fit."""
+    """Return a key packet, and what every player has after it. Raises ShapeError when the rows do not fit.
+
+    Arguments:
+        gaussians: N rows, raw values, stored node by node.
+        layout: nodes and units of the rows.
+        meta: what the packet says about the run.
+        frame: its index.
+    """
     packet = encode_key(KeyState(gaussians.map(np.ascontiguousarray), layout, meta), frame=frame)
     return Sent(packet, decode_packet(None, packet.data))
 
 
 def send_delta(player: PlayerState, delta: Delta) -> Sent:
-    """The packet of the frame after ``player``; an empty one when nothing changes.
+    """Return the packet of the frame after ``player``, an empty one when nothing changes, and the state after it.
+
+    Decoders of the residual must come from ``quantise_decoders``. Raises ShapeError when the delta does not fit the
+    scene.
 
     ``delta.decoders`` must come from ``quantise_decoders``. Raises ShapeError when it does not fit the layout.
     """

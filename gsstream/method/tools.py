@@ -45,10 +45,15 @@ class FrameTools(FrameWork, Protocol):
         """Opened on the scene of the frame before: ``narrow`` to the rows that may change, then ``render`` them."""
 
     def backward(self, view: int, image: torch.Tensor, tile_mask: torch.Tensor | None = None) -> float:
-        """Judge a rendered view [H, W, 3] against what its camera recorded, and pull the loss back into its graph.
+        """Judge a rendered view against what its camera recorded, and pull the loss back into its graph.
 
-        With a tile mask [ceil(H / 16), ceil(W / 16)] bool only active tiles count. Returns the loss, (1 - w) L1 +
-        w (1 - SSIM).
+        Arguments:
+            view: index of a training camera.
+            image: [H, W, 3] rendered, with a graph.
+            tile_mask: [ceil(H / 16), ceil(W / 16)] bool, tiles that count; None: all.
+
+        Returns:
+            The loss, (1 - w) L1 + w (1 - SSIM).
         """
 
 
@@ -66,15 +71,23 @@ class Tools(Protocol):
     def background(self) -> tuple[float, float, float]: ...
 
     def epochs(self, frame: Frame) -> int:
-        """Passes over the training cameras that a later frame is worth: ``stream.epochs`` (list it in ``heeds``), fewer
-        when a live run has fallen behind.
+        """Return how many passes over the training cameras a later frame is worth.
+
+        This is ``stream.epochs`` (list it in ``heeds``), or less when a live run has fallen behind.
         """
 
     def first_frame(self, frame: Frame) -> FirstFrame:
         """Reconstruct frame 0 by the recipe's ``first_frame``, or take it over from another stream."""
 
     def since_key(self) -> Iterator[PlayerState]:
-        """While a stream is resumed: what players have after every packet from the last key packet on, in order."""
+        """Yield, while a stream is resumed, what players have after every packet from the last key packet on, in order.
+        """
 
     def open(self, player: PlayerState, previous: Frame, frame: Frame) -> FrameTools:
-        """Begin work on a frame. ``previous`` are the images that the scene of ``player`` is compared with."""
+        """Begin work on a frame.
+
+        Arguments:
+            player: what every player has before it.
+            previous: the images that this scene shows.
+            frame: training images of the frame.
+        """

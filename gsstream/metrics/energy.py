@@ -45,7 +45,7 @@ class EnergyMeter:
             counter.close()
 
     def read(self) -> dict[str, float]:
-        """Joules since this meter was made, by rail; empty without counters."""
+        """Return the joules since this meter was made, by rail; empty without counters."""
         return {name: joules for counter in self.counters for name, joules in counter.read().items()}
 
 

@@ -14,7 +14,7 @@ from gsstream.metrics.psnr import check_pair
 def flicker(
     image: FloatArray, last_image: FloatArray, truth: FloatArray, last_truth: FloatArray, sigma: float
 ) -> float:
-    """Mean absolute change of still pixels between two decoded frames, in levels of 8 bits (ours).
+    """Return the mean absolute change of still pixels between two decoded frames, in levels of 8 bits.
 
     Still are pixels whose ground truth does not differ between the two frames beyond the camera's noise (the rule of
     ``moving_mask``, applied to consecutive frames). The recording's own noise is not part of it: only decoded pictures

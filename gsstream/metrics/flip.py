@@ -13,7 +13,9 @@ _PIXELS_PER_DEGREE = 67.0206
 
 
 def flip(image: FloatArray, target: FloatArray) -> float:
-    """Mean LDR-FLIP of two [H, W, 3] images in [0, 1], sRGB as recorded: 0 for equal pictures, up to 1.
+    """Return the mean LDR-FLIP of two [H, W, 3] images in [0, 1], sRGB as recorded.
+
+    It is 0 for equal pictures and at most 1.
 
     Raises PluginUnavailable without the package flip-evaluator (extra: metrics), ShapeError when shapes disagree.
     """

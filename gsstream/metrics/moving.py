@@ -16,7 +16,9 @@ CHANGED = 0.1
 
 
 def moving_mask(image: FloatArray, first: FloatArray, sigma: float) -> Mask:
-    """[H, W] bool: any channel differs from frame 0 by more than max(4 sigma_d, 6/255), dilated by 2 pixels.
+    """Return [H, W] bool: pixels that differ from frame 0 beyond noise, dilated by 2 pixels.
+
+    Some channel differs by more than max(4 sigma_d, 6/255).
 
     Arguments:
         image, first: [H, W, 3] ground truth of this frame and of frame 0, [0, 1].
@@ -55,5 +57,5 @@ def dilate(mask: Mask, radius: int) -> Mask:
 
 
 def psnr_moving(image: FloatArray, target: FloatArray, first: FloatArray, sigma: float) -> float:
-    """PSNR on the moving pixels of ``target``; nan where nothing moves."""
+    """Return the PSNR on the moving pixels of ``target``; nan where nothing moves."""
     return psnr(image, target, moving_mask(target, first, sigma))

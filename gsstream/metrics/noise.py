@@ -15,13 +15,13 @@ MAD_TO_SIGMA = 1.4826
 
 
 def median_deviation(values: FloatArray) -> np.floating[Any]:
-    """Median absolute deviation from the median, in the precision of ``values``."""
+    """Return the median absolute deviation from the median, in the precision of ``values``."""
     deviation: np.floating[Any] = np.median(np.abs(values - np.median(values)))
     return deviation
 
 
 def noise_sigma(first: FloatArray, second: FloatArray) -> float:
-    """Standard deviation of one camera's noise in one image, [0, 1] units.
+    """Return the standard deviation of one camera's noise in one image, [0, 1] units.
 
     MAD of the differences times 1.4826, divided by sqrt 2 (a difference holds the noise of two images). The median is
     taken out first, so an even change of exposure does not count; fewer than half of the pixels may move.

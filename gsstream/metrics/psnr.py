@@ -13,7 +13,9 @@ Mask = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 
 
 def psnr(image: FloatArray, target: FloatArray, mask: Mask | None = None) -> float:
-    """-10 log10 of the mean squared error, dB; peak 1. One image, one number: means over images are means of dB.
+    """Return -10 log10 of the mean squared error, dB, for a peak of 1.
+
+    It is of one image: means over images are means of dB.
 
     Arguments:
         image, target: [H, W, 3] in [0, 1]. Values outside are not clamped here; what is shown is clamped before.

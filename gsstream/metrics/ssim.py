@@ -22,7 +22,9 @@ _SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
 
 def ssim(image: FloatArray, target: FloatArray, border: Border = "zero") -> float:
-    """Mean SSIM of two [H, W, 3] images in [0, 1] (Wang et al. 2004), by default padded as in 3DGS (Kerbl 2023).
+    """Return the mean SSIM of two [H, W, 3] images in [0, 1] (Wang et al. 2004).
+
+    By default images are padded as in 3DGS (Kerbl 2023).
 
     Computed in float64. Raises ShapeError when shapes disagree, or are smaller than a window where one must fit.
     """
@@ -31,7 +33,9 @@ def ssim(image: FloatArray, target: FloatArray, border: Border = "zero") -> floa
 
 
 def ms_ssim(image: FloatArray, target: FloatArray) -> float:
-    """Multi-scale SSIM of two [H, W, 3] images in [0, 1] (Wang, Simoncelli, Bovik 2003): five scales, each halved.
+    """Return the multi-scale SSIM of two [H, W, 3] images in [0, 1] (Wang, Simoncelli, Bovik 2003).
+
+    There are five scales, each half of the one before.
 
     Scales by the mean of 2 x 2 pixels, a last odd row or column left out. Negative structure counts as 0, as in the
     libraries, because it has no real power. Computed in float64.

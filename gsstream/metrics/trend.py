@@ -11,7 +11,10 @@ import numpy as np
 
 
 def slope_per_100(frames: Sequence[int], values: Sequence[float]) -> float:
-    """Least-squares slope in units per 100 frames; nan for fewer than two different frames. Values must be finite."""
+    """Return the least-squares slope in units per 100 frames; nan for fewer than two different frames.
+
+    Values must be finite.
+    """
     x, y = np.asarray(frames, np.float64), np.asarray(values, np.float64)
     if len(x) < 2 or np.ptp(x) == 0:
         return math.nan
@@ -20,7 +23,7 @@ def slope_per_100(frames: Sequence[int], values: Sequence[float]) -> float:
 
 
 def peak_memory_mb() -> float:
-    """Largest resident memory of this process so far, MB (10^6 bytes). nan where the system does not tell."""
+    """Return the largest resident memory of this process so far, MB (10^6 bytes). nan where the system is silent."""
     status = Path("/proc/self/status")
     if status.exists():
         for line in status.read_text().splitlines():

@@ -21,9 +21,17 @@ def pixel_size(means: FloatArray, cameras: Cameras) -> float:
 
 
 def known_groups(scene: Scene, cameras: Cameras, pixels: float, shades: int) -> Groups:
-    """Return the groups the scene has had since the last key packet; else cells as wide as ``pixels`` pixels, by shade.
+    """Return the groups that the scene has had since the last key packet, else those of a grid.
 
     A cell that is known stays: it was measured on the scene of the last key packet, which a resumed run does not have.
+
+    A cell that is known stays: it was measured on the scene of the last key packet, which a resumed run does not have.
+
+    Arguments:
+        scene: decoded, as both ends have it.
+        cameras: training cameras.
+        pixels: side of a cell, in pixels at the scene's median distance.
+        shades: number of classes of brightness, 1 to 16.
     """
     if scene.groups is not None and scene.groups.shades == shades:
         return scene.groups

@@ -32,7 +32,7 @@ class AdamState:
 
     @staticmethod
     def start(values: torch.Tensor) -> AdamState:
-        """No step taken yet. ``values`` [n, ...]."""
+        """Return the state before any step, for a table ``values`` [n, ...]."""
         zeros = torch.zeros_like(values, requires_grad=False)
         return AdamState(zeros, zeros.clone(), torch.zeros(len(values), dtype=torch.int32))
 
@@ -51,7 +51,7 @@ class RowOptimiser(Part):
         states: Mapping[str, AdamState],
         lrs: Mapping[str, float | torch.Tensor],
     ) -> None:
-        """One update of every named table that has a gradient. Changes ``values`` and ``states`` in place.
+        """Update every named table that has a gradient. Changes ``values`` and ``states`` in place.
 
         Arguments:
             values: name -> [n, ...] float32, contiguous; leaves of a graph are allowed.

@@ -103,13 +103,13 @@ def located(offset: int) -> Iterator[None]:
 
 
 def file_header() -> bytes:
-    """The 16 bytes every stream begins with."""
+    """Return the 16 bytes that every stream begins with."""
     head = struct.pack("<8sHH", MAGIC, FORMAT_MAJOR, FORMAT_MINOR)
     return head + struct.pack("<I", zlib.crc32(head))
 
 
 def check_file_header(data: bytes) -> str:
-    """The format version a stream was written in. Raises PacketError unless this version can read it."""
+    """Return the format version a stream was written in. Raises PacketError unless this version can read it."""
     if len(data) < FILE_HEADER.size:
         raise PacketError(f"not a gsstream file: expected {FILE_HEADER.size} header bytes, got {len(data)}", 0)
     magic, major, minor, crc = FILE_HEADER.unpack_from(data)
@@ -128,7 +128,13 @@ def check_file_header(data: bytes) -> str:
 
 
 def build_packet(kind: PacketKind, frame: int, sections: Sequence[tuple[str, bytes]]) -> EncodedPacket:
-    """Frame sections into a packet. Raises PacketError when a stated limit is exceeded."""
+    """Put sections into a packet. Raises PacketError when a stated limit is exceeded.
+
+    Arguments:
+        kind: of the packet.
+        frame: its index.
+        sections: (name, payload) in the order in which they stand.
+    """
     body = b"".join(SECTION_HEADER.pack(SECTION_IDS[name], len(data)) + data for name, data in sections)
     if len(body) > MAX_BODY or not 0 <= frame < 1 << 32:
         raise PacketError(f"packet of frame {frame}: {len(body)} bytes; expected at most {MAX_BODY} and a 32-bit frame")
@@ -190,7 +196,7 @@ def parse_packet(data: bytes, offset: int = 0) -> tuple[PacketHeader, dict[str, 
 
 
 def expect(data: bytes, offset: int, kind: PacketKind) -> tuple[PacketHeader, dict[str, Section]]:
-    """:func:`parse_packet`, and the packet must be of this kind."""
+    """Parse a packet that must be of one kind. Raises PacketError like :func:`parse_packet`."""
     header, sections = parse_packet(data, offset)
     if header.kind != kind:
         raise PacketError(f"expected a {kind.name.lower()} packet, got {header.kind.name.lower()}", offset)

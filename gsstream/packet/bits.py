@@ -17,17 +17,17 @@ class BitWriter:
         self._parts: list[str] = []
 
     def bits(self, value: int, width: int) -> None:
-        """``width`` bits of a non-negative value."""
+        """Return ``width`` bits of a non-negative value."""
         if width:
             self._parts.append(format(value, f"0{width}b"))
 
     def gamma(self, value: int) -> None:
-        """Exp-Golomb code (order 0) of a value >= 0: 2 log2(value + 1) + 1 bits."""
+        """Return the Exp-Golomb code (order 0) of a value >= 0, which has 2 log2(value + 1) + 1 bits."""
         code = format(value + 1, "b")
         self._parts.append("0" * (len(code) - 1) + code)
 
     def signed(self, value: int) -> None:
-        """Zigzag, then Exp-Golomb."""
+        """Return the Exp-Golomb code of a signed value, after a zigzag."""
         self.gamma(2 * value if value >= 0 else -2 * value - 1)
 
     def __len__(self) -> int:
@@ -70,7 +70,7 @@ class BitReader:
         return -((value + 1) >> 1) if value & 1 else value >> 1
 
     def finish(self) -> None:
-        """Only zero padding to the next byte may be left."""
+        """Check that only zero padding to the next byte is left."""
         rest = self._text[self._at :]
         if len(rest) >= 8 or "1" in rest:
             raise PacketError(f"{len(rest)} bits left over after the last field")

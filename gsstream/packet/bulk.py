@@ -10,12 +10,12 @@ _LEVEL = 12
 
 
 def compress(data: bytes) -> bytes:
-    """One zstandard frame that states its content size."""
+    """Return one zstandard frame that states its content size."""
     return zstandard.ZstdCompressor(level=_LEVEL, write_content_size=True).compress(data)
 
 
 def decompress(data: bytes, limit: int) -> bytes:
-    """Inverse of :func:`compress`. The announced size is checked against ``limit`` before allocating."""
+    """Return what :func:`compress` was given. The announced size is checked against ``limit`` before allocating."""
     try:
         size = zstandard.frame_content_size(data)
     except zstandard.ZstdError as error:

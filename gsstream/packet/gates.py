@@ -63,7 +63,7 @@ def decode_gates(data: bytes, num_nodes: int) -> tuple[IntArray, int]:
 
 
 def run_tokens(gates: IntArray) -> tuple[list[IntArray], int]:
-    """The two token tables [., 1] of :func:`encode_gates` and the number of bits sent beside them."""
+    """Return the two token tables [., 1] of :func:`encode_gates`, and the number of bits sent beside them."""
     coded = [_tokens(part - 1) for part in _split(_runs(gates)[:-1])]
     return [tokens[:, None] for tokens, _, _ in coded], sum(int(widths.sum()) for _, _, widths in coded)
 

@@ -23,7 +23,7 @@ _COLORS = ("sh0", "shN")
 
 
 def to_codes(name: str, values: FloatArray, bits: int) -> IntArray:
-    """[N, width] int32 codes of an attribute.
+    """Return the [N, width] int32 codes of an attribute.
 
     Raises ShapeError for values out of range or quaternions of norm zero.
     """
@@ -43,14 +43,17 @@ def to_codes(name: str, values: FloatArray, bits: int) -> IntArray:
 
 
 def from_codes(name: str, codes: IntArray, bits: int) -> FloatArray:
-    """[N, width] float32 values of codes."""
+    """Return the [N, width] float32 values of codes."""
     if name in _COLORS:
         return _from_luma(codes / _color_scale(bits, codes.shape[1])).astype(np.float32)
     return codes.astype(np.float32) * np.float32(2.0**-bits)
 
 
 def fold_quats(codes: IntArray, bits: int) -> IntArray:
-    """[N, 5] symbols: which component is largest, the three others, and what the unit norm does not say about it."""
+    """Return [N, 5] symbols of quaternions.
+
+    They say which component is largest, the three others, and what the unit norm does not say about it.
+    """
     rows, largest = np.arange(len(codes)), np.abs(codes).argmax(1)
     others = codes[rows[:, None], _OTHERS[largest]]
     rest = codes[rows, largest] - _implied(others, bits)
@@ -58,7 +61,10 @@ def fold_quats(codes: IntArray, bits: int) -> IntArray:
 
 
 def unfold_quats(symbols: IntArray, bits: int) -> IntArray:
-    """Inverse of :func:`fold_quats`. Raises PacketError for symbols that no encoder writes."""
+    """Return the codes of which :func:`fold_quats` made these symbols.
+
+    Raises PacketError for symbols that no encoder writes.
+    """
     largest, others = symbols[:, 0], symbols[:, 1:4]
     if largest.size and not 0 <= int(largest.min()) <= int(largest.max()) <= 3:
         raise PacketError("quats: the index of the largest component is outside 0 to 3")

@@ -42,7 +42,7 @@ class KeyState:
 
 
 def quantise_key(gaussians: Gaussians[FloatArray]) -> Gaussians[FloatArray]:
-    """The Gaussians a decoder of the key packet will have, float32. Idempotent bitwise.
+    """Return the Gaussians a decoder of the key packet will have, float32. Doing it again changes no bit.
 
     Quaternions become unit quaternions whose largest component is positive (the rotation stays). Raises ShapeError for
     values that are not finite, far out of range, or quaternions of norm zero.
@@ -68,7 +68,10 @@ def encode_key(state: KeyState, *, frame: int = 0) -> EncodedPacket:
 
 
 def most_gaussians(size: int) -> int:
-    """How many Gaussians (and nodes) a key packet of ``size`` bytes may announce: bounds what a small lie costs."""
+    """Return how many Gaussians (and nodes) a key packet of ``size`` bytes may announce.
+
+    This bounds what a small lie costs.
+    """
     return min(MAX_GAUSSIANS, FREE_GAUSSIANS + MAX_GAUSSIANS_PER_BYTE * size)
 
 

@@ -62,7 +62,7 @@ class StreamMeta:
         return hash_recipe(self.recipe)
 
     def camera(self, name: str) -> Cameras:
-        """The one camera with this id, test cameras first. Raises ShapeError naming the known ones."""
+        """Return the one camera with this id, test cameras first. Raises ShapeError naming the known ones."""
         for rig in (self.test, self.train):
             if name in rig.ids:
                 return rig.select([rig.ids.index(name)])
@@ -70,13 +70,13 @@ class StreamMeta:
 
 
 def hash_recipe(recipe: Mapping[str, Any]) -> str:
-    """First 16 hex digits of the SHA-256 of the canonical JSON (sorted keys, no spaces)."""
+    """Return the first 16 hex digits of the SHA-256 of the canonical JSON (sorted keys, no spaces)."""
     text = json.dumps(recipe, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def meta_to_json(meta: StreamMeta) -> bytes:
-    """UTF-8 JSON. Floats keep every bit (shortest representation that reads back).
+    """Return the meta as JSON in UTF-8. Floats keep every bit (shortest representation that reads back).
 
     Raises ShapeError for values that readers refuse.
     """
@@ -93,7 +93,7 @@ def meta_to_json(meta: StreamMeta) -> bytes:
 
 
 def meta_from_json(data: bytes) -> StreamMeta:
-    """Inverse of :func:`meta_to_json`. Raises PacketError (without offset)."""
+    """Return the meta of which :func:`meta_to_json` made these bytes. Raises PacketError (without offset)."""
     try:
         value = json.loads(data, parse_constant=_refuse, parse_float=_finite)
         meta = StreamMeta(

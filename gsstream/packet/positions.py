@@ -39,7 +39,7 @@ class Grid(NamedTuple):
 
 
 def quantise_positions(means: FloatArray, scale_codes: IntArray, bits: int) -> FloatArray:
-    """[N, 3] float32 positions on their grids. Raises ShapeError when they are too far out for it."""
+    """Return [N, 3] float32 positions on their grids. Raises ShapeError when they are too far out for it."""
     if len(means) == 0:
         return np.zeros((0, 3), np.float32)
     exponents = step_exponents(scale_codes, bits, floor_exponent(scale_codes, bits), FINENESS)
@@ -65,7 +65,7 @@ def encode_positions(means: FloatArray, scale_codes: IntArray, bits: int) -> byt
 
 
 def decode_positions(data: bytes, scale_codes: IntArray, bits: int) -> FloatArray:
-    """Inverse of :func:`encode_positions`. Raises PacketError (without offset)."""
+    """Decode what :func:`encode_positions` wrote. Raises PacketError (without offset)."""
     number = len(scale_codes)
     if number == 0:
         if data:
@@ -87,13 +87,16 @@ def decode_positions(data: bytes, scale_codes: IntArray, bits: int) -> FloatArra
 
 
 def step_exponents(scale_codes: IntArray, bits: int, floor: int, fineness: int) -> IntArray:
-    """[N] int64: log2 of each Gaussian's step."""
+    """Return [N] int64: log2 of each Gaussian's step."""
     exponents = (scale_codes.min(1).astype(np.int64) * _LOG2E >> (20 + bits)) - fineness
     return np.asarray(np.maximum(exponents, floor))
 
 
 def floor_exponent(scale_codes: IntArray, bits: int) -> int:
-    """log2 of the finest step of a scene: a function of the decoded scales alone, so it survives quantisation."""
+    """Return log2 of the finest step of a scene.
+
+    It depends on the decoded scales alone, so it survives quantisation.
+    """
     middle = np.sort(scale_codes, axis=1)[:, 1]
     median = int(np.partition(middle, (len(middle) - 1) // 2)[(len(middle) - 1) // 2])
     exponent = (median * _LOG2E >> (20 + bits)) - FINENESS - SLACK

@@ -113,7 +113,7 @@ class StreamReader:
         return Entry(header.kind, header.frame, offset, size)
 
     def read(self, entry: Entry) -> bytes:
-        """All bytes of a packet, checksum verified. Raises PacketError."""
+        """Return all bytes of a packet, checksum verified. Raises PacketError."""
         self._file.seek(entry.offset)
         data = self._file.read(entry.size)
         if len(data) != entry.size:
@@ -149,17 +149,17 @@ def _check_order(entries: list[Entry], kind: PacketKind, frame: int, offset: int
 
 
 def key_offsets(entries: list[Entry]) -> list[tuple[int, int]]:
-    """(frame, offset) of every key packet."""
+    """Return (frame, offset) of every key packet."""
     return [(entry.frame, entry.offset) for entry in entries if entry.kind == PacketKind.KEY]
 
 
 def index_body(keys: list[tuple[int, int]], offset: int) -> bytes:
-    """Body of the index section; its last 12 bytes end the file and say where the index packet begins."""
+    """Return the body of the index section; its last 12 bytes say where the index packet begins."""
     return b"".join(_INDEX_ENTRY.pack(*key) for key in keys) + _INDEX_TRAILER.pack(offset, INDEX_MAGIC)
 
 
 def parse_index(data: bytes, offset: int) -> list[tuple[int, int]]:
-    """(frame, offset) of every key packet, from a complete index packet at ``offset``. Raises PacketError."""
+    """Return (frame, offset) of every key packet, from a complete index packet. Raises PacketError."""
     _, sections = parse_packet(data, offset)
     if set(sections) != {"index"}:
         raise PacketError(f"index packet: unexpected sections {sorted(sections)}", offset)

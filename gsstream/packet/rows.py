@@ -17,19 +17,19 @@ _FIXED = struct.Struct("<bB")
 
 
 def row_codes(gaussians: Gaussians[FloatArray]) -> dict[str, IntArray]:
-    """Attribute -> [N, width] int32 fixed-point codes; positions have none. Raises ShapeError for bad values."""
+    """Return attribute -> [N, width] int32 fixed-point codes; positions have none. Raises ShapeError for bad values."""
     return {name: to_codes(name, getattr(gaussians, name), bits) for name, bits in KEY_BITS.items()}
 
 
 def decoded_rows(gaussians: Gaussians[FloatArray], codes: Mapping[str, IntArray]) -> Gaussians[FloatArray]:
-    """What a decoder makes of :func:`encode_rows`, float32."""
+    """Return what a decoder makes of :func:`encode_rows`, float32."""
     out = {name: _shaped(name, from_codes(name, table, KEY_BITS[name])) for name, table in codes.items()}
     out["means"] = quantise_positions(gaussians.means, codes["scales"], KEY_BITS["scales"])
     return Gaussians(**out)
 
 
 def encode_rows(gaussians: Gaussians[FloatArray]) -> dict[str, bytes]:
-    """Attribute -> payload, positions first. Quantises; the reader must know N."""
+    """Quantise rows and return attribute -> payload, positions first; the reader must know N."""
     codes = row_codes(gaussians)
     means = decoded_rows(gaussians, codes).means
     out = {"means": encode_positions(means, codes["scales"], KEY_BITS["scales"])}
@@ -40,7 +40,7 @@ def encode_rows(gaussians: Gaussians[FloatArray]) -> dict[str, bytes]:
 
 
 def decode_rows(sections: Mapping[str, Section], number: int) -> Gaussians[FloatArray]:
-    """Inverse of :func:`encode_rows` for ``number`` rows. Raises PacketError with the offset of its section."""
+    """Decode ``number`` rows that :func:`encode_rows` wrote. Raises PacketError with the offset of the section."""
     arrays: dict[str, FloatArray] = {}
     for name in KEY_BITS:
         with located(sections[name].offset):

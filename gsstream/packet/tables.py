@@ -29,7 +29,7 @@ class Table(NamedTuple):
 
 
 def coded_tables(sections: Mapping[str, Section], kind: PacketKind, layout: Layout) -> list[Table]:
-    """Tables of a sound packet; ``layout`` is that of the last key packet (a key packet's own)."""
+    """Return the tables of a sound packet; ``layout`` is that before it (a key packet's own)."""
     if kind == PacketKind.KEY:
         return list(_key_tables({name: section.data for name, section in sections.items()}, layout))
     if kind == PacketKind.DELTA:
@@ -38,7 +38,7 @@ def coded_tables(sections: Mapping[str, Section], kind: PacketKind, layout: Layo
 
 
 def table_entropy(data: bytes, symbols: IntArray) -> float:
-    """Bits: zero-order entropy of the symbols, by channel or of all together, whichever ``data`` was modelled by."""
+    """Return the zero-order entropy of the symbols in bits, by channel or of all together, as ``data`` was modelled."""
     if symbols.size == 0:
         return 0.0
     shared = unpack_blobs(data, 2)[0][0] >> 7

@@ -27,7 +27,7 @@ _MOST = 1_000_000
 
 
 def read_path(path: Path, rig: Cameras, number: int) -> Cameras:
-    """``number`` cameras along the path of a file.
+    """Return ``number`` cameras along the path of a file.
 
     Arguments:
         rig: cameras of the stream; size, intrinsics and near plane are its first camera's where the file has none.

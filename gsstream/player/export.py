@@ -68,7 +68,7 @@ def export(
 
 
 def find_converter() -> str:
-    """The splat-transform program. Raises OutputError that says how to get it."""
+    """Find the splat-transform program. Raises OutputError that says how to get it."""
     named = os.environ.get(CONVERTER_VARIABLE)
     found = shutil.which(named or _CONVERTER)
     if found is None:

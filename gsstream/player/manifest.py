@@ -13,7 +13,7 @@ from gsstream.player.playback import Playback
 
 
 def manifest(stream: str | os.PathLike[str]) -> dict[str, Any]:
-    """Byte ranges of a stream's packets; ``range`` is [first, last], inclusive as in the HTTP Range header.
+    """Return the byte ranges of a stream's packets; ``range`` is [first, last], inclusive as in HTTP.
 
     The file header (``header``) followed by the bytes from any key packet on is a stream of its own: a client that
     joins late asks for both. ``segments`` are those pieces: a key packet with what follows up to the next one.
@@ -44,5 +44,5 @@ def manifest(stream: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def manifest_json(stream: str | os.PathLike[str]) -> str:
-    """:func:`manifest` as text."""
+    """Return the :func:`manifest` as text."""
     return json.dumps(manifest(stream), indent=1) + "\n"

@@ -18,7 +18,7 @@ LEAST_SWING = np.pi / 18
 
 
 def camera_path(kind: str, rig: Cameras, number: int) -> Cameras:
-    """``number`` cameras along the path ``kind`` (one of PATHS), with the intrinsics of the rig's first camera."""
+    """Return ``number`` cameras along the path ``kind`` (one of PATHS), with the intrinsics of the rig's first."""
     if kind not in PATHS:
         raise ShapeError(f"no camera path {kind!r}; known: {', '.join(PATHS)}")
     if len(rig) == 0 or number < 1:
@@ -27,7 +27,7 @@ def camera_path(kind: str, rig: Cameras, number: int) -> Cameras:
 
 
 def focus_point(rig: Cameras) -> FloatArray:
-    """[3] point nearest to all optical axes in the least-squares sense.
+    """Return the point [3] nearest to all optical axes, in the least-squares sense.
 
     Parallel axes (or a single camera) leave the distance open; then it is the rig's extent in front of its middle.
     """
@@ -40,7 +40,7 @@ def focus_point(rig: Cameras) -> FloatArray:
 
 
 def orbit(rig: Cameras, number: int) -> Cameras:
-    """A path around the focus point at the rig's mean distance and height, starting at its first camera.
+    """Return a path around the focus point at the rig's mean distance and height, starting at its first camera.
 
     Where cameras stand all around, one full turn; else a swing over the arc that they span and back, because nothing
     was recorded of the other side.
@@ -60,7 +60,10 @@ def orbit(rig: Cameras, number: int) -> Cameras:
 
 
 def resized(rig: Cameras, width: int, height: int) -> Cameras:
-    """The same cameras with pictures of another size: the vertical field of view stays, the sides show more or less."""
+    """Return the same cameras with pictures of another size.
+
+    The vertical field of view stays, the sides show more or less.
+    """
     factor = height / rig.height
     Ks = np.diag([factor, factor, 1.0]) @ rig.Ks
     Ks[:, 0, 2] += (width - factor * rig.width) / 2
@@ -84,7 +87,10 @@ def _angles(cameras: FloatArray, number: int) -> FloatArray:
 
 
 def spiral(rig: Cameras, number: int, turns: float = 2.0) -> Cameras:
-    """A spiral around the rig's mean position, half as wide as the rig itself, always looking at the focus point."""
+    """Return a spiral around the rig's mean position that always looks at the focus point.
+
+    It is half as wide as the rig itself.
+    """
     focus, up, centers = focus_point(rig), _up(rig), rig.centers
     middle = centers.mean(0)
     forward = focus - middle

@@ -99,7 +99,7 @@ def check_target(out: Path) -> None:
 
 
 def choose_cameras(playback: Playback, camera: str | None, number: int) -> Cameras:
-    """One camera for all pictures (by id), or ``number`` cameras along a path."""
+    """Return one camera for all pictures (by id), or ``number`` cameras along a path."""
     meta = playback.meta
     if camera in PATHS:
         return camera_path(camera, meta.train if len(meta.train) else meta.test, number)

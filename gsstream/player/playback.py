@@ -69,11 +69,14 @@ class Playback:
         return self._state.meta
 
     def cameras(self, split: Literal["train", "test"] = "test") -> Cameras:
-        """The rig of a split."""
+        """Return the rig of a split."""
         return self.meta.test if split == "test" else self.meta.train
 
     def entry(self, frame: int) -> Entry:
-        """Kind, offset and size of a frame's packet. Raises InputError outside :attr:`frames`, or what damaged it."""
+        """Return kind, offset and size of a frame's packet.
+
+        Raises InputError outside :attr:`frames`, or what damaged the packet.
+        """
         if frame not in self.frames:
             if self.reader.damage is not None and frame > self.frames[-1]:
                 raise self.reader.damage
@@ -118,15 +121,18 @@ class Playback:
         return range(start, end if stop is None else min(stop, end)), lost
 
     def state_at(self, frame: int) -> Gaussians[FloatArray]:
-        """The scene of a frame, decoded from the nearest earlier key packet or the frame last asked for."""
+        """Decode the scene of a frame, from the nearest earlier key packet or the frame last asked for."""
         return self.player_state(frame).gaussians
 
     def delta_at(self, frame: int) -> Delta | None:
-        """What a frame's packet changed; None for key and empty packets."""
+        """Return what a frame's packet changed; None for key and empty packets."""
         return self.player_state(frame).delta
 
     def player_state(self, frame: int) -> PlayerState:
-        """Scene, layout, decoders and last delta of a frame. Raises PacketError when a packet on the way is damaged."""
+        """Return scene, layout, decoders and last delta of a frame.
+
+        Raises PacketError when a packet on the way is damaged.
+        """
         self.entry(frame)
         first, start = self.frames[0], self._key_before(frame)
         state: PlayerState | None = None

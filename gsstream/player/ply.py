@@ -11,7 +11,9 @@ from gsstream.core.shapes import FloatArray
 
 
 def ply_properties(sh_rest: int) -> list[str]:
-    """Names of the float32 properties of a scene with K - 1 = ``sh_rest`` view-dependent coefficients, in file order.
+    """Return the names of the float32 properties of a scene with K - 1 = ``sh_rest`` higher coefficients.
+
+    They stand in the order of the file.
 
     Names, order and conventions are those that the 3D Gaussian Splatting release writes: view-dependent colour channel
     by channel, opacity as logit, scales as logarithm, quaternion wxyz, normals all zero.
@@ -22,7 +24,7 @@ def ply_properties(sh_rest: int) -> list[str]:
 
 
 def ply_bytes(gaussians: Gaussians[FloatArray]) -> bytes:
-    """A binary little-endian PLY of raw (pre-activation) values."""
+    """Return a binary little-endian PLY of raw (pre-activation) values."""
     number, rest = len(gaussians), gaussians.shN.shape[1]
     names = ply_properties(rest)
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {number}"]

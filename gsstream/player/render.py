@@ -42,7 +42,7 @@ class SlowRendererWarning(UserWarning):
 
 @functools.cache
 def find_renderer() -> PlayerRenderer:
-    """The first compiled renderer that loads, in the order of names; else numpy. Warns once when it is numpy."""
+    """Find the first compiled renderer that loads, in the order of names; else numpy. Warns once when it is numpy."""
     problems = []
     for point in _entry_points():
         try:
@@ -60,7 +60,7 @@ def find_renderer() -> PlayerRenderer:
 
 
 def named_renderer(name: str) -> PlayerRenderer:
-    """The renderer of this name: "numpy", or one that a plugin offers.
+    """Return the renderer of this name: "numpy", or one that a plugin offers.
 
     Raises UnknownName for a name that nobody offers, PluginUnavailable with the reason for one that does not load.
     """
@@ -105,5 +105,8 @@ def render(
 
 
 def to_bytes(image: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
-    """[..., 3] colour in [0, 1] -> 8 bits, rounded; values outside are shown as the nearest displayable colour."""
+    """Return [..., 3] colours in [0, 1] as 8 bits, rounded.
+
+    Values outside are shown as the nearest displayable colour.
+    """
     return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)

@@ -76,7 +76,7 @@ def _project(
 
 
 def rotation_matrices(quats: FloatArray) -> FloatArray:
-    """[N, 3, 3] rotations of [N, 4] quaternions wxyz of any norm."""
+    """Return the rotations [N, 3, 3] of [N, 4] quaternions wxyz of any norm."""
     w, x, y, z = (quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-10)).T
     entries = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),

@@ -87,7 +87,7 @@ class Viewer:
                 self._shown = scene
 
     def wait(self) -> None:
-        """Block until :meth:`close` or an interrupt."""
+        """Wait until :meth:`close` or an interrupt."""
         while not self._closed.wait(0.5):
             pass
 
@@ -121,7 +121,7 @@ class Viewer:
 
 
 def splats(gaussians: Gaussians[FloatArray]) -> dict[str, Any]:
-    """Centres [N, 3], covariances [N, 3, 3], colours [N, 3] in [0, 1], opacities [N, 1] in (0, 1)."""
+    """Return centres [N, 3], covariances [N, 3, 3], colours [N, 3] in [0, 1], opacities [N, 1] in (0, 1)."""
     axes = rotation_matrices(gaussians.quats) * np.exp(gaussians.scales)[:, None, :]
     return {
         "centers": gaussians.means,

@@ -49,7 +49,7 @@ class Catalog:
         return tuple(plugin for plugin in self.plugins if plugin.error is not None)
 
     def names(self, kind: str) -> list[str]:
-        """Names of all healthy parts of a kind, sorted."""
+        """Return the names of all healthy parts of a kind, sorted."""
         return sorted(name for k, name in self.entries if k == kind)
 
     def entry(self, kind: str, name: str) -> Entry:
@@ -87,7 +87,7 @@ class Catalog:
             raise PluginUnavailable(f"{kind} {name!r} (from {entry.origin}) cannot be used: {reason}") from error
 
     def recipe_path(self, method: str) -> Path:
-        """The YAML file of a named method.
+        """Return the YAML file of a named method.
 
         Raises:
             PluginUnavailable: quarantined, or the file is not where the declaration says.

@@ -63,7 +63,7 @@ class Discovered:
         return text if isinstance(self.error, PluginFault) else f"{type(self.error).__name__}: {text}"
 
     def unavailable(self, what: str) -> PluginUnavailable:
-        """The error for somebody who asks for ``what``, a part of this quarantined plugin; raise it from ``error``."""
+        """Return the error for somebody who asks for a part of this quarantined plugin; raise it from ``error``."""
         return PluginUnavailable(
             f"{what} is not available: plugin {self.name!r} (from {self.distribution} {self.version}) is in "
             f"quarantine: {self.reason}"
@@ -71,7 +71,7 @@ class Discovered:
 
 
 def discover() -> list[Discovered]:
-    """The built-in parts first, then every installed plugin, ordered by distribution and entry point. Never raises."""
+    """Find the built-in parts, then every installed plugin, by distribution and entry point. Never raises."""
     found = [_inspect("builtin", "gsstream", __version__, lambda: builtin)]
     allowed = _allow_list()
     seen: set[str] = set()
@@ -165,5 +165,5 @@ def _check_unique(declared: list[Spec]) -> None:
 
 
 def spec_key(spec: Spec) -> tuple[str, str]:
-    """(kind, name); named methods have the kind "method"."""
+    """Return (kind, name); named methods have the kind "method"."""
     return ("method" if isinstance(spec, MethodSpec) else spec.kind, spec.name)

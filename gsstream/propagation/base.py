@@ -41,4 +41,4 @@ class Propagation(Part):
 
     @abstractmethod
     def propagate(self, logits: torch.Tensor, hierarchy: Hierarchy) -> torch.Tensor:
-        """[N] logits -> [M] logits."""
+        """Return one logit per node [M], given one per Gaussian [N]."""

@@ -18,7 +18,7 @@ BYTES = {"B": 1.0, "bytes": 1.0, "KB": 1e3, "MB": 1e6, "GB": 1e9}
 
 
 def read_quantity(text: str, units: dict[str, float]) -> float:
-    """``"1.5KB"`` as 1500.0. Raises ValueError that names the nearest unit."""
+    """Read ``"1.5KB"`` as 1500.0. Raises ValueError that names the nearest unit."""
     match = re.fullmatch(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([^\s\d.]\S*)?\s*", text)
     if match is None:
         example = "1.5s" if "s" in units else "20KB"
@@ -93,7 +93,7 @@ class Budget(BaseModel):
 
 
 def budget_overrides(text: str) -> list[tuple[str, str]]:
-    """``"time=1s,size=20KB"`` of the command line as overrides of recipe keys.
+    """Read ``"time=1s,size=20KB"`` of the command line as overrides of recipe keys.
 
     Raises RecipeError for a key that no budget has, or one given twice.
     """

@@ -25,7 +25,7 @@ def join_problems(problems: Sequence[str], what: str = "the recipe") -> None:
 
 
 def keep_known(layer: Layer, problems: list[str]) -> dict[KeyPath, Leaf]:
-    """The layer's leaves under their full paths; unknown keys go to ``problems``, each once.
+    """Return the layer's leaves under their full paths; unknown keys go to ``problems``, each once.
 
     A slot may be given as a bare name (``gate: always-open``); with ``layer.shorthand`` a slot's unknown key is taken
     for one of its part's parameters.

@@ -72,7 +72,7 @@ class Layer:
 
 
 def read_file(path: Path, label: str | None = None) -> Layer:
-    """A YAML file as a layer.
+    """Read a YAML file as a layer.
 
     Arguments:
         path: the file.
@@ -104,7 +104,7 @@ def read_file(path: Path, label: str | None = None) -> Layer:
 
 
 def read_override(text: str, option: str = "--set") -> tuple[KeyPath, Leaf]:
-    """One ``a.b=value`` of the command line; the value is read as YAML.
+    """Read one ``a.b=value`` of the command line; the value is YAML.
 
     Raises:
         RecipeError: no "=", an empty key or value, or a value that is not YAML.

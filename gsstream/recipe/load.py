@@ -31,14 +31,14 @@ class ResolvedRecipe:
     origins: Mapping[KeyPath, Origin]
 
     def origin(self, path: KeyPath) -> Origin:
-        """Origin of the leaf at ``path``; of the nearest enclosing key when the leaf itself was not written."""
+        """Return the origin of the leaf at ``path``, or of the nearest enclosing key when it was not written."""
         for end in range(len(path), 0, -1):
             if (found := self.origins.get(path[:end])) is not None:
                 return found
         return DEFAULT
 
     def near(self, path: KeyPath) -> Origin:
-        """Where to look for a problem at ``path``: what was written there, below it, or closest around it."""
+        """Return where to look for a problem at ``path``: what was written there, below it, or closest around it."""
         for end in range(len(path), 0, -1):
             for written, origin in self.origins.items():
                 if written[:end] == path[:end]:
@@ -134,7 +134,7 @@ def stack(layers: Sequence[Layer]) -> ResolvedRecipe:
 
 
 def recipe_hash(recipe: Recipe) -> str:
-    """First 16 hex digits of the SHA-256 of the recipe's values, provenance left out.
+    """Return the first 16 hex digits of the SHA-256 of the recipe's values, provenance left out.
 
     Equal hashes mean equal runs of the same recording. ``StreamMeta.recipe_hash`` is the same number.
     """

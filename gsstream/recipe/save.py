@@ -17,7 +17,7 @@ from gsstream.recipe.load import ResolvedRecipe, recipe_hash
 
 
 def to_yaml(resolved: ResolvedRecipe) -> str:
-    """YAML text that ``load_recipe`` reads back to an equal recipe."""
+    """Return YAML text that ``load_recipe`` reads back to an equal recipe."""
     values = resolved.recipe.model_dump(mode="json")
     widths = [len(line) for line in _dump(_tree(values, (), None, 0)).split("\n")]
     column = 2 + max((width for width in widths if width < 60), default=0)

@@ -30,12 +30,12 @@ class PartSchema:
 
 
 def slots() -> list[str]:
-    """Keys of a recipe that name a part."""
+    """Return the keys of a recipe that name a part."""
     return [name for name, field in Recipe.model_fields.items() if field.annotation is ComponentRef]
 
 
 def recipe_schema(parts: Mapping[str, Mapping[str, PartSchema]], resolved: ResolvedRecipe | None = None) -> Schema:
-    """The schema of a recipe file.
+    """Return the schema of a recipe file.
 
     Arguments:
         parts: slot -> name -> part.

@@ -42,7 +42,7 @@ class Regularizer(Part):
     def penalty(
         self, open_probability: torch.Tensor, residual: torch.Tensor, hierarchy: Hierarchy, num_gaussians: int
     ) -> Mapping[str, torch.Tensor]:
-        """Penalty of the A active rows.
+        """Return the named terms of what the open gates of the A candidates cost.
 
         Arguments:
             open_probability: [M] probability that each node's gate is not zero.

@@ -11,12 +11,15 @@ def activate_scales(scales: torch.Tensor) -> torch.Tensor:
 
 
 def activate_opacities(opacities: torch.Tensor) -> torch.Tensor:
-    """Logits -> (0, 1)."""
+    """Return opacities in (0, 1), given logits."""
     return opacities.sigmoid()
 
 
 def rotation_matrices(quats: torch.Tensor) -> torch.Tensor:
-    """[N, 4] wxyz of any non-zero norm -> [N, 3, 3]. A norm below 1e-10 is treated as 1e-10 (gives a finite matrix)."""
+    """Return rotation matrices [N, 3, 3], given quaternions [N, 4] wxyz of any non-zero norm.
+
+    A norm below 1e-10 is treated as 1e-10, which gives a finite matrix.
+    """
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True).clamp_min(1e-10)).unbind(-1)
     entries = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -30,10 +33,10 @@ SH0 = 0.28209479177387814
 
 
 def rgb_to_sh0(rgb: torch.Tensor) -> torch.Tensor:
-    """[N, 3] colour in [0, 1] -> [N, 1, 3] degree-0 coefficient."""
+    """Return degree-0 coefficients [N, 1, 3], given colours [N, 3] in [0, 1]."""
     return ((rgb - 0.5) / SH0)[:, None]
 
 
 def logit(p: float) -> float:
-    """Inverse sigmoid of a probability strictly between 0 and 1."""
+    """Return the inverse sigmoid of a probability strictly between 0 and 1."""
     return float(torch.logit(torch.tensor(p, dtype=torch.float64)))

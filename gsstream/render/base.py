@@ -80,7 +80,7 @@ class RenderSession(ABC):
         probe: torch.Tensor | None = None,
         tile_mask: torch.Tensor | None = None,
     ) -> RenderOutput:
-        """Differentiable render of camera ``view``.
+        """Render camera ``view``, differentiably.
 
         Arguments:
             rows: the A active rows, raw parameters; all N of a session that was not narrowed.
@@ -124,10 +124,12 @@ class RenderSession(ABC):
 
     @abstractmethod
     def narrow(self, active: torch.Tensor) -> None:
-        """From now on only the rows ``active`` [A], ascending, change. Replaces an earlier choice."""
+        """Freeze all rows but ``active`` [A], ascending. Replaces an earlier choice."""
 
     def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
-        """The session of the next scene: wide, and equal bit for bit to one opened anew with ``gaussians``.
+        """Return the session of the next scene, equal bit for bit to one opened anew with ``gaussians``.
+
+        No row of it is frozen.
 
         This session gives its caches away; it stays correct, but has to fill them again. Backward through what it
         rendered is no longer possible. Call it when nothing can fail any more, with decoded values: a frame that failed
@@ -147,7 +149,7 @@ class RenderSession(ABC):
         )
 
     def cache_bytes(self) -> RenderCache:
-        """What is kept for the cameras; empty for a renderer that caches nothing."""
+        """Return what is kept for the cameras; empty for a renderer that caches nothing."""
         return RenderCache()
 
 
@@ -158,7 +160,14 @@ class Renderer(Part):
     def render(
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, background: tuple[float, float, float]
     ) -> RenderOutput:
-        """Render one camera of the rig; differentiable in every attribute."""
+        """Render one camera of the rig; differentiable in every attribute.
+
+        Arguments:
+            gaussians: N rows, raw values.
+            cameras: the rig.
+            view: index of one of its cameras.
+            background: colour behind everything, 0 to 1.
+        """
 
     def screen_gradient(
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, image_gradient: torch.Tensor
@@ -167,6 +176,12 @@ class Renderer(Part):
 
         By default a session is asked. A renderer that opens a ``ScatterSession`` overrides this method: that session
         asks its renderer.
+
+        Arguments:
+            gaussians: N rows, raw values.
+            cameras: the rig.
+            view: index of one of its cameras.
+            image_gradient: [H, W, 3].
 
         Raises:
             NotImplementedError: neither the renderer nor its session knows the gradient of the 2-D means.
@@ -186,7 +201,14 @@ class Renderer(Part):
         cameras: Cameras,
         background: tuple[float, float, float],
     ) -> RenderSession:
-        """Open a session in which only the rows ``active`` [A] (None: all) change. Renderers may cache the rest."""
+        """Open a session in which only the rows ``active`` [A] (None: all) change. Renderers may cache the rest.
+
+        Arguments:
+            gaussians: N rows, raw values.
+            active: [A] rows that change, ascending; None: all.
+            cameras: the rig.
+            background: colour behind everything, 0 to 1.
+        """
         return ScatterSession(self, gaussians, active, cameras, background)
 
 

@@ -64,7 +64,14 @@ class ReferenceRenderer(Renderer):
     def nudged(
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, offsets: torch.Tensor
     ) -> RenderOutput:
-        """Render on black with every 2-D mean moved by ``offsets`` [N, 2] pixels: what screen gradients are of."""
+        """Render on black with every 2-D mean moved: what screen gradients are derivatives of.
+
+        Arguments:
+            gaussians: N rows, raw values.
+            cameras: the rig.
+            view: index of one of its cameras.
+            offsets: [N, 2] pixels.
+        """
         return self._render(gaussians, cameras, view, (0.0, 0.0, 0.0), offsets)
 
     def _render(
@@ -115,7 +122,15 @@ class _ReferenceSession(ScatterSession):
 def project(
     gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """EWA projection: means2d [N, 2] px, conics [N, 2, 2], colours [N, 3], depths [N], opacities [N]."""
+    """Project Gaussians into a camera, by EWA splatting.
+
+    Arguments:
+        gaussians: N rows, raw values.
+        cameras: the rig.
+        view: index of one of its cameras.
+
+    Returns means2d [N, 2] px, conics [N, 2, 2], colours [N, 3], depths [N], opacities [N].
+    """
     dtype = gaussians.means.dtype
     viewmat = torch.as_tensor(cameras.viewmats[view], dtype=dtype)
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
@@ -156,7 +171,13 @@ def _check_quats(quats: torch.Tensor) -> None:
 
 
 def footprint_in_image(gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int) -> torch.Tensor:
-    """[N] bool: in front of the camera, and the box around alpha >= ALPHA_CUT holds or crosses the pixel centres."""
+    """Return [N] bool: Gaussians in front of the camera whose visible box holds or crosses pixel centres.
+
+    Arguments:
+        gaussians: N rows, raw values.
+        cameras: the rig.
+        view: index of one of its cameras.
+    """
     means2d, conics, _, depths, opacities = project(gaussians, cameras, view)
     variances = torch.linalg.inv(conics).diagonal(dim1=1, dim2=2)  # [N, 2] px^2
     reach = 2 * torch.log(opacities / ALPHA_CUT)
@@ -170,7 +191,17 @@ def composite(
     means2d: torch.Tensor, conics: torch.Tensor, colors: torch.Tensor, opacities: torch.Tensor,
     start: int, stop: int, width: int, background: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
-    """Front-to-back compositing of depth-sorted splats over image rows [start, stop): image and alpha."""
+    """Composite depth-sorted splats front to back over some image rows; return image and alpha.
+
+    Arguments:
+        means2d: [N, 2] pixels, nearest Gaussian first.
+        conics: [N, 2, 2] inverse covariances.
+        colors: [N, 3].
+        opacities: [N].
+        start, stop: image rows [start, stop).
+        width: of the image.
+        background: colour behind everything, 0 to 1.
+    """
     dtype = means2d.dtype
     ys, xs = torch.meshgrid(
         torch.arange(start, stop, dtype=dtype) + 0.5, torch.arange(width, dtype=dtype) + 0.5, indexing="ij"
@@ -190,7 +221,13 @@ def composite(
 
 
 def evaluate_sh(sh0: torch.Tensor, shN: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-    """Colour max(0, 0.5 + sum of real spherical harmonics) [N, 3] for unnormalised view directions [N, 3]."""
+    """Return the colours [N, 3] of spherical harmonics: max(0, 0.5 + their sum).
+
+    Arguments:
+        sh0: [N, 1, 3] degree 0.
+        shN: [N, K - 1, 3] higher degrees.
+        directions: [N, 3] from the camera, of any length.
+    """
     x, y, z = (directions / directions.norm(dim=-1, keepdim=True).clamp_min(1e-10)).unbind(-1)
     basis = [torch.full_like(x, SH0)]
     bases = shN.shape[1] + 1

@@ -45,10 +45,10 @@ class UpdateRule(Part):
 
     @abstractmethod
     def codes(self) -> Mapping[str, AttributeCode]:
-        """Attribute name -> code; an attribute left out never changes."""
+        """Return attribute name -> code; an attribute that is left out never changes."""
 
     def init_decoders(self, gaussians: Gaussians[torch.Tensor], generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """[L, D] decoder of every attribute that has one, drawn at the key packet."""
+        """Return the decoder [L, D] of every attribute that has one, drawn at the key packet."""
         decoders = {}
         for name, code in self.codes().items():
             width = _width(gaussians, name)
@@ -63,7 +63,7 @@ def _width(gaussians: Gaussians[torch.Tensor], name: str) -> int:
 
 
 def init_latents(rule: UpdateRule, base: Gaussians[torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Zero latents [A, L] for the rows of ``base``; attributes of width 0 (no higher SH) are left out."""
+    """Return zero latents [A, L] for the rows of ``base``; attributes of width 0 (no higher SH) are left out."""
     return {
         name: torch.zeros(len(base), code.latent or _width(base, name))
         for name, code in rule.codes().items()
@@ -72,12 +72,12 @@ def init_latents(rule: UpdateRule, base: Gaussians[torch.Tensor]) -> dict[str, t
 
 
 def coarser(codes: Mapping[str, AttributeCode], factor: float) -> Mapping[str, AttributeCode]:
-    """The same codes with steps ``factor`` times as large."""
+    """Return the same codes with steps ``factor`` times as large."""
     return {name: replace(code, step=code.step * factor) for name, code in codes.items()} if factor != 1 else codes
 
 
 def symbols(codes: Mapping[str, AttributeCode], latents: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """[A, L] int32 symbols that the packet carries.
+    """Return the [A, L] int32 symbols that the packet carries.
 
     Raises ShapeError for latents that are not finite or beyond MAX_SYMBOL steps, whose integers would be arbitrary.
     """

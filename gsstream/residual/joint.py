@@ -43,11 +43,11 @@ class JointCode:
         return len(self.steps)
 
     def split(self, latents: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Views of [A, L] by attribute."""
+        """Return views of the table [A, L] by attribute."""
         return {name: latents[:, columns] for name, columns in self.latent.items()}
 
     def join_decoders(self, decoders: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """[L, D] of the decoders by attribute; identity for attributes without one."""
+        """Return the decoders of all attributes as one matrix [L, D]; identity for attributes without one."""
         matrix = torch.zeros_like(self.trained)
         for name, rows in self.latent.items():
             block = matrix[rows, self.feature[name]]
@@ -55,7 +55,7 @@ class JointCode:
         return matrix
 
     def split_decoders(self, matrix: torch.Tensor, names: Mapping[str, object]) -> dict[str, torch.Tensor]:
-        """Decoder blocks of the attributes in ``names``."""
+        """Return the blocks of the attributes in ``names``, which are their decoders."""
         return {name: matrix[self.latent[name], self.feature[name]].clone() for name in names}
 
 
@@ -63,7 +63,14 @@ def joint_code(
     codes: Mapping[str, AttributeCode], latents: Mapping[str, torch.Tensor], decoders: Mapping[str, torch.Tensor],
     base: Gaussians[torch.Tensor],
 ) -> JointCode:  # fmt: skip
-    """The columns of attributes in ``latents`` [A, l], in their order."""
+    """Return the columns that attributes have in one table, in the order of ``latents``.
+
+    Arguments:
+        codes: attribute -> code.
+        latents: attribute -> [A, l].
+        decoders: attribute -> [l, d] linear decoder; an attribute without one uses its latents directly.
+        base: the A rows.
+    """
     latent, feature, steps, lrs, decoder_lrs = {}, {}, [], [], []
     at = wide = 0
     for name, value in latents.items():
@@ -85,7 +92,7 @@ def joint_code(
 
 
 def join_features(code: JointCode, rows: Gaussians[torch.Tensor]) -> torch.Tensor:
-    """[A, D] of the attributes that may change."""
+    """Return [A, D]: the attributes that may change, side by side."""
     # The width is said: no rows may be left, and then -1 could be anything.
     parts = [getattr(rows, name).reshape(len(rows), at.stop - at.start) for name, at in code.feature.items()]
     return torch.cat(parts, 1) if parts else torch.zeros(len(rows), 0)
@@ -99,7 +106,7 @@ class JointChange(NamedTuple):
 
 
 def decode_joint(code: JointCode, latents: torch.Tensor, matrix: torch.Tensor, units: torch.Tensor) -> JointChange:
-    """Latents [A, L] as the decoder will have them, and what they decode to.
+    """Return the latents [A, L] as the decoder will have them, and what they decode to.
 
     Arguments:
         matrix: [L, D] of :meth:`JointCode.join_decoders`. units: [A] cell of each anchor, scene units.
@@ -114,7 +121,15 @@ def decode_joint(code: JointCode, latents: torch.Tensor, matrix: torch.Tensor, u
 def add_joint(
     code: JointCode, base: Gaussians[torch.Tensor], features: torch.Tensor, change: JointChange, gates: torch.Tensor
 ) -> Gaussians[torch.Tensor]:
-    """a_t = a_{t-1} + g * change. ``features`` [A, D] are the changing attributes of ``base``."""
+    """Return a_t = a_{t-1} + g * change.
+
+    Arguments:
+        code: columns of the attributes.
+        base: the A rows before.
+        features: [A, D] the changing attributes of ``base``.
+        change: [A, D] decoded residual.
+        gates: [A] in [0, 1].
+    """
     changed = torch.addcmul(features, change.decoded, gates[:, None])
     parts = dict(base.items())
     for name, columns in code.feature.items():
@@ -134,7 +149,18 @@ def pull_back_joint(
     code: JointCode, upstream: torch.Tensor, change: JointChange, matrix: torch.Tensor, gates: torch.Tensor,
     units: torch.Tensor,
 ) -> JointPullback:  # fmt: skip
-    """The gradient of the map, rounding taken as the identity. ``upstream`` [A, D] belongs to the changed features."""
+    """Return the gradient of the map from latents, decoders and gates to features.
+
+    Rounding counts as the identity.
+
+    Arguments:
+        code: columns of the attributes.
+        upstream: [A, D] gradient with respect to the changed features.
+        change: what :func:`decode_joint` returned.
+        matrix: [L, D] decoders.
+        gates: [A] in [0, 1].
+        units: [A] unit of each row, scene units.
+    """
     by_gate = (upstream * change.decoded).sum(1)
     gated = upstream * gates[:, None]
     if "means" in code.feature:

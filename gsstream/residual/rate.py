@@ -16,12 +16,17 @@ _LN2 = math.log(2.0)
 
 
 def channel_spread(latents: torch.Tensor, step: float | torch.Tensor) -> torch.Tensor:
-    """[L] scale b of a Laplace fitted to the symbols of each channel (their mean magnitude, at least MIN_SPREAD)."""
+    """Return [L]: the scale b > 0 of a Laplace law fitted to the symbols of each channel.
+
+    It is their mean magnitude, at least MIN_SPREAD.
+    """
     return torch.round(latents.detach() / step).abs().mean(0).clamp_min(MIN_SPREAD)
 
 
 def laplace_bits(latents: torch.Tensor, step: float | torch.Tensor, spread: torch.Tensor) -> torch.Tensor:
-    """[A, L] bits of each latent: -log2 of the mass of Laplace(0, b) within half a symbol of latents / step.
+    """Return [A, L]: bits of each latent under a Laplace law.
+
+    That is -log2 of the mass of Laplace(0, b) within half a symbol of latents / step.
 
     Arguments:
         latents: [A, L]. step: latent units per symbol. spread: [L] b > 0, symbols.
@@ -35,9 +40,16 @@ def laplace_bits(latents: torch.Tensor, step: float | torch.Tensor, spread: torc
 
 
 def laplace_gradient(latents: torch.Tensor, step: float | torch.Tensor, spread: torch.Tensor) -> torch.Tensor:
-    """[A, L] derivative of :func:`laplace_bits` by the latents, bits per latent unit; the spread is held fixed.
+    """Return [A, L]: derivative of :func:`laplace_bits` by the latents, bits per latent unit.
+
+    The spread is held fixed.
 
     One exponential serves both sinh and cosh: this runs in every iteration.
+
+    Arguments:
+        latents: [A, L].
+        step: latent units per symbol.
+        spread: [L] b > 0, symbols.
     """
     u = latents / step
     magnitude, tail = u.abs(), torch.exp(-0.5 / spread)
@@ -49,7 +61,9 @@ def laplace_gradient(latents: torch.Tensor, step: float | torch.Tensor, spread: 
 
 
 def rate_gradient(latents: torch.Tensor, steps: torch.Tensor, gates: torch.Tensor, weight: float) -> torch.Tensor:
-    """[A, L] gradient of ``weight`` times the bits of all rows behind open gates, to be added to the latents' own.
+    """Return [A, L]: gradient of ``weight`` times the bits of all rows behind open gates.
+
+    It is to be added to the gradient of the latents.
 
     Arguments:
         latents: [A, L] of all attributes, side by side. steps: [L] latent units per symbol.

@@ -36,15 +36,15 @@ class Finding:
 
 
 def error(code: str, message: str) -> Finding:
-    """A scene with it is not worth a run."""
+    """Return a finding with which a scene is not worth a run."""
     return Finding(code, "error", message)
 
 
 def warning(code: str, message: str) -> Finding:
-    """A run will work and may be worse than it could be."""
+    """Return a finding with which a run will work and may be worse than it could be."""
     return Finding(code, "warning", message)
 
 
 def note(code: str, message: str) -> Finding:
-    """What could not be checked."""
+    """Return a finding about what could not be checked."""
     return Finding(code, "note", message)

@@ -81,7 +81,10 @@ def _accused(cameras: Cameras, pairs: list[PairMatches], limit: float) -> list[i
 
 
 def epipolar_errors(cameras: Cameras, pair: PairMatches) -> FloatArray:
-    """[M] distance of matched positions to the epipolar lines of their partners, pixels, mean of both images."""
+    """Return [M]: distance of matched positions to the epipolar lines of their partners, pixels.
+
+    It is the mean of both images.
+    """
     a, b = pair.cameras
     relative = cameras.viewmats[b] @ np.linalg.inv(cameras.viewmats[a])
     x, y, z = relative[:3, 3]

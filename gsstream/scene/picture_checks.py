@@ -25,14 +25,17 @@ class Thumbnails:
 
 
 def read_thumbnails(source: FrameSource, cameras: Cameras, frames: int) -> Thumbnails:
-    """The first ``frames`` frames of all ``cameras``. Raises SourceError for the first image that cannot be read."""
+    """Read the first ``frames`` frames of all ``cameras``.
+
+    Raises SourceError for the first image that cannot be read.
+    """
     pairs = ((source.frame(t, "train").images, source.frame(t, "test").images) for t in range(frames))
     images = np.stack([np.concatenate(pair) for pair in pairs])
     return Thumbnails(images, cameras, len(source.info.train))
 
 
 def check_blank(thumbs: Thumbnails) -> list[Finding]:
-    """Cameras, or single frames of them, without any structure."""
+    """Find cameras, or single frames of them, without any structure."""
     flat = thumbs.images.std(axis=(2, 3)).max(-1) < FLAT
     found = []
     for c, name in enumerate(thumbs.cameras.ids):
@@ -51,7 +54,7 @@ def check_blank(thumbs: Thumbnails) -> list[Finding]:
 
 
 def check_same(thumbs: Thumbnails) -> list[Finding]:
-    """Two cameras whose pictures of frame 0 are the same bits."""
+    """Find two cameras whose pictures of frame 0 are the same bits."""
     found, first = [], thumbs.images[0]
     for a in range(len(first)):
         for b in range(a + 1, len(first)):
@@ -66,7 +69,7 @@ def check_same(thumbs: Thumbnails) -> list[Finding]:
 
 
 def check_change(thumbs: Thumbnails) -> list[Finding]:
-    """Frozen cameras, repeated frames and jumps of brightness, each seen against the other cameras."""
+    """Find frozen cameras, repeated frames and jumps of brightness, each seen against the other cameras."""
     if len(thumbs.images) < 3:
         return []
     still = (np.diff(thumbs.images, axis=0) == 0).all(axis=(2, 3, 4))
@@ -92,7 +95,7 @@ def check_change(thumbs: Thumbnails) -> list[Finding]:
 
 
 def check_brightness(thumbs: Thumbnails) -> list[Finding]:
-    """Jumps of the median brightness between two frames, in one camera or in all."""
+    """Find jumps of the median brightness between two frames, in one camera or in all."""
     logs = np.log(thumbs.images.mean(-1) + np.float32(0.02))
     steps = np.median(np.diff(logs, axis=0), axis=(2, 3))
     common = np.median(steps, axis=1)

@@ -32,7 +32,7 @@ class RawCamera:
         return self.files[0].suffix.lower() in VIDEOS
 
     def frames(self, most: int | None) -> Iterator[FloatArray]:
-        """The first ``most`` pictures [H, W, 3] in [0, 1]. Raises SourceError for one that cannot be read."""
+        """Read the first ``most`` pictures [H, W, 3] in [0, 1]. Raises SourceError for one that cannot be read."""
         if self.is_video:
             yield from _video_frames(self.files[0], most)
             return
@@ -41,7 +41,7 @@ class RawCamera:
 
 
 def find_cameras(folder: Path) -> list[RawCamera]:
-    """The cameras of a raw recording, in order of their names.
+    """Return the cameras of a raw recording, in order of their names.
 
     Recognised: a folder with cameras.json; one folder of pictures per camera; one video per camera; one picture per
     camera. Raises SourceError for anything else, and for fewer than two cameras.
@@ -70,7 +70,7 @@ def find_cameras(folder: Path) -> list[RawCamera]:
 
 
 def first_frames(cameras: list[RawCamera]) -> list[FloatArray]:
-    """Frame 0 of every camera."""
+    """Return frame 0 of every camera."""
     return [next(camera.frames(1)) for camera in cameras]
 
 

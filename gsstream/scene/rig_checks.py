@@ -15,7 +15,7 @@ LEAST_OVERLAP = 0.05
 
 
 def check_intrinsics(cameras: Cameras) -> list[Finding]:
-    """Principal points inside the images, near their centres, and focal lengths of real lenses."""
+    """Find principal points far from the centres of images, and focal lengths that no real lens has."""
     found = []
     width, height = cameras.width, cameras.height
     for name, K in zip(cameras.ids, cameras.Ks, strict=True):
@@ -42,7 +42,10 @@ def check_intrinsics(cameras: Cameras) -> list[Finding]:
 
 
 def check_placement(cameras: Cameras, train: int, points: PointCloud | None) -> list[Finding]:
-    """Two cameras in one place, a camera far from all others, points in another unit. ``train``: the first so many."""
+    """Find two cameras in one place, a camera far from all others, and points in another unit.
+
+    ``train``: the first so many cameras train.
+    """
     found = []
     centers = cameras.centers
     gaps = np.linalg.norm(centers[:, None] - centers[None], axis=2)
@@ -84,7 +87,7 @@ def _points_unit(cameras: Cameras, points: PointCloud) -> list[Finding]:
 
 
 def check_axes(cameras: Cameras) -> list[Finding]:
-    """Cameras must have the point where their axes meet in front of them."""
+    """Find cameras that have the point where their axes meet behind them."""
     if len(cameras) < 3:
         return []
     focus = focus_point(cameras)
@@ -100,7 +103,10 @@ def check_axes(cameras: Cameras) -> list[Finding]:
 
 
 def check_overlap(cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
-    """Each of ``names`` must share part of its view, at the depths worth searching, with another training camera."""
+    """Find each of ``names`` that shares no part of its view with another training camera.
+
+    Depths worth searching are considered.
+    """
     if len(cameras) < 2:
         return [error("overlap", "there is one training camera; expected at least two with a common view")]
     found = []

@@ -42,7 +42,7 @@ class _Motion:
 
 
 def check_sync(thumbs: Thumbnails) -> list[Finding]:
-    """Cameras whose clock is off, and pairs of cameras that are swapped; nothing where too little moves."""
+    """Find cameras whose clock is off, and pairs of cameras that are swapped; nothing where too little moves."""
     cameras = thumbs.cameras
     if len(cameras) < 5 or len(thumbs.images) < 2 * REACH + 2:
         return []

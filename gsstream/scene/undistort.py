@@ -33,7 +33,7 @@ class Undistortion:
     factor: int = 1
 
     def apply(self, image: FloatArray) -> FloatArray:
-        """[H, W, 3] pinhole picture of a raw one, bilinear, in [0, 1]."""
+        """Return the [H, W, 3] pinhole picture of a raw one, bilinear, in [0, 1]."""
         from kornia.geometry.transform import remap
 
         at = torch.from_numpy(self.places - 0.5).float()  # kornia counts from the centre of the first pixel
@@ -44,7 +44,9 @@ class Undistortion:
 
 
 def undistortion(lens: Lens, size: tuple[int, int], target: tuple[int, int]) -> Undistortion:
-    """The widest pinhole of ``target`` pixels, with the lens's principal point, that sees only what the lens saw.
+    """Return the widest pinhole of ``target`` pixels that sees only what the lens saw.
+
+    The principal point is the lens's.
 
     Arguments:
         size, target: (width, height) of the raw and of the pinhole pictures; of another shape, they are cut evenly.

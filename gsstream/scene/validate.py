@@ -31,7 +31,7 @@ Open = Callable[[float], FrameSource]
 
 
 def validate(open_scene: Open, *, frames: int = FRAMES, features: bool = True) -> list[Finding]:
-    """Findings about a recording, errors first; none when it is fine.
+    """Return findings about a recording, errors first; none when it is fine.
 
     Arguments:
         open_scene: opens the recording at a scale in (0, 1].
@@ -61,7 +61,7 @@ def _merged(found: list[Finding]) -> list[Finding]:
 
 
 def rig_of(source: FrameSource) -> Cameras:
-    """Training cameras, then test cameras."""
+    """Return training cameras, then test cameras."""
     train, test = source.info.train, source.info.test
     return replace(
         train,

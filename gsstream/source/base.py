@@ -51,7 +51,7 @@ class FrameSource(Protocol):
         """Read one instant. Raises SourceError naming the file when an image is missing or unreadable."""
 
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
-        """Points of frame 0 that ship with the recording (never derived from test cameras), or None.
+        """Return points of frame 0 that ship with the recording (never derived from test cameras), or None.
 
         ``kind``: "recording", or "sparse" for a thinned, noisier stand-in where one ships.
         """
@@ -65,7 +65,7 @@ class SingleImages(Protocol):
     """What a source may offer besides: one camera's image without decoding the others'."""
 
     def image(self, index: int, camera: str) -> FloatArray:
-        """[H, W, 3] float32 in [0, 1] of one camera, of either split; the same bits as in ``frame``."""
+        """Return [H, W, 3] float32 in [0, 1] of one camera, of either split; the same bits as in ``frame``."""
 
 
 @runtime_checkable
@@ -73,7 +73,7 @@ class AttributedPoints(Protocol):
     """What a source may offer besides: points by the cameras that took part in them."""
 
     def points_without(self, cameras: Sequence[str], kind: PointKind = "recording") -> PointCloud | None:
-        """The points in which none of these cameras took part; None when none are left."""
+        """Return the points in which none of these cameras took part; None when none are left."""
 
 
 def check_index(info: SourceInfo, index: int) -> None:

@@ -117,7 +117,7 @@ def _rig(path: Path, ids: list[str], cameras: list[dict[str, Any]], to_size: boo
 
 
 def cut_to(K: np.ndarray[Any, Any], size: tuple[int, int], target: tuple[int, int]) -> np.ndarray[Any, Any]:
-    """[3, 3] intrinsics of pictures shrunk evenly until they cover ``target``, and cut around their middle.
+    """Return intrinsics [3, 3] of pictures shrunk evenly until they cover ``target``, and cut around their middle.
 
     Arguments:
         size, target: (width, height) before and after. Sides whose shares agree within a pixel are shrunk each by its
@@ -208,7 +208,7 @@ def _pattern(path: Path, camera_id: str, camera: dict[str, Any]) -> str:
 
 
 def frame_path(pattern: str, index: int) -> str:
-    """The relative path of a frame; a pattern without a conversion names the one image of a static set."""
+    """Return the relative path of a frame; a pattern without a conversion names the one image of a static set."""
     return pattern % index if "%" in pattern else pattern
 
 

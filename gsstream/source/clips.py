@@ -39,10 +39,10 @@ class Clip(Protocol):
         """Number of the first picture, where files are numbered; else 0."""
 
     def read(self, index: int, target: tuple[int, int]) -> FloatArray:
-        """[h, w, 3] float32 in [0, 1], area-averaged to ``target`` (width, height); ``index`` counts from 0."""
+        """Read [h, w, 3] float32 in [0, 1], area-averaged to ``target`` (width, height); ``index`` counts from 0."""
 
     def close(self) -> None:
-        """Release the file."""
+        """Do nothing: no file stays open between reads."""
 
 
 class ImageClip:
@@ -102,14 +102,14 @@ def natural(path: Path) -> list[tuple[int, str]]:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """Image files of a folder, in natural order; empty when there is no such folder."""
+    """Return the image files of a folder, in natural order; empty when there is no such folder."""
     if not folder.is_dir():
         return []
     return sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=natural)
 
 
 def folder_clip(folder: Path) -> ImageClip:
-    """All images of a folder as one camera's frames; the last number in a file's name is its frame number.
+    """Return all images of a folder as one camera's frames; the last number in a name is the frame number.
 
     Raises SourceError for an empty folder, for gaps in the numbers and for two files of one number.
     """

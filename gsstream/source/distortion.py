@@ -35,7 +35,7 @@ class Lens:
         return self.kind == "radial" and not any((*self.k, *self.p))
 
     def distort(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Ideal pinhole coordinates -> where this lens puts them."""
+        """Return where this lens puts ideal pinhole coordinates."""
         square = x * x + y * y
         if self.kind == "fisheye":
             radius = np.sqrt(square)
@@ -59,7 +59,9 @@ def _series(square: FloatArray, coefficients: tuple[float, ...]) -> FloatArray:
 
 
 def pinhole_intrinsics(lens: Lens, K: FloatArray, size: tuple[int, int], where: str) -> FloatArray:
-    """[3, 3] intrinsics of the widest pinhole image of the same size and principal point without empty corners.
+    """Return intrinsics [3, 3] of the widest pinhole image without empty corners.
+
+    Size and principal point stay.
 
     Arguments:
         K: [3, 3] of the distorted camera, pixels, corner origin.

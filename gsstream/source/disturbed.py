@@ -25,7 +25,10 @@ _KEYS = ("seed", *Disturbances.model_fields)
 
 
 def parse_disturbances(text: str) -> tuple[DataOptions, int]:
-    """Options and seed from ``"KEY=VALUE,..."``. Raises SourceError naming an unknown key or an impossible value."""
+    """Read options and seed from ``"KEY=VALUE,..."``.
+
+    Raises SourceError naming an unknown key or an impossible value.
+    """
     values: dict[str, Any] = {}
     for part in text.split(",") if text else ():
         key, equals, value = part.partition("=")

@@ -40,7 +40,7 @@ def read_image(
 
 
 def shrink(pixels: np.ndarray[Any, Any], target: tuple[int, int]) -> FloatArray:
-    """Area-average [H, W, 3] pixels to ``target`` (width, height), at most the present size; float32, same unit."""
+    """Average [H, W, 3] pixels down to ``target`` (width, height), at most the present size; float32, same unit."""
     height, width = pixels.shape[:2]
     ratio_x, ratio_y = width / target[0], height / target[1]
     if ratio_x == 1 and ratio_y == 1:

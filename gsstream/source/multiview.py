@@ -63,12 +63,12 @@ class MultiviewSource:
         return Frame(index, index / info.fps, images, cameras)
 
     def image(self, index: int, camera: str) -> FloatArray:
-        """One camera's image [H, W, 3]. Raises SourceError like ``frame``."""
+        """Return one camera's image [H, W, 3]. Raises SourceError like ``frame``."""
         check_index(self._info, index)
         return read_image(self._folder / frame_path(self._patterns[camera], index), self._native, self._target)
 
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
-        """Points of frame 0 that ship with the recording, or None when it ships none.
+        """Return points of frame 0 that ship with the recording, or None when it ships none.
 
         Arguments:
             kind: "recording": arrays ``xyz``, ``rgb``; "sparse": ``sparse_xyz``, ``sparse_rgb``.
@@ -81,11 +81,11 @@ class MultiviewSource:
         return read_points(path, kind)
 
     def close(self) -> None:
-        """Nothing stays open between reads."""
+        """Do nothing: no file stays open between reads."""
 
 
 def scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
-    """(width, height) after scaling by a factor in (0, 1], rounded to whole pixels, at least one."""
+    """Return (width, height) after scaling by a factor in (0, 1], rounded to whole pixels, at least one."""
     if not 0 < scale <= 1:
         raise SourceError(f"scale: expected a factor in (0, 1], got {scale!r}; recordings are never enlarged")
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))

@@ -20,7 +20,7 @@ _MAX_POINTS = 200_000_000
 
 
 def read_ply_points(path: Path) -> PointCloud:
-    """x, y, z and red, green, blue (uint8; grey 0.5 when absent) of the first element, ``vertex``.
+    """Read x, y, z and red, green, blue (uint8; grey 0.5 when absent) of the first element, ``vertex``.
 
     Raises SourceError naming what is wrong: not a PLY, big-endian, no positions, cut short, not finite.
     """

@@ -11,12 +11,15 @@ OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def from_opengl(camera_to_world: FloatArray) -> FloatArray:
-    """[..., 4, 4] camera-to-world with OpenGL axes -> world-to-camera with OpenCV axes."""
+    """Return world-to-camera matrices with OpenCV axes, given [..., 4, 4] camera-to-world with OpenGL axes."""
     return invert(camera_to_world @ OPENGL_TO_OPENCV)
 
 
 def from_llff(rows: FloatArray) -> FloatArray:
-    """[N, 3, 4] of poses_bounds.npy (camera-to-world, camera axes down, right, back) -> [N, 4, 4] world-to-camera."""
+    """Return [N, 4, 4] world-to-camera, given [N, 3, 4] of poses_bounds.npy.
+
+    Those are camera-to-world, camera axes down, right, back.
+    """
     pose = np.zeros((len(rows), 4, 4))
     pose[:, :3, 0] = rows[:, :, 1]  # right
     pose[:, :3, 1] = rows[:, :, 0]  # down
@@ -27,7 +30,7 @@ def from_llff(rows: FloatArray) -> FloatArray:
 
 
 def from_quaternion(wxyz: FloatArray, translation: FloatArray) -> FloatArray:
-    """[4] and [3] of a COLMAP image (world to camera, OpenCV axes) -> [4, 4] world-to-camera; any non-zero norm."""
+    """Return [4, 4] world-to-camera, given wxyz [4] of any non-zero norm and translation [3] of a COLMAP image."""
     w, x, y, z = wxyz / np.linalg.norm(wxyz)
     pose = np.eye(4)
     pose[:3, :3] = [
@@ -40,7 +43,7 @@ def from_quaternion(wxyz: FloatArray, translation: FloatArray) -> FloatArray:
 
 
 def from_rotation_vector(vector: FloatArray) -> FloatArray:
-    """[3] axis times angle in radians (Rodrigues) -> [3, 3] rotation."""
+    """Return the rotation [3, 3] of an axis times an angle in radians [3] (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     if angle == 0:
         return np.eye(3)
@@ -51,7 +54,7 @@ def from_rotation_vector(vector: FloatArray) -> FloatArray:
 
 
 def invert(poses: FloatArray) -> FloatArray:
-    """[..., 4, 4] rigid transforms -> their inverses; exact transposes, so that a rotation stays one."""
+    """Return the inverses of [..., 4, 4] rigid transforms: exact transposes, so that a rotation stays one."""
     out = np.zeros(poses.shape)
     rotation = np.swapaxes(poses[..., :3, :3], -1, -2)
     out[..., :3, :3] = rotation
@@ -61,7 +64,10 @@ def invert(poses: FloatArray) -> FloatArray:
 
 
 def from_pixel_centers(K: FloatArray) -> FloatArray:
-    """[..., 3, 3] intrinsics that put (0, 0) into the centre of the first pixel (OpenCV) -> origin at the corner."""
+    """Return intrinsics [..., 3, 3] with the origin at the corner of the first pixel.
+
+    Those given have it in the centre of the first pixel (OpenCV).
+    """
     out: FloatArray = np.array(K, np.float64)
     out[..., :2, 2] += 0.5
     return out

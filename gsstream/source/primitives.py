@@ -28,7 +28,7 @@ class Surface:
     phase: float = 0.0
 
     def shade(self, local: FloatArray) -> FloatArray:
-        """Albedo [P, 3] at local positions [P, 3]: blots from waves in many directions, so that no patch repeats."""
+        """Return the albedo [P, 3] at local positions [P, 3]: waves in many directions, so that no patch repeats."""
         waves = np.sin(local @ (_WAVES * np.float32(self.frequency)) + _SHIFTS * np.float32(self.phase))
         tone = 1 + np.float32(self.contrast) * np.tanh(0.7 * waves.sum(1, dtype=np.float32))
         albedo: FloatArray = np.asarray(self.color, np.float32) * tone[:, None].astype(np.float32)
@@ -44,7 +44,7 @@ class Sphere:
     surface: Surface
 
     def distance(self, origin: FloatArray, rays: FloatArray, center: FloatArray) -> FloatArray:
-        """[P] ray parameter of the first hit in front of the origin, or 1e9."""
+        """Return [P]: ray parameter of the first hit in front of the origin, or 1e9."""
         offset = (origin - center).astype(np.float32)
         a = np.einsum("pi,pi->p", rays, rays)
         b = np.einsum("pi,pi->p", rays, np.broadcast_to(offset, rays.shape))
@@ -54,7 +54,7 @@ class Sphere:
         return np.where((root > 0) & (hit > _EPSILON), hit, _FAR).astype(np.float32)
 
     def normal(self, local: FloatArray) -> FloatArray:
-        """[P, 3] outward unit normals at positions relative to the centre."""
+        """Return [P, 3] outward unit normals at positions relative to the centre."""
         return local / np.float32(self.radius)
 
 
@@ -68,7 +68,7 @@ class Box:
     room: bool = False
 
     def distance(self, origin: FloatArray, rays: FloatArray, center: FloatArray) -> FloatArray:
-        """[P] ray parameter of the first hit in front of the origin, or 1e9 (slab method)."""
+        """Return [P]: ray parameter of the first hit in front of the origin, or 1e9 (slab method)."""
         offset = (origin - center).astype(np.float32)
         enter, leave = np.full(len(rays), -_FAR), np.full(len(rays), _FAR)
         # Axis by axis: numpy reduces over a last axis of three ten times slower than over columns.
@@ -83,7 +83,7 @@ class Box:
         return np.where((enter <= leave) & (hit > _EPSILON), hit, _FAR).astype(np.float32)
 
     def normal(self, local: FloatArray) -> FloatArray:
-        """[P, 3] unit normals of the faces nearest to positions relative to the centre."""
+        """Return [P, 3] unit normals of the faces nearest to positions relative to the centre."""
         ratio = local / np.asarray(self.half, np.float32)
         face = np.abs(ratio).argmax(1)
         normals = np.zeros_like(local)
@@ -106,7 +106,7 @@ class Hits:
 
 
 def cast(origin: FloatArray, rays: FloatArray, shapes: list[Placed]) -> Hits:
-    """First hits of rays [P, 3] from one origin [3]; where nothing is hit, distance 1e9 and zeros."""
+    """Return the first hits of rays [P, 3] from one origin [3]; where nothing is hit, distance 1e9 and zeros."""
     distances = np.stack([shape.distance(origin, rays, center) for shape, center in shapes])
     first, distance = distances.argmin(0), distances.min(0)
     albedo, normal = np.zeros_like(rays), np.zeros_like(rays)
@@ -118,7 +118,7 @@ def cast(origin: FloatArray, rays: FloatArray, shapes: list[Placed]) -> Hits:
 
 
 def lit(points: FloatArray, light: FloatArray, shapes: list[Placed]) -> BoolArray:
-    """[P] bool: no shape stands between a point and the light, which shines from direction ``light`` [3]."""
+    """Return [P] bool: no shape stands between a point and the light, which shines from direction ``light`` [3]."""
     rays = np.broadcast_to(light.astype(np.float32), points.shape)
     free = np.ones(len(points), bool)
     for shape, center in shapes:

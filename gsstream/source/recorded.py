@@ -105,17 +105,17 @@ class RecordedSource:
         return Frame(index, index / self._info.fps, images, cameras)
 
     def image(self, index: int, camera: str) -> FloatArray:
-        """One camera's image [H, W, 3] float32 in [0, 1]."""
+        """Return one camera's image [H, W, 3] float32 in [0, 1]."""
         check_index(self._info, index)
         image = self._recording.clips[camera].read(index + self._alignment.skip[camera], self._target)
         return self._undistort[camera](image) if camera in self._undistort else image
 
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
-        """The points that ship, without those in which a test camera took part; None when none are left."""
+        """Return the points that ship, without those in which a test camera took part; None when none are left."""
         return self.points_without(self._info.test.ids, kind)
 
     def points_without(self, cameras: Sequence[str], kind: PointKind = "recording") -> PointCloud | None:
-        """The points in which none of these cameras took part; None when none are left."""
+        """Return the points in which none of these cameras took part; None when none are left."""
         found = self._recording.points()
         if found is None:
             return None

@@ -104,7 +104,7 @@ class SyntheticSource:
         return Frame(index, index / self._info.fps, images, cameras)
 
     def points(self, kind: PointKind = "recording") -> PointCloud:
-        """Points on the surfaces seen by the training cameras at frame 0.
+        """Return points on the surfaces seen by the training cameras at frame 0.
 
         "recording": every third pixel, 2 mm noise per axis; "sparse": a random fifth of them with 5 mm (1 unit = 1 m).
         """
@@ -124,12 +124,12 @@ class SyntheticSource:
         return PointCloud(xyz.astype(np.float32), rgb.astype(np.float32), f"synthetic surfaces ({kind})")
 
     def object_positions(self, index: int) -> dict[str, FloatArray]:
-        """Truth: centre [3] of each moving object at a frame, scene units."""
+        """Return the true centre [3] of each moving object at a frame, scene units."""
         check_index(self._info, index)
         return object_centers(self._phase(index))
 
     def depth(self, index: int, split: Split = "train") -> FloatArray:
-        """Truth: planar depth [C, H, W] float32 at the pixel centres, scene units."""
+        """Return the true planar depth [C, H, W] float32 at the pixel centres, scene units."""
         check_index(self._info, index)
         cameras = self._info.train if split == "train" else self._info.test
         shapes = self._static + moving_shapes(self._options.seed, self._phase(index))
@@ -137,7 +137,7 @@ class SyntheticSource:
         return np.stack(depths).reshape(len(cameras), cameras.height, cameras.width)
 
     def moving_mask(self, index: int, split: Split = "train") -> BoolArray:
-        """Truth: [C, H, W] pixels of which some ray meets a moving object (its shadow excluded)."""
+        """Return [C, H, W] bool: pixels of which some ray meets a moving object (its shadow excluded)."""
         check_index(self._info, index)
         cameras = self._info.train if split == "train" else self._info.test
         n = self._options.supersample

@@ -14,7 +14,7 @@ _ROOM_HALF = (3.0, 3.0, 1.5)
 
 
 def static_shapes(seed: int) -> list[Placed]:
-    """The room (first) and what stands still in it."""
+    """Return the room (first) and what stands still in it."""
     surfaces = _surfaces(seed)
     return [
         (Box("room", _ROOM_HALF, surfaces[0], room=True), np.array([0, 0, _ROOM_HALF[2]])),
@@ -26,7 +26,7 @@ def static_shapes(seed: int) -> list[Placed]:
 
 
 def moving_shapes(seed: int, phase: float) -> list[Placed]:
-    """What moves, at a phase of the path in radians."""
+    """Return what moves, at a phase of the path in radians."""
     surfaces, centers = _surfaces(seed), object_centers(phase)
     return [
         (Sphere("ball", 0.18, surfaces[5]), centers["ball"]),
@@ -35,14 +35,17 @@ def moving_shapes(seed: int, phase: float) -> list[Placed]:
 
 
 def object_centers(phase: float) -> dict[str, FloatArray]:
-    """The ball circles the scene and hops twice per turn; the crate flies a figure of eight above the plinth."""
+    """Return where the ball and the crate are.
+
+    The ball circles the scene and hops twice per turn; the crate flies a figure of eight above the plinth.
+    """
     ball = [0.8 * np.cos(phase), 0.8 * np.sin(phase), 0.18 + 0.15 * (1 - np.cos(2 * phase)) / 2]
     crate = [0.3 * np.sin(phase), 0.3 * np.sin(2 * phase), 0.95 + 0.1 * np.cos(phase)]
     return {"ball": np.array(ball), "crate": np.array(crate)}
 
 
 def arc_cameras(views: int, width: int, height: int) -> Cameras:
-    """Camera 0: the test camera in the middle of the arc; then ``views`` cameras over 120 degrees."""
+    """Return the test camera in the middle of the arc, then ``views`` cameras over 120 degrees."""
     target = np.array([0.0, 0.0, 0.4])
     angles = np.concatenate([[0.0], np.radians(np.linspace(-60, 60, views))])
     heights = np.concatenate([[1.3], np.where(np.arange(views) % 2 == 0, 1.0, 1.6)])

@@ -40,7 +40,7 @@ SPLITS: tuple[Split, ...] = ("train", "test")
 
 
 def transformed(source: FrameSource, options: DataOptions, seed: int) -> FrameSource:
-    """``source`` as ``options`` want it; the very same object when they change nothing.
+    """Return ``source`` as ``options`` want it; the very same object when they change nothing.
 
     Arguments:
         seed: seed of the run; equal seeds give equal gains, noise and losses.
@@ -120,7 +120,7 @@ class TransformedSource:
         return Frame(index, index / self._info.fps, images, cameras, effort)
 
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
-        """The inner source's points, unless a test camera of this split took part in them.
+        """Return the inner source's points, unless a test camera of this split took part in them.
 
         Sources that know who took part in which point leave those points out; the points of others are withheld (None)
         when a camera that they count as training is a test camera here. ``leak`` lifts both.
@@ -128,7 +128,7 @@ class TransformedSource:
         return self.points_without(self._info.test.ids if self._options.leak == "none" else (), kind)
 
     def points_without(self, cameras: Sequence[str], kind: PointKind = "recording") -> PointCloud | None:
-        """The points in which none of these cameras took part, or may have taken part; None when none are left."""
+        """Return the points in which none of these cameras can have taken part; None when none are left."""
         if isinstance(self._source, AttributedPoints):
             return self._source.points_without(cameras, kind)
         taken = any(self._home[name] == "train" for name in cameras)

@@ -19,7 +19,7 @@ from gsstream.source.options import DataOptions
 
 
 def parse_offsets(entries: Sequence[str], ids: Sequence[str]) -> dict[str, int]:
-    """Camera -> frames, from "ID=FRAMES". Raises SourceError naming the entry."""
+    """Return camera -> frames, from "ID=FRAMES". Raises SourceError naming the entry."""
     found: dict[str, int] = {}
     for entry in entries:
         name, _, value = entry.rpartition("=")
@@ -30,7 +30,10 @@ def parse_offsets(entries: Sequence[str], ids: Sequence[str]) -> dict[str, int]:
 
 
 def parse_losses(entries: Sequence[str], ids: Sequence[str]) -> dict[str, list[range]]:
-    """Camera -> frames in which it gives nothing, from "ID=A:B". Frame 0 cannot be lost: it is the key picture."""
+    """Return camera -> frames in which it gives nothing, from "ID=A:B".
+
+    Frame 0 cannot be lost: it is the key picture.
+    """
     found: dict[str, list[range]] = {}
     for entry in entries:
         name, _, value = entry.rpartition("=")
@@ -54,7 +57,7 @@ def _known(key: str, name: str, ids: Sequence[str], taken: Sequence[str] | dict[
 
 
 def choose_split(options: DataOptions, train: Cameras, test: Cameras) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """(training ids, test ids) after ``test_cameras``, ``train_cameras``, ``train_views`` and ``leak``.
+    """Return (training ids, test ids) as ``test_cameras``, ``train_cameras``, ``train_views``, ``leak`` ask for.
 
     Raises SourceError for unknown or repeated ids, a camera on both sides, or no training camera left.
     """
@@ -97,7 +100,7 @@ def _far_apart(names: tuple[str, ...], count: int, train: Cameras, test: Cameras
 
 
 def gain_at(options: DataOptions, index: int, rng: Rng) -> float:
-    """Factor on all images of frame ``index``, training and test, in gain * [1 - amplitude, 1 + amplitude]."""
+    """Return the factor on all images of frame ``index``, in gain * [1 - amplitude, 1 + amplitude]."""
     if options.gain_pattern == "sine":
         wave = math.sin(2 * math.pi * index / options.gain_period)
     else:
@@ -106,7 +109,7 @@ def gain_at(options: DataOptions, index: int, rng: Rng) -> float:
 
 
 def with_gain(image: FloatArray, factor: float) -> FloatArray:
-    """The image times a factor; what exceeds 1 saturates, as in a camera."""
+    """Return the image times a factor; what exceeds 1 saturates, as in a camera."""
     if factor == 1:
         return image
     out: FloatArray = np.minimum(image * np.float32(factor), np.float32(1))
@@ -114,14 +117,14 @@ def with_gain(image: FloatArray, factor: float) -> FloatArray:
 
 
 def with_noise(image: FloatArray, sigma: float, camera: str, index: int, rng: Rng) -> FloatArray:
-    """The image with Gaussian noise of ``sigma`` 8-bit levels, clipped to [0, 1] (paper, first-frame noise)."""
+    """Return the image with Gaussian noise of ``sigma`` 8-bit levels, clipped to [0, 1] (paper, first-frame noise)."""
     noise = rng.numpy(f"data noise {camera}", index).standard_normal(image.shape, np.float32)
     out: FloatArray = np.clip(image + noise * np.float32(sigma / 255), 0, 1)
     return out
 
 
 def is_lost(options: DataOptions, losses: dict[str, list[range]], camera: str, index: int, rng: Rng) -> bool:
-    """Whether a training camera gives nothing at a frame; never at frame 0."""
+    """Say whether a training camera gives nothing at a frame; never at frame 0."""
     if index == 0:
         return False
     if any(index in frames for frames in losses.get(camera, ())):

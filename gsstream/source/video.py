@@ -170,7 +170,7 @@ class VideoClip:
 
 
 def upright(pixels: np.ndarray[Any, Any], rotation: int, path: Path) -> np.ndarray[Any, Any]:
-    """[H, W, 3] pixels turned counterclockwise by what the file's display matrix says, degrees.
+    """Turn [H, W, 3] pixels counterclockwise by what the file's display matrix says, degrees.
 
     Raises SourceError for an angle that is no multiple of 90.
     """

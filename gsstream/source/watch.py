@@ -122,7 +122,7 @@ class WatchSource:
         return Frame(index, index / self._info.fps, images, cameras, plan.effort)
 
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
-        """Points that were written beside cameras.json before the run began, or None."""
+        """Return points that were written beside cameras.json before the run began, or None."""
         path = self._folder / POINTS_FILE
         return read_points(path, kind) if path.exists() else None
 

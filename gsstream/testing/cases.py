@@ -77,17 +77,17 @@ class World:
         return self.sigma
 
     def blended(self, share: float) -> World:
-        """The same world with only a share of the change between the frames."""
+        """Return the same world with only a share of the change between the frames."""
         pairs = zip(self.before, self.now, strict=True)
         return replace(self, now=tuple(b + share * (n - b) for b, n in pairs))
 
     def views(self, order: list[int]) -> World:
-        """The same world with the cameras in another order, or fewer of them."""
+        """Return the same world with the cameras in another order, or fewer of them."""
         before, now = (tuple(images[i] for i in order) for images in (self.before, self.now))
         return replace(self, cameras=self.cameras.select(order), before=before, now=now)
 
     def permuted(self, order: torch.Tensor) -> World:
-        """The same world with the Gaussians in another order."""
+        """Return the same world with the Gaussians in another order."""
         return replace(
             self, gaussians=self.gaussians.rows(order), moved=self.moved[order], logits=self.logits[order],
             residual=self.residual[order], hierarchy=self.hierarchy.rows(order),
@@ -98,12 +98,12 @@ class World:
         )  # fmt: skip
 
     def double(self) -> World:
-        """Logits and residuals in double precision."""
+        """Return the same world with logits and residuals in double precision."""
         return replace(self, logits=self.logits.double(), residual=self.residual.double())
 
 
 def rig(views: int = 3) -> Cameras:
-    """Cameras on an arc of radius 3 around the origin, looking inwards."""
+    """Return cameras on an arc of radius 3 around the origin, looking inwards."""
     viewmats = []
     for angle in np.linspace(-0.4, 0.4, views):
         c, s = np.cos(angle), np.sin(angle)
@@ -117,7 +117,7 @@ def rig(views: int = 3) -> Cameras:
 
 
 def scene(means: torch.Tensor, seed: int = 0, scales: torch.Tensor | None = None) -> Scene:
-    """Small, fairly opaque blobs of random colours at ``means`` [N, 3]."""
+    """Return small, fairly opaque blobs of random colours at ``means`` [N, 3]."""
     n = len(means)
     g = torch.Generator().manual_seed(seed)
     return Gaussians(
@@ -131,13 +131,16 @@ def scene(means: torch.Tensor, seed: int = 0, scales: torch.Tensor | None = None
 
 
 def flat(n: int) -> Hierarchy:
-    """One root node per Gaussian."""
+    """Return one root node per Gaussian."""
     index = torch.arange(n)
     return Hierarchy(index, index, torch.zeros_like(index))
 
 
 def forest(n: int) -> Hierarchy:
-    """Three trees: nodes 0 to 2 are roots, nodes 3 to 14 their children (four each); flat below twelve Gaussians."""
+    """Return three trees: nodes 0 to 2 are roots, nodes 3 to 14 their children (four each).
+
+    It is flat below twelve Gaussians.
+    """
     if n < 12:
         return flat(n)
     parent = torch.cat([torch.arange(3), torch.arange(12) % 3])
@@ -145,7 +148,7 @@ def forest(n: int) -> Hierarchy:
 
 
 def make_world(name: str, before: Scene, cameras: Cameras, *, shift: float = 0.0) -> World:
-    """A world whose Gaussians with x > 0.3 and in view move by ``shift`` between the frames."""
+    """Return a world whose Gaussians with x > 0.3 and in view move by ``shift`` between the frames."""
     n = len(before)
     moved = (before.means[:, 0] > 0.3) & (before.means[:, 1].abs() < 5) & (shift != 0)
     means = before.means.clone()
@@ -163,7 +166,7 @@ def make_world(name: str, before: Scene, cameras: Cameras, *, shift: float = 0.0
 
 
 def images(gaussians: Scene, cameras: Cameras) -> tuple[torch.Tensor, ...]:
-    """What the cameras see, without noise: one [H, W, 3] per camera, by the reference renderer."""
+    """Return what the cameras see, without noise: one [H, W, 3] per camera, by the reference renderer."""
     with torch.no_grad():
         return tuple(RENDERER.render(gaussians, cameras, view, BLACK).image for view in range(len(cameras)))
 
@@ -219,7 +222,7 @@ def _made(name: str) -> World:
 
 
 def world(name: str) -> World:
-    """A fresh copy of a named world, so that a part that spoils its inputs spoils nobody else's."""
+    """Return a fresh copy of a named world, so that a part that spoils its inputs spoils nobody else's."""
     fresh: World = _copy(_made(name))
     return fresh
 
@@ -240,7 +243,7 @@ def _copy(value: Any) -> Any:
 
 
 def fingerprint(value: Any) -> list[bytes]:
-    """The bits of every array inside a value, in a fixed order."""
+    """Return the bits of every array inside a value, in a fixed order."""
     if isinstance(value, torch.Tensor):
         return [value.detach().numpy().tobytes(), str((value.dtype, tuple(value.shape), value.requires_grad)).encode()]
     if isinstance(value, np.ndarray):

@@ -34,7 +34,7 @@ def all_equal(
     what: str, got: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor], tolerance: float = 0.0,
     why: str = EXACT,
 ) -> None:  # fmt: skip
-    """:func:`equal` for every named tensor; the names must agree too."""
+    """Apply :func:`equal` to every named tensor; the names must agree too."""
     assert set(got) == set(expected), f"{what}: expected the outputs {sorted(expected)}, got {sorted(got)}"
     for name, value in expected.items():
         equal(f"{what}: {name}", got[name], value, tolerance, why)

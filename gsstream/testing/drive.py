@@ -39,21 +39,21 @@ class Behaviour:
 
 
 def behaviour_of(part: Part) -> Behaviour:
-    """The behaviour of the part's kind."""
+    """Return the behaviour of the part's kind."""
     found: Behaviour = importlib.import_module(f"gsstream.testing.{kind_of(part)}.behaviour").BEHAVIOUR
     return found
 
 
 def outputs(part: Part, world: World) -> Outputs:
-    """What ``part`` makes of a world, tensor by tensor."""
+    """Return what ``part`` makes of a world, tensor by tensor."""
     return behaviour_of(part).outputs(part, world)
 
 
 def draw(part: GateSampler, number: int, seed: int = 7) -> torch.Tensor | None:
-    """Noise from a fresh generator."""
+    """Draw noise from a fresh generator."""
     return part.noise(number, torch.Generator().manual_seed(seed))
 
 
 def poison_logits(world: World, value: float) -> None:
-    """Spoil the logit of one Gaussian."""
+    """Change the logit of one Gaussian to a value that no logit has."""
     world.logits[5] = value

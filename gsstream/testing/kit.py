@@ -69,7 +69,7 @@ def run_check(entry: Check, subject: Any, expected: str | None = None) -> CheckR
 
 
 def claimed(subject: Any, trait: str) -> bool:
-    """Whether a part claims a trait; a claim may be a number, and that number 0.
+    """Say whether a part claims a trait; a claim may be a number, and that number 0.
 
     Raises AssertionError when its claims are not the record of its kind.
     """
@@ -92,7 +92,7 @@ def run_checks(part: Part | SourceUnderTest, expected_failures: Mapping[str, str
 
 
 def skip_checks(kind: str, name: str, reason: str) -> list[CheckResult]:
-    """What :func:`run_checks` says of a part that cannot be made here: every check of its kind is skipped."""
+    """Return what :func:`run_checks` says of a part that cannot be made here: every check of its kind is skipped."""
     return [CheckResult(entry.name, name, "skipped", reason) for entry in checks_for(kind)]
 
 
@@ -163,12 +163,12 @@ def _check_reasons(expected: Mapping[str, str], known: Iterable[str]) -> None:
 
 
 def all_checks() -> list[Check]:
-    """Every registered check, in the order of the reports."""
+    """Return every registered check, in the order of the reports."""
     return list(CHECKS.values())
 
 
 def summary(results: Sequence[CheckResult]) -> str:
-    """"12 passed, 1 failed, 3 skipped": every status that occurs is counted."""
+    """Return "12 passed, 1 failed, 3 skipped": every status that occurs is counted."""
     order: tuple[Status, ...] = ("passed", "failed", "expected failure", "skipped")
     counts = {status: sum(result.status == status for result in results) for status in order}
     return ", ".join(f"{number} {status}" for status, number in counts.items() if number)

@@ -30,7 +30,7 @@ class SourceUnderTest:
 
     @contextmanager
     def open(self, scale: float = 1.0) -> Iterator[FrameSource]:
-        """The open recording; closed when the check is over."""
+        """Open the recording; it is closed when the check is over."""
         try:
             source = self.target(self.uri, scale)
         except SourceError as error:

@@ -60,7 +60,7 @@ def check(kind: str, trait: str | None = None, kinds: tuple[str, ...] | None = N
 
 
 def kind_of(part: Part | SourceUnderTest) -> str:
-    """The kind whose abstract base class ``part`` implements. Raises TypeError when it is none of them."""
+    """Return the kind whose abstract base class ``part`` implements. Raises TypeError when it is none of them."""
     if isinstance(part, SourceUnderTest):
         return "source"
     for kind in CONTRACTS:
@@ -70,7 +70,7 @@ def kind_of(part: Part | SourceUnderTest) -> str:
 
 
 def checks_for(kind: str) -> list[Check]:
-    """All checks made on a kind of part, common ones first."""
+    """Return all checks made on a kind of part, common ones first."""
     return [entry for entry in CHECKS.values() if kind in entry.kinds]
 
 

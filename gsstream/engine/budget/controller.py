@@ -31,13 +31,13 @@ class Controller:
             self._note(line)
 
     def allow(self) -> Allowance | None:
-        """What the frame that begins now may spend; None without a limit on frames."""
+        """Return what the frame that begins now may spend; None without a limit on frames."""
         if not self.budget.limits_frames:
             return None
         return Allowance.start(self.budget, plan(self.budget, self._stream, self._history))
 
     def key_refusal(self, num_gaussians: int, allowance: Allowance | None) -> str | None:
-        """Why a key packet that is due must wait, by what the last one cost; None: it may be tried."""
+        """Say why a key packet that is due must wait, judged by what the last one cost; None: it may be tried."""
         if allowance is None or self._key is None:
             return None
         size, seconds = (value * num_gaussians for value in self._key)
@@ -48,9 +48,11 @@ class Controller:
         return None
 
     def settle(self, metrics: dict[str, Any], seconds: float) -> dict[str, Any]:
-        """``metrics`` of a finished frame with its entry ``budget``.
+        """Return the metrics of a finished frame with its entry ``budget``.
 
-        ``seconds``: of the whole frame, by the budget's clock.
+        Arguments:
+            metrics: of the frame.
+            seconds: what the whole frame took, by the budget's clock.
         """
         if not self.budget.limits_anything:
             return metrics
@@ -82,7 +84,7 @@ class Controller:
 
 
 def planned(parts: Assembly, frame_plan: FramePlan) -> Assembly:
-    """The parts with the recipe of one frame: the plan's passes, threshold and weight."""
+    """Return the parts with the recipe of one frame: the plan's passes, threshold and weight."""
     changes = {
         "epochs": frame_plan.epochs, "change_threshold": frame_plan.change_threshold,
         "rate_weight": frame_plan.rate_weight,

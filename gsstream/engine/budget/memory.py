@@ -26,12 +26,14 @@ LEAST_GAUSSIANS = 1_000
 
 
 def memory_floor(info: SourceInfo) -> int:
-    """Bytes a run of this recording needs with the least number of Gaussians."""
+    """Return how many bytes a run of this recording needs with the least number of Gaussians."""
     return _fixed(info) + round(LEAST_GAUSSIANS * BYTES_PER_GAUSSIAN / FOR_GAUSSIANS)
 
 
 def within_memory(parts: Assembly, info: SourceInfo) -> Assembly:
-    """The parts with ``first_frame.max_gaussians`` and the renderer's ``cache_mb`` cut to what the budget holds.
+    """Return the parts with limits on Gaussians and caches that the budget of memory can hold.
+
+    These are ``first_frame.max_gaussians`` and the renderer's ``cache_mb``.
 
     Raises InputError when the budget is below what any run of this recording needs.
     """

@@ -37,7 +37,7 @@ class Allowance:
 
     @staticmethod
     def start(budget: Budget, plan: FramePlan) -> Allowance:
-        """From now on."""
+        """Return an allowance that counts from now on."""
         clock = CLOCKS[budget.clock]
         return Allowance(plan, clock(), clock)
 
@@ -74,7 +74,7 @@ class Pace:
         self._iterations: list[float] = []
 
     def begin(self, candidates: int) -> None:
-        """The first pass begins, with so many Gaussians."""
+        """Note that the first pass begins, with so many Gaussians."""
         if self._timed is None:
             return
         now, plan = self._timed.clock(), self._timed.plan
@@ -96,7 +96,7 @@ class Pace:
         return self._timed.started + seconds - kept - now
 
     def close(self) -> None:
-        """The optimisation has ended."""
+        """Note that the optimisation has ended."""
         if self._allowance is not None:
             self.optimise = self._allowance.clock() - self._allowance.started - self.before
 
@@ -112,7 +112,7 @@ class Pace:
         return self._allowance is not None and self._allowance.plan.max_bytes is not None
 
     def is_over(self) -> bool:
-        """Called after every iteration: whether the time for another one is gone."""
+        """Say, after every iteration, whether the time for another one is gone."""
         if self._timed is None:
             return False
         now = self._timed.clock()
@@ -159,11 +159,16 @@ class Pace:
 
 
 def next_weight(weight: float, expected: float, wanted: float) -> float:
-    """Weight of the rate after a pass that would send ``expected`` bytes where ``wanted`` are to be sent.
+    """Return the weight of the rate after a pass that would send more or fewer bytes than are wanted.
 
     Bytes fall with about the square root of the weight (docs/results/stream.md), so the first power leads half of the
     way to the goal; a factor of three a pass is the most that residuals can follow. What was taken back comes slowly
     again, so the way down is half as fast.
+
+    Arguments:
+        weight: as it was, above 0.
+        expected: bytes that would be sent now.
+        wanted: bytes that are to be sent.
     """
     factor = min(max(expected / wanted, 1 / 9), 3.0)
     factor = factor if factor > 1 else factor**0.5
@@ -171,7 +176,7 @@ def next_weight(weight: float, expected: float, wanted: float) -> float:
 
 
 def estimated_bytes(symbols: torch.Tensor) -> float:
-    """Bytes of a table of symbols [A, L]: the entropy of every channel's histogram, and its model."""
+    """Return the bytes of a table of symbols [A, L]: the entropy of each channel's histogram, and its model."""
     rows, channels = symbols.shape
     if rows == 0 or channels == 0:
         return 0.0

@@ -62,7 +62,7 @@ class Past:
 
 
 def past_of(metrics: Mapping[str, Any]) -> Past | None:
-    """A line of ``metrics.jsonl`` as the planner sees it; None for frames that were not optimised."""
+    """Return a line of ``metrics.jsonl`` as the planner sees it; None for frames that were not optimised."""
     spent = metrics.get("budget", {}).get("spent")
     if spent is None:
         return None
@@ -108,7 +108,7 @@ class FramePlan:
 
 
 def plan(budget: Budget, stream: Stream, history: Sequence[Past]) -> FramePlan:
-    """What the next frame is to spend.
+    """Return what the next frame is to spend.
 
     Arguments:
         stream: the recipe's settings, from which the controller departs.
@@ -140,20 +140,32 @@ def plan(budget: Budget, stream: Stream, history: Sequence[Past]) -> FramePlan:
 
 
 def seconds_per_epoch(history: Sequence[Past]) -> float | None:
-    """Median of what a pass took in the last three frames; None while nothing is known."""
+    """Return the median of what a pass took in the last three frames; None while nothing is known."""
     known = [p.optimise / p.epochs for p in history[-3:] if p.epochs > 0]
     return median(known) if known else None
 
 
 def epochs_within(seconds: float, each: float, most: int) -> int:
-    """Passes of ``each`` seconds that fit, at least 1 and at most ``most``."""
+    """Return how many passes fit into a time, at least 1.
+
+    Arguments:
+        seconds: that there are.
+        each: seconds of a pass, above 0.
+        most: passes that the recipe asks for.
+    """
     if each <= 0:
         return most
     return max(1, min(most, math.floor(min(seconds / each, most) + 1e-9)))
 
 
 def each_with(each: float, then: int, now: int) -> float:
-    """Seconds of a pass with ``now`` candidates where it took ``each`` with ``then``; a part of it does not scale."""
+    """Return the seconds of a pass with another number of candidates; a part of it does not scale.
+
+    Arguments:
+        each: seconds that a pass has taken.
+        then: candidates it had.
+        now: candidates it is to have.
+    """
     return each * (FIXED_SHARE + (1 - FIXED_SHARE) * now / then) if then > 0 else each
 
 

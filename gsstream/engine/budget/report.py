@@ -12,13 +12,13 @@ LISTED = 20
 
 
 def quantity(name: str, value: float) -> str:
-    """``19.80 KB``."""
+    """Return a number with its unit: ``19.80 KB``."""
     factor, unit, form = _UNITS[name]
     return f"{form.format(factor * value)} {unit}"
 
 
 def violations(metrics: Mapping[str, Any]) -> list[str]:
-    """``size 21.3 KB of 20.0 KB`` for every limit that a frame broke."""
+    """Return ``size 21.3 KB of 20.0 KB`` for every limit that a frame broke."""
     entry = metrics.get("budget", {})
     return [
         f"{name} {quantity(name, entry['actual'][name])} of {quantity(name, entry['limits'][name])}"
@@ -27,7 +27,7 @@ def violations(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def budget_lines(lines: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The budget's part of a run's summary; empty for a run without one."""
+    """Return the budget's part of a run's summary; empty for a run without one."""
     held = [line for line in lines if line.get("budget", {}).get("limits")]
     if not held:
         return []

@@ -12,7 +12,7 @@ from gsstream.recipe.model import Stream
 def spent(
     allowance: Allowance, pace: Pace, fitted: Fitted, stream: Stream, epochs: float
 ) -> dict[str, Any]:
-    """The entry ``budget`` of a frame, before the session adds limits and what the whole frame cost.
+    """Return the entry ``budget`` of a frame, before its limits and the cost of the whole frame are added.
 
     Arguments:
         stream: the recipe's own settings, from which the plan departed.

@@ -46,7 +46,7 @@ def fit(
     delta: Delta, packet: EncodedPacket, curvature: Mapping[str, FloatArray], layout: Layout,
     encode: Callable[[Delta], EncodedPacket], max_bytes: int,
 ) -> Fitted:  # fmt: skip
-    """The delta, with as little given up as makes its packet at most ``max_bytes``; unchanged when it fits.
+    """Return the delta, with as little given up as makes its packet fit; unchanged when it fits already.
 
     Arguments:
         packet: the delta, encoded.

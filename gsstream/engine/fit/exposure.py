@@ -24,11 +24,11 @@ class Exposure:
         return Exposure(torch.eye(3).repeat(num_cameras, 1, 1), torch.zeros(num_cameras, 3))
 
     def apply(self, view: int, image: torch.Tensor) -> torch.Tensor:
-        """[H, W, 3] scene colours -> colours as camera ``view`` records them."""
+        """Return [H, W, 3]: scene colours as camera ``view`` records them."""
         return torch.addmm(self.offset[view], image.reshape(-1, 3), self.matrix[view].T).reshape(image.shape)
 
     def pull(self, view: int, gradient: torch.Tensor) -> torch.Tensor:
-        """Gradient with respect to recorded colours -> gradient with respect to scene colours."""
+        """Return the gradient with respect to scene colours, given that with respect to recorded colours [H, W, 3]."""
         return (gradient.reshape(-1, 3) @ self.matrix[view]).reshape(gradient.shape)
 
 
@@ -47,7 +47,7 @@ class ExposureFit:
         return ExposureFit(Exposure.identity(num_cameras), zeros, zeros, (0,) * num_cameras)
 
     def step(self, view: int, image: torch.Tensor, gradient: torch.Tensor, lr: float, pull: float) -> ExposureFit:
-        """One Adam step of camera ``view``.
+        """Make one Adam step of camera ``view``.
 
         Arguments:
             image, gradient: [H, W, 3] uncorrected render, and the loss gradient with respect to the corrected one.

@@ -56,7 +56,16 @@ def shown(
     renderer: Renderer, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int,
     background: tuple[float, float, float], exposure: Exposure | None,
 ) -> torch.Tensor:  # fmt: skip
-    """Return [H, W, 3]: a scene as the camera of this view records it; no graph."""
+    """Return [H, W, 3]: a scene as the camera of this view records it; no graph.
+
+    Arguments:
+        renderer: that draws.
+        gaussians: N rows, raw values.
+        cameras: training cameras.
+        view: index of one of them.
+        background: colour behind everything, 0 to 1.
+        exposure: colour maps of the cameras, or None.
+    """
     with torch.no_grad():
         image = renderer.render(gaussians, cameras, view, background).image
     return exposure.apply(view, image) if exposure else image

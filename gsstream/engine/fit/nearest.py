@@ -12,7 +12,9 @@ ALONE = 0.01
 
 
 def neighbour_distance(positions: torch.Tensor) -> torch.Tensor:
-    """[N] root mean squared distance to the three nearest other points (3DGS), float32; fewer than three: to those.
+    """Return [N] float32: root mean squared distance to the three nearest other points, as in 3DGS.
+
+    With fewer than three others: to those.
 
     Points at one place are neighbours at distance 0. A point alone is taken to be 0.01 from another.
 
@@ -28,7 +30,7 @@ def neighbour_distance(positions: torch.Tensor) -> torch.Tensor:
 
 
 def nearest_rows(points: FloatArray, means: FloatArray) -> tuple[FloatArray, IntArray]:
-    """[B] distance of each point to the nearest of ``means``, and its row; infinitely far when there is none."""
+    """Return [B] the distance of each point to the nearest of ``means``, and its row; infinitely far without any."""
     if not len(means):
         return np.full(len(points), np.inf), np.zeros(len(points), np.int64)
     distances, rows = _query(points, means, 1)

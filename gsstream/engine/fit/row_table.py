@@ -27,7 +27,7 @@ class RowTable:
         return self.leaves[name]
 
     def step(self, gradients: Mapping[str, torch.Tensor] = EMPTY) -> None:
-        """One Adam step from ``gradients`` and whatever waits on the leaves, which is then dropped."""
+        """Make one Adam step from ``gradients`` and whatever waits on the leaves, which is then dropped."""
         total = dict(gradients)
         for name, leaf in self.leaves.items():
             if leaf.grad is not None:
@@ -58,7 +58,7 @@ class RowTable:
             state.exp_avg_sq[edit.fresh] = 0
 
     def moments(self, name: str) -> dict[str, torch.Tensor]:
-        """Adam state of one leaf, row by row."""
+        """Return the Adam state of one leaf, row by row."""
         state = self._states[name]
         return {"exp_avg": state.exp_avg, "exp_avg_sq": state.exp_avg_sq, "steps": state.steps}
 

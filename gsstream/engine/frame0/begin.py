@@ -66,9 +66,14 @@ def begin(
 
 
 def seeded(parts: Assembly, points: PointCloud, frame: Frame) -> Anchors:
-    """Anchors, at most ``first_frame.max_gaussians`` of them.
+    """Return anchors, at most ``first_frame.max_gaussians`` of them.
 
     A structure places one or more for each point, so where there are too many it is given fewer points.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        points: seeds of the scene.
+        frame: training images of frame 0.
     """
     most = parts.recipe.first_frame.max_gaussians
     while True:
@@ -79,7 +84,13 @@ def seeded(parts: Assembly, points: PointCloud, frame: Frame) -> Anchors:
 
 
 def check_cameras(cameras: Cameras, least: int, who: str) -> None:
-    """Raise InputError when there are fewer training cameras than somebody needs."""
+    """Raise InputError when there are fewer training cameras than somebody needs.
+
+    Arguments:
+        cameras: training cameras.
+        least: number that is needed.
+        who: who needs them, for the error.
+    """
     if len(cameras) < least:
         raise InputError(
             f"{who} needs at least {least} training camera{'s'[: least != 1]}, got {len(cameras)}; record with "
@@ -88,7 +99,16 @@ def check_cameras(cameras: Cameras, least: int, who: str) -> None:
 
 
 def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
-    """Start from the decoded frame 0 of another stream, grouped by this method: methods compare on the same scene.
+    """Start from the decoded frame 0 of another stream, grouped by this method.
+
+    Methods can then be compared on the same scene.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        first: what players have of that frame 0.
+        frame: training images of frame 0.
+        meta: what the key packet says about the run.
+        rng: random streams by name and frame.
 
     Raises InputError when the recipe asks for another degree of spherical harmonics than the stream has.
     """
@@ -118,7 +138,13 @@ def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMe
 
 
 def own_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
-    """The grid this method's structure would lay; each Gaussian gets the level of the nearest cell size."""
+    """Return the grid that this method's structure would lay; each Gaussian gets the level of the nearest cell size.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        first: the decoded scene.
+        frame: training images of frame 0.
+    """
     theirs = decoded_anchors(first)
     grid = parts.structure.seed(cloud_of(first), frame.cameras)
     sizes = theirs.cell_sizes[theirs.levels]
@@ -127,13 +153,13 @@ def own_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
 
 
 def cloud_of(first: PlayerState) -> PointCloud:
-    """The centres of a decoded scene; their colour is unknown, grey."""
+    """Return the centres of a decoded scene as points; their colour is unknown, grey."""
     means = first.gaussians.means
     return PointCloud(means, np.full_like(means, 0.5), "frame 0 of another stream")
 
 
 def decoded_anchors(player: PlayerState) -> Anchors:
-    """What a structure needs to group a decoded scene again."""
+    """Return what a structure needs to group a decoded scene again."""
     gaussians = player.gaussians.map(torch.from_numpy)
     return Anchors(
         positions=gaussians.means,
@@ -147,7 +173,14 @@ def decoded_anchors(player: PlayerState) -> Anchors:
 def arrange(
     parts: Assembly, gaussians: Gaussians[torch.Tensor], levels: torch.Tensor, anchors: Anchors
 ) -> tuple[Hierarchy, torch.Tensor, Gaussians[torch.Tensor]]:
-    """Group the Gaussians and store them node by node: (hierarchy, levels, Gaussians), all in the new order."""
+    """Group the Gaussians and store them node by node: (hierarchy, levels, Gaussians), all in the new order.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        gaussians: N rows, raw values, in any order.
+        levels: [N] level of the anchor of each.
+        anchors: what the structure laid.
+    """
     hierarchy = parts.structure.build(gaussians, anchors)
     with blaming("structure", parts.part("structure"), parts.where):
         hierarchy.validate()
@@ -156,7 +189,13 @@ def arrange(
 
 
 def make_layout(hierarchy: Hierarchy, levels: torch.Tensor, anchors: Anchors) -> Layout:
-    """What both ends know until the next key packet; ``hierarchy.node_of`` must be sorted."""
+    """Return what both ends know until the next key packet.
+
+    Arguments:
+        hierarchy: M nodes; ``node_of`` [N] must be sorted.
+        levels: [N] level of each row.
+        anchors: cell sizes of the levels.
+    """
     counts = torch.bincount(hierarchy.node_of, minlength=hierarchy.num_nodes)
     return Layout(
         node_counts=counts.numpy().astype(np.int32),
@@ -176,7 +215,18 @@ def key_state(
     origin: torch.Tensor,
     rng: Rng,
 ) -> tuple[StreamState, EncodedPacket]:
-    """Encode a key packet and continue from its decoded bytes."""
+    """Encode a key packet and continue from its decoded bytes.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        gaussians: N rows, stored node by node.
+        layout, hierarchy: how they are stored and grouped.
+        frame: training images of the frame.
+        meta: what the key packet says about the run.
+        exposure: colour maps of the cameras, or None.
+        origin: [3] origin of the structure's grid.
+        rng: random streams by name and frame.
+    """
     extra: Mapping[str, Any] = {**meta.extra, **exposure_to_meta(exposure), "origin": origin.tolist()}
     arrays: Gaussians[FloatArray] = gaussians.map(lambda t: np.ascontiguousarray(t.numpy()))
     packet = encode_key(KeyState(arrays, layout, replace(meta, extra=extra)), frame=frame.index)
@@ -190,14 +240,14 @@ def key_state(
 
 
 def exposure_to_meta(exposure: Exposure | None) -> dict[str, Any]:
-    """The colour maps of the training cameras as plain values: what a camera recorded can be shown from the stream."""
+    """Return the colour maps of the training cameras as plain values, for the key packet."""
     if exposure is None:
         return {}
     return {"exposure": {"matrix": exposure.matrix.tolist(), "offset": exposure.offset.tolist()}}
 
 
 def exposure_from_meta(meta: StreamMeta) -> Exposure | None:
-    """Inverse of :func:`exposure_to_meta`; encoder and resumed encoder both continue from the packet's values."""
+    """Return the colour maps that a key packet holds; an encoder, resumed or not, goes on from these values."""
     stored = meta.extra.get("exposure")
     if stored is None:
         return None

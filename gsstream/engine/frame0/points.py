@@ -50,7 +50,10 @@ def gather_points(
 
 
 def with_test_views(source: FrameSource, frame: Frame) -> Frame:
-    """The frame with the test cameras' images behind its own: what ``data.leak = points`` lets seeding see."""
+    """Return the frame with the images of the test cameras behind its own.
+
+    This is what ``data.leak = points`` lets seeding see.
+    """
     test = source.frame(frame.index, "test")
     cameras = replace(
         frame.cameras,
@@ -62,7 +65,7 @@ def with_test_views(source: FrameSource, frame: Frame) -> Frame:
 
 
 def join(first: PointCloud, second: PointCloud) -> PointCloud:
-    """Both clouds, in order."""
+    """Return both clouds as one, in order."""
     return PointCloud(
         np.concatenate([first.xyz, second.xyz]).astype(np.float32),
         np.concatenate([first.rgb, second.rgb]).astype(np.float32),

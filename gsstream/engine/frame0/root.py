@@ -45,7 +45,7 @@ class RootResult:
 
 
 def initial_gaussians(anchors: Anchors, settings: FirstFrame) -> Gaussians[torch.Tensor]:
-    """One isotropic Gaussian per anchor, as wide as the distance to its three nearest neighbours (3DGS)."""
+    """Return one isotropic Gaussian per anchor, as wide as the distance to its three nearest neighbours (3DGS)."""
     count = len(anchors.positions)
     if count == 0:
         raise InputError("the structure placed no anchors: expected at least 1 Gaussian to start from, got 0")
@@ -63,7 +63,12 @@ def initial_gaussians(anchors: Anchors, settings: FirstFrame) -> Gaussians[torch
 
 
 def first_rates(settings: FirstFrame, extent: float) -> dict[str, float]:
-    """Learning rate of every attribute at the start of frame 0; ``extent``: of the cameras, scene units."""
+    """Return the learning rate of every attribute at the start of frame 0.
+
+    Arguments:
+        settings: section ``first_frame`` of the recipe.
+        extent: of the cameras, scene units.
+    """
     s = settings
     rates = {"means": s.lr_means * extent, "quats": schedule.LR_QUATS, "scales": schedule.LR_SCALES}
     return {**rates, "opacities": schedule.LR_OPACITIES, "sh0": schedule.LR_SH0, "shN": schedule.LR_SHN}
@@ -180,5 +185,5 @@ def _log_linear(first: float, last: float, fraction: float) -> float:
 
 
 def sort_by_node(node_of: torch.Tensor) -> TopologyEdit:
-    """The permutation that stores Gaussians node by node (stable)."""
+    """Return the permutation that stores Gaussians node by node (stable)."""
     return TopologyEdit.permute(torch.argsort(node_of, stable=True))

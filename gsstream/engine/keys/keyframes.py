@@ -50,7 +50,15 @@ def _postponed(step: Step, refused: str) -> Step:
 
 
 def decoded_again(parts: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
-    """Return the current decoded scene as a key packet, and the state that follows from its bytes."""
+    """Return the current decoded scene as a key packet, and the state that follows from its bytes.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        state: after the frame, as players have it.
+        frame: training images of the frame.
+        meta: what the key packet says about the run.
+        rng: random streams by name and frame.
+    """
     player = state.player
     gaussians = quantise_key(player.gaussians).map(torch.from_numpy)
     anchors = decoded_anchors(player)

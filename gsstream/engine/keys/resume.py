@@ -73,7 +73,12 @@ def _played(path: Path, last: int | None) -> Iterator[tuple[PlayerState, PacketK
 
 
 def check_stream(parts: Assembly, path: Path, info: SourceInfo) -> bool:
-    """Whether a stream has a complete frame 0 to go on from.
+    """Say whether a stream has a complete frame 0 to go on from.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        path: of the stream.
+        info: what the recording says about itself.
 
     Raises OutputError when the recipe or the recording is not the one it was written with.
     """
@@ -92,6 +97,11 @@ def state_after(parts: Assembly, states: Iterable[PlayerState], rng: Rng) -> Str
     """Return the encoder state after these player states, the first of which is that of a key packet.
 
     ``previous`` is not set: no stream holds images.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        states: of players, in order, from a key packet on.
+        rng: random streams by name and frame.
     """
     state: StreamState | None = None
     for player in states:
@@ -101,7 +111,13 @@ def state_after(parts: Assembly, states: Iterable[PlayerState], rng: Rng) -> Str
 
 
 def key_state_from_player(parts: Assembly, player: PlayerState, rng: Rng) -> StreamState:
-    """Return the encoder state right after a key packet, from the decoded packet alone (``previous`` is not set)."""
+    """Return the encoder state right after a key packet, from the decoded packet alone (``previous`` is not set).
+
+    Arguments:
+        parts: the live parts of the recipe.
+        player: decoded from a key packet.
+        rng: random streams by name and frame.
+    """
     gaussians = player.gaussians.map(torch.from_numpy)
     decoders = parts.update.init_decoders(gaussians, rng.stream("decoders", player.frame))
     return StreamState(
@@ -115,7 +131,7 @@ def key_state_from_player(parts: Assembly, player: PlayerState, rng: Rng) -> Str
 
 
 def rebuild_hierarchy(parts: Assembly, player: PlayerState) -> Hierarchy:
-    """The hierarchy the encoder built: the structure sees the same bits, so it gives the same forest."""
+    """Return the hierarchy that the encoder built: the structure sees the same bits, so it gives the same forest."""
     return parts.structure.build(player.gaussians.map(torch.from_numpy), decoded_anchors(player))
 
 

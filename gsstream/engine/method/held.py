@@ -38,6 +38,11 @@ def begin_held(tools: RunTools, frame: Frame) -> Step[Any]:
 def step_held(tools: RunTools, state: MethodState, frame: Frame) -> Step[Any]:
     """Make a later frame.
 
+    Arguments:
+        tools: what the run lends to its method.
+        state: after the frame before.
+        frame: training images of this frame.
+
     Raises ComponentError when the method fails, unless the recipe says ``stream.on_error: repeat``: then the method is
     asked for the same frame as one that is worth nothing, which it has to answer by an empty packet.
     """

@@ -132,7 +132,7 @@ class Encoder:
         return end.player.frame
 
     def at_near(self, frame: Frame) -> Frame:
-        """The frame with the near plane that the recipe gives this rig."""
+        """Return the frame with the near plane that the recipe gives this rig."""
         return replace(frame, cameras=replace(frame.cameras, near=self.near))
 
     def _begin(self, frame: Frame) -> Step[Any]:

@@ -28,7 +28,7 @@ class HeldOut:
         self._sigma: list[float] = []
 
     def measure(self, state: MethodState, frame: Frame) -> dict[str, Any]:
-        """PSNR, SSIM and moving-pixel PSNR per test camera; None where undefined (nothing moves, or equal images)."""
+        """Return PSNR, SSIM and PSNR of moving and changed pixels by test camera; None where undefined."""
         if self._first is None:
             self._first = frame
         elif not self._sigma:
@@ -45,13 +45,19 @@ class HeldOut:
         return out
 
     def remember(self, first: Frame, second: Frame | None) -> None:
-        """What a resumed run must know of the frames it does not redo."""
+        """Note what a resumed run must know of the frames it does not redo."""
         self._first = first
         if second is not None:
             self._sigma = [noise_sigma(a, b) for a, b in zip(first.images, second.images, strict=True)]
 
     def render(self, state: MethodState, frame: Frame, view: int) -> FloatArray:
-        """[H, W, 3] decoded image in [0, 1]."""
+        """Return the decoded image [H, W, 3] of a test camera, in [0, 1].
+
+        Arguments:
+            state: what players have.
+            frame: test images, for their cameras.
+            view: index of a test camera.
+        """
         gaussians = state.player.gaussians.map(torch.from_numpy)
         with torch.no_grad():
             output = self._renderer.render(gaussians, frame.cameras, view, self._background)

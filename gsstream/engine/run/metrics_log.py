@@ -15,7 +15,7 @@ from gsstream.engine.run.output import disk_errors, write_whole
 
 
 def read_metrics(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
-    """(line number, line) of every frame's record, in the order of the file; empty lines are passed over.
+    """Return (line number, line) of every frame's record, in the order of the file.
 
     A last line that is no JSON is left out: a run that is being written, or was killed, ends in half of one. Raises
     InputError naming file and line for anything else that is not a JSON object with a frame, and when there is no file.
@@ -39,7 +39,7 @@ def read_metrics(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def last_written(path: Path) -> int:
-    """Last frame up to which no line is missing; -1: none."""
+    """Return the last frame up to which no line is missing; -1: none."""
     frames = {int(line["frame"]) for line in _written(path)}
     return next(frame for frame in itertools.count(-1) if frame + 1 not in frames)
 
@@ -56,9 +56,14 @@ def trim_metrics(path: Path, last: int) -> list[dict[str, Any]]:
 
 
 def lost_lines(path: Path, first: int, last: int) -> list[int]:
-    """Frames ``first`` to ``last`` of a stream that have no line: a kill fell between their packet and their line.
+    """Return the frames of a stream that have no line: a kill fell between their packet and their line.
 
     Tables of such a file leave these frames out; a run that goes on measures them again, or says so.
+
+    Arguments:
+        path: of ``metrics.jsonl``.
+        first: frame of the stream.
+        last: frame of the stream.
     """
     written = {int(line["frame"]) for line in _written(path)}
     return [frame for frame in range(first, last + 1) if frame not in written]

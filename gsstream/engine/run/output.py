@@ -31,6 +31,11 @@ def claim_output(out: Path, *, resume: bool = False, overwrite: bool = False) ->
 
     Arguments and errors are those of :func:`prepare_output`; besides, OutputError when another run holds the folder,
     saying which. The lock goes with the process, however that ends. Gives whether there is a run to continue.
+
+    Arguments:
+        out: the folder of the run.
+        resume: go on with the run that it holds.
+        overwrite: replace the run that it holds.
     """
     check_output(out, resume=resume, overwrite=overwrite)
     try:
@@ -187,7 +192,13 @@ def prepare_output(out: Path, *, resume: bool = False, overwrite: bool = False) 
 
 
 def check_output(out: Path, *, resume: bool = False, overwrite: bool = False) -> list[str]:
-    """The checks of :func:`prepare_output`, and nothing written; returns which ``RUN_FILES`` there are."""
+    """Make the checks of :func:`prepare_output` and write nothing; return which ``RUN_FILES`` there are.
+
+    Arguments:
+        out: the folder of the run.
+        resume: go on with the run that it holds.
+        overwrite: replace the run that it holds.
+    """
     if resume and overwrite:
         raise OutputError("--resume continues the run in the output folder, --overwrite deletes it: give one of them")
     if out.exists() and not out.is_dir():

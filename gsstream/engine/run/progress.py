@@ -39,7 +39,14 @@ class RunProgress:
             self._bar.stop()
 
     def root(self, iteration: int, iterations: int, loss: float, count: int) -> None:
-        """Called after every iteration of frame 0."""
+        """Show an iteration of frame 0.
+
+        Arguments:
+            iteration: from 0.
+            iterations: of frame 0 in all.
+            loss: of this iteration.
+            count: Gaussians there are.
+        """
         note = f"loss {loss:.4f}, {count} Gaussians"
         if self._bar:
             if self._task is None:
@@ -50,7 +57,7 @@ class RunProgress:
             self.say(f"frame 0: iteration {iteration}/{iterations}, {note}")
 
     def frame(self, metrics: Mapping[str, Any]) -> None:
-        """Called after every frame that was written."""
+        """Show a frame that was written."""
         index = int(metrics["frame"])
         if index == 0 and self._bar and self._task is not None:
             self._bar.remove_task(self._task)
@@ -63,14 +70,17 @@ class RunProgress:
         self.say(line)
 
     def say(self, line: str) -> None:
-        """One plain line, unless quiet."""
+        """Print one plain line, unless quiet."""
         if not self._quiet:
             console = self._bar.console if self._bar else self._console
             console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def frame_line(metrics: Mapping[str, Any], total: int | None) -> str:
-    """``frame 3/29: 27.31 dB (moving 24.90), 8.4 KB, 0.52 s, 4.1 % active``; ``total``: None while nobody knows."""
+    """Return ``frame 3/29: 27.31 dB (moving 24.90), 8.4 KB, 0.52 s, 4.1 % active``.
+
+    ``total`` is None while nobody knows it.
+    """
     values = [v for v in metrics.get("psnr", {}).values() if v is not None]
     moving = [v for v in metrics.get("psnr_moving", {}).values() if v is not None]
     parts = []

@@ -35,6 +35,11 @@ def open_recording(uri: str, recipe: Recipe, catalog: Catalog) -> FrameSource:
 def reopen_recording(uri: str, recipe: Mapping[str, Any], catalog: Catalog) -> FrameSource:
     """Open ``uri`` as the run did whose recipe a stream carries (``StreamMeta.recipe``).
 
+    Arguments:
+        uri: as ``--source`` takes it.
+        recipe: as a stream carries it.
+        catalog: of the parts that are installed.
+
     Raises RecipeError when the stream's recipe has data options that this version does not know, else as
     :func:`open_recording`.
     """
@@ -72,7 +77,7 @@ def _open_plain(uri: str, scale: float, catalog: Catalog) -> FrameSource:
 
 
 def read_first_frame(path: Path) -> PlayerState:
-    """The decoded first frame of a stream.
+    """Return the decoded first frame of a stream.
 
     Raises SourceError when there is no such file, PacketError when its first packet is missing or damaged.
     """

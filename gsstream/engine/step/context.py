@@ -50,7 +50,7 @@ class FrameView:
         return self._session
 
     def session_for(self, rows: torch.Tensor) -> RenderSession:
-        """The session in which only ``rows`` change. When all do, no cache is of use: a new one."""
+        """Return the session in which only ``rows`` change; a new one when all do, since no cache is of use then."""
         if len(rows) == len(self._gaussians):
             return self._parts.renderer.open(self._gaussians, None, self.cameras, self._background)
         self.session.narrow(rows)

@@ -11,7 +11,7 @@ RESOLUTION = 2.0**-24
 
 
 def count_dead(gate: GateSampler, logits: torch.Tensor) -> int:
-    """How many of the gates with these logits [M] neither the images nor the price can move.
+    """Count the gates with these logits [M] that neither the images nor the price can move.
 
     Dead: the derivatives by the logit both of the deterministic gate (through which the images act) and of the open
     probability (through which the price acts) are below RESOLUTION. Samplers that do not depend on their logits have

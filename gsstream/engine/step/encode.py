@@ -32,7 +32,13 @@ def encode_frame(delta: Delta, before: PlayerState, problem: Problem, solution: 
 
 
 def encode(delta: Delta, before: PlayerState, frame: int) -> EncodedPacket:
-    """Return the packet of a delta; an empty one when nothing changes."""
+    """Return the packet of a delta; an empty one when nothing changes.
+
+    Arguments:
+        delta: what the frame changes.
+        before: what players have before it.
+        frame: its index.
+    """
     if delta.is_empty:
         return encode_empty(frame=frame)
     return encode_delta(delta, before.layout, before.decoders, frame=frame)

@@ -96,7 +96,13 @@ def frame_step(
 
 
 def still(state: StreamState, frame: Frame, clock: PhaseClock) -> Outcome:
-    """Return the step of a frame in which no tile of any view changed, or that is skipped: an empty packet."""
+    """Return the step of a frame in which no tile of any view changed, or that is skipped: an empty packet.
+
+    Arguments:
+        state: after the frame before.
+        frame: training images of this frame.
+        clock: of its phases.
+    """
     with clock.phase("code"):
         packet = encode_empty(frame=frame.index)
         after = replace(state, player=decode_packet(state.player, packet.data))

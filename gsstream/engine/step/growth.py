@@ -15,6 +15,13 @@ from gsstream.growth.none import NoGrowth
 def grown(parts: Assembly, state: StreamState, delta: Delta, view: FrameView, rng: Rng) -> Delta:
     """Return the delta with the rows that leave and those that join.
 
+    Arguments:
+        parts: the live parts of the recipe.
+        state: after the frame before.
+        delta: motions and residual of this frame.
+        view: the frame as parts see it.
+        rng: random streams by name and frame.
+
     Raises ComponentError when the part fails, ShapeError when what it proposes does not fit the scene.
     """
     if isinstance(parts.part("growth"), NoGrowth):

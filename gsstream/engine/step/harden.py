@@ -25,6 +25,11 @@ def harden(parts: Assembly, problem: Problem, solution: Solution) -> Residual | 
 
     A gate behind which every symbol is zero is closed: it would cost bits and change nothing.
 
+    Arguments:
+        parts: the live parts of the recipe.
+        problem: what the optimisation was given.
+        solution: what it found.
+
     Raises ComponentError when what was learned cannot be sent: not finite, or beyond symbols of 32 bits.
     """
     check_solution(parts, problem, solution)
@@ -51,7 +56,13 @@ def harden(parts: Assembly, problem: Problem, solution: Solution) -> Residual | 
 
 
 def check_solution(parts: Assembly, problem: Problem, solution: Solution) -> None:
-    """Raise ComponentError unless what was learned can be sent: finite, and residuals within 32 bit symbols."""
+    """Raise ComponentError unless what was learned can be sent: finite, and residuals within 32 bit symbols.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        problem: what the optimisation was given.
+        solution: what it found.
+    """
     codes, look = coarser(parts.update.codes(), problem.step_scale), Look(
         parts.checks, "update", parts.part("update"), parts.where
     )
@@ -64,7 +75,13 @@ def check_solution(parts: Assembly, problem: Problem, solution: Solution) -> Non
 
 
 def rows_of(values: np.ndarray[Any, Any], known: IntArray, wanted: IntArray) -> np.ndarray[Any, Any]:
-    """Return the rows ``wanted`` of a table whose rows belong to ``known`` (both ascending); others are zero."""
+    """Return the wanted rows of a table; rows that it does not know are zero.
+
+    Arguments:
+        values: [K, L] the table.
+        known: [K] int64 rows that it has, ascending.
+        wanted: [W] int64 rows, ascending.
+    """
     out = np.zeros((len(wanted), values.shape[1]), values.dtype)
     place = np.searchsorted(known, wanted)
     inside = (place < len(known)) & (known[np.minimum(place, max(0, len(known) - 1))] == wanted)

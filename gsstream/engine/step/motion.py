@@ -28,6 +28,13 @@ class Moved(NamedTuple):
 def moved(parts: Assembly, state: StreamState, frame: Frame, change: Change | None, rng: Rng) -> Moved:
     """Ask the motion part, and apply what it proposes as every player will.
 
+    Arguments:
+        parts: the live parts of the recipe.
+        state: after the frame before.
+        frame: training images of this frame.
+        change: what changed in them; None: everything counts as changed.
+        rng: random streams by name and frame.
+
     Raises ComponentError when the part fails, ShapeError when its motions do not fit the scene.
     """
     scene = state.player.scene

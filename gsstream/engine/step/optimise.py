@@ -27,6 +27,11 @@ def optimise(parts: Assembly, problem: Problem, generator: torch.Generator) -> S
     """Minimise photometric loss + penalty over epochs x views, one view per iteration.
 
     After every epoch rows whose gate has closed may leave, as the recipe says.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        problem: candidates, their gates, and what they are compared with.
+        generator: of noise and of the order of views.
     """
     if len(problem.rows) == 0:
         return Solution(problem.rows, {}, {}, problem.logits)

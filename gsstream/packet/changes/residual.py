@@ -28,7 +28,10 @@ _MAX_CHANGE = 1e18
 
 
 def quantise_decoders(decoders: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-    """The float32 decoders a player will have: rounded to float16. Idempotent. Raises ShapeError beyond +-65504."""
+    """Return the float32 decoders a player will have: rounded to float16.
+
+    Doing it again changes nothing. Raises ShapeError beyond +-65504.
+    """
     out: dict[str, FloatArray] = {}
     for name, value in decoders.items():
         with np.errstate(over="ignore"):

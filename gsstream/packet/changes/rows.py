@@ -22,7 +22,7 @@ HEAD_PARTS = 5
 
 
 def most_births(size: int) -> int:
-    """How many Gaussians, and how many nodes, a section of ``size`` bytes may announce."""
+    """Return how many Gaussians, and how many nodes, a section of ``size`` bytes may announce."""
     return min(MAX_GAUSSIANS, MAX_GAUSSIANS_PER_BYTE * size)
 
 
@@ -66,14 +66,14 @@ def _check_births(births: Births, layout: Layout, leaving: int) -> None:
 
 
 def encode_deaths(deaths: IntArray, number: int) -> bytes:
-    """Rows [D] that leave a scene of N, as runs of those that stay and those that go."""
+    """Encode the rows [D] that leave a scene of N, as runs of those that stay and those that go."""
     gone = np.zeros(number, np.uint8)
     gone[deaths] = 1
     return encode_gates(gone, 1)
 
 
 def decode_deaths(data: bytes, number: int) -> IntArray:
-    """Inverse of :func:`encode_deaths`. Raises PacketError (without offset)."""
+    """Decode what :func:`encode_deaths` wrote. Raises PacketError (without offset)."""
     gone, levels = decode_gates(data, number)
     if levels != 1 or not gone.any():
         raise PacketError("deaths: no row leaves, or rows leave by levels")

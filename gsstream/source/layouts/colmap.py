@@ -34,12 +34,15 @@ _PLACES = ("sparse/0", "sparse", ".")
 
 
 def looks_like(folder: Path) -> bool:
-    """cameras and images (.bin or .txt) in sparse/0/ or sparse/."""
+    """Say whether cameras and images (.bin or .txt) lie in sparse/0/ or sparse/."""
     return any(has_model(folder / place) for place in _PLACES)
 
 
 def read(folder: Path) -> Recording:
-    """Cameras with distortion are undistorted on reading; a point counts as seen by the images of its track."""
+    """Read a COLMAP model; cameras with distortion are undistorted on reading.
+
+    A point counts as seen by the images of its track.
+    """
     model = next((folder / place for place in _PLACES if has_model(folder / place)), None)
     if model is None:
         raise SourceError(f"{folder}: no COLMAP model; expected cameras and images (.bin or .txt) in sparse/0/")
@@ -76,7 +79,10 @@ def read(folder: Path) -> Recording:
 
 
 def intrinsics(camera: ModelCamera, where: str) -> tuple[FloatArray, Lens | None]:
-    """[3, 3] K and the distortion of a COLMAP camera. Raises SourceError for models without a lens of ours."""
+    """Return K [3, 3] and the distortion of a COLMAP camera.
+
+    Raises SourceError for models whose lens gsstream does not know.
+    """
     p = camera.params
     single = camera.model.startswith(("SIMPLE_", "RADIAL"))
     fx, fy, cx, cy = (p[0], p[0], p[1], p[2]) if single else p[:4]

@@ -95,7 +95,7 @@ class _Bytes:
 
 
 def read_cameras(folder: Path) -> dict[int, ModelCamera]:
-    """Camera number -> intrinsics. Raises SourceError for a model nobody knows, a cut or unreadable file."""
+    """Return camera number -> intrinsics. Raises SourceError for an unknown model, a cut or unreadable file."""
     path = _file(folder, "cameras")
     cameras: dict[int, ModelCamera] = {}
     if path.suffix == ".bin":
@@ -119,7 +119,7 @@ def read_cameras(folder: Path) -> dict[int, ModelCamera]:
 
 
 def read_images(folder: Path) -> dict[int, ModelImage]:
-    """Image number -> registered image."""
+    """Return image number -> registered image."""
     path = _file(folder, "images")
     images: dict[int, ModelImage] = {}
     if path.suffix == ".bin":
@@ -144,7 +144,7 @@ def read_images(folder: Path) -> dict[int, ModelImage]:
 
 
 def read_points(folder: Path) -> ModelPoints:
-    """All points of the model."""
+    """Return all points of the model."""
     path = _file(folder, "points3D")
     xyz: list[Any] = []
     rgb: list[Any] = []
@@ -171,12 +171,12 @@ def read_points(folder: Path) -> ModelPoints:
 
 
 def has_model(folder: Path) -> bool:
-    """Whether cameras and images lie here."""
+    """Say whether cameras and images lie here."""
     return all(any((folder / f"{name}{end}").is_file() for end in (".bin", ".txt")) for name in ("cameras", "images"))
 
 
 def has_points(folder: Path) -> bool:
-    """Whether points lie here, too."""
+    """Say whether points lie here, too."""
     return any((folder / f"points3D{end}").is_file() for end in (".bin", ".txt"))
 
 

@@ -29,12 +29,12 @@ INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
 
 
 def looks_like(folder: Path) -> bool:
-    """intri.yml beside extri.yml."""
+    """Say whether there is an intri.yml beside an extri.yml."""
     return (folder / INTRINSICS).is_file() and (folder / EXTRINSICS).is_file()
 
 
 def read(folder: Path) -> Recording:
-    """ENeRF-Outdoor: 18 cameras, 1920 x 1080, 30 frames per second; the first camera (00) judges (paper)."""
+    """Read ENeRF-Outdoor: 18 cameras, 1920 x 1080, 30 frames per second; the first camera (00) judges (paper)."""
     intri, extri = _load(folder / INTRINSICS), _load(folder / EXTRINSICS)
     names = intri.get("names")
     if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):

@@ -25,7 +25,7 @@ _ASPECT_TOLERANCE = 0.01
 
 
 def camera_clips(folder: Path, pattern: str) -> dict[str, Clip]:
-    """Camera id -> clip, in natural order, from the first of these that is there:
+    """Return camera id -> clip, in natural order, from the first of these layouts that is there.
 
     ``NAME.mp4``; ``NAME/images/*.png``; ``NAME/*.png``; ``frame000001/NAME.png`` (one folder per instant).
     NAME follows ``pattern`` (a glob); PNG or JPEG.
@@ -57,7 +57,7 @@ def _by_instant(instants: list[Path], pattern: str) -> dict[str, Clip]:
 
 
 def read_poses_bounds(path: Path, names: Sequence[str], size: tuple[int, int]) -> Cameras:
-    """The rig of poses_bounds.npy for pictures of ``size`` (width, height).
+    """Return the rig of poses_bounds.npy for pictures of ``size`` (width, height).
 
     Raises SourceError when the file is not such an array, has another number of rows than there are cameras, or was
     made for pictures of another shape.

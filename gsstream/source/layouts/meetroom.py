@@ -12,14 +12,14 @@ PATTERN = "cam_[0-9]*"
 
 
 def looks_like(folder: Path) -> bool:
-    """poses_bounds.npy beside cam_0.mp4, cam_0/ or frame000001/cam_0.png."""
+    """Say whether there is a poses_bounds.npy beside cam_0.mp4, cam_0/ or frame000001/cam_0.png."""
     return (folder / POSES_FILE).is_file() and any(
         any(folder.glob(pattern)) for pattern in (PATTERN, f"frame*1/{PATTERN}")
     )
 
 
 def read(folder: Path) -> Recording:
-    """13 cameras, 1280 x 720, 30 frames per second; cam_0, the middle one, judges.
+    """Read Meet Room: 13 cameras, 1280 x 720, 30 frames per second; cam_0, the middle one, judges.
 
     Rows of poses_bounds.npy follow the numbers of the cameras (cam_2 before cam_10), as in StreamRF's preparation.
     """

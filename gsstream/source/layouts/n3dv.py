@@ -16,14 +16,14 @@ PATTERN = "cam[0-9]*"
 
 
 def looks_like(folder: Path) -> bool:
-    """poses_bounds.npy beside cam00.mp4, cam00/ or frame000001/cam00.png."""
+    """Say whether there is a poses_bounds.npy beside cam00.mp4, cam00/ or frame000001/cam00.png."""
     return (folder / POSES_FILE).is_file() and any(
         any(folder.glob(pattern)) for pattern in (PATTERN, f"frame*1/{PATTERN}")
     )
 
 
 def read(folder: Path) -> Recording:
-    """18 to 21 cameras, 2704 x 2028, 30 frames per second; cam00 judges (paper and released code)."""
+    """Read N3DV: 18 to 21 cameras, 2704 x 2028, 30 frames per second; cam00 judges (paper and released code)."""
     clips = camera_clips(folder, PATTERN)
     names = tuple(clips)
     rig = read_poses_bounds(folder / POSES_FILE, names, clips[names[0]].size)

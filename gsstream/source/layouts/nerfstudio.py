@@ -39,12 +39,12 @@ _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
 
 
 def looks_like(folder: Path) -> bool:
-    """transforms.json."""
+    """Say whether there is a transforms.json."""
     return (folder / FILE).is_file()
 
 
 def read(folder: Path, missing: Missing = "skip") -> Recording:
-    """One rig of cameras that stand still.
+    """Read one rig of cameras that stand still.
 
     Arguments:
         missing: entries whose picture is missing are skipped with a warning, or refused.

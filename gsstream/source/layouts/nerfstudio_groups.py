@@ -21,7 +21,7 @@ _INTRINSICS = (
 
 
 def group_entries(path: Path, frames: list[Entry], pose: Pose) -> dict[str, list[Entry]]:
-    """Camera id -> its entries, in the order of ``time``, else of names.
+    """Return camera id -> its entries, in the order of ``time``, else of names.
 
     One folder per camera with one pose each; else entries of one pose and one set of intrinsics, where ``time`` (or
     equal numbers of them) says that they are a recording; else one camera per entry, a still scene.

@@ -24,12 +24,12 @@ TRAIN, TEST, IMAGES, POINTS = "train_meta.json", "test_meta.json", "ims", "init_
 
 
 def looks_like(folder: Path) -> bool:
-    """train_meta.json beside ims/."""
+    """Say whether there is a train_meta.json beside ims/."""
     return (folder / TRAIN).is_file() and (folder / IMAGES).is_dir()
 
 
 def read(folder: Path) -> Recording:
-    """27 training cameras, 640 x 360, 150 frames; the cameras of test_meta.json judge (0, 10, 15, 30)."""
+    """Read CMU Panoptic: 27 training cameras, 640 x 360, 150 frames; those of test_meta.json judge (0, 10, 15, 30)."""
     ids: list[str] = []
     poses, intrinsics = [], []
     clips: dict[str, Clip] = {}

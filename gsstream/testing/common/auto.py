@@ -15,7 +15,7 @@ from gsstream.testing.registry import Skip, check
 
 
 def extreme_scenes() -> list[SceneFacts]:
-    """Facts at the ends of their ranges, in every combination that matters, and an everyday scene."""
+    """Return facts at the ends of their ranges, in every combination that matters, and an everyday scene."""
     everyday = SceneFacts(12, 320, 240, 12_000, 1000.0, 900.0, 20.0, (2.0, 1.5, 1.0, 0.8, 0.5), 0.2, (0.3, 0.3, 0.1))
     none, gains = (0.0,) * 5, ((0.0, 0.0, 0.0), (-5.0, -9.0, -20.0), (3.0, 6.0, 9.0))
     spans = ((0.0, 1.0, 1.0, none), (1e9, 1e9, float("inf"), (9.0, 9.0, 9.0, 9.0, 9.0)), (5.0, 3.0, 1.0, none))

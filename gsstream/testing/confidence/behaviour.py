@@ -11,12 +11,12 @@ SPOT = (10, 10)
 
 
 def outputs(part: ConfidenceEstimator, world: World) -> Outputs:
-    """Logits per Gaussian."""
+    """Return logits per Gaussian."""
     return {"estimate()": part.estimate(world)}
 
 
 def poison(world: World, value: float) -> None:
-    """Spoil one pixel of every image of the frame."""
+    """Change one pixel of every image of the frame to a value that no image has."""
     for image in world.now:
         image[SPOT] = value
 

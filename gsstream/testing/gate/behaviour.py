@@ -8,7 +8,7 @@ from gsstream.testing.drive import Behaviour, Outputs, draw, poison_logits
 
 
 def outputs(part: GateSampler, world: World) -> Outputs:
-    """Logits, gates and probabilities; every Gaussian has a gate of its own here."""
+    """Return logits, gates and probabilities; every Gaussian has a gate of its own here."""
     logits = part.init(world.logits)
     noise = draw(part, len(world.logits))
     found = {

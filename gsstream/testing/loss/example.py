@@ -14,7 +14,7 @@ C1, C2 = 0.01**2, 0.03**2
 
 
 def blurred(planes: torch.Tensor) -> torch.Tensor:
-    """[P, H, W] each seen through an 11 x 11 Gaussian window, sigma 1.5, zeros beyond the border."""
+    """Return [P, H, W] planes seen through an 11 x 11 Gaussian window, sigma 1.5, zeros beyond the border."""
     places = torch.arange(-RADIUS, RADIUS + 1, dtype=planes.dtype)
     window = torch.softmax(-(places**2) / (2 * 1.5**2), 0)
     down = conv2d(planes[:, None], window[None, None, :, None], padding=(RADIUS, 0))
@@ -22,7 +22,7 @@ def blurred(planes: torch.Tensor) -> torch.Tensor:
 
 
 def similarity(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """[H, W, 3] structural similarity (Wang et al. 2004, as 3DGS has it)."""
+    """Return [H, W, 3]: structural similarity (Wang et al. 2004, as 3DGS has it)."""
     x, y = image.permute(2, 0, 1), target.permute(2, 0, 1)
     mx, my, xx, yy, xy = (blurred(planes) for planes in (x, y, x * x, y * y, x * y))
     over = (2 * mx * my + C1) * (2 * (xy - mx * my) + C2)
@@ -59,6 +59,6 @@ class ExampleLoss(Loss):
 
 
 def pixels(tiles: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
-    """[H, W, 1] from [ceil(H / 16), ceil(W / 16)]."""
+    """Return [H, W, 1]: the mask of tiles [ceil(H / 16), ceil(W / 16)], pixel by pixel."""
     large = tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)
     return large[: image.shape[0], : image.shape[1], None]

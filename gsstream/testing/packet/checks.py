@@ -39,7 +39,7 @@ class PacketCodec:
 
 
 def tiny_key(seed: int = 0, number: int = 40, nodes: int = 12) -> KeyState:
-    """A scene of 40 Gaussians in 12 nodes."""
+    """Return a scene of 40 Gaussians in 12 nodes."""
     rng = np.random.default_rng(seed)
 
     def normal(*shape: int) -> FloatArray:
@@ -58,7 +58,7 @@ def tiny_key(seed: int = 0, number: int = 40, nodes: int = 12) -> KeyState:
 
 
 def tiny_delta(layout: Layout, seed: int = 1) -> Delta:
-    """About half of the nodes open, three attributes change."""
+    """Return a delta in which about half of the nodes are open and three attributes change."""
     rng = np.random.default_rng(seed)
     gates = (rng.random(len(layout.node_counts)) < 0.5) * rng.integers(1, 5, len(layout.node_counts))
     rows = len(sent_rows(layout, gates))

@@ -8,7 +8,7 @@ from gsstream.testing.drive import Behaviour, Outputs, poison_logits
 
 
 def outputs(part: Propagation, world: World) -> Outputs:
-    """Logits per node."""
+    """Return logits per node."""
     return {"propagate()": part.propagate(world.logits, world.hierarchy)}
 
 

@@ -10,14 +10,14 @@ from gsstream.testing.drive import Behaviour, Outputs
 
 
 def outputs(part: Regularizer, world: World) -> Outputs:
-    """Every term. Nodes have the same probabilities whatever the order of the Gaussians."""
+    """Return every term. Nodes have the same probabilities whatever the order of the Gaussians."""
     opened = torch.sigmoid(torch.linspace(-2, 2, world.hierarchy.num_nodes).to(world.logits.dtype))
     terms = part.penalty(opened, world.residual, world.hierarchy, len(world.logits))
     return {f"penalty()[{name!r}]": value for name, value in terms.items()}
 
 
 def poison(world: World, value: float) -> None:
-    """Spoil one coordinate of one residual."""
+    """Change one coordinate of one residual to a value that none has."""
     world.residual[5, 0] = value
 
 

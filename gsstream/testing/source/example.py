@@ -10,7 +10,7 @@ SIZE, FRAMES = 32, 5
 
 
 def rig(ids: tuple[str, ...], size: int) -> Cameras:
-    """Cameras side by side, a tenth of a unit apart, that look at the wall two units away."""
+    """Return cameras side by side, a tenth of a unit apart, that look at the wall two units away."""
     viewmats = np.tile(np.eye(4), (len(ids), 1, 1))
     viewmats[:, 0, 3] = [0.1 * place for place in range(len(ids))]
     K = np.array([[1.25 * size, 0, size / 2], [0, 1.25 * size, size / 2], [0, 0, 1]])
@@ -28,7 +28,7 @@ class ExampleSource:
         self.info = SourceInfo("square", uri, FRAMES, 30.0, train, test, "ours, free for any use")
 
     def image(self, index: int, camera: str) -> np.ndarray:
-        """[H, W, 3] float32 in [0, 1]; here every camera sees the same."""
+        """Return [H, W, 3] float32 in [0, 1]; here every camera sees the same."""
         if not 0 <= index < FRAMES:
             raise SourceError(f"{self.info.uri}: no frame {index}; expected 0 to {FRAMES - 1}")
         picture = np.zeros((self.size, self.size, 3), np.float32)
@@ -37,13 +37,14 @@ class ExampleSource:
         return picture
 
     def frame(self, index: int, split: str = "train") -> Frame:
-        """One instant of all cameras of a split."""
+        """Return one instant of all cameras of a split."""
         cameras = self.info.train if split == "train" else self.info.test
         images = np.stack([self.image(index, camera) for camera in cameras.ids])
         return Frame(index, index / self.info.fps, images, cameras)
 
     def points(self, kind: str = "recording") -> PointCloud | None:
-        """Points of frame 0, or None where the recording has none: then they are found in the training images."""
+        """Return points of frame 0, or None where the recording has none: then they are found in the training images.
+        """
         xyz = np.random.default_rng(0).uniform((-0.3, -0.3, 1.7), (0.3, 0.3, 2.3), (50, 3))
         return PointCloud(xyz.astype(np.float32), np.full((50, 3), 0.5, np.float32), "square")
 

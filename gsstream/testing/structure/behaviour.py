@@ -8,7 +8,7 @@ from gsstream.testing.drive import Behaviour, Outputs
 
 
 def outputs(part: Structure, world: World) -> Outputs:
-    """Anchors and hierarchy."""
+    """Return anchors and hierarchy."""
     found: Outputs = {}
     if len(world.points):
         anchors = part.seed(world.points, world.cameras)
@@ -19,7 +19,7 @@ def outputs(part: Structure, world: World) -> Outputs:
 
 
 def poison(world: World, value: float) -> None:
-    """Spoil one coordinate of one Gaussian."""
+    """Change one coordinate of one Gaussian to a value that none has."""
     world.gaussians.means[5, 0] = value
 
 

@@ -19,7 +19,7 @@ WORLDS = ("one", "two identical", "line", "cloud", "far", "thin", "unseen")
 
 
 def canonical(labels: torch.Tensor) -> list[int]:
-    """Labels renamed in the order of their first occurrence."""
+    """Return labels renamed in the order of their first occurrence."""
     names: dict[int, int] = {}
     return [names.setdefault(int(label), len(names)) for label in labels]
 

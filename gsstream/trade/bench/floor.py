@@ -55,7 +55,7 @@ class Footprints:
     height: int
 
     def in_tiles(self, mask: BoolArray) -> IntArray:
-        """Rows whose centre lies in a tile of the mask: those the benchmark lets move."""
+        """Return the rows whose centre lies in a tile of the mask: those the benchmark lets move."""
         rows = np.flatnonzero(self.visible)
         tile = np.floor(self.means2d[rows] / TILE).astype(np.int64)
         known = (tile >= 0).all(1) & (tile[:, 0] < mask.shape[1]) & (tile[:, 1] < mask.shape[0])
@@ -81,7 +81,7 @@ def footprints(gaussians: Gaussians[FloatArray], cameras: Cameras, view: int = 0
 
 
 def live_pairs(scene: Footprints) -> IntArray:
-    """[H, W] number of Gaussians that add light to each pixel."""
+    """Return [H, W]: number of Gaussians that add light to each pixel."""
     counts = np.zeros((scene.height, scene.width), np.int64)
     light = np.ones((scene.height, scene.width), np.float32)
     rows = np.flatnonzero(scene.visible)
@@ -105,7 +105,7 @@ def live_pairs(scene: Footprints) -> IntArray:
 
 
 def central_tiles(width: int, height: int, share: float) -> BoolArray:
-    """[tile rows, tile columns] bool: the ``share`` of tiles (at least one) that lie nearest to the image's centre."""
+    """Return [tile rows, tile columns] bool: the share of tiles nearest to the image's centre, at least one."""
     rows, columns = -(-height // TILE), -(-width // TILE)
     y, x = np.mgrid[:rows, :columns] + 0.5
     distance = np.hypot(x - columns / 2, y - rows / 2).ravel()
@@ -115,12 +115,12 @@ def central_tiles(width: int, height: int, share: float) -> BoolArray:
 
 
 def pixels_of(mask: BoolArray, width: int, height: int) -> BoolArray:
-    """A tile mask as a pixel mask [H, W]."""
+    """Return a tile mask as a pixel mask [H, W]."""
     return mask.repeat(TILE, 0).repeat(TILE, 1)[:height, :width]
 
 
 def floor_ms(peak: Peak, *, pairs: int, visible: int, rows: int, pixels: int, floats: int) -> tuple[float, float]:
-    """Milliseconds that forward and backward take at least.
+    """Return the milliseconds that forward and backward take at least.
 
     Arguments:
         pairs: live pixel pairs. visible: Gaussians that are drawn. rows: Gaussians given and differentiated.

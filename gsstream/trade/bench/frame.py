@@ -139,7 +139,10 @@ def bench_frame(plan: FramePlan, catalog: Catalog, progress: Progress) -> dict[s
 
 
 def variants(recipe: Recipe) -> dict[str, Recipe]:
-    """dense: every gate open, everything takes part; gated: the recipe's gates; active: and only what changed."""
+    """Return the three variants of a recipe: dense, gated and active.
+
+    dense: every gate open, everything takes part; gated: the recipe's gates; active: and only what changed.
+    """
     threshold = recipe.stream.change_threshold or CHANGE_THRESHOLD
     active = recipe.model_copy(update={"stream": recipe.stream.model_copy(update={"change_threshold": threshold})})
     gated = recipe.model_copy(update={"stream": recipe.stream.model_copy(update={"change_threshold": 0.0})})

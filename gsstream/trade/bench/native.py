@@ -29,7 +29,7 @@ class NativeKernel(Protocol):
     def backward(self) -> Any: ...
 
     def statistics(self) -> dict[str, int]:
-        """Counts of the last pass; ``memory_bytes`` among them."""
+        """Return counts of the last pass; ``memory_bytes`` among them."""
 
 
 class NativeBench(Protocol):
@@ -42,21 +42,21 @@ class NativeBench(Protocol):
     Kernel: Any
 
     def isa(self) -> str:
-        """Instruction set in use."""
+        """Return the instruction set in use."""
 
     def num_threads(self) -> int: ...
 
     def set_num_threads(self, n: int) -> None: ...
 
     def fma_peak(self, threads: int, seconds: float) -> float:
-        """10^9 float32 operations a second, measured in registers for so long."""
+        """Measure 10^9 float32 operations a second, in registers, for so long."""
 
     def copy_peak(self, threads: int, megabytes: float) -> float:
-        """10^9 bytes read plus written a second, measured by copying so much a thread."""
+        """Measure 10^9 bytes read plus written a second, by copying so much a thread."""
 
 
 def find_native(name: str) -> NativeBench | None:
-    """The native benchmark of the renderer ``name``, or None; one that fails to load is reported in a warning."""
+    """Return the native benchmark of the renderer ``name``, or None; one that fails to load gets a warning."""
     for point in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP, name=name):
         try:
             return cast(NativeBench, point.load())
@@ -67,7 +67,7 @@ def find_native(name: str) -> NativeBench | None:
 
 
 def measure_peaks(native: NativeBench | None, threads: tuple[int, ...], known: dict[int, Peak]) -> dict[int, Peak]:
-    """The better of the peaks known and those measured now: other work on the machine only ever lowers them."""
+    """Return the better of the peaks known and those measured now: other work only ever lowers them."""
     if native is None:
         return known
     found = dict(known)

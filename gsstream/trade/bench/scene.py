@@ -37,7 +37,9 @@ class Points:
 
 
 def synthetic_points(count: int, seed: int) -> Points:
-    """Points on the walls of a room, on a dozen bodies in it, and on a far shell; surfaces depend on the seed alone.
+    """Return points on the walls of a room, on a dozen bodies in it, and on a far shell.
+
+    Surfaces depend on the seed alone.
 
     The bodies stand beside and behind the object, so that the cameras of :func:`arc_rig` see it.
     """
@@ -59,7 +61,7 @@ def synthetic_points(count: int, seed: int) -> Points:
 
 
 def object_points(count: int, seed: int) -> Points:
-    """Points on the body that moves: a ball of radius OBJECT_RADIUS with a bold texture."""
+    """Return points on the body that moves: a ball of radius OBJECT_RADIUS with a bold texture."""
     directions = Rng(seed).numpy("bench object").normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     rgb = 0.5 + 0.45 * np.sign(np.sin(9.0 * directions))
@@ -67,8 +69,10 @@ def object_points(count: int, seed: int) -> Points:
 
 
 def read_points(path: Path) -> Points:
-    """A .npz with ``xyz`` or ``means3d`` [P, 3], ``rgb`` or ``colors`` [P, 3] (uint8 or [0, 1]), and optionally
-    ``viewmats`` [C, 4, 4] and ``Ks`` [C, 3, 3], of which the first camera is used.
+    """Read a .npz of points.
+
+    It holds ``xyz`` or ``means3d`` [P, 3], ``rgb`` or ``colors`` [P, 3] (uint8 or [0, 1]), and optionally ``viewmats``
+    [C, 4, 4] and ``Ks`` [C, 3, 3], of which the first camera is used.
 
     Raises InputError naming the file and what it lacks.
     """
@@ -89,7 +93,7 @@ def read_points(path: Path) -> Points:
 
 
 def make_gaussians(points: Points, count: int, seed: int, *, degree: int = 2) -> Gaussians[FloatArray]:
-    """``count`` Gaussians at these points, float32: drawn from them without replacement, then near them."""
+    """Return ``count`` Gaussians at these points, float32: drawn from them without replacement, then near them."""
     rng = Rng(seed).numpy("bench gaussians", count)
     have = len(points.xyz)
     chosen = rng.permutation(have)[: min(have, count)]
@@ -115,7 +119,7 @@ def make_gaussians(points: Points, count: int, seed: int, *, degree: int = 2) ->
 
 
 def morton_order(xyz: FloatArray) -> IntArray:
-    """Permutation that sorts points along a Z curve of 10 bits an axis."""
+    """Return the permutation that sorts points along a Z curve of 10 bits an axis."""
     low = xyz.min(0)
     cells = ((xyz - low) / max(1e-12, float((xyz.max(0) - low).max())) * (2**_MORTON_BITS - 1)).astype(np.int64)
     keys = np.zeros(len(xyz), np.int64)
@@ -126,7 +130,10 @@ def morton_order(xyz: FloatArray) -> IntArray:
 
 
 def neighbour_spacing(xyz: FloatArray) -> FloatArray:
-    """[P] mean distance to the three nearest among the rows around each (points in Morton order), without outliers."""
+    """Return [P]: mean distance to the three nearest among the rows around each, without outliers.
+
+    Points must be in Morton order.
+    """
     count = len(xyz)
     reach = [k for k in range(-_NEIGHBOURS, _NEIGHBOURS + 1) if k]
     around = (np.arange(count)[:, None] + reach).clip(0, count - 1)
@@ -138,7 +145,10 @@ def neighbour_spacing(xyz: FloatArray) -> FloatArray:
 
 
 def bench_camera(width: int, height: int, points: Points | None = None) -> Cameras:
-    """One camera that sees about half of the scene: the points' own, scaled to cover the image, or one in the room."""
+    """Return one camera that sees about half of the scene.
+
+    It is the points' own, scaled to cover the image, or one in the room.
+    """
     if points is not None and points.viewmat is not None and points.K is not None:
         old_width, old_height = 2 * points.K[0, 2], 2 * points.K[1, 2]
         scale = max(width / old_width, height / old_height)
@@ -149,7 +159,10 @@ def bench_camera(width: int, height: int, points: Points | None = None) -> Camer
 
 
 def arc_rig(views: int, width: int, height: int) -> Cameras:
-    """``views`` cameras on an arc of 60 degrees that look at the object, 2.4 units away, 60 degrees wide."""
+    """Return ``views`` cameras on an arc of 60 degrees that look at the object.
+
+    They are 2.4 units away and 60 degrees wide.
+    """
     angles = np.deg2rad(np.linspace(-30, 30, views)) if views > 1 else np.zeros(1)
     viewmats = np.tile(np.eye(4), (views, 1, 1))
     for viewmat, angle in zip(viewmats, angles, strict=True):

@@ -10,7 +10,7 @@ from gsstream.trade.measure.summary import format_table
 
 
 def render_table(data: Mapping[str, Any]) -> str:
-    """``bench render``: one row per case, times in ms, least of the repetitions unless it says median."""
+    """Return the table of ``bench render``: a row per case, ms, least of the repetitions unless it says median."""
     times = ["forward", "backward", "both", "median", "cpu", "floor", "x floor", "cpu x"]
     rows = [["renderer", "rows", "scene", "tiles", "thr", *times]]
     for case in data["cases"]:
@@ -39,7 +39,7 @@ def render_table(data: Mapping[str, Any]) -> str:
 
 
 def frame_table(data: Mapping[str, Any]) -> str:
-    """``bench frame``: one row per case, seconds, least of the repetitions unless it says median."""
+    """Return the table of ``bench frame``: a row per case, seconds, least of the repetitions unless it says median."""
     phases = list(dict.fromkeys(phase for case in data["cases"] for phase in case["phases_ms"]))
     head = ["case", "static", "variant", "changed", "rows", "s", "cpu s", *phases, "bytes", "PSNR", "held", "of dense"]
     rows = [head]

@@ -41,7 +41,7 @@ class Timing:
         return statistics.median(self.samples)
 
     def to_json(self) -> dict[str, float]:
-        """Least and median, and the least processor time, ms."""
+        """Return least and median, and the least processor time, ms."""
         return {"min": round(self.minimum, 5), "median": round(self.median, 5), "cpu": round(min(self.cpu), 5)}
 
 
@@ -73,7 +73,7 @@ def interleaved(cases: Sequence[Steps], repetitions: int, warm_up: int) -> list[
 
 @contextmanager
 def torch_threads(count: int) -> Any:
-    """Torch with this many threads inside the block."""
+    """Let torch have this many threads inside the block."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -97,12 +97,12 @@ def check_writable(path: Path) -> None:
 
 
 def headline(machine: Mapping[str, Any]) -> str:
-    """One line about the machine for a Markdown report."""
+    """Return one line about the machine for a Markdown report."""
     gpu = f", {machine['gpu']}" if machine["gpu"] else ""
     load = "" if machine["load_average"] is None else f", load {machine['load_average']:.1f} at the start"
     return f"{machine['date']}, {machine['processor']}, {machine['processors_usable']} processors{gpu}{load}"
 
 
 def cell(value: float | None, form: str = ".2f") -> str:
-    """A number for a table; "-" for what was not measured."""
+    """Return a number for a table; "-" for what was not measured."""
     return "-" if value is None or not math.isfinite(value) else format(value, form)

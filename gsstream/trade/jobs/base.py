@@ -39,5 +39,5 @@ class Executor(Protocol):
 
 
 def thread_environment(threads: int) -> dict[str, str]:
-    """Environment of a worker with this many threads."""
+    """Return the environment of a worker with this many threads."""
     return dict.fromkeys(_THREAD_VARIABLES, str(threads))

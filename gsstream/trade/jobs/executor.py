@@ -18,7 +18,7 @@ from gsstream.trade.jobs.base import Executor, Finished, Work, thread_environmen
 
 
 def usable_processors() -> int:
-    """Processors that this process may use."""
+    """Return how many processors this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -80,7 +80,7 @@ class LocalExecutor:
 
 
 def make_executor(work: Work, workers: int | None, threads: int, ray: str | None = None) -> Executor:
-    """Processes on this machine, or tasks on the Ray cluster at ``ray``.
+    """Return processes on this machine, or tasks on the Ray cluster at ``ray``.
 
     Arguments:
         workers: jobs at a time; None: as many as the processors allow.

@@ -12,7 +12,7 @@ LOCK = "sweep.lock"
 
 
 def recording_uri(uri: str, data: Path | None) -> str:
-    """The recording as a worker opens it, wherever it works: a relative folder lies in ``data``, or here."""
+    """Return the recording as a worker opens it, wherever it works: a relative folder lies in ``data``, or here."""
     scheme, colon, rest = uri.rpartition(":")
     folder = (data or Path()) / rest
     return f"{scheme}{colon}{folder.resolve()}" if uri != "demo" and rest and folder.is_dir() else uri

@@ -13,7 +13,7 @@ import torch
 
 
 def machine_facts() -> dict[str, Any]:
-    """Date, processor, load and versions: what a number means nothing without."""
+    """Return date, processor, load and versions, without which a measured number means nothing."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None

@@ -50,7 +50,7 @@ class RayExecutor:
         self._running: dict[Any, str] = {}
 
     def submit(self, job: Any) -> None:
-        """Queue the job as a task."""
+        """Add the job to the queue as a task."""
         # Another machine has no such folder; it takes its own for temporary files.
         self._running[self._remote.remote(replace(job, work=None))] = job.id
 

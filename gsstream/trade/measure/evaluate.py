@@ -80,12 +80,12 @@ class Evaluation:
     lpips_variant: str | None = None
 
     def series(self, name: str) -> dict[int, float]:
-        """Frame -> mean over cameras of a quantity of :class:`ViewQuality` (views where it is not finite left out)."""
+        """Return frame -> mean over cameras of a quantity of :class:`ViewQuality`, over views where it is finite."""
         frames = sorted({view.frame for view in self.views})
         return {t: mean(getattr(v, name) for v in self.views if v.frame == t) for t in frames}
 
     def to_json(self) -> str:
-        """Everything as JSON; nan and inf become null."""
+        """Return everything as JSON; nan and inf become null."""
         unknown = ("extra",) if self.lpips_variant else ("lpips", "hold_lpips", "extra")
         views = [{k: _plain(v) for k, v in asdict(view).items() if k not in unknown} for view in self.views]
         for row, view in zip(views, self.views, strict=True):
@@ -97,7 +97,10 @@ class Evaluation:
         return json.dumps(data, indent=1, allow_nan=False)
 
     def table(self) -> str:
-        """Markdown: decoded and held, frame 0, mean of later frames, slope, SSIM, moving pixels, LPIPS if measured."""
+        """Return a Markdown table of the decoded stream and of frame 0 held still.
+
+        Columns: frame 0, mean of later frames, slope, SSIM, moving pixels, LPIPS if measured.
+        """
         names, forms = ["ssim", "psnr_moving"], [".2f", ".2f", "+.2f", ".4f", ".2f"]
         rows = [["", "PSNR 0", "PSNR", "dB/100", "SSIM", "moving"]]
         if self.lpips_variant:

@@ -36,7 +36,7 @@ VARIANTS: Mapping[str, str] = {
 
 
 def extras(names: Iterable[str]) -> dict[str, ViewMetric]:
-    """The named metrics. Raises UnknownName, naming the nearest."""
+    """Return the named metrics. Raises UnknownName, naming the nearest."""
     out = {}
     for name in names:
         if name not in EXTRAS:

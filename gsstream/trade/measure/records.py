@@ -51,7 +51,7 @@ class FrameRecord:
 
 
 def mean(values: Iterable[float]) -> float:
-    """Mean of the finite values; nan when there are none."""
+    """Return the mean of the finite values; nan when there are none."""
     kept = [v for v in values if math.isfinite(v)]
     return sum(kept) / len(kept) if kept else math.nan
 
@@ -77,7 +77,7 @@ def read_records(path: str | os.PathLike[str]) -> list[FrameRecord]:
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
-    """The lines of a ``metrics.jsonl`` as they are, in the order of frames; the last entry of a frame counts.
+    """Read the lines of a ``metrics.jsonl`` as they are, in the order of frames; the last entry of a frame counts.
 
     Raises InputError as ``engine.run.metrics_log.read_metrics``.
     """
@@ -86,7 +86,7 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def record_of(data: Mapping[str, Any]) -> FrameRecord:
-    """A line of ``metrics.jsonl`` that has been read; raises ValueError, TypeError, KeyError or AttributeError."""
+    """Read one line of ``metrics.jsonl``; raises ValueError, TypeError, KeyError or AttributeError."""
     memory = data.get("peak_memory_mb")
     return FrameRecord(
         frame=int(data["frame"]),

@@ -67,7 +67,7 @@ class StreamStats:
     fps: float
 
     def of(self, *kinds: str) -> list[PacketStats]:
-        """The packets of these kinds."""
+        """Return the packets of these kinds."""
         return [packet for packet in self.packets if packet.kind in kinds]
 
     @property
@@ -86,13 +86,13 @@ class StreamStats:
         return None if self.kb_per_frame is None else self.kb_per_frame * 8e-3 * self.fps
 
     def efficiency(self, *kinds: str) -> float | None:
-        """Coded bytes over entropy, all packets of these kinds together."""
+        """Return coded bytes over entropy, all packets of these kinds together."""
         chosen = self.of(*kinds)
         entropy = sum(p.entropy for p in chosen)
         return sum(p.coded for p in chosen) / entropy if entropy else None
 
     def sections(self, *kinds: str) -> dict[str, int]:
-        """Section -> bytes, all packets of these kinds together."""
+        """Return section -> bytes, all packets of these kinds together."""
         out: dict[str, int] = {}
         for packet in self.of(*kinds):
             for name, size in packet.sections.items():
@@ -100,7 +100,7 @@ class StreamStats:
         return out
 
     def summary(self) -> dict[str, Any]:
-        """The numbers of a table row."""
+        """Return the numbers of a table row."""
         deltas, keys = self.of("delta"), self.of("key")
         coded, plain = (sum(getattr(p, name) for p in deltas) for name in ("coded", "float16_zstd"))
         return {
@@ -118,7 +118,7 @@ class StreamStats:
         }  # fmt: skip
 
     def to_json(self) -> str:
-        """Summary, sections and every packet."""
+        """Return summary, sections and every packet."""
         data = {
             "summary": self.summary(), "key_sections": self.sections("key"), "delta_sections": self.sections("delta"),
             "packets": [asdict(packet) for packet in self.packets],
@@ -153,7 +153,9 @@ def stream_stats(
 
 
 def paper_estimate(state: PlayerState, kind: PacketKind) -> float:
-    """Bytes the S2GS paper would report for this packet (s2gs released code, its size function; read and restated).
+    """Return the bytes that the S2GS paper would report for this packet.
+
+    The size function of the released code was read and restated.
 
     Frame 0: every attribute but positions and view-dependent colour as float32, position offsets as float32, and the
     zero-order entropy of the view-dependent colour. Later: decoders as float32 in every frame, position offsets of
@@ -189,13 +191,13 @@ def _plain_estimate(gaussians: Gaussians[FloatArray]) -> float:
 
 
 def entropy_bits(values: Any) -> float:
-    """Zero-order entropy of an array, bits in total."""
+    """Return the zero-order entropy of an array, bits in total."""
     _, counts = np.unique(values, return_counts=True)
     return float((counts * np.log2(counts.sum() / counts)).sum())
 
 
 def float16_bytes(gaussians: Gaussians[FloatArray], names: Sequence[str], rows: IntArray) -> int:
-    """Bytes of these rows as float16 by zstandard level 19: what a plain codec would send."""
+    """Return the bytes of these rows as float16 by zstandard level 19: what a plain codec would send."""
     parts = [getattr(gaussians, name)[rows].astype(np.float16).tobytes() for name in names]
     return len(zstandard.ZstdCompressor(level=19).compress(b"".join(parts)))
 

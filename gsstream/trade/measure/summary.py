@@ -80,7 +80,7 @@ _COLUMNS: Mapping[str, tuple[str, str]] = {
 
 
 def summary_table(runs: Mapping[str, Summary]) -> str:
-    """A Markdown table, one row per run; "-" where nothing was measured."""
+    """Return a Markdown table, one row per run; "-" where nothing was measured."""
     rows = [["run", *(title for title, _ in _COLUMNS.values())]]
     for name, summary in runs.items():
         rows.append([name, *(_cell(getattr(summary, key), form) for key, (_, form) in _COLUMNS.items())])
@@ -88,7 +88,7 @@ def summary_table(runs: Mapping[str, Summary]) -> str:
 
 
 def format_table(rows: Sequence[Sequence[str]]) -> str:
-    """Markdown with aligned columns: text left, numbers right. The first row is the head."""
+    """Return Markdown with aligned columns: text left, numbers right. The first row is the head."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = []
     for number, row in enumerate(rows):

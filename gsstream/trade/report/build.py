@@ -26,7 +26,7 @@ _WAITED = (
 
 
 def build_report(data: SweepData, sheets: Mapping[str, Picture]) -> list[Block]:
-    """All blocks, in reading order.
+    """Return all blocks, in reading order.
 
     Arguments:
         sheets: scene -> contact sheet.
@@ -165,7 +165,10 @@ def _ratio(value: float) -> str:
 
 
 def write_sheets(folder: Path, data: SweepData, scenes: Sequence[str], recordings: Path | None) -> dict[str, Picture]:
-    """A contact sheet of the first variant of each scene. Raises InputError when a recording cannot be found."""
+    """Write a contact sheet of the first variant of each scene.
+
+    Raises InputError when a recording cannot be found.
+    """
     import tempfile
 
     from gsstream.engine.run.recording import reopen_recording

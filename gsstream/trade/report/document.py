@@ -75,7 +75,7 @@ def write_report(title: str, blocks: Sequence[Block], out: Path) -> list[Path]:
 
 
 def to_markdown(title: str, blocks: Sequence[Block]) -> str:
-    """Markdown; pictures by their names."""
+    """Return Markdown; pictures by their names."""
     parts = [f"# {title}"]
     for block in blocks:
         if isinstance(block, Heading):
@@ -91,7 +91,7 @@ def to_markdown(title: str, blocks: Sequence[Block]) -> str:
 
 
 def to_html(title: str, blocks: Sequence[Block]) -> str:
-    """One page: styles and images inside, no script, nothing fetched."""
+    """Return one page: styles and images inside, no script, nothing fetched."""
     parts = [f"<h1>{html.escape(title)}</h1>"]
     for block in blocks:
         if isinstance(block, Heading):

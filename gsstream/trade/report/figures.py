@@ -23,13 +23,15 @@ _CURVES = len(COLORS)
 
 
 def measured_costs(groups: Sequence[Group]) -> list[str]:
-    """Costs that every group has; no wall time of runs that waited for the processor."""
+    """Return costs that every group has; no wall time of runs that waited for the processor."""
     useless = {"seconds"} if waited(groups) else set()
     return [key for key in COSTS if key not in useless and all(math.isfinite(group.mean(key)) for group in groups)]
 
 
 def pareto_figure(groups: Sequence[Group], title: str) -> bytes:
-    """One panel per quality and cost: every group, its spread over seeds, the front as a line, the knee in a ring.
+    """Draw one panel per quality and cost: every group, its spread, the front as a line, the knee in a ring.
+
+    The spread is that over seeds.
 
     Points far below the rest stand at the lower edge as triangles with their value. Names that would cover one another
     are left out, those of the front last.
@@ -57,8 +59,11 @@ def pareto_figure(groups: Sequence[Group], title: str) -> bytes:
 
 
 def floor_of(values: Sequence[float]) -> float:
-    """Where an axis of qualities starts: the least value, or a little below the better three quarters of them when that
-    alone would take up most of the height."""
+    """Return where an axis of qualities starts.
+
+    It is the least value, or a little below the better three quarters of them when that alone would take up most of the
+    height.
+    """
     best, least = max(values), min(values)
     quarter = statistics.quantiles(values, n=4, method="inclusive")[0] if len(values) > 3 else least
     low = best - 2 * (best - quarter)
@@ -116,14 +121,14 @@ def _name(axis: Any, text: str, place: tuple[float, float], first: bool) -> None
 
 
 def frame_curves(groups: Sequence[Group], title: str) -> bytes:
-    """Curves over frames of the first seed of up to seven groups."""
+    """Draw curves over frames of the first seed of up to seven groups."""
     runs = {group.label: list(group.runs[0].records) for group in groups[:_CURVES]}
     with tempfile.TemporaryDirectory() as folder:
         return plot_runs(runs, Path(folder) / "curves.png", title).read_bytes()
 
 
 def curve_groups(groups: Sequence[Group]) -> list[Group]:
-    """Whose curves are drawn: the variants as they are; where there are none, the front of PSNR against KB/frame."""
+    """Return whose curves are drawn: the variants as they are; without any, the front of PSNR against KB/frame."""
     plain = [group for group in groups if not group.axes]
     if plain:
         return plain[:_CURVES]

@@ -11,7 +11,7 @@ from gsstream.trade.report.groups import Group, is_tie, seed_noise
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Indices of (cost, good) points that no other beats in both, by rising cost.
+    """Return the indices of (cost, good) points that no other beats in both, by rising cost.
 
     A point is beaten by one that costs no more and is no worse, and differs from it. Of equal points the first counts;
     points with nan are left out.
@@ -25,7 +25,7 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def knee(front: Sequence[tuple[float, float]]) -> int | None:
-    """The point of a front that lies furthest above the chord between its ends, cost on a logarithmic scale.
+    """Return the point of a front furthest above the chord between its ends, cost on a logarithmic scale.
 
     Both axes run from 0 to 1 over the front ("Kneedle", Satopää et al. 2011, without smoothing). None for fewer than
     three points, a cost that is not positive, or a front with no point above the chord.
@@ -54,14 +54,14 @@ class Effect:
     ties: Mapping[str, bool | None]
 
     def per(self, good: str, cost: str) -> float:
-        """dB gained per unit of cost, when both move in the same direction beyond the noise; else nan."""
+        """Return dB gained per unit of cost, when both move in the same direction beyond the noise; else nan."""
         gained, paid = self.deltas[good], self.deltas[cost]
         if self.ties[good] or self.ties[cost] or gained * paid <= 0:
             return math.nan
         return gained / paid
 
     def verdict(self, good: str, cost: str) -> str:
-        """buys, saves, better and cheaper, worse and dearer, or which side is a tie."""
+        """Return "buys", "saves", "better and cheaper", "worse and dearer", or which side is a tie."""
         if self.ties[good] and self.ties[cost]:
             return "tie"
         cheaper, dearer = self.deltas[cost] < 0, self.deltas[cost] > 0
@@ -75,7 +75,9 @@ class Effect:
 
 
 def effects(groups: Sequence[Group], keys: Sequence[str]) -> list[Effect]:
-    """Every pair of groups of one scene and variant that differ in one axis; see :func:`_reference` for the order.
+    """Return every pair of groups of one scene and variant that differ in one axis.
+
+    The order is that of :func:`_reference`.
 
     Variants are compared with the first one of the scene, as they are, too.
     """

@@ -42,11 +42,11 @@ class Group:
         return " ".join([self.variant, *(f"{key.rpartition('.')[2]}={_short(v)}" for key, v in self.axes.items())])
 
     def mean(self, key: str) -> float:
-        """Mean over seeds; nan when a seed did not measure it."""
+        """Return the mean over seeds; nan when a seed did not measure it."""
         return statistics.fmean(run.values[key] for run in self.runs)
 
     def spread(self, key: str) -> float:
-        """Standard deviation over seeds; nan with a single one."""
+        """Return the standard deviation over seeds; nan with a single one."""
         values = [run.values[key] for run in self.runs]
         return statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else math.nan
 
@@ -72,11 +72,11 @@ class SweepData:
         return list(dict.fromkeys(group.scene for group in self.groups))
 
     def of(self, scene: str) -> list[Group]:
-        """Groups of a scene."""
+        """Return the groups of a scene."""
         return [group for group in self.groups if group.scene == scene]
 
     def measured(self) -> list[str]:
-        """Keys of quantities that at least one group has."""
+        """Return the keys of quantities that at least one group has."""
         return [q.key for q in QUANTITIES if any(math.isfinite(group.mean(q.key)) for group in self.groups)]
 
 
@@ -119,7 +119,9 @@ def _first_seconds(row: Mapping[str, Any], table: TableData) -> float | None:
 
 
 def waited(groups: Sequence[Group]) -> bool:
-    """Whether the runs waited for the processor: wall time of frames beyond 1.5 times what their threads account for.
+    """Say whether the runs waited for the processor.
+
+    Then the wall time of frames is beyond 1.5 times what their threads account for.
 
     Then seconds say more about the other programs than about the recipes.
     """
@@ -132,7 +134,10 @@ def waited(groups: Sequence[Group]) -> bool:
 
 
 def seed_noise(groups: Sequence[Group], key: str) -> float:
-    """Standard deviation between seeds of one point, pooled over all points with several; nan when there is none."""
+    """Return the standard deviation between seeds of one point, pooled over all points with several.
+
+    It is nan when there is none.
+    """
     parts = [(len(group.runs) - 1, group.spread(key)) for group in groups]
     known = [(freedom, spread) for freedom, spread in parts if math.isfinite(spread)]
     freedom = sum(f for f, _ in known)
@@ -140,7 +145,7 @@ def seed_noise(groups: Sequence[Group], key: str) -> float:
 
 
 def is_tie(first: Group, second: Group, key: str, noise: float) -> bool | None:
-    """Whether two means differ by no more than two standard errors of their difference; None: noise unknown."""
+    """Say whether two means differ by no more than two standard errors of their difference; None: noise unknown."""
     if not math.isfinite(noise):
         return None
     error = noise * math.sqrt(1 / len(first.runs) + 1 / len(second.runs))

@@ -33,7 +33,7 @@ class PaperTable:
 
 
 def paper_table(name: str) -> PaperTable:
-    """A table by its name. Raises UnknownName, naming the nearest."""
+    """Return a table of the paper by its name. Raises UnknownName, naming the nearest."""
     content: Mapping[str, Any] = YAML(typ="safe", pure=True).load(_FILE.read_text(encoding="utf-8"))
     if name not in content["tables"]:
         raise UnknownName("table of the paper", name, content["tables"])
@@ -50,7 +50,9 @@ def paper_table(name: str) -> PaperTable:
 def beside_ours(
     table: PaperTable, groups: Sequence[Group], scene: str, variants: Mapping[str, str] = MappingProxyType({})
 ) -> Table:
-    """The paper's rows, each followed by our run in the paper's columns, moving pixels and processor seconds.
+    """Return the paper's rows, each followed by our run in the same columns.
+
+    Moving pixels and processor seconds of our run stand behind them.
 
     Arguments:
         variants: row -> our variant; by default the one of that name.

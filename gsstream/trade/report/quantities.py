@@ -80,13 +80,13 @@ GOODS, COSTS = ("psnr", "psnr_moving"), ("kb", "seconds", "cpu_seconds", "memory
 
 
 def values_of(records: Sequence[FrameRecord], row: Row) -> dict[str, float]:
-    """Every quantity of one run; nan for what was not measured."""
+    """Return every quantity of one run; nan for what was not measured."""
     summary, later = summarise(records), row["frames"][1:]
     return {quantity.key: quantity.value(summary, later, row) for quantity in QUANTITIES}
 
 
 def cell(key: str, value: float, spread: float = math.nan) -> str:
-    """``31.22`` or ``31.22 ± 0.04``; "-" for what was not measured."""
+    """Return ``31.22`` or ``31.22 ± 0.04``; "-" for what was not measured."""
     if not math.isfinite(value):
         return "-"
     form = BY_KEY[key].form

@@ -14,7 +14,7 @@ SENDING = ("confidence", "propagation", "gate", "regularizer", "update")
 
 
 def leap_recipe(resolved: ResolvedRecipe, epochs: int, method: StreamingMethod[Any]) -> ResolvedRecipe:
-    """A method's own recipe with the epochs of a leap.
+    """Return a method's own recipe with the epochs of a leap.
 
     Arguments:
         epochs: passes over the training cameras.
@@ -27,7 +27,7 @@ def leap_recipe(resolved: ResolvedRecipe, epochs: int, method: StreamingMethod[A
 
 
 def open_leap_recipe(resolved: ResolvedRecipe, epochs: int) -> ResolvedRecipe:
-    """A recipe of parts with every gate open, every attribute free and no limit on bytes or time.
+    """Return a recipe of parts with every gate open, every attribute free and no limit on bytes or time.
 
     The delta of a leap is never sent: the key packet that follows holds the whole scene, whatever changed. So few open
     gates and coarse latents save nothing here, and lose quality (ours; docs/results/segments.md has what it costs).

@@ -116,7 +116,7 @@ class Carried:
         return replace(self._source.frame(self._shown, split), index=index, timestamp=index / self.info.fps)
 
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
-        """Points of frame 0."""
+        """Return points of frame 0."""
         return self._source.points(kind)
 
     def close(self) -> None:

@@ -33,7 +33,10 @@ class Seam:
 
 
 def first_frame_of(path: Path) -> bytes:
-    """The stream up to its first frame, as a stream of its own. Raises PacketError when that frame is not whole."""
+    """Return the stream up to its first frame, as a stream of its own.
+
+    Raises PacketError when that frame is not whole.
+    """
     with StreamReader(path) as reader:
         if not reader.frames:
             raise reader.damage or PacketError(f"{path} holds no complete packet yet", reader.end)
@@ -65,7 +68,7 @@ def join(streams: Sequence[Path], out: Path) -> None:
 
 
 def seams(starts: Sequence[int], frames: Sequence[dict[str, Any]]) -> list[Seam]:
-    """What each seam shows in the metrics of the joined frames."""
+    """Return what each seam shows in the metrics of the joined frames."""
     found = []
     for start in starts:
         deltas = [_size(frame) for frame in frames if frame["status"] != "key" and abs(frame["frame"] - start) <= 3]

@@ -36,7 +36,7 @@ class Task:
     shown: int | None = None
 
     def done(self, out: Path) -> bool:
-        """Whether its stream is there whole."""
+        """Say whether its stream is there whole."""
         path = out / self.id / STREAM
         if not path.is_file() or path.stat().st_size == 0:
             return False

@@ -94,7 +94,7 @@ def sheet_of_stream(
 
 
 def paint_gates(state: PlayerState) -> Gaussians[FloatArray]:
-    """The scene in two colours: orange what the frame moved or its gates let change, by gate value, grey the rest."""
+    """Return the scene in two colours: orange what the frame moved or let change, by gate value, grey the rest."""
     gaussians = state.gaussians
     share: FloatArray = np.zeros(len(gaussians), np.float32)
     if state.delta is not None and state.before is not None:

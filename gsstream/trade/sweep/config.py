@@ -214,7 +214,10 @@ def _read(path: Path, model: type[Model]) -> Model:
 
 
 def flat_settings(values: Mapping[str, Any], where: str) -> dict[tuple[str, ...], Any]:
-    """``{"gate.temperature": 0.3, "gate": {"name": "x"}}`` as key path -> value. Raises RecipeError for a bad key."""
+    """Return ``{"gate.temperature": 0.3, "gate": {"name": "x"}}`` as key path -> value.
+
+    Raises RecipeError for a bad key.
+    """
     out: dict[tuple[str, ...], Any] = {}
     for key, value in values.items():
         path = tuple(key.split("."))

@@ -166,17 +166,17 @@ def _first_of(task: Cell | FirstFrameRun) -> str | None:
 
 
 def stable_id(facts: Mapping[str, Any]) -> str:
-    """Short id of a machine's facts."""
+    """Return a short id of a machine's facts."""
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def first_frame_file(out: Path, key: str) -> Path:
-    """Where a shared frame 0 lies."""
+    """Return where a shared frame 0 lies."""
     return out / FIRST_FRAMES / f"{key}.gss"
 
 
 def cell_file(out: Path, key: str) -> Path:
-    """Where the stream of a cell lies."""
+    """Return where the stream of a cell lies."""
     return out / CELLS / f"{key}.gss"
 
 
@@ -191,7 +191,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def summary_line(frames: Sequence[Mapping[str, Any]]) -> str:
-    """``31.22 dB (moving 29.27), 25.6 KB, 0.45 s/frame``: means over the frames after the first."""
+    """Return ``31.22 dB (moving 29.27), 25.6 KB, 0.45 s/frame``: means over the frames after the first."""
     later = frames[1:] or frames
     whole, moving = (
         mean(value for frame in later for value in frame.get(name, {}).values() if value is not None)

@@ -146,7 +146,7 @@ def _measure(measure: Measure, stream: Path, recording: FrameSource, frames: lis
 
 
 def frame_values(evaluation: Evaluation, frame: int, lpips: bool) -> dict[str, dict[str, float | None]]:
-    """Quantity -> camera -> value of one frame; None where it is not defined."""
+    """Return quantity -> camera -> value of one frame; None where it is not defined."""
     views = [view for view in evaluation.views if view.frame == frame]
     names = [name for name in views[0].__slots__ if name not in _PLACE and (lpips or "lpips" not in name)]
     values = {name: {view.camera: _plain(getattr(view, name)) for view in views} for name in names}
@@ -154,7 +154,10 @@ def frame_values(evaluation: Evaluation, frame: int, lpips: bool) -> dict[str, d
 
 
 def frames_per_second(stream: Path) -> float:
-    """Pictures per second of the last frame, first test camera: median of 30 renders after 5 that do not count."""
+    """Measure pictures per second of the last frame and first test camera.
+
+    It is the median of 30 renders after 5 that do not count.
+    """
     from gsstream.player.playback import Playback
     from gsstream.player.render import render
 

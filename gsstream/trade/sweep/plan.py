@@ -127,7 +127,7 @@ def _points(config: SweepConfig, variant: Variant, seed: int) -> Iterator[dict[s
 
 
 def combinations(config: SweepConfig, variant: Variant) -> Iterator[dict[str, Any]]:
-    """The axis values of a variant's cells, in order."""
+    """Return the axis values of a variant's cells, in order."""
     axes: dict[str, Axis] = {**config.axes, **variant.axes}
     if config.search == "random":
         # Drawn from the seed and the variant's name alone: the same file always means the same cells.

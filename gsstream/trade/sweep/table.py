@@ -29,7 +29,7 @@ class TableData:
     cells: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def done(self) -> set[str]:
-        """Ids of cells that need not run again."""
+        """Return the ids of cells that need not run again."""
         return {key for key, row in self.cells.items() if row["status"] == "done"}
 
 

@@ -64,7 +64,7 @@ class Trial:
 
 
 def candidates(methods: Sequence[str], budget: Budget) -> list[Variant]:
-    """What is tried: every method as it is, with a knob or two for what is limited, and with the controller."""
+    """Return what is tried: each method as it is, with a knob or two for what is limited, with the controller."""
     limits = {f"budget.{name}": value for name, value in budget.model_dump(exclude_defaults=True).items()}
     out = []
     for method in methods:
@@ -81,7 +81,7 @@ def candidates(methods: Sequence[str], budget: Budget) -> list[Variant]:
 
 
 def pilot(scene: Scene, methods: Sequence[str], budget: Budget, seed: int) -> SweepConfig:
-    """The sweep that tries them."""
+    """Return the sweep that tries them."""
     return SweepConfig(
         name="tune", description="pilot of gsstream tune", scenes=[scene], seeds=[seed],
         variants=candidates(methods, budget), first_frame=FirstFrame(share="scene"),
@@ -103,7 +103,7 @@ def give_first_frame(plan: Plan, out: Path, stream: Path) -> None:
 
 
 def trial_of(name: str, row: Mapping[str, Any], budget: Budget) -> Trial:
-    """A cell's line of the sweep's table, held against the budget."""
+    """Return a cell's line of the sweep's table, held against the budget."""
     if row["status"] != "done":
         return Trial(name, error=str(row.get("error", "it was not run")))
     later = [frame for frame in row["frames"] if frame["frame"] > 0]
@@ -124,7 +124,7 @@ def _mean(frames: Sequence[Mapping[str, Any]], name: str) -> float:
 
 
 def choose(trials: Sequence[Trial]) -> Trial | None:
-    """The best of those that fit; of equals the one with fewer bytes; None when nothing fits.
+    """Return the best of those that fit; of equals the one with fewer bytes; None when nothing fits.
 
     Raises InputError when nothing was measured: a recording without test cameras has no quality to choose by.
     """
@@ -141,13 +141,13 @@ def choose(trials: Sequence[Trial]) -> Trial | None:
 
 
 def nearest(trials: Sequence[Trial]) -> Trial | None:
-    """Of what does not fit, the one with most frames inside, then with fewest bytes."""
+    """Return, of what does not fit, the one with most frames inside, then with fewest bytes."""
     tried = [trial for trial in trials if trial.frames]
     return max(tried, key=lambda t: (t.inside / t.frames, -sum(t.sizes)), default=None)
 
 
 def tune_table(trials: Sequence[Trial], chosen: Trial | None) -> str:
-    """One row per candidate, the best first; "-" where nothing was measured."""
+    """Return one row per candidate, the best first; "-" where nothing was measured."""
     head = ["recipe", "inside", "PSNR", "moving", "KB/frame", "most KB", "s/frame", "most s", "peak MB", ""]
     rows = [head]
     order = sorted(trials, key=lambda t: (not t.fits, -t.quality if math.isfinite(t.quality) else math.inf))
@@ -164,6 +164,6 @@ def tune_table(trials: Sequence[Trial], chosen: Trial | None) -> str:
 
 
 def tuned_recipe(resolved: ResolvedRecipe) -> str:
-    """The chosen recipe as ``gsstream run --recipe`` takes it: whole, without the pilot's number of frames."""
+    """Return the chosen recipe as ``gsstream run --recipe`` takes it: whole, without the pilot's number of frames."""
     recipe = resolved.recipe.model_copy(update={"frames": None})
     return to_yaml(ResolvedRecipe(recipe, resolved.origins))

@@ -50,12 +50,12 @@ class Change:
         return float(self.tiles.float().mean()) if self.tiles.numel() else 0.0
 
     def pixels(self, view: int) -> torch.Tensor:
-        """[H, W, 1] float mask of the pixels in changed tiles."""
+        """Return [H, W, 1]: 1.0 where a pixel of this view lies in a changed tile, else 0.0."""
         grown = self.tiles[view].repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)
         return grown[: self.height, : self.width, None].float()
 
     def votes(self, means: torch.Tensor, cameras: Cameras) -> torch.Tensor:
-        """[N] share of the views a centre projects into in which its tile, or one beside it, has changed.
+        """Return [N]: share of the views a centre projects into in which its tile, or one beside it, has changed.
 
         Arguments:
             means: [N, 3] centres. A centre that projects into no view gets 0.

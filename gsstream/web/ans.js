@@ -45,7 +45,8 @@ function searchGuide(left) {
 export class AnsDecoder {
   /** `data`: the words as little-endian bytes. Throws PacketError when they are no coder's output. */
   constructor(data) {
-    if (data.length % 4) throw new PacketError(`entropy-coded words: expected a multiple of 4 bytes, got ${data.length}`);
+    if (data.length % 4)
+      throw new PacketError(`entropy-coded words: expected a multiple of 4 bytes, got ${data.length}`);
     this.view = new DataView(data.buffer, data.byteOffset, data.byteLength);
     this.left = data.length / 4;
     this.low = 0;
@@ -88,9 +89,9 @@ export class AnsDecoder {
       // state = (state >> 24) * width + rest: the low half by integer products, the high half in exact pieces.
       const rest = quantile - begin;
       const small = (high & 0xffff) * width * 256 + ((low >>> 24) * width + rest);
-      const big = (high >>> 16) * width + Math.floor(small / 16777216);
+      const big = (high >>> 16) * width + Math.floor(small * 2 ** -24);
       low = (Math.imul((high << 8) | (low >>> 24), width) + rest) | 0;
-      high = Math.floor(big / 256) | 0;
+      high = Math.floor(big * 2 ** -8) | 0;
       if (high === 0 && left > 0) {
         left -= 1;
         high = low;

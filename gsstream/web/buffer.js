@@ -84,7 +84,12 @@ export class PacketBuffer {
   want(frame) {
     this.frame = frame;
     const part = this._wanted(frame);
-    if (this.loading && this.loading.part !== part && this._part(frame) !== this.loading.part && part === this._part(frame)) {
+    if (
+      this.loading &&
+      this.loading.part !== part &&
+      this._part(frame) !== this.loading.part &&
+      part === this._part(frame)
+    ) {
       this.loading.abort.abort(new DOMException("another part is needed", "AbortError"));
       this.loading = null;
     }

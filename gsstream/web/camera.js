@@ -15,8 +15,19 @@ export function viewsOf(meta) {
       const [right, down, forward] = [0, 4, 8].map((row) => m.slice(row, row + 3));
       const eye = [0, 1, 2].map((k) => -(right[k] * m[3] + down[k] * m[7] + forward[k] * m[11]));
       return {
-        id, split, eye, right, down, forward, fx: K[0], fy: K[4], cx: K[2], cy: K[5], width: rig.width,
-        height: rig.height, near: rig.near,
+        id,
+        split,
+        eye,
+        right,
+        down,
+        forward,
+        fx: K[0],
+        fy: K[4],
+        cx: K[2],
+        cy: K[5],
+        width: rig.width,
+        height: rig.height,
+        near: rig.near,
       };
     });
   });
@@ -28,8 +39,15 @@ export function cameraOf(view, width, height) {
   const rows = [view.right, view.down, view.forward];
   const viewmat = rows.flatMap((row) => [...row, -dot(row, view.eye)]);
   return {
-    viewmat: [...viewmat, 0, 0, 0, 1], scale, fx: view.fx * scale, fy: view.fy * scale, near: view.near, width, height,
-    cx: view.cx * scale + (width - view.width * scale) / 2, cy: view.cy * scale + (height - view.height * scale) / 2,
+    viewmat: [...viewmat, 0, 0, 0, 1],
+    scale,
+    fx: view.fx * scale,
+    fy: view.fy * scale,
+    near: view.near,
+    width,
+    height,
+    cx: view.cx * scale + (width - view.width * scale) / 2,
+    cy: view.cy * scale + (height - view.height * scale) / 2,
   };
 }
 
@@ -62,8 +80,8 @@ export function pivotOf(views) {
 }
 
 /**
- * The direction across the cameras' x axes, which are level unless a camera is rolled; their mean up direction would lean
- * towards the side from which half a circle looks down. It is taken where the x axes are parallel.
+ * The direction across the cameras' x axes, which are level unless a camera is rolled; their mean up direction would
+ * lean towards the side from which half a circle looks down. It is taken where the x axes are parallel.
  */
 function upOf(views) {
   const mean = unit(views.reduce((sum, view) => add(sum, view.down, -1), [0, 0, 0]));
@@ -106,7 +124,15 @@ export function looked(view, pivot, yaw, pitch) {
 
 /** View and pivot moved along the view's own axes, in scene units. */
 export function moved(view, pivot, [right, down, forward]) {
-  const step = add(add(view.right.map((v) => v * right), view.down, down), view.forward, forward);
+  const step = add(
+    add(
+      view.right.map((v) => v * right),
+      view.down,
+      down,
+    ),
+    view.forward,
+    forward,
+  );
   return { view: { ...view, eye: add(view.eye, step) }, pivot: { ...pivot, point: add(pivot.point, step) } };
 }
 

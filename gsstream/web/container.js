@@ -11,8 +11,20 @@ const MAGIC = [0x89, 0x47, 0x53, 0x53, 0x0d, 0x0a, 0x1a, 0x0a];
 export const KIND = { key: 1, delta: 2, empty: 3, index: 4 };
 export const KIND_NAMES = { 1: "key", 2: "delta", 3: "empty", 4: "index" };
 export const SECTION_NAMES = {
-  1: "meta", 2: "layout", 3: "gates", 4: "decoders", 5: "index", 6: "deaths", 7: "births", 8: "motion",
-  16: "means", 17: "quats", 18: "scales", 19: "opacities", 20: "sh0", 21: "shN",
+  1: "meta",
+  2: "layout",
+  3: "gates",
+  4: "decoders",
+  5: "index",
+  6: "deaths",
+  7: "births",
+  8: "motion",
+  16: "means",
+  17: "quats",
+  18: "scales",
+  19: "opacities",
+  20: "sh0",
+  21: "shN",
 };
 
 const CRC_TABLE = new Uint32Array(256).map((_, byte) => {
@@ -50,7 +62,9 @@ export function checkFileHeader(data) {
     const what = major < FORMAT_MAJOR ? "older" : "newer";
     throw new PacketError(
       `packet format ${major}.${minor} cannot be read: it is ${what} than this player, which reads ` +
-      `${FORMAT_MAJOR}.0 to ${FORMAT_MAJOR}.${FORMAT_MINOR}`, 8);
+        `${FORMAT_MAJOR}.0 to ${FORMAT_MAJOR}.${FORMAT_MINOR}`,
+      8,
+    );
   }
   return `${major}.${minor}`;
 }
@@ -62,7 +76,10 @@ export function parseHeader(data, offset) {
   }
   const view = viewOf(data);
   const header = {
-    kind: data[0], sections: data[1], frame: view.getUint32(4, true), body: view.getUint32(8, true),
+    kind: data[0],
+    sections: data[1],
+    frame: view.getUint32(4, true),
+    body: view.getUint32(8, true),
     checksum: view.getUint32(12, true),
   };
   const packed = new Uint8Array(14);
@@ -115,7 +132,9 @@ function splitSections(header, body, start) {
     at += SECTION_HEADER;
     if (length > body.length - at) {
       throw new PacketError(
-        `section ${name}: ${length} bytes announced, ${body.length - at} left in the packet`, start + at);
+        `section ${name}: ${length} bytes announced, ${body.length - at} left in the packet`,
+        start + at,
+      );
     }
     sections.push({ name, data: body.subarray(at, at + length), offset: start + at });
     at += length;

@@ -87,7 +87,9 @@ export class Controls {
     event.preventDefault();
     if (!this.scene.view) return;
     const lines = event.deltaMode === 1 ? 30 : 1;
-    this._set(zoomed(this.scene.view, this.scene.pivot, Math.exp(Math.max(-1, Math.min(1, event.deltaY * lines * 0.0015)))));
+    this._set(
+      zoomed(this.scene.view, this.scene.pivot, Math.exp(Math.max(-1, Math.min(1, event.deltaY * lines * 0.0015)))),
+    );
   }
 
   _key(event, down) {

@@ -12,8 +12,8 @@ import { ATTRIBUTES } from "./limits.js";
 /**
  * The state after one complete packet at byte `offset` of its file.
  *
- * `state` is that of the frame before (null is fine for a key packet). A delta changes it in place and returns it: it is
- * decoded as a whole first, so after a PacketError the state still is that of the frame before.
+ * `state` is that of the frame before (null is fine for a key packet). A delta changes it in place and returns it: it
+ * is decoded as a whole first, so after a PacketError the state still is that of the frame before.
  *
  * A state has `frame`, `number` (Gaussians), `scene` (attribute -> Float32Array), `widths` (values a row), `layout`,
  * `meta`, `decoders`, `groups` and `moved` (what the next packet may refer to), and `change`: what this packet did, for
@@ -43,7 +43,15 @@ function keyState(header, sections, size, offset) {
   const number = layout.unitOf.length;
   const widths = { means: 3, quats: 4, scales: 3, opacities: 1, sh0: 3, shN: number ? scene.shN.length / number : 0 };
   return {
-    frame: header.frame, number, scene, widths, layout, meta, decoders: new Map(), groups: null, moved: null,
+    frame: header.frame,
+    number,
+    scene,
+    widths,
+    layout,
+    meta,
+    decoders: new Map(),
+    groups: null,
+    moved: null,
     change: { kind: KIND_NAMES[KIND.key] },
   };
 }
@@ -68,9 +76,9 @@ function decodeDelta(sections, state, offset) {
 }
 
 /**
- * Apply what was decoded, in order. Returns what changed: `moved`, lists of rows with their gates and attributes as they
- * were numbered before births and deaths, and `source`, the row each row was before (null when none joined or left; see
- * `applyRows`).
+ * Apply what was decoded, in order. Returns what changed: `moved`, lists of rows with their gates and attributes as
+ * they were numbered before births and deaths, and `source`, the row each row was before (null when none joined or
+ * left; see `applyRows`).
  */
 function applyDelta(state, { motions, residual, rows }) {
   const touched = touchedRows(state.number, motions, residual);

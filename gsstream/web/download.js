@@ -17,10 +17,14 @@ export const settings = { patience: 15_000, firstPause: FIRST_PAUSE, fetch: (...
 function sleep(milliseconds, signal) {
   return new Promise((resolve, reject) => {
     const timer = setTimeout(resolve, milliseconds);
-    signal?.addEventListener("abort", () => {
-      clearTimeout(timer);
-      reject(signal.reason);
-    }, { once: true });
+    signal?.addEventListener(
+      "abort",
+      () => {
+        clearTimeout(timer);
+        reject(signal.reason);
+      },
+      { once: true },
+    );
   });
 }
 
@@ -61,14 +65,14 @@ export async function* chunksOf(response, signal) {
 }
 
 /**
- * Bytes `start` to `end` of a file as chunks, in order. `whole`: the file is just these bytes, so the first request needs
- * no range. A connection that breaks is taken up where it broke, a few times.
+ * Bytes `start` to `end` of a file as chunks, in order. `whole`: the file is just these bytes, so the first request
+ * needs no range. A connection that breaks is taken up where it broke, a few times.
  *
  * Throws SourceError when the file is not there or the server stops for good.
  */
 export async function* bytesOf(url, { start = 0, end = null, whole = false, signal } = {}) {
   let at = start;
-  for (let failures = 0; ; ) {
+  for (let failures = 0; ;) {
     try {
       const ranged = !(whole && at === start);
       const response = await request(url, { start: at, end, ranged, signal });

@@ -15,13 +15,15 @@ canvas:active { cursor: grabbing; }
 .bar { position: absolute; inset: auto 0 0 0; display: flex; gap: 8px; align-items: center; padding: 24px 12px 8px;
   background: linear-gradient(transparent, #000b); transition: opacity .25s; }
 :host([idle]) .bar { opacity: 0; }
-button, select { background: #fff2; color: inherit; border: 0; border-radius: 4px; padding: 4px 8px; font: inherit; cursor: pointer; }
+button, select { background: #fff2; color: inherit; border: 0; border-radius: 4px; padding: 4px 8px; font: inherit;
+  cursor: pointer; }
 button:hover, select:hover { background: #fff4; }
 button[aria-pressed=true] { background: #e8a33d; color: #111; }
 select option { color: #111; }
 input { flex: 1; min-width: 60px; accent-color: #e8a33d; }
 .time { font-variant-numeric: tabular-nums; white-space: nowrap; }
-.message, .facts { position: absolute; left: 12px; top: 12px; max-width: calc(100% - 24px); padding: 6px 10px; border-radius: 4px;
+.message, .facts { position: absolute; left: 12px; top: 12px; max-width: calc(100% - 24px); padding: 6px 10px;
+  border-radius: 4px;
   background: #000a; white-space: pre-line; pointer-events: none; }
 .message { left: 50%; top: 45%; transform: translate(-50%, -50%); text-align: center; }
 .facts { font-variant-numeric: tabular-nums; }
@@ -54,8 +56,22 @@ export class PlayerElement extends HTMLElement {
     const root = this.shadowRoot ?? this.attachShadow({ mode: "open" });
     root.innerHTML = `<style>${STYLE}</style>${PAGE}`;
     this.parts = Object.fromEntries(
-      ["canvas", "play", "seek", "time", "speed", "camera", "rendition", "marks", "statistics", "full", "facts", "message", "bar"]
-        .map((name) => [name, root.querySelector(name === "canvas" ? name : `.${name}`)]));
+      [
+        "canvas",
+        "play",
+        "seek",
+        "time",
+        "speed",
+        "camera",
+        "rendition",
+        "marks",
+        "statistics",
+        "full",
+        "facts",
+        "message",
+        "bar",
+      ].map((name) => [name, root.querySelector(name === "canvas" ? name : `.${name}`)]),
+    );
     this.parts.bar.hidden = this.getAttribute("controls") === "false";
     try {
       this._makePlayer();
@@ -123,12 +139,15 @@ export class PlayerElement extends HTMLElement {
     const { parts, player } = this;
     parts.play.onclick = () => this._toggle();
     parts.seek.oninput = () => player.seek(Number(parts.seek.value));
-    parts.speed.replaceChildren(...SPEEDS.map((speed) => new Option(`${speed}×`, speed, false, speed === player.speed)));
+    parts.speed.replaceChildren(
+      ...SPEEDS.map((speed) => new Option(`${speed}×`, speed, false, speed === player.speed)),
+    );
     parts.speed.onchange = () => {
       player.speed = Number(parts.speed.value);
     };
     parts.camera.onchange = () => player.look(parts.camera.selectedIndex);
-    parts.rendition.onchange = () => player.choose(parts.rendition.selectedIndex);
+    // What goes wrong is told by the event `problem`.
+    parts.rendition.onchange = () => player.choose(parts.rendition.selectedIndex).catch(() => {});
     parts.marks.onclick = () => this._marks();
     parts.statistics.onclick = () => this._statistics();
     parts.full.onclick = () => this._full();
@@ -170,7 +189,9 @@ export class PlayerElement extends HTMLElement {
 
   _fillLists() {
     const { parts, player } = this;
-    parts.camera.replaceChildren(...player.views.map((view) => new Option(view.split === "test" ? `${view.id} (held out)` : view.id)));
+    parts.camera.replaceChildren(
+      ...player.views.map((view) => new Option(view.split === "test" ? `${view.id} (held out)` : view.id)),
+    );
     const renditions = player.source.renditions;
     parts.rendition.hidden = renditions.length < 2;
     parts.rendition.replaceChildren(...renditions.map(({ name }) => new Option(name)));
@@ -216,9 +237,19 @@ export class PlayerElement extends HTMLElement {
       player.seek(player.frame + way);
     };
     const actions = {
-      " ": () => this._toggle(), ArrowRight: () => step(1), ArrowLeft: () => step(-1), Home: () => player.seek(player.first),
-      End: () => player.seek(player.last), g: () => this._marks(), i: () => this._statistics(), f: () => this._full(),
-      "+": () => speed(1), "-": () => speed(-1), l: () => { player.loop = !player.loop; },
+      " ": () => this._toggle(),
+      ArrowRight: () => step(1),
+      ArrowLeft: () => step(-1),
+      Home: () => player.seek(player.first),
+      End: () => player.seek(player.last),
+      g: () => this._marks(),
+      i: () => this._statistics(),
+      f: () => this._full(),
+      "+": () => speed(1),
+      "-": () => speed(-1),
+      l: () => {
+        player.loop = !player.loop;
+      },
       r: () => player.look(Math.max(0, this.parts.camera.selectedIndex)),
     };
     const number = Number(event.key) - 1;

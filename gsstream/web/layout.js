@@ -19,7 +19,8 @@ export function decodeLayout(data, most) {
   if (number > most || nodes > most || kinds > MAX_UNITS) {
     throw new PacketError(
       `layout of ${number} Gaussians, ${nodes} nodes, ${kinds} units is beyond the limits: at most ${most} ` +
-      `Gaussians and nodes in a packet of this size, ${MAX_UNITS} units`);
+        `Gaussians and nodes in a packet of this size, ${MAX_UNITS} units`,
+    );
   }
   if (data.length - 9 < 4 * kinds) throw new PacketError("units cut short");
   const units = Float32Array.from({ length: kinds }, (_, i) => view.getFloat32(9 + 4 * i, true));

@@ -63,9 +63,16 @@ function isColour(value) {
 function isRig(rig) {
   if (rig === null || typeof rig !== "object" || !Array.isArray(rig.ids)) return false;
   const number = rig.ids.length;
-  return rig.ids.every((id) => typeof id === "string")
-    && [rig.width, rig.height].every((side) => Number.isInteger(side) && side >= 0 && side <= 1 << 16)
-    && Number.isFinite(rig.near) && rig.near > 0
-    && Array.isArray(rig.viewmats) && rig.viewmats.length === number && rig.viewmats.every((m) => isNumbers(m, 16))
-    && Array.isArray(rig.Ks) && rig.Ks.length === number && rig.Ks.every((K) => isNumbers(K, 9));
+  return (
+    rig.ids.every((id) => typeof id === "string") &&
+    [rig.width, rig.height].every((side) => Number.isInteger(side) && side >= 0 && side <= 1 << 16) &&
+    Number.isFinite(rig.near) &&
+    rig.near > 0 &&
+    Array.isArray(rig.viewmats) &&
+    rig.viewmats.length === number &&
+    rig.viewmats.every((m) => isNumbers(m, 16)) &&
+    Array.isArray(rig.Ks) &&
+    rig.Ks.length === number &&
+    rig.Ks.every((K) => isNumbers(K, 9))
+  );
 }

@@ -13,8 +13,8 @@ import { Snapshots } from "./snapshots.js";
 const BUDGET = 24;
 
 /**
- * Events: `ready` (the first picture can be drawn), `frame`, `state` (playing, waiting, paused, ended), `problem` (detail: a
- * sentence), `view`.
+ * Events: `ready` (the first picture can be drawn), `frame`, `state` (playing, waiting, paused, ended), `problem`
+ * (detail: a sentence), `view`.
  */
 export class Player extends EventTarget {
   constructor(canvas, options = {}) {
@@ -279,7 +279,8 @@ export class Player extends EventTarget {
 
   _news() {
     // The first frame of a file without an index is known only now.
-    if (this.state === null && this.buffer?.first !== null && this._target < this.buffer.first) this._target = this.buffer.first;
+    if (this.state === null && this.buffer?.first !== null && this._target < this.buffer.first)
+      this._target = this.buffer.first;
     this.invalidate();
   }
 

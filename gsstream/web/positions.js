@@ -9,7 +9,7 @@ const MAX_EXPONENT = 60;
 const MAX_CELL = 2 ** 29;
 const LOG2E = 1512775;
 
-/** Decode [N, 3] positions into a Float32Array. `scales`: integer codes of three channels with `bits` fractional bits. */
+/** Decode [N, 3] positions. `scales`: integer codes of three channels with `bits` fractional bits. */
 export function decodePositions(data, scales, bits, number) {
   if (number === 0) {
     if (data.length) throw new PacketError(`${data.length} bytes for no positions`);

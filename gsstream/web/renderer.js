@@ -13,8 +13,8 @@ const MARK_LASTS = 3;
 
 /**
  * A camera is `{ viewmat, fx, fy, cx, cy, width, height, near }`: world to camera as 16 numbers row by row (x right, y
- * down, z forward), the rest in pixels with the corner of the picture as origin, near in scene units; `scale`: pixels of
- * the picture for one of the recording, 1 if left out.
+ * down, z forward), the rest in pixels with the corner of the picture as origin, near in scene units; `scale`: pixels
+ * of the picture for one of the recording, 1 if left out.
  */
 export class Renderer {
   /**
@@ -22,7 +22,12 @@ export class Renderer {
    * plain words when the browser offers no WebGL2.
    */
   constructor(canvas, { onChange = () => {}, useWorker = true } = {}) {
-    const gl = canvas.getContext("webgl2", { antialias: false, depth: false, alpha: false, powerPreference: "high-performance" });
+    const gl = canvas.getContext("webgl2", {
+      antialias: false,
+      depth: false,
+      alpha: false,
+      powerPreference: "high-performance",
+    });
     if (!gl) throw new Error("This browser offers no WebGL2, which the player draws with.");
     this.canvas = canvas;
     this.gl = gl;
@@ -77,7 +82,8 @@ export class Renderer {
     const data = new Uint8Array(width * height * 4);
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, data);
     const out = new Uint8Array(data.length);
-    for (let y = 0; y < height; y += 1) out.set(data.subarray(4 * width * (height - 1 - y), 4 * width * (height - y)), 4 * width * y);
+    for (let y = 0; y < height; y += 1)
+      out.set(data.subarray(4 * width * (height - 1 - y), 4 * width * (height - y)), 4 * width * y);
     return out;
   }
 
@@ -170,7 +176,8 @@ export class Renderer {
 
   _fitTarget() {
     const { gl, canvas } = this;
-    if (!this.deep || (this.target && this.target.width === canvas.width && this.target.height === canvas.height)) return;
+    if (!this.deep || (this.target && this.target.width === canvas.width && this.target.height === canvas.height))
+      return;
     if (this.target) {
       gl.deleteTexture(this.target.texture);
       gl.deleteFramebuffer(this.target.buffer);
@@ -239,7 +246,10 @@ export class Renderer {
 /** A program and its uniforms by name. Throws an Error with the compiler's words. */
 function link(gl, vertex, fragment) {
   const handle = gl.createProgram();
-  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+  for (const [kind, text] of [
+    [gl.VERTEX_SHADER, vertex],
+    [gl.FRAGMENT_SHADER, fragment],
+  ]) {
     const shader = gl.createShader(kind);
     gl.shaderSource(shader, text);
     gl.compileShader(shader);

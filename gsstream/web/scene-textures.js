@@ -63,7 +63,8 @@ class AttributeTexture {
 
   _lines(used) {
     const runs = [];
-    for (let start = 0; start < used; start += 2 ** this.shift) runs.push([start, Math.min(start + 2 ** this.shift, used)]);
+    for (let start = 0; start < used; start += 2 ** this.shift)
+      runs.push([start, Math.min(start + 2 ** this.shift, used)]);
     return runs;
   }
 
@@ -98,7 +99,9 @@ export class SceneTextures {
     const { used } = this.slots;
     if (degree !== this.degree) {
       if (this.colours && this.colours.texture) this.gl.deleteTexture(this.colours.texture);
-      this.colours = new AttributeTexture(this.gl, colourTexels(degree), (out, at, slot) => this._fillColour(out, at, slot));
+      this.colours = new AttributeTexture(this.gl, colourTexels(degree), (out, at, slot) =>
+        this._fillColour(out, at, slot),
+      );
       this.degree = degree;
     }
     const room = Math.ceil(used * 1.25) + 1;

@@ -10,12 +10,20 @@ export function colourTexels(degree) {
 
 const CONSTANTS = [
   "0.28209479177387814",
-  "-0.4886025119029199 * y", "0.4886025119029199 * z", "-0.4886025119029199 * x",
-  "1.0925484305920792 * x * y", "-1.0925484305920792 * y * z", "0.31539156525252005 * (2.0 * z * z - x * x - y * y)",
-  "-1.0925484305920792 * x * z", "0.5462742152960396 * (x * x - y * y)",
-  "-0.5900435899266435 * y * (3.0 * x * x - y * y)", "2.890611442640554 * x * y * z",
-  "-0.4570457994644658 * y * (5.0 * z * z - 1.0)", "0.3731763325901154 * z * (5.0 * z * z - 3.0)",
-  "-0.4570457994644658 * x * (5.0 * z * z - 1.0)", "1.445305721320277 * z * (x * x - y * y)",
+  "-0.4886025119029199 * y",
+  "0.4886025119029199 * z",
+  "-0.4886025119029199 * x",
+  "1.0925484305920792 * x * y",
+  "-1.0925484305920792 * y * z",
+  "0.31539156525252005 * (2.0 * z * z - x * x - y * y)",
+  "-1.0925484305920792 * x * z",
+  "0.5462742152960396 * (x * x - y * y)",
+  "-0.5900435899266435 * y * (3.0 * x * x - y * y)",
+  "2.890611442640554 * x * y * z",
+  "-0.4570457994644658 * y * (5.0 * z * z - 1.0)",
+  "0.3731763325901154 * z * (5.0 * z * z - 3.0)",
+  "-0.4570457994644658 * x * (5.0 * z * z - 1.0)",
+  "1.445305721320277 * z * (x * x - y * y)",
   "-0.5900435899266435 * x * (x * x - 3.0 * y * y)",
 ];
 
@@ -91,8 +99,9 @@ void main() {
   vec2 t = clamp(p.xy / p.z, -intrinsics.zw / focal - margin, (size - intrinsics.zw) / focal + margin);
   mat3 axes = rotation * rotationOf(texelFetch(geometry, texel + ivec2(1, 0), 0));
   vec3 spread = exp(third.xyz);
-  vec3 across = focal.x / p.z * vec3(axes[0].x - t.x * axes[0].z, axes[1].x - t.x * axes[1].z, axes[2].x - t.x * axes[2].z) * spread;
-  vec3 down = focal.y / p.z * vec3(axes[0].y - t.y * axes[0].z, axes[1].y - t.y * axes[1].z, axes[2].y - t.y * axes[2].z) * spread;
+  vec3 depths = vec3(axes[0].z, axes[1].z, axes[2].z);
+  vec3 across = focal.x / p.z * (vec3(axes[0].x, axes[1].x, axes[2].x) - t.x * depths) * spread;
+  vec3 down = focal.y / p.z * (vec3(axes[0].y, axes[1].y, axes[2].y) - t.y * depths) * spread;
   float a = dot(across, across) + blur, b = dot(across, down), c = dot(down, down) + blur;
   float determinant = a * c - b * b;
   if (!(determinant > 0.0)) return;

@@ -27,7 +27,8 @@ export class SortQueue {
   }
 
   update(slots, positions) {
-    for (let i = 0; i < slots.length; i += 1) this.mirror.positions.set(positions.subarray(3 * i, 3 * i + 3), 3 * slots[i]);
+    for (let i = 0; i < slots.length; i += 1)
+      this.mirror.positions.set(positions.subarray(3 * i, 3 * i + 3), 3 * slots[i]);
     if (this.worker) this.worker.postMessage({ slots, positions }, [slots.buffer, positions.buffer]);
     else this.local.update(slots, positions);
   }

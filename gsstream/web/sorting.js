@@ -22,8 +22,8 @@ export class DepthSorter {
 
   /**
    * The slots with depth above `near`, farthest first, as a new Uint32Array. `axis`: the four numbers of the row of
-   * the world-to-camera matrix that gives the depth. Of equal depths the first counts as nearer, by slot, or by its place
-   * in `list` where one is given: copies of a Gaussian lie at the very same place.
+   * the world-to-camera matrix that gives the depth. Of equal depths the first counts as nearer, by slot, or by its
+   * place in `list` where one is given: copies of a Gaussian lie at the very same place.
    */
   sort([x, y, z, offset], near, list = null) {
     const { positions, keys, slots } = this;

@@ -10,8 +10,8 @@ const TRAILER = 12;
 /**
  * Find out what is at `url`: `{ segments, frames, fps, renditions }`.
  *
- * A segment is `{ first, last, url, start, end, whole }`: a key packet and what follows, bytes `start` to `end` of a file,
- * or the whole file. `last` and `frames` are null where only playing tells. Throws SourceError or PacketError.
+ * A segment is `{ first, last, url, start, end, whole }`: a key packet and what follows, bytes `start` to `end` of a
+ * file, or the whole file. `last` and `frames` are null where only playing tells. Throws SourceError or PacketError.
  */
 export async function openSource(url, signal) {
   const address = new URL(url, globalThis.document?.baseURI);
@@ -31,7 +31,8 @@ async function openManifest(url, signal) {
   const version = /^gsstream (\d+)\.(\d+)$/.exec(manifest?.format ?? "");
   if (version && (Number(version[1]) !== FORMAT_MAJOR || Number(version[2]) > FORMAT_MINOR)) {
     throw new SourceError(
-      `This stream has packet format ${version[1]}.${version[2]}; this player reads ${FORMAT_MAJOR}.${FORMAT_MINOR}.`);
+      `This stream has packet format ${version[1]}.${version[2]}; this player reads ${FORMAT_MAJOR}.${FORMAT_MINOR}.`,
+    );
   }
   const renditions = [manifest, ...(manifest.renditions ?? [])].map((entry, i) => ({
     name: entry.name ?? (i ? `rendition ${i}` : "full"),
@@ -65,11 +66,17 @@ async function openFile(url, signal) {
   });
   if (response.status === 200) return plain(response);
   if (response.status === 416) return plain();
-  if (response.status !== 206) throw new SourceError(`There is no stream at ${url}: the server answers ${response.status}.`);
+  if (response.status !== 206)
+    throw new SourceError(`There is no stream at ${url}: the server answers ${response.status}.`);
   const total = /\/(\d+)$/.exec(response.headers.get("Content-Range") ?? "");
   const tail = new Uint8Array(await response.arrayBuffer());
   if (!total || tail.length !== TRAILER || String.fromCharCode(...tail.subarray(8)) !== "GSSX") return plain();
-  const segments = await indexed(url, Number(new DataView(tail.buffer).getBigUint64(0, true)), Number(total[1]), signal);
+  const segments = await indexed(
+    url,
+    Number(new DataView(tail.buffer).getBigUint64(0, true)),
+    Number(total[1]),
+    signal,
+  );
   if (!segments) return plain();
   const last = segments[segments.length - 1].last;
   return { segments, frames: last - segments[0].first + 1, fps: null, renditions: [] };
@@ -104,7 +111,8 @@ export async function* packetsOf(segment, signal) {
   const walker = new PacketWalker(segment.start);
   const { body } = segment;
   segment.body = null;
-  const chunks = body && !body.bodyUsed ? continued(body, segment, signal) : bytesOf(segment.url, { ...segment, signal });
+  const chunks =
+    body && !body.bodyUsed ? continued(body, segment, signal) : bytesOf(segment.url, { ...segment, signal });
   for await (const chunk of chunks) {
     walker.push(chunk);
     for (let packet = walker.next(); packet; packet = walker.next()) yield packet;

@@ -58,15 +58,19 @@ export class PacketWalker {
     if (last.kind === KIND.index) throw new PacketError("a packet follows the index, which must be the last", offset);
     const expected = kind === KIND.index ? last.frame : last.frame + 1;
     if (frame !== expected) {
-      throw new PacketError(`frames must be consecutive: expected ${expected} after ${last.frame}, got ${frame}`, offset);
+      throw new PacketError(
+        `frames must be consecutive: expected ${expected} after ${last.frame}, got ${frame}`,
+        offset,
+      );
     }
   }
 
   _checkIndex(data, offset) {
     const listed = parseIndex(data, offset);
     if (!this.whole) return;
-    const same = listed.length === this.keys.length
-      && listed.every((key, i) => key.frame === this.keys[i].frame && key.offset === this.keys[i].offset);
+    const same =
+      listed.length === this.keys.length &&
+      listed.every((key, i) => key.frame === this.keys[i].frame && key.offset === this.keys[i].offset);
     if (!same) throw new PacketError("the index does not describe this stream", offset);
   }
 

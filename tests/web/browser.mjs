@@ -6,8 +6,16 @@ import { tmpdir } from "node:os";
 import { join } from "node:path";
 
 const FLAGS = [
-  "--headless", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-  "--ignore-gpu-blocklist", "--remote-debugging-pipe", "--no-first-run", "--disable-dev-shm-usage", "--hide-scrollbars",
+  "--headless",
+  "--no-sandbox",
+  "--use-gl=angle",
+  "--use-angle=swiftshader",
+  "--enable-unsafe-swiftshader",
+  "--ignore-gpu-blocklist",
+  "--remote-debugging-pipe",
+  "--no-first-run",
+  "--disable-dev-shm-usage",
+  "--hide-scrollbars",
 ];
 
 /** One browser with one page. */
@@ -16,8 +24,9 @@ export class Browser {
   static async start(path, { width = 960, height = 600, flags = [] } = {}) {
     const browser = new Browser();
     browser.profile = mkdtempSync(join(tmpdir(), "chromium-"));
-    browser.child = spawn(path, [...FLAGS, ...flags, `--user-data-dir=${browser.profile}`, "about:blank"],
-      { stdio: ["ignore", "ignore", "ignore", "pipe", "pipe"] });
+    browser.child = spawn(path, [...FLAGS, ...flags, `--user-data-dir=${browser.profile}`, "about:blank"], {
+      stdio: ["ignore", "ignore", "ignore", "pipe", "pipe"],
+    });
     browser.last = 0;
     browser.waiting = new Map();
     browser.messages = [];
@@ -73,7 +82,9 @@ export class Browser {
   /** What an expression (a promise is awaited) comes to in the page. */
   async evaluate(expression) {
     const { result, exceptionDetails } = await this.send("Runtime.evaluate", {
-      expression, awaitPromise: true, returnByValue: true,
+      expression,
+      awaitPromise: true,
+      returnByValue: true,
     });
     if (exceptionDetails) throw new Error(exceptionDetails.exception?.description ?? exceptionDetails.text);
     return result.value;

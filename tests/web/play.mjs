@@ -38,7 +38,7 @@ const [, , from, to] = process.argv;
 const data = new Uint8Array(readFileSync(from));
 const view = new DataView(data.buffer);
 const streams = [];
-for (let at = 0; at < data.length; ) {
+for (let at = 0; at < data.length;) {
   const size = view.getUint32(at, true);
   streams.push(play(data.subarray(at + 4, at + 4 + size), streams.length % 2 ? 1000 : 1 << 20));
   at += 4 + size;

@@ -1,7 +1,7 @@
 // Carry out steps in a headless browser. Usage: node scenario.mjs CHROMIUM STEPS RESULTS (both JSON files)
 //
-// STEPS: { width, height, throttle (bytes/s), steps: [[name, ...arguments], ...] }. RESULTS: a list with what each step gave, and
-// `messages`, the errors that the page reported.
+// STEPS: { width, height, throttle (bytes/s), steps: [[name, ...arguments], ...] }. RESULTS: a list with what each
+// step gave, and `messages`, the errors that the page reported.
 
 import { readFileSync, writeFileSync } from "node:fs";
 
@@ -17,8 +17,13 @@ const actions = {
   until: (expression, seconds) => browser.until(expression, seconds),
   evaluate: (expression) => browser.evaluate(expression),
   pause,
-  throttle: (bytes) => browser.send("Network.emulateNetworkConditions",
-    { offline: false, latency: 20, downloadThroughput: bytes, uploadThroughput: bytes }),
+  throttle: (bytes) =>
+    browser.send("Network.emulateNetworkConditions", {
+      offline: false,
+      latency: 20,
+      downloadThroughput: bytes,
+      uploadThroughput: bytes,
+    }),
   screenshot: async (path) => writeFileSync(path, await browser.screenshot()),
   key: async (key) => {
     await browser.send("Input.dispatchKeyEvent", { type: "keyDown", key, text: key.length === 1 ? key : undefined });
@@ -28,13 +33,26 @@ const actions = {
     const buttons = button === "left" ? 1 : 2;
     await browser.send("Input.dispatchMouseEvent", { type: "mousePressed", x, y, button, buttons, clickCount: 1 });
     for (let i = 1; i <= 8; i += 1) {
-      await browser.send("Input.dispatchMouseEvent", { type: "mouseMoved", x: x + (dx * i) / 8, y: y + (dy * i) / 8, button, buttons });
+      await browser.send("Input.dispatchMouseEvent", {
+        type: "mouseMoved",
+        x: x + (dx * i) / 8,
+        y: y + (dy * i) / 8,
+        button,
+        buttons,
+      });
     }
-    await browser.send("Input.dispatchMouseEvent", { type: "mouseReleased", x: x + dx, y: y + dy, button, clickCount: 1 });
+    await browser.send("Input.dispatchMouseEvent", {
+      type: "mouseReleased",
+      x: x + dx,
+      y: y + dy,
+      button,
+      clickCount: 1,
+    });
   },
   wheel: (x, y, deltaY) => browser.send("Input.dispatchMouseEvent", { type: "mouseWheel", x, y, deltaX: 0, deltaY }),
   // RGBA bytes of a frame, drawn at the recording's size in exact depth order.
-  picture: (frame, width, height) => browser.evaluate(`(async () => {
+  picture: (frame, width, height) =>
+    browser.evaluate(`(async () => {
     const player = ${PLAYER};
     player.canvas.width = ${width};
     player.canvas.height = ${height};

@@ -51,6 +51,12 @@ def pictures(encoded: list[str], width: int, height: int) -> list[np.ndarray]:
     return [np.frombuffer(base64.b64decode(t), np.uint8).reshape(height, width, 4)[..., :3] for t in encoded]
 
 
+def drawn(playback: Playback, frame: int) -> np.ndarray:
+    """A frame from the first test camera by the player's reference renderer, 8 bits."""
+    renderer = PlayerRenderer("numpy", render_numpy)
+    return to_bytes(render(playback.state_at(frame), playback.cameras("test"), 0, playback.meta.background, renderer))
+
+
 def test_pictures_of_a_run_are_those_of_the_python_player(tmp_path):
     source = "synthetic:frames=6&views=3&width=64&height=48"
     settings = ["--set", "first_frame.max_iterations=60", "--set", "first_frame.fill_points=400"]
@@ -64,8 +70,7 @@ def test_pictures_of_a_run_are_those_of_the_python_player(tmp_path):
         steps = [["go", f"{url}/index.html"], READY, *(["picture", f, rig.width, rig.height] for f in frames)]
         got = pictures(in_browser(steps, tmp_path, size=SIZE)[2:], rig.width, rig.height)
         for frame, picture in zip(frames, got, strict=True):
-            scene = playback.state_at(frame)
-            expected = to_bytes(render(scene, rig, 0, playback.meta.background, PlayerRenderer("numpy", render_numpy)))
+            expected = drawn(playback, frame)
             assert expected.std() > 10, "a picture of nothing tests little"
             assert psnr(expected, picture) >= 45, frame
 
@@ -84,10 +89,7 @@ def test_every_degree_of_colour_and_every_kind_of_change_is_drawn_as_in_python(t
         steps = [["go", f"{url}/index.html"], READY, *(["picture", f, rig.width, rig.height] for f in frames)]
         got = pictures(in_browser(steps, tmp_path, size=SIZE)[2:], rig.width, rig.height)
         for frame, picture in zip(frames, got, strict=True):
-            scene = playback.state_at(frame)
-            expected = render_numpy(*(a for _, a in scene.items()), rig.viewmats[0], rig.Ks[0], rig.width, rig.height,
-                                    playback.meta.background, near=rig.near)  # fmt: skip
-            assert psnr(to_bytes(expected), picture) >= 45, frame
+            assert psnr(drawn(playback, frame), picture) >= 45, frame
 
 
 def test_playing_seeking_keys_and_views(site, tmp_path):
@@ -150,6 +152,29 @@ def test_a_seek_in_a_file_with_an_index_fetches_the_last_segment_first(site, tmp
     assert results[-1] == 2
     assert ranges[0] == "bytes=-12"
     assert all(wanted.startswith("bytes=") for wanted in ranges)
+
+
+def test_another_rendition_shows_the_same_frame(tmp_path):
+    streams = [tmp_path / "full.gss", tmp_path / "small.gss"]
+    for path, number in zip(streams, (80, 20), strict=True):
+        with StreamWriter.open(path) as writer:
+            for packet in moving_packets(seed=3, frames=8, number=number, nodes=10, key_at=5):
+                writer.append(packet)
+    package(streams[0], tmp_path / "site", renditions=streams[1:])
+    choose = f"{ROOT}.querySelector('.rendition')"
+    steps = [
+        ["go", "URL/index.html"], READY, ["evaluate", f"{PLAYER}.seek(6)"], ["until", f"{PLAYER}.frame === 6"],
+        ["evaluate", f"{PLAYER}.state.number"], ["evaluate", f"{choose}.hidden"],
+        ["evaluate", f"{choose}.selectedIndex = 1, {choose}.onchange()"], ["until", f"{PLAYER}.frame === 6"],
+        ["evaluate", f"{PLAYER}.state.number"], ["picture", 7, 32, 24],
+    ]  # fmt: skip
+    with serving(tmp_path / "site") as (url, _):
+        results = in_browser(_at(url, steps), tmp_path, size=SIZE)
+    with Playback(streams[0]) as full, Playback(streams[1]) as small:
+        assert (results[4], results[5], results[8]) == (len(full.state_at(6)), False, len(small.state_at(6)))
+        expected = drawn(small, 7)
+    (got,) = pictures(results[9:], 32, 24)
+    assert psnr(expected, got) >= 45
 
 
 def test_what_is_wrong_is_said_in_one_sentence(site, tmp_path):

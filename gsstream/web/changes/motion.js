@@ -170,7 +170,11 @@ function moveCentre(means, row, quats, centre, shift, k) {
   means[3 * row] = t0 + centre[3 * k] + shift[3 * k];
   means[3 * row + 1] = t1 + centre[3 * k + 1] + shift[3 * k + 1];
   means[3 * row + 2] = t2 + centre[3 * k + 2] + shift[3 * k + 2];
-  if (!Number.isFinite(means[3 * row]) || !Number.isFinite(means[3 * row + 1]) || !Number.isFinite(means[3 * row + 2])) {
+  if (
+    !Number.isFinite(means[3 * row]) ||
+    !Number.isFinite(means[3 * row + 1]) ||
+    !Number.isFinite(means[3 * row + 2])
+  ) {
     throw new PacketError("motion: it leads to positions beyond the range of float32");
   }
 }

@@ -23,7 +23,8 @@ export function decodeResidual(sections, state, offset) {
   const { rows, gate } = openRows(counts, gates, levels);
   const decoders = new Map(state.decoders);
   const sent = sections.decoders
-    ? located(sections.decoders.offset, () => decodeDecoders(sections.decoders.data)) : new Map();
+    ? located(sections.decoders.offset, () => decodeDecoders(sections.decoders.data))
+    : new Map();
   for (const [name, decoder] of sent) decoders.set(name, decoder);
   const parts = [];
   for (const name of ATTRIBUTES) {
@@ -158,7 +159,9 @@ function checkWidths(parts, scene, number, offset) {
     if (width * number !== scene[name].length) {
       throw new PacketError(
         `delta of ${name}: expected ${scene[name].length / number} values a row, got ${width}; ` +
-        "the packet belongs to another scene", offset);
+          "the packet belongs to another scene",
+        offset,
+      );
     }
   }
 }

@@ -22,7 +22,8 @@ const HEAD_PARTS = 5;
 export function decodeRows(sections, state, offset) {
   const number = state.layout.unitOf.length;
   const gone = sections.deaths
-    ? located(sections.deaths.offset, () => decodeDeaths(sections.deaths.data, number)) : null;
+    ? located(sections.deaths.offset, () => decodeDeaths(sections.deaths.data, number))
+    : null;
   let births = null;
   if (sections.births) {
     const leaving = gone ? gone.reduce((sum, flag) => sum + flag, 0) : 0;

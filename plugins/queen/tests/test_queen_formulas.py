@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from gsstream_queen.births import Statistics, densify, densify_epochs, turn
+from gsstream_queen.births import densify, densify_epochs
 from gsstream_queen.change import changed_tiles, gradient_difference
 from gsstream_queen.gates import BOUND, gates, initial_logits, open_probability
 from gsstream_queen.latents import cosines, decoder, rounded, weight_of
@@ -16,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from gsstream.blocks import DensifyStatistics, children
 from gsstream.testing import world
 from gsstream.testing.cases import RENDERER, scene
 
@@ -128,10 +130,15 @@ class TestBirths:
         _, litter = self.grow(may=[True, False, True, False])
         assert (litter.replaced.tolist(), len(litter.gaussians)) == ([], 1)
 
-    def test_turning_is_the_rotation_matrix(self) -> None:
+    def test_halves_are_drawn_along_the_axes_of_their_parent(self) -> None:
+        """An offset is the draw in units of the parent's size, turned by the parent's rotation matrix."""
         generator = torch.Generator().manual_seed(4)
-        quats, vectors = torch.randn(9, 4, generator=generator), torch.randn(9, 3, generator=generator)
-        for q, v, got in zip(quats, vectors, turn(quats, vectors), strict=True):
+        quats, sizes = torch.randn(9, 4, generator=generator), torch.rand(9, 3, generator=generator) + 0.1
+        rows = replace(scene(torch.zeros(9, 3), scales=sizes.log()), quats=quats)
+        halves, seeded = torch.ones(9, dtype=torch.bool), torch.Generator().manual_seed(7)
+        born = children(rows, torch.arange(9), halves, seeded).means
+        draws = torch.randn(9, 3, generator=torch.Generator().manual_seed(7)) * sizes
+        for q, v, got in zip(quats, draws, born, strict=True):
             w, x, y, z = (q / q.norm()).tolist()
             matrix = torch.tensor([
                 [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -141,7 +148,7 @@ class TestBirths:
             torch.testing.assert_close(got, matrix @ v, atol=1e-5, rtol=1e-5)
 
     def test_means_count_only_the_iterations_that_hit(self) -> None:
-        statistics = Statistics.zeros(2).add(torch.tensor([[3.0, 4.0], [0, 0]])).add(torch.zeros(2, 2))
+        statistics = DensifyStatistics.zeros(2).add(torch.tensor([[3.0, 4.0], [0, 0]])).add(torch.zeros(2, 2))
         assert statistics.mean.tolist() == [5.0, 0.0]
 
 

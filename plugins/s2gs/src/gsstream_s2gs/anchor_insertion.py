@@ -41,7 +41,7 @@ RATES = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 0.05, "sh0
 
 @final
 class AnchorInsertion(Growth):
-    """Gives birth where a frame is still wrong in several cameras (future work of S2GS).
+    """Gives birth where a frame is still wrong in several cameras (future work of the paper).
 
     Nothing leaves: deaths are left to other parts.
     """

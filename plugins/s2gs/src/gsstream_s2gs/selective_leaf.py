@@ -21,7 +21,7 @@ from gsstream.api import (
 
 @final
 class SelectiveLeaf(Propagation):
-    """HFP where a region is homogeneous, leaf by leaf where it is not.
+    """Shares one decision where a region is homogeneous and decides leaf by leaf elsewhere (the paper: future work).
 
     For a structure whose gates lie below the roots (``structure.gate_level`` 1 or more). A tree whose suspect nodes
     (logit above ``suspect``) are at least a share ``spread`` of its nodes with members moves as one: all its nodes get

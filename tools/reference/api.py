@@ -1,37 +1,57 @@
-"""The page of ``gsstream.api``: every exported name with its signature."""
+"""The page of the front doors ``api``, ``blocks``, ``encode`` and ``play``: every exported name with its signature."""
 
 from __future__ import annotations
 
+import ast
 import dataclasses
+import importlib
 import inspect
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
-from tools.reference.text import NOTE, signature
+from tools.reference.text import NOTE, cell, signature
+
+#: The modules that scripts and plugins may import, and who they are for.
+DOORS = {
+    "api": "What a plugin imports: records and contracts. Imports torch.",
+    "blocks": "Functions that the engine itself is built from, for methods of other kinds. Imports torch.",
+    "encode": "What a script imports to encode: frames in, packets out. Imports torch.",
+    "play": "What a script imports to play: packets in, Gaussians and pictures out. Imports no torch.",
+}
 
 
-def exported() -> dict[str, Any]:
-    """Every public name of gsstream.api, modules left out."""
-    import gsstream.api
-
-    names = {name: value for name, value in vars(gsstream.api).items() if not name.startswith("_")}
-    return {name: names[name] for name in sorted(names, key=str.lower) if not inspect.ismodule(names[name])}
+def exported(door: str = "api") -> dict[str, Any]:
+    """Every public name of a door: what it imports under its own name, and what it defines."""
+    module = importlib.import_module(f"gsstream.{door}")
+    tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
+    imported = [alias for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names]
+    names = {alias.asname for alias in imported if alias.asname == alias.name}
+    names |= {node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+    return {name: getattr(module, name) for name in sorted(names - {None}, key=str.lower) if not name.startswith("_")}
 
 
 def api() -> str:
-    """Every exported name: one line in a table, then its exact signature, fields and methods."""
-    lines = [NOTE, "# gsstream.api", "", "Everything a plugin or a script may import.", ""]
-    lines += ["| name | what it is | defined in |", "|---|---|---|"]
-    for name, value in exported().items():
-        described = inspect.isclass(value) or inspect.isroutine(value)
-        text = (inspect.getdoc(value) or "").splitlines()[0] if described else f"constant, `{value!r}`"
-        module = getattr(value, "__module__", "gsstream") if described else "-"
-        lines.append(f"| `{name}` | {text.replace('|', chr(92) + '|')} | `{module}` |")
-    lines += ["", "## Signatures", ""]
-    for name, value in exported().items():
+    """Every exported name of every door: one line in a table, then its exact signature, fields and methods."""
+    lines = [NOTE, "# Python names", "", "Everything that a plugin or a script may import.", ""]
+    for door, use in DOORS.items():
+        lines += [f"## gsstream.{door}", "", use, "", "| name | what it is | defined in |", "|---|---|---|"]
+        lines += [_row(name, value) for name, value in exported(door).items()]
+        lines.append("")
+    lines += ["## Signatures", ""]
+    everything = {name: value for door in DOORS for name, value in exported(door).items()}
+    for name in sorted(everything, key=str.lower):
+        value = everything[name]
         if inspect.isclass(value) or inspect.isroutine(value):
             lines += [f"### {name}", "", "```python", *_declared(name, value), "```", ""]
     return "\n".join(lines)
+
+
+def _row(name: str, value: Any) -> str:
+    described = inspect.isclass(value) or inspect.isroutine(value)
+    text = (inspect.getdoc(value) or "").splitlines()[0] if described else f"constant, `{value!r}`"
+    module = getattr(value, "__module__", "gsstream") if described else "-"
+    return f"| `{name}` | {cell(text)} | `{module}` |"
 
 
 def _declared(name: str, value: Any) -> Iterator[str]:

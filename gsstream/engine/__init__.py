@@ -1,1 +1,1 @@
-"""The corridor: the only code that walks through the rooms."""
+"""The encoder: the only code that uses all rooms, because rooms do not import each other."""

@@ -20,6 +20,7 @@ class Growth(Part):
         Arguments:
             after: the scene as players will have it after this frame's motions and residual (numpy; do not change it).
                 Deaths are its rows; births are placed in its nodes or in new ones.
-            work: the frame: images, what changed, and rendering.
+            work: the frame, seen from the scene before its residual: images, what changed, and rendering; ``work.on``
+                shows it from another scene.
             rng: random streams by name and frame; draw from nothing else.
         """

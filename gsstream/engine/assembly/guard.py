@@ -15,7 +15,7 @@ from gsstream.engine.assembly.where import Where
 from gsstream.render.base import RenderSession
 
 T = TypeVar("T")
-#: Sessions of a renderer are looked at under this name of a slot; errors say "renderer".
+#: The name under which the table of checks lists the sessions of a renderer; errors about them say "renderer".
 SESSION = "session"
 
 
@@ -73,10 +73,13 @@ class Guarded:
 
     def _value(self, name: str) -> Any:
         """An attribute of the part; what a property of it raises is the part's failure like any other."""
-        if getattr_static(self._subject, name, None) is None:
-            return getattr(self._subject, name)  # there is none: an AttributeError, unless the part makes it up
-        with blaming(self._slot, self._part, self._where):
+        try:
             return getattr(self._subject, name)
+        except Exception as error:
+            if isinstance(error, AttributeError) and getattr_static(self._subject, name, None) is None:
+                raise  # the part has none, which whoever asks may want to know
+            with blaming(self._slot, self._part, self._where):
+                raise
 
     def _guarding(self, name: str, method: Callable[..., Any]) -> Callable[..., Any]:
         slot, part, where, kind = self._slot, self._part, self._where, self._kind

@@ -1,4 +1,4 @@
-"""Which written keys a method would not read: they are refused, not ignored."""
+"""Which keys of a recipe a method would not read: a run that changes them is refused, so that none is ignored."""
 
 from __future__ import annotations
 

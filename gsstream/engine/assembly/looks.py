@@ -1,4 +1,4 @@
-"""What is looked at behind each call of a part: one entry per kind and function, nothing else checks by hand."""
+"""What is checked of the result of each call of a part: one entry per kind and function, and no checks elsewhere."""
 
 # ruff: noqa: ARG001  # a table of functions with one signature
 

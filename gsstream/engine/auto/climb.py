@@ -16,12 +16,12 @@ from gsstream.engine.auto.rules import put
 from gsstream.engine.auto.short_fits import Trial
 from gsstream.recipe.document import KeyPath
 
-#: What a step must gain, dB: left-out cameras of a few short fits do not tell less apart.
+#: Least gain of a step, dB: smaller differences cannot be told from noise by a few short fits.
 MARGIN = 0.05
-#: Steps without that before a walk turns back: one bad value does not hide a good one behind it.
+#: Steps without such a gain after which a search stops: one bad value must not hide a good one behind it.
 PATIENCE = 1
 
-#: What settings come to, given the trial that they have to beat.
+#: Makes the trial of settings, given the trial that they have to beat.
 Try = Callable[[Assembly, Trial | None], Trial]
 
 

@@ -16,9 +16,9 @@ PRIOR = 10.0
 #: Samples further than this many median deviations from their seed's colour are of something in front of it.
 OUTLIER = 4.0
 LEAST_VIEWS = 4
-#: Squared error under which there is nothing to explain: a hundredth of what rounding to 8 bits makes.
+#: Squared error below which nothing is left to explain: a hundredth of that of rounding to 8 bits.
 LEAST = 1e-8
-#: Small enough that a colour of one coefficient stays clear of its clamp at 0.
+#: So small that a colour of one coefficient stays away from the clamp at 0.
 SMALL = 1e-3
 
 

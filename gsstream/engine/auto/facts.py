@@ -11,7 +11,7 @@ from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.engine.auto.colour_gain import colour_gain
 
 _GREY = np.array([0.299, 0.587, 0.114], np.float32)
-#: Seeds looked at; more would not change a quantile.
+#: Number of seeds that facts are estimated from; more would not change a quantile.
 MOST_SEEDS = 4000
 #: Seeds whose nearest neighbour among all is looked for.
 MOST_NEIGHBOURS = 500

@@ -24,9 +24,9 @@ from gsstream.packet.base import FILE_HEADER
 from gsstream.recipe.document import KeyPath, Origin
 from gsstream.recipe.model import ComponentRef, FirstFrame
 
-#: A degree more must gain at least this for a camera that was left out, dB: its coefficients are most of a key packet.
+#: Least gain in dB of one more degree, seen by a left-out camera: coefficients are most of the bytes of a key packet.
 WORTHWHILE = 0.1
-#: 3 has nearly twice the coefficients: trials go beyond the usual degree only when the rule does.
+#: The usual degree. Trials go beyond it only when the rule does, because degree 3 has nearly twice the coefficients.
 USUAL_DEGREE: int = FirstFrame.model_fields["sh_degree"].default
 DEGREE = "first_frame.sh_degree"
 

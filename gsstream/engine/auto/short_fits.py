@@ -22,12 +22,12 @@ from gsstream.engine.frame0.begin import begin, seeded
 from gsstream.metrics import psnr
 from gsstream.packet import StreamMeta
 
-#: What a key packet of half the size is worth, dB. Little, for short fits show only a part of what more coefficients
-#: gain in long ones: it decides between choices that are as good.
+#: Gain in dB that a key packet of half the size counts as. It is small, because short fits show only a part of what
+#: more coefficients gain in long ones: it decides between choices of the same quality.
 HALVED = 0.1
-#: A trial that is so far behind after a fold gets no other, dB.
+#: A trial that is this far behind after a fold, dB, is not made on the other folds.
 HOPELESS = 0.25
-#: Training cameras below which none can be spared.
+#: With fewer training cameras than this, none can be left out.
 LEAST_CAMERAS = 4
 
 

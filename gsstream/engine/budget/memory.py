@@ -19,9 +19,9 @@ PROCESS = 280_000_000
 IMAGE_COPIES = 12
 #: A Gaussian with its gradients and moments in frame 0, and the copies of a frame step.
 BYTES_PER_GAUSSIAN = 1_700
-#: Share of what images leave that goes to Gaussians; the rest is cache (about 250 bytes per camera and Gaussian).
+#: Share of the memory beside the images that Gaussians get; caches get the rest (250 bytes per camera and Gaussian).
 FOR_GAUSSIANS = 0.6
-#: Below this a scene is not worth the run.
+#: With fewer Gaussians than this a scene is not worth encoding.
 LEAST_GAUSSIANS = 1_000
 
 

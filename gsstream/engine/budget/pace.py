@@ -1,4 +1,4 @@
-"""Holding a plan inside the optimiser: how many passes the clock still allows, and what a residual may weigh."""
+"""How the optimiser keeps to a plan: how many passes the clock still allows, and how strongly bits are weighed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gsstream.engine.budget.plan import (
 from gsstream.recipe.budget import Budget
 
 CLOCKS: Mapping[str, Callable[[], float]] = {"wall": time.perf_counter, "processor": time.process_time}
-#: Share of the passes before the size is looked at: residuals first have to grow to what they will be.
+#: Share of the passes after which the size is first estimated: before that, residuals are still growing.
 SETTLE = 0.25
 
 
@@ -57,7 +57,7 @@ class Pace:
     ) -> None:
         plan = None if allowance is None else allowance.plan
         self._timed = allowance if plan is not None and plan.seconds is not None else None
-        # With a time budget the plan's number is a prediction, and the clock may allow more.
+        # With a time budget the number of passes in the plan is a prediction, and the clock may allow more.
         self._most = max(epochs, round(effort * plan.most_epochs)) if plan is not None and self._timed else epochs
         self.epochs, self.rate_weight = epochs, rate_weight
         self.estimate = 0.0
@@ -157,7 +157,7 @@ class Pace:
         if plan.max_bytes is None or done < SETTLE * self.epochs:
             return
         expected = estimate * plan.correction
-        # Between the two the packet is left to trimming.
+        # Between the two bounds the weight stays, and trimming makes the packet fit.
         wanted = min(max(expected, SIZE_AIM * plan.max_bytes), MOST_TRIMMED * plan.max_bytes)
         self.rate_weight = next_weight(self.rate_weight, expected, wanted)
 

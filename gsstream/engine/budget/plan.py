@@ -15,18 +15,18 @@ from typing import Any
 from gsstream.recipe.budget import Budget
 from gsstream.recipe.model import Stream
 
-#: Frames that are looked back on.
+#: Number of earlier frames that a plan is made from.
 WINDOW = 5
-#: Share of a time budget that is planned with; the rest is for what no plan sees coming.
+#: Share of a time budget that is planned; the rest is a reserve for delays that cannot be predicted.
 TIME_MARGIN = 0.93
 #: Below this share of a size budget the weight falls; above this multiple it rises. In between the packet is trimmed:
 #: that takes 43 % of the bytes for less than any weight does (docs/results/budget.md).
 SIZE_AIM, MOST_TRIMMED = 0.94, 2.0
-#: Share of a time that is kept at most for what follows the passes while no frame has shown what it costs.
+#: Largest share of the time that is kept for the phases after the passes, while no frame has shown what they cost.
 UNKNOWN_RESERVE = 0.2
 #: Share of a pass's time that does not depend on the number of candidates.
 FIXED_SHARE = 0.3
-#: Fewer passes than this are worth less than fewer candidates.
+#: When fewer passes than this fit, it is better to have fewer candidates and more passes.
 LEAST_EPOCHS = 4
 #: Weights of the rate that the controller may use; recipes ship 3e-4, which halves the bytes (docs/results/stream.md).
 LEAST_WEIGHT, MOST_WEIGHT = 3e-5, 3e-2
@@ -182,7 +182,7 @@ def _around(recent: Sequence[Past]) -> tuple[float, float]:
     """Seconds before and after the passes."""
     if not recent:
         return 0.0, 0.0
-    # What follows cannot be cut short: the dearest of the last frames, unless it was a hiccup.
+    # The phases after the passes cannot be cut short, so the slowest of the last frames counts, unless it was an outlier.
     after = [p.after for p in recent]
     return median(p.before for p in recent), min(max(after), 2 * median(after))
 

@@ -19,9 +19,9 @@ from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.packet import EncodedPacket
 
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
-#: Packets that are encoded at most on the way to one that fits, and the share of the limit that is good enough.
+#: Most packets that are encoded in search of one that fits, and the share of the limit that counts as close enough.
 TRIES, GOOD_ENOUGH = 8, 0.95
-#: Steps of the search for a price; bits of an open gate besides its rows.
+#: Steps of the search for a price per bit; bits that an open gate takes besides its rows.
 _BISECTIONS, _GATE_BITS = 24, 3.0
 
 
@@ -64,7 +64,7 @@ def fit(
     able = delta.residual is not None and delta.residual.symbols
     found = _trimmed(delta, packet, curvature, layout, encode, max_bytes) if able else None
     if found is None and delta.edits_rows:
-        # What is born is fitted last and costs most per row: without it the rest may fit.
+        # Births cost most per row, so they are given up first: without them the rest may fit.
         rest = delta.with_rows(None)
         plain = fit(rest, encode(rest), curvature, layout, encode, max_bytes)
         return replace(plain, untrimmed=untrimmed, births=0 if delta.births is None else len(delta.births))

@@ -7,7 +7,7 @@ import torch
 
 from gsstream.core.shapes import FloatArray, IntArray
 
-#: Metres (scene units) that a point without a neighbour is taken to be away from one.
+#: Distance in scene units that is assumed for a point that has no neighbour.
 ALONE = 0.01
 
 
@@ -38,7 +38,7 @@ def nearest_rows(points: FloatArray, means: FloatArray) -> tuple[FloatArray, Int
 
 
 def _query(points: FloatArray, among: FloatArray, k: int) -> tuple[FloatArray, IntArray]:
-    # 30 MB of a process, which one that only plays or goes on with a stream does without.
+    # Imported here because it takes 30 MB, which a process that only plays or resumes a stream does not need.
     from scipy.spatial import KDTree
 
     found: tuple[FloatArray, IntArray] = KDTree(among).query(points, k=np.arange(1, k + 1))

@@ -116,7 +116,7 @@ class _FirstFrameRun:
         self.views = len(frame.cameras)
         self.extent = frame.cameras.extent
         self.iterations = min(self.settings.epochs * self.views, self.settings.max_iterations)
-        # The name of the stream of older versions, so that a seed gives the same frame 0.
+        # The name of this random stream is that of older versions, so that a seed still gives the same frame 0.
         self.generator = rng.stream("root", frame.index)
         self.table = RowTable(dict(start.items()), first_rates(self.settings, self.extent), parts.optimiser)
         self.judge = Judge(parts.loss, parts.recipe.loss.dssim, frame.images, None)

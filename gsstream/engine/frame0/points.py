@@ -15,7 +15,7 @@ from gsstream.init.seeding import fill_volume, photo_consistent_seeds, thin_poin
 from gsstream.recipe.model import FirstFrame
 from gsstream.source.base import FrameSource, PointKind
 
-#: Fewer points than this cannot carry a scene: "auto" then sweeps the views for more.
+#: With fewer points than this a scene cannot be reconstructed: "auto" then looks for more by a plane sweep.
 SPARSE = 2000
 SWEEP_WIDTH = 160
 
@@ -95,7 +95,8 @@ def _base_points(
     try:
         return _sweep(frame, settings)
     except InputError:
-        # Fewer than three cameras, or views that agree nowhere: what ships, or only seeds of the view volume.
+        # With fewer than three cameras, or views that agree nowhere, the recording's points are taken, or only random
+        # seeds in the view volume.
         empty = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), "none")
         return empty if shipped is None else shipped
 

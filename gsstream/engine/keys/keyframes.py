@@ -23,7 +23,8 @@ from gsstream.packet import StreamMeta, quantise_key
 def refresh(parts: Assembly, step: Step, frame: Frame, tools: RunTools) -> Step:
     """Return ``step``, or when the recipe asks for a key packet at this frame, the step that writes one instead of it.
 
-    A key packet that the budget refuses, or whose frame is skipped, stays due: the next frame tries again. Pure, like a frame step.
+    A key packet that the budget refuses, or whose frame is skipped, stays due: the next frame tries again. Pure, like a
+    frame step.
 
     Arguments:
         parts: the live parts of the recipe.
@@ -34,7 +35,7 @@ def refresh(parts: Assembly, step: Step, frame: Frame, tools: RunTools) -> Step:
     every, state = parts.recipe.codec.key_every, step.state
     if step.status == "key" or not every or state.player.frame - state.key_frame < every:
         return step
-    # A skipped frame is an empty packet: nothing of it may fail, and a key packet costs what was to be saved.
+    # A skipped frame stays an empty packet: it must not fail, and a key packet would take the time that skipping saves.
     refused = "the frame is skipped" if frame.effort == 0 else tools.refuse_key(len(state.gaussians))
     if refused is not None:
         return _postponed(step, refused)
@@ -43,7 +44,7 @@ def refresh(parts: Assembly, step: Step, frame: Frame, tools: RunTools) -> Step:
     max_bytes = None if tools.allowance is None else tools.allowance.plan.max_bytes
     if max_bytes is not None and len(after.packet.data) > max_bytes:
         return _postponed(step, f"{len(after.packet.data)} bytes where {max_bytes} are allowed")
-    # The scene goes on showing what it showed: a key packet after still frames is no new picture.
+    # A key packet does not change which images the scene shows: after still frames these are older ones.
     metrics = {**step.metrics, **after.metrics, "key_reason": "period"}
     metrics["seconds"] = {**metrics["seconds"], "key": time.perf_counter() - started}
     return Step(replace(after.state, previous=state.previous), after.packet, "key", metrics)

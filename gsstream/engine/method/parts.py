@@ -13,6 +13,7 @@ from gsstream.engine.keys.keyframes import refresh
 from gsstream.engine.keys.resume import state_after
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.frame_step import frame_step
+from gsstream.engine.step.metrics import cache_metrics
 from gsstream.method.base import StreamingMethod
 from gsstream.packet import PlayerState
 
@@ -38,6 +39,7 @@ class PartsMethod(StreamingMethod[StreamState]):
         allowance, own = tools.allowance, tools.parts
         parts = own if allowance is None else planned(own, allowance.plan)
         step, pace, fitted = frame_step(parts, state, frame, tools.rng, allowance)
+        step = replace(step, metrics={**step.metrics, **cache_metrics(step.state.session)})
         if allowance is not None and pace is not None and fitted is not None:
             epochs = step.metrics["iterations"] / len(frame.cameras)
             entry = spent(allowance, pace, fitted, own.recipe.stream, epochs)

@@ -122,7 +122,7 @@ class Encoder:
         """
         if (extra := stream_extra(stream)) is not None:
             self.parts = recall(self.parts, extra)
-        # Before the replay: other parts would fail over a stream that is not theirs, and say something else.
+        # Checked before the replay, which with the parts of another recipe would fail with a less helpful message.
         if not check_stream(self.parts, stream, self.info) or (last is not None and last < 0):
             return None
         end = ended(stream, last)

@@ -28,7 +28,7 @@ from gsstream.recipe.save import save_resolved
 from gsstream.source.base import FrameSource, GrowingSource, SourceInfo
 from gsstream.source.prefetch import Prefetcher
 
-#: Sees every step of a run.
+#: A function that is called with every step of a run.
 Witness = Callable[[Step[Any]], None]
 STREAM, METRICS, RECIPE = "stream.gss", "metrics.jsonl", "recipe.yaml"
 
@@ -104,7 +104,7 @@ class _Run:
         recipe = self.encoder.parts.recipe
         with (
             _stop_on_interrupt(self.progress.say, self.source) as stop,
-            # Also when resuming finds no complete frame 0: what a kill left of it is cut off, and it starts again.
+            # This is also the way when resuming finds no complete frame 0: the incomplete one is cut off and made again.
             StreamWriter.open(self.out / STREAM, resume=resume, last_frame=last, fsync=recipe.codec.fsync) as writer,
             self.progress,
             Prefetcher(self.source, indices, storage=recipe.data.images) as frames,

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 from gsstream.core.changes import Delta, sent_rows
 from gsstream.engine.budget.trim import Fitted, fit
 from gsstream.engine.step.harden import rows_of
@@ -18,28 +21,29 @@ def encode_frame(delta: Delta, before: PlayerState, problem: Problem, solution: 
         delta: what the frame is to change. before: what players have before it.
         trim: share of the bytes to be given up where no size is asked for, 0 to 1.
     """
-    packet = encode(delta, before, problem.frame)
+    encoded = partial(encode, before=before, frame=problem.frame)
+    packet = encoded(delta)
     whole = Fitted(delta, packet, len(packet.data))
     budget = None if problem.allowance is None else problem.allowance.plan.max_bytes
-    limit = budget or _share(delta, before, problem.frame, whole.untrimmed, trim)
+    limit = budget or _share(delta, encoded, whole.untrimmed, trim)
     if whole.untrimmed <= limit:
         return whole
     curvature = {}
     if delta.residual is not None:
         rows, sent = solution.rows.numpy(), sent_rows(before.layout, delta.residual.gates)
         curvature = {n: rows_of(solution.curvature[n].numpy(), rows, sent) for n in delta.residual.symbols}
-    found = fit(delta, packet, curvature, before.layout, lambda some: encode(some, before, problem.frame), limit)
+    found = fit(delta, packet, curvature, before.layout, encoded, limit)
     # Where only a share is asked for, a packet is not trimmed to nothing: one that is mostly headers would lose all of
     # its change for a few bytes.
     lost = found.delta.is_empty or found.delta.edits_rows != delta.edits_rows
     return whole if budget is None and lost else found
 
 
-def _share(delta: Delta, before: PlayerState, frame: int, size: int, trim: float) -> int:
+def _share(delta: Delta, encoded: Callable[[Delta], EncodedPacket], size: int, trim: float) -> int:
     """Bytes left of ``size`` when the residual gives up the share ``trim``; motions and births give up nothing."""
     others = delta.with_residual(None)
-    fixed = 0 if others.is_empty else len(encode(others, before, frame).data)
-    return max(fixed + int((1 - trim) * (size - fixed)), len(encode_empty(frame=frame).data))
+    fixed = 0 if others.is_empty else len(encoded(others).data)
+    return max(fixed + int((1 - trim) * (size - fixed)), len(encoded(Delta()).data))
 
 
 def encode(delta: Delta, before: PlayerState, frame: int) -> EncodedPacket:

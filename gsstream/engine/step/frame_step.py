@@ -106,7 +106,7 @@ def still(state: StreamState, frame: Frame, clock: PhaseClock) -> Outcome:
     with clock.phase("code"):
         packet = encode_empty(frame=frame.index)
         after = replace(state, player=decode_packet(state.player, packet.data))
-    # No part is asked anything here, nor is what the renderer keeps counted: this is what follows when a part failed.
+    # No part and no renderer is called here, because this step is also made after a part has failed.
     metrics = step_metrics(Delta(), replace(after, session=None), packet, None, 0)
     return Outcome(Step(after, packet, "empty", {**metrics, "changed_tiles": 0.0, "seconds": clock.seconds}))
 

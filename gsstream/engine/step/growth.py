@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import torch
-
 from gsstream.core.changes import Delta, apply_delta
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
@@ -28,7 +26,7 @@ def grown(parts: Assembly, state: StreamState, delta: Delta, view: FrameView, rn
     if isinstance(parts.part("growth"), NoGrowth):
         return delta  # nobody looks at the scene after the residual, so it need not be made
     after = apply_delta(state.player.scene, delta)
-    rows = parts.growth.propose(after, view.on(after.gaussians.map(torch.from_numpy)), rng)
+    rows = parts.growth.propose(after, view, rng)
     with blaming("growth", parts.part("growth"), parts.where):
         if rows is not None:
             apply_delta(after, Delta((rows,)))

@@ -16,7 +16,7 @@ from gsstream.packet import quantise_decoders
 from gsstream.residual.base import coarser
 from gsstream.residual.base import symbols as residual_symbols
 
-#: Largest symbol a residual may have; float32 rounds what lies between it and 2^31 up.
+#: Largest symbol of 32 bits that float32 represents: anything between it and 2^31 would be rounded up to 2^31.
 MOST_SYMBOL = 2.0**31 - 256
 
 

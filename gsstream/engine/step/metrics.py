@@ -41,7 +41,6 @@ def step_metrics(
         "candidate_gaussians": candidates,
         "loss": 0.0 if solution is None else solution.loss,
         "iterations": 0 if solution is None else solution.iterations,
-        **cache_metrics(after.session),
     }
 
 

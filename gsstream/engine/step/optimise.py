@@ -43,7 +43,7 @@ def optimise(parts: Assembly, problem: Problem, generator: torch.Generator) -> S
     pace.begin(len(problem.rows))
     while epoch < pace.epochs:
         losses: list[float] = []
-        # Reversed: streams of older versions took their views from the end of the list, and their bytes stay.
+        # Reversed, because older versions took views from the end of the list: so equal seeds still give equal bytes.
         for place, view in enumerate(reversed(torch.randperm(views, generator=generator).tolist())):
             iteration = epoch * views + place
             losses.append(run.step(view, iteration, iteration / (pace.epochs * views)))
@@ -68,7 +68,8 @@ class _FrameRun:
         self.parts, self.problem, self.generator, self.pace = parts, problem, generator, pace
         self.rows, self.base = problem.rows, problem.base
         layout, rows = problem.layout, problem.rows.numpy()
-        # Only gates with candidates behind them are sampled and trained; parents matter to no gate.
+        # Only gates with candidates behind them are sampled and trained. Sampling does not look at parents, so the forest
+        # is replaced by roots.
         self.nodes, node_of = torch.unique(problem.hierarchy.node_of[problem.rows], return_inverse=True)
         self.logits = problem.logits
         self.hierarchy = _forest(node_of, len(self.nodes))
@@ -134,7 +135,7 @@ class _FrameRun:
 
     def _penalty(self, logits: torch.Tensor) -> Mapping[str, torch.Tensor]:
         columns = self.code.latent.get("means")
-        # The motion term also pulls on the residual itself; that gradient waits on the leaf for the latents' step.
+        # The motion term also has a gradient with respect to the residual; it stays on the leaf until the latents step.
         residual = torch.zeros(len(self.base), 3) if columns is None else self.latents["latents"][:, columns]
         probability = self.parts.gate.open_probability(logits)
         total = self.problem.hierarchy.num_gaussians

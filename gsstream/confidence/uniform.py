@@ -1,4 +1,4 @@
-"""Uniform confidence: every Gaussian is equally suspect."""
+"""Uniform confidence: every Gaussian is equally likely to have changed."""
 
 from __future__ import annotations
 

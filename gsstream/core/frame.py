@@ -10,7 +10,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError
 from gsstream.core.shapes import FloatArray, check_shape
 
-#: How far outside [0, 1] an image may be: what resampling in float32 leaves.
+#: How far outside [0, 1] an image may be: the rounding error of resampling in float32.
 ROUNDING = 1e-4
 
 
@@ -40,7 +40,7 @@ class Frame:
         """
         check_shape("images", self.images, (len(self.cameras), self.cameras.height, self.cameras.width, 3))
         for camera, image in zip(self.cameras.ids, self.images, strict=True):
-            # Each is NaN when a pixel is, and a comparison with NaN is false.
+            # Least and largest value are NaN when any pixel is, and comparing with NaN gives false.
             if image.size and not (float(image.min()) >= -ROUNDING and float(image.max()) <= 1 + ROUNDING):
                 self._refuse(camera, image)
 

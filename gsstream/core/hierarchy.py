@@ -67,7 +67,7 @@ def tree_roots(parent: torch.Tensor) -> torch.Tensor:
     root = parent
     for _ in range(len(parent).bit_length()):
         root = root[root]
-    # Checked at the end: a circle whose length is a power of two looks settled on the way.
+    # Checked at the end, because a circle whose length is a power of two looks like a root in between.
     if bool((parent[root] == root).all()):
         return root
     raise ShapeError(f"parent: expected every node to end at a root, got a cycle among {len(parent)} nodes")

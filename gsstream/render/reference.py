@@ -49,7 +49,7 @@ class ReferenceRenderer(Renderer):
             output = self._render(fixed, cameras, view, (0.0, 0.0, 0.0), probe)
             (gradient,) = torch.autograd.grad((output.image * image_gradient).sum(), probe, allow_unused=True)
         gradient = torch.zeros_like(probe) if gradient is None else gradient.detach()
-        # Visible does not depend on what the gradient happens to be: a still Gaussian in view has gradient 0.
+        # Visibility must not be read from the gradient: a Gaussian in view that nothing pulls on has gradient 0.
         return ScreenGradient(gradient, footprint_in_image(fixed, cameras, view) | (gradient != 0).any(1))
 
     def open(
@@ -135,7 +135,7 @@ def project(
     viewmat = torch.as_tensor(cameras.viewmats[view], dtype=dtype)
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     points = gaussians.means @ rotation.T + translation  # [N, 3] camera space
-    # Points at or behind the camera are culled later; a safe depth keeps their (unused) arithmetic finite.
+    # Points at or behind the camera are removed later; until then a depth of 1 keeps their unused arithmetic finite.
     depth = points[:, 2]
     safe = torch.where(depth > cameras.near, depth, torch.ones_like(depth))
     K = torch.as_tensor(cameras.Ks[view], dtype=dtype)

@@ -93,7 +93,7 @@ def joint_code(
 
 def join_features(code: JointCode, rows: Gaussians[torch.Tensor]) -> torch.Tensor:
     """Return [A, D]: the attributes that may change, side by side."""
-    # The width is said: no rows may be left, and then -1 could be anything.
+    # The width is given explicitly, because with no rows left reshape could not infer it from -1.
     parts = [getattr(rows, name).reshape(len(rows), at.stop - at.start) for name, at in code.feature.items()]
     return torch.cat(parts, 1) if parts else torch.zeros(len(rows), 0)
 

@@ -10,7 +10,7 @@ import math
 
 import torch
 
-#: Least spread of a channel, symbols: a channel that is zero now must be able to begin. At 0.3 a zero costs 0.3 bits.
+#: Least spread of a channel, symbols, so that a channel that is all zeros can leave zero. At 0.3 a zero costs 0.3 bits.
 MIN_SPREAD = 0.3
 _LN2 = math.log(2.0)
 

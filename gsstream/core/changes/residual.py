@@ -82,7 +82,7 @@ def apply_residual(gaussians: Gaussians[FloatArray], layout: Layout, residual: R
             )
         scale = gate * layout.units_of(index) if name == "means" else gate
         change *= scale[:, None]
-        # Rows first: taking and putting whole rows is several times faster than indexing the attribute's own shape.
+        # Flattened to rows first, because gathering and scattering whole rows is several times faster.
         out = base.reshape(len(base), -1).copy()
         out[index] = out.take(index, axis=0) + change
         changed[name] = out.reshape(base.shape)

@@ -182,7 +182,8 @@ def _around(recent: Sequence[Past]) -> tuple[float, float]:
     """Seconds before and after the passes."""
     if not recent:
         return 0.0, 0.0
-    # The phases after the passes cannot be cut short, so the slowest of the last frames counts, unless it was an outlier.
+    # The phases after the passes cannot be cut short, so the slowest of the last frames counts, unless it was an
+    # outlier.
     after = [p.after for p in recent]
     return median(p.before for p in recent), min(max(after), 2 * median(after))
 

@@ -96,7 +96,8 @@ class FrameView:
         return self.session.screen_gradient(view, upstream.contiguous())
 
     def noise_sigma(self, view: int) -> float:
-        # Where everything moves, the estimate measures the motion instead of the noise, so it is bounded; see MOST_SIGMA.
+        # Where everything moves, the estimate measures the motion instead of the noise, so it is bounded; see
+        # MOST_SIGMA.
         measured = noise_sigma(unpacked(self._previous.images[view]), self._frame.images[view])
         return min(measured, MOST_PIXEL_SIGMA)
 

@@ -53,8 +53,8 @@ def moved(parts: Assembly, state: StreamState, frame: Frame, change: Change | No
             scene, rows = apply_motion(scene, motion)
             touched = np.union1d(touched, rows)
     gaussians = scene.gaussians.map(torch.from_numpy)
-    # The session is handed on to the moved scene, with its caches of all that stands still. The old session stays correct,
-    # as it must until the frame has succeeded: should it be used again, it fills its caches anew.
+    # The session is handed on to the moved scene, with its caches of all that stands still. The old session stays
+    # correct, as it must until the frame has succeeded: should it be used again, it fills its caches anew.
     session = view.session.commit(gaussians, torch.from_numpy(touched)) if 2 * len(touched) <= len(gaussians) else None
     after = FrameView(parts, gaussians, state.hierarchy, frame, state.previous, state.exposure, change, session)
     return Moved(motions, scene, after)

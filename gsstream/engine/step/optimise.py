@@ -68,8 +68,8 @@ class _FrameRun:
         self.parts, self.problem, self.generator, self.pace = parts, problem, generator, pace
         self.rows, self.base = problem.rows, problem.base
         layout, rows = problem.layout, problem.rows.numpy()
-        # Only gates with candidates behind them are sampled and trained. Sampling does not look at parents, so the forest
-        # is replaced by roots.
+        # Only gates with candidates behind them are sampled and trained. Sampling does not look at parents, so the
+        # forest is replaced by roots.
         self.nodes, node_of = torch.unique(problem.hierarchy.node_of[problem.rows], return_inverse=True)
         self.logits = problem.logits
         self.hierarchy = _forest(node_of, len(self.nodes))

@@ -1,4 +1,4 @@
-"""What a whole method promises, on a recording of 32 x 24 pixels."""
+"""What a method promises, on a recording of 32 x 24 pixels."""
 
 from __future__ import annotations
 

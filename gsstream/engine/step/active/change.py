@@ -21,16 +21,17 @@ BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 BLOCK = 4
 #: Blocks of a 16 x 16 tile (of 16) that must exceed the threshold.
 LEAST_BLOCKS = 2
-#: Lower bound on the estimated noise of a block's mean difference. Compressed video repeats still blocks exactly; without a floor the change
-#: of half a grey level by the encoder would count as motion.
+#: Lower bound on the estimated noise of a block's mean difference. Compressed video repeats still blocks exactly;
+#: without a floor the change of half a grey level by the encoder would count as motion.
 LEAST_SIGMA = 0.5 / 255
 #: Upper bound on the same estimate. The estimate holds while fewer than half of the blocks
 #: move; a flash or a cut moves all of them, and then the change itself would pass for noise and nothing would be seen
 #: to change. Recordings have about 1 / 255.
 MOST_SIGMA = 4 / 255
-#: Upper bound on the same estimate, in multiples of the differences between neighbouring blocks. Noise differs from block
-#: to block, a slow change of the light hardly does: at a gain of 1.03 the spread of the differences doubles, their second differences grow by 5 %. Without
-#: such a change the first is at most 1.2 times the second on the recordings at hand.
+#: Upper bound on the same estimate, in multiples of the differences between neighbouring blocks. Noise differs from
+#: block to block, a slow change of the light hardly does: at a gain of 1.03 the spread of the differences doubles,
+#: their second differences grow by 5 %. Without such a change the first is at most 1.2 times the second on the
+#: recordings at hand.
 MOST_OF_ROUGHNESS = 1.5
 #: The same for the noise of one pixel of one image.
 MOST_PIXEL_SIGMA = 16 / 255

@@ -15,7 +15,7 @@ from gsstream.core.changes import Delta, Displacement, Groups
 from gsstream.core.errors import ComponentError, RecipeError
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.fit.exposure import Exposure
-from gsstream.engine.method.held import RepeatedFrameWarning
+from gsstream.engine.method.held import RepeatedFrameWarning, difference_between
 from gsstream.method.base import StreamingMethod
 from gsstream.method.hold import Hold, HoldState
 from gsstream.method.packets import send_delta
@@ -25,8 +25,8 @@ from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe
 from gsstream.source.open import open_source
-from gsstream.testing.stepping import SOURCE, MethodUnderTest
 from gsstream.testing.stepper.example import ExampleStepper
+from gsstream.testing.stepping import SOURCE, MethodUnderTest
 
 Follow: Any = ExampleStepper  # final: only what is wrong on purpose may inherit from it
 
@@ -110,6 +110,19 @@ def test_a_state_that_players_do_not_have_is_an_error(wrong, message: str) -> No
         subject.step(start.state, open_source(SOURCE).frame(1))
     assert message in str(caught.value)
     assert (caught.value.slot, caught.value.part, caught.value.frame) == ("stepper", "Wrong", 1)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("cell", 2.0), ("shades", 3), ("count", 2), ("group_of", np.ones(12, np.int32))]
+)
+def test_groups_are_compared_field_by_field(begun, field: str, value: Any) -> None:
+    """Equal rows under another cell or in more groups: the marks of the next motion would be of other groups."""
+    player = begun[1]
+    groups = Groups(1.0, 2, np.zeros(12, np.int32), 1)
+    known = replace(player, scene=replace(player.scene, groups=groups))
+    claimed = replace(player, scene=replace(player.scene, groups=replace(groups, **{field: value})))
+    assert difference_between(known, replace(known)) == ""
+    assert difference_between(known, claimed) == f"scene: groups, {field}"
 
 
 def test_a_packet_of_another_frame_is_an_error() -> None:
@@ -232,9 +245,9 @@ def test_keys_that_a_whole_method_does_not_read_are_refused() -> None:
 
 
 def test_settings_of_a_whole_method() -> None:
-    assert refusal("stepper.speed=3") == ["--set stepper.speed=3: unknown key 'stepper.params.speed'; none are registered"]
-    assert "stepper.name: no stepper named 'hodl'; did you mean 'hold'?" in refusal("stepper=hodl")[0]
     wanted = "unknown key 'stepper.params.speed'; none are registered"
+    assert refusal("stepper.speed=3") == [f"--set stepper.speed=3: {wanted}"]
+    assert "stepper.name: no stepper named 'hodl'; did you mean 'hold'?" in refusal("stepper=hodl")[0]
     assert wanted in refusal("stepper.speed=3", method="dense")[0]
 
 

@@ -13,7 +13,8 @@ from numeric_scenes import some
 
 from gsstream.core.errors import ComponentError
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.engine.assembly.checks import Checks, check_terms
+from gsstream.engine.assembly.checks import Checks, Look
+from gsstream.engine.assembly.where import Where
 
 
 def flat(nodes: int, rows: int) -> Hierarchy:
@@ -74,7 +75,7 @@ def test_a_residual_that_diverged_is_refused_by_name() -> None:
     part = ExpectedSparsity()
     found = part.penalty(torch.ones(1), torch.full((2, 3), 1e30), flat(1, 2), 2)
     with pytest.raises(ComponentError, match=r"penalty 'motion': expected one finite number, got inf"):
-        check_terms(Checks.FRAME, part, 3, 5, found)
+        Look(Checks.FRAME, "regularizer", part, Where(3, 5)).terms(found)
 
 
 @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16])

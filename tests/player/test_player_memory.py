@@ -64,8 +64,8 @@ def test_the_estimate_bounds_what_decoding_takes(sh_rest) -> None:
     state = decode_packet(state, packets[2].data)
     packets.append(encode_delta(make_motions(rng, state.scene, 2), state.layout, {}, frame=3))
     state = decode_packet(state, packets[3].data)
-    predicted = make_motions(rng, state.scene, 1).changes
-    packets.append(encode_delta(Delta((*predicted, *make_edit(rng, state, births=5000).changes)), state.layout, {}, frame=4))
+    delta = Delta((*make_motions(rng, state.scene, 1).changes, *make_edit(rng, state, births=5000).changes))
+    packets.append(encode_delta(delta, state.layout, {}, frame=4))
     state = None
     for packet in packets:
         smallest = least_limit(packet.data, state)

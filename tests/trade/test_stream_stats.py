@@ -54,7 +54,7 @@ def test_paper_estimate_and_plain_codec_of_a_delta(tmp_path):
     path = make_stream(tmp_path / "s.gss")
     stats = stream_stats(path)
     with Playback(path) as playback:
-        delta, scene = playback.delta_at(1), playback.state_at(1)
+        delta, scene = playback.delta_at(1).residual, playback.state_at(1)
     opened = int(np.count_nonzero(delta.gates))
     expected = (96 * opened + entropy_by_hand(delta.gates != 0)) / 8
     packet = stats.packets[1]
@@ -92,7 +92,8 @@ def test_large_tables_are_coded_within_four_percent_of_their_entropy(tmp_path):
     symbols = {n: np.rint(rng.laplace(size=(rows, w)) * 2).astype(np.int32) for n, w in widths.items()}
     with StreamWriter.open(tmp_path / "s.gss") as writer:
         writer.append(encode_key(KeyState(scene, layout, meta)))
-        writer.append(encode_delta(Delta((Residual(gates, 1, symbols, dict.fromkeys(widths, 0.01)),)), layout, {}, frame=1))
+        delta = Delta((Residual(gates, 1, symbols, dict.fromkeys(widths, 0.01)),))
+        writer.append(encode_delta(delta, layout, {}, frame=1))
         writer.append(encode_empty(frame=2))
     stats = stream_stats(tmp_path / "s.gss")
     assert 1 <= stats.efficiency("key") < 1.01

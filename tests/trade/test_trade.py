@@ -139,6 +139,7 @@ def records():
         FrameRecord(
             t, {"x": 30.0 - t, "y": 31.0 - t}, {"x": 0.9}, {"x": 20.0} if t > 1 else {},
             {"gates": 1000 * t, "header": 16}, {"confidence": 0.5, "optimise": 1.5}, 10 * t, 100, t, 10, 100.0 * t,
+            {"x": 10.0 * t} if t > 1 else {},
         )
         for t in (1, 2, 3)
     ]  # fmt: skip
@@ -148,6 +149,7 @@ def records():
 def test_summary_follows_the_definitions():
     s = summarise(records())
     assert (s.frames, s.psnr_first, s.psnr, s.ssim, s.psnr_moving) == (4, 31.0, 28.5, 0.9, 20.0)
+    assert s.psnr_changed == 25.0
     assert s.psnr_slope == pytest.approx(-100)
     assert s.kb_per_frame == pytest.approx(2.016)
     assert (s.key_kb, s.seconds_first, s.seconds) == (100.0, 60.0, 2.0)
@@ -167,16 +169,20 @@ def test_later_key_packets_are_not_delta_packets():
 def test_what_was_not_measured_is_a_dash():
     row = summary_table({"only frame 0": summarise([FrameRecord(0)])}).splitlines()[2]
     cells = [cell.strip() for cell in row.strip("|").split("|")]
-    assert cells == ["only frame 0", "1", *["-"] * 13]
+    assert cells == ["only frame 0", "1", *["-"] * 14]
 
 
 def test_records_round_trip_and_survive_a_killed_run(tmp_path):
     path = tmp_path / "metrics.jsonl"
-    line = {"frame": 1, "psnr": {"x": 30.5, "y": None}, "bytes": {"gates": 7}, "novelty": [1, 2], "num_gates": 3}
+    line = {
+        "frame": 1, "psnr": {"x": 30.5, "y": None}, "psnr_changed": {"x": 20.5, "y": None}, "bytes": {"gates": 7},
+        "novelty": [1, 2], "num_gates": 3,
+    }  # fmt: skip
     path.write_text(json.dumps({"frame": 0}) + "\n\n" + json.dumps(line) + "\n" + '{"frame": 2, "psn')
     read = read_records(tmp_path)
     assert [r.frame for r in read] == [0, 1]
     assert (read[1].psnr, read[1].total_bytes, read[1].num_gates) == ({"x": 30.5}, 7, 3)
+    assert read[1].psnr_changed == {"x": 20.5}
     assert math.isnan(read[1].peak_memory_mb)
 
 

@@ -158,7 +158,7 @@ def check_method_takes_first_frame(method: MethodUnderTest) -> None:
     """Given frame 0 of another stream, it starts from exactly those Gaussians, in an order of its own."""
     own = method.steps[0].state.player
     given = quantise_key(replace(own.gaussians, means=own.gaussians.means / 2))
-    step = method.take_over(replace(own, gaussians=given), open_source(SOURCE).frame(0))
+    step = method.take_over(replace(own, scene=replace(own.scene, gaussians=given)), open_source(SOURCE).frame(0))
     want, got = _sorted_rows(given), _sorted_rows(step.state.player.gaussians)
     assert want.shape == got.shape, f"expected {len(want)} Gaussians of {want.shape[1]} values, got {list(got.shape)}"
     off = int((want != got).any(1).sum())

@@ -44,14 +44,14 @@ def check(
     subjects = []
     for subject in _subjects(load_catalog(), name, source, settings or []):
         typer.echo(subject.heading)
-        # One reason for all of them is said once.
+        # When all have the same reason, it is printed once.
         for result in subject.results[:1] if subject.absent else subject.results:
             if not (quiet and result.status == "passed"):
                 typer.echo(_line(result, "every check" if subject.absent else result.check))
         typer.echo(f"  {summary(subject.results)}")
         subjects.append(subject)
     everything = [result for subject in subjects for result in subject.results]
-    # Nothing checked is no success, unless it is this machine that lacks something.
+    # It is a failure when nothing was checked, unless this machine lacks something that the part needs.
     idle = all(result.status == "skipped" for result in everything) and not all(subject.absent for subject in subjects)
     if idle or not all(result.ok for result in everything):
         raise typer.Exit(1)

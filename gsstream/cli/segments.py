@@ -97,7 +97,7 @@ def _encode(
     try:
         work = make_work(wanted, first, resolved, assembly, recording)
         say = (lambda _: None) if quiet else typer.echo
-        # Workers before the folder is touched: --overwrite must not delete a run for want of a cluster.
+        # Workers are started before the folder is touched: --overwrite must not delete a run when there is no cluster.
         with closing(make_executor(run_segment, wanted.workers, wanted.threads, wanted.ray)) as executor:
             out.mkdir(parents=True, exist_ok=True)
             with only_one(out, "run"):

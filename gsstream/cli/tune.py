@@ -91,7 +91,7 @@ def _run(
     if first is not None:
         give_first_frame(plan, out, stream_file(first))
     processors = usable_processors()
-    # Candidates beside each other would take each other's time.
+    # Candidates that run at the same time would slow each other down.
     workers = workers or (1 if limits.time is not None else processors)
     executor = make_executor(run_job, workers, max(1, processors // workers))
     run_sweep(plan, out, executor, data=data, say=(lambda _: None) if quiet else typer.echo)

@@ -39,7 +39,7 @@ def _both_ways(cost: FloatArray, guide: FloatArray, step: float, jump: float, ed
                 reach = np.minimum(path, floor + jumps[min(s, last)])
                 np.minimum(reach[1:], path[:-1] + np.float32(step), out=reach[1:])
                 np.minimum(reach[:-1], path[1:] + np.float32(step), out=reach[:-1])
-                # Taking the floor off keeps the numbers bounded along the path; it moves no minimum.
+                # Subtracting the minimum keeps the numbers bounded along the path and changes no position of a minimum.
                 reach -= floor
                 reach += cost[s]
                 path = reach

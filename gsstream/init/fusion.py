@@ -111,7 +111,7 @@ def color_gains(images: FloatArray, depths: FloatArray, accepted: BoolArray, cam
                 ratios.append(ratio)
     if not rows:
         return np.ones((count, 3), np.float32)
-    # The weak last row fixes the common factor, which no ratio sees.
+    # The last row, with a small weight, fixes the common factor, on which no ratio depends.
     matrix = np.concatenate([np.stack(rows), np.full((1, count), 1e-3), 1e-4 * np.eye(count)])
     right = np.concatenate([np.stack(ratios), np.zeros((1 + count, 3))])
     logs = np.linalg.lstsq(matrix, right, rcond=None)[0]

@@ -88,7 +88,7 @@ def depth_range(cameras: Cameras, near: float = 0.3, far: float = 4.0) -> FloatA
     centers = cameras.centers
     gaps = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     distance = np.linalg.norm(centers - focus_point(cameras), axis=1)
-    # Parallel axes put the focus at the cameras themselves; the rig's own size is the next best ruler.
+    # With parallel axes the focus lies at the cameras themselves; then the size of the rig is taken as the distance.
     distance = np.maximum(distance, max(float(gaps.max()), 1e-6) * 0.25)
     return np.stack([near * distance, np.maximum(far * distance, 1.3 * gaps.max(1))], axis=1)
 

@@ -75,7 +75,7 @@ def photo_consistent_seeds(
     gains = color_gains(images, depths, sure, cameras)
     depths = interpolate_depths(depths, sure)
     verdict = agreement(depths, cameras, tolerance)
-    # A bridged pixel has no match of its own to vouch for it, so it needs twice the majority.
+    # The depth of an interpolated pixel was not matched, so twice as many views must support it.
     accepted = np.where(
         sure, verdict.accepted(least_support, dominance), verdict.accepted(least_support, 2 * dominance)
     )

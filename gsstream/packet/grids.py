@@ -91,7 +91,7 @@ def _implied(others: IntArray, bits: int) -> IntArray:
 
 def _unit(values: FloatArray, bits: int) -> FloatArray:
     scaled = np.rint(values * 2.0**bits)
-    # Decided on the rounded codes: rounding moves a norm by at most 2^-bits, so what comes out is left alone next time.
+    # Decided on the rounded codes: rounding moves a norm by at most 2^-bits, so doing it again changes nothing.
     stray = np.abs(np.linalg.norm(scaled, axis=1) / 2.0**bits - 1) > 1.25 * 2.0**-bits
     norm = np.linalg.norm(values[stray], axis=1, keepdims=True)
     if norm.size and float(norm.min()) < 1e-30:

@@ -73,7 +73,8 @@ def _row_tables(data: Mapping[str, bytes], number: int) -> Iterator[Table]:
 
 def _delta_tables(data: Mapping[str, bytes], layout: Layout) -> Iterator[Table]:
     if "motion" in data:
-        # Its tables depend on the groups of the whole scene; it counts as if it could not be smaller.
+        # Its tables depend on the groups of the whole scene, which are not at hand; its entropy is taken to be its
+        # size.
         yield Table("motion", len(data["motion"]), 8.0 * len(data["motion"]))
     if "gates" in data:
         yield from _residual_tables(data, layout)

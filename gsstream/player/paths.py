@@ -120,7 +120,8 @@ def _up(rig: Cameras) -> FloatArray:
     """
     mean = -rig.viewmats[:, 1, :3].mean(0)
     if np.linalg.norm(mean) < 1e-3:
-        # Cameras rolled against each other cancel; the first one then decides.
+        # The "up" directions of cameras that are rolled against each other cancel out; then that of the first one is
+        # taken.
         mean = -rig.viewmats[0, 1, :3]
     axes = rig.viewmats[:, 0, :3]
     values, vectors = np.linalg.eigh(axes.T @ axes / len(rig))

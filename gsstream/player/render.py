@@ -82,7 +82,7 @@ def _entry_points() -> list[importlib.metadata.EntryPoint]:
 
 def _load(point: importlib.metadata.EntryPoint) -> PlayerRenderer:
     function = point.load()
-    # Found out here, where there still is another renderer, and not at the first picture.
+    # Tried here, where another renderer can still be chosen, and not at the first picture.
     inspect.signature(function).bind(*[None] * 8, 1, 1, (0.0, 0.0, 0.0), near=0.01)
     return PlayerRenderer(point.name, function)
 

@@ -67,7 +67,7 @@ def _slot(
     slot: str, field: Schema, parts: Mapping[str, PartSchema], default: str | None, definitions: Schema
 ) -> Schema:
     """A bare name, or {name, params}; the name decides which settings are known."""
-    # What a slot is without being asked need not be a part: the renderer may say "auto".
+    # The default of a slot need not be the name of a part: that of the renderer is "auto".
     names = list(dict.fromkeys([Recipe.model_fields[slot].default.name, *parts]))
     keys: set[str] = set()
     cases = []

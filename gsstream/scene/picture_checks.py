@@ -73,7 +73,7 @@ def check_change(thumbs: Thumbnails) -> list[Finding]:
     if len(thumbs.images) < 3:
         return []
     still = (np.diff(thumbs.images, axis=0) == 0).all(axis=(2, 3, 4))
-    # Where half of the cameras see nothing change, nothing changes.
+    # A frame in which half of the cameras see no change counts as one in which nothing changes.
     busy = still.mean(1) < 0.5
     frozen = still[busy].all(0) if busy.any() else np.zeros(still.shape[1], bool)
     found = [

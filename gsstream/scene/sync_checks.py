@@ -20,7 +20,7 @@ from gsstream.scene.match_checks import REPAIRS
 from gsstream.scene.picture_checks import Thumbnails
 
 GRID = 36
-#: Frames a clock may be off.
+#: Largest offset of a clock that is searched for, frames.
 REACH = 3
 AGREE, MARGIN = 0.45, 0.15
 LEAST_VOXELS = 40
@@ -65,7 +65,8 @@ def check_sync(thumbs: Thumbnails) -> list[Finding]:
             )))  # fmt: skip
     if found and (better := _better_poses(thumbs, table)):
         return better
-    # A clock is off against a majority. Where half of the cameras seem to be, motion is too little or too slow to tell.
+    # A clock can only be off against a majority. Where half of the cameras seem to be off, there is too little motion,
+    # or too slow a motion, to tell.
     return found if 2 * len(found) < len(cameras) else []
 
 

@@ -67,7 +67,7 @@ def _widest(lens: Lens, base: FloatArray, size: tuple[int, int], target: tuple[i
     tried = [_rays(border, _zoomed(base, zoom)) for zoom in ZOOMS]
     places = lens_places(lens, size, np.concatenate(tried)).reshape(len(ZOOMS), -1, 2)
     inside = np.asarray(((places >= 0) & (places <= np.array(size))).all(axis=(1, 2)))
-    # From the narrow end: a lens model may fold back far outside of the picture and look covered there.
+    # Searched from the narrow end: far outside of the picture a lens model may fold back and seem to be covered.
     covered = np.flatnonzero(~inside[::-1])
     first = len(ZOOMS) - int(covered[0]) if len(covered) else 0
     if first == len(ZOOMS):

@@ -93,7 +93,7 @@ def _stages(source: FrameSource, open_scene: Open, frames: int, features: bool) 
     yield check_change(thumbs)
     clocks = check_sync(thumbs)
     if clocks and features:
-        # Poses that are wrong as a whole also put what moves at different places: the clocks may be right.
+        # Where most poses are wrong, what moves seems to be at different places although the clocks may be right.
         yield [finding for finding in _matched(rig, *first, rig_only=True) if finding.severity == "error"]
     yield clocks
     if features:

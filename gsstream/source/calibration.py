@@ -225,7 +225,7 @@ def _text(path: Path, key: str, value: Any, most: int) -> str:
     text = str(value)
     if len(text) > most:
         raise SourceError(f"{path}: {key!r} is {len(text)} letters long; expected at most {most}")
-    # A folder's name may have been no UTF-8; a JSON text has no such excuse.
+    # The name of a folder may hold bytes that are not UTF-8; in a JSON text they are an error.
     if path.parent.name != text and any("\ud800" <= sign <= "\udfff" for sign in text):
         raise SourceError(f"{path}: {key!r} holds half of a character (a lone surrogate); write it as UTF-8")
     return text

@@ -82,7 +82,8 @@ def pinhole_intrinsics(lens: Lens, K: FloatArray, size: tuple[int, int], where: 
         rings = K[0, 2] + (u - K[0, 2]) * shares, K[1, 2] + (v - K[1, 2]) * shares
         at_u, at_v = _source(lens, K, zoom, *rings)
         inside = (at_u[-1] >= 0) & (at_u[-1] <= width) & (at_v[-1] >= 0) & (at_v[-1] <= height)
-        # Outwards in the result must be outwards in the picture: else the lens folds it over itself.
+        # Farther out in the result must be farther out in the picture, else the lens model folds the picture over
+        # itself.
         outwards = np.diff(np.hypot(at_u - K[0, 2], at_v - K[1, 2]), axis=0) > 0
         return bool(inside.all() and outwards[:, (u != K[0, 2]) | (v != K[1, 2])].all())
 

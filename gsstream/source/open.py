@@ -45,7 +45,7 @@ def open_source(uri: str, scale: float = 1.0) -> FrameSource:
         return _disturbed(rest, scale, uri)
     named = scheme if separator and scheme in (*LAYOUTS, "folder") else None
     folder = Path(rest if named else uri)
-    # An empty text is the current folder to Path, and never what was meant.
+    # Path takes an empty text for the current folder, which is never what was meant.
     if not (uri and _exists(folder)) and not named:
         raise SourceError(f"source {uri[:200]!r}: no such folder and no known scheme; expected {_KNOWN}")
     if named == "nerfstudio" and not _exists(folder):

@@ -10,7 +10,7 @@ from gsstream.core.errors import SourceError
 from gsstream.source.clips import Clip
 from gsstream.source.video import VideoClip
 
-#: Misfits beyond this many frames are told.
+#: Differences between clips of more than this many frames, in number or in time, are reported.
 NOTABLE = 0.5
 
 

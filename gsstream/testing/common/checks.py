@@ -1,4 +1,4 @@
-"""What all parts promise: settings, freezing, declaration; and of the five kinds purity, shapes and equivariance."""
+"""What all parts promise: settings, freezing, declaration; and of some kinds purity, shapes and equivariance."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ SCHEMA = "gsstream-bench-frame-1"
 #: A tile has changed when a pixel of it did by more than this without noise, [0, 1] units.
 CHANGED = 3 / 255
 NOISE = 1.5 / 255
-#: Of the variant "active" where the recipe itself has none: sigmas of noise.
+#: Threshold of change of the variant "active", sigmas of noise, where the recipe has none.
 CHANGE_THRESHOLD = 4.0
 #: Slots that decide what may change, as parts that let everything change.
 DENSE = {"confidence": "uniform", "propagation": "group-max", "gate": "always-open", "regularizer": "none"}
@@ -186,7 +186,8 @@ def _case(plan: FramePlan, parts: Assembly, static: int, ball: _Ball) -> _Case:
     before = _draw(parts, player.gaussians, rig)
     noise = Rng(plan.seed).numpy("bench noise")
     state: StreamState = _encoder(parts, rig, player).encode(Frame(0, 0.0, before, rig)).state
-    # Stored in the method's own order the scene is rounded anew: what stands still must look as it did.
+    # The method stores rows in its own order, which rounds the scene anew. Images are rendered from that scene, so that
+    # what stands still does not seem to change.
     before = _draw(parts, state.player.gaussians, rig)
     state = replace(state, previous=Frame(0, 0.0, _noisy(before, noise), rig))
     after = _draw(parts, _moved(plan, state.player.gaussians, rig, ball), rig)

@@ -48,7 +48,7 @@ class LocalExecutor:
     def submit(self, job: Any) -> None:
         """Start a process for the job."""
         here, there = self._context.Pipe(duplex=False)
-        # The fork server's environment is that of its start; a worker's is that of now.
+        # A worker inherits the environment that the fork server was started with, so the present one is set here.
         environment = {**os.environ, **thread_environment(self._threads)}
         arguments = (there, self._work, job, environment)
         process = self._context.Process(target=_serve, args=arguments, name=f"cell {job.id}", daemon=True)

@@ -9,7 +9,7 @@ from gsstream.core.errors import UnknownName
 from gsstream.metrics import FLIP_VARIANT, MS_SSIM_VARIANT, flicker, flip, ms_ssim
 from gsstream.trade.measure.evaluate import ViewMetric, ViewPair
 
-#: MS-SSIM needs its coarsest scale to hold a window.
+#: Least side of an image for MS-SSIM, in pixels: its coarsest scale must be as large as a window.
 _MS_SSIM_SIDE = 176
 
 

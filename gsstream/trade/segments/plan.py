@@ -80,7 +80,7 @@ def make_plan(frames: int, segments: int, start: Start, *, first_given: bool) ->
         if start == "anew":
             keys.append(Task(f"key-{k:03d}", range(starts[k], starts[k] + 1)))
         else:
-            # Two frames: the scene as it was, called the frame before, and the step from it to this one.
+            # A leap encodes two frames: the last key frame, as if it were the frame before, and this key frame.
             keys.append(Task(f"key-{k:03d}", range(starts[k] - 1, starts[k] + 1), before, starts[k - 1]))
     parts = [
         Task(f"segment-{k:03d}", range(starts[k], bounds[k + 1]), f"key-{k:03d}" if k or not first_given else "first")

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from gsstream.core.errors import InputError
 from gsstream.trade.measure.records import FrameRecord, mean
 
-#: Told apart without colour vision too (Okabe and Ito).
+#: Colours that people who are colour-blind can tell apart, too (Okabe and Ito).
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
 Series = Callable[[FrameRecord], float]
 

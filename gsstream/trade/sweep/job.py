@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from gsstream.source.base import FrameSource
     from gsstream.trade.measure.evaluate import Evaluation
 
-#: What says where a view belongs; the rest of it are numbers. Extra metrics are numbers, too, by their own names.
+#: Fields of a record that say which view it is about; all others are numbers, extra metrics included.
 _PLACE = ("frame", "camera", "extra")
 _FPS_WARM_UP, _FPS_RENDERS = 5, 30
 

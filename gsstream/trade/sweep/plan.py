@@ -17,7 +17,7 @@ from gsstream.recipe.load import FindMethod, ResolvedRecipe, recipe_hash, resolv
 from gsstream.trade.sweep.config import Axis, Range, Scene, SweepConfig, Variant, flat_settings
 from gsstream.trade.sweep.rows import with_bases
 
-#: Sections of a recipe that say nothing of frame 0; a section that nobody thought of counts as one that does.
+#: Sections of a recipe that do not influence frame 0. A section that is not listed counts as one that does.
 LATER_KEYS = (
     "schema_version", "method", "seed", "frames", "confidence", "propagation", "gate", "regularizer", "update",
     "stepper", "stream", "gate_training", "codec", "motion", "growth",
@@ -152,7 +152,7 @@ def _draw(axis: Axis, draw: random.Random) -> Any:
 
 def _uniform(axis: Range, draw: random.Random) -> float:
     if axis.log:
-        # exp and log may leave the range by a rounding.
+        # Rounding in exp and log may lead out of the range.
         return min(max(math.exp(draw.uniform(math.log(axis.low), math.log(axis.high))), axis.low), axis.high)
     return draw.uniform(axis.low, axis.high)
 

@@ -11,7 +11,7 @@ import pytest
 from flow_runs import WORLD, arguments, broken_off_in, demo_copy, encode, metrics, without_test_cameras
 
 from gsstream.cli.main import run_command
-from gsstream.engine.auto.rules import trials
+from gsstream.engine.auto import trials
 from gsstream.engine.run import encoder
 from gsstream.packet import StreamReader, decode_packet
 from gsstream.recipe.load import load_recipe

@@ -1,0 +1,277 @@
+"""Every function of every part is guarded: what it raises names slot, part, frame and iteration, and costs one frame.
+
+One recording of five frames is encoded for each function; the part fails in it while frame 2 is made (which is a key
+packet where the function is called for those alone). Then the same with ``stream.on_error: repeat``.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from gsstream.core.changes import Births, Rows
+from gsstream.core.errors import ComponentError
+from gsstream.core.frame import Frame
+from gsstream.encode import Encoder, encoder_for, open_recording
+from gsstream.engine.assembly.guard import Guarded, guard, plain
+from gsstream.engine.assembly.where import Where
+from gsstream.engine.method.held import RepeatedFrameWarning
+from gsstream.engine.step import frame_step as step_module
+from gsstream.gate.always_open import AlwaysOpen
+from gsstream.growth.base import Growth
+from gsstream.packet import decode_packet
+from gsstream.render.base import RenderSession
+
+WORLD = "synthetic:frames=5&views=2&width=32&height=24&supersample=1"
+TINY = {
+    "first_frame.max_iterations": 6, "first_frame.max_points": 120, "first_frame.fill_points": 0, "stream.epochs": 1,
+}  # fmt: skip
+BAD = 2
+
+#: slot, function -> (whether frame 2 is made a key packet for it, whether it is called in iterations).
+FUNCTIONS: dict[tuple[str, str], tuple[bool, bool]] = {
+    ("structure", "build"): (True, False),
+    ("confidence", "estimate"): (False, False),
+    ("propagation", "propagate"): (False, False),
+    ("gate", "num_levels"): (False, False),
+    ("gate", "init"): (False, False),
+    ("gate", "noise"): (False, True),
+    ("gate", "sample"): (False, True),
+    ("gate", "open_probability"): (False, False),
+    ("gate", "bound"): (False, True),
+    ("motion", "propose"): (False, False),
+    ("update", "codes"): (False, False),
+    ("update", "init_decoders"): (True, False),
+    ("growth", "propose"): (False, False),
+    ("regularizer", "penalty"): (False, True),
+    ("loss", "evaluate"): (False, True),
+    ("optimiser", "step"): (False, True),
+    ("session", "render"): (False, True),
+    ("session", "visible"): (False, False),
+    ("session", "screen_gradient"): (False, False),
+    ("session", "narrow"): (False, False),
+    ("session", "commit"): (False, False),
+    ("session", "cache_bytes"): (False, False),
+}
+
+
+class Failing:
+    """A part that raises in one of its functions in one frame, and otherwise does what the sound one does."""
+
+    def __init__(self, part: Any, function: str, where: Where, frame: int = BAD) -> None:
+        self.__dict__.update(part=part, function=function, where=where, frame=frame)
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self.part, name)
+        if name != self.function:
+            return value
+        if not callable(value):
+            self.fail()
+            return value
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            self.fail()
+            return value(*args, **kwargs)
+
+        return call
+
+    def fail(self) -> None:
+        if self.where.frame == self.frame:
+            raise RuntimeError("out of order")
+
+
+class FailingSession(RenderSession):
+    """The same for a session of a renderer, and for those that follow from it."""
+
+    def __init__(self, session: RenderSession, failing: Failing) -> None:
+        self.session, self.failing = session, failing
+
+    def _call(self, name: str, *args: Any, **kwargs: Any) -> Any:
+        if name == self.failing.function:
+            self.failing.fail()
+        return getattr(self.session, name)(*args, **kwargs)
+
+    def render(self, *args: Any, **kwargs: Any) -> Any:
+        return self._call("render", *args, **kwargs)
+
+    def visible(self, *args: Any) -> Any:
+        return self._call("visible", *args)
+
+    def screen_gradient(self, *args: Any) -> Any:
+        return self._call("screen_gradient", *args)
+
+    def narrow(self, *args: Any) -> Any:
+        return self._call("narrow", *args)
+
+    def commit(self, *args: Any) -> Any:
+        return FailingSession(self._call("commit", *args), self.failing)
+
+    def cache_bytes(self) -> Any:
+        return self._call("cache_bytes")
+
+
+class FailingRenderer(Failing):
+    """Its sessions fail."""
+
+    def open(self, *args: Any) -> Any:
+        return FailingSession(self.part.open(*args), self)
+
+
+@cache
+def frames() -> tuple[Frame, ...]:
+    with open_recording(WORLD) as source:
+        return tuple(source.frame(index) for index in range(5))
+
+
+def encoder(slot: str, make: Callable[[Any, Where], Any], **settings: Any) -> Encoder:
+    """An encoder in which the part of one slot is replaced."""
+    with open_recording(WORLD) as source:
+        made = encoder_for("s2gs-edge", source, {**TINY, **settings})
+    made.parts = replace(made.parts, **{slot: make(made.parts.part(slot), made.parts.where)})
+    return made
+
+
+def spoiled(slot: str, function: str, **settings: Any) -> Encoder:
+    key, _ = FUNCTIONS[slot, function]
+    if key:
+        settings["codec.key_every"] = BAD
+    if slot == "session":
+        return encoder("renderer", lambda part, where: FailingRenderer(part, function, where), **settings)
+    return encoder(slot, lambda part, where: Failing(part, function, where), **settings)
+
+
+@pytest.fixture(autouse=True)
+def few_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten rows take part in a frame: so few that a session is narrowed, and kept for the next frame."""
+    found = step_module.candidates
+    monkeypatch.setattr(step_module, "candidates", lambda *args: found(*args)[:10])
+
+
+@pytest.mark.parametrize(("slot", "function"), FUNCTIONS)
+def test_what_a_function_raises_is_said_with_its_place(slot: str, function: str) -> None:
+    made = spoiled(slot, function)
+    for frame in frames()[:BAD]:
+        made.encode(frame)
+    before = made.state
+    with pytest.raises(ComponentError, match="RuntimeError: out of order") as caught:
+        made.encode(frames()[BAD])
+    error = caught.value
+    assert error.slot == ("renderer" if slot == "session" else slot)
+    assert error.part == ("FailingRenderer" if slot == "session" else "Failing")
+    assert error.frame == BAD
+    assert (error.iteration is not None) == FUNCTIONS[slot, function][1]
+    assert made.state is before
+
+
+@pytest.mark.parametrize(("slot", "function"), FUNCTIONS)
+def test_repeat_goes_on_after_any_of_them(slot: str, function: str) -> None:
+    made, player = spoiled(slot, function, **{"stream.on_error": "repeat"}), None
+    steps = []
+    for frame in frames():
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", RepeatedFrameWarning)
+            steps.append(made.encode(frame))
+        said = [str(one.message) for one in caught if one.category is RepeatedFrameWarning]
+        assert len(said) == (frame.index == BAD), said
+        player = decode_packet(player, steps[-1].packet.data)
+        assert player.gaussians.means.tobytes() == made.state.player.gaussians.means.tobytes()
+    assert steps[BAD].status == "empty"
+    assert "RuntimeError: out of order" in steps[BAD].metrics["error"]
+    assert steps[BAD].metrics["seconds"]["failed"] >= 0
+    # A key packet that could not be made stays due.
+    key, _ = FUNCTIONS[slot, function]
+    assert [step.status for step in steps[BAD + 1 :]] == (["key", "delta"] if key else ["delta", "delta"])
+
+
+def test_a_part_that_fails_in_frame_0_ends_there() -> None:
+    for slot, function in (("structure", "seed"), ("structure", "build"), ("update", "init_decoders"), ("loss", "prepare")):
+        made = encoder(
+            slot, lambda part, where, name=function: Failing(part, name, where, 0), **{"stream.on_error": "repeat"}
+        )
+        with pytest.raises(ComponentError) as caught:
+            made.encode(frames()[0])
+        assert (caught.value.slot, caught.value.part, caught.value.frame) == (slot, "Failing", 0)
+        assert made.state is None
+
+
+class Odd(Growth):
+    """Proposes what the test wants."""
+
+    wanted: Callable[[Any], Any]
+
+    def propose(self, after: Any, work: Any, rng: Any) -> Any:
+        return type(self).wanted(after)
+
+
+def _births(after: Any, **changes: Any) -> Rows:
+    given = {"nodes": np.zeros(1, np.int64), "unit_of": np.zeros(1, np.uint8), "parents": np.zeros(0, np.int64)}
+    return Rows(Births(after.gaussians.rows(np.array([0])), **{**given, **changes}))
+
+
+ODD = {
+    "another type": (lambda after: [1, 2], "expected Rows or None, got list"),
+    "a node that is not there": (
+        lambda after: _births(after, nodes=np.array([10**6])), "births: expected nodes from 0 to",
+    ),
+    "a unit that is not there": (lambda after: _births(after, unit_of=np.array([200], np.uint8)), "expected units 0 to"),
+    "a row that is not there": (lambda after: Rows(None, np.array([10**6])), "deaths: expected rows from 0 to"),
+    "a number that is none": (
+        lambda after: Rows(replace(
+            _births(after).births, gaussians=after.gaussians.rows(np.array([0])).map(lambda v: np.full_like(v, np.nan))
+        )), "births: means: expected finite values, got nan",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", ODD)
+def test_growth_is_blamed_for_what_does_not_fit(what: str) -> None:
+    """Packets refuse it too, but then nobody knows any more whose it was."""
+    wanted, message = ODD[what]
+    part = type("Grower", (Odd,), {"wanted": staticmethod(wanted)})()
+    made = encoder("growth", lambda *_: part)
+    made.encode(frames()[0])
+    before = made.state
+    with pytest.raises(ComponentError, match=message) as caught:
+        made.encode(frames()[1])
+    assert (caught.value.slot, caught.value.part, caught.value.frame) == ("growth", "Grower", 1)
+    assert made.state is before
+
+
+class TestGuard:
+    def part(self) -> Any:
+        return guard("gate", AlwaysOpen(), Where(), encoder("gate", lambda part, _: part).parts.checks)
+
+    def test_it_stands_in_the_parts_place(self) -> None:
+        guarded = self.part()
+        assert guarded == AlwaysOpen()
+        assert guarded == self.part()
+        assert hash(guarded) == hash(AlwaysOpen())
+        assert repr(guarded) == repr(AlwaysOpen())
+        assert guarded.config == AlwaysOpen().config
+        assert guarded.num_levels == 1
+        assert type(plain(guarded)) is AlwaysOpen
+        assert plain(AlwaysOpen()) == AlwaysOpen()
+
+    def test_nothing_is_guarded_twice(self) -> None:
+        again = guard("gate", self.part(), Where(), self.part()._level)
+        assert isinstance(again, Guarded)
+        assert type(plain(again)) is AlwaysOpen
+
+    def test_what_a_part_lacks_it_lacks(self) -> None:
+        assert not hasattr(self.part(), "no_such_thing")
+        assert getattr(self.part(), "no_such_thing", 3) == 3
+
+    def test_every_part_of_an_assembly_is_guarded_once(self) -> None:
+        parts = encoder("gate", lambda part, _: part).parts
+        for slot in ("structure", "confidence", "gate", "motion", "growth", "stepper", "renderer", "loss", "optimiser"):
+            assert isinstance(getattr(parts, slot), Guarded)
+            assert not isinstance(parts.part(slot), Guarded)
+        with pytest.raises(ComponentError, match="propagation .* failed at frame None"):
+            parts.propagation.propagate(torch.zeros(3), "no hierarchy")

@@ -9,10 +9,15 @@ import torch
 
 from gsstream.confidence.uniform import Uniform
 from gsstream.core.kinds import CONTRACTS, PART_KINDS
+from gsstream.engine.method.parts import PartsMethod
 from gsstream.gate.always_open import AlwaysOpen
 from gsstream.gate.base import GateSampler
+from gsstream.growth.none import NoGrowth
 from gsstream.loss.photometric import ReferenceLoss
 from gsstream.method.hold import Hold
+from gsstream.motion.coasting import Coasting
+from gsstream.motion.rigid import Rigid
+from gsstream.motion.still import Still
 from gsstream.optimiser.adam import ReferenceAdam
 from gsstream.propagation.group_max import GroupMax
 from gsstream.regularizer.none import NoRegularizer
@@ -34,7 +39,7 @@ from gsstream.testing.stepper.example import ExampleStepper
 
 BUILTIN = [
     Flat(), Uniform(), Uniform(Uniform.Config(logit=-50)), GroupMax(), AlwaysOpen(), NoRegularizer(), Additive(),
-    ReferenceRenderer(), ReferenceLoss(), ReferenceAdam(), Hold(),
+    ReferenceRenderer(), ReferenceLoss(), ReferenceAdam(), Hold(), PartsMethod(), Still(), Coasting(), Rigid(), NoGrowth(),
 ]  # fmt: skip
 EXAMPLES = [ExampleStructure(), ExampleConfidence(), ExamplePropagation(), ExampleGate(), ExampleRegularizer()]
 EXAMPLES += [ExampleStepper(), ExampleUpdate(), ExampleLoss()]

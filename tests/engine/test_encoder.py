@@ -117,10 +117,12 @@ def test_images_that_do_not_fit_are_refused_and_cost_nothing() -> None:
 
 
 class BrokenGrowth:
-    """Stands for a growth part that fails after everything else of the frame has worked."""
+    """Stands for a growth part that fails after everything else of the frame has worked; or for a loss."""
 
     def propose(self, *_: Any) -> None:
         raise RuntimeError("no room")
+
+    prepare = propose
 
 
 @pytest.mark.parametrize("case", list(CASES))

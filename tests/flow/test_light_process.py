@@ -19,7 +19,7 @@ UNWANTED = ("torch._dynamo", "torch._inductor", "sympy", "torch.fx.experimental.
 def test_a_run_loads_no_compiler_and_no_symbols(tmp_path: Path) -> None:
     source = demo_copy(tmp_path / "demo", frames=2)
     arguments = ["run", "--method", "s2gs-edge", "--source", str(source), "--out", str(tmp_path / "out"), "--no-video"]
-    settings = ["first_frame.epochs=1", "stream.epochs=1", "growth.per_frame=50"]
+    settings = ["first_frame.epochs=1", "stream.epochs=1", "growth=anchor-insertion", "growth.per_frame=50"]
     arguments += ["--quiet", *(word for setting in settings for word in ("--set", setting))]
     program = f"""
 import sys

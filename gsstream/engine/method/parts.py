@@ -39,7 +39,8 @@ class PartsMethod(StreamingMethod[StreamState]):
         allowance, own = tools.allowance, tools.parts
         parts = own if allowance is None else planned(own, allowance.plan)
         step, pace, fitted = frame_step(parts, state, frame, tools.rng, allowance)
-        step = replace(step, metrics={**step.metrics, **cache_metrics(step.state.session)})
+        if frame.effort > 0:  # a skipped frame calls no part: it is also the answer to one that failed
+            step = replace(step, metrics={**step.metrics, **cache_metrics(step.state.session)})
         if allowance is not None and pace is not None and fitted is not None:
             epochs = step.metrics["iterations"] / len(frame.cameras)
             entry = spent(allowance, pace, fitted, own.recipe.stream, epochs)

@@ -97,7 +97,7 @@ def skip_checks(kind: str, name: str, reason: str) -> list[CheckResult]:
 
 
 def run_method_checks(name: str, expected_failures: Mapping[str, str] | None = None) -> list[CheckResult]:
-    """Make the checks of whole methods on a named method, with a tiny budget.
+    """Make the checks of methods on a named method, with a tiny budget.
 
     Raises RecipeError, UnknownName or PluginUnavailable when it cannot be assembled.
     """

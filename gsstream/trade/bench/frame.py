@@ -114,7 +114,7 @@ def bench_frame(plan: FramePlan, catalog: Catalog, progress: Progress) -> dict[s
     for assembly in parts.values():
         refuse_pending(assembly)
     results: list[dict[str, Any]] = []
-    # One torch thread, as in a run: see engine.session.
+    # One torch thread, as in a run: see engine.run.threads.
     with torch_threads(1):
         for static in plan.static:
             for sweep, ball in _balls(plan, parts["active"], static, progress):

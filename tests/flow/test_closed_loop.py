@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from flow_runs import WORLD, Witness, demo_copy, encode, metrics, without_test_cameras
+from flow_runs import WORLD, Witness, arguments, demo_copy, encode, metrics, without_test_cameras
 from residual_oracle import train_rows
 
 from gsstream.cli.main import run_command
-from gsstream.core.changes import Delta, apply_delta
+from gsstream.core.changes import Delta, Scene, apply_delta
+from gsstream.core.context import FrameWork
 from gsstream.core.gaussians import ATTRIBUTES
+from gsstream.core.rng import Rng
+from gsstream.engine.method.held import difference_between
 from gsstream.engine.step import frame_step as step_module
+from gsstream.motion.coasting import Coasting
 from gsstream.packet import PacketKind
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, find_renderer, render
@@ -200,3 +207,77 @@ def test_a_run_repeats_from_its_saved_recipe(tmp_path: Path) -> None:
     again = ["run", "--source", WORLD, "--recipe", str(tmp_path / "a" / "recipe.yaml"), "--out", str(tmp_path / "b")]
     assert run_command([*again, "--quiet", "--no-video"]) == 0
     assert (tmp_path / "b" / "stream.gss").read_bytes() == first
+
+
+MOTION = {
+    "coasting": {"motion": "coasting"},
+    "rigid": {"motion": "rigid", "motion__epochs": 1},
+    "growing": {"growth": "anchor-insertion", "growth__error": 0.05, "growth__least_views": 2, "growth__per_frame": 40},
+}  # fmt: skip
+MOTION["growing and coasting"] = {**MOTION["growing"], **MOTION["coasting"]}
+MOTION["growing and rigid"] = {**MOTION["growing"], **MOTION["rigid"]}
+
+
+@pytest.mark.parametrize("case", MOTION)
+def test_motions_and_births_leave_both_ends_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str) -> None:
+    """What later motions are predicted from, displacements and groups, is the same on both ends too."""
+    witness = Witness(monkeypatch)
+    encode(tmp_path, "--frames", "4", method="s2gs-edge", **MOTION[case])
+    lines = metrics(tmp_path)[1:]
+    assert any(line["moving_groups"] > 0 for line in lines) == ("motion" in MOTION[case])
+    assert any(line["births"] > 0 for line in lines) == ("growth" in MOTION[case]) or case == "growing and rigid"
+    with Playback(tmp_path / "stream.gss") as playback:
+        for frame, state in enumerate(witness.states):
+            theirs = playback.player_state(frame)
+            same_bits(state.player.gaussians, theirs.gaussians)
+            assert difference_between(theirs, state.player) == ""
+        for frame in (3, 1, 2, 0):
+            same_bits(witness.states[frame].player.gaussians, playback.state_at(frame))
+
+
+SPOILED = {
+    "another type": (lambda motion: [motion], "expected a tuple of Motion, got list"),
+    "numbers": (lambda motion: (motion.symbols,), "expected a tuple of Motion"),
+    "too few groups": (lambda motion: (replace(motion, moving=motion.moving[:-1]),), "expected"),
+    "too few symbols": (lambda motion: (replace(motion, symbols=motion.symbols[:-1]),), "symbols: expected"),
+    "symbols of halves": (lambda motion: (replace(motion, symbols=motion.symbols + 0.5),), "expected int32, got float64"),
+    "no cell": (lambda motion: (replace(motion, cell=float("nan")),), "cell: expected a float32 above 0"),
+    "a cell of zero": (lambda motion: (replace(motion, cell=0.0),), "cell: expected a float32 above 0"),
+    "no shades": (lambda motion: (replace(motion, shades=0),), "shades: expected 1 to 16"),
+    "beyond everything": (
+        lambda motion: (replace(motion, symbols=np.full_like(motion.symbols, 2**31 - 1), shift_step=9e8),), "motion",
+    ),
+    "too many": (lambda motion: (motion,) * 9, "at most 8 motions"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("how", SPOILED)
+def test_a_motion_that_does_not_fit_ends_in_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], how: str
+) -> None:
+    """Nothing written is lost, and with the part mended the run goes on to the bytes of an undisturbed one."""
+    spoil, message = SPOILED[how]
+    sound = Coasting.propose
+
+    def propose(self: Coasting, scene: Scene, work: FrameWork, rng: Rng) -> Any:
+        found = sound(self, scene, work, rng)
+        return spoil(found[0]) if found else found
+
+    options = {"method": "s2gs-edge", "motion": "coasting"}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Coasting, "propose", propose)
+        assert run_command(arguments(tmp_path, "--frames", "4", **options)) == 1
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1, err
+    assert err.startswith("error: motion 'Coasting' (from gsstream) failed at frame 2: ")
+    assert message in err
+    with Playback(tmp_path / "stream.gss") as playback:
+        assert list(playback.frames) == [0, 1]
+    assert len(metrics(tmp_path)) == 2
+    resumed = encode(tmp_path, "--resume", "--frames", "4", **options)
+    assert resumed == _undisturbed(str(tmp_path.parent))
+
+
+@cache
+def _undisturbed(folder: str) -> bytes:
+    return encode(Path(folder) / "undisturbed", "--frames", "4", method="s2gs-edge", motion="coasting")

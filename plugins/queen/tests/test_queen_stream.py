@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,15 @@ from gsstream_queen import frame as frame_module
 from gsstream_queen import method as method_module
 
 from gsstream.cli.main import run_command
-from gsstream.engine.run import session
+from gsstream.core.frame import Frame
+from gsstream.engine.run.encoder import Encoder
 from gsstream.packet import PacketKind
 from gsstream.player.playback import Playback
 
 SOURCE = "synthetic:frames=5&views=3&width=64&height=48&supersample=1"
 SETTINGS = {
     "first_frame.max_iterations": 40, "first_frame.fill_points": 100, "first_frame.max_points": 500, "stream.epochs": 3,
-    "whole.births.every": 1, "whole.births.gradient": 1e-4, "whole.births.most": 30, "whole.dynamic": 1e-4,
+    "stepper.births.every": 1, "stepper.births.gradient": 1e-4, "stepper.births.most": 30, "stepper.dynamic": 1e-4,
 }  # fmt: skip
 
 
@@ -41,21 +43,19 @@ def watched(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Any], 
     out, states, solved = tmp_path_factory.mktemp("watched"), [], []
     patch = pytest.MonkeyPatch()
 
-    def remember(step):
-        def call(*args: Any) -> Any:
-            outcome = step(*args)
-            states.append(outcome.state)
-            return outcome
+    encoded = Encoder.encode
 
-        return call
+    def remember(encoder: Encoder, frame: Frame) -> Any:
+        step = encoded(encoder, frame)
+        states.append(step.state)
+        return step
 
     def solve(config, problem, generator):
         run = frame_module.optimise(config, problem, generator)
         solved.append((problem, run))
         return run
 
-    patch.setattr(session, "begin_whole", remember(session.begin_whole))
-    patch.setattr(session, "step_whole", remember(session.step_whole))
+    patch.setattr(Encoder, "encode", remember)
     patch.setattr(method_module, "optimise", solve)
     encode(out)
     patch.undo()
@@ -84,16 +84,18 @@ def test_what_was_trained_is_what_was_sent(watched) -> None:
     for before, after, (problem, result) in zip(states, states[1:], solved, strict=False):
         delta = after.player.delta
         assert delta is not None
+        residual, gates = delta.residual, delta.gates(before.player.layout)
+        assert residual is not None
         for name, table in result.solution.symbols.items():
-            if name in delta.symbols:
+            if name in residual.symbols:
                 nodes = before.player.layout.node_of[problem.active.numpy()]
-                kept = ~result.gone[problem.active].numpy() & delta.gates[nodes].astype(bool)
-                np.testing.assert_array_equal(delta.symbols[name], table.numpy()[kept], err_msg=name)
-        for name, sent in delta.decoders.items():
+                kept = ~result.gone[problem.active].numpy() & gates[nodes].astype(bool)
+                np.testing.assert_array_equal(residual.symbols[name], table.numpy()[kept], err_msg=name)
+        for name, sent in residual.decoders.items():
             np.testing.assert_allclose(sent, result.solution.decoders[name].numpy(), rtol=1e-3, atol=1e-6)
         stay = np.delete(np.arange(len(before.player.gaussians)), delta.deaths)
         moved = after.player.gaussians.means[: len(stay)] - before.player.gaussians.means[stay]
-        closed = delta.gates[before.player.layout.node_of[stay]] == 0
+        closed = gates[before.player.layout.node_of[stay]] == 0
         assert not moved[closed].any()
 
 
@@ -102,12 +104,23 @@ def test_resumed_in_the_middle_it_gives_the_same_bytes(tmp_path: Path, watched) 
     assert encode(tmp_path / "again") == once
     with Playback(watched[0] / "stream.gss") as playback:
         third = playback.entry(3)
-    for name, size in (("torn", third.offset + third.size // 2), ("whole", third.offset)):
+    for name, size, logged in (
+        ("torn", third.offset + third.size // 2, 3), ("at the end of a packet", third.offset, 3),
+        ("a kill lost two lines", third.offset, 1), ("without a log", third.offset, 0),
+    ):  # fmt: skip
         out = tmp_path / name
-        encode(out, "--frames", "1")
+        shutil.copytree(watched[0], out)
         (out / "stream.gss").write_bytes(once[:size])
+        kept = (out / "metrics.jsonl").read_text().splitlines(keepends=True)[:logged]
+        if logged:
+            (out / "metrics.jsonl").write_text("".join(kept))
+        else:
+            (out / "metrics.jsonl").unlink()
         assert encode(out, "--resume") == once, name
-        assert [line["frame"] for line in metrics(out)] == [0, 3, 4], "frames 1 and 2 were never measured here"
+        # Lines hold seconds: those that are as they were are of frames that were not encoded again.
+        assert (out / "metrics.jsonl").read_text().splitlines(keepends=True)[:logged] == kept
+        made = [line["frame"] for line in metrics(out)][logged:]
+        assert made == ([1, 2, 3, 4] if logged == 1 else [3, 4]), name
 
 
 def test_a_static_recording_costs_headers(tmp_path: Path) -> None:
@@ -119,8 +132,8 @@ def test_a_static_recording_costs_headers(tmp_path: Path) -> None:
 
 def test_policies_decide_what_is_sent(tmp_path: Path) -> None:
     """Only sh0 may change: no other section is in any packet, and centres keep their bits."""
-    frozen = {f"whole__{name}__policy": "frozen" for name in ("means", "quats", "scales", "opacities", "shN")}
-    encode(tmp_path, whole__births__every=0, whole__sh0__lr=0.3, **frozen)
+    frozen = {f"stepper__{name}__policy": "frozen" for name in ("means", "quats", "scales", "opacities", "shN")}
+    encode(tmp_path, stepper__births__every=0, stepper__sh0__lr=0.3, **frozen)
     with Playback(tmp_path / "stream.gss") as playback:
         first, last = playback.state_at(0), playback.state_at(4)
     assert first.means.tobytes() == last.means.tobytes()
@@ -133,7 +146,7 @@ def test_gates_close_where_they_cost(tmp_path: Path) -> None:
     """A heavy L0 leaves fewer centres moving than none."""
     moving = []
     for name, weight in (("free", 0.0), ("dear", 100.0)):
-        encode(tmp_path / name, "--frames", "3", whole__gate__l0=weight, stream__epochs=8, whole__births__every=0)
+        encode(tmp_path / name, "--frames", "3", stepper__gate__l0=weight, stream__epochs=8, stepper__births__every=0)
         moving.append(sum(line["moved_gaussians"] for line in metrics(tmp_path / name)[1:]))
     assert moving[1] < moving[0]
 
@@ -141,9 +154,9 @@ def test_gates_close_where_they_cost(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("whole.sh0.latnt=3", "unknown key 'whole.params.sh0.latnt'; did you mean 'latent'?"),
-        ("whole.gate.gamma=0.5", "whole.params.gate.gamma: input should be less than 0, got 0.5"),
-        ("gate_training.warmup=0.5", "gate_training.warmup: the whole method 'queen' does not read it"),
+        ("stepper.sh0.latnt=3", "unknown key 'stepper.params.sh0.latnt'; did you mean 'latent'?"),
+        ("stepper.gate.gamma=0.5", "stepper.params.gate.gamma: input should be less than 0, got 0.5"),
+        ("gate_training.lr=0.5", "gate_training.lr: the stepper 'queen' does not read it"),
     ],
 )
 def test_wrong_settings_are_refused(
@@ -161,4 +174,4 @@ def test_the_other_commands_know_it(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert run_command(["evaluate", out, "--source", SOURCE]) == 0
     assert run_command(["play", out, "--out", str(tmp_path / "frames"), "--frames", "0:2"]) == 0
     assert run_command(["methods", "show", "queen"]) == 0
-    assert "whole     queen" in capsys.readouterr().out
+    assert "stepper   queen" in capsys.readouterr().out

@@ -33,13 +33,14 @@ from gsstream.testing.loss.example import ExampleLoss
 from gsstream.testing.propagation.example import ExamplePropagation
 from gsstream.testing.regularizer.example import ExampleRegularizer
 from gsstream.testing.source.example import ExampleSource
+from gsstream.testing.stepper.example import ExampleStepper
 from gsstream.testing.structure.example import ExampleStructure
 from gsstream.testing.update.example import ExampleUpdate
-from gsstream.testing.stepper.example import ExampleStepper
 
 BUILTIN = [
     Flat(), Uniform(), Uniform(Uniform.Config(logit=-50)), GroupMax(), AlwaysOpen(), NoRegularizer(), Additive(),
-    ReferenceRenderer(), ReferenceLoss(), ReferenceAdam(), Hold(), PartsMethod(), Still(), Coasting(), Rigid(), NoGrowth(),
+    ReferenceRenderer(), ReferenceLoss(), ReferenceAdam(), Hold(), PartsMethod(),
+    Still(), Coasting(), Rigid(), NoGrowth(),
 ]  # fmt: skip
 EXAMPLES = [ExampleStructure(), ExampleConfidence(), ExamplePropagation(), ExampleGate(), ExampleRegularizer()]
 EXAMPLES += [ExampleStepper(), ExampleUpdate(), ExampleLoss()]

@@ -22,12 +22,13 @@ from gsstream.play import Playback
 #: A body that moves two pixels a frame: motions have something to say.
 WORLD = "synthetic:frames=6&views=3&width=32&height=24&supersample=1"
 TINY: Mapping[str, Any] = {
-    "first_frame.max_iterations": 12, "first_frame.max_points": 250, "first_frame.fill_points": 0, "stream.epochs": 1,
+    "first_frame.max_iterations": 12, "first_frame.max_points": 250, "first_frame.fill_points": 0,
+    "stream.epochs": 1,
 }  # fmt: skip
 #: Anchor insertion finds nothing in so small a world unless it is easily pleased.
 GROWING: Mapping[str, Any] = {
-    "growth": "anchor-insertion", "growth.per_frame": 24, "growth.error": 0.02, "growth.votes": 0.5, "growth.least_views": 2,
-    "growth.agreement": 0.5, "growth.least_opacity": 0.0, "growth.epochs": 1,
+    "growth": "anchor-insertion", "growth.per_frame": 24, "growth.error": 0.02, "growth.votes": 0.5,
+    "growth.least_views": 2, "growth.agreement": 0.5, "growth.least_opacity": 0.0, "growth.epochs": 1,
 }  # fmt: skip
 CASES: Mapping[str, Mapping[str, Any]] = {
     "still": {},
@@ -136,7 +137,7 @@ def test_a_frame_that_fails_leaves_the_encoder_as_it_was(case: str) -> None:
             bits = [value.tobytes() for _, value in player.gaussians.items()]
             made.parts = replace(sound, growth=BrokenGrowth())
             for _ in range(2):
-                with pytest.raises(ComponentError, match=f"'BrokenGrowth' .* failed at frame {frame.index}: RuntimeErr"):
+                with pytest.raises(ComponentError, match=f"'BrokenGrowth' .* failed at frame {frame.index}: "):
                     made.encode(frame)
             assert made.state is before
             assert [value.tobytes() for _, value in made.state.player.gaussians.items()] == bits

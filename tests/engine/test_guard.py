@@ -191,7 +191,8 @@ def test_repeat_goes_on_after_any_of_them(slot: str, function: str) -> None:
 
 
 def test_a_part_that_fails_in_frame_0_ends_there() -> None:
-    for slot, function in (("structure", "seed"), ("structure", "build"), ("update", "init_decoders"), ("loss", "prepare")):
+    called = (("structure", "seed"), ("structure", "build"), ("update", "init_decoders"), ("loss", "prepare"))
+    for slot, function in called:
         made = encoder(
             slot, lambda part, where, name=function: Failing(part, name, where, 0), **{"stream.on_error": "repeat"}
         )
@@ -220,7 +221,9 @@ ODD = {
     "a node that is not there": (
         lambda after: _births(after, nodes=np.array([10**6])), "births: expected nodes from 0 to",
     ),
-    "a unit that is not there": (lambda after: _births(after, unit_of=np.array([200], np.uint8)), "expected units 0 to"),
+    "a unit that is not there": (
+        lambda after: _births(after, unit_of=np.array([200], np.uint8)), "expected units 0 to",
+    ),
     "a row that is not there": (lambda after: Rows(None, np.array([10**6])), "deaths: expected rows from 0 to"),
     "a number that is none": (
         lambda after: Rows(replace(
@@ -273,5 +276,5 @@ class TestGuard:
         for slot in ("structure", "confidence", "gate", "motion", "growth", "stepper", "renderer", "loss", "optimiser"):
             assert isinstance(getattr(parts, slot), Guarded)
             assert not isinstance(parts.part(slot), Guarded)
-        with pytest.raises(ComponentError, match="propagation .* failed at frame None"):
+        with pytest.raises(ComponentError, match=r"propagation .* failed at frame None"):
             parts.propagation.propagate(torch.zeros(3), "no hierarchy")

@@ -240,7 +240,7 @@ SPOILED = {
     "numbers": (lambda motion: (motion.symbols,), "expected a tuple of Motion"),
     "too few groups": (lambda motion: (replace(motion, moving=motion.moving[:-1]),), "expected"),
     "too few symbols": (lambda motion: (replace(motion, symbols=motion.symbols[:-1]),), "symbols: expected"),
-    "symbols of halves": (lambda motion: (replace(motion, symbols=motion.symbols + 0.5),), "expected int32, got float64"),
+    "symbols of halves": (lambda motion: (replace(motion, symbols=motion.symbols + 0.5),), "expected int32, got"),
     "no cell": (lambda motion: (replace(motion, cell=float("nan")),), "cell: expected a float32 above 0"),
     "a cell of zero": (lambda motion: (replace(motion, cell=0.0),), "cell: expected a float32 above 0"),
     "no shades": (lambda motion: (replace(motion, shades=0),), "shades: expected 1 to 16"),

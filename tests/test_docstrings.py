@@ -8,8 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import pytest
-
 ROOT = Path(__file__).parents[1]
 LIBRARY = sorted((ROOT / "gsstream").rglob("*.py"))
 
@@ -25,9 +23,10 @@ Time Triangulate Try Turn Update Use Validate Verify Wait Walk Write Yield
 """
 #: The start of a noun phrase that describes a class or a property fully: a capital, a shape, a name, a number, a quote.
 NOUN_PHRASE = re.compile(r"""[A-Z\[(`"0-9]""")
-#: Rooms whose functions with three or more parameters name their arguments.
-EXPLAINED = ("engine", "method", "motion", "growth", "residual", "core/changes", "encode.py", "blocks.py", "play.py")
+#: Functions with as many parameters as this name them all under ``Arguments:``.
 MANY = 3
+#: Where they need not: commands describe their options where these are declared, and one file has no line left.
+UNEXPLAINED = ("gsstream/cli/", "gsstream/trade/bench/frame.py")
 
 
 class Documented(NamedTuple):
@@ -106,12 +105,11 @@ def test_functions_begin_with_a_verb_and_nouns_with_a_phrase() -> None:
     assert [f"{one.place}: {one.doc.splitlines()[0]}" for one in EVERYTHING if not starts_well(one)] == []
 
 
-@pytest.mark.parametrize("room", EXPLAINED)
-def test_functions_of_many_parameters_name_them_all(room: str) -> None:
-    inside = [one for one in EVERYTHING if one.path.startswith(f"gsstream/{room}")]
-    many = [one for one in inside if does_something(one) and len(one.parameters) >= MANY]
+def test_functions_of_many_parameters_name_them_all() -> None:
+    rooms = [one for one in EVERYTHING if not one.path.startswith(UNEXPLAINED)]
+    many = [one for one in rooms if does_something(one) and len(one.parameters) >= MANY]
     assert [f"{one.place}: {left}" for one in many if (left := undocumented_arguments(one))] == []
-    assert inside or room.endswith(".py"), "the room was not found"
+    assert len(many) > 200
 
 
 def test_nothing_is_called_ours() -> None:

@@ -79,6 +79,8 @@ def tree_max(values: torch.Tensor, hierarchy: Hierarchy, empty: float) -> torch.
     Differentiable; at ties the gradient is shared equally between the tied members.
 
     Arguments:
+        values: [N] one for each Gaussian.
+        hierarchy: M nodes and the node of each Gaussian.
         empty: value of a tree without members.
 
     Raises:

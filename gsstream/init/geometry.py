@@ -33,6 +33,11 @@ def project(points: FloatArray, cameras: Cameras, index: int) -> tuple[FloatArra
     """Return pixel positions [P, 2] (pixel-corner origin) and depths [P] in one camera.
 
     Positions are 0 where depth <= 0.
+
+    Arguments:
+        points: [P, 3] scene units.
+        cameras: the rig.
+        index: index of one of them.
     """
     view, intrinsics = cameras.viewmats[index], cameras.Ks[index]
     local = points @ view[:3, :3].T + view[:3, 3]
@@ -45,13 +50,26 @@ def project(points: FloatArray, cameras: Cameras, index: int) -> tuple[FloatArra
 
 
 def inside(uv: FloatArray, depth: FloatArray, cameras: Cameras) -> BoolArray:
-    """Return [P] bool: in front of the camera and within its image."""
+    """Return [P] bool: in front of the camera and within its image.
+
+    Arguments:
+        uv: [P, 2] pixels, origin at the corner.
+        depth: [P] scene units.
+        cameras: the rig, for its image size.
+    """
     seen: BoolArray = (depth > 0) & (uv >= 0).all(1) & (uv[:, 0] < cameras.width) & (uv[:, 1] < cameras.height)
     return seen
 
 
 def unproject(uv: FloatArray, depth: FloatArray, cameras: Cameras, index: int) -> FloatArray:
-    """Return world points [P, 3] at pixel positions [P, 2] and planar depths [P] of one camera."""
+    """Return world points [P, 3] at pixel positions [P, 2] and planar depths [P] of one camera.
+
+    Arguments:
+        uv: [P, 2] pixels, origin at the corner.
+        depth: [P] planar depth, scene units.
+        cameras: the rig.
+        index: index of one of them.
+    """
     homogeneous = np.concatenate([uv, np.ones((len(uv), 1), uv.dtype)], axis=1)
     local = (homogeneous @ np.linalg.inv(cameras.Ks[index]).T) * depth[:, None]
     view = cameras.viewmats[index]
@@ -82,6 +100,7 @@ def depth_range(cameras: Cameras, near: float = 0.3, far: float = 4.0) -> FloatA
     """Return [C, 2]: nearest and farthest planar depth worth searching, scene units.
 
     Arguments:
+        cameras: the C cameras.
         near, far: multiples of each camera's distance to the rig's focus. The far end is at least 1.3 times the
             distance to the farthest other camera, so that an inside-out dome reaches its opposite wall.
     """
@@ -99,6 +118,11 @@ def neighbour_views(cameras: Cameras, count: int, least_angle: float = 5.0) -> I
     They are nearest in direction seen from the focus.
 
     Angles under ``least_angle`` degrees give poor depth and are put back in the order.
+
+    Arguments:
+        cameras: the C cameras.
+        count: partners of each, at most.
+        least_angle: degrees.
     """
     outward = cameras.centers - focus_point(cameras)
     outward = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12)

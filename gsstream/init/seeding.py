@@ -49,6 +49,7 @@ def photo_consistent_seeds(
     """Find points that several views agree on: plane sweep, cross-view check, bridging of plain surfaces, thinning.
 
     Arguments:
+        settings: of the search.
         images: [C, H, W, 3] float32 in [0, 1]; 160 to 320 pixels wide is enough, time grows with pixels times C.
         cameras: C >= 3 training cameras of that size.
         count: at most this many seeds.
@@ -111,6 +112,9 @@ def fill_volume(
     cells without a point in most of the views that see it. Depth is uniform between the rig's near and far end.
 
     Arguments:
+        cameras: the C cameras.
+        min_views: training cameras that must see a seed.
+        rng: random numbers, numpy.
         points: what exists already, or None.
         images: [C, H, W, 3] float32 in [0, 1], for colours: the median over the views that see a seed.
         count: seeds wanted; fewer come back when little is uncovered.

@@ -26,6 +26,7 @@ def triangulate_points(
     Runs in a process of its own, so that an abort inside the native library does not take this one down.
 
     Arguments:
+        cameras: the C cameras.
         images: [C, H, W, 3] float32 in [0, 1] of C >= 2 training cameras.
         max_error: points with a larger mean reprojection error are dropped, pixels.
         timeout: seconds after which the process is ended.
@@ -68,6 +69,11 @@ def write_rig(folder: Path, cameras: Cameras) -> None:
 
 def run_pycolmap(task: str, folder: Path, timeout: float) -> None:
     """Run one task of ``gsstream.init._pycolmap`` on a folder, in a process of its own.
+
+    Arguments:
+        task: name of a function there.
+        folder: with its input; its output goes there, too.
+        timeout: seconds.
 
     Raises InputError when pycolmap is not installed, and when the process fails or takes more than ``timeout`` seconds.
     """

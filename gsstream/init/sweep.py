@@ -50,6 +50,8 @@ def sweep_depths(images: FloatArray, cameras: Cameras, settings: SweepSettings) 
     """Return the planar depth of every pixel of every view, right or wrong: nothing is rejected here.
 
     Arguments:
+        cameras: the C cameras.
+        settings: of the search.
         images: [C, H, W, 3] float32 in [0, 1] of C >= 2 cameras.
 
     Returns [C, H, W] float32, scene units. Deterministic for any number of workers.

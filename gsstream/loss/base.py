@@ -24,6 +24,9 @@ class Loss(Part):
         """Return the loss of ``image`` [H, W, 3] and its gradient [H, W, 3].
 
         Arguments:
+            image: [H, W, 3] rendered.
+            prepared: what :meth:`prepare` returned of the target.
+            dssim: weight w of 1 - SSIM, 0 to 1.
             tile_mask: [ceil(H / 16), ceil(W / 16)] bool, the only tiles that differ from an image judged before. The
                 sum then runs over them and the tiles beside them, whose windows see them, divided by the number of all
                 pixels. In masked tiles the gradient is that of the whole loss; elsewhere it is 0. A full mask equals

@@ -57,5 +57,12 @@ def dilate(mask: Mask, radius: int) -> Mask:
 
 
 def psnr_moving(image: FloatArray, target: FloatArray, first: FloatArray, sigma: float) -> float:
-    """Return the PSNR on the moving pixels of ``target``; nan where nothing moves."""
+    """Return the PSNR on the moving pixels of ``target``; nan where nothing moves.
+
+    Arguments:
+        image: [H, W, 3] decoded.
+        target: [H, W, 3] ground truth of this frame.
+        first: [H, W, 3] ground truth of frame 0.
+        sigma: noise of one image, [0, 1] units.
+    """
     return psnr(image, target, moving_mask(target, first, sigma))

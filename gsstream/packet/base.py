@@ -196,7 +196,13 @@ def parse_packet(data: bytes, offset: int = 0) -> tuple[PacketHeader, dict[str, 
 
 
 def expect(data: bytes, offset: int, kind: PacketKind) -> tuple[PacketHeader, dict[str, Section]]:
-    """Parse a packet that must be of one kind. Raises PacketError like :func:`parse_packet`."""
+    """Parse a packet that must be of one kind. Raises PacketError like :func:`parse_packet`.
+
+    Arguments:
+        data: bytes that begin with a packet.
+        offset: place of the packet in the file, for errors.
+        kind: that it must be of.
+    """
     header, sections = parse_packet(data, offset)
     if header.kind != kind:
         raise PacketError(f"expected a {kind.name.lower()} packet, got {header.kind.name.lower()}", offset)

@@ -33,6 +33,7 @@ def encode_delta(
     """Encode one frame's changes.
 
     Arguments:
+        frame: its index.
         delta: decoders of its residual must come from :func:`quantise_decoders`.
         layout: that of the frame before.
         previous_decoders: the decoders last sent since the last key packet (:func:`next_decoders`).
@@ -55,6 +56,8 @@ def decode_delta(
     """Decode a complete delta packet.
 
     Arguments:
+        data: a complete packet.
+        offset: place of the packet in the file, for errors.
         scene: that of the frame before; the groups of a motion depend on it.
         previous_decoders: as for :func:`encode_delta`.
 

@@ -25,6 +25,11 @@ _COLORS = ("sh0", "shN")
 def to_codes(name: str, values: FloatArray, bits: int) -> IntArray:
     """Return the [N, width] int32 codes of an attribute.
 
+    Arguments:
+        name: of the attribute.
+        values: [N, ...] float32, raw.
+        bits: fractional bits.
+
     Raises ShapeError for values out of range or quaternions of norm zero.
     """
     flat = np.asarray(values, np.float64).reshape(len(values), math.prod(values.shape[1:]))
@@ -43,7 +48,13 @@ def to_codes(name: str, values: FloatArray, bits: int) -> IntArray:
 
 
 def from_codes(name: str, codes: IntArray, bits: int) -> FloatArray:
-    """Return the [N, width] float32 values of codes."""
+    """Return the [N, width] float32 values of codes.
+
+    Arguments:
+        name: of the attribute.
+        codes: [N, width] int32.
+        bits: fractional bits.
+    """
     if name in _COLORS:
         return _from_luma(codes / _color_scale(bits, codes.shape[1])).astype(np.float32)
     return codes.astype(np.float32) * np.float32(2.0**-bits)

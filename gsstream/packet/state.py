@@ -47,10 +47,12 @@ class PlayerState:
 
 
 def decode_packet(state: PlayerState | None, data: bytes, *, offset: int = 0) -> PlayerState:
-    """Return the state after one complete packet.
+    """Return the state after one complete packet. Raises PacketError with the byte offset.
 
-    ``state`` is that of the frame before (a key packet needs none); ``offset`` is the packet's place in the file.
-    Raises PacketError with the byte offset.
+    Arguments:
+        state: that of the frame before; a key packet needs none.
+        data: the packet.
+        offset: its place in the file, for errors.
     """
     header = parse_header(data, offset)
     if header.kind == PacketKind.KEY:

@@ -30,6 +30,12 @@ class StreamWriter:
         Every packet reaches the operating system before the call that wrote it returns: a killed process loses none.
         With ``fsync`` it also reaches the disk (and the file its folder's list): a power cut loses none either.
 
+        Arguments:
+            path: of the stream.
+            resume: go on with the stream that is there.
+            last_frame: go on after this frame; None: after the last sound packet.
+            fsync: force every packet to disk.
+
         Raises OutputError when the file exists (or, with ``resume``, cannot be opened), PacketError when it is damaged
         before its last packet: nothing is cut then.
         """

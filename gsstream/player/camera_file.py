@@ -30,6 +30,8 @@ def read_path(path: Path, rig: Cameras, number: int) -> Cameras:
     """Return ``number`` cameras along the path of a file.
 
     Arguments:
+        path: of the file.
+        number: of cameras, at least 1.
         rig: cameras of the stream; size, intrinsics and near plane are its first camera's where the file has none.
 
     Raises InputError naming file and camera for anything that is not such a path.

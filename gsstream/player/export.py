@@ -27,6 +27,9 @@ def export(
     """Write one file per frame into the folder ``out``; returns the files.
 
     Arguments:
+        stream: file to read.
+        out: folder to write.
+        progress: called with (files written, files in all).
         kind: ``ply``; ``spz`` (through splat-transform, an npm package); ``sequence``: PLYs and ``sequence.json`` with
             frame indices, times and the cameras.
         frames: frame indices; default: all up to the first damaged packet.

@@ -56,7 +56,12 @@ class MemoryLimit:
         self._check(wanted, f"decoding frame {header.frame}")
 
     def check_pictures(self, width: int, height: int, kept: int = 1) -> None:
-        """Refuse pictures of a size of which ``kept`` are in memory at a time, as bytes. Raises InputError."""
+        """Refuse pictures of a size of which ``kept`` are in memory at a time, as bytes. Raises InputError.
+
+        Arguments:
+            width, height: pixels.
+            kept: pictures in memory at a time.
+        """
         self._check(width * height * (PER_PIXEL + 3 * kept), f"drawing {width} x {height} pixels")
 
     def _check(self, wanted: int, what: str) -> None:

@@ -18,7 +18,13 @@ LEAST_SWING = np.pi / 18
 
 
 def camera_path(kind: str, rig: Cameras, number: int) -> Cameras:
-    """Return ``number`` cameras along the path ``kind`` (one of PATHS), with the intrinsics of the rig's first."""
+    """Return ``number`` cameras along the path ``kind`` (one of PATHS), with the intrinsics of the rig's first.
+
+    Arguments:
+        kind: a name of PATHS.
+        rig: cameras of the stream.
+        number: of cameras, at least 1.
+    """
     if kind not in PATHS:
         raise ShapeError(f"no camera path {kind!r}; known: {', '.join(PATHS)}")
     if len(rig) == 0 or number < 1:
@@ -63,6 +69,10 @@ def resized(rig: Cameras, width: int, height: int) -> Cameras:
     """Return the same cameras with pictures of another size.
 
     The vertical field of view stays, the sides show more or less.
+
+    Arguments:
+        rig: cameras of the stream.
+        width, height: pixels.
     """
     factor = height / rig.height
     Ks = np.diag([factor, factor, 1.0]) @ rig.Ks
@@ -90,6 +100,11 @@ def spiral(rig: Cameras, number: int, turns: float = 2.0) -> Cameras:
     """Return a spiral around the rig's mean position that always looks at the focus point.
 
     It is half as wide as the rig itself.
+
+    Arguments:
+        rig: cameras of the stream.
+        number: of cameras, at least 1.
+        turns: around the mean position.
     """
     focus, up, centers = focus_point(rig), _up(rig), rig.centers
     middle = centers.mean(0)

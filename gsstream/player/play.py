@@ -45,6 +45,8 @@ def play(
     """Render a stream from one camera.
 
     Arguments:
+        stream: file to read.
+        renderer: that draws; None: the fastest that loads.
         out: ``.mp4`` needs PyAV, and becomes a folder of PNGs (with a warning) where it is missing; ``.webp`` and
             ``.gif`` are animated pictures; a name without a suffix is a folder.
         camera: id of a train or test camera, "orbit" or "spiral", or a JSON file with a path
@@ -99,7 +101,13 @@ def check_target(out: Path) -> None:
 
 
 def choose_cameras(playback: Playback, camera: str | None, number: int) -> Cameras:
-    """Return one camera for all pictures (by id), or ``number`` cameras along a path."""
+    """Return one camera for all pictures (by id), or ``number`` cameras along a path.
+
+    Arguments:
+        playback: an open stream.
+        camera: id of a camera, the name of a path, or a file that holds one; None: the first test camera.
+        number: of pictures.
+    """
     meta = playback.meta
     if camera in PATHS:
         return camera_path(camera, meta.train if len(meta.train) else meta.test, number)

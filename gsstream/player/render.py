@@ -93,6 +93,13 @@ def render(
 ) -> FloatArray:  # fmt: skip
     """Render one camera of a rig: [H, W, 3] float32, not clamped above 1.
 
+    Arguments:
+        gaussians: N rows, raw values, numpy.
+        cameras: the rig.
+        view: index of one of them.
+        background: colour behind everything, 0 to 1.
+        renderer: that draws; None: the fastest that loads.
+
     Raises ShapeError when the renderer returns another shape or a value that is not finite.
     """
     chosen = find_renderer() if renderer is None else renderer

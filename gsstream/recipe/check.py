@@ -82,6 +82,9 @@ def validate(
     """Validate ``values`` laid over the model's defaults; on failure append one line per problem and return None.
 
     Arguments:
+        model: pydantic model of the section.
+        values: key -> value, nested.
+        problems: that one line is appended to per problem.
         origin: full path -> where it was written.
         prefix: full path of ``values`` in the recipe, e.g. ("gate", "params").
     """

@@ -83,6 +83,7 @@ class RenderSession(ABC):
         """Render camera ``view``, differentiably.
 
         Arguments:
+            view: index of a camera of the rig.
             rows: the A active rows, raw parameters; all N of a session that was not narrowed.
             probe: [A, 2] zeros that require grad; its gradient is the gradient of the 2-D means in pixels.
             tile_mask: [ceil(H / 16), ceil(W / 16)] bool; None renders everything. Inside, image and alpha are those
@@ -163,10 +164,8 @@ class Renderer(Part):
         """Render one camera of the rig; differentiable in every attribute.
 
         Arguments:
-            gaussians: N rows, raw values.
-            cameras: the rig.
-            view: index of one of its cameras.
-            background: colour behind everything, 0 to 1.
+            gaussians: N rows, raw values. cameras: the rig.
+            view: index of one of its cameras. background: colour behind everything, 0 to 1.
         """
 
     def screen_gradient(
@@ -178,10 +177,8 @@ class Renderer(Part):
         asks its renderer.
 
         Arguments:
-            gaussians: N rows, raw values.
-            cameras: the rig.
-            view: index of one of its cameras.
-            image_gradient: [H, W, 3].
+            gaussians: N rows, raw values. cameras: the rig.
+            view: index of one of its cameras. image_gradient: [H, W, 3].
 
         Raises:
             NotImplementedError: neither the renderer nor its session knows the gradient of the 2-D means.
@@ -204,10 +201,8 @@ class Renderer(Part):
         """Open a session in which only the rows ``active`` [A] (None: all) change. Renderers may cache the rest.
 
         Arguments:
-            gaussians: N rows, raw values.
-            active: [A] rows that change, ascending; None: all.
-            cameras: the rig.
-            background: colour behind everything, 0 to 1.
+            gaussians: N rows, raw values. active: [A] rows that change, ascending; None: all.
+            cameras: the rig. background: colour behind everything, 0 to 1.
         """
         return ScatterSession(self, gaussians, active, cameras, background)
 
@@ -274,10 +269,8 @@ def drawn_rows(
     is clamped at 0 has no derivative.
 
     Arguments:
-        render: draws a whole scene; differentiable by its colours.
-        gaussians: the scene, N rows.
-        size: (H, W) of the image, pixels.
-        tiles: [ceil(H / 16), ceil(W / 16)] bool.
+        render: draws a whole scene; differentiable by its colours. gaussians: the scene, N rows.
+        size: (H, W) of the image, pixels. tiles: [ceil(H / 16), ceil(W / 16)] bool.
 
     Returns:
         [N] bool.

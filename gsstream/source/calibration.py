@@ -41,6 +41,7 @@ def read_calibration(folder: Path, *, growing: bool = False, to_size: bool = Fal
     """Read and check ``folder/cameras.json``.
 
     Arguments:
+        folder: of the recording.
         growing: the number of frames may be left out.
         to_size: cameras of several sizes are given as they are once cut to the smallest width and height, where
             pictures are about to be brought to that size; else they are an error.
@@ -120,6 +121,7 @@ def cut_to(K: np.ndarray[Any, Any], size: tuple[int, int], target: tuple[int, in
     """Return intrinsics [3, 3] of pictures shrunk evenly until they cover ``target``, and cut around their middle.
 
     Arguments:
+        K: [3, 3] before, pixels, corner origin.
         size, target: (width, height) before and after. Sides whose shares agree within a pixel are shrunk each by its
             own share, so that rounded heights cut nothing.
     """

@@ -22,9 +22,13 @@ _READABLE = "8-bit JPEG or PNG, or 16-bit PNG, without transparency"
 def read_image(
     path: Path, size: tuple[int, int], target: tuple[int, int], declared: str = "cameras.json declares"
 ) -> FloatArray:
-    """Decode an image of ``size`` (width, height) and average it down to ``target`` (width, height).
+    """Decode an image and average it down.
 
-    ``declared``: who says so, for the message.
+    Arguments:
+        path: of the file.
+        size: (width, height) that it must have.
+        target: (width, height) of the result.
+        declared: who says the size, for the message.
 
     Returns [h, w, 3] float32 in [0, 1]; grey images are repeated over the three channels.
     Raises SourceError naming the file when it is missing, damaged, of another size, or of an unsupported kind.

@@ -43,6 +43,8 @@ def transformed(source: FrameSource, options: DataOptions, seed: int) -> FrameSo
     """Return ``source`` as ``options`` want it; the very same object when they change nothing.
 
     Arguments:
+        source: an open recording.
+        options: section ``data`` of the recipe.
         seed: seed of the run; equal seeds give equal gains, noise and losses.
 
     Raises SourceError when an option names a camera that does not exist or leaves nothing to train on.

@@ -59,6 +59,10 @@ def _known(key: str, name: str, ids: Sequence[str], taken: Sequence[str] | dict[
 def choose_split(options: DataOptions, train: Cameras, test: Cameras) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return (training ids, test ids) as ``test_cameras``, ``train_cameras``, ``train_views``, ``leak`` ask for.
 
+    Arguments:
+        options: section ``data`` of the recipe.
+        train, test: ids of the recording's own split.
+
     Raises SourceError for unknown or repeated ids, a camera on both sides, or no training camera left.
     """
     ids = (*train.ids, *test.ids)
@@ -100,7 +104,13 @@ def _far_apart(names: tuple[str, ...], count: int, train: Cameras, test: Cameras
 
 
 def gain_at(options: DataOptions, index: int, rng: Rng) -> float:
-    """Return the factor on all images of frame ``index``, in gain * [1 - amplitude, 1 + amplitude]."""
+    """Return the factor on all images of frame ``index``, in gain * [1 - amplitude, 1 + amplitude].
+
+    Arguments:
+        options: section ``data`` of the recipe.
+        index: of the frame.
+        rng: random streams by name and frame.
+    """
     if options.gain_pattern == "sine":
         wave = math.sin(2 * math.pi * index / options.gain_period)
     else:
@@ -117,14 +127,30 @@ def with_gain(image: FloatArray, factor: float) -> FloatArray:
 
 
 def with_noise(image: FloatArray, sigma: float, camera: str, index: int, rng: Rng) -> FloatArray:
-    """Return the image with Gaussian noise of ``sigma`` 8-bit levels, clipped to [0, 1] (paper, first-frame noise)."""
+    """Return the image with Gaussian noise of ``sigma`` 8-bit levels, clipped to [0, 1] (paper, first-frame noise).
+
+    Arguments:
+        image: [H, W, 3] in [0, 1].
+        sigma: 8-bit levels.
+        camera: id.
+        index: of the frame.
+        rng: random streams by name and frame.
+    """
     noise = rng.numpy(f"data noise {camera}", index).standard_normal(image.shape, np.float32)
     out: FloatArray = np.clip(image + noise * np.float32(sigma / 255), 0, 1)
     return out
 
 
 def is_lost(options: DataOptions, losses: dict[str, list[range]], camera: str, index: int, rng: Rng) -> bool:
-    """Say whether a training camera gives nothing at a frame; never at frame 0."""
+    """Say whether a training camera gives nothing at a frame; never at frame 0.
+
+    Arguments:
+        options: section ``data`` of the recipe.
+        losses: camera -> frames in which it gives nothing.
+        camera: id.
+        index: of the frame.
+        rng: random streams by name and frame.
+    """
     if index == 0:
         return False
     if any(index in frames for frames in losses.get(camera, ())):

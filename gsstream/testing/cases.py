@@ -117,7 +117,13 @@ def rig(views: int = 3) -> Cameras:
 
 
 def scene(means: torch.Tensor, seed: int = 0, scales: torch.Tensor | None = None) -> Scene:
-    """Return small, fairly opaque blobs of random colours at ``means`` [N, 3]."""
+    """Return small, fairly opaque blobs of random colours at ``means`` [N, 3].
+
+    Arguments:
+        means: [N, 3].
+        seed: of colours and shapes.
+        scales: standard deviation, scene units.
+    """
     n = len(means)
     g = torch.Generator().manual_seed(seed)
     return Gaussians(
@@ -148,7 +154,14 @@ def forest(n: int) -> Hierarchy:
 
 
 def make_world(name: str, before: Scene, cameras: Cameras, *, shift: float = 0.0) -> World:
-    """Return a world whose Gaussians with x > 0.3 and in view move by ``shift`` between the frames."""
+    """Return a world whose Gaussians with x > 0.3 and in view move by ``shift`` between the frames.
+
+    Arguments:
+        name: of the world.
+        before: its Gaussians in the frame before.
+        cameras: that see it.
+        shift: [3] scene units.
+    """
     n = len(before)
     moved = (before.means[:, 0] > 0.3) & (before.means[:, 1].abs() < 5) & (shift != 0)
     means = before.means.clone()

@@ -14,6 +14,12 @@ def equal(what: str, got: torch.Tensor, expected: torch.Tensor, tolerance: float
     """Raise AssertionError unless shape and dtype agree and no value is farther off than ``tolerance``.
 
     ``tolerance`` is absolute up to a magnitude of 1 and relative above.
+
+    Arguments:
+        what: is compared, for the message.
+        got, expected: tensors.
+        tolerance: absolute up to a magnitude of 1, relative above.
+        why: the tolerance is what it is.
     """
     assert got.shape == expected.shape, f"{what}: expected shape {list(expected.shape)}, got {list(got.shape)}"
     assert got.dtype == expected.dtype, f"{what}: expected {expected.dtype}, got {got.dtype}"
@@ -34,14 +40,29 @@ def all_equal(
     what: str, got: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor], tolerance: float = 0.0,
     why: str = EXACT,
 ) -> None:  # fmt: skip
-    """Apply :func:`equal` to every named tensor; the names must agree too."""
+    """Apply :func:`equal` to every named tensor; the names must agree too.
+
+    Arguments:
+        what: is compared, for the message.
+        got, expected: name -> tensor.
+        tolerance: as for :func:`equal`.
+        why: the tolerance is what it is.
+    """
     assert set(got) == set(expected), f"{what}: expected the outputs {sorted(expected)}, got {sorted(got)}"
     for name, value in expected.items():
         equal(f"{what}: {name}", got[name], value, tolerance, why)
 
 
 def at_most(what: str, got: torch.Tensor, bound: torch.Tensor | float, tolerance: float, why: str) -> None:
-    """Raise AssertionError unless every value is <= ``bound`` + ``tolerance``; NaN never is."""
+    """Raise AssertionError unless every value is <= ``bound`` + ``tolerance``; NaN never is.
+
+    Arguments:
+        what: is compared, for the message.
+        got: a tensor.
+        bound: that it must not exceed.
+        tolerance: added to the bound.
+        why: the bound holds.
+    """
     if got.numel() == 0:
         return
     limit = torch.as_tensor(bound, dtype=torch.float64).expand(got.shape)

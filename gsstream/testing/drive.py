@@ -50,7 +50,13 @@ def outputs(part: Part, world: World) -> Outputs:
 
 
 def draw(part: GateSampler, number: int, seed: int = 7) -> torch.Tensor | None:
-    """Draw noise from a fresh generator."""
+    """Draw noise from a fresh generator.
+
+    Arguments:
+        part: a gate.
+        number: of nodes.
+        seed: of the generator.
+    """
     return part.noise(number, torch.Generator().manual_seed(seed))
 
 

@@ -43,6 +43,7 @@ def run_check(entry: Check, subject: Any, expected: str | None = None) -> CheckR
     """Make one check; whatever the part raises is a failure with its name.
 
     Arguments:
+        entry: the check.
         subject: a part, or what stands for one (a source on a recording, a method, a packet codec).
         expected: why the check must fail; None: it must pass.
     """
@@ -92,7 +93,13 @@ def run_checks(part: Part | SourceUnderTest, expected_failures: Mapping[str, str
 
 
 def skip_checks(kind: str, name: str, reason: str) -> list[CheckResult]:
-    """Return what :func:`run_checks` says of a part that cannot be made here: every check of its kind is skipped."""
+    """Return what :func:`run_checks` says of a part that cannot be made here: every check of its kind is skipped.
+
+    Arguments:
+        kind: of the part.
+        name: of the part.
+        reason: why it cannot be made here.
+    """
     return [CheckResult(entry.name, name, "skipped", reason) for entry in checks_for(kind)]
 
 
@@ -110,7 +117,13 @@ def run_packet_checks(codec: PacketCodec | None = None) -> list[CheckResult]:
 
 
 def run_subject(kind: str, subject: Any, expected: Mapping[str, str] | None = None) -> list[CheckResult]:
-    """Make every check of a kind on something that is no part of a recipe."""
+    """Make every check of a kind on something that is no part of a recipe.
+
+    Arguments:
+        kind: of the checks.
+        subject: a method, a packet codec, a source.
+        expected: check -> why it must fail.
+    """
     given = dict(expected or {})
     entries = checks_for(kind)
     _check_reasons(given, [entry.name for entry in entries])

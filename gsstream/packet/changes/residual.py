@@ -72,7 +72,13 @@ def encode_residual(
 def decode_residual(
     sections: Mapping[str, Section], layout: Layout, previous_decoders: Mapping[str, FloatArray]
 ) -> Residual | None:
-    """Return the residual that the sections of a delta packet hold, if they hold one. Raises PacketError."""
+    """Return the residual that the sections of a delta packet hold, if they hold one. Raises PacketError.
+
+    Arguments:
+        sections: name -> section of the packet.
+        layout: nodes and units before the frame.
+        previous_decoders: the decoders last sent since the last key packet.
+    """
     if "gates" not in sections:
         strange = [name for name in ("decoders", *ATTRIBUTES) if name in sections]
         if strange:

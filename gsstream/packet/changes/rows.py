@@ -109,6 +109,12 @@ def encode_births(births: Births, num_nodes: int) -> bytes:
 def decode_births(section: Section, num_nodes: int, num_units: int, most: int) -> Births:
     """Decode births into a scene of M nodes and H units that may grow by ``most`` Gaussians.
 
+    Arguments:
+        section: of the packet.
+        num_nodes: M.
+        num_units: H.
+        most: Gaussians that may be added.
+
     Raises PacketError (without offset where it is that of the section).
     """
     blobs = unpack_blobs(section.data, HEAD_PARTS + len(ATTRIBUTES))

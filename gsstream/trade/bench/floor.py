@@ -64,7 +64,13 @@ class Footprints:
 
 
 def footprints(gaussians: Gaussians[FloatArray], cameras: Cameras, view: int = 0) -> Footprints:
-    """Project a scene with the reference renderer's formulas."""
+    """Project a scene with the reference renderer's formulas.
+
+    Arguments:
+        gaussians: N rows, raw values.
+        cameras: the rig.
+        view: index of one of them.
+    """
     with torch.no_grad():
         means2d, conics, _, depths, opacities = project(gaussians.map(torch.from_numpy), cameras, view)
         variances = torch.linalg.inv(conics).diagonal(dim1=1, dim2=2)
@@ -105,7 +111,12 @@ def live_pairs(scene: Footprints) -> IntArray:
 
 
 def central_tiles(width: int, height: int, share: float) -> BoolArray:
-    """Return [tile rows, tile columns] bool: the share of tiles nearest to the image's centre, at least one."""
+    """Return [tile rows, tile columns] bool: the share of tiles nearest to the image's centre, at least one.
+
+    Arguments:
+        width, height: pixels.
+        share: of the tiles, 0 to 1.
+    """
     rows, columns = -(-height // TILE), -(-width // TILE)
     y, x = np.mgrid[:rows, :columns] + 0.5
     distance = np.hypot(x - columns / 2, y - rows / 2).ravel()
@@ -115,7 +126,12 @@ def central_tiles(width: int, height: int, share: float) -> BoolArray:
 
 
 def pixels_of(mask: BoolArray, width: int, height: int) -> BoolArray:
-    """Return a tile mask as a pixel mask [H, W]."""
+    """Return a tile mask as a pixel mask [H, W].
+
+    Arguments:
+        mask: [tile rows, tile columns] bool.
+        width, height: pixels.
+    """
     return mask.repeat(TILE, 0).repeat(TILE, 1)[:height, :width]
 
 
@@ -123,6 +139,7 @@ def floor_ms(peak: Peak, *, pairs: int, visible: int, rows: int, pixels: int, fl
     """Return the milliseconds that forward and backward take at least.
 
     Arguments:
+        peak: what the machine can do.
         pairs: live pixel pairs. visible: Gaussians that are drawn. rows: Gaussians given and differentiated.
         pixels: pixels drawn. floats: parameters of a Gaussian.
     """

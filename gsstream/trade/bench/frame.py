@@ -59,11 +59,9 @@ class FramePlan:
     """What is measured.
 
     Arguments:
-        recipe: what :func:`variants` are made of.
-        shares: of tiles that change, [0, 1], at ``static[0]`` Gaussians.
+        recipe: what :func:`variants` are made of. shares: of tiles that change, [0, 1], at ``static[0]`` Gaussians.
         static: Gaussians of the part that stands still; at every size the object alone moves in one case.
-        moving: Gaussians of the object.
-        shift: how far everything moving moves, in pixels.
+        moving: Gaussians of the object. shift: how far everything moving moves, in pixels.
     """
 
     recipe: Recipe
@@ -139,10 +137,7 @@ def bench_frame(plan: FramePlan, catalog: Catalog, progress: Progress) -> dict[s
 
 
 def variants(recipe: Recipe) -> dict[str, Recipe]:
-    """Return the three variants of a recipe: dense, gated and active.
-
-    dense: every gate open, everything takes part; gated: the recipe's gates; active: and only what changed.
-    """
+    """Return the variants dense (every gate open), gated (the recipe's gates) and active (and only what changed)."""
     threshold = recipe.stream.change_threshold or CHANGE_THRESHOLD
     active = recipe.model_copy(update={"stream": recipe.stream.model_copy(update={"change_threshold": threshold})})
     gated = recipe.model_copy(update={"stream": recipe.stream.model_copy(update={"change_threshold": 0.0})})

@@ -83,6 +83,9 @@ def make_executor(work: Work, workers: int | None, threads: int, ray: str | None
     """Return processes on this machine, or tasks on the Ray cluster at ``ray``.
 
     Arguments:
+        work: what a worker does.
+        threads: of each worker.
+        ray: address of a cluster; None: this machine.
         workers: jobs at a time; None: as many as the processors allow.
 
     Raises what :class:`gsstream.trade.jobs.ray_executor.RayExecutor` raises.

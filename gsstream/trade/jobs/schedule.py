@@ -35,6 +35,7 @@ def finished_tasks(
     """Run tasks and yield each once it is over, in the order in which they end.
 
     Arguments:
+        executor: that runs them.
         tasks: those to run; of those that could start, the first does.
         have: ids of tasks whose result is there. The caller adds to it, before it asks for the next task, the id of a
             finished one that others may go on from.

@@ -131,6 +131,10 @@ def evaluate(
     evaluated frames; "moving" is relative to the first evaluated frame, which is also the one held.
 
     Arguments:
+        stream: file to read.
+        source: an open recording.
+        split: "test" or "train".
+        renderer: that draws.
         frames: frame indices; default all of the stream.
         lpips, extras: measured besides the rest; default: not measured.
         progress: called with (done, total) after every frame.

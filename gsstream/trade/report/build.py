@@ -167,6 +167,12 @@ def _ratio(value: float) -> str:
 def write_sheets(folder: Path, data: SweepData, scenes: Sequence[str], recordings: Path | None) -> dict[str, Picture]:
     """Write a contact sheet of the first variant of each scene.
 
+    Arguments:
+        folder: of the sweep.
+        data: the sweep's table.
+        scenes: names.
+        recordings: folder in which relative recordings lie.
+
     Raises InputError when a recording cannot be found.
     """
     import tempfile

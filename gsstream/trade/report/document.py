@@ -59,7 +59,13 @@ img { max-width: 100%; height: auto; margin: 0.6em 0 }
 
 
 def write_report(title: str, blocks: Sequence[Block], out: Path) -> list[Path]:
-    """Write ``report.html`` (self-contained), ``report.md`` and the images it names. Raises OutputError."""
+    """Write ``report.html`` (self-contained), ``report.md`` and the images it names. Raises OutputError.
+
+    Arguments:
+        title: of the report.
+        blocks: in reading order.
+        out: folder to write.
+    """
     try:
         out.mkdir(parents=True, exist_ok=True)
         written = [out / "report.html", out / "report.md"]

@@ -55,6 +55,9 @@ def beside_ours(
     Moving pixels and processor seconds of our run stand behind them.
 
     Arguments:
+        table: of the paper.
+        groups: of the sweep.
+        scene: its name.
         variants: row -> our variant; by default the one of that name.
     """
     ours = {group.variant: group for group in groups if not group.axes}

@@ -17,6 +17,7 @@ def leap_recipe(resolved: ResolvedRecipe, epochs: int, method: StreamingMethod[A
     """Return a method's own recipe with the epochs of a leap.
 
     Arguments:
+        resolved: recipe of the run.
         epochs: passes over the training cameras.
         method: one that does not read epochs keeps its recipe.
     """

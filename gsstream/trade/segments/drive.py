@@ -52,6 +52,13 @@ def run_segments(
 ) -> SegmentsResult:
     """Make every task that ``out`` does not hold whole, then join the segments into ``out/stream.gss``.
 
+    Arguments:
+        plan: tasks, and what each waits for.
+        setting: what all tasks share.
+        out: folder of the run.
+        executor: that runs the tasks.
+        say: called with lines for a person.
+
     Raises GsstreamError when a segment fails; what is finished stays, and the same call goes on. KeyboardInterrupt
     passes through; no worker is left.
     """

@@ -61,6 +61,8 @@ def make_plan(frames: int, segments: int, start: Start, *, first_given: bool) ->
     """Cut ``frames`` frames into ``segments`` of nearly equal length.
 
     Arguments:
+        frames: of the recording.
+        segments: how many.
         start: "warm": the scene of a segment's first frame is that of the segment before, carried over in one step;
             "open": so, too (the two differ in the recipe of that step, ``carry``); "anew": it is reconstructed.
         first_given: frame 0 is taken over from another stream.
@@ -91,6 +93,11 @@ def make_plan(frames: int, segments: int, start: Start, *, first_given: bool) ->
 
 def write_plan(out: Path, facts: Mapping[str, Any], *, resume: bool) -> None:
     """Leave in ``out`` what is being made there; to go on, it must be the same.
+
+    Arguments:
+        out: folder of the run.
+        facts: that must be the same to go on.
+        resume: go on with what is there.
 
     Raises OutputError when it is not.
     """

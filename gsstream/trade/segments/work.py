@@ -45,6 +45,10 @@ def make_work(
     """Cut the recording into segments and settle the recipes of segments and leaps.
 
     Arguments:
+        wanted: segments and how they start.
+        resolved: recipe of the run.
+        assembly: its live parts.
+        recording: that is encoded.
         first: the stream that the first frame of the recording is taken from; None: it is reconstructed.
 
     Raises InputError for a recording whose end nobody knows, and where there are no gates to open.
@@ -78,6 +82,13 @@ def _carrying(resolved: ResolvedRecipe, assembly: Assembly, wanted: Wanted) -> R
 
 def prepare_folder(out: Path, facts: dict[str, Any], first: bytes | None, *, resume: bool, overwrite: bool) -> None:
     """Make sure that ``out`` holds nothing else, or exactly this run; overwriting removes what such a run writes.
+
+    Arguments:
+        out: folder of the run.
+        facts: that must be the same to go on.
+        first: bytes of the stream that frame 0 is taken from, or None.
+        resume: go on with what is there.
+        overwrite: remove what such a run writes.
 
     Raises OutputError when the folder holds something else, or a run begun with other facts.
     """

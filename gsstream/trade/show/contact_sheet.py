@@ -68,6 +68,11 @@ def sheet_of_stream(
     """Render a contact sheet of a stream's frames against its recording and save it as PNG.
 
     Arguments:
+        stream: file to read.
+        source: an open recording.
+        frames: to show.
+        out: picture to write.
+        renderer: that draws.
         camera: id of a test or train camera; default the first test camera.
 
     Raises InputError for an unknown camera or frame.

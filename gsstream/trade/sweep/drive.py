@@ -39,6 +39,8 @@ def run_sweep(
     """Make every cell of a plan that the table in ``out`` does not hold yet.
 
     Arguments:
+        plan: cells and shared frames 0.
+        executor: that runs them.
         out: folder of the table (``table.jsonl``), the streams (``cells/ID.gss``) and the shared frames 0.
         data: folder in which relative recordings are looked up.
         say: told one line at a time.

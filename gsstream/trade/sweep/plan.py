@@ -91,6 +91,7 @@ def make_plan(config: SweepConfig, folder: Path, find_method: FindMethod) -> Pla
     """Resolve every cell of a sweep.
 
     Arguments:
+        config: the sweep's file.
         folder: where the sweep's file lies; recipe files and bases of variants are relative to it.
         find_method: name -> recipe file (``Catalog.recipe_path``).
 

@@ -1,4 +1,4 @@
-"""The front door: every name a plugin or a script may import.
+"""The front door for plugins: records and contracts. Scripts import ``gsstream.encode`` and ``gsstream.play``.
 
 Importing this module imports torch (the parts are torch code); ``gsstream.spec`` does not.
 """

@@ -101,7 +101,7 @@ SOMETIMES: Mapping[str, Draw] = MappingProxyType({
     "gate_training.lr": _of(0.0, 0.01, 1.0, 10.0), "codec.key_every": _of(0, 1, 2, 3), "codec.fsync": _of(True),
     "data.leak": _of("none", "points", "training"), "data.images": _of("float16", "uint8"),
 })  # fmt: skip
-#: Drawn with the others where the six parts are the method.
+#: Drawn with the others where the method is made of parts.
 OF_PARTS: Mapping[str, Draw] = MappingProxyType({
     "codec.trim": _of(0.0, 0.3, 0.9, 0.999), "budget.size": _of(16, 200, 1500, 20_000), "budget.time": _logs(1e-3, 2),
     "budget.clock": _of("processor", "wall"), "first_frame.sh_degree": _of("auto"),

@@ -87,7 +87,7 @@ METHODS = [
 
 @hookimpl
 def gsstream_components() -> list[ComponentSpec]:
-    """The six parts of S2GS, and variants to ablate and to extend it."""
+    """Declare the parts of S2GS, and variants to ablate and to extend it."""
     return list(COMPONENTS)
 
 

@@ -327,4 +327,4 @@ def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str], whole: tup
     assert "segments" in err
     assert "already holds a run in segments" in refused(*world, "--segments", "2", "--out", str(out))
     err = refused(*world, "--segments", "2", "--out", str(tmp_path / "b"), "--method", "hold", "--start", "open")
-    assert "--start open: expected a method made of parts, got the whole method 'hold'" in err
+    assert "--start open: expected a method made of parts, got the stepper 'hold'" in err

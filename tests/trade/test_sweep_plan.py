@@ -63,12 +63,12 @@ def test_settings_win_in_the_documented_order(plan_of, tmp_path):
     (tmp_path / "s.yaml").write_text("near: 0.3\nloss: {dssim: 0.3}\nfirst_frame: {exposure: true}\n")
     text = (
         "name: o\nscenes: [{name: a, uri: demo, recipe: s.yaml, set: {loss.dssim: 0.4, gate_training.lr: 0.4}}]\n"
-        "set: {loss.dssim: 0.35, gate_training.lr: 0.35, gate_training.warmup: 0.35}\n"
-        "variants: [{name: v, recipe: v.yaml, set: {gate_training.lr: 0.5}}]\naxes: {gate_training.warmup: [0.6]}\n"
+        "set: {loss.dssim: 0.35, gate_training.lr: 0.35, stream.change_votes: 0.35}\n"
+        "variants: [{name: v, recipe: v.yaml, set: {gate_training.lr: 0.5}}]\naxes: {stream.change_votes: [0.6]}\n"
     )
     recipe = plan_of(text).points[0].resolved.recipe
     assert (recipe.stream.epochs, recipe.near, recipe.loss.dssim) == (2, 0.3, 0.4)
-    assert (recipe.gate_training.lr, recipe.gate_training.warmup) == (0.5, 0.6)
+    assert (recipe.gate_training.lr, recipe.stream.change_votes) == (0.5, 0.6)
     assert (recipe.seed, recipe.first_frame.exposure) == (0, True)
     origins = plan_of(text).points[0].resolved
     assert origins.origin(("gate_training", "lr")).label == "sweep, variant v: set"

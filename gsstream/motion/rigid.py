@@ -22,7 +22,8 @@ BETAS, EPSILON = (0.9, 0.99), 1e-12
 
 
 class Units(NamedTuple):
-    """What counts as one: ``shift`` [scene units] is a pixel, ``turn`` [tan(angle / 2)] moves a group's edge as far."""
+    """The sizes of one unit: ``shift`` [scene units] is a pixel, ``turn`` [tan(angle / 2)] moves a group's edge as far.
+    """
 
     shift: float
     turn: float

@@ -42,7 +42,7 @@ class PlayerState:
 
     @property
     def layout(self) -> Layout:
-        """How they are stored."""
+        """How the rows of this frame are stored."""
         return self.scene.layout
 
 

@@ -21,7 +21,7 @@ Columns = Mapping[str, slice]
 
 @dataclass(frozen=True)
 class JointCode:
-    """Where everything stands.
+    """The places of each attribute's latents and features in the tables that hold all attributes side by side.
 
     Arguments:
         latent, feature: attribute -> its columns of the latents [A, L] and of the features [A, D].

@@ -62,7 +62,7 @@ class FrameSource(Protocol):
 
 @runtime_checkable
 class SingleImages(Protocol):
-    """What a source may offer besides: one camera's image without decoding the others'."""
+    """A source that can also give one camera's image without decoding the others'."""
 
     def image(self, index: int, camera: str) -> FloatArray:
         """Return [H, W, 3] float32 in [0, 1] of one camera, of either split; the same bits as in ``frame``."""
@@ -70,7 +70,7 @@ class SingleImages(Protocol):
 
 @runtime_checkable
 class AttributedPoints(Protocol):
-    """What a source may offer besides: points by the cameras that took part in them."""
+    """A source that can also give points by the cameras that took part in them."""
 
     def points_without(self, cameras: Sequence[str], kind: PointKind = "recording") -> PointCloud | None:
         """Return the points in which none of these cameras took part; None when none are left."""

@@ -33,7 +33,7 @@ LEAST_CAMERAS = 4
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What one choice came to in short frames 0.
+    """The result of one choice in short fits of frame 0.
 
     Arguments:
         folds: PSNR of the cameras that each fold left out, after the best affine colour map (they have none of their

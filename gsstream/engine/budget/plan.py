@@ -38,7 +38,7 @@ MOST_THRESHOLD, FIRST_THRESHOLD = 4.0, 3.0
 
 @dataclass(frozen=True, slots=True)
 class Past:
-    """What one frame cost that was optimised.
+    """The cost of one earlier frame that was optimised.
 
     Arguments:
         epochs: passes made. candidates: Gaussians that took part.
@@ -78,7 +78,7 @@ def past_of(metrics: Mapping[str, Any]) -> Past | None:
 
 @dataclass(frozen=True, slots=True)
 class FramePlan:
-    """What a frame is to be made with.
+    """The settings with which the next frame is made, and what it is expected to cost.
 
     Arguments:
         epochs: passes over the cameras; with a time budget a prediction, corrected after every pass.

@@ -36,7 +36,7 @@ Seeds = Callable[[Frame], PointCloud]
 
 @dataclass(frozen=True)
 class Listeners:
-    """What is told of an encoder's work.
+    """Functions that an encoder calls while it works.
 
     Arguments:
         packet: every packet, as soon as it is made; what it does counts as part of the frame.

@@ -17,7 +17,7 @@ from gsstream.render.base import RenderSession
 
 @dataclass(frozen=True)
 class Problem:
-    """What one frame's optimisation is given.
+    """The input of one frame's optimisation.
 
     Arguments:
         frame: index of the frame.
@@ -55,7 +55,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Solution:
-    """What the optimisation found.
+    """The result of one frame's optimisation.
 
     Arguments:
         rows: [A] int64 rows that stayed to the end, ascending; what other rows had is given up.

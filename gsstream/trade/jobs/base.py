@@ -26,7 +26,7 @@ class Executor(Protocol):
 
     @property
     def slots(self) -> int:
-        """How many jobs it is worth handing over at once."""
+        """Number of jobs that are handed over at once."""
 
     def submit(self, job: Any) -> None:
         """Start a job, or queue it."""

@@ -23,7 +23,7 @@ KEY_STREAMS = "first.gss"
 
 @dataclass(frozen=True, slots=True)
 class SegmentsResult:
-    """How it ended: the joined stream and metrics in the output folder, tasks made and kept, and the seams."""
+    """The joined stream and metrics in the output folder, the tasks made and kept, and the seams."""
 
     frames: int
     made: int

@@ -148,11 +148,11 @@ class _Run:
         planned = self.encoder.controller.budget.limits_frames
         # A kill between a packet and its line leaves a frame that no table would count, and that a budget would plan
         # without: such frames are encoded again, to the same bytes. A run without any line goes on from its packets.
-        wanted = last_written(log) if planned or log.exists() else None
+        wanted = last_written(log, self.start) if planned or log.exists() else None
         last = self.encoder.resume(stream, lambda index: self.source.frame(index, "train"), wanted)
         self.encoder.controller.remember(trim_metrics(log, -1 if last is None else last))
-        if last is None and planned:
-            stream.unlink()
+        if last is None and wanted is not None:
+            stream.unlink()  # it may hold sound packets of frames that are made again
         return last
 
     def _remember(self, done: int) -> None:

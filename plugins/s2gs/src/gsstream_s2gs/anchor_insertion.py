@@ -85,11 +85,14 @@ class AnchorInsertion(Growth):
         return Rows(place(born.map(lambda value: value.numpy()), after.gaussians.means, after.layout))
 
     def _lacking(self, scene: Gaussians[torch.Tensor], work: FrameWork, view: int) -> IntArray:
-        """[H, W] bool: pixels that changed since the last frame and that the scene does not show."""
+        """Return [H, W] bool: pixels that changed since the last frame and that the scene does not show.
+
+        Only tiles that changed count: elsewhere a difference is noise, however small ``error`` is.
+        """
         now = work.image(view)
         wrong = (work.shown(scene, view) - now).abs().amax(-1) > self.config.error
         changed = (work.previous_image(view) - now).abs().amax(-1) > self.config.error
-        marked: IntArray = (wrong & changed).numpy()
+        marked: IntArray = (wrong & changed & work.changed_pixels(view)).numpy()
         return marked
 
     def _fitted(

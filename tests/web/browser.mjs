@@ -26,6 +26,8 @@ export class Browser {
     browser.profile = mkdtempSync(join(tmpdir(), "chromium-"));
     browser.child = spawn(path, [...FLAGS, ...flags, `--user-data-dir=${browser.profile}`, "about:blank"], {
       stdio: ["ignore", "ignore", "ignore", "pipe", "pipe"],
+      // A process group of its own, so that `stop` can end its children with it.
+      detached: true,
     });
     browser.last = 0;
     browser.waiting = new Map();
@@ -107,10 +109,28 @@ export class Browser {
 
   async stop() {
     const ended = new Promise((resolve) => this.child.on("exit", resolve));
-    // A polite end takes seconds, and nothing of the profile is kept.
-    this.child.kill("SIGKILL");
+    // A polite end takes seconds, and nothing of the profile is kept. The whole group is killed, because the browser's
+    // own children outlive it and write to the profile.
+    process.kill(-this.child.pid, "SIGKILL");
     await ended;
-    rmSync(this.profile, { recursive: true, force: true, maxRetries: 5 });
+    await removed(this.profile);
+  }
+}
+
+/**
+ * Remove a folder to which dying processes may still write.
+ *
+ * `maxRetries` of rmSync does not do this: it tries the removal of a folder again without emptying it again.
+ */
+export async function removed(folder, seconds = 10) {
+  const end = Date.now() + 1000 * seconds;
+  for (;;) {
+    try {
+      return rmSync(folder, { recursive: true, force: true });
+    } catch (error) {
+      if (error.code !== "ENOTEMPTY" || Date.now() > end) throw error;
+      await new Promise((resolve) => setTimeout(resolve, 50));
+    }
   }
 }
 

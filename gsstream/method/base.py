@@ -88,11 +88,6 @@ class StreamingMethod(Part, Generic[State]):
         ``effort`` is 0 is skipped: an empty packet, so that numbering and time go on; also one that failed, where the
         recipe says ``stream.on_error: repeat``.
 
-        ``state.player`` of the result must be ``decoder()(before.player, packet.data)``, bit for bit: the method goes
-        on from what it sent, not from what it trained. The engine decodes every packet and compares. A frame whose
-        ``effort`` is 0 is skipped: an empty packet, so that numbering and time go on; also one that failed, where the
-        recipe says ``stream.on_error: repeat``.
-
         Arguments:
             state: what this method returned for the frame before.
             frame: training images of this frame.

@@ -46,8 +46,6 @@ def send_delta(player: PlayerState, delta: Delta) -> Sent:
 
     Decoders of the residual must come from ``quantise_decoders``. Raises ShapeError when the delta does not fit the
     scene.
-
-    ``delta.decoders`` must come from ``quantise_decoders``. Raises ShapeError when it does not fit the layout.
     """
     frame = player.frame + 1
     if delta.is_empty:

@@ -25,8 +25,6 @@ def known_groups(scene: Scene, cameras: Cameras, pixels: float, shades: int) -> 
 
     A cell that is known stays: it was measured on the scene of the last key packet, which a resumed run does not have.
 
-    A cell that is known stays: it was measured on the scene of the last key packet, which a resumed run does not have.
-
     Arguments:
         scene: decoded, as both ends have it.
         cameras: training cameras.

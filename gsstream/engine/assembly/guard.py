@@ -26,9 +26,6 @@ def blaming(slot: str, part: object, where: Where) -> Iterator[None]:
     A ShapeError is turned, too: it says that this part refuses what another part gave it. Of a renderer so is every
     InputError, because a renderer is given nothing but arrays. Other errors of gsstream pass unchanged.
 
-    So does what the part refuses of another's: a ShapeError, and of a renderer every InputError, because it is given
-    nothing but arrays. Other errors of gsstream pass unchanged.
-
     Arguments:
         slot: of the part.
         part: the part itself.

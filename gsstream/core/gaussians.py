@@ -15,6 +15,8 @@ Other = TypeVar("Other")
 
 #: Attribute names in the order used by every table, packet and optimiser group.
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
+#: Value of the spherical harmonic of degree 0: colour = 0.5 + SH0 * sh0.
+SH0 = 0.28209479177387814
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,15 +41,24 @@ def send_key(gaussians: Gaussians[FloatArray], layout: Layout, meta: StreamMeta,
     return Sent(packet, decode_packet(None, packet.data))
 
 
+def delta_packet(player: PlayerState, delta: Delta, *, frame: int) -> EncodedPacket:
+    """Return the packet of a delta, an empty one when nothing changes. Raises ShapeError as :func:`send_delta` does.
+
+    Arguments:
+        player: what players have before it.
+        delta: what the frame changes.
+        frame: its index.
+    """
+    if delta.is_empty:
+        return encode_empty(frame=frame)
+    return encode_delta(delta, player.layout, player.decoders, frame=frame)
+
+
 def send_delta(player: PlayerState, delta: Delta) -> Sent:
     """Return the packet of the frame after ``player``, an empty one when nothing changes, and the state after it.
 
     Decoders of the residual must come from ``quantise_decoders``. Raises ShapeError when the delta does not fit the
     scene.
     """
-    frame = player.frame + 1
-    if delta.is_empty:
-        packet = encode_empty(frame=frame)
-    else:
-        packet = encode_delta(delta, player.layout, player.decoders, frame=frame)
+    packet = delta_packet(player, delta, frame=player.frame + 1)
     return Sent(packet, decode_packet(player, packet.data))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsstream.core.gaussians import SH0
 from gsstream.core.shapes import FloatArray, IntArray
 
 BLUR, ALPHA_CUT, ALPHA_MAX, TRANSMITTANCE_MIN = 0.3, 1 / 255, 0.999, 1e-4
@@ -94,7 +95,7 @@ def _conics(covariance: FloatArray) -> FloatArray:
 def _colors(sh0: FloatArray, shN: FloatArray, directions: FloatArray) -> FloatArray:
     """[N, 3] view-dependent colour, clamped at 0."""
     x, y, z = (directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-10)).T
-    basis = [np.full_like(x, 0.28209479177387814)]
+    basis = [np.full_like(x, SH0)]
     if shN.shape[1] > 0:
         basis += [-_SH1 * y, _SH1 * z, -_SH1 * x]
     if shN.shape[1] > 3:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsstream.core.errors import InputError, OutputError
-from gsstream.core.gaussians import Gaussians
+from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.core.shapes import FloatArray
 from gsstream.player.playback import Playback
 from gsstream.player.software import rotation_matrices
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     import viser
 
 LOOPBACK = "127.0.0.1"
-_SH_DC = 0.28209479177387814
 
 
 class Viewer:
@@ -126,6 +125,6 @@ def splats(gaussians: Gaussians[FloatArray]) -> dict[str, Any]:
     return {
         "centers": gaussians.means,
         "covariances": axes @ axes.transpose(0, 2, 1),
-        "rgbs": np.clip(0.5 + _SH_DC * gaussians.sh0[:, 0], 0, 1),
+        "rgbs": np.clip(0.5 + SH0 * gaussians.sh0[:, 0], 0, 1),
         "opacities": 1 / (1 + np.exp(-np.clip(gaussians.opacities, -80, 80)))[:, None],
     }

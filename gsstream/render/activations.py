@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import torch
 
+from gsstream.core.gaussians import SH0
+
 
 def activate_scales(scales: torch.Tensor) -> torch.Tensor:
     """Return standard deviations, scene units, given their logarithms."""
@@ -28,8 +30,6 @@ def rotation_matrices(quats: torch.Tensor) -> torch.Tensor:
     ]  # fmt: skip
     return torch.stack(entries, -1).reshape(-1, 3, 3)
 
-
-SH0 = 0.28209479177387814
 
 
 def rgb_to_sh0(rgb: torch.Tensor) -> torch.Tensor:

@@ -13,10 +13,10 @@ from pydantic import Field
 from gsstream.core.cameras import Cameras
 from gsstream.core.context import ScreenGradient
 from gsstream.core.errors import ShapeError
-from gsstream.core.gaussians import Gaussians
+from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.core.part import PartConfig
 from gsstream.core.shapes import check_finite
-from gsstream.render.activations import SH0, activate_opacities, activate_scales, rotation_matrices
+from gsstream.render.activations import activate_opacities, activate_scales, rotation_matrices
 from gsstream.render.base import Renderer, RenderOutput, ScatterSession
 
 BLUR = 0.3

@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 
 from gsstream.core.changes.history import displacement
-from gsstream.core.changes.motion import Motion, apply_motion
+from gsstream.core.changes.motion import Motion, apply_motions
 from gsstream.core.changes.residual import Residual, apply_residual, sent_rows
 from gsstream.core.changes.rows import Births, Rows, apply_rows, gather_rows, join_rows
 from gsstream.core.changes.scene import Layout, Scene
@@ -96,10 +96,7 @@ def apply_delta(scene: Scene, delta: Delta) -> Scene:
 
     Rows that no change touches keep their bits. Raises ShapeError when the delta does not fit the scene.
     """
-    after, touched = scene, np.zeros(0, np.int64)
-    for motion in delta.motions:
-        after, rows = apply_motion(after, motion)
-        touched = np.union1d(touched, rows)
+    after, touched = apply_motions(scene, delta.motions)
     if delta.residual is not None:
         after = replace(after, gaussians=apply_residual(after.gaussians, after.layout, delta.residual))
         touched = np.union1d(touched, sent_rows(after.layout, delta.residual.gates))

@@ -7,6 +7,7 @@ where the prediction holds, and six small integers where it does not.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -14,14 +15,12 @@ import numpy as np
 
 from gsstream.core.changes.scene import Scene
 from gsstream.core.errors import ShapeError
-from gsstream.core.gaussians import Gaussians
+from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.core.shapes import FloatArray, IntArray
 
 #: Cells are counted from -HALF_GRID to HALF_GRID - 1 along each axis; what lies beyond belongs to the outermost one.
 HALF_GRID = 1 << 15
 MAX_SHADES = 16
-#: Value of the spherical harmonic of degree 0: colour = 0.5 + SH0 * sh0.
-SH0 = 0.28209479177387814
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,6 +172,18 @@ def apply_motion(scene: Scene, motion: Motion) -> tuple[Scene, IntArray]:
     turn = moves.turn + motion.symbols[:, 3:].astype(np.float64) * float(motion.turn_step)
     gaussians = transformed(scene.gaussians, moves._replace(shift=shift, turn=turn))
     return replace(scene, gaussians=gaussians, groups=groups), moves.rows
+
+
+def apply_motions(scene: Scene, motions: Sequence[Motion]) -> tuple[Scene, IntArray]:
+    """Return the scene after motions one after the other, and the rows [A], ascending, of all groups that moved.
+
+    Raises ShapeError as :func:`apply_motion` does.
+    """
+    touched = np.zeros(0, np.int64)
+    for motion in motions:
+        scene, rows = apply_motion(scene, motion)
+        touched = np.union1d(touched, rows)
+    return scene, touched
 
 
 def transformed(gaussians: Gaussians[FloatArray], moves: Moves) -> Gaussians[FloatArray]:

@@ -9,7 +9,8 @@ from gsstream.core.changes import Delta, sent_rows
 from gsstream.engine.budget.trim import Fitted, fit
 from gsstream.engine.step.harden import rows_of
 from gsstream.engine.step.problem import Problem, Solution
-from gsstream.packet import EncodedPacket, PlayerState, encode_delta, encode_empty
+from gsstream.method.packets import delta_packet
+from gsstream.packet import EncodedPacket, PlayerState
 
 
 def encode_frame(delta: Delta, before: PlayerState, problem: Problem, solution: Solution, trim: float) -> Fitted:
@@ -21,7 +22,7 @@ def encode_frame(delta: Delta, before: PlayerState, problem: Problem, solution: 
         delta: what the frame is to change. before: what players have before it.
         trim: share of the bytes to be given up where no size is asked for, 0 to 1.
     """
-    encoded = partial(encode, before=before, frame=problem.frame)
+    encoded = partial(delta_packet, before, frame=problem.frame)
     packet = encoded(delta)
     whole = Fitted(delta, packet, len(packet.data))
     budget = None if problem.allowance is None else problem.allowance.plan.max_bytes
@@ -44,16 +45,3 @@ def _share(delta: Delta, encoded: Callable[[Delta], EncodedPacket], size: int, t
     others = delta.with_residual(None)
     fixed = 0 if others.is_empty else len(encoded(others).data)
     return max(fixed + int((1 - trim) * (size - fixed)), len(encoded(Delta()).data))
-
-
-def encode(delta: Delta, before: PlayerState, frame: int) -> EncodedPacket:
-    """Return the packet of a delta; an empty one when nothing changes.
-
-    Arguments:
-        delta: what the frame changes.
-        before: what players have before it.
-        frame: its index.
-    """
-    if delta.is_empty:
-        return encode_empty(frame=frame)
-    return encode_delta(delta, before.layout, before.decoders, frame=frame)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
 import torch
 
 from gsstream.core.changes import Motion, Scene
-from gsstream.core.changes.motion import apply_motion
+from gsstream.core.changes.motion import apply_motions
 from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
@@ -46,12 +45,9 @@ def moved(parts: Assembly, state: StreamState, frame: Frame, change: Change | No
     motions = tuple(motion for motion in parts.motion.propose(scene, view, rng) if not motion.is_empty)
     if not motions:
         return Moved((), scene, view)
-    touched = np.zeros(0, np.int64)
     with blaming("motion", parts.part("motion"), parts.where):
         encode_motions(motions)  # what cannot be sent is refused before anything is learned on it
-        for motion in motions:
-            scene, rows = apply_motion(scene, motion)
-            touched = np.union1d(touched, rows)
+        scene, touched = apply_motions(scene, motions)
     gaussians = scene.gaussians.map(torch.from_numpy)
     # The session is handed on to the moved scene, with its caches of all that stands still. The old session stays
     # correct, as it must until the frame has succeeded: should it be used again, it fills its caches anew.

@@ -14,10 +14,9 @@ import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
-from gsstream.core.gaussians import Gaussians
+from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray, IntArray
-from gsstream.render.activations import SH0
 
 #: Where the object stands that the frame benchmark moves; no static point lies within OBJECT_ROOM of its centre.
 OBJECT_CENTER = (0.0, 0.0, 0.0)

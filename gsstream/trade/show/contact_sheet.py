@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from gsstream.core.changes import row_gates
 from gsstream.core.errors import InputError
-from gsstream.core.gaussians import Gaussians
+from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.core.shapes import FloatArray
 from gsstream.metrics import psnr
 from gsstream.packet import PlayerState
@@ -23,7 +23,6 @@ from gsstream.source.base import FrameSource
 
 #: Errors are shown this much larger than they are.
 ERROR_GAIN = 4
-_SH0 = 0.28209479177387814
 _CLOSED, _OPEN = (0.25, 0.27, 0.30), (1.0, 0.55, 0.0)
 _MARGIN, _GAP, _TEXT = 8, 4, 18
 
@@ -110,7 +109,7 @@ def paint_gates(state: PlayerState) -> Gaussians[FloatArray]:
     color = closed + share[:, None] * (opened - closed)
     return Gaussians(
         gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities,
-        ((color - 0.5) / _SH0)[:, None].astype(np.float32), np.zeros_like(gaussians.shN),
+        ((color - 0.5) / SH0)[:, None].astype(np.float32), np.zeros_like(gaussians.shN),
     )  # fmt: skip
 
 

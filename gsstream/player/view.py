@@ -12,6 +12,7 @@ import numpy as np
 
 from gsstream.core.errors import InputError, OutputError
 from gsstream.core.gaussians import SH0, Gaussians
+from gsstream.core.needs import install_extra
 from gsstream.core.shapes import FloatArray
 from gsstream.player.playback import Playback
 from gsstream.player.software import rotation_matrices
@@ -36,7 +37,7 @@ class Viewer:
         nothing can be served at this address.
         """
         if importlib.util.find_spec("viser") is None:
-            raise InputError("viewing in the browser needs viser: pip install 'gsstream[viewer]'; or use gsstream play")
+            raise InputError(f"viewing in the browser needs viser: {install_extra('viewer')}; or use gsstream play")
         import viser
 
         self.playback = Playback(stream)

@@ -34,7 +34,7 @@ class SyntheticOptions(BaseModel):
         default="paths",
         description="what happens. paths: two objects on smooth paths; at frame 'event' they stop (stop) or turn back "
         "(reversal), the light flashes for that frame (flash), a training camera gives its last picture for four "
-        "frames (dropout); a ball bounces off the floor (bounce), goes through a tunnel (occlusion) or comes into the picture "
+        "frames (dropout); a ball bounces off the floor (bounce), goes through a tunnel (occlusion) or comes into view "
         "(enters), a door slides away from a picture (door)",
     )
     event: int = Field(default=8, ge=1, le=100_000, description="the frame at which the scene's event happens")

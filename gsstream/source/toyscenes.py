@@ -72,7 +72,7 @@ class ToyScene:
             # Up and down between floor and 0.9 m, there and back between two walls nobody sees; the floor at frame E.
             return {_BALL: np.array([0.7, _zigzag(way, 0.8), 0.18 + _above(way, 0.72)])}
         if self.name == "occlusion":
-            return {_BALL: np.array([0.75, _zigzag(way - 0.18, 1.1), 0.13])}
+            return {_BALL: np.array([0.75, _zigzag(way - 0.16, 1.1), 0.13])}
         if self.name == "enters":
             # From above every camera's picture down to where it stays; its edge is in one of them at frame E.
             return {_BALL: np.array([0.45, 0.1, min(max(0.78, 1.54 - way), 2.75)])}

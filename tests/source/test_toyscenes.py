@@ -50,7 +50,7 @@ def test_what_is_hidden_is_hidden_from_every_camera_and_comes_out_again() -> Non
     source = scene("occlusion")
     seen = [source.moving_mask(t).any((1, 2)) for t in range(20)]
     assert seen[0].sum() >= 2
-    assert not np.array([seen[t] for t in range(EVENT, EVENT + 4)]).any(), "hidden from all of them"
+    assert not np.array([seen[t] for t in range(EVENT, EVENT + 5)]).any(), "hidden from all of them"
     assert seen[16].sum() >= 2
 
 

@@ -122,8 +122,11 @@ def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMe
             f"the first frame has spherical harmonics of degree {first.gaussians.sh_degree}, the recipe asks for "
             f"{parts.recipe.first_frame.degree}; set first_frame.sh_degree={first.gaussians.sh_degree}"
         )
-    gaussians = first.gaussians.map(torch.from_numpy)
-    anchors = own_anchors(parts, first, frame)
+    # A delta may have put Gaussians between the positions that a key packet can say. They are grouped as players will
+    # have them, or a resumed run would find other groups.
+    held = replace(first, scene=replace(first.scene, gaussians=quantise_key(first.gaussians)))
+    gaussians = held.gaussians.map(torch.from_numpy)
+    anchors = own_anchors(parts, held, frame)
     hierarchy, levels, gaussians = arrange(parts, gaussians, anchors.levels, anchors)
     layout = make_layout(hierarchy, levels, anchors)
     exposure = exposure_from_meta(first.meta)

@@ -182,13 +182,19 @@ def cloud_of(first: PlayerState) -> PointCloud:
 
 def decoded_anchors(player: PlayerState) -> Anchors:
     """Return what a structure needs to group a decoded scene again."""
-    gaussians = player.gaussians.map(torch.from_numpy)
+    gaussians, origin = player.gaussians.map(torch.from_numpy), player.meta.extra.get("origin")
+    if origin is None:
+        raise InputError(
+            "the stream does not say where the grid of its Gaussians begins (extra.origin of its key packet): it was "
+            "not written by this encoder, which can neither go on with it nor take its scene over; encode the "
+            "recording anew"
+        )
     return Anchors(
         positions=gaussians.means,
         colors=torch.zeros_like(gaussians.means),
         levels=torch.from_numpy(player.layout.unit_of.astype(np.int64)),
         cell_sizes=torch.from_numpy(np.asarray(player.layout.units)),
-        origin=torch.tensor(player.meta.extra["origin"], dtype=torch.float32),
+        origin=torch.tensor(origin, dtype=torch.float32),
     )
 
 

@@ -39,8 +39,9 @@ def gap(
     """Reconstruct frames of a run from their own images alone and say how much better they are than the stream.
 
     A reconstruction is made by the run's recipe for frame 0, with seeds of that frame, and kept: the same command goes
-    on where it was stopped. The table (gap.txt) and every number (gap.json) are written beside the stream. Give enough
-    passes: below about 150, a fresh reconstruction may be worse than the cameras allow, and the gap too small.
+    on where it was stopped. The table (gap.txt) and every number (gap.json) are written beside the stream, and the
+    contact sheet shows both close up. Give enough passes: below about 150, a fresh reconstruction may be worse than the
+    cameras allow, and the gap too small.
     """
     from gsstream.core.errors import InputError
     from gsstream.engine.run.output import write_whole
@@ -50,6 +51,7 @@ def gap(
     from gsstream.recipe.load import load_recipe
     from gsstream.trade.measure.fresh import FreshFrames, check_cameras
     from gsstream.trade.measure.gap import GAP_FILES, measure_gap, usual_frames
+    from gsstream.trade.show.gallery import write_sheet
 
     file = stream_file(run)
     if not run.is_dir() or not (run / "recipe.yaml").is_file():
@@ -69,10 +71,11 @@ def gap(
             _make(fresh, frame, quiet)
         files = {frame: fresh.file(frame).resolve() for frame in chosen}
         found = measure_gap(file, files, recording, fresh.epochs, progress=progress_on("frame"))
+        write_whole(run / GAP_FILES[0], found.table() + "\n")
+        write_whole(run / GAP_FILES[1], found.to_json() + "\n")
+        write_sheet(run, recording)
     finally:
         recording.close()
-    write_whole(run / GAP_FILES[0], found.table() + "\n")
-    write_whole(run / GAP_FILES[1], found.to_json() + "\n")
     typer.echo(found.to_json() if as_json else found.table())
 
 

@@ -63,16 +63,14 @@ def gap(
     chosen = _frames(at, frames) if at is not None else usual_frames(frames)
     recording = open_recording(source or named_recording(file, meta, catalog), recipe, catalog)
     try:
-        if len(recording.info.test) == 0:
-            raise InputError(f"{run}: the recording has no test cameras, so there is nothing to judge by")
         check_cameras(meta, recording.info)
         fresh = FreshFrames.of_run(recipe, recording, cache or run / "fresh", catalog, epochs)
         for frame in chosen:
             _make(fresh, frame, quiet)
         files = {frame: fresh.file(frame).resolve() for frame in chosen}
         found = measure_gap(file, files, recording, fresh.epochs, progress=progress_on("frame"))
-        write_whole(run / GAP_FILES[0], found.table() + "\n")
-        write_whole(run / GAP_FILES[1], found.to_json() + "\n")
+        for name, text in zip(GAP_FILES, (found.table(), found.to_json()), strict=True):
+            write_whole(run / name, text + "\n")
         write_sheet(run, recording)
     finally:
         recording.close()

@@ -115,17 +115,19 @@ class FreshFrames:
 
 
 def check_cameras(meta: StreamMeta, info: SourceInfo) -> None:
-    """Raise InputError when a recording's cameras are not those of a stream.
+    """Raise InputError when a recording's cameras are not those of a stream, or when none of them judges.
 
     Arguments:
         meta: of the stream.
         info: of the recording, opened as the run did.
     """
-    for split, theirs, ours in (("training", meta.train, info.train), ("test", meta.test, info.test)):
-        same = theirs.ids == ours.ids and (theirs.width, theirs.height) == (ours.width, ours.height)
-        if not same or not np.allclose(theirs.viewmats, ours.viewmats, atol=1e-6):
+    if len(meta.test) == 0:
+        raise InputError("the stream has no test cameras, so there is nothing to judge by (data.test_cameras)")
+    for split, theirs, here in (("training", meta.train, info.train), ("test", meta.test, info.test)):
+        same = theirs.ids == here.ids and (theirs.width, theirs.height) == (here.width, here.height)
+        if not same or not np.allclose(theirs.viewmats, here.viewmats, atol=1e-6):
             raise InputError(
                 f"the recording {info.name!r} is not the one of the stream: expected {split} cameras "
-                f"{list(theirs.ids)} at {theirs.width} x {theirs.height}, got {list(ours.ids)} at {ours.width} x "
-                f"{ours.height}; name the recording of the run with --source"
+                f"{list(theirs.ids)} at {theirs.width} x {theirs.height}, got {list(here.ids)} at {here.width} x "
+                f"{here.height}; name the recording of the run with --source"
             )

@@ -34,12 +34,13 @@ def source_date() -> str:
     return subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
 
 
-def build(out: Path, chosen: Sequence[Path]) -> dict[str, str]:
+def build(out: Path, chosen: Sequence[Path], *, isolated: bool = True) -> dict[str, str]:
     """Build distributions into a folder.
 
     Arguments:
         out: must not hold archives yet.
         chosen: folders of the projects.
+        isolated: each in an environment of its own with the pinned tools; else with what is installed here.
 
     Returns file name -> SHA-256 of all that was built; ``out`` has them as ``SHA256SUMS`` too.
 
@@ -52,6 +53,7 @@ def build(out: Path, chosen: Sequence[Path]) -> dict[str, str]:
     for project in chosen:
         print(f"== {project.relative_to(ROOT)}", flush=True)
         command = [sys.executable, "-m", "build", "--outdir", str(out.resolve()), str(project)]
+        command += [] if isolated else ["--no-isolation"]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
         if done.returncode:
             print(done.stdout + done.stderr, file=sys.stderr)

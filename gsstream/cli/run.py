@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import warnings
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -32,6 +35,12 @@ def run(
     checks: Annotated[str | None, typer.Option("--checks", help="Look at parts: off, frame (default), step.")] = None,
     no_video: options.NoVideo = False,
     quiet: options.Quiet = False,
+    serve: Annotated[
+        int | None,
+        typer.Option(
+            "--serve", metavar="PORT", min=0, max=65535, help="Show the frames live at this port (extra: serve)."
+        ),
+    ] = None,
 ) -> None:
     """Encode a recording as a stream of 3D Gaussians.
 
@@ -46,6 +55,8 @@ def run(
     changes = options.overrides(settings, budget=budget, frames=frames, scale=scale, seed=seed, renderer=renderer)
     catalog = load_catalog()
     resolved = resolve_recipe(method, catalog.recipe_path, recipe or (), changes)
+    # Before the folder is touched: a port in use must not cost the run that it holds.
+    server = _server(out, serve)
     # The slow imports come last: a mistake on the command line is answered at once.
     from gsstream.engine.assembly.assemble import assemble
     from gsstream.engine.run.recording import open_recording, read_first_frame
@@ -56,13 +67,27 @@ def run(
     first = None if first_frame is None else read_first_frame(stream_file(first_frame))
     recording = open_recording(source, assembly.recipe, catalog)
     try:
-        with claim_output(out, resume=resume, overwrite=overwrite), disk_errors(out), ended_by_signals() as came:
+        with (
+            claim_output(out, resume=resume, overwrite=overwrite), disk_errors(out), ended_by_signals() as came, server,
+        ):  # fmt: skip
             result = run_session(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first)
             _pictures(result, recording, not no_video, quiet, assembly.recipe.renderer.name == "reference")
     finally:
         recording.close()
     if result.interrupted:
         raise typer.Exit(128 + came[0] if came else 130)
+
+
+def _server(out: Path, port: int | None) -> AbstractContextManager[object]:
+    """The server of ``--serve``: it shows what the run writes, on this machine alone."""
+    if port is None:
+        return nullcontext()
+    from gsstream.cli.serve import TOKEN
+    from gsstream.serve.server import Server
+
+    server = Server(out / "stream.gss", live=True, port=port, token=os.environ.get(TOKEN) or None)
+    typer.echo(f"live at {server.url}")
+    return server
 
 
 def _pictures(result: RunResult, recording: FrameSource, video: bool, quiet: bool, warned: bool) -> None:

@@ -61,9 +61,10 @@ export class Player extends EventTarget {
 
   _start(segments, frame) {
     this.snapshots.clear();
-    this.buffer = new PacketBuffer(segments, () => this._news());
+    this.buffer = this.source.follow?.(this) ?? new PacketBuffer(segments, () => this._news());
     this.buffer.fps = this.source.fps ?? 30;
-    this._target = frame ?? this.buffer.first ?? 0;
+    this.playing ||= Boolean(this.buffer.live);
+    this._target = this.buffer.live ? null : (frame ?? this.buffer.first ?? 0);
     this.buffer.want(this._target);
     return new Promise((resolve, reject) => {
       this._opened = { resolve, reject };
@@ -90,20 +91,23 @@ export class Player extends EventTarget {
   play() {
     if (this.playing) return;
     if (this.frame !== null && this.buffer.last !== null && this.frame >= this.last) this.seek(this.first);
-    if (this.problem) this.buffer?.retry();
+    if (this.problem) this.buffer?.retry?.();
     this.problem = null;
     this.playing = true;
+    this.buffer?.resume?.();
     this._clock = 0;
     this._say("state");
   }
 
   pause() {
     this.playing = false;
+    this.buffer?.pause?.();
     this._say("state");
   }
 
-  /** Show a frame as soon as it is there. */
+  /** Show a frame as soon as it is there. A live stream only shows its newest. */
   seek(frame) {
+    if (this.source?.live) return;
     const wanted = Math.max(this.first, Math.min(Math.round(frame), this.last));
     this._target = wanted;
     this._clock = 0;
@@ -143,6 +147,7 @@ export class Player extends EventTarget {
     this.renderer.draw(cameraOf(this.view, this.canvas.width, this.canvas.height), options);
     this.statistics.drawn += 1;
     this.statistics.uploaded += this.renderer.uploaded;
+    this.buffer?.shown?.(this.frame);
   }
 
   close() {
@@ -167,7 +172,8 @@ export class Player extends EventTarget {
     const seconds = this._then === null ? 0 : Math.min((now - this._then) / 1000, 0.25);
     this._then = now;
     this.options.beforeFrame?.(seconds);
-    if (this.buffer) this._advance(seconds);
+    if (this.buffer?.live) this.buffer.feed();
+    else if (this.buffer) this._advance(seconds);
     if (this._dirty && this.state) {
       this._dirty = false;
       this.draw();

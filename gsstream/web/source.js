@@ -11,10 +11,12 @@ const TRAILER = 12;
  * Find out what is at `url`: `{ segments, frames, fps, renditions }`.
  *
  * A segment is `{ first, last, url, start, end, whole }`: a key packet and what follows, bytes `start` to `end` of a
- * file, or the whole file. `last` and `frames` are null where only playing tells. Throws SourceError or PacketError.
+ * file, or the whole file. `last` and `frames` are null where only playing tells. Of a live stream
+ * there is no segment, but `follow(player)`, which returns its buffer. Throws SourceError or PacketError.
  */
 export async function openSource(url, signal) {
   const address = new URL(url, globalThis.document?.baseURI);
+  if (/^wss?:$/.test(address.protocol)) return liveSource(address);
   if (address.pathname.endsWith("/")) address.pathname += "stream.json";
   return address.pathname.endsWith(".json") ? openManifest(address.href, signal) : openFile(address.href, signal);
 }
@@ -34,6 +36,7 @@ async function openManifest(url, signal) {
       `This stream has packet format ${version[1]}.${version[2]}; this player reads ${FORMAT_MAJOR}.${FORMAT_MINOR}.`,
     );
   }
+  if (typeof manifest?.live === "string") return liveSource(beside(manifest.live, url));
   const renditions = [manifest, ...(manifest.renditions ?? [])].map((entry, i) => ({
     name: entry.name ?? (i ? `rendition ${i}` : "full"),
     gaussians: entry.gaussians ?? null,
@@ -44,6 +47,24 @@ async function openManifest(url, signal) {
   return { segments, frames: last - segments[0].first + 1, fps: manifest.fps ?? null, renditions };
 }
 
+/** A stream as it is written, at the address of its socket. Only who looks at one loads what it takes. */
+async function liveSource(address) {
+  if (/^https?:$/.test(address.protocol)) address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
+  const { LiveBuffer } = await import("./live.js");
+  const follow = (player) => new LiveBuffer(address.href, player);
+  return { live: true, follow, segments: [], frames: null, fps: null, renditions: [] };
+}
+
+/** What a manifest names, with the token of its own address, if it has one. */
+function beside(name, base) {
+  const address = new URL(name, base);
+  const { origin, searchParams } = new URL(base);
+  if (origin === address.origin && searchParams.has("token")) {
+    address.searchParams.set("token", searchParams.get("token"));
+  }
+  return address;
+}
+
 function segmentsOf(entry, base) {
   const list = entry?.segments;
   const sound = Array.isArray(list) && list.length && list.every((s) => Array.isArray(s.frames) && (s.file || s.range));
@@ -51,7 +72,7 @@ function segmentsOf(entry, base) {
   return list.map((segment) => ({
     first: segment.frames[0],
     last: segment.frames[1],
-    url: new URL(segment.file ?? entry.file, base).href,
+    url: beside(segment.file ?? entry.file, base).href,
     start: segment.file ? 0 : segment.range[0],
     end: segment.file ? (segment.bytes ?? null) && segment.bytes - 1 : segment.range[1],
     whole: Boolean(segment.file),

@@ -57,7 +57,7 @@ class Rules:
         return None
 
     def foreign(self, request: HTTPConnection) -> bool:
-        """Whether a browser asks on behalf of a page from elsewhere. Programs other than browsers name no origin."""
+        """Say whether a browser asks for a page from elsewhere. Programs other than browsers name no origin."""
         origin = request.headers.get("origin")
         if origin is None or origin in self.origins:
             return False

@@ -79,11 +79,12 @@ class Hub:
 
     async def _send(self, socket: WebSocket, cursor: Cursor) -> None:
         """Send packets and states for ever. The connection holds at most one packet that the viewer has not taken."""
-        stream, told, generation = self.follower, None, None
+        stream, told, damage, generation = self.follower, None, None, None
         while True:
             news, entry = self._news, cursor.next()
             # Whoever has packets to come is told so, also when the encoder has ended meanwhile.
-            state = self.state if entry is None else State("live")
+            damage = damage if entry is None else None
+            state = damage or (self.state if entry is None else State("live"))
             if state != told:
                 told = state
                 await _tell(socket, state=state.name, detail=state.detail, newest=stream.newest)
@@ -97,8 +98,7 @@ class Hub:
                     await socket.send_bytes(stream.header())
             except (PacketError, OSError) as error:
                 cursor.refuse()
-                told = State("damaged", str(error))
-                await _tell(socket, state=told.name, detail=told.detail, newest=stream.newest)
+                damage = State("damaged", str(error))
                 continue
             if cursor.generation != stream.generation:
                 continue

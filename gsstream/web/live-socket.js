@@ -93,8 +93,9 @@ export class LiveSocket {
     } catch {
       // Not ours: whatever it is, the packets say by themselves whether they are sound.
     }
-    if (message && "pong" in message) this._answered(message);
-    else if (message) this.handlers.message(message);
+    if (message === null || typeof message !== "object") return;
+    if ("pong" in message) this._answered(message);
+    else this.handlers.message(message);
   }
 
   _answered({ pong, now }) {

@@ -5,14 +5,12 @@ import { PacketError } from "./errors.js";
 import { Latency } from "./latency.js";
 import { LiveSocket } from "./live-socket.js";
 
-/** Bytes that may wait to be decoded. A page that is not shown takes no more and catches up later. */
-const MOST_BYTES = 16 * 2 ** 20;
 /** Milliseconds of decoding between two pictures: for a viewer in time, and for one that has many packets waiting. */
 const BUDGET = 24;
 const CATCH_UP = 200;
 const MANY = 8;
 /** Milliseconds without a frame of which the viewer is told; longer where frames come seldom. */
-const QUIET = 10_000;
+export const settings = { quiet: 10_000 };
 
 /** Stands where a recording has its buffer (see buffer.js); the player calls `feed` for every picture. */
 export class LiveBuffer {
@@ -28,6 +26,8 @@ export class LiveBuffer {
     this.latency = new Latency();
     this.queue = [];
     this.waiting = 0;
+    /** Bytes that may wait to be decoded. A page that is not shown takes no more and catches up later. */
+    this.most = 16 * 2 ** 20;
     this.state = { name: "live", detail: "" };
     this.trouble = null;
     this.broken = null;
@@ -131,13 +131,13 @@ export class LiveBuffer {
   _message(data) {
     if (!(data instanceof ArrayBuffer)) {
       if ("state" in data) this._stateIs(data);
-      else if ("written" in data) this.latency.written(data.frame, data.written, Date.now() + this.socket.ahead);
+      else if (Number.isFinite(data.written)) this.latency.written(data.frame, data.written, Date.now() + this.socket.ahead);
       return;
     }
     const bytes = new Uint8Array(data);
     this.received += bytes.length;
     try {
-      if (bytes[0] === 0x89) this._begin(bytes);
+      if (!this.begun || bytes[0] === 0x89) this._begin(bytes);
       else this._packet(bytes);
     } catch (error) {
       this._refuse(error);
@@ -145,7 +145,7 @@ export class LiveBuffer {
   }
 
   _stateIs({ state, detail }) {
-    this.state = { name: state, detail };
+    this.state = { name: state, detail: String(detail ?? "") };
     this.trouble = null;
     this._tell();
   }
@@ -159,7 +159,7 @@ export class LiveBuffer {
 
   _packet(data) {
     const header = parseHeader(data, 0);
-    if (!this.begun || data.length !== PACKET_HEADER + header.body) {
+    if (data.length !== PACKET_HEADER + header.body) {
       throw new PacketError("the server sends something that is no stream");
     }
     if (header.kind !== KIND.key && header.frame !== (this.before?.frame ?? NaN) + 1) {
@@ -175,7 +175,7 @@ export class LiveBuffer {
     this.trouble = null;
     this.socket.sound();
     this._timed();
-    if (this.waiting > MOST_BYTES && this.queue.length > 1) {
+    if (this.waiting > this.most && this.queue.length > 1) {
       this.asleep = true;
       this.socket.stop();
     }
@@ -191,11 +191,11 @@ export class LiveBuffer {
     this._forget();
     this.before = null;
     if (this.begun) {
-      this.socket.again(sentence(error));
+      this.socket.again(sentence(error.message));
       return;
     }
     this.socket.stop();
-    this.player._stop(new PacketError(sentence(error)));
+    this.player._stop(new PacketError(sentence(error.message)));
   }
 
   _timed() {
@@ -206,12 +206,12 @@ export class LiveBuffer {
 
   _sentence() {
     if (this.trouble) return this.trouble;
-    if (this.broken) return sentence({ message: this.broken });
+    if (this.broken) return sentence(this.broken);
     const { name, detail } = this.state;
     if (name === "ended") return "The stream has ended.";
-    if (name !== "live") return detail || "No frame is encoded yet.";
+    if (name !== "live") return sentence(detail || "no frame is encoded yet.");
     const silence = this.at ? performance.now() - this.at : 0;
-    if (!this.player.playing || silence < Math.max(QUIET, 3 * Math.max(0, ...this.gaps))) return "";
+    if (!this.player.playing || silence < Math.max(settings.quiet, 3 * Math.max(0, ...this.gaps))) return "";
     return `No new frame came for ${Math.floor(silence / 1000)} s.`;
   }
 
@@ -224,8 +224,8 @@ export class LiveBuffer {
   }
 }
 
-function sentence({ message }) {
-  return message.charAt(0).toUpperCase() + message.slice(1);
+function sentence(text) {
+  return text.charAt(0).toUpperCase() + text.slice(1);
 }
 
 function hex(bytes) {

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import warnings
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +16,7 @@ from gsstream.cli.streams import stream_file
 
 if TYPE_CHECKING:
     from gsstream.engine.run.session import RunResult
+    from gsstream.serve.server import Server
     from gsstream.source.base import FrameSource
 
 
@@ -68,7 +70,8 @@ def run(
     recording = open_recording(source, assembly.recipe, catalog)
     try:
         with (
-            claim_output(out, resume=resume, overwrite=overwrite), disk_errors(out), ended_by_signals() as came, server,
+            claim_output(out, resume=resume, overwrite=overwrite), disk_errors(out), ended_by_signals() as came,
+            _serving(server),
         ):  # fmt: skip
             result = run_session(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first)
             _pictures(result, recording, not no_video, quiet, assembly.recipe.renderer.name == "reference")
@@ -78,16 +81,24 @@ def run(
         raise typer.Exit(128 + came[0] if came else 130)
 
 
-def _server(out: Path, port: int | None) -> AbstractContextManager[object]:
-    """The server of ``--serve``: it shows what the run writes, on this machine alone."""
+def _server(out: Path, port: int | None) -> Server | None:
+    """The server of ``--serve``, with its address taken: it shows what the run writes, on this machine alone."""
     if port is None:
-        return nullcontext()
+        return None
     from gsstream.cli.serve import TOKEN
     from gsstream.serve.server import Server
 
-    server = Server(out / "stream.gss", live=True, port=port, token=os.environ.get(TOKEN) or None)
-    typer.echo(f"live at {server.url}")
-    return server
+    return Server(out / "stream.gss", live=True, port=port, token=os.environ.get(TOKEN) or None)
+
+
+@contextmanager
+def _serving(server: Server | None) -> Iterator[None]:
+    if server is None:
+        yield
+        return
+    with server:
+        typer.echo(f"live at {server.url}")
+        yield
 
 
 def _pictures(result: RunResult, recording: FrameSource, video: bool, quiet: bool, warned: bool) -> None:

@@ -43,6 +43,9 @@ export class LiveBuffer {
         this._tell();
       },
     });
+    this.heard = () => (player.playing ? this.resume() : this.pause());
+    player.addEventListener("state", this.heard);
+    player.playing = true;
     this.socket.start();
   }
 
@@ -67,6 +70,7 @@ export class LiveBuffer {
   }
 
   dispose() {
+    this.player.removeEventListener("state", this.heard);
     this.socket.stop();
   }
 

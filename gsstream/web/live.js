@@ -108,10 +108,14 @@ export class LiveBuffer {
   _decode(packet) {
     if (this.broken && packet.header.kind !== KIND.key) return false;
     try {
-      this.player._decode(packet);
+      this.player._take({ packet });
       this.broken = null;
       return true;
     } catch (error) {
+      if (!(error instanceof PacketError)) {
+        this.player._stop(error);
+        return false;
+      }
       this.broken = `${error.message}; the picture stands still until the next key packet.`;
       return false;
     }

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from gsstream.cli.streams import stream_file
+
+if TYPE_CHECKING:
+    from gsstream.serve.server import Server
 
 #: Environment variable with the token: unlike an option it is not in the list of processes.
 TOKEN = "GSSTREAM_TOKEN"
@@ -41,6 +47,26 @@ def serve(
     )
     typer.echo(f"{file}: {server.url} (Ctrl-C ends)")
     server.run()
+
+
+def server_beside(out: Path, port: int | None) -> Server | None:
+    """Take the address for ``run --serve``: what a run writes to ``out``, shown on this machine alone."""
+    if port is None:
+        return None
+    from gsstream.serve.server import Server
+
+    return Server(out / "stream.gss", live=True, port=port, token=os.environ.get(TOKEN) or None)
+
+
+@contextmanager
+def serving(server: Server | None) -> Iterator[None]:
+    """Serve meanwhile, and say where."""
+    if server is None:
+        yield
+        return
+    with server:
+        typer.echo(f"live at {server.url}")
+        yield
 
 
 def _coming(stream: Path) -> Path:

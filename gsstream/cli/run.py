@@ -56,7 +56,6 @@ def run(
     changes = options.overrides(settings, budget=budget, frames=frames, scale=scale, seed=seed, renderer=renderer)
     catalog = load_catalog()
     resolved = resolve_recipe(method, catalog.recipe_path, recipe or (), changes)
-    # Before the folder is touched: a port in use must not cost the run that it holds.
     server = server_beside(out, serve)
     # The slow imports come last: a mistake on the command line is answered at once.
     from gsstream.engine.assembly.assemble import assemble
@@ -72,7 +71,6 @@ def run(
         _what_is_taken(say, resolved.recipe, recording.info, named=bool(method or recipe), catalog=catalog)
         if not resume:
             _first_look(recording, source)
-        slow = assembly.recipe.renderer.name == "reference"
         with claim_output(out, resume=resume, overwrite=overwrite), ended_by_signals() as came, serving(server):
             try:
                 with disk_errors(out):
@@ -81,7 +79,7 @@ def run(
                 _what_there_is(error, out, recording, not no_video, quiet)
                 raise
             with disk_errors(out):
-                _pictures(result, recording, not no_video, quiet, slow)
+                _pictures(result, recording, not no_video, quiet, assembly.recipe.renderer.name == "reference")
     finally:
         recording.close()
     if result.interrupted:

@@ -50,7 +50,10 @@ def serve(
 
 
 def server_beside(out: Path, port: int | None) -> Server | None:
-    """Take the address for ``run --serve``: what a run writes to ``out``, shown on this machine alone."""
+    """Take the address for ``run --serve``: what a run writes to ``out``, shown on this machine alone.
+
+    To be called before the folder is touched: a port in use must not cost the run that it holds.
+    """
     if port is None:
         return None
     from gsstream.serve.server import Server

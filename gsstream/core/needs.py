@@ -42,14 +42,18 @@ def page(name: str) -> str:
     return str(next((folder / name for folder in DOCS if (folder / name).is_file()), Path("docs") / name))
 
 
-def install(requirement: str) -> str:
-    """Return the command that installs a requirement into the environment that runs now.
+def pip() -> str:
+    """Return the command of the installer of the environment that runs now.
 
     ``pip`` alone is another environment's where this one is used without having been activated.
     """
-    pip, here = shutil.which("pip"), Path(sys.executable)
-    alone = pip is not None and Path(pip).parent == here.parent
-    return f"{'pip' if alone else f'{shlex.quote(str(here))} -m pip'} install {shlex.quote(requirement)}"
+    found, here = shutil.which("pip"), Path(sys.executable)
+    return "pip" if found is not None and Path(found).parent == here.parent else f"{shlex.quote(str(here))} -m pip"
+
+
+def install(requirement: str) -> str:
+    """Return the command that installs a requirement into the environment that runs now."""
+    return f"{pip()} install {shlex.quote(requirement)}"
 
 
 def install_extra(extra: str) -> str:

@@ -38,6 +38,7 @@ def run(
     resume: options.Resume = False,
     overwrite: options.Overwrite = False,
     checks: Annotated[str | None, typer.Option("--checks", help="Look at parts: off, frame (default), step.")] = None,
+    diagnose: options.Diagnose = False,
     no_video: options.NoVideo = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -72,7 +73,8 @@ def run(
         with claim_output(out, resume=resume, overwrite=overwrite), ended_by_signals() as came:
             try:
                 with disk_errors(out):
-                    result = run_session(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first)
+                    given = {"resume": resume, "quiet": quiet, "first_frame": first, "diagnose": diagnose}
+            result = run_session(assembly, recording, out, **given)
             except GsstreamError as error:
                 _what_there_is(error, out, recording, not no_video, quiet)
                 raise

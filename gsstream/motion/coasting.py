@@ -33,7 +33,7 @@ class Coasting(MotionPart):
         )
         share: float = Field(default=0.5, ge=0, le=1, description="share of a group's Gaussians that must lie there")
         displaced: float = Field(
-            default=0.5, ge=0, le=1, description="share of a group's Gaussians that the last frame must have displaced"
+            default=0.1, ge=0, le=1, description="share of a group's Gaussians that the last frame must have displaced"
         )
         asked: float = Field(
             default=0.5, ge=0, le=1, description="share of the cameras that judge each group, in turn; 0: none does"

@@ -34,6 +34,12 @@ def gains(scene: Scene, work: FrameWork, moves: Moves, views: Sequence[int] | In
 
 
 def some_views(number: int, share: float, frame: int) -> IntArray:
-    """Return the views that take their turn in a frame: a share of all, evenly spread, others in the next frame."""
+    """Return the views that take their turn in a frame: a share of all, evenly spread, others in the next frame.
+
+    Arguments:
+        number: of training cameras.
+        share: of them, 0 to 1; at least one is asked.
+        frame: index of the frame.
+    """
     count = max(1, round(share * number))
     return np.unique((np.arange(count) * number // count + frame) % number)

@@ -178,7 +178,7 @@ def apply_motions(scene: Scene, motions: Sequence[Motion]) -> tuple[Scene, IntAr
 
     Raises ShapeError as :func:`apply_motion` does.
     """
-    touched = np.zeros(0, np.int64)
+    touched: IntArray = np.zeros(0, np.int64)
     for motion in motions:
         scene, rows = apply_motion(scene, motion)
         touched = either(len(scene.gaussians), touched, rows)

@@ -123,7 +123,7 @@ def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMe
             f"{parts.recipe.first_frame.degree}; set first_frame.sh_degree={first.gaussians.sh_degree}"
         )
     gaussians = first.gaussians.map(torch.from_numpy)
-    anchors = own_anchors(parts, first, frame)
+    anchors = taken_anchors(parts, first, frame)
     hierarchy, levels, gaussians = arrange(parts, gaussians, anchors.levels, anchors)
     layout = make_layout(hierarchy, levels, anchors)
     exposure = exposure_from_meta(first.meta)
@@ -140,8 +140,12 @@ def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMe
     return Step(state, packet, "key", metrics)
 
 
-def own_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
-    """Return the grid that this method's structure would lay; each Gaussian gets the level of the nearest cell size.
+def taken_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
+    """Return the grid on which a frame 0 of another stream goes on.
+
+    It is that stream's own, bit for bit, if a structure of the same settings laid it, or if this method's structure
+    needs no grid: then rates, steps and gates of both streams have the same units. Otherwise it is the grid that this
+    structure lays around the decoded centres, and each Gaussian gets the level of the nearest cell size.
 
     Arguments:
         parts: the live parts of the recipe.
@@ -149,10 +153,30 @@ def own_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
         frame: training images of frame 0.
     """
     theirs = decoded_anchors(first)
+    if keeps_grid(parts, first.meta.recipe):
+        return theirs
     grid = parts.structure.seed(cloud_of(first), frame.cameras)
     sizes = theirs.cell_sizes[theirs.levels]
     levels = (sizes.log()[:, None] - grid.cell_sizes.log()[None]).abs().argmin(1)
     return replace(theirs, levels=levels, cell_sizes=grid.cell_sizes, origin=grid.origin)
+
+
+def keeps_grid(parts: Assembly, recipe: Mapping[str, Any]) -> bool:
+    """Return whether the grid of a stream serves this method's structure as it is.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        recipe: of the stream, as its key packet holds it.
+    """
+    if not parts.structure.claims().lays_grid:
+        return True
+    mine, theirs = parts.recipe.structure, recipe.get("structure", {})
+    grouping = parts.structure.grouping_settings
+
+    def laying(params: Mapping[str, Any]) -> dict[str, Any]:
+        return {key: value for key, value in params.items() if key not in grouping}
+
+    return bool(theirs.get("name") == mine.name and laying(theirs.get("params", {})) == laying(mine.params))
 
 
 def cloud_of(first: PlayerState) -> PointCloud:

@@ -48,11 +48,19 @@ def sent_rows(layout: Layout, gates: IntArray) -> IntArray:
     return np.asarray(np.repeat(starts - before, counts) + np.arange(int(counts.sum())))
 
 
+def changing_rows(residual: Residual) -> int:
+    """Return how many of the rows behind open gates have a symbol that is not zero, in whatever attribute."""
+    changing = np.zeros(0, bool)
+    for table in residual.symbols.values():
+        found = table.any(1)
+        changing = changing | found if changing.size else found
+    return int(np.count_nonzero(changing))
+
+
 def apply_residual(gaussians: Gaussians[FloatArray], layout: Layout, residual: Residual) -> Gaussians[FloatArray]:
     """Return the Gaussians after a residual, in raw values.
 
-    a_t = a_{t-1} + g * (step * symbols) W. Rows behind closed gates keep their bits. All arithmetic is float32 in a
-    fixed order.
+    a_t = a_{t-1} + g * (step * symbols) W.
 
     Rows behind closed gates keep their bits. All arithmetic is float32 in a fixed order. Raises ShapeError when the
     residual does not fit the scene.

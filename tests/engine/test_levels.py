@@ -21,7 +21,7 @@ def waiting_share(unit_of: np.ndarray, fraction: float) -> float:
 
 
 def test_empty_levels_are_not_counted() -> None:
-    """Anchors per level as counted in a run: counting all eight levels, the schedule would begin at one nobody is in."""
+    """Anchors per level as counted in a run: counting all eight, the schedule would begin at a level that is empty."""
     rows = units(148, 161, 54, 32, 2, 0, 0, 0)
     assert waiting_share(rows, 0.0) == pytest.approx(34 / 397)
     assert level_schedule(PROGRESSIVE, rows) == level_schedule(PROGRESSIVE, units(148, 161, 54, 32, 2))

@@ -31,7 +31,7 @@ def test_every_table_comes_back_zeros_and_all(seed: int, share: float) -> None:
         name: (rng.integers(-3, 4, (rows, width)) * (rng.random((rows, 1)) < share)).astype(np.int32)
         for name, width in widths.items()
     }
-    residual = Residual(gates, 1, symbols, {name: 0.5 for name in widths}, {})
+    residual = Residual(gates, 1, symbols, dict.fromkeys(widths, 0.5), {})
     packet = encode_delta(Delta().with_residual(residual), before.layout, {}, frame=1)
     found = decode_delta(packet.data, before, {}).residual
     assert found is not None
@@ -47,7 +47,7 @@ def test_rows_of_zeros_cost_next_to_nothing() -> None:
     kept = rng.random(4000) < 0.05
     for table in symbols.values():
         table[~kept] = 0
-    residual = Residual(np.ones(9, np.uint8), 1, symbols, {name: 0.5 for name in symbols}, {})
+    residual = Residual(np.ones(9, np.uint8), 1, symbols, dict.fromkeys(symbols, 0.5), {})
     sizes = encode_delta(Delta().with_residual(residual), state.layout, {}, frame=1).sizes
     with_pattern = sum(sizes[name] for name in ("pattern", *symbols))
     assert with_pattern < 0.7 * sum(len(encode_symbols(table)) for table in symbols.values())

@@ -101,99 +101,21 @@ def check_cameras(cameras: Cameras, least: int, who: str) -> None:
         )
 
 
-def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
-    """Start from the decoded frame 0 of another stream, grouped by this method.
-
-    Methods can then be compared on the same scene.
-
-    Arguments:
-        parts: the live parts of the recipe.
-        first: what players have of that frame 0.
-        frame: training images of frame 0.
-        meta: what the key packet says about the run.
-        rng: random streams by name and frame.
-
-    Raises InputError when the recipe asks for another degree of spherical harmonics than the stream has.
-    """
-    refuse_pending(parts)
-    started = time.perf_counter()
-    if first.gaussians.sh_degree != parts.recipe.first_frame.degree:
-        raise InputError(
-            f"the first frame has spherical harmonics of degree {first.gaussians.sh_degree}, the recipe asks for "
-            f"{parts.recipe.first_frame.degree}; set first_frame.sh_degree={first.gaussians.sh_degree}"
-        )
-    gaussians = first.gaussians.map(torch.from_numpy)
-    anchors = taken_anchors(parts, first, frame)
-    hierarchy, levels, gaussians = arrange(parts, gaussians, anchors.levels, anchors)
-    layout = make_layout(hierarchy, levels, anchors)
-    exposure = exposure_from_meta(first.meta)
-    state, packet = key_state(parts, gaussians, layout, hierarchy, frame, meta, exposure, anchors.origin, rng)
-    metrics = {
-        "bytes": dict(packet.sizes),
-        "num_gaussians": len(gaussians),
-        "active_gaussians": len(gaussians),
-        "num_gates": len(layout.node_counts),
-        "active_gates": 0,
-        "iterations": 0,
-        "seconds": {"code": time.perf_counter() - started},
-    }
-    return Step(state, packet, "key", metrics)
-
-
-def taken_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
-    """Return the grid on which a frame 0 of another stream goes on.
-
-    It is that stream's own, bit for bit, if a structure of the same settings laid it, or if this method's structure
-    needs no grid: then rates, steps and gates of both streams have the same units. Otherwise it is the grid that this
-    structure lays around the decoded centres, and each Gaussian gets the level of the nearest cell size.
-
-    Arguments:
-        parts: the live parts of the recipe.
-        first: the decoded scene.
-        frame: training images of frame 0.
-    """
-    theirs = decoded_anchors(first)
-    if keeps_grid(parts, first.meta.recipe):
-        return theirs
-    grid = parts.structure.seed(cloud_of(first), frame.cameras)
-    sizes = theirs.cell_sizes[theirs.levels]
-    levels = (sizes.log()[:, None] - grid.cell_sizes.log()[None]).abs().argmin(1)
-    return replace(theirs, levels=levels, cell_sizes=grid.cell_sizes, origin=grid.origin)
-
-
-def keeps_grid(parts: Assembly, recipe: Mapping[str, Any]) -> bool:
-    """Return whether the grid of a stream serves this method's structure as it is.
-
-    Arguments:
-        parts: the live parts of the recipe.
-        recipe: of the stream, as its key packet holds it.
-    """
-    if not parts.structure.claims().lays_grid:
-        return True
-    mine, theirs = parts.recipe.structure, recipe.get("structure", {})
-    grouping = parts.structure.grouping_settings
-
-    def laying(params: Mapping[str, Any]) -> dict[str, Any]:
-        return {key: value for key, value in params.items() if key not in grouping}
-
-    return bool(theirs.get("name") == mine.name and laying(theirs.get("params", {})) == laying(mine.params))
-
-
-def cloud_of(first: PlayerState) -> PointCloud:
-    """Return the centres of a decoded scene as points; their colour is unknown, grey."""
-    means = first.gaussians.means
-    return PointCloud(means, np.full_like(means, 0.5), "frame 0 of another stream")
-
-
 def decoded_anchors(player: PlayerState) -> Anchors:
     """Return what a structure needs to group a decoded scene again."""
-    gaussians = player.gaussians.map(torch.from_numpy)
+    gaussians, origin = player.gaussians.map(torch.from_numpy), player.meta.extra.get("origin")
+    if origin is None:
+        raise InputError(
+            "the stream does not say where the grid of its Gaussians begins (extra.origin of its key packet): it was "
+            "not written by this encoder, which can neither go on with it nor take its scene over; encode the "
+            "recording anew"
+        )
     return Anchors(
         positions=gaussians.means,
         colors=torch.zeros_like(gaussians.means),
         levels=torch.from_numpy(player.layout.unit_of.astype(np.int64)),
         cell_sizes=torch.from_numpy(np.asarray(player.layout.units)),
-        origin=torch.tensor(player.meta.extra["origin"], dtype=torch.float32),
+        origin=torch.tensor(origin, dtype=torch.float32),
     )
 
 

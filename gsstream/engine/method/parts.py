@@ -8,7 +8,8 @@ from typing import Any, ClassVar, final
 from gsstream.core.frame import Frame
 from gsstream.engine.budget.controller import planned
 from gsstream.engine.budget.spent import spent
-from gsstream.engine.frame0.begin import begin, begin_from
+from gsstream.engine.frame0.begin import begin
+from gsstream.engine.frame0.taken import begin_from
 from gsstream.engine.keys.keyframes import refresh
 from gsstream.engine.keys.resume import state_after
 from gsstream.engine.state.stream_state import Step, StreamState

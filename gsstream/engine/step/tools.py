@@ -12,8 +12,9 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.pace import Allowance
-from gsstream.engine.frame0.begin import begin, begin_from, exposure_from_meta
+from gsstream.engine.frame0.begin import begin, exposure_from_meta
 from gsstream.engine.frame0.optimise import Progress
+from gsstream.engine.frame0.taken import begin_from
 from gsstream.engine.step.context import FrameView
 from gsstream.method.tools import FirstFrame
 from gsstream.packet import PlayerState, StreamMeta

@@ -50,11 +50,9 @@ def sent_rows(layout: Layout, gates: IntArray) -> IntArray:
 
 def changing_rows(residual: Residual) -> int:
     """Return how many of the rows behind open gates have a symbol that is not zero, in whatever attribute."""
-    changing = np.zeros(0, bool)
-    for table in residual.symbols.values():
-        found = table.any(1)
-        changing = changing | found if changing.size else found
-    return int(np.count_nonzero(changing))
+    if not residual.symbols:
+        return 0
+    return int(np.count_nonzero(np.concatenate(list(residual.symbols.values()), axis=1).any(axis=1)))
 
 
 def apply_residual(gaussians: Gaussians[FloatArray], layout: Layout, residual: Residual) -> Gaussians[FloatArray]:

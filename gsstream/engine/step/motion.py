@@ -10,6 +10,7 @@ from gsstream.core.changes import Motion, Scene
 from gsstream.core.changes.motion import apply_motions
 from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
+from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import blaming
 from gsstream.engine.state.stream_state import StreamState
@@ -26,7 +27,9 @@ class Moved(NamedTuple):
     view: FrameView
 
 
-def moved(parts: Assembly, state: StreamState, frame: Frame, change: Change | None, rng: Rng) -> Moved:
+def moved(
+    parts: Assembly, state: StreamState, frame: Frame, change: Change | None, rng: Rng, targets: FloatArray
+) -> Moved:
     """Ask the motion part, and apply what it proposes as every player will.
 
     Arguments:
@@ -35,13 +38,15 @@ def moved(parts: Assembly, state: StreamState, frame: Frame, change: Change | No
         frame: training images of this frame.
         change: what changed in them; None: everything counts as changed.
         rng: random streams by name and frame.
+        targets: [V, H, W, 3] what renders are compared with: the images, or what the cameras remember of them.
 
     Raises ComponentError when the part fails, or proposes motions that do not fit the scene or cannot be sent.
     """
     scene = state.player.scene
     view = FrameView(
-        parts, state.gaussians, state.hierarchy, frame, state.previous, state.exposure, change, state.session
-    )
+        parts, state.gaussians, state.hierarchy, frame, state.previous, state.exposure, change, state.session,
+        targets,
+    )  # fmt: skip
     motions = tuple(motion for motion in parts.motion.propose(scene, view, rng) if not motion.is_empty)
     if not motions:
         return Moved((), scene, view)
@@ -52,5 +57,7 @@ def moved(parts: Assembly, state: StreamState, frame: Frame, change: Change | No
     # The session is handed on to the moved scene, with its caches of all that stands still. The old session stays
     # correct, as it must until the frame has succeeded: should it be used again, it fills its caches anew.
     session = view.session.commit(gaussians, torch.from_numpy(touched)) if 2 * len(touched) <= len(gaussians) else None
-    after = FrameView(parts, gaussians, state.hierarchy, frame, state.previous, state.exposure, change, session)
+    after = FrameView(
+        parts, gaussians, state.hierarchy, frame, state.previous, state.exposure, change, session, targets
+    )
     return Moved(motions, scene, after)

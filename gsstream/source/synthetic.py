@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from urllib.parse import parse_qsl
 
 import numpy as np
@@ -114,14 +115,23 @@ class SyntheticSource:
 
         "recording": every third pixel, 2 mm noise per axis; "sparse": a random fifth of them with 5 mm (1 unit = 1 m).
         """
+        points = self.points_without((), kind)
+        assert points is not None, "every camera sees a surface"
+        return points
+
+    def points_without(self, cameras: Sequence[str], kind: PointKind = "recording") -> PointCloud | None:
+        """Return those of the points that no camera named here has seen; None when none are left."""
         frame, depth = self.frame(0), self.depth(0)
         rows = slice(_POINT_STRIDE // 2, None, _POINT_STRIDE)
+        views = [i for i, name in enumerate(frame.cameras.ids) if name not in cameras]
+        if not views:
+            return None
         clouds = []
-        for i in range(len(frame.cameras)):
+        for i in views:
             origin, rays = _camera_rays(frame.cameras, i, 1)
             hits = (origin + rays * depth[i].reshape(-1, 1)).reshape(*depth[i].shape, 3)
             clouds.append(hits[rows, rows].reshape(-1, 3))
-        xyz, rgb = np.concatenate(clouds), frame.images[:, rows, rows].reshape(-1, 3)
+        xyz, rgb = np.concatenate(clouds), frame.images[views][:, rows, rows].reshape(-1, 3)
         rng = Rng(self._options.seed).numpy("synthetic points")
         if kind == "sparse":
             chosen = np.sort(rng.permutation(len(xyz))[: len(xyz) // _SPARSE_SHARE])

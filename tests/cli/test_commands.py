@@ -56,7 +56,7 @@ OPTIONS = {
         "--quiet",
     ],
     "gsstream sweep": [
-        "CONFIG", "--out", "--scenes", "--data", "--workers", "--threads", "--ray", "--dry-run", "--quiet",
+        "CONFIG", "--out", "--scenes", "--data", "--workers", "--threads", "--ray", "--split", "--dry-run", "--quiet",
     ],
     "gsstream tune": [
         "--scene", "--budget", "--out", "--data", "--recipe", "--set", "--method", "--frames", "--scale", "--seed",

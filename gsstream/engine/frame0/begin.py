@@ -113,10 +113,12 @@ def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMe
         meta: what the key packet says about the run.
         rng: random streams by name and frame.
 
-    Raises InputError when the recipe asks for another degree of spherical harmonics than the stream has.
+    Raises InputError when the recipe asks for another degree of spherical harmonics than the stream has, when a camera
+    that judges here took part in it, or when its colour maps are of other cameras.
     """
     refuse_pending(parts)
     started = time.perf_counter()
+    _check_views(first.meta, frame.cameras, () if parts.recipe.data.leak == "training" else meta.test.ids)
     if first.gaussians.sh_degree != parts.recipe.first_frame.degree:
         raise InputError(
             f"the first frame has spherical harmonics of degree {first.gaussians.sh_degree}, the recipe asks for "
@@ -138,6 +140,20 @@ def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMe
         "seconds": {"code": time.perf_counter() - started},
     }
     return Step(state, packet, "key", metrics)
+
+
+def _check_views(theirs: StreamMeta, cameras: Cameras, judges: tuple[str, ...]) -> None:
+    """Refuse a frame 0 that has learned from cameras that judge here, or whose colour maps are of other cameras."""
+    if seen := [name for name in judges if name in theirs.train.ids]:
+        raise InputError(
+            f"the first frame was reconstructed with {', '.join(seen)}, which would judge here; take one of a run with "
+            "the same data.split and data.test_cameras"
+        )
+    if exposure_from_meta(theirs) is not None and theirs.train.ids != cameras.ids:
+        raise InputError(
+            f"the first frame has colour maps of the training cameras {', '.join(theirs.train.ids)}, got "
+            f"{', '.join(cameras.ids)}; take one of a run with the same training cameras"
+        )
 
 
 def own_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:

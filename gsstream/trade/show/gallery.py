@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gsstream.engine.budget.report import budget_lines
+from gsstream.packet import StreamMeta
 from gsstream.player.play import play
 from gsstream.player.playback import Playback
 from gsstream.source.base import FrameSource
@@ -32,13 +33,14 @@ def write_gallery(out: Path, source: FrameSource, *, video: bool = True) -> list
     with Playback(out / STREAM) as playback:
         frames, method = playback.frames, playback.meta.method
         name = (playback.meta.test.ids or playback.meta.train.ids)[0]
+        judges = judges_line(playback.meta)
     records = read_records(out / METRICS)
     chosen = sorted({int(i) for i in np.linspace(frames[0], frames[-1], min(COLUMNS, len(frames)))})
     written = [sheet_of_stream(out / STREAM, source, chosen, out / SHEET)]
     # Frame 0 alone, and no test camera to measure it: there is no curve to draw.
     if len(records) > 1 or records[0].psnr:
         written.append(plot_runs({method: records}, out / PLOTS, title=f"{method} on {source.info.name}"))
-    text = [summary_table({method: summarise(records)})]
+    text = [summary_table({method: summarise(records)}), "", judges]
     budget = budget_lines(read_lines(out / METRICS))
     text += ["", *budget] if budget else []
     (out / SUMMARY).write_text("\n".join(text) + "\n", encoding="utf-8")
@@ -47,3 +49,12 @@ def write_gallery(out: Path, source: FrameSource, *, video: bool = True) -> list
         play(out / STREAM, out / VIDEO, camera=name)
         written.append(out / VIDEO)
     return written
+
+
+def judges_line(meta: StreamMeta) -> str:
+    """Return the sentence that says which cameras judged a run, and by which split."""
+    if len(meta.test) == 0:
+        return "no camera judged: all of them train"
+    split = meta.recipe.get("data", {}).get("split", "reporting")
+    purpose = "training cameras left out, to choose settings" if split == "tuning" else "test cameras"
+    return f"judged by {', '.join(meta.test.ids)} ({split} split: {purpose})"

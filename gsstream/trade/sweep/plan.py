@@ -162,9 +162,10 @@ def _resolve(
     config: SweepConfig, scene: Scene, variant: Variant, axes: Mapping[str, Any], seed: int, folder: Path,
     find_method: FindMethod,
 ) -> ResolvedRecipe:  # fmt: skip
-    """Method <- variant's file <- scene's file <- set of all, of the scene, of the variant <- axes <- seed and size."""
+    """Method <- variant's file <- scene's file <- split <- set of all, scene, variant <- axes <- seed and size."""
     size = {"seed": seed, "scale": scene.scale, "frames": scene.frames}
     written = [
+        ("split", {"data.split": config.split}),
         ("set", config.set),
         (f"scene {scene.name}: set", scene.set),
         (f"variant {variant.name}: set", variant.set),

@@ -52,7 +52,7 @@ class ErrorGrowth(Growth):
         rays: int = Field(default=96, ge=1, le=10_000, description="most rays searched per view")
         depths: int = Field(default=64, ge=2, le=1000, description="depths tried along a ray")
         pixels: float = Field(default=1.5, gt=0, le=20, description="standard deviation of a newborn Gaussian, pixels")
-        epochs: int = Field(default=3, ge=0, le=100, description="passes over the proposing views that fit the newborn")
+        epochs: int = Field(default=6, ge=0, le=100, description="passes over the proposing views that fit the newborn")
         split: float = Field(
             default=6.0, ge=0, le=1000,
             description="Gaussians with a longer axis in what is wrong, as a standard deviation in pixels, are split; "

@@ -8,10 +8,12 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from gsstream.core.changes import Scene, apply_rows
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
+from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.engine.fit.exposure import Exposure
 from gsstream.engine.step.active.change import detect_change
@@ -41,16 +43,9 @@ class Entered(NamedTuple):
         method, now = self.method, frame or self.frame
         change = detect_change(self.before, now, 6.0)
         gaussians = self.scene.gaussians.map(torch.from_numpy)
-        nodes = torch.from_numpy(self.scene.layout.node_of)
-        hierarchy = method.parts.structure.build(gaussians, None) if nodes is None else _forest(nodes)
+        roots = torch.arange(len(self.scene.layout.node_counts))
+        hierarchy = Hierarchy(torch.from_numpy(self.scene.layout.node_of), roots, torch.zeros_like(roots))
         return FrameView(method.parts, gaussians, hierarchy, now, self.before, exposure, change)
-
-
-def _forest(node_of: torch.Tensor):
-    from gsstream.core.hierarchy import Hierarchy
-
-    roots = torch.arange(int(node_of.max()) + 1)
-    return Hierarchy(node_of, roots, torch.zeros_like(roots))
 
 
 @pytest.fixture(scope="module")
@@ -106,11 +101,9 @@ def test_cameras_of_different_colour_response_find_the_same(entered: Entered) ->
     gains = np.linspace(0.6, 1.0, VIEWS).astype(np.float32)
     matrix = torch.stack([float(gain) * torch.eye(3) for gain in gains])
     exposure = Exposure(matrix, torch.zeros(VIEWS, 3))
-    images = entered.frame.images * gains[:, None, None, None]
-    frame = replace(entered.frame, images=images)
-    lit = replace(entered, before=None) if False else entered._replace(
-        before=replace(entered.before, images=entered.before.images * gains[:, None, None, None])
-    )
+    factors = gains[:, None, None, None]
+    frame = replace(entered.frame, images=entered.frame.images * factors)
+    lit = entered._replace(before=replace(entered.before, images=entered.before.images * factors))
     work = lit.work(exposure, frame)
     for view in range(VIEWS):
         assert np.allclose(work.scene_image(view).numpy(), entered.frame.images[view], atol=1e-5)
@@ -127,7 +120,8 @@ def proposed(entered: Entered):
 
 
 def test_views_left_out_are_less_wrong_afterwards(entered: Entered, proposed) -> None:
-    assert proposed is not None and len(proposed.births) > 10
+    assert proposed is not None
+    assert len(proposed.births) > 10
     after = apply_rows(entered.scene, proposed).gaussians.map(torch.from_numpy)
     before = entered.scene.gaussians.map(torch.from_numpy)
     work = entered.work()
@@ -178,8 +172,6 @@ def test_halves_cover_what_their_parent_covered() -> None:
 
 def _covariance(gaussians: Gaussians[np.ndarray], row: int) -> np.ndarray:
     """R S S R^T by an independent route: the rotation from scipy."""
-    from scipy.spatial.transform import Rotation
-
     w, x, y, z = gaussians.quats[row].astype(np.float64)
     turn = Rotation.from_quat([x, y, z, w]).as_matrix()
     return turn @ np.diag(np.exp(2.0 * gaussians.scales[row])) @ turn.T
@@ -202,8 +194,6 @@ def test_only_what_is_long_and_wrong_is_split(entered: Entered) -> None:
 def test_nothing_is_born_with_two_views(entered: Entered) -> None:
     """One view would judge and one propose: nothing says how deep it is."""
     work = entered.work()
-    two = replace(
-        entered.frame, images=entered.frame.images[:2], cameras=work.cameras.select([0, 1])
-    )
+    two = replace(entered.frame, images=entered.frame.images[:2], cameras=work.cameras.select([0, 1]))
     before = replace(entered.before, images=entered.before.images[:2], cameras=two.cameras)
     assert ErrorGrowth().propose(entered.scene, entered._replace(before=before).work(frame=two), Rng(0)) is None

@@ -121,6 +121,8 @@ def run_command(argv: Sequence[str]) -> int:
                 traceback.print_exc()
             else:
                 typer.echo(f"error: {printable(error, keep=_LINE)}", err=True)
+                for note in getattr(error, "__notes__", ()):
+                    typer.echo(printable(note, keep=_LINE), err=True)
             return 2 if isinstance(error, InputError) else 1
     if code == 130:
         return _interrupted()

@@ -17,6 +17,7 @@ from gsstream.cli import (
     bench,
     check,
     deliver,
+    gap,
     info,
     methods,
     package,
@@ -78,6 +79,7 @@ def _root(
 app.command(name="run")(run.run)
 app.command(name="play")(streams.play)
 app.command(name="evaluate")(streams.evaluate)
+app.command(name="gap")(gap.gap)
 app.command(name="info")(info.info)
 app.command(name="export")(deliver.export)
 app.command(name="manifest")(deliver.manifest)

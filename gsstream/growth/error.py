@@ -80,11 +80,10 @@ class ErrorGrowth(Growth):
         born = fitted(without(scene, parents), born, work, proposing, self.config.epochs, rng)
         sound = finite(born)
         born, parents = born.rows(sound), parents[sound]
-        kept = self._kept(scene, born, parents, work, out)
-        if not len(kept):
+        gain = self._gains(scene, born, parents, work, out)
+        if not bool((gain > 0).any()):
             return None
-        dying = np.unique(parents[kept][parents[kept] >= 0])
-        return self._balanced(after, work, born.rows(kept), dying)
+        return self._balanced(after, work, born, parents, gain)
 
     def _candidates(
         self, after: Scene, work: FrameWork, maps: dict[int, ErrorMap], rng: Rng
@@ -103,32 +102,40 @@ class ErrorGrowth(Growth):
         both = joined(lone.rows(np.arange(number)), pairs)
         return both.map(torch.from_numpy), np.concatenate([np.full(number, -1), np.repeat(rows, 2)]).astype(np.int64)
 
-    def _kept(
+    def _gains(
         self, scene: Gaussians[torch.Tensor], born: Gaussians[torch.Tensor], parents: IntArray, work: FrameWork,
         out: list[int],
-    ) -> IntArray:  # fmt: skip
-        """Newborn Gaussians that lower the error of the views left out, if they do so together, too."""
+    ) -> FloatArray:  # fmt: skip
+        """[B] how much each takes away from the error of the views left out; nobody gains if all together do not."""
         gain, _ = gains(scene, born, parents, work, out)
         # Both halves of a split stay or go, with their parent.
         for parent in np.unique(parents[parents >= 0]):
             gain[parents == parent] = gain[parents == parent].sum()
         kept = np.flatnonzero(gain > 0)
-        if not len(kept):
-            return kept
-        _, total = gains(scene, born.rows(kept), parents[kept], work, out)
-        return kept if total > 0 else kept[:0]
+        if len(kept):
+            _, total = gains(scene, born.rows(torch.from_numpy(kept)), parents[kept], work, out)
+            if total > 0:
+                return gain
+        return np.zeros(len(born))
 
-    def _balanced(self, after: Scene, work: FrameWork, born: Gaussians[torch.Tensor], dying: IntArray) -> Rows | None:
-        """Births with as many deaths: parents that were split, then what no view shows."""
+    def _balanced(
+        self, after: Scene, work: FrameWork, born: Gaussians[torch.Tensor], parents: IntArray, gain: FloatArray
+    ) -> Rows | None:
+        """The births that gain most, and a death for each: parents that are split, and what no view shows."""
         drawn = work.on(after.gaussians.map(torch.from_numpy)).drawn_rows().numpy()
-        spare = np.setdiff1d(np.flatnonzero(~drawn), dying)
-        room = int((len(dying) + len(spare)) / max(1e-9, 1 - self.config.growth))
-        number = min(len(born), max(room, len(dying)))
+        spare = np.setdiff1d(np.flatnonzero(~drawn), parents)
+        # A birth alone makes one more, and so do two halves in the place of one parent.
+        units = np.where(parents < 0, np.arange(len(born)), len(born) + parents)
+        order = [int(row) for row in np.argsort(-gain, kind="stable") if gain[row] > 0]
+        ranked = list(dict.fromkeys(units[order].tolist()))
+        dying = 1 - self.config.growth
+        number = len(ranked) if dying == 0 else min(len(ranked), int(len(spare) / dying))
         if number == 0:
             return None
-        births = born.rows(torch.arange(number)).map(lambda value: value.numpy())
-        need = max(0, round(number * (1 - self.config.growth)) - len(dying))
-        deaths = np.union1d(dying, spare[:need]).astype(np.int64)
+        kept = np.flatnonzero(np.isin(units, ranked[:number]))
+        split = np.unique(parents[kept][parents[kept] >= 0])
+        deaths = np.union1d(split, spare[: round(number * dying)]).astype(np.int64)
+        births = born.rows(torch.from_numpy(kept)).map(lambda value: value.numpy())
         return Rows(self._settled(after, births), deaths)
 
     def _settled(self, after: Scene, born: Gaussians[FloatArray]) -> Births:

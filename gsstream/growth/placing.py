@@ -39,7 +39,7 @@ def placed(
     work: FrameWork, maps: Mapping[int, ErrorMap], means: FloatArray, *, rays: int, depths: int, votes: float,
     agreement: float, generator: np.random.Generator,
 ) -> Placed:  # fmt: skip
-    """Search rays through wrong pixels for the depth at which the other views agree.
+    """Return points on rays through wrong pixels, at the depth at which the other views agree.
 
     Pictures are compared in the colours of the scene, so cameras of different colour response may be compared.
 

@@ -57,7 +57,13 @@ def error_map(work: FrameWork, scene: Gaussians[torch.Tensor], view: int, sigmas
 
 
 def project(points: FloatArray, cameras: Cameras, view: int) -> Projected:
-    """Return where points [P, 3] land in a view."""
+    """Return where points land in a view.
+
+    Arguments:
+        points: [P, 3] scene units.
+        cameras: training cameras.
+        view: index of one of them.
+    """
     pose, K = cameras.viewmats[view], cameras.Ks[view]
     local = points @ pose[:3, :3].T + pose[:3, 3]
     front = local[:, 2] > cameras.near

@@ -65,7 +65,7 @@ def frame_step(
         return still(state, frame, clock)
 
     with clock.phase("motion"):
-        motions, scene, view = moved(parts, state, frame, change, rng, targets)
+        motions, scene, view = moved(parts, state, frame, change, rng, targets, allowance)
     with clock.phase("confidence"):
         confidence = parts.propagation.propagate(parts.confidence.estimate(view), state.hierarchy)
         logits = parts.gate.init(confidence)

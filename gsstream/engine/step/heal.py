@@ -70,7 +70,13 @@ def _unfinished(view: FrameView, memory: StillMemory, place: int) -> FloatArray:
 
 
 def raised(logits: torch.Tensor, rows: torch.Tensor, hierarchy: Hierarchy) -> torch.Tensor:
-    """Return the logits [M] with the gates of these rows [N] bool no more shut than undecided."""
+    """Return the logits [M] with the gates of some rows no more shut than undecided.
+
+    Arguments:
+        logits: [M] initial gate logits.
+        rows: [N] bool, Gaussians that are to be mended.
+        hierarchy: node of each Gaussian.
+    """
     out = logits.clone()
     nodes = torch.unique(hierarchy.node_of[rows])
     out[nodes] = out[nodes].clamp_min(START)

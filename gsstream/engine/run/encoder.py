@@ -126,7 +126,9 @@ class Encoder:
         if not check_stream(self.parts, stream, self.info) or (last is not None and last < 0):
             return None
         end = ended(stream, last)
-        tools = self._tools(replay=lambda: since_key(stream, end))
+        tools = self._tools(
+            replay=lambda: since_key(stream, end), images=lambda index: self.at_near(image(index))
+        )
         self.parts.where.enter(end.player.frame)
         with one_torch_thread():
             self.state = self.parts.stepper.resume(end.player, self.at_near(image(end.shown)), tools)

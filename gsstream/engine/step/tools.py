@@ -35,6 +35,7 @@ class RunTools:
         allowance: what a budget lets the next frame spend; None: what the recipe says.
         refuse_key: number of Gaussians -> why a key packet cannot be paid for now, or None.
         replay: the states of players since the last key packet, while a stream is being resumed.
+        images: frame index -> its training images, while a stream is being resumed.
     """
 
     parts: Assembly
@@ -46,6 +47,7 @@ class RunTools:
     allowance: Allowance | None = None
     refuse_key: Callable[[int], str | None] = lambda _: None
     replay: Callable[[], Iterator[PlayerState]] = lambda: iter(())
+    images: Callable[[int], Frame] | None = None
 
     @property
     def renderer(self) -> Renderer:

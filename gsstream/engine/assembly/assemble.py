@@ -16,6 +16,7 @@ from gsstream.core.part import Part
 from gsstream.engine.assembly.checks import Checks, wanted_checks
 from gsstream.engine.assembly.guard import guard, plain
 from gsstream.engine.assembly.heeded import unheeded
+from gsstream.engine.assembly.title import title
 from gsstream.engine.assembly.where import Where
 from gsstream.gate.base import GateSampler
 from gsstream.growth.base import Growth
@@ -60,6 +61,7 @@ class Assembly:
         pending: paths of values that are still ``auto``; the parts have their defaults there
             (``engine.auto.rules.settle``).
         chosen: key -> what the scene decided.
+        title: the method and what was changed of its recipe, for tables and pictures.
         where: the frame and iteration that errors name.
 
     Every part is behind a guard (:class:`gsstream.engine.assembly.guard.Guarded`), so no caller has to be careful.
@@ -83,6 +85,7 @@ class Assembly:
     checks: Checks = Checks.FRAME
     pending: tuple[KeyPath, ...] = ()
     chosen: Mapping[str, Choice] = field(default_factory=dict)
+    title: str = ""
     where: Where = field(default_factory=Where, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -146,7 +149,7 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
     recipe = resolved.recipe.model_copy(update=refs)
     return Assembly(
         recipe=recipe, origins=resolved.origins, distributions=tuple(owners), pending=tuple(pending), checks=level,
-        **parts,
+        title=title(resolved.recipe, catalog), **parts,
     )  # fmt: skip
 
 

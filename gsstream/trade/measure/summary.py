@@ -87,6 +87,27 @@ def summary_table(runs: Mapping[str, Summary]) -> str:
     return format_table(rows)
 
 
+def fitted(text: str, width: float) -> str:
+    """Return a text whose Markdown tables that are wider than a terminal stand upright: a line for each column.
+
+    Arguments:
+        text: lines, some of which are tables as :func:`format_table` makes them.
+        width: characters of a line.
+    """
+    lines, out = text.splitlines(), list[str]()
+    while lines:
+        count = next((i for i, line in enumerate(lines) if not line.startswith("|")), len(lines))
+        if count > 1 and max(map(len, lines[:count])) > width:
+            rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[:count]]
+            upright = format_table(list(zip(rows[0], *rows[2:], strict=True)))
+            out += upright.splitlines()
+        else:
+            count = max(count, 1)
+            out += lines[:count]
+        lines = lines[count:]
+    return "\n".join(out)
+
+
 def format_table(rows: Sequence[Sequence[str]]) -> str:
     """Return Markdown with aligned columns: text left, numbers right. The first row is the head."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]

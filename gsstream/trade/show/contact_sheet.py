@@ -37,26 +37,28 @@ class Column:
     active: FloatArray | None = None
 
 
-def contact_sheet(columns: Sequence[Column]) -> Image.Image:
-    """Draw the sheet; images keep their pixels. Raises InputError for an empty list."""
+def contact_sheet(columns: Sequence[Column], heading: str = "") -> Image.Image:
+    """Draw the sheet under a heading; images keep their pixels. Raises InputError for an empty list."""
     if not columns:
         raise InputError("a contact sheet needs at least one frame")
     height, width = columns[0].truth.shape[:2]
     labels = ["ground truth", "decoded", f"|error| x {ERROR_GAIN}"]
     labels += ["allowed to change"] if any(c.active is not None for c in columns) else []
     left = 2 * _MARGIN + max(int(_font().getlength(label)) for label in labels)
-    size = (left + len(columns) * (width + _GAP) + _MARGIN, _TEXT + len(labels) * (height + _GAP) + _MARGIN)
+    top = 2 * _TEXT if heading else _TEXT
+    size = (left + len(columns) * (width + _GAP) + _MARGIN, top + len(labels) * (height + _GAP) + _MARGIN)
     sheet = Image.new("RGB", size, "white")
     draw = ImageDraw.Draw(sheet)
+    draw.text((_MARGIN, 3), heading, "black", _font())
     for row, label in enumerate(labels):
-        draw.text((_MARGIN, _TEXT + row * (height + _GAP) + height // 2 - 6), label, "black", _font())
+        draw.text((_MARGIN, top + row * (height + _GAP) + height // 2 - 6), label, "black", _font())
     for index, column in enumerate(columns):
         x = left + index * (width + _GAP)
-        draw.text((x, 3), column.title, "black", _font())
+        draw.text((x, top - _TEXT + 3), column.title, "black", _font())
         error = np.abs(column.truth - np.clip(column.decoded, 0, 1)) * ERROR_GAIN
         for row, image in enumerate((column.truth, column.decoded, error, column.active)):
             if image is not None:
-                sheet.paste(Image.fromarray(to_bytes(image)), (x, _TEXT + row * (height + _GAP)))
+                sheet.paste(Image.fromarray(to_bytes(image)), (x, top + row * (height + _GAP)))
     return sheet
 
 
@@ -93,7 +95,7 @@ def sheet_of_stream(
             columns.append(Column(f"frame {frame}   {psnr(image, truth):.2f} dB", truth, image, active))
     out = Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
-    contact_sheet(columns).save(out)
+    contact_sheet(columns, f"{meta.title} on {meta.source}, camera {rig.ids[0]}").save(out)
     return out
 
 

@@ -45,11 +45,14 @@ def contact_sheet(columns: Sequence[Column], heading: str = "") -> Image.Image:
     labels = ["ground truth", "decoded", f"|error| x {ERROR_GAIN}"]
     labels += ["allowed to change"] if any(c.active is not None for c in columns) else []
     left = 2 * _MARGIN + max(int(_font().getlength(label)) for label in labels)
-    top = 2 * _TEXT if heading else _TEXT
-    size = (left + len(columns) * (width + _GAP) + _MARGIN, top + len(labels) * (height + _GAP) + _MARGIN)
+    right = left + len(columns) * (width + _GAP) + _MARGIN
+    said = _wrapped(heading, right - 2 * _MARGIN)
+    top = _TEXT * (1 + len(said))
+    size = (right, top + len(labels) * (height + _GAP) + _MARGIN)
     sheet = Image.new("RGB", size, "white")
     draw = ImageDraw.Draw(sheet)
-    draw.text((_MARGIN, 3), heading, "black", _font())
+    for number, line in enumerate(said):
+        draw.text((_MARGIN, 3 + number * _TEXT), line, "black", _font())
     for row, label in enumerate(labels):
         draw.text((_MARGIN, top + row * (height + _GAP) + height // 2 - 6), label, "black", _font())
     for index, column in enumerate(columns):
@@ -113,6 +116,18 @@ def paint_gates(state: PlayerState) -> Gaussians[FloatArray]:
         gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities,
         ((color - 0.5) / SH0)[:, None].astype(np.float32), np.zeros_like(gaussians.shN),
     )  # fmt: skip
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    """A text in lines of at most ``width`` pixels, broken between words."""
+    lines: list[str] = []
+    for word in text.split():
+        longer = f"{lines[-1]} {word}" if lines else word
+        if lines and _font().getlength(longer) <= width:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    return lines
 
 
 def _font() -> Any:

@@ -11,6 +11,7 @@ import typer
 
 from gsstream.cli import options
 from gsstream.cli.listing import fitting
+from gsstream.cli.serve import server_beside, serving
 from gsstream.cli.streams import stream_file
 from gsstream.core.errors import ComponentError, GsstreamError, SourceError
 
@@ -41,6 +42,7 @@ def run(
     checks: Annotated[str | None, typer.Option("--checks", help="Look at parts: off, frame (default), step.")] = None,
     no_video: options.NoVideo = False,
     quiet: options.Quiet = False,
+    serve: options.Serve = None,
 ) -> None:
     """Encode a recording as a stream of 3D Gaussians.
 
@@ -55,6 +57,7 @@ def run(
     changes = options.overrides(settings, budget=budget, frames=frames, scale=scale, seed=seed, renderer=renderer)
     catalog = load_catalog()
     resolved = resolve_recipe(method, catalog.recipe_path, recipe or (), changes)
+    server = server_beside(out, serve)
     # The slow imports come last: a mistake on the command line is answered at once.
     from gsstream.engine.assembly.assemble import assemble
     from gsstream.engine.run.recording import open_recording, read_first_frame
@@ -69,8 +72,7 @@ def run(
         _what_is_taken(say, resolved.recipe, recording.info, named=bool(method or recipe), catalog=catalog)
         if not resume:
             _first_look(recording, source)
-        slow = assembly.recipe.renderer.name == "reference"
-        with claim_output(out, resume=resume, overwrite=overwrite), ended_by_signals() as came:
+        with claim_output(out, resume=resume, overwrite=overwrite), ended_by_signals() as came, serving(server):
             try:
                 with disk_errors(out):
                     result = run_session(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first)
@@ -78,7 +80,7 @@ def run(
                 _what_there_is(error, out, recording, not no_video, quiet)
                 raise
             with disk_errors(out):
-                _pictures(result, recording, not no_video, quiet, slow)
+                _pictures(result, recording, not no_video, quiet, assembly.recipe.renderer.name == "reference")
     finally:
         recording.close()
     if result.interrupted:

@@ -138,10 +138,8 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
             refs[slot] = _written_out(slot, ref, built, pending)
     loss = _loss(resolved, catalog, problems)
     if "stepper" in parts:
-        name = resolved.recipe.stepper.name
-        hint = f"the stepper {name!r} does not read it; its own settings: gsstream plugins show stepper/{name}"
-        paths = unheeded(resolved.recipe.model_copy(update=refs), parts["stepper"], parts, pending)
-        problems += [f"{resolved.near(path).where}: {'.'.join(path)}: {hint}" for path in paths]
+        paths = list(unheeded(resolved.recipe.model_copy(update=refs), parts["stepper"], parts, pending))
+        problems += _unread(paths, resolved)
     join_problems(problems)
     parts["loss"] = loss
     parts["optimiser"] = _optimiser(catalog)
@@ -151,6 +149,21 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
         recipe=recipe, origins=resolved.origins, distributions=tuple(owners), pending=tuple(pending), checks=level,
         title=title(resolved.recipe, catalog), **parts,
     )  # fmt: skip
+
+
+def _unread(paths: list[KeyPath], resolved: ResolvedRecipe) -> list[str]:
+    """What to say about keys that the stepper does not read: each, or in one line where it is the whole method's."""
+    name, base = resolved.recipe.stepper.name, resolved.recipe.method
+    from_base = [path for path in paths if resolved.near(path).label == f"method {base}"]
+    if len(from_base) > 2:
+        where = resolved.near(("stepper", "name")).where
+        some = ", ".join(".".join(path) for path in from_base[:3])
+        return [
+            f"{where}: the stepper {name!r} reads none of {len(from_base)} settings that the method {base!r} brings "
+            f"({some}, ...); put it in place of another method: --method dense --set stepper={name}"
+        ]
+    hint = f"the stepper {name!r} does not read it; its own settings: gsstream plugins show stepper/{name}"
+    return [f"{resolved.near(path).where}: {'.'.join(path)}: {hint}" for path in paths]
 
 
 def _written_out(slot: str, ref: ComponentRef, part: Part, pending: list[KeyPath]) -> ComponentRef:
@@ -247,6 +260,8 @@ def _auto_renderer(
             return name, _construct("renderer", name, cls, cls.Config(), catalog)
         except (UnknownName, PluginUnavailable) as error:
             reasons.append(str(error))
+    off = [plugin.distribution for plugin in catalog.plugins if plugin.left_out]
+    reasons += [f"GSSTREAM_LOAD_PLUGINS switches {', '.join(off)} off"] if off else []
     warnings.warn(
         "no fast renderer works here, so the reference renderer is used: about 500 times slower. To mend it, install a "
         f"C++ compiler and run 'pip install ./plugins/cpu_render'. Reason: {'; '.join(reasons)}",

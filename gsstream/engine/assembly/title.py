@@ -45,17 +45,17 @@ def title(recipe: Recipe, catalog: Catalog) -> str:
 def _changes(recipe: Recipe, base: Recipe, catalog: Catalog) -> Iterator[str]:
     """``slot=part`` for other parts, then ``key=value`` for other values, in the order of the recipe."""
     values: list[str] = []
-    for section, ours in recipe:
-        theirs = getattr(base, section)
+    for section, value in recipe:
+        usual = getattr(base, section)
         if section in NOT_THE_METHOD:
             continue
-        if not isinstance(ours, ComponentRef):
-            values += _differences(_plain(ours), _plain(theirs), section)
-        elif ours.name != theirs.name:
-            yield f"{section}={ours.name}"
+        if not isinstance(value, ComponentRef):
+            values += _differences(_plain(value), _plain(usual), section)
+        elif value.name != usual.name:
+            yield f"{section}={value.name}"
         else:
-            written = _merged(_defaults(section, ours.name, catalog), theirs.params)
-            values += _differences(ours.params, written, section)
+            written = _merged(_defaults(section, value.name, catalog), usual.params)
+            values += _differences(value.params, written, section)
     yield from values
 
 
@@ -80,12 +80,12 @@ def _plain(section: Any) -> Any:
     return section.model_dump(mode="json") if hasattr(section, "model_dump") else section
 
 
-def _differences(ours: Any, theirs: Any, path: str) -> Iterator[str]:
-    if isinstance(ours, Mapping) and isinstance(theirs, Mapping):
-        for key, value in ours.items():
-            yield from _differences(value, theirs.get(key), f"{path}.{key}")
-    elif theirs != AUTO and path not in NOR_THESE and ours != theirs and _as_list(ours) != _as_list(theirs):
-        yield f"{path}={_short(ours)}"
+def _differences(value: Any, usual: Any, path: str) -> Iterator[str]:
+    if isinstance(value, Mapping) and isinstance(usual, Mapping):
+        for key, inner in value.items():
+            yield from _differences(inner, usual.get(key), f"{path}.{key}")
+    elif usual != AUTO and path not in NOR_THESE and value != usual and _as_list(value) != _as_list(usual):
+        yield f"{path}={_short(value)}"
 
 
 def _as_list(value: Any) -> Any:

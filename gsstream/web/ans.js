@@ -1,6 +1,7 @@
 // The entropy decoder: the stack coder of constriction 0.5 (64-bit state, 32-bit words) with 24-bit categorical models.
 //
-// The state is kept as two halves of 32 bits; no product below exceeds 2^49, so all of it is exact without BigInt.
+// The state is kept as two halves of 32 bits, and multiplied in pieces of 12 and 16: all of it is arithmetic of 32-bit
+// integers, exact without BigInt.
 
 import { PacketError } from "./errors.js";
 
@@ -19,7 +20,7 @@ export function quantiseCounts(counts) {
   let sum = 0;
   for (let i = 0; i < number; i += 1) sum += counts[i];
   const scale = (TOTAL - number) / sum;
-  const left = new Uint32Array(number + 1);
+  const left = new Int32Array(number + 1);
   let before = 0;
   for (let i = 0; i < number; i += 1) {
     left[i] = Math.trunc(before * scale) + i;
@@ -86,12 +87,18 @@ export class AnsDecoder {
       }
       const begin = model[symbol];
       const width = model[symbol + 1] - begin;
-      // state = (state >> 24) * width + rest: the low half by integer products, the high half in exact pieces.
+      // state = (state >> 24) * width + rest, of which `high` gets what is above 2^32.
       const rest = quantile - begin;
-      const small = (high & 0xffff) * width * 256 + ((low >>> 24) * width + rest);
-      const big = (high >>> 16) * width + Math.floor(small * 2 ** -24);
-      low = (Math.imul((high << 8) | (low >>> 24), width) + rest) | 0;
-      high = Math.floor(big * 2 ** -8) | 0;
+      const shifted = (high << 8) | (low >>> 24);
+      const a = shifted >>> 16;
+      const b = shifted & 0xffff;
+      const w1 = width >>> 12;
+      const w0 = width & 0xfff;
+      const m = Math.imul(b, w1) + ((Math.imul(b, w0) + rest) >>> 12);
+      const n = Math.imul(a, w0) + (m >>> 4);
+      const k = Math.imul(a, w1) + (n >>> 12);
+      low = (Math.imul(shifted, width) + rest) | 0;
+      high = ((k >>> 4) + Math.imul(high >>> 24, width)) | 0;
       if (high === 0 && left > 0) {
         left -= 1;
         high = low;

@@ -14,6 +14,8 @@ import { Snapshots } from "./snapshots.js";
 const BUDGET = 24;
 
 /**
+ * `options.renderer` takes the place of the player's own; it has `update(state)`, `draw(camera)` and `dispose()`.
+ *
  * Events: `ready` (the first picture can be drawn), `frame`, `state` (playing, waiting, paused, ended), `problem`
  * (detail: a sentence), `view`.
  */
@@ -22,7 +24,8 @@ export class Player extends EventTarget {
     super();
     this.canvas = canvas;
     this.options = options;
-    this.renderer = new Renderer(canvas, { onChange: () => this.invalidate(), useWorker: options.worker !== false });
+    const drawing = { onChange: () => this.invalidate(), useWorker: options.worker !== false };
+    this.renderer = options.renderer ?? new Renderer(canvas, drawing);
     this.loop = options.loop ?? true;
     this.speed = options.speed ?? 1;
     this.playing = false;
@@ -266,11 +269,8 @@ export class Player extends EventTarget {
   /** A frame is not loaded: wait for it, or, when it will never come, say why and go on with what is sound. */
   _missing(frame) {
     const failure = this.buffer.failure(frame, this.frame);
-    if (!failure) {
-      this.buffer.want(frame, this.frame);
-      return;
-    }
-    this._stop(failure);
+    if (failure) this._stop(failure);
+    else this.buffer.want(frame, this.frame);
   }
 
   /** Say what is wrong. A damaged segment is left out where another one follows; anything else ends the playing. */

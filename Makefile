@@ -1,5 +1,5 @@
 # Two commands, nothing to prepare: 'make demo' and 'make test'. Both set up .venv first (Python >= 3.11, a C++ compiler).
-#   make demo            encode the recording that ships with gsstream; says where the pictures are
+#   make demo            encode the recording that ships with gsstream; says where the pictures are and how to open it
 #   make test            lint, types, import rules and all tests
 #   make PYTHON=python3.12 test    choose the interpreter .venv is made with
 #   make clean           remove .venv and what was built
@@ -28,6 +28,9 @@ demo: setup
 	$(BIN)/gsstream run --method $(DEMO_METHOD) --source demo --out $(DEMO_OUT) --overwrite
 	@echo "The stream, its measurements and the pictures are in $(abspath $(DEMO_OUT)):"
 	@ls -1 $(DEMO_OUT)
+	@$(BIN)/gsstream package $(DEMO_OUT) --out $(DEMO_OUT)/site >/dev/null
+	@echo "This line opens it in your browser (Ctrl-C ends):"
+	@echo "  (sleep 1; $(BIN)/python -m webbrowser http://127.0.0.1:8000) & $(BIN)/python -m http.server --directory $(DEMO_OUT)/site --bind 127.0.0.1 8000"
 
 # Every check runs even when an earlier one failed; pytest comes last, so that its summary is the last thing printed.
 test: setup

@@ -16,6 +16,7 @@ import sys
 
 import numpy as np
 
+from gsstream.core.shapes import IntArray
 from gsstream.packet import KeyState, decode_packet, encode_key
 from gsstream.player.playback import Playback
 from gsstream.serve.joins import encode_join, follow
@@ -32,7 +33,8 @@ def measure(path: str, every: float) -> dict[str, object]:
         first, *others = (playback.entry(frame) for frame in playback.frames)
         state = key = decode_packet(None, playback.reader.read(first))
         step = max(1, round(every * key.meta.fps))
-        source, deltas, places = np.arange(len(key.gaussians)), 0, []
+        source: IntArray = np.arange(len(key.gaussians), dtype=np.int64)
+        deltas, places = 0, []
         for number, entry in enumerate(others, 1):
             state = decode_packet(state, playback.reader.read(entry))
             source = follow(source, state)

@@ -31,10 +31,10 @@ SEEK = f"""(async () => {{
 STEPS = f"""(async () => {{
   const found = [];
   for (let frame = {P}.frame + 1; frame <= Math.min({P}.last, {P}.first + 8); frame += 1) {{
+    const uploaded = {P}.statistics.uploaded;
     {P}.seek(frame);
     while ({P}.frame !== frame) await new Promise((resolve) => setTimeout(resolve, 5));
     const rows = new Set(({P}.state.change.moved ?? []).flatMap((part) => [...part.rows])).size;
-    const uploaded = {P}.statistics.uploaded;
     {P}.draw();
     await new Promise((resolve) => setTimeout(resolve, 30));
     found.push([rows, {P}.statistics.uploaded - uploaded, {P}.renderer.sorter.milliseconds]);
@@ -85,7 +85,7 @@ def measure(given: argparse.Namespace) -> dict[str, object]:
         ]  # fmt: skip
         for name, yaw, tip in (("left", 0.35, 0.0), ("right", -0.35, 0.1), ("above", 0.1, -0.25)):
             steps += [["evaluate", f"{P}.canvas.parentNode.host._fit()"]]
-            steps += [["evaluate", TURN.format(p=P, yaw=yaw, tip=tip)], ["pause", 3000]]
+            steps += [["evaluate", TURN.format(p=P.replace("?.", "."), yaw=yaw, tip=tip)], ["pause", 3000]]
             steps += [["screenshot", str(given.out / f"orbit-{name}.png")]]
         results = in_browser(steps, given.out, size=tuple(given.size))
         psnrs = []

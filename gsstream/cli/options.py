@@ -38,6 +38,11 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the run th
 NoVideo = Annotated[bool, typer.Option("--no-video", help="Write no video, only still pictures.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print only warnings and errors.")]
 
+Serve = Annotated[
+    int | None,
+    typer.Option("--serve", metavar="PORT", min=0, max=65535, help="Show the frames live at this port (extra: serve)."),
+]
+
 
 def workers(jobs: str, default: str = "one for each processor") -> Any:
     """Return the option --workers of a command whose workers do ``jobs``."""

@@ -5,10 +5,9 @@ import { cameraOf, pivotOf, viewsOf } from "./camera.js";
 import { KIND } from "./container.js";
 import { decodePacket } from "./decode.js";
 import { PacketError } from "./errors.js";
-import { decodeJoin } from "./joins.js";
+import { Snapshots, decodeJoin } from "./joins.js";
 import { Renderer } from "./renderer.js";
 import { openSource } from "./source.js";
-import { Snapshots } from "./snapshots.js";
 
 /** Decoding may take so many milliseconds of one picture's time before the page gets its turn. */
 const BUDGET = 24;
@@ -65,9 +64,9 @@ export class Player extends EventTarget {
 
   _start(segments, frame) {
     this.snapshots.clear();
-    this.buffer = new PacketBuffer(segments, () => this._news());
+    this.buffer = this.source.follow?.(this) ?? new PacketBuffer(segments, () => this._news());
     this.buffer.fps = this.source.fps ?? 30;
-    this._target = frame ?? this.buffer.first ?? 0;
+    this._target = this.buffer.live ? null : (frame ?? this.buffer.first ?? 0);
     this.buffer.want(this._target);
     return new Promise((resolve, reject) => {
       this._opened = { resolve, reject };
@@ -94,7 +93,7 @@ export class Player extends EventTarget {
   play() {
     if (this.playing) return;
     if (this.frame !== null && this.buffer.last !== null && this.frame >= this.last) this.seek(this.first);
-    if (this.problem) this.buffer?.retry();
+    if (this.problem) this.buffer?.retry?.();
     this.problem = null;
     this.playing = true;
     this._clock = 0;
@@ -106,7 +105,7 @@ export class Player extends EventTarget {
     this._say("state");
   }
 
-  /** Show a frame as soon as it is there. */
+  /** Show a frame as soon as it is there. A live stream only shows its newest. */
   seek(frame) {
     const wanted = Math.max(this.first, Math.min(Math.round(frame), this.last));
     this._target = wanted;
@@ -147,6 +146,7 @@ export class Player extends EventTarget {
     this.renderer.draw(cameraOf(this.view, this.canvas.width, this.canvas.height), options);
     this.statistics.drawn += 1;
     this.statistics.uploaded += this.renderer.uploaded;
+    this.buffer?.shown?.(this.frame);
   }
 
   close() {
@@ -171,7 +171,8 @@ export class Player extends EventTarget {
     const seconds = this._then === null ? 0 : Math.min((now - this._then) / 1000, 0.25);
     this._then = now;
     this.options.beforeFrame?.(seconds);
-    if (this.buffer) this._advance(seconds);
+    if (this.buffer?.live) this.buffer.feed();
+    else if (this.buffer) this._advance(seconds);
     if (this._dirty && this.state) {
       this._dirty = false;
       this.draw();
@@ -279,10 +280,8 @@ export class Player extends EventTarget {
     this._target = next;
     this.playing &&= next !== null;
     this.problem = error.message;
-    if (this._opened) {
-      this._opened.reject(error);
-      this._opened = null;
-    }
+    this._opened?.reject(error);
+    this._opened = null;
     this.dispatchEvent(new CustomEvent("problem", { detail: error.message }));
     this._say("state");
   }

@@ -45,6 +45,7 @@ OPTIONS = {
     ],
     "gsstream play": ["STREAM", "--out", "--camera", "--frames", "--size", "--renderer", "--max-memory"],
     "gsstream evaluate": ["STREAM", "--source", "--lpips-onnx", "--lpips-range", "--json", "--max-memory"],
+    "gsstream gap": ["RUN", "--at", "--cache", "--epochs", "--source", "--json", "--quiet"],
     "gsstream info": ["STREAM", "--json"],
     "gsstream export": ["STREAM", "--out", "--format", "--frames", "--max-memory"],
     "gsstream manifest": ["STREAM", "--out"],

@@ -43,6 +43,14 @@ LIES = {
     "background of texts": put(background=["0", "0", "0"]),
     "source_uri is no text": put(extra={"source_uri": ["a"]}),
     "licence is no text": put(extra={"licence": 7}),
+    "title is no text": put(extra={"title": ["dense"]}),
+    **{f"origin {origin!r}": put(extra={"origin": origin}) for origin in ([0, 0], 3, "abc", [0, 0, 1e39], [[0], 1, 2])},
+    "exposure without a matrix": put(extra={"exposure": {"offset": [[0, 0, 0]] * 3}}),
+    "exposure of fewer cameras": put(extra={"exposure": {"matrix": [np.eye(3).tolist()], "offset": [[0, 0, 0]]}}),
+    "exposure is a list": put(extra={"exposure": [1]}),
+    "shown before the start": put(extra={"shown": -1}),
+    "shown as text": put(extra={"shown": "1"}),
+    "a choice without its reason": put(extra={"auto": {"first_frame.sh_degree": {"value": 2}}}),
 }
 
 

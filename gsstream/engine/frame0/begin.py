@@ -124,8 +124,11 @@ def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMe
             f"the first frame has spherical harmonics of degree {first.gaussians.sh_degree}, the recipe asks for "
             f"{parts.recipe.first_frame.degree}; set first_frame.sh_degree={first.gaussians.sh_degree}"
         )
-    gaussians = first.gaussians.map(torch.from_numpy)
-    anchors = own_anchors(parts, first, frame)
+    # A delta may have put Gaussians between the positions that a key packet can say. They are grouped as players will
+    # have them, or a resumed run would find other groups.
+    held = replace(first, scene=replace(first.scene, gaussians=quantise_key(first.gaussians)))
+    gaussians = held.gaussians.map(torch.from_numpy)
+    anchors = own_anchors(parts, held, frame)
     hierarchy, levels, gaussians = arrange(parts, gaussians, anchors.levels, anchors)
     layout = make_layout(hierarchy, levels, anchors)
     exposure = exposure_from_meta(first.meta)
@@ -179,13 +182,19 @@ def cloud_of(first: PlayerState) -> PointCloud:
 
 def decoded_anchors(player: PlayerState) -> Anchors:
     """Return what a structure needs to group a decoded scene again."""
-    gaussians = player.gaussians.map(torch.from_numpy)
+    gaussians, origin = player.gaussians.map(torch.from_numpy), player.meta.extra.get("origin")
+    if origin is None:
+        raise InputError(
+            "the stream does not say where the grid of its Gaussians begins (extra.origin of its key packet): it was "
+            "not written by this encoder, which can neither go on with it nor take its scene over; encode the "
+            "recording anew"
+        )
     return Anchors(
         positions=gaussians.means,
         colors=torch.zeros_like(gaussians.means),
         levels=torch.from_numpy(player.layout.unit_of.astype(np.int64)),
         cell_sizes=torch.from_numpy(np.asarray(player.layout.units)),
-        origin=torch.tensor(player.meta.extra["origin"], dtype=torch.float32),
+        origin=torch.tensor(origin, dtype=torch.float32),
     )
 
 

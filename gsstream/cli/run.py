@@ -39,15 +39,15 @@ def run(
     resume: options.Resume = False,
     overwrite: options.Overwrite = False,
     checks: Annotated[str | None, typer.Option("--checks", help="Look at parts: off, frame (default), step.")] = None,
+    diagnose: options.Diagnose = False,
     no_video: options.NoVideo = False,
     quiet: options.Quiet = False,
     serve: options.Serve = None,
 ) -> None:
     """Encode a recording as a stream of 3D Gaussians.
 
-    The recipe of the run is the method's, changed by --recipe FILE, then by --set and the short options. Ctrl-C ends
-    after the current frame with a valid stream (exit code 130), SIGTERM does so too (143); --resume continues it to the
-    same bytes.
+    The recipe is the method's, changed by --recipe FILE, then by --set and the short options. Ctrl-C (exit code 130)
+    and SIGTERM (143) end after the current frame with a valid stream; --resume continues it to the same bytes.
     """
     from gsstream.engine.run.output import claim_output, disk_errors, ended_by_signals
     from gsstream.plugins.catalog import load_catalog
@@ -55,12 +55,11 @@ def run(
 
     changes = options.overrides(settings, budget=budget, frames=frames, scale=scale, seed=seed, renderer=renderer)
     catalog = load_catalog()
-    resolved = resolve_recipe(method, catalog.recipe_path, recipe or (), changes)
-    server = server_beside(out, serve)
+    resolved, server = resolve_recipe(method, catalog.recipe_path, recipe or (), changes), server_beside(out, serve)
     # The slow imports come last: a mistake on the command line is answered at once.
     from gsstream.engine.assembly.assemble import assemble
     from gsstream.engine.run.recording import open_recording, read_first_frame
-    from gsstream.engine.run.session import run as run_session
+    from gsstream.engine.run.session import run as encode
 
     assembly = assemble(resolved, catalog, checks)
     # Read before the folder is touched: --overwrite must not delete a run for the sake of a faulty recording.
@@ -74,7 +73,8 @@ def run(
         with claim_output(out, resume=resume, overwrite=overwrite), ended_by_signals() as came, serving(server):
             try:
                 with disk_errors(out):
-                    result = run_session(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first)
+                    result = encode(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first,
+                                    diagnose=diagnose)  # fmt: skip
             except GsstreamError as error:
                 _what_there_is(error, out, recording, not no_video, quiet)
                 raise

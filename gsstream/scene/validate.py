@@ -79,7 +79,7 @@ def _stages(source: FrameSource, open_scene: Open, frames: int, features: bool) 
     except SourceError as fault:
         yield [error("files", str(fault))]
         return
-    yield check_placement(rig, len(train), points)
+    yield check_placement(rig, len(train), points, source.info.world.scale)
     yield check_axes(rig)
     yield check_overlap(train, train.ids)
     try:

@@ -22,6 +22,7 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import blaming
 from gsstream.engine.assembly.pending import refuse_pending
 from gsstream.engine.fit.exposure import Exposure
+from gsstream.engine.frame0.carried import numbers
 from gsstream.engine.frame0.optimise import Progress, initial_gaussians, optimise_first_frame, sort_by_node
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.init.thinning import thin_points
@@ -148,11 +149,11 @@ def own_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
         first: the decoded scene.
         frame: training images of frame 0.
     """
-    theirs = decoded_anchors(first)
+    means = torch.from_numpy(first.gaussians.means)
     grid = parts.structure.seed(cloud_of(first), frame.cameras)
-    sizes = theirs.cell_sizes[theirs.levels]
+    sizes = torch.from_numpy(np.asarray(first.layout.units)[first.layout.unit_of])
     levels = (sizes.log()[:, None] - grid.cell_sizes.log()[None]).abs().argmin(1)
-    return replace(theirs, levels=levels, cell_sizes=grid.cell_sizes, origin=grid.origin)
+    return Anchors(means, torch.zeros_like(means), levels, grid.cell_sizes, grid.origin)
 
 
 def cloud_of(first: PlayerState) -> PointCloud:
@@ -162,14 +163,14 @@ def cloud_of(first: PlayerState) -> PointCloud:
 
 
 def decoded_anchors(player: PlayerState) -> Anchors:
-    """Return what a structure needs to group a decoded scene again."""
+    """Return what a structure needs to group a decoded scene again. Raises PacketError when the meta lacks it."""
     gaussians = player.gaussians.map(torch.from_numpy)
     return Anchors(
         positions=gaussians.means,
         colors=torch.zeros_like(gaussians.means),
         levels=torch.from_numpy(player.layout.unit_of.astype(np.int64)),
         cell_sizes=torch.from_numpy(np.asarray(player.layout.units)),
-        origin=torch.tensor(player.meta.extra["origin"], dtype=torch.float32),
+        origin=torch.from_numpy(numbers(player.meta.extra.get("origin"), (3,), "origin")),
     )
 
 
@@ -250,8 +251,16 @@ def exposure_to_meta(exposure: Exposure | None) -> dict[str, Any]:
 
 
 def exposure_from_meta(meta: StreamMeta) -> Exposure | None:
-    """Return the colour maps that a key packet holds; an encoder, resumed or not, goes on from these values."""
+    """Return the colour maps that a key packet holds; an encoder, resumed or not, goes on from these values.
+
+    Raises PacketError when they are not one map for each training camera.
+    """
     stored = meta.extra.get("exposure")
     if stored is None:
         return None
-    return Exposure(torch.tensor(stored["matrix"]), torch.tensor(stored["offset"]))
+    matrix, offset = (stored.get(key) if isinstance(stored, dict) else None for key in ("matrix", "offset"))
+    views = len(meta.train)
+    return Exposure(
+        torch.from_numpy(numbers(matrix, (views, 3, 3), "exposure.matrix")),
+        torch.from_numpy(numbers(offset, (views, 3), "exposure.offset")),
+    )

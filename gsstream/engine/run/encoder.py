@@ -19,6 +19,7 @@ from gsstream.engine.auto.trials import choose
 from gsstream.engine.budget.controller import Controller
 from gsstream.engine.budget.pace import CLOCKS
 from gsstream.engine.frame0.begin import cloud_of
+from gsstream.engine.frame0.carried import in_world
 from gsstream.engine.frame0.optimise import Progress
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.keys.resume import check_stream, ended, since_key
@@ -75,7 +76,8 @@ class Encoder:
         #: State after the last frame; None before frame 0.
         self.state: Any = None
         self.controller = Controller(parts.recipe.budget, parts.recipe.stream)
-        self._seeds, self._first, self._listeners = seeds or self._swept, first_frame, listeners or Listeners()
+        self._first = None if first_frame is None else in_world(first_frame, info.world)
+        self._seeds, self._listeners = seeds or self._swept, listeners or Listeners()
 
     def encode(self, frame: Frame) -> Step[Any]:
         """Encode the next frame: the first as a key packet, later ones as the method decides.
@@ -181,6 +183,7 @@ class Encoder:
             background=recipe.background,
             plugins={name: version(name) for name in sorted(distributions)},
             extra={"source_uri": info.uri, "licence": info.licence, **record(self.parts)},
+            world=info.world,
         )
 
 

@@ -115,7 +115,8 @@ class World:
             w * y1 - x * z1 + y * w1 + z * x1, w * z1 + x * y1 - y * x1 + z * w1,
         ], 1)  # fmt: skip
         return Gaussians(
-            means=self.points(scene.means), quats=quats, scales=np.asarray(scene.scales, np.float64) + np.log(self.scale),
+            means=self.points(scene.means), quats=quats,
+            scales=np.asarray(scene.scales, np.float64) + np.log(self.scale),
             opacities=scene.opacities, sh0=scene.sh0, shN=turned_harmonics(scene.shN, self.matrix),
         )  # fmt: skip
 

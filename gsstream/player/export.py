@@ -46,9 +46,9 @@ def export(
             to the world's offset, which ``sequence.json`` and the headers of the PLYs state. The files hold float32,
             which is too coarse for a scene far from the recording's origin.
 
-    Raises InputError for an unknown format or frame, for positions that float32 cannot hold and beyond ``max_memory``, PacketError for a damaged stream
-    (without ``frames``: once the files before the damage are written), OutputError when the folder cannot be written
-    or the converter is missing or fails.
+    Raises InputError for an unknown format or frame, for positions that float32 cannot hold and beyond ``max_memory``,
+    PacketError for a damaged stream (without ``frames``: once the files before the damage are written), OutputError
+    when the folder cannot be written or the converter is missing or fails.
     """
     if kind not in FORMATS:
         raise InputError(f"cannot export to {kind!r}: expected one of {', '.join(FORMATS)}")
@@ -110,9 +110,9 @@ def _world_of_files(playback: Playback, frames: Sequence[int], origin: str) -> W
     smallest = world.scale * float(np.exp(np.median(scene.scales.min(1))))
     if step > smallest:
         raise InputError(
-            f"files hold positions as float32, which this far from the recording's origin "
-            f"({', '.join(f'{value:.6g}' for value in world.offset)}) are rounded to {step:.2g}, more than Gaussians are "
-            f"thin ({smallest:.2g}); write them relative to that place: --origin local"
+            f"files hold positions as float32; this far from the recording's origin they are rounded to {step:.2g} "
+            f"units, and half of the Gaussians are thinner than {smallest:.2g}: write positions relative to "
+            f"({', '.join(f'{value:.6g}' for value in world.offset)}) by --origin local"
         )
     return world
 

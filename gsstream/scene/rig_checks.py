@@ -73,8 +73,8 @@ def check_placement(
         usual = float(np.median(distance))
         found = [
             error("placement", (
-                f"camera {cameras.ids[i]!r} is {unit * distance[i]:.4g} units away from the middle of the rig, the others "
-                f"about {unit * usual:.4g}; its translation is probably in another unit (mm instead of m?)"
+                f"camera {cameras.ids[i]!r} is {unit * distance[i]:.4g} units away from the middle of the rig, the "
+                f"others about {unit * usual:.4g}; its translation is probably in another unit (mm instead of m?)"
             ))
             for i in np.flatnonzero(distance > FAR * max(usual, 1e-12))
         ]  # fmt: skip
@@ -89,8 +89,8 @@ def _points_unit(cameras: Cameras, points: PointCloud, unit: float) -> list[Find
     if 1 / FAR < ratio < FAR:
         return []
     return [error("placement", (
-        f"the points of frame 0 spread over {unit * spread:.4g} units, the rig over {unit * cameras.extent:.4g}: one of them is "
-        "probably in mm and the other in m; bring poses and points to one unit"
+        f"the points of frame 0 spread over {unit * spread:.4g} units, the rig over {unit * cameras.extent:.4g}: one "
+        "of them is probably in mm and the other in m; bring poses and points to one unit"
     ))]  # fmt: skip
 
 

@@ -12,7 +12,6 @@ from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.world import World, own_world, snapped
 from gsstream.source.base import FrameSource, GrowingSource, PointKind, SourceInfo, Split
 
-
 #: Points farther from the rig than this many of its extents leave the range in which positions can be coded.
 FARTHEST = 1e12
 
@@ -68,8 +67,8 @@ class CanonicalSource:
         xyz = self._world.points_back(cloud.xyz)
         if len(xyz) and not float(np.abs(xyz).max()) < FARTHEST:
             raise SourceError(
-                f"points of {self._info.name!r} ({cloud.origin}): expected positions within {FARTHEST:g} times the size "
-                f"of the rig, got one at {float(np.abs(xyz).max()):g}; take it out of the file"
+                f"points of {self._info.name!r} ({cloud.origin}): expected positions within {FARTHEST:g} times the "
+                f"size of the rig, got one at {float(np.abs(xyz).max()):g}; take it out of the file"
             )
         return replace(cloud, xyz=xyz.astype(np.float32))
 

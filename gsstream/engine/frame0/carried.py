@@ -53,5 +53,5 @@ def in_world(first: PlayerState, world: World) -> PlayerState:
         gaussians=scene.map(lambda values: np.asarray(values, np.float32)),
         layout=replace(layout, units=np.asarray(layout.units * move.scale, np.float32)),
     )
-    rigs = {"train": move.cameras(first.meta.train), "test": move.cameras(first.meta.test)}
-    return replace(first, scene=moved, meta=replace(first.meta, world=world, **rigs))
+    train, test = move.cameras(first.meta.train), move.cameras(first.meta.test)
+    return replace(first, scene=moved, meta=replace(first.meta, world=world, train=train, test=test))

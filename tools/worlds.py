@@ -1,7 +1,7 @@
 """Does it matter in which coordinates a recording comes? Encode one in several similar worlds, and compare.
 
-Usage: python -m tools.worlds [--source demo] [--method s2gs-fast] [--set KEY=VALUE ...] [--rows NAME ...] [--seeds 0 1 2]
-[--as-filed]
+Usage: python -m tools.worlds [--source demo] [--method s2gs-fast] [--set KEY=VALUE ...] [--rows NAME ...]
+[--seeds 0 1 2] [--as-filed]
 
 Prints a table: as it is with several seeds, then moved, scaled and turned with the first one. ``--as-filed`` leaves the
 recording in the coordinates it comes in, as gsstream did before decision 0031.

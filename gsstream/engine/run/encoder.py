@@ -13,6 +13,7 @@ from typing import Any
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.rng import Rng
+from gsstream.core.world import snapped
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.auto.rules import recall, record, stream_extra
 from gsstream.engine.auto.trials import choose
@@ -64,13 +65,14 @@ class Encoder:
         seeds: makes the points that frame 0 starts from; None: a plane sweep over its training images.
         first_frame: frame 0 of another stream, taken over instead of being reconstructed.
         listeners: what is told of the work.
+        place: frames bring cameras in the recording's coordinates, which are taken to those of ``info``.
     """
 
     def __init__(
         self, parts: Assembly, info: SourceInfo, seeds: Seeds | None = None, *, first_frame: PlayerState | None = None,
-        listeners: Listeners | None = None,
+        listeners: Listeners | None = None, place: bool = False,
     ) -> None:  # fmt: skip
-        self.parts, self.info = parts, info
+        self.parts, self.info, self._place = parts, info, place
         self.rng = Rng(parts.recipe.seed)
         self.near = parts.recipe.near * info.train.extent
         #: State after the last frame; None before frame 0.
@@ -135,8 +137,9 @@ class Encoder:
         return end.player.frame
 
     def at_near(self, frame: Frame) -> Frame:
-        """Return the frame with the near plane that the recipe gives this rig."""
-        return replace(frame, cameras=replace(frame.cameras, near=self.near))
+        """Return the frame with the near plane that the recipe gives this rig, in the stream's coordinates."""
+        cameras = snapped(self.info.world.cameras_back(frame.cameras)) if self._place else frame.cameras
+        return replace(frame, cameras=replace(cameras, near=self.near))
 
     def _begin(self, frame: Frame) -> Step[Any]:
         if self.parts.pending:

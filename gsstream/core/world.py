@@ -154,8 +154,15 @@ def own_world(rig: Cameras, points: Callable[[], PointCloud | None] = lambda: No
 
 
 def snapped(rig: Cameras) -> Cameras:
-    """Return cameras whose poses are rounded to ``GRID``."""
-    return replace(rig, viewmats=np.rint(rig.viewmats / GRID) * GRID + 0.0)
+    """Return cameras whose poses are rounded to ``GRID``; what was a rotation is one still."""
+    viewmats = np.rint(rig.viewmats / GRID) * GRID + 0.0
+    rotations = viewmats[:, :3, :3]
+    error = np.einsum("cji,cjk->cik", rotations, rotations) - np.eye(3)
+    # One Newton step to the nearest rotation: taken back to coordinates far from the origin, a rounding of 1e-9 would
+    # move centres. Rotations that the calibration itself has rounded more coarsely stay as they are.
+    step = np.where(np.abs(error).max((1, 2), keepdims=True) < 1e-8, 0.5 * error, 0.0)
+    viewmats[:, :3, :3] = rotations - np.einsum("cij,cjk->cik", rotations, step)
+    return replace(rig, viewmats=viewmats)
 
 
 def up_direction(rig: Cameras) -> FloatArray:

@@ -24,7 +24,8 @@ def numbers(value: Any, shape: tuple[int, ...], key: str) -> FloatArray:
     Raises PacketError when it is missing, or not finite numbers of this shape.
     """
     try:
-        array = np.asarray(value, np.float64).astype(np.float32)
+        with np.errstate(over="ignore"):  # what does not fit into float32 becomes infinite and is refused
+            array = np.asarray(value, np.float64).astype(np.float32)
     except (TypeError, ValueError, OverflowError):
         array = np.empty(0, np.float32)
     if array.shape != shape or not np.isfinite(array).all():

@@ -17,6 +17,7 @@ from gsstream.cli import (
     bench,
     check,
     deliver,
+    gap,
     info,
     methods,
     package,
@@ -78,6 +79,7 @@ def _root(
 app.command(name="run")(run.run)
 app.command(name="play")(streams.play)
 app.command(name="evaluate")(streams.evaluate)
+app.command(name="gap")(gap.gap)
 app.command(name="info")(info.info)
 app.command(name="export")(deliver.export)
 app.command(name="manifest")(deliver.manifest)
@@ -121,6 +123,8 @@ def run_command(argv: Sequence[str]) -> int:
                 traceback.print_exc()
             else:
                 typer.echo(f"error: {printable(error, keep=_LINE)}", err=True)
+                for note in getattr(error, "__notes__", ()):
+                    typer.echo(printable(note, keep=_LINE), err=True)
             return 2 if isinstance(error, InputError) else 1
     if code == 130:
         return _interrupted()

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from gsstream.cli import options
 from gsstream.cli.streams import stream_file
+from gsstream.core.errors import ComponentError, GsstreamError, SourceError
 
 if TYPE_CHECKING:
     from gsstream.engine.run.session import RunResult
-    from gsstream.source.base import FrameSource
+    from gsstream.plugins.catalog import Catalog
+    from gsstream.recipe.model import Recipe
+    from gsstream.source.base import FrameSource, SourceInfo
+
+#: Methods that are recommended where none is named, best first.
+SUGGESTED = ("s2gs-fast", "queen")
 
 
 def run(
@@ -56,13 +64,79 @@ def run(
     first = None if first_frame is None else read_first_frame(stream_file(first_frame))
     recording = open_recording(source, assembly.recipe, catalog)
     try:
-        with claim_output(out, resume=resume, overwrite=overwrite), disk_errors(out), ended_by_signals() as came:
-            result = run_session(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first)
-            _pictures(result, recording, not no_video, quiet, assembly.recipe.renderer.name == "reference")
+        say = _silent if quiet else _note
+        _what_is_taken(say, resolved.recipe, recording.info, named=bool(method or recipe), catalog=catalog)
+        if not resume:
+            _first_look(recording, source)
+        slow = assembly.recipe.renderer.name == "reference"
+        with claim_output(out, resume=resume, overwrite=overwrite), ended_by_signals() as came:
+            try:
+                with disk_errors(out):
+                    result = run_session(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first)
+            except GsstreamError as error:
+                _what_there_is(error, out, recording, not no_video, quiet)
+                raise
+            with disk_errors(out):
+                _pictures(result, recording, not no_video, quiet, slow)
     finally:
         recording.close()
     if result.interrupted:
         raise typer.Exit(128 + came[0] if came else 130)
+
+
+def _note(line: str) -> None:
+    typer.echo(f"note: {line}", err=True)
+
+
+def _silent(_: str) -> None:
+    pass
+
+
+def _what_is_taken(
+    say: Callable[[str], None], recipe: Recipe, info: SourceInfo, *, named: bool, catalog: Catalog
+) -> None:
+    """Say what nobody asked for and a person would want to know: method, frames, test cameras."""
+    if not named:
+        better = next((name for name in SUGGESTED if ("method", name) in catalog.entries), None)
+        advice = "" if better is None else f"; --method {better} makes far smaller packets"
+        say(f"no --method given: taking {recipe.method!r}, in which everything may change{advice}")
+    if recipe.frames is not None and info.num_frames is not None and info.num_frames < recipe.frames:
+        say(f"{recipe.frames} frames are wanted, the recording has {info.num_frames}: encoding {info.num_frames}")
+    if len(info.test) == 0:
+        some = f", e.g. --set 'data.test_cameras=[{info.train.ids[0]}]'" if len(info.train) > 2 else ""
+        say(f"no camera is held out, so no quality is measured{some}")
+
+
+def _first_look(recording: FrameSource, uri: str) -> None:
+    """Warn of poses that cannot be right, before an hour is spent on them."""
+    from gsstream.scene.pose_checks import first_look
+
+    for finding in first_look(recording):
+        warnings.warn(f"[{finding.code}] {finding.message}. All checks: gsstream scene validate {uri}", stacklevel=2)
+
+
+def _what_there_is(error: GsstreamError, out: Path, recording: FrameSource, video: bool, quiet: bool) -> None:
+    """Summary and pictures of a run that failed, as far as it came; the error learns how to go on."""
+    from gsstream.engine.run.metrics_log import last_written
+    from gsstream.engine.run.session import METRICS, RunResult
+
+    try:
+        done = last_written(out / METRICS) + 1 if (out / METRICS).exists() else 0
+        if done == 0:
+            return
+        _pictures(RunResult(out, done, False), recording, video, quiet, True)
+    except (GsstreamError, OSError) as trouble:
+        error.add_note(f"its pictures could not be made: {trouble}")
+        return
+    advice = ""
+    if isinstance(error, SourceError):
+        advice = "; with --set data.bad_image=repeat (or drop) as well, it passes over pictures that cannot be read"
+    elif isinstance(error, ComponentError):
+        advice = "; with --set stream.on_error=repeat as well, a frame that fails repeats the one before it"
+    error.add_note(
+        f"the stream in {out} is complete up to frame {done - 1}, and its summary and pictures are made. When the "
+        f"cause is mended, the same command with --resume goes on{advice}"
+    )
 
 
 def _pictures(result: RunResult, recording: FrameSource, video: bool, quiet: bool, warned: bool) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -26,6 +26,10 @@ def sweep(
     workers: Annotated[int | None, options.workers("Cells")] = None,
     threads: options.Threads = 1,
     ray: options.Ray = None,
+    split: Annotated[
+        Literal["tuning", "reporting"] | None,
+        typer.Option("--split", help="Which cameras judge: data.split of every cell; by default the file's."),
+    ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would run, and what is there already.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print only warnings, errors and failed cells.")] = False,
 ) -> None:
@@ -38,7 +42,7 @@ def sweep(
     from gsstream.trade.sweep.config import read_sweep
     from gsstream.trade.sweep.plan import make_plan
 
-    plan = make_plan(read_sweep(config, scenes), config.parent, load_catalog().recipe_path)
+    plan = make_plan(read_sweep(config, scenes, split), config.parent, load_catalog().recipe_path)
     if dry_run:
         typer.echo(_describe(plan, out))
         return

@@ -81,6 +81,35 @@ def sweep_depths(images: FloatArray, cameras: Cameras, settings: SweepSettings) 
         torch.set_num_threads(threads)
 
 
+def agreement(images: FloatArray, cameras: Cameras, settings: SweepSettings, *, views: int, limit: float) -> float:
+    """Return how much of the texture of some views lies, at some depth, where the nearest cameras see the same.
+
+    A wrong depth seldom looks right, so that poses that do not fit the images agree about next to nothing.
+
+    Arguments:
+        images: [C, H, W, 3] float32 in [0, 1] of C >= 2 cameras.
+        cameras: the C cameras.
+        settings: of the search; texture counts from three times its noise.
+        views: how many of the cameras are looked at, spread over all of them.
+        limit: largest matching cost, 0 to 1, that counts as the same; an uncorrelated match costs 0.5.
+
+    Returns the mean over views of the share, 0 to 1, of their textured pixels; 0 where none has texture.
+    """
+    check_shape("images", images, (len(cameras), cameras.height, cameras.width, 3))
+    grey = torch.from_numpy(np.ascontiguousarray(images @ _GREY))
+    partners = neighbour_views(cameras, settings.neighbours)
+    near_far = depth_range(cameras)
+    shares = []
+    for view in np.unique(np.linspace(0, len(cameras) - 1, min(views, len(cameras))).round().astype(int)):
+        root = np.linspace(near_far[view, 1] ** -0.5, near_far[view, 0] ** -0.5, settings.planes)
+        inverse = (root**2).astype(np.float32)
+        cost = _matching_cost(grey, cameras, view, partners[view].tolist(), inverse, settings).min(0)
+        variance = _mean_and_variance(grey[view][None, None], settings.windows[0])[1][0, 0].numpy()
+        textured = variance > (3 * settings.noise) ** 2
+        shares += [float((cost[textured] < limit).mean())] if textured.any() else []
+    return float(np.mean(shares)) if shares else 0.0
+
+
 def _matching_cost(
     grey: torch.Tensor, cameras: Cameras, view: int, partners: list[int], inverse: FloatArray, settings: SweepSettings
 ) -> FloatArray:

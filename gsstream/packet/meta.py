@@ -137,8 +137,36 @@ def _check(meta: StreamMeta) -> None:
     meta.world.validate()
     for name, version in meta.plugins.items():
         _text(name), _text(version)
-    for key in ("source_uri", "licence"):
+    for key in ("source_uri", "licence", "title"):
         _text(meta.extra.get(key, ""))
+    _check_encoder_s_own(meta)
+
+
+def _check_encoder_s_own(meta: StreamMeta) -> None:
+    """What encoders leave for those that go on from this scene: a grid's origin, colour maps, choices."""
+    extra = meta.extra
+    if "origin" in extra:
+        _array("extra.origin", extra["origin"], (3,))
+    if "exposure" in extra:
+        maps, cameras = _object(extra["exposure"]), len(meta.train)
+        _array("extra.exposure.matrix", maps.get("matrix"), (cameras, 3, 3))
+        _array("extra.exposure.offset", maps.get("offset"), (cameras, 3))
+    shown = extra.get("shown", 0)
+    if isinstance(shown, bool) or not isinstance(shown, int) or shown < 0:
+        raise ValueError(f"extra.shown: expected the number of a frame, got {shown!r:.60}")
+    for key, choice in _object(extra.get("auto", {})).items():
+        if not {"value", "why"} <= _object(choice).keys():
+            raise ValueError(f"extra.auto.{key}: expected a value and why, got {choice!r:.60}")
+
+
+def _array(name: str, value: Any, shape: tuple[int, ...]) -> None:
+    """Hold nested lists of numbers against a shape. Raises ValueError."""
+    try:
+        array = np.asarray(value, np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{name}: expected numbers in the shape {list(shape)}: {error}") from error
+    if array.shape != shape or not (np.abs(array) < 3.4e38).all():
+        raise ValueError(f"{name}: expected finite numbers in the shape {list(shape)}, got {array.shape}")
 
 
 def _rig(cameras: Cameras) -> dict[str, Any]:

@@ -13,6 +13,9 @@ from gsstream.core.versions import version_problem
 from gsstream.recipe.document import Empty, KeyPath, Layer, Leaf, Origin
 from gsstream.recipe.model import SCHEMA_VERSION, ComponentRef, Recipe
 
+#: Problems that are told at once; whoever wrote more of them gave the wrong file.
+MOST_PROBLEMS = 30
+
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -33,6 +36,9 @@ def keep_known(layer: Layer, problems: list[str]) -> dict[KeyPath, Leaf]:
     known: dict[KeyPath, Leaf] = {}
     refused: set[KeyPath] = set()
     for path, leaf in layer.leaves.items():
+        if len(problems) >= MOST_PROBLEMS:
+            problems.append("and more")
+            break
         full, problem, upto = _full_path(path, leaf, layer.shorthand)
         if problem is None:
             known[full] = leaf

@@ -5,7 +5,9 @@ YAML 1.2 through ruamel.yaml: ``1e-3`` is a number, ``on`` is a word, a key give
 
 from __future__ import annotations
 
+import itertools
 import math
+import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +20,11 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from gsstream.core.errors import RecipeError
 
 KeyPath = tuple[str, ...]
+#: Bytes of a recipe file; a whole recipe with all its settings has about 5 KB.
+LONGEST = 200_000
+#: Lists within lists.
+DEEPEST = 100
+_NESTING = {"[": 1, "{": 1, "]": -1, "}": -1}
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,10 +88,7 @@ def read_file(path: Path, label: str | None = None) -> Layer:
     Raises:
         RecipeError: unreadable, not YAML, a key given twice, an anchor, a value that is no JSON value.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecipeError(f"cannot read the recipe {path}: {error}") from error
+    text = _text_of(path)
     root = _compose(text, str(path))
     if root is None:
         return Layer({})
@@ -101,6 +105,28 @@ def read_file(path: Path, label: str | None = None) -> Layer:
         if not isinstance(value, Section):
             leaves[key] = Leaf(value, marks[key])
     return Layer(leaves, marks)
+
+
+def _text_of(path: Path) -> str:
+    """The text of a file, of which no more is read than a recipe can have: ``path`` may be a device without an end."""
+    try:
+        with path.open("rb") as file:
+            content = file.read(LONGEST + 1)
+        if len(content) > LONGEST:
+            raise RecipeError(f"{path}: expected at most {LONGEST // 1000} KB of YAML, as a recipe has; got more")
+        return content.decode("utf-8")
+    except (OSError, ValueError) as error:  # ValueError: no UTF-8, or a name with a NUL
+        if isinstance(error, RecipeError):
+            raise
+        raise RecipeError(f"cannot read the recipe {path}: {error}") from error
+
+
+def is_file(path: Path) -> bool:
+    """Say whether there is such a file; of a name that no file can have, there is none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def read_override(text: str, option: str = "--set") -> tuple[KeyPath, Leaf]:
@@ -120,6 +146,9 @@ def read_override(text: str, option: str = "--set") -> tuple[KeyPath, Leaf]:
 
 
 def _compose(text: str, name: str) -> Node | None:
+    deepest = max(itertools.accumulate(_NESTING.get(sign, 0) for sign in text), default=0)
+    if deepest > DEEPEST:  # the parser would find out, too, after a minute
+        raise RecipeError(f"{name}: not valid YAML: nested too deeply")
     try:
         return YAML(typ="safe", pure=True).compose(text)  # type: ignore[no-any-return]
     except MarkedYAMLError as error:
@@ -168,11 +197,18 @@ def _plain(node: Node, name: str, *, located: bool = True) -> Any:
         return [_plain(item, name, located=located) for item in node.value]
     if isinstance(node, MappingNode):
         return {str(key.value): _plain(value, name, located=located) for key, value in node.value}
-    value = YAML(typ="safe", pure=True).constructor.construct_object(node)
+    try:
+        value = YAML(typ="safe", pure=True).constructor.construct_object(node)
+    except (YAMLError, ValueError, ArithmeticError, LookupError, TypeError) as error:
+        # What a tag promises and the text does not hold: !!int abc, !foo, an integer of five thousand digits.
+        reason = getattr(error, "problem", None) or str(error)
+        raise RecipeError(f"{where}: {textwrap.shorten(str(node.value), 60)!r} has no plain value: {reason}") from error
     if value is not None and not isinstance(value, str | bool | int | float):
         raise RecipeError(f"{where}: {node.value!r} reads as a {type(value).__name__}; quote it if a word is meant")
     if isinstance(value, float) and not math.isfinite(value):
         raise RecipeError(f"{where}: expected a finite number, got {node.value}")
+    if isinstance(value, int) and value.bit_length() > 63:
+        raise RecipeError(f"{where}: expected a whole number of at most 63 bits, got one of {value.bit_length()}")
     return value
 
 

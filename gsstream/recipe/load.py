@@ -16,7 +16,17 @@ from typing import Any
 
 from gsstream.core.errors import RecipeError
 from gsstream.recipe.check import join_problems, keep_known, validate
-from gsstream.recipe.document import DEFAULT, Empty, KeyPath, Layer, Leaf, Origin, read_file, read_override
+from gsstream.recipe.document import (
+    DEFAULT,
+    Empty,
+    KeyPath,
+    Layer,
+    Leaf,
+    Origin,
+    is_file,
+    read_file,
+    read_override,
+)
 from gsstream.recipe.model import Recipe
 
 #: Finds the YAML file of a named method; raises UnknownName or PluginUnavailable.
@@ -78,10 +88,21 @@ def resolve_recipe(
     if not any(leaf.origin.label.startswith("method ") for leaf in stated):
         chain = _method_chain(name, find_method, ()) + chain
     chain += later
+    for layer in layers:
+        if ("method",) in layer.leaves:
+            leaf = layer.leaves[("method",)]
+            raise RecipeError(
+                f"{leaf.origin.where}: method: expected a setting, got a method, which brings a recipe of its own"
+            )
     if overrides:
         leaves: dict[KeyPath, Leaf] = {}
         for option, text in overrides:
             path, leaf = read_override(text, option)
+            if path == ("method",):
+                raise RecipeError(
+                    f"{leaf.origin.where}: this would only change the name that a stream bears, not the method; say "
+                    f"--method {leaf.value} (now: {name})"
+                )
             leaves.pop(path, None)  # a repeated key counts where it was given last
             leaves[path] = leaf
         chain = [*chain, Layer(leaves, shorthand=True)]
@@ -151,8 +172,8 @@ def _method_chain(name: str, find_method: FindMethod, within: tuple[str, ...]) -
 
 def _file_chain(path: Path, find_method: FindMethod, within: tuple[str, ...], label: str | None = None) -> list[Layer]:
     """The layers of a file: those of its base, then its own."""
-    key = str(path.resolve())
     layer = read_file(path, label)
+    key = str(path.resolve())
     leaves = dict(layer.leaves)
     base = leaves.pop(("base",), None)
     if base is None:
@@ -161,7 +182,7 @@ def _file_chain(path: Path, find_method: FindMethod, within: tuple[str, ...], la
         raise RecipeError(f"{base.origin.where}: base: expected the name of a method or a file, got {base.value!r}")
     method = re.fullmatch(r"[a-z][a-z0-9_-]*", base.value) is not None
     target = find_method(base.value) if method else path.parent / base.value
-    if not target.is_file():
+    if not is_file(target):
         raise RecipeError(f"{base.origin.where}: base: there is no file {target}")
     circle = (*within, key, str(target.resolve()))
     if circle[-1] in circle[:-1]:

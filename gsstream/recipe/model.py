@@ -14,6 +14,11 @@ from gsstream.recipe.budget import Budget
 from gsstream.source.options import DataOptions
 
 SCHEMA_VERSION = "1.0"
+#: Sections of a recipe that do not influence frame 0. A section that is not listed counts as one that does.
+LATER_KEYS = (
+    "schema_version", "method", "seed", "frames", "confidence", "propagation", "gate", "regularizer", "update",
+    "stepper", "stream", "gate_training", "codec", "motion", "growth",
+)  # fmt: skip
 
 
 class Section(BaseModel):

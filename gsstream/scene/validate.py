@@ -19,6 +19,7 @@ from gsstream.init.matching import match_images
 from gsstream.scene.findings import Finding, error, note
 from gsstream.scene.match_checks import check_matches
 from gsstream.scene.picture_checks import Thumbnails, check_blank, check_change, check_same, read_thumbnails
+from gsstream.scene.pose_checks import check_poses
 from gsstream.scene.rig_checks import check_axes, check_intrinsics, check_overlap, check_placement
 from gsstream.scene.sync_checks import check_sync
 from gsstream.source.base import FilesMissing, FrameSource
@@ -91,9 +92,11 @@ def _stages(source: FrameSource, open_scene: Open, frames: int, features: bool) 
     yield check_blank(thumbs)
     yield check_same(thumbs)
     yield check_change(thumbs)
+    # Before clocks: where poses do not fit, what moves seems to be at different places although clocks may be right.
+    yield check_poses(first[0])
     clocks = check_sync(thumbs)
     if clocks and features:
-        # Where most poses are wrong, what moves seems to be at different places although the clocks may be right.
+        # The same for poses that are wrong in a way that no convention explains.
         yield [finding for finding in _matched(rig, *first, rig_only=True) if finding.severity == "error"]
     yield clocks
     if features:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import shutil
 from collections.abc import Sequence
@@ -12,26 +13,33 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from gsstream.core.errors import InputError, OutputError
-from gsstream.packet import FORMAT_VERSION, PacketKind, StreamReader, decode_key
+from gsstream.core.shapes import IntArray
+from gsstream.packet import FORMAT_VERSION, Entry, PacketKind, StreamReader, decode_key, decode_packet
 from gsstream.packet.base import file_header
+from gsstream.serve.joins import encode_join, follow
 
 MANIFEST = "stream.json"
 SEGMENTS = "segments"
 
 
 class Package(NamedTuple):
-    """What was written: the folder, the number of segments (of all renditions) and the bytes of streams and player."""
+    """What was written: the folder, segments and joins (of all renditions), and the bytes of each and of the player."""
 
     folder: Path
     segments: int
+    joins: int
     stream_bytes: int
+    join_bytes: int
     player_bytes: int
 
 
 def package(
-    stream: str | os.PathLike[str], out: str | os.PathLike[str], *, renditions: Sequence[str | os.PathLike[str]] = ()
-) -> Package:
+    stream: str | os.PathLike[str], out: str | os.PathLike[str], *,
+    renditions: Sequence[str | os.PathLike[str]] = (), join_every: float = 10.0,
+) -> Package:  # fmt: skip
     """Write page, manifest and one file for each key segment.
 
     A segment is a key packet with all that follows up to the next one, behind a file header: a valid stream. Its name
@@ -41,19 +49,22 @@ def package(
         stream: the stream to be packaged; nothing of it is coded anew.
         out: a folder that is empty, does not exist, or holds a package, which is replaced.
         renditions: other streams of the same recording; a viewer may change to them at key packets.
+        join_every: seconds of playing after which a segment gets a join (:mod:`gsstream.serve.joins`); 0 writes none.
 
     Raises SourceError when there is no stream, PacketError when it is damaged, InputError when a rendition has other
-    frames, OutputError when the folder holds something else or cannot be written.
+    frames or ``join_every`` is negative, OutputError when the folder holds something else or cannot be written.
     """
     folder = Path(out)
-    old = _old_segments(folder)
+    if not (math.isfinite(join_every) and join_every >= 0):
+        raise InputError(f"join_every: expected seconds, 0 or more, got {join_every}")
+    old = _old_files(folder)
     try:
         (folder / SEGMENTS).mkdir(parents=True, exist_ok=True)
-        main, *others = [_write_stream(Path(path), folder) for path in (stream, *renditions)]
+        main, *others = [_write_stream(Path(path), folder, join_every) for path in (stream, *renditions)]
         for path, other in zip(renditions, others, strict=True):
             _check_frames(path, other, main)
         manifest = {"format": f"gsstream {FORMAT_VERSION}", **main, "renditions": others}
-        new = {segment["file"] for entry in (main, *others) for segment in entry["segments"]}
+        new = _files(manifest)
         size = _copy(resources.files("gsstream") / "web", folder)
         # The manifest last: whoever reads the folder meanwhile finds every file that it names.
         _replace(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
@@ -61,27 +72,33 @@ def package(
             (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"cannot write the package {folder}: {error.strerror or error}") from error
-    total = sum(segment["bytes"] for entry in (main, *others) for segment in entry["segments"])
-    return Package(folder, len(new), total, size)
+    segments = {s["file"]: s["bytes"] for entry in (main, *others) for s in entry["segments"]}
+    joins = {j["file"]: j["bytes"] for entry in (main, *others) for s in entry["segments"] for j in s["joins"]}
+    return Package(folder, len(segments), len(joins), sum(segments.values()), sum(joins.values()), size)
 
 
-def _old_segments(folder: Path) -> set[str]:
+def _files(manifest: dict[str, Any]) -> set[str]:
+    """Return the names of all segments and joins of a manifest."""
+    segments = [segment for entry in (manifest, *manifest["renditions"]) for segment in entry["segments"]]
+    return {str(part["file"]) for segment in segments for part in (segment, *segment.get("joins", ()))}
+
+
+def _old_files(folder: Path) -> set[str]:
     """Files of the package that is there. Raises OutputError when something else is."""
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return set()
     try:
         manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        entries = [manifest, *manifest["renditions"]]
-        files = {str(segment["file"]) for entry in entries for segment in entry["segments"]}
+        files = _files(manifest)
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise OutputError(
             f"{folder} holds something that is no package: expected an empty folder, a new one, or one with {MANIFEST}"
         ) from error
     # Only what a package names there: a manifest that somebody else wrote removes nothing beyond its own segments.
-    return {name for name in files if Path(name).parent == Path(SEGMENTS) and Path(name).suffix == ".gss"}
+    return {name for name in files if Path(name).parent == Path(SEGMENTS) and Path(name).suffix in (".gss", ".gsj")}
 
 
-def _write_stream(path: Path, folder: Path) -> dict[str, Any]:
+def _write_stream(path: Path, folder: Path, join_every: float) -> dict[str, Any]:
     """Write the segments of a stream; returns its entry in the manifest."""
     with StreamReader(path) as reader:
         reader.check()
@@ -91,18 +108,47 @@ def _write_stream(path: Path, folder: Path) -> dict[str, Any]:
         if not starts:
             raise InputError(f"{path}: expected at least one complete frame, got none")
         first = decode_key(reader.read(reader.frames[0]), offset=reader.frames[0].offset)
-        segments = []
-        for start, stop in zip(starts, [*starts[1:], len(reader.frames)], strict=True):
-            entries = reader.frames[start:stop]
-            data = file_header() + b"".join(reader.read(entry) for entry in entries)
-            name = f"{SEGMENTS}/{entries[0].frame:06d}-{hashlib.sha256(data).hexdigest()[:12]}.gss"
-            _replace(folder / name, data)
-            segments.append({"frames": [entries[0].frame, entries[-1].frame], "file": name, "bytes": len(data)})
+        every = max(1, round(join_every * first.meta.fps)) if join_every else len(reader.frames)
+        segments = [
+            _write_segment(reader, reader.frames[start:stop], folder, every)
+            for start, stop in zip(starts, [*starts[1:], len(reader.frames)], strict=True)
+        ]
         frames = reader.frames
     return {
         "name": path.parent.name if path.name == "stream.gss" else path.stem, "fps": first.meta.fps,
         "frames": len(frames), "first_frame": frames[0].frame, "gaussians": len(first.gaussians), "segments": segments,
     }  # fmt: skip
+
+
+def _write_segment(reader: StreamReader, entries: Sequence[Entry], folder: Path, every: int) -> dict[str, Any]:
+    """Write a key packet with what follows, and a join after every so many frames; returns the segment's entry."""
+    data = file_header() + b"".join(reader.read(entry) for entry in entries)
+    shift = len(file_header()) - entries[0].offset
+    segment: dict[str, Any] = {
+        "frames": [entries[0].frame, entries[-1].frame], "file": _write(folder, entries[0].frame, ".gss", data),
+        "bytes": len(data), "key_bytes": shift + entries[0].offset + entries[0].size, "joins": [],
+    }  # fmt: skip
+    if len(entries) <= every:
+        return segment
+    state = key = decode_packet(None, reader.read(entries[0]), offset=entries[0].offset)
+    source: IntArray = np.arange(len(key.gaussians), dtype=np.int64)
+    # A join holds the state that the packet at its offset continues from.
+    for number, entry in enumerate(entries[1:], 1):
+        if number % every == 0:
+            data = encode_join(key, state, source)
+            name = _write(folder, entry.frame, ".gsj", data)
+            join = {"frame": entry.frame, "offset": shift + entry.offset, "file": name, "bytes": len(data)}
+            segment["joins"].append(join)
+        state = decode_packet(state, reader.read(entry), offset=entry.offset)
+        source = follow(source, state)
+    return segment
+
+
+def _write(folder: Path, frame: int, suffix: str, data: bytes) -> str:
+    """Write a file that is named by its frame and a digest of its bytes; returns its name in the package."""
+    name = f"{SEGMENTS}/{frame:06d}-{hashlib.sha256(data).hexdigest()[:12]}{suffix}"
+    _replace(folder / name, data)
+    return name
 
 
 def _check_frames(path: str | os.PathLike[str], entry: dict[str, Any], main: dict[str, Any]) -> None:

@@ -10,6 +10,7 @@ from gsstream.core.storage import Storage
 
 Leak = Literal["none", "points", "training"]
 LostAs = Literal["hold", "black"]
+JudgedBy = Literal["reporting", "tuning"]
 BadImage = Literal["stop", "repeat", "drop"]
 
 
@@ -44,6 +45,11 @@ class Disturbances(BaseModel):
 class DataOptions(Disturbances):
     """Section ``data`` of a recipe: the split, corrections, and disturbances for experiments."""
 
+    split: JudgedBy = Field(
+        default="reporting",
+        description="which cameras judge. reporting: the test cameras, for results; tuning: the test cameras are taken "
+        "away altogether and about one in six training cameras judges instead, for choosing settings",
+    )
     test_cameras: tuple[str, ...] | None = Field(
         default=None, description="cameras that only judge, by id; null: the recording's own split; []: none"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from urllib.parse import parse_qsl
 
 import numpy as np
@@ -16,7 +17,8 @@ from gsstream.core.shapes import FloatArray
 from gsstream.source.base import PointKind, SourceInfo, Split, check_index
 from gsstream.source.multiview import scaled_size
 from gsstream.source.primitives import BoolArray, Hits, Placed, cast, lit
-from gsstream.source.toyroom import LIGHT, arc_cameras, moving_shapes, object_centers, static_shapes
+from gsstream.source.toyroom import LIGHT, arc_cameras
+from gsstream.source.toyscenes import SceneName, ToyScene
 
 _AMBIENT = np.float32(0.45)
 _POINT_STRIDE = 3
@@ -28,12 +30,20 @@ class SyntheticOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    scene: SceneName = Field(
+        default="paths",
+        description="what happens. paths: two objects on smooth paths; at frame 'event' they stop (stop) or turn back "
+        "(reversal), the light flashes for that frame (flash), a training camera gives its last picture for four "
+        "frames (dropout); a ball bounces off the floor (bounce), goes through a tunnel (occlusion) or comes into view "
+        "(enters), a door slides away from a picture (door)",
+    )
+    event: int = Field(default=8, ge=1, le=100_000, description="the frame at which the scene's event happens")
     frames: int = Field(default=40, ge=1, description="number of frames")
     views: int = Field(default=8, ge=2, le=64, description="training cameras; one test camera stands in their middle")
     width: int = Field(default=160, ge=8, le=4096, description="image width in pixels")
     height: int = Field(default=120, ge=8, le=4096, description="image height in pixels")
     seed: int = Field(default=0, ge=0, description="seed of textures, starting phase and noise")
-    motion: float = Field(default=1.0, ge=0, le=20, description="speed; at 1 the objects go round once in 60 frames")
+    motion: float = Field(default=1.0, ge=0, le=20, description="speed; at 1 an object goes about 8 cm a frame")
     static: bool = Field(default=False, description="nothing moves (noise stays)")
     noise: float = Field(default=0.0, ge=0, le=0.5, description="standard deviation of image noise, full scale 1")
     shadows: bool = Field(default=True, description="objects cast shadows")
@@ -41,7 +51,9 @@ class SyntheticOptions(BaseModel):
 
 
 class SyntheticSource:
-    """Two objects move on known smooth paths among static ones, inside a textured room; all surfaces are finite.
+    """Objects move on known paths among static ones, inside a textured room; all surfaces are finite.
+
+    Which ones, and what happens to them, says the option ``scene`` (``source.toyscenes``).
 
     Images are quantised to 8 bits after noise, like a camera's. Thread-safe; the same options give the same bits.
     """
@@ -59,7 +71,8 @@ class SyntheticSource:
             test=rig.select([0]),
             licence="made by this package",
         )
-        self._static: list[Placed] = static_shapes(options.seed)
+        self._scene = ToyScene(options.scene, options.seed, 0.0 if options.static else options.motion, options.event)
+        self._static: list[Placed] = self._scene.static()
         self._background: dict[str, tuple[FloatArray, Hits, FloatArray]] = {}
         self._lock = threading.Lock()
 
@@ -106,7 +119,8 @@ class SyntheticSource:
         """Ray-cast one instant. Raises SourceError for an index outside the recording."""
         check_index(self._info, index)
         cameras = self._info.train if split == "train" else self._info.test
-        images = np.stack([self._image(cameras, i, index) for i in range(len(cameras))])
+        shown = [self._scene.shown(i, index) if split == "train" else index for i in range(len(cameras))]
+        images = np.stack([self._image(cameras, i, shown[i]) for i in range(len(cameras))])
         return Frame(index, index / self._info.fps, images, cameras)
 
     def points(self, kind: PointKind = "recording") -> PointCloud:
@@ -114,14 +128,23 @@ class SyntheticSource:
 
         "recording": every third pixel, 2 mm noise per axis; "sparse": a random fifth of them with 5 mm (1 unit = 1 m).
         """
+        points = self.points_without((), kind)
+        assert points is not None, "every camera sees a surface"
+        return points
+
+    def points_without(self, cameras: Sequence[str], kind: PointKind = "recording") -> PointCloud | None:
+        """Return those of the points that no camera named here has seen; None when none are left."""
         frame, depth = self.frame(0), self.depth(0)
         rows = slice(_POINT_STRIDE // 2, None, _POINT_STRIDE)
+        views = [i for i, name in enumerate(frame.cameras.ids) if name not in cameras]
+        if not views:
+            return None
         clouds = []
-        for i in range(len(frame.cameras)):
+        for i in views:
             origin, rays = _camera_rays(frame.cameras, i, 1)
             hits = (origin + rays * depth[i].reshape(-1, 1)).reshape(*depth[i].shape, 3)
             clouds.append(hits[rows, rows].reshape(-1, 3))
-        xyz, rgb = np.concatenate(clouds), frame.images[:, rows, rows].reshape(-1, 3)
+        xyz, rgb = np.concatenate(clouds), frame.images[views][:, rows, rows].reshape(-1, 3)
         rng = Rng(self._options.seed).numpy("synthetic points")
         if kind == "sparse":
             chosen = np.sort(rng.permutation(len(xyz))[: len(xyz) // _SPARSE_SHARE])
@@ -132,13 +155,13 @@ class SyntheticSource:
     def object_positions(self, index: int) -> dict[str, FloatArray]:
         """Return the true centre [3] of each moving object at a frame, scene units."""
         check_index(self._info, index)
-        return object_centers(self._phase(index))
+        return self._scene.centers(index)
 
     def depth(self, index: int, split: Split = "train") -> FloatArray:
         """Return the true planar depth [C, H, W] float32 at the pixel centres, scene units."""
         check_index(self._info, index)
         cameras = self._info.train if split == "train" else self._info.test
-        shapes = self._static + moving_shapes(self._options.seed, self._phase(index))
+        shapes = self._static + self._scene.moving(index)
         depths = [cast(*_camera_rays(cameras, i, 1), shapes).distance for i in range(len(cameras))]
         return np.stack(depths).reshape(len(cameras), cameras.height, cameras.width)
 
@@ -150,25 +173,38 @@ class SyntheticSource:
         masks = []
         for i in range(len(cameras)):
             rays, behind, _ = self._backdrop(cameras, i)
-            moving = cast(cameras.centers[i], rays, moving_shapes(self._options.seed, self._phase(index)))
+            moving = cast(cameras.centers[i], rays, self._scene.moving(index))
             nearer = (moving.distance < behind.distance).reshape(cameras.height, n, cameras.width, n)
             masks.append(nearer.any(axis=(1, 3)))
         return np.stack(masks)
+
+    def new_mask(self, index: int, split: Split = "train") -> BoolArray:
+        """Return [C, H, W] bool: pixels whose centre shows a surface that no training camera sees at frame 0.
+
+        That is the ball of the scene "enters" and the picture behind the door of "door"; nothing in other scenes.
+        """
+        check_index(self._info, index)
+        cameras = self._info.train if split == "train" else self._info.test
+        moving = self._scene.moving(index)
+        new = moving if self._options.scene == "enters" else self._scene.revealed()
+        shape = (len(cameras), cameras.height, cameras.width)
+        if not new:
+            return np.zeros(shape, bool)
+        views = [_camera_rays(cameras, i, 1) for i in range(len(cameras))]
+        first = [cast(*view, self._static + moving).distance for view in views]
+        own = [cast(*view, new).distance for view in views]
+        mask: BoolArray = np.stack([a <= b for a, b in zip(own, first, strict=True)]).reshape(shape)
+        return mask
 
     def close(self) -> None:
         """Drop the cached background."""
         with self._lock:
             self._background.clear()
 
-    def _phase(self, index: int) -> float:
-        start = Rng(self._options.seed).numpy("synthetic phase").uniform(0, 2 * np.pi)
-        turns = 0.0 if self._options.static else self._options.motion * index / 60.0
-        return float(start + 2 * np.pi * turns)
-
     def _image(self, cameras: Cameras, i: int, index: int) -> FloatArray:
         rays, behind, light = self._backdrop(cameras, i)
         origin = cameras.centers[i]
-        shapes = moving_shapes(self._options.seed, self._phase(index))
+        shapes = self._scene.moving(index)
         moving = cast(origin, rays, shapes)
         front = moving.distance < behind.distance
         albedo = np.where(front[:, None], moving.albedo, behind.albedo)
@@ -176,7 +212,7 @@ class SyntheticSource:
         light[front] = np.maximum(moving.normal[front] @ LIGHT, 0)
         if self._options.shadows:
             self._cast_shadows(origin, rays, np.minimum(moving.distance, behind.distance), front, light, shapes)
-        colors = albedo * (_AMBIENT + (1 - _AMBIENT) * light)[:, None]
+        colors = albedo * (_AMBIENT + (1 - _AMBIENT) * light)[:, None] * np.float32(self._scene.light(index))
         n = self._options.supersample
         fine = colors.reshape(cameras.height, n, cameras.width, n, 3)
         image = sum(fine[:, y, :, x] for y in range(n) for x in range(n)) / np.float32(n * n)

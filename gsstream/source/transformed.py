@@ -66,7 +66,7 @@ class TransformedSource:
         both = _joined(info.train, info.test)
         self._home: dict[str, Split] = dict.fromkeys(info.test.ids, "test")
         self._home.update(dict.fromkeys(info.train.ids, "train"))
-        train, test = choose_split(options, info.train, info.test)
+        train, test, self._away = choose_split(options, info.train, info.test)
         self._offsets = parse_offsets(options.time_offset, both.ids)
         self._losses = parse_losses(options.lost_cameras, train)
         used = [self._offsets.get(i, 0) for i in {*train, *test}]
@@ -130,7 +130,11 @@ class TransformedSource:
         return self.points_without(self._info.test.ids if self._options.leak == "none" else (), kind)
 
     def points_without(self, cameras: Sequence[str], kind: PointKind = "recording") -> PointCloud | None:
-        """Return the points in which none of these cameras can have taken part; None when none are left."""
+        """Return the points in which none of these cameras can have taken part; None when none are left.
+
+        Nor can the test cameras that the tuning split took away.
+        """
+        cameras = (*cameras, *self._away)
         if isinstance(self._source, AttributedPoints):
             return self._source.points_without(cameras, kind)
         taken = any(self._home[name] == "train" for name in cameras)

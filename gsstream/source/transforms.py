@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -56,14 +57,24 @@ def _known(key: str, name: str, ids: Sequence[str], taken: Sequence[str] | dict[
     return name
 
 
-def choose_split(options: DataOptions, train: Cameras, test: Cameras) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return (training ids, test ids) as ``test_cameras``, ``train_cameras``, ``train_views``, ``leak`` ask for.
+class ChosenSplit(NamedTuple):
+    """Ids of the cameras that train, of those that judge, and of those that a run must see nothing of."""
+
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+    away: tuple[str, ...] = ()
+
+
+def choose_split(options: DataOptions, train: Cameras, test: Cameras) -> ChosenSplit:
+    """Return who trains and who judges, as the options of a recipe ask for.
 
     Arguments:
-        options: section ``data`` of the recipe.
-        train, test: ids of the recording's own split.
+        options: section ``data`` of the recipe; of it ``split``, ``test_cameras``, ``train_cameras``, ``train_views``
+            and ``leak``.
+        train, test: cameras of the recording's own split.
 
-    Raises SourceError for unknown or repeated ids, a camera on both sides, or no training camera left.
+    Raises SourceError for unknown or repeated ids, a camera on both sides, no training camera left, or a leak in the
+    tuning split.
     """
     ids = (*train.ids, *test.ids)
     tests = test.ids if options.test_cameras is None else _named("data.test_cameras", options.test_cameras, ids)
@@ -76,11 +87,59 @@ def choose_split(options: DataOptions, train: Cameras, test: Cameras) -> tuple[t
         )
     if options.train_views is not None:
         trains = _far_apart(trains, options.train_views, train, test)
+    if options.split == "tuning":
+        return _for_tuning(options, trains, tests, _centers(trains, train, test))
     if options.leak == "training":
         trains = (*trains, *tests)
     if not trains:
         raise SourceError(f"data: no training camera is left; test cameras: {', '.join(tests)}")
-    return trains, tests
+    return ChosenSplit(trains, tests)
+
+
+#: One training camera in so many judges in the tuning split, rounded to the nearest number, and at least one.
+TRAINING_TO_JUDGES = 6
+
+
+def _for_tuning(
+    options: DataOptions, trains: tuple[str, ...], tests: tuple[str, ...], centers: FloatArray
+) -> ChosenSplit:
+    """The tuning split of a reporting split; ``centers`` [T, 3] are those of its training cameras."""
+    if options.leak != "none":
+        raise SourceError(
+            f"data.split: the tuning split takes the test cameras away, got data.leak={options.leak}, which uses "
+            "them; choose settings with data.leak=none"
+        )
+    if len(trains) < 2:
+        raise SourceError(
+            f"data.split: the tuning split needs two training cameras, one of which judges; got {len(trains)}"
+        )
+    count = max(1, (len(trains) + TRAINING_TO_JUDGES // 2) // TRAINING_TO_JUDGES)
+    judges = [trains[i] for i in _medoids(centers, count)]
+    return ChosenSplit(tuple(i for i in trains if i not in judges), tuple(judges), tests)
+
+
+def _medoids(centers: FloatArray, count: int) -> list[int]:
+    """Rows of ``count`` of the points to which the others are nearest (k-medoids by swaps), in order.
+
+    Judges that lie farthest apart would be the rim of the rig, where no training camera is left around them. Medoids
+    are spread over the whole rig and lie in the middle of their neighbours, as test cameras usually do.
+    """
+    apart = np.linalg.norm(centers[:, None].astype(np.float64) - centers[None], axis=2)
+    rows = range(len(centers))
+
+    def cost(chosen: list[int]) -> float:
+        return float(apart[:, chosen].min(1).sum())
+
+    chosen: list[int] = []
+    for _ in range(count):
+        chosen.append(min((i for i in rows if i not in chosen), key=lambda i: cost([*chosen, i])))
+    # A swap has to gain more than rounding, so that it ends and cameras in regular rows give the same answer anywhere.
+    while True:
+        swaps = [[*chosen[:k], i, *chosen[k + 1 :]] for k in range(count) for i in rows if i not in chosen]
+        best = min(swaps, key=cost, default=chosen)
+        if cost(best) >= cost(chosen) * (1 - 1e-6):
+            return sorted(chosen)
+        chosen = best
 
 
 def _named(key: str, wanted: tuple[str, ...], ids: tuple[str, ...]) -> tuple[str, ...]:
@@ -93,14 +152,18 @@ def _far_apart(names: tuple[str, ...], count: int, train: Cameras, test: Cameras
     """The first ``count`` cameras of a farthest-point order, so that fewer views are a subset of more; in rig order."""
     if count > len(names):
         raise SourceError(f"data.train_views: there are only {len(names)} training cameras, got {count}")
-    places = dict(zip((*train.ids, *test.ids), np.concatenate([train.centers, test.centers]), strict=True))
-    centers = np.stack([places[name] for name in names])
+    centers = _centers(names, train, test)
     chosen = [int(np.linalg.norm(centers - centers.mean(0), axis=1).argmin())]
     while len(chosen) < count:
         gaps = np.linalg.norm(centers[:, None] - centers[None, chosen], axis=2).min(1)
         gaps[chosen] = -1  # cameras may share a place
         chosen.append(int(gaps.argmax()))
     return tuple(names[i] for i in sorted(chosen))
+
+
+def _centers(names: tuple[str, ...], train: Cameras, test: Cameras) -> FloatArray:
+    places = dict(zip((*train.ids, *test.ids), np.concatenate([train.centers, test.centers]), strict=True))
+    return np.array([places[name] for name in names]).reshape(-1, 3)
 
 
 def gain_at(options: DataOptions, index: int, rng: Rng) -> float:

@@ -1,21 +1,30 @@
 // The packets that are there, and the downloads that bring those that will be needed.
 
 import { KIND } from "./container.js";
+import { fileOf } from "./download.js";
 import { packetsOf } from "./source.js";
 
 /** Seconds of playing that are loaded ahead. */
 const AHEAD = 30;
 /** Bytes of packets beyond which segments that lie far behind are forgotten. */
 const MOST_BYTES = 128 * 2 ** 20;
+/** Seconds of deltas that are rather replayed than jumped over by a join. */
+const REPLAYED = 1;
 
-/** Packets by frame, loaded segment by segment around the frame that is played. `onNews` is called for every packet. */
+/** Packets by frame, loaded piece by piece around the frame that is played. `onNews` is called for every packet. */
 export class PacketBuffer {
   constructor(segments, onNews) {
     this.parts = segments.map((segment) => ({ segment, state: "absent", packets: [], bytes: 0, error: null }));
+    let home = null;
+    for (const part of this.parts) {
+      if (!part.segment.join) home = part;
+      Object.assign(part, { home, key: null, join: part.segment.join ? { state: "absent", data: null } : null });
+    }
     this.onNews = onNews;
     this.received = 0;
     this.fps = 30;
     this.frame = null;
+    this.from = null;
     this.loading = null;
   }
 
@@ -35,7 +44,7 @@ export class PacketBuffer {
   /** Last frame of the last segment that has any packet. */
   get lastLoaded() {
     const part = this.parts.findLast((p) => p.packets.length);
-    return part ? part.packets[part.packets.length - 1].header.frame : null;
+    return part ? lastOf(part) : null;
   }
 
   /** The packet of a frame, or undefined. */
@@ -44,25 +53,41 @@ export class PacketBuffer {
     return part?.packets[frame - part.packets[0]?.header.frame];
   }
 
-  /** Frame of the nearest key packet at or before `frame`, or null while it is not loaded. */
-  keyOf(frame) {
-    const part = this._part(frame);
-    const start = part?.packets[0]?.header.frame;
-    if (start === undefined) return null;
-    for (let i = Math.min(frame - start, part.packets.length - 1); i >= 0; i -= 1) {
-      if (part.packets[i].header.kind === KIND.key) return part.packets[i].header.frame;
+  /**
+   * What leads from the state after frame `from` (null: there is none) towards `frame`: `{ packet }`, the next one or a
+   * key packet to start from; `{ key, join }`, a key packet and the data of a join; or null while that is not loaded.
+   */
+  towards(frame, from) {
+    const { part, join } = this._way(frame, from);
+    if (join) {
+      const key = this._keyPacket(part);
+      return key && join.data ? { key, join: join.data } : null;
     }
-    return null;
+    const key = this._keyOf(frame);
+    if (key === null) return null;
+    const packet = this.packet(from !== null && from >= key && from < frame ? from + 1 : key);
+    return packet ? { packet } : null;
   }
 
   /** Why a frame will not come: the error that ended its segment, or null while it may still come. */
-  failure(frame) {
-    const part = this._part(frame);
-    if (!part || part.state === "absent" || part.state === "loading") return null;
-    return part.error ?? new Error("The stream is cut short here.");
+  failure(frame, from) {
+    const { parts, join } = this._way(frame, from);
+    if (join && join.state !== "done") return null;
+    const failed = parts.find((part) => part.state === "failed");
+    if (failed) return failed.error;
+    const part = parts[parts.length - 1];
+    return part?.state === "done" ? new Error("The stream is cut short here.") : null;
   }
 
-  /** First frame of the segment after that of `frame`, or null. */
+  /** A packet or the join that leads to a frame turned out to be damaged. Returns whether there is another way. */
+  spoil(frame, error, byJoin) {
+    const part = this._part(frame);
+    if (byJoin) part.join = { state: "failed", data: null };
+    else if (this.parts.length > 1) Object.assign(part, { state: "failed", error });
+    return byJoin;
+  }
+
+  /** First frame of the next piece after that of `frame` at which playing can begin, or null. */
   nextSegment(frame) {
     const part = this.parts[this.parts.indexOf(this._part(frame)) + 1];
     return part ? part.segment.first : null;
@@ -72,33 +97,37 @@ export class PacketBuffer {
   secondsAfter(frame) {
     let end = frame;
     for (let part = this._part(frame); part; part = this._part(end + 1)) {
-      const last = part.packets[part.packets.length - 1]?.header.frame;
-      if (last === undefined || last < end || (part.state !== "done" && last <= end)) break;
+      const last = lastOf(part);
+      if (last === null || last < end || (part.state !== "done" && last <= end)) break;
       end = last;
       if (part.state !== "done" || end + 1 > (this.last ?? end)) break;
     }
     return Math.max(0, (end - frame) / this.fps);
   }
 
-  /** Load what `frame` and the seconds after it need. A download that is not needed now is given up. */
-  want(frame) {
-    this.frame = frame;
-    const part = this._wanted(frame);
-    if (
-      this.loading &&
-      this.loading.part !== part &&
-      this._part(frame) !== this.loading.part &&
-      part === this._part(frame)
-    ) {
-      this.loading.abort.abort(new DOMException("another part is needed", "AbortError"));
+  /**
+   * Load what leads from the state after frame `from` (null: there is none) to `frame`, and the seconds after it. A
+   * download that is not needed now is given up.
+   */
+  want(frame, from = null) {
+    Object.assign(this, { frame, from });
+    const needed = this._needed(frame, from);
+    const absent = needed.filter(isAbsent);
+    const { loading } = this;
+    if (loading && absent.length && !needed.some((job) => job.part === loading.part && job.join === loading.join)) {
+      loading.abort.abort(new DOMException("another part is needed", "AbortError"));
       this.loading = null;
     }
-    if (part && !this.loading) this._load(part);
+    const [job] = absent.length ? absent : this._ahead(frame);
+    if (job && !this.loading) this._load(job);
   }
 
-  /** Try the segments again that failed. */
+  /** Try again what failed. */
   retry() {
-    for (const part of this.parts) if (part.state === "failed") this._forget(part);
+    for (const part of this.parts) {
+      if (part.state === "failed") this._forget(part);
+      if (part.join?.state === "failed") part.join.state = "absent";
+    }
   }
 
   dispose() {
@@ -110,43 +139,104 @@ export class PacketBuffer {
     return this.parts.find(({ segment }) => segment.first <= frame && frame <= segment.last);
   }
 
-  _wanted(frame) {
-    const own = this._part(frame) ?? this.parts[0];
-    if (own.state === "absent") return own;
-    for (let i = this.parts.indexOf(own) + 1; i < this.parts.length; i += 1) {
-      const part = this.parts[i];
-      if ((part.segment.first - frame) / this.fps > AHEAD) return null;
-      if (part.state === "absent") return part;
+  /** `{ part, parts, join }`: the piece of `frame`, those that are decoded on the way, and the join to begin with. */
+  _way(frame, from) {
+    const part = this._part(frame) ?? this.parts[0];
+    if (!part.join) return { part, parts: [part], join: null };
+    const since = (start) => this.parts.slice(this.parts.indexOf(start), this.parts.indexOf(part) + 1);
+    if (from !== null && from < frame && from >= part.home.segment.first) {
+      const parts = since(this._part(from + 1));
+      if (parts.length === 1 || frame - from <= REPLAYED * this.fps) return { part, parts, join: null };
+    }
+    if (part.join.state !== "failed") return { part, parts: [part], join: part.join };
+    return { part, parts: since(part.home), join: null };
+  }
+
+  _keyPacket(part) {
+    return part.home.packets[0] ?? part.home.key;
+  }
+
+  /** Frame of the nearest key packet at or before `frame`, or null while it is not loaded. */
+  _keyOf(frame) {
+    const part = this._part(frame);
+    if (part?.join) return part.home.segment.first;
+    const start = part?.packets[0]?.header.frame;
+    if (start === undefined) return null;
+    for (let i = Math.min(frame - start, part.packets.length - 1); i >= 0; i -= 1) {
+      if (part.packets[i].header.kind === KIND.key) return part.packets[i].header.frame;
     }
     return null;
   }
 
-  async _load(part) {
+  /** Downloads that `frame` waits for, `{ part, join }` each, in order; also those that are done. */
+  _needed(frame, from) {
+    const { part, parts, join } = this._way(frame, from);
+    return [...(join ? [{ part, join: true }] : []), ...parts.map((one) => ({ part: one, join: false }))];
+  }
+
+  /** Downloads for the time after `frame` that have not begun. */
+  _ahead(frame) {
+    const here = this.parts.indexOf(this._part(frame));
+    const soon = this.parts.slice(here + 1).filter(({ segment }) => (segment.first - frame) / this.fps <= AHEAD);
+    return here < 0 ? [] : soon.map((part) => ({ part, join: false })).filter(isAbsent);
+  }
+
+  async _load(job) {
     const abort = new AbortController();
-    this.loading = { part, abort };
-    this._forget(part);
-    part.state = "loading";
+    const { part } = job;
+    const place = job.join ? part.join : part;
+    this.loading = { ...job, abort };
+    if (!job.join) this._forget(part);
+    place.state = "loading";
     try {
-      for await (const packet of packetsOf(part.segment, abort.signal)) {
-        if (packet.header.kind === KIND.index) continue;
-        part.packets.push(packet);
-        part.bytes += packet.data.length;
-        this.received += packet.data.length;
-        this.onNews();
-      }
-      part.state = "done";
+      await (job.join ? this._loadJoin(part, abort.signal) : this._loadPackets(part, abort.signal));
+      place.state = "done";
     } catch (error) {
       if (abort.signal.aborted) {
-        this._forget(part);
+        this._unfinished();
         return;
       }
-      part.state = "failed";
-      part.error = error;
+      Object.assign(place, { state: "failed", error });
     }
     this.loading = null;
+    this._unfinished();
     this._makeRoom();
     this.onNews();
-    this.want(this.frame);
+    this.want(this.frame, this.from);
+  }
+
+  /** Packets of a piece; those of others, when the server sends the whole file, are kept as well. */
+  async _loadPackets(part, signal) {
+    for await (const packet of packetsOf(part.segment, signal)) {
+      const { kind, frame } = packet.header;
+      const owner = this._part(frame) ?? part;
+      const expected = owner.packets.length ? lastOf(owner) + 1 : (owner.segment.first ?? frame);
+      if (kind === KIND.index || owner.state === "done" || frame !== expected) continue;
+      owner.packets.push(packet);
+      owner.bytes += packet.data.length;
+      owner.state = frame === owner.segment.last && owner !== part ? "done" : "loading";
+      this.received += packet.data.length;
+      this.onNews();
+    }
+  }
+
+  async _loadJoin(part, signal) {
+    const { key, join } = part.segment;
+    if (!this._keyPacket(part)) {
+      for await (const packet of packetsOf(key, signal)) part.home.key = packet;
+      this.received += part.home.key.data.length;
+    }
+    part.join.data = await fileOf(join.url, { bytes: join.bytes, signal });
+    this.received += part.join.data.length;
+  }
+
+  /** Forget what is half there and not being loaded any more. */
+  _unfinished() {
+    for (const part of this.parts) {
+      if (part === this.loading?.part) continue;
+      if (part.state === "loading") this._forget(part);
+      if (part.join?.state === "loading") part.join.state = "absent";
+    }
   }
 
   _forget(part) {
@@ -161,6 +251,15 @@ export class PacketBuffer {
       if (bytes <= MOST_BYTES || way <= 1) return;
       bytes -= part.bytes;
       if (part.state === "done") this._forget(part);
+      if (part.join?.state === "done") part.join = { state: "absent", data: null };
     }
   }
+}
+
+function lastOf(part) {
+  return part.packets.length ? part.packets[part.packets.length - 1].header.frame : null;
+}
+
+function isAbsent({ part, join }) {
+  return (join ? part.join : part).state === "absent";
 }

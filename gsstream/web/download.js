@@ -68,14 +68,22 @@ export async function* chunksOf(response, signal) {
  * Bytes `start` to `end` of a file as chunks, in order. `whole`: the file is just these bytes, so the first request
  * needs no range. A connection that breaks is taken up where it broke, a few times.
  *
+ * A server that knows no ranges sends the whole file. `all` is `{ end }` for a caller who can use that: it then gets
+ * everything up to that byte, and `all.sent` is true.
+ *
  * Throws SourceError when the file is not there or the server stops for good.
  */
-export async function* bytesOf(url, { start = 0, end = null, whole = false, signal } = {}) {
+export async function* bytesOf(url, { start = 0, end = null, whole = false, all = null, signal } = {}) {
   let at = start;
   for (let failures = 0; ;) {
     try {
       const ranged = !(whole && at === start);
       const response = await request(url, { start: at, end, ranged, signal });
+      if (all && ranged && response.status === 200 && at === start) {
+        all.sent = true;
+        start = at = 0;
+        end = all.end;
+      }
       const first = firstByte(response, url, ranged ? at : start);
       if (first === null) return;
       for await (const chunk of clipped(chunksOf(response, signal), first, at, end)) {
@@ -117,6 +125,13 @@ async function* clipped(chunks, first, at, end) {
     place += chunk.length;
     if (end !== null && place > end) return;
   }
+}
+
+/** All bytes of a file at once. Throws SourceError. */
+export async function fileOf(url, { bytes = null, signal } = {}) {
+  const parts = [];
+  for await (const chunk of bytesOf(url, { end: bytes && bytes - 1, whole: true, signal })) parts.push(chunk);
+  return new Uint8Array(await new Blob(parts).arrayBuffer());
 }
 
 function sentence(error) {

@@ -66,17 +66,15 @@ export function gatherDisplacement(moved, source, number) {
   return { rows: Uint32Array.from(rows), shift: pick(moved.shift, from, 3), turn: pick(moved.turn, from, 3) };
 }
 
-/** The groups of rows after births and deaths: a birth joins the group of the row before it. */
+/** The groups of rows after births and deaths: a birth joins the group of the row before it; without old rows, none. */
 export function gatherGroups(groups, source, number) {
-  if (!groups) return null;
+  const first = source.find((row) => row < number);
+  if (!groups || first === undefined) return null;
   const groupOf = new Int32Array(source.length);
-  if (number > 0) {
-    const first = source.find((row) => row < number);
-    let last = groups.groupOf[first === undefined ? 0 : first];
-    for (let i = 0; i < source.length; i += 1) {
-      if (source[i] < number) last = groups.groupOf[source[i]];
-      groupOf[i] = last;
-    }
+  let last = groups.groupOf[first];
+  for (let i = 0; i < source.length; i += 1) {
+    if (source[i] < number) last = groups.groupOf[source[i]];
+    groupOf[i] = last;
   }
   return { ...groups, groupOf };
 }

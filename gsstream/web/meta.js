@@ -9,7 +9,7 @@ import { isWorld } from "./world.js";
 export function decodeMeta(data) {
   let value;
   try {
-    value = JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(inflate(data)));
+    value = JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(inflate(data, MAX_META)));
   } catch (error) {
     if (error instanceof PacketError) throw error;
     throw new PacketError(`meta: not what was expected: ${error.message}`);
@@ -25,11 +25,11 @@ export function decodeMeta(data) {
   return value;
 }
 
-/** The content of one zstandard frame, whose announced size is checked before it is allocated. */
-function inflate(data) {
+/** The content of one zstandard frame, whose announced size is checked against `limit` before it is allocated. */
+export function inflate(data, limit) {
   const size = contentSize(data);
-  if (size === null || size > MAX_META) {
-    throw new PacketError(`compressed part announces ${size} bytes; expected at most ${MAX_META}`);
+  if (size === null || size > limit) {
+    throw new PacketError(`compressed part announces ${size} bytes; expected at most ${limit}`);
   }
   let out;
   try {

@@ -5,6 +5,7 @@ import { cameraOf, pivotOf, viewsOf } from "./camera.js";
 import { KIND } from "./container.js";
 import { decodePacket } from "./decode.js";
 import { PacketError } from "./errors.js";
+import { decodeJoin } from "./joins.js";
 import { Renderer } from "./renderer.js";
 import { openSource } from "./source.js";
 import { Snapshots } from "./snapshots.js";
@@ -107,7 +108,7 @@ export class Player extends EventTarget {
     const wanted = Math.max(this.first, Math.min(Math.round(frame), this.last));
     this._target = wanted;
     this._clock = 0;
-    this.buffer?.want(wanted);
+    this.buffer?.want(wanted, this.frame);
     this.invalidate();
   }
 
@@ -199,19 +200,22 @@ export class Player extends EventTarget {
       this.playing = false;
       this._say("state");
     }
-    if (this._target !== null) this.buffer.want(this._target);
+    if (this._target !== null) this.buffer.want(this._target, this.frame);
   }
 
   _decodeTo(frame) {
     const started = performance.now();
+    let step = null;
     try {
       while (this.state === null || this.state.frame !== frame) {
-        const packet = this._nextPacket(frame);
-        if (!packet) return this._missing(frame);
-        this._decode(packet);
+        step = this.buffer.towards(frame, this.frame);
+        if (!step) return this._missing(frame);
+        this._take(step);
         if (performance.now() - started > BUDGET && this.state.frame !== frame) return undefined;
       }
     } catch (error) {
+      // What is damaged was not applied. A join may be done without.
+      if (error instanceof PacketError && this.buffer.spoil(frame, error, Boolean(step?.join))) return undefined;
       return this._stop(error);
     }
     this._target = null;
@@ -220,28 +224,34 @@ export class Player extends EventTarget {
     return undefined;
   }
 
-  /** The packet that leads towards `frame` from the state there is, or from a key packet or a snapshot of one. */
-  _nextPacket(frame) {
-    const key = this.buffer.keyOf(frame);
-    if (key === null) return undefined;
-    const near = this.state !== null && this.state.frame < frame && this.state.frame >= key;
-    return this.buffer.packet(near ? this.state.frame + 1 : key);
-  }
-
-  _decode(packet) {
+  /** Decode one packet, or begin where a join says. */
+  _take({ packet, key, join }) {
     const started = performance.now();
-    const known = packet.header.kind === KIND.key ? this.snapshots.get(packet) : null;
-    this.state = known ?? decodePacket(this.state, packet.data, packet.offset);
-    if (!known && packet.header.kind === KIND.key) this.snapshots.keep(packet, this.state);
+    if (join) {
+      this.state = decodeJoin(this._keyState(key), join);
+    } else if (packet.header.kind === KIND.key) {
+      this.state = this._keyState(packet);
+    } else {
+      this.state = decodePacket(this.state, packet.data, packet.offset);
+    }
     this.renderer.update(this.state);
     this.statistics.decode = performance.now() - started;
-    this.statistics.bytes = packet.data.length;
-    this.statistics.key = packet.header.kind === KIND.key;
+    this.statistics.bytes = (packet?.data ?? join).length;
+    this.statistics.key = this.state.change.kind === "key";
     if (this.view === null) this._ready();
     if (this._opened) {
       this._opened.resolve();
       this._opened = null;
     }
+  }
+
+  /** The state after a key packet, decoded once for several uses. */
+  _keyState(packet) {
+    const known = this.snapshots.get(packet);
+    if (known) return known;
+    const state = decodePacket(null, packet.data, packet.offset);
+    this.snapshots.keep(packet, state);
+    return state;
   }
 
   _ready() {
@@ -255,9 +265,9 @@ export class Player extends EventTarget {
 
   /** A frame is not loaded: wait for it, or, when it will never come, say why and go on with what is sound. */
   _missing(frame) {
-    const failure = this.buffer.failure(frame);
+    const failure = this.buffer.failure(frame, this.frame);
     if (!failure) {
-      this.buffer.want(frame);
+      this.buffer.want(frame, this.frame);
       return;
     }
     this._stop(failure);

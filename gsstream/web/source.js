@@ -1,7 +1,7 @@
 // What there is to play at an address: a manifest with segments, or a stream file with or without an index.
 
 import { FILE_HEADER, parseHeader, parseIndex } from "./container.js";
-import { SourceError, bytesOf, chunksOf, request } from "./download.js";
+import { SourceError, bytesOf, chunksOf, fileOf, request } from "./download.js";
 import { FORMAT_MAJOR, FORMAT_MINOR } from "./limits.js";
 import { PacketWalker } from "./walker.js";
 
@@ -11,7 +11,9 @@ const TRAILER = 12;
  * Find out what is at `url`: `{ segments, frames, fps, renditions }`.
  *
  * A segment is `{ first, last, url, start, end, whole }`: a key packet and what follows, bytes `start` to `end` of a
- * file, or the whole file. `last` and `frames` are null where only playing tells. Throws SourceError or PacketError.
+ * file, or the whole file. `last` and `frames` are null where only playing tells. Where a segment can be joined in its
+ * middle, each piece is an entry of its own: those behind the first have `join`, the state they begin with, and `key`,
+ * the key packet that it refers to; `all` says where their file ends. Throws SourceError or PacketError.
  */
 export async function openSource(url, signal) {
   const address = new URL(url, globalThis.document?.baseURI);
@@ -20,11 +22,10 @@ export async function openSource(url, signal) {
 }
 
 async function openManifest(url, signal) {
-  const parts = [];
-  for await (const chunk of bytesOf(url, { whole: true, signal })) parts.push(chunk);
+  const data = await fileOf(url, { signal });
   let manifest;
   try {
-    manifest = JSON.parse(await new Blob(parts).text());
+    manifest = JSON.parse(new TextDecoder().decode(data));
   } catch {
     throw new SourceError(`${url} is no manifest of a stream.`);
   }
@@ -48,13 +49,31 @@ function segmentsOf(entry, base) {
   const list = entry?.segments;
   const sound = Array.isArray(list) && list.length && list.every((s) => Array.isArray(s.frames) && (s.file || s.range));
   if (!sound) throw new SourceError(`${base} is no manifest of a stream: it lists no segments.`);
-  return list.map((segment) => ({
+  return list.flatMap((segment) => piecesOf(segment, entry, base));
+}
+
+function piecesOf(segment, entry, base) {
+  const whole = {
     first: segment.frames[0],
     last: segment.frames[1],
     url: new URL(segment.file ?? entry.file, base).href,
     start: segment.file ? 0 : segment.range[0],
     end: segment.file ? (segment.bytes ?? null) && segment.bytes - 1 : segment.range[1],
     whole: Boolean(segment.file),
+  };
+  const joins = segment.joins ?? [];
+  if (!joins.length) return [whole];
+  const key = { url: whole.url, start: 0, end: segment.key_bytes - 1, first: whole.first };
+  return [null, ...joins].map((join, i) => ({
+    first: join ? join.frame : whole.first,
+    last: i < joins.length ? joins[i].frame - 1 : whole.last,
+    url: whole.url,
+    start: join ? join.offset : 0,
+    end: i < joins.length ? joins[i].offset - 1 : whole.end,
+    whole: false,
+    all: { end: whole.end },
+    key: join && key,
+    join: join && { url: new URL(join.file, base).href, bytes: join.bytes ?? null },
   }));
 }
 
@@ -108,16 +127,20 @@ async function indexed(url, offset, total, signal) {
 
 /** Packets `{ data, offset, header }` of a segment as they arrive. Throws PacketError or SourceError. */
 export async function* packetsOf(segment, signal) {
-  const walker = new PacketWalker(segment.start);
   const { body } = segment;
   segment.body = null;
+  const all = segment.all && { ...segment.all, sent: false };
   const chunks =
-    body && !body.bodyUsed ? continued(body, segment, signal) : bytesOf(segment.url, { ...segment, signal });
+    body && !body.bodyUsed ? continued(body, segment, signal) : bytesOf(segment.url, { ...segment, all, signal });
+  // Whether the server sends the piece or the whole file is known with the first bytes.
+  const make = () => (all?.sent ? new PacketWalker(0) : new PacketWalker(segment.start, segment.join && segment.first));
+  let walker = null;
   for await (const chunk of chunks) {
+    walker ??= make();
     walker.push(chunk);
     for (let packet = walker.next(); packet; packet = walker.next()) yield packet;
   }
-  walker.finish();
+  (walker ?? make()).finish();
 }
 
 /** The body of an answer that is there already; when it breaks off, the rest is asked for. */

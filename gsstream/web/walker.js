@@ -8,13 +8,16 @@ import { PacketError } from "./errors.js";
  * lengths that they announce.
  */
 export class PacketWalker {
-  /** `offset`: byte of the file at which the pushed bytes begin; 0 expects the file header first. */
-  constructor(offset = 0) {
+  /**
+   * `offset`: byte of the file at which the pushed bytes begin; 0 expects the file header first. `frame`: that of the
+   * first packet where it need not be a key packet, else null.
+   */
+  constructor(offset = 0, frame = null) {
     this.offset = offset;
     this.chunks = [];
     this.size = 0;
     this.version = null;
-    this.last = null;
+    this.last = frame === null ? null : { kind: KIND.delta, frame: frame - 1 };
     this.keys = [];
     this.whole = offset === 0;
   }

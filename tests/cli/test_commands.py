@@ -45,6 +45,7 @@ OPTIONS = {
     ],
     "gsstream play": ["STREAM", "--out", "--camera", "--frames", "--size", "--renderer", "--max-memory"],
     "gsstream evaluate": ["STREAM", "--source", "--lpips-onnx", "--lpips-range", "--json", "--max-memory"],
+    "gsstream gap": ["RUN", "--at", "--cache", "--epochs", "--source", "--json", "--quiet"],
     "gsstream info": ["STREAM", "--json"],
     "gsstream export": ["STREAM", "--out", "--format", "--frames", "--max-memory"],
     "gsstream manifest": ["STREAM", "--out"],
@@ -56,7 +57,7 @@ OPTIONS = {
         "--quiet",
     ],
     "gsstream sweep": [
-        "CONFIG", "--out", "--scenes", "--data", "--workers", "--threads", "--ray", "--dry-run", "--quiet",
+        "CONFIG", "--out", "--scenes", "--data", "--workers", "--threads", "--ray", "--split", "--dry-run", "--quiet",
     ],
     "gsstream tune": [
         "--scene", "--budget", "--out", "--data", "--recipe", "--set", "--method", "--frames", "--scale", "--seed",

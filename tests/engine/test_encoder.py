@@ -10,11 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from gsstream.cli.main import run_command
 from gsstream.core.errors import ComponentError, InputError, ShapeError
 from gsstream.core.frame import Frame
 from gsstream.encode import Encoder, Listeners, encoder_for, encoder_of_rig, open_recording
+from gsstream.engine.frame0.begin import decoded_anchors
+from gsstream.engine.keys.resume import rebuild_hierarchy
 from gsstream.method.base import Step
 from gsstream.packet import PacketKind, StreamReader, StreamWriter, decode_packet
 from gsstream.play import Playback
@@ -115,6 +118,23 @@ def test_images_that_do_not_fit_are_refused_and_cost_nothing() -> None:
         made.encode(replace(second, images=np.full_like(second.images, 2.0)))
     assert made.state is before
     assert made.encode(second).packet.data == packets(whole("still"))[1]
+
+
+def test_a_scene_taken_over_is_grouped_as_players_have_it() -> None:
+    """A delta leaves positions between those a key packet can say; a resumed run sees only what the packet says."""
+    player, apart = whole("still")[-1].state.player, 0
+    for seed in range(12):
+        shift = np.random.default_rng(seed).normal(0, 0.05, player.gaussians.means.shape).astype(np.float32)
+        moved = replace(player.gaussians, means=player.gaussians.means + shift)
+        with open_recording(WORLD) as source:
+            parts = encoder().parts
+            first = replace(player, scene=replace(player.scene, gaussians=moved))
+            state = Encoder(parts, source.info, first_frame=first).encode(frames()[0]).state
+        again = rebuild_hierarchy(parts, state.player)
+        assert state.hierarchy.node_of.tolist() == again.node_of.tolist(), seed
+        given = parts.structure.build(moved.map(torch.from_numpy), decoded_anchors(state.player))
+        apart += given.num_nodes != again.num_nodes
+    assert apart, "the positions that were given are grouped otherwise: else this proves nothing"
 
 
 class BrokenGrowth:

@@ -8,6 +8,7 @@ import pytest
 
 from gsstream.core.errors import OutputError
 from gsstream.engine.run.output import MADE_FILES, RUN_FILES, prepare_output
+from gsstream.trade.measure.gap import GAP_FILES
 from gsstream.trade.show import gallery
 
 
@@ -48,7 +49,7 @@ def test_overwrite_deletes_the_files_of_a_run_and_nothing_else(tmp_path: Path) -
 
 
 def test_made_files_are_the_ones_the_gallery_writes() -> None:
-    assert set(MADE_FILES) == {gallery.SHEET, gallery.PLOTS, gallery.SUMMARY, gallery.VIDEO}
+    assert set(MADE_FILES) == {gallery.SHEET, gallery.PLOTS, gallery.SUMMARY, gallery.VIDEO, *GAP_FILES}
 
 
 def test_resume(tmp_path: Path) -> None:

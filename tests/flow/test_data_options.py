@@ -8,6 +8,7 @@ import pytest
 from flow_runs import arguments, broken_off_in, encode, metrics
 
 from gsstream.cli.main import run_command
+from gsstream.player.playback import Playback
 from gsstream.source.open import open_source
 
 DISTURBED = "disturbed:gain_amplitude=0.3,noise_sigma=8,lost_share=0.4"
@@ -38,6 +39,28 @@ def test_leaks_change_the_stream_only_when_asked_for(tmp_path: Path, leak: str) 
     options = {"source": world, "first_frame__points": "sweep", "stream__epochs": 1}
     honest = encode(tmp_path / "honest", **options)
     assert encode(tmp_path / leak, data__leak=leak, **options) != honest
+
+
+def test_the_tuning_split_knows_nothing_of_the_test_camera(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not a byte of a run in the tuning split depends on what the test camera sees."""
+    world = "synthetic:frames=2&views=4&width=64&height=48&supersample=1"
+    (judge,) = open_source(world).info.test.ids
+    encode(tmp_path / "o", source=world, stream__epochs=1, data__split="tuning")
+    with Playback(tmp_path / "o" / "stream.gss") as playback:
+        meta = playback.meta
+    assert judge not in (*meta.train.ids, *meta.test.ids)
+    assert f"judged by {meta.test.ids[0]} (tuning split" in (tmp_path / "o" / "summary.txt").read_text()
+    assert list(metrics(tmp_path / "o")[1]["psnr"]) == list(meta.test.ids)
+    # A frame 0 that has seen the judge is refused, and one whose colour maps are of other cameras.
+    encode(tmp_path / "all", "--frames", "1", source=world, first_frame__exposure="true")
+    capsys.readouterr()
+    for change, message in (("split=tuning", "which would judge here"), ("train_views=3", "has colour maps of")):
+        take = ("--first-frame", str(tmp_path / "all"), "--overwrite", "--set", f"data.{change}")
+        command = arguments(tmp_path / "no", *take, source=world)
+        assert run_command(command) == 2
+        assert message in capsys.readouterr().err
 
 
 def test_a_camera_that_is_not_there_ends_with_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

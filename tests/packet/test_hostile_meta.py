@@ -50,6 +50,14 @@ LIES = {
     **{f"world with {key} {value!r:.20}": put(world={**WORLD, key: value}) for key, value in NO_WORLDS},
     "world is no object": put(world=[1]),
     "world without scale": put(world={"rotation": WORLD["rotation"], "offset": WORLD["offset"]}),
+    "title is no text": put(extra={"title": ["dense"]}),
+    **{f"origin {origin!r}": put(extra={"origin": origin}) for origin in ([0, 0], 3, "abc", [0, 0, 1e39], [[0], 1, 2])},
+    "exposure without a matrix": put(extra={"exposure": {"offset": [[0, 0, 0]] * 3}}),
+    "exposure of fewer cameras": put(extra={"exposure": {"matrix": [np.eye(3).tolist()], "offset": [[0, 0, 0]]}}),
+    "exposure is a list": put(extra={"exposure": [1]}),
+    "shown before the start": put(extra={"shown": -1}),
+    "shown as text": put(extra={"shown": "1"}),
+    "a choice without its reason": put(extra={"auto": {"first_frame.sh_degree": {"value": 2}}}),
 }
 
 

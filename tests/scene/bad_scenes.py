@@ -265,7 +265,7 @@ BAD = (
     BadScene("swapped-still", "the same, and nothing moves", "epipolar", lambda f, d: (
         swap(f, "cam01", "cam05"), d.update(frames=1)
     )),
-    BadScene("camera-to-world", "c2w where w2c is expected", "epipolar", lambda f, d: poses(d, np.linalg.inv)),
+    BadScene("camera-to-world", "c2w where w2c is expected", "axes", lambda f, d: poses(d, np.linalg.inv)),
     BadScene("distorted", "a lens with distortion, declared pinhole", "epipolar",
              lambda f, d: pictures(f, "cam03", distorted)),
     BadScene("nudged", "a camera was turned by 3 degrees after calibration", "epipolar",

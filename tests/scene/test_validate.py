@@ -108,7 +108,7 @@ def test_wrong_poses_are_not_taken_for_wrong_clocks(tmp_path: Path, monkeypatch:
     # Whatever the hull of motion makes of these poses: here it blames a clock, as it does on the demo.
     monkeypatch.setattr(module, "check_sync", lambda _: [error("sync", "camera 'cam00' is 3 frames late")])
     found = findings(folder)
-    assert [finding.code for finding in found] == ["epipolar"]
+    assert [finding.code for finding in found] == ["axes"]
     assert "invert w2c" in found[0].message
     assert [finding.code for finding in findings(tmp_path / "good")] == ["sync"], "with sound poses it is heard"
 

@@ -9,7 +9,6 @@ from gsstream.core.errors import SourceError
 from gsstream.source.open import open_source
 from gsstream.source.primitives import cast
 from gsstream.source.synthetic import SyntheticSource
-from gsstream.source.toyroom import moving_shapes
 
 SMALL = "width=64&height=48&views=3&frames=20"
 
@@ -84,7 +83,7 @@ def test_depth_agrees_between_views() -> None:
     pixels = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1)
     local = pixels @ np.linalg.inv(cameras.Ks[0]).T * depth[0].reshape(-1, 1)
     world = (local - cameras.viewmats[0, :3, 3]) @ cameras.viewmats[0, :3, :3]
-    shapes = source._static + moving_shapes(0, source._phase(0))
+    shapes = source._static + source._scene.moving(0)
     hits = cast(cameras.centers[1], (world - cameras.centers[1]).astype(np.float32), shapes)
     # From another camera the ray to a surface point ends there (parameter 1) or on something nearer, never behind.
     assert hits.distance.max() < 1.001

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
@@ -17,6 +18,7 @@ from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.source.open import open_source
 from gsstream.source.options import DataOptions
+from gsstream.source.synthetic import SyntheticSource
 from gsstream.source.transformed import transformed
 from gsstream.source.transforms import gain_at
 
@@ -58,8 +60,9 @@ def test_a_test_camera_leaves_training_and_takes_its_points_along() -> None:
     np.testing.assert_array_equal(source.frame(2, "test").images, plain.frame(2).images[[1, 0]])
     np.testing.assert_array_equal(source.frame(2).images[-1], plain.frame(2, "test").images[0])
     np.testing.assert_array_equal(source.info.test.viewmats, plain.info.train.viewmats[[1, 0]])
-    assert source.points() is None  # made with a and b, which are held out now
-    assert opened(test_cameras=(b,), leak="points").points() is not None
+    assert len(source.points()) == len(plain.points()) * len(rest) / len(plain.info.train), "those of a and b are out"
+    assert opened("demo", test_cameras=("cam01",)).points() is None, "which camera took part is not known"
+    assert len(opened(test_cameras=(b,), leak="points").points()) == len(plain.points())
     assert opened(test_cameras=()).points() is not None
 
 
@@ -68,6 +71,55 @@ def test_leak_into_training_is_asked_for_and_complete() -> None:
     assert source.info.train.ids == (*plain.info.train.ids, *plain.info.test.ids)
     assert source.info.test.ids == plain.info.test.ids
     np.testing.assert_array_equal(source.frame(1).images[-1], plain.frame(1, "test").images[0])
+
+
+@settings(max_examples=40, deadline=None)
+@given(views=st.integers(2, 30), seed=st.integers(0, 5))
+def test_the_tuning_split_shows_nothing_of_the_test_cameras(views: int, seed: int) -> None:
+    """Whatever the rig: the test cameras are nowhere, the judges were training cameras, about one in six of them."""
+    plain = open_source(WORLD.replace("views=4", f"views={views}"))
+    info = opened(WORLD.replace("views=4", f"views={views}"), seed, split="tuning").info
+    assert sorted((*info.train.ids, *info.test.ids)) == sorted(plain.info.train.ids), "no camera is lost, none doubled"
+    assert len(info.test) >= 1
+    assert abs(len(info.test) - views / 6) <= 0.5 or len(info.test) == 1
+    again = opened(WORLD.replace("views=4", f"views={views}"), seed + 1, split="tuning").info
+    assert again.test.ids == info.test.ids, "the choice knows no seed"
+
+
+def test_judges_of_the_tuning_split_are_where_the_other_cameras_are_nearest() -> None:
+    """Against all subsets: the medoids have the least sum of distances, or nearly (a search by swaps may miss it)."""
+    plain = open_source(WORLD.replace("views=4", "views=13"))
+    judges = opened(WORLD.replace("views=4", "views=13"), split="tuning").info.test.ids
+    centers = plain.info.train.centers.astype(np.float64)
+    apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+    costs = {pair: apart[:, pair].min(1).sum() for pair in itertools.combinations(range(13), len(judges))}
+    mine = tuple(plain.info.train.ids.index(name) for name in judges)
+    assert len(judges) == 2
+    assert costs[mine] <= 1.05 * min(costs.values())
+    assert costs[mine] < np.median(list(costs.values()))
+
+
+def test_points_that_a_judge_of_the_tuning_split_has_seen_are_withheld() -> None:
+    assert opened("demo", split="tuning").points() is None, "nobody knows which camera took part in which of them"
+    plain, source = open_source(WORLD), opened(split="tuning")
+    kept = [i for i, name in enumerate(plain.info.train.ids) if name in source.info.train.ids]
+    cloud = source.points()
+    assert len(cloud) == len(plain.points()) * len(kept) / len(plain.info.train)
+    np.testing.assert_array_equal(cloud.rgb, plain.frame(0).images[kept][:, 1::3, 1::3].reshape(-1, 3))
+
+
+def test_points_of_test_cameras_that_were_taken_away_are_withheld_too() -> None:
+    """A COLMAP model's points may be of any camera: those of the judges and those of the test cameras go."""
+    asked: list[set[str]] = []
+
+    class Attributed(SyntheticSource):
+        def points_without(self, cameras: Any, kind: Any = "recording") -> Any:
+            asked.append(set(cameras))
+            return super().points_without(cameras, kind)
+
+    source = transformed(Attributed.from_query(WORLD.partition(":")[2]), DataOptions(split="tuning"), 0)
+    source.points()
+    assert asked == [{*source.info.test.ids, "test"}]
 
 
 @given(st.integers(2, 7))
@@ -161,6 +213,8 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "ghost train": ({"train_cameras": ("cam9",)}, "data.train_cameras: no camera 'cam9'"),
     "both sides": ({"train_cameras": ("TEST",)}, "would train and test"),
     "twice": ({"test_cameras": ("TEST", "TEST")}, "given twice"),
+    "tuning leak": ({"split": "tuning", "leak": "points"}, "takes the test cameras away, got data.leak=points"),
+    "tuning alone": ({"split": "tuning", "train_cameras": ("cam00",)}, "needs two training cameras"),
     "nobody": ({"train_cameras": ()}, "no training camera is left"),
     "too many": ({"train_views": 9}, "there are only 4 training cameras, got 9"),
     "offset form": ({"time_offset": ("TEST",)}, "expected ID=FRAMES"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 
@@ -23,7 +24,7 @@ from gsstream.source.base import SourceInfo
 from gsstream.trade.measure.evaluate import evaluate
 from gsstream.trade.measure.records import FrameRecord, read_lines, read_records
 from gsstream.trade.measure.summary import summarise, summary_table
-from gsstream.trade.show.contact_sheet import contact_sheet, sheet_of_stream
+from gsstream.trade.show.contact_sheet import Column, changed_most, contact_sheet, sheet_of_stream
 from gsstream.trade.show.plots import plot_runs
 
 NUMPY = PlayerRenderer("numpy", render_numpy)
@@ -248,6 +249,34 @@ def test_contact_sheet_shows_truth_decoded_error_and_gates(tmp_path):
     assert orange[1].sum() > 20  # the blobs that jumped
     assert orange[2].sum() == 0  # nothing was allowed to change
     assert (cell[3][0] == 255).all()  # frame 0 has no gates
+
+
+def test_the_close_up_is_where_most_pixels_changed():
+    """Against every window, one by one."""
+    draw = np.random.default_rng(3)
+    first, truth = np.zeros((31, 44, 3), np.float32), np.zeros((31, 44, 3), np.float32)
+    assert changed_most(truth, first) is None
+    truth[draw.random((31, 44)) < 0.05] = 0.5
+    truth[20:, 30:][draw.random((11, 14)) < 0.6] = 0.5
+    rows, columns = changed_most(truth, first)
+    changed = (truth > 0.1).any(-1)
+    counts = {
+        (y, x): changed[y : y + 10, x : x + 14].sum() for y, x in itertools.product(range(22), range(31))
+    }
+    assert changed[rows, columns].shape == (10, 14)
+    assert changed[rows, columns].sum() == max(counts.values())
+
+
+def test_contact_sheet_shows_the_fresh_reconstruction_close_up_where_there_is_one(tmp_path):
+    truth, stream, fresh = (np.full((30, 45, 3), value, np.float32) for value in (0.2, 0.4, 0.6))
+    part = (slice(3, 13), slice(5, 20))
+    with_fresh = Column("a", truth, stream, fresh=fresh, close=part)
+    sheet = np.asarray(contact_sheet([with_fresh, Column("b", truth, stream)])).astype(int)
+    plain = np.asarray(contact_sheet([Column("b", truth, stream)])).astype(int)
+    assert sheet.shape[0] - plain.shape[0] == 3 * 34, "three rows more, and none for the gates that nobody gave"
+    left, top = sheet.shape[1] - 8 - 2 * 49, 18 + 3 * 34
+    cells = [sheet[top + r * 34 : top + r * 34 + 30, left : left + 45] for r in range(3)]
+    assert [cell.min() for cell in cells] == [cell.max() for cell in cells] == [51, 102, 153]
 
 
 def test_contact_sheet_refuses_what_it_cannot_show(tmp_path):

@@ -15,7 +15,9 @@ from gsstream.core.errors import InputError
 from gsstream.recipe.budget import Budget
 from gsstream.recipe.load import load_recipe
 from gsstream.recipe.model import Recipe
+from gsstream.source.open import open_source
 from gsstream.trade.report.groups import read_sweep_data
+from gsstream.trade.sweep.table import read_table
 from gsstream.trade.sweep.tune import Trial, candidates, choose, nearest, trial_of, tune_table
 from tools.held import held_table, main
 
@@ -67,7 +69,7 @@ def test_the_best_that_fits_is_chosen() -> None:
     assert choose([large]) is None
     assert nearest([large, trial("far", 31.0, 100, inside=0), Trial("broken", error="x")]) is large
     assert nearest([Trial("broken", error="x")]) is None
-    with pytest.raises(InputError, match="no test cameras") as refused:
+    with pytest.raises(InputError, match="no camera judges") as refused:
         choose([trial("blind", math.nan, 100)])
     hint = re.search(r"--set '(\w+)\.(\w+)=", str(refused.value))
     assert hint, "the message says what to do"
@@ -88,14 +90,17 @@ def command(out: Path, budget: str, *more: str) -> list[str]:
 def test_a_pilot_writes_a_recipe_that_runs_inside_the_budget(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    encode(tmp_path / "first", "--frames", "1", method="dense")
-    given = ("--first-frame", str(tmp_path / "first"))
+    encode(tmp_path / "choosing", "--frames", "1", method="dense", data__split="tuning")
+    given = ("--first-frame", str(tmp_path / "choosing"))
     assert run_command(command(tmp_path / "pilot", "size=600B", *given)) == 0
     out = capsys.readouterr().out
+    (judge,) = open_source(WORLD).info.test.ids
+    cells = read_table(tmp_path / "pilot").cells.values()
+    assert {name for cell in cells for name in cell["frames"][0]["psnr"]}.isdisjoint({judge}), "it has no say"
     assert "| s2gs-edge+budget " in out
     assert out.count("<- chosen") == 1
     tuned = load_recipe(tmp_path / "pilot" / "tuned.yaml").recipe
-    assert tuned.frames is None
+    assert (tuned.frames, tuned.data.split) == (None, "reporting"), "the run itself trains on all training cameras"
     assert len(read_sweep_data(tmp_path / "pilot").groups) == 4, "a pilot can be reported, its frame 0 was given"
     pilot = read_sweep_data(tmp_path / "pilot")
     rows = held_table([], "size=600B", sweep=(tmp_path / "pilot", pilot.scenes[0])).splitlines()
@@ -103,7 +108,9 @@ def test_a_pilot_writes_a_recipe_that_runs_inside_the_budget(
     assert any("s2gs-edge+budget" in row and " 2/2 " in row for row in rows)
     program, *said = shlex.split(out.rpartition("next: ")[2])
     assert program == "gsstream"
-    assert run_command([*said, "--frames", "3", "--quiet", "--no-video", *given]) == 0
+    run_it = [*said, "--frames", "3", "--quiet", "--no-video", "--first-frame"]
+    assert run_command([*run_it, str(tmp_path / "choosing")]) == 0
+    assert f"judged by {judge} (reporting split" in (tmp_path / "pilot" / "run" / "summary.txt").read_text()
     assert all(sum(line["bytes"].values()) <= 600 for line in metrics(tmp_path / "pilot" / "run")[1:])
     # Nothing fits: said so, with the nearest; the pilot's other candidates are there already.
     (tmp_path / "pilot" / "tuned.yaml").unlink()
@@ -111,7 +118,7 @@ def test_a_pilot_writes_a_recipe_that_runs_inside_the_budget(
     err = capsys.readouterr().err
     assert "nothing fits time=0.001 (seconds, bytes): nearest is " in err
     assert not (tmp_path / "pilot" / "tuned.yaml").exists()
-    encode(tmp_path / "other", "--frames", "1", "--seed", "5", method="dense")
+    encode(tmp_path / "other", "--frames", "1", "--seed", "5", method="dense", data__split="tuning")
     assert run_command(command(tmp_path / "pilot", "time=1ms", "--first-frame", str(tmp_path / "other"))) == 2
     assert "from another frame 0" in capsys.readouterr().err
 

@@ -22,7 +22,6 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import blaming
 from gsstream.engine.assembly.pending import refuse_pending
 from gsstream.engine.fit.exposure import Exposure
-from gsstream.engine.frame0.carried import numbers
 from gsstream.engine.frame0.optimise import Progress, initial_gaussians, optimise_first_frame, sort_by_node
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.init.thinning import thin_points
@@ -114,17 +113,22 @@ def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMe
         meta: what the key packet says about the run.
         rng: random streams by name and frame.
 
-    Raises InputError when the recipe asks for another degree of spherical harmonics than the stream has.
+    Raises InputError when the recipe asks for another degree of spherical harmonics than the stream has, when a camera
+    that judges here took part in it, or when its colour maps are of other cameras.
     """
     refuse_pending(parts)
     started = time.perf_counter()
+    _check_views(first.meta, frame.cameras, () if parts.recipe.data.leak == "training" else meta.test.ids)
     if first.gaussians.sh_degree != parts.recipe.first_frame.degree:
         raise InputError(
             f"the first frame has spherical harmonics of degree {first.gaussians.sh_degree}, the recipe asks for "
             f"{parts.recipe.first_frame.degree}; set first_frame.sh_degree={first.gaussians.sh_degree}"
         )
-    gaussians = first.gaussians.map(torch.from_numpy)
-    anchors = own_anchors(parts, first, frame)
+    # A delta may have put Gaussians between the positions that a key packet can say. They are grouped as players will
+    # have them, or a resumed run would find other groups.
+    held = replace(first, scene=replace(first.scene, gaussians=quantise_key(first.gaussians)))
+    gaussians = held.gaussians.map(torch.from_numpy)
+    anchors = own_anchors(parts, held, frame)
     hierarchy, levels, gaussians = arrange(parts, gaussians, anchors.levels, anchors)
     layout = make_layout(hierarchy, levels, anchors)
     exposure = exposure_from_meta(first.meta)
@@ -141,6 +145,20 @@ def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMe
     return Step(state, packet, "key", metrics)
 
 
+def _check_views(theirs: StreamMeta, cameras: Cameras, judges: tuple[str, ...]) -> None:
+    """Refuse a frame 0 that has learned from cameras that judge here, or whose colour maps are of other cameras."""
+    if seen := [name for name in judges if name in theirs.train.ids]:
+        raise InputError(
+            f"the first frame was reconstructed with {', '.join(seen)}, which would judge here; take one of a run with "
+            "the same data.split and data.test_cameras"
+        )
+    if exposure_from_meta(theirs) is not None and theirs.train.ids != cameras.ids:
+        raise InputError(
+            f"the first frame has colour maps of the training cameras {', '.join(theirs.train.ids)}, got "
+            f"{', '.join(cameras.ids)}; take one of a run with the same training cameras"
+        )
+
+
 def own_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
     """Return the grid that this method's structure would lay; each Gaussian gets the level of the nearest cell size.
 
@@ -149,11 +167,11 @@ def own_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
         first: the decoded scene.
         frame: training images of frame 0.
     """
-    means = torch.from_numpy(first.gaussians.means)
+    theirs = decoded_anchors(first)
     grid = parts.structure.seed(cloud_of(first), frame.cameras)
-    sizes = torch.from_numpy(np.asarray(first.layout.units)[first.layout.unit_of])
+    sizes = theirs.cell_sizes[theirs.levels]
     levels = (sizes.log()[:, None] - grid.cell_sizes.log()[None]).abs().argmin(1)
-    return Anchors(means, torch.zeros_like(means), levels, grid.cell_sizes, grid.origin)
+    return replace(theirs, levels=levels, cell_sizes=grid.cell_sizes, origin=grid.origin)
 
 
 def cloud_of(first: PlayerState) -> PointCloud:
@@ -163,14 +181,20 @@ def cloud_of(first: PlayerState) -> PointCloud:
 
 
 def decoded_anchors(player: PlayerState) -> Anchors:
-    """Return what a structure needs to group a decoded scene again. Raises PacketError when the meta lacks it."""
-    gaussians = player.gaussians.map(torch.from_numpy)
+    """Return what a structure needs to group a decoded scene again."""
+    gaussians, origin = player.gaussians.map(torch.from_numpy), player.meta.extra.get("origin")
+    if origin is None:
+        raise InputError(
+            "the stream does not say where the grid of its Gaussians begins (extra.origin of its key packet): it was "
+            "not written by this encoder, which can neither go on with it nor take its scene over; encode the "
+            "recording anew"
+        )
     return Anchors(
         positions=gaussians.means,
         colors=torch.zeros_like(gaussians.means),
         levels=torch.from_numpy(player.layout.unit_of.astype(np.int64)),
         cell_sizes=torch.from_numpy(np.asarray(player.layout.units)),
-        origin=torch.from_numpy(numbers(player.meta.extra.get("origin"), (3,), "origin")),
+        origin=torch.tensor(origin, dtype=torch.float32),
     )
 
 
@@ -251,16 +275,8 @@ def exposure_to_meta(exposure: Exposure | None) -> dict[str, Any]:
 
 
 def exposure_from_meta(meta: StreamMeta) -> Exposure | None:
-    """Return the colour maps that a key packet holds; an encoder, resumed or not, goes on from these values.
-
-    Raises PacketError when they are not one map for each training camera.
-    """
+    """Return the colour maps that a key packet holds; an encoder, resumed or not, goes on from these values."""
     stored = meta.extra.get("exposure")
     if stored is None:
         return None
-    matrix, offset = (stored.get(key) if isinstance(stored, dict) else None for key in ("matrix", "offset"))
-    views = len(meta.train)
-    return Exposure(
-        torch.from_numpy(numbers(matrix, (views, 3, 3), "exposure.matrix")),
-        torch.from_numpy(numbers(offset, (views, 3), "exposure.offset")),
-    )
+    return Exposure(torch.tensor(stored["matrix"]), torch.tensor(stored["offset"]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -19,6 +19,9 @@ from gsstream.engine.state.stream_state import StreamState
 from gsstream.packet import PacketKind, PlayerState, StreamMeta, StreamReader, decode_packet
 from gsstream.packet.base import FILE_HEADER
 from gsstream.source.base import SourceInfo
+
+#: Keys that may differ when a run is resumed, by section; besides them, ``frames``.
+ENDING = {"data": ("bad_image",), "stream": ("on_error",)}
 
 
 class Ended(NamedTuple):
@@ -137,13 +140,21 @@ def rebuild_hierarchy(parts: Assembly, player: PlayerState) -> Hierarchy:
 
 def _check_recipe(parts: Assembly, meta: StreamMeta) -> None:
     old, new = dict(meta.recipe), parts.recipe.model_dump(mode="json")
-    # The number of frames may grow: it decides where a run ends, not what its packets hold.
-    changed = sorted(key for key in new if key != "frames" and old.get(key) != new[key])
+    changed = sorted(key for key in new if key != "frames" and _deciding(key, old.get(key)) != _deciding(key, new[key]))
     if changed:
         raise OutputError(
             f"the stream was written with another recipe: {', '.join(changed)} differ; resume with the same recipe "
             "(recipe.yaml beside the stream) or start again with --overwrite"
         )
+
+
+def _deciding(section: str, values: Any) -> Any:
+    """A section of a recipe without what only decides where a run ends, and not what the packets before hold.
+
+    So may the number of frames, which grows, and what is done about pictures that cannot be read and parts that fail.
+    """
+    left_out = ENDING.get(section, ())
+    return {k: v for k, v in values.items() if k not in left_out} if isinstance(values, dict) else values
 
 
 def _check_recording(info: SourceInfo, meta: StreamMeta) -> None:

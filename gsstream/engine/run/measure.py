@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,11 @@ from gsstream.core.shapes import FloatArray
 from gsstream.method.base import MethodState
 from gsstream.metrics import changed_mask, moving_mask, noise_sigma, psnr, ssim
 from gsstream.render.base import Renderer
+
+#: Held-out PSNR of frame 0 below which training views are looked at, and how far it may lie below theirs, dB.
+DOUBTFUL, FAR_BELOW = 20.0, 4.0
+#: Training views that are looked at.
+LOOKED_AT = 4
 
 
 class HeldOut:
@@ -44,6 +50,29 @@ class HeldOut:
             out["psnr_changed"][name] = _finite(psnr(image, truth, changed_mask(truth, self._first.images[view])))
         return out
 
+    def doubt(self, state: MethodState, train: Frame, measured: Mapping[str, float | None]) -> str:
+        """Say when frame 0 shows the training cameras what they saw and the held-out cameras something else.
+
+        Arguments:
+            state: after frame 0.
+            train: its training images.
+            measured: PSNR of the held-out cameras.
+
+        Returns one line for a person; empty where there is nothing to say.
+        """
+        held_out = [value for value in measured.values() if value is not None]
+        if not held_out or float(np.mean(held_out)) >= DOUBTFUL:
+            return ""
+        views = np.unique(np.linspace(0, len(train.cameras) - 1, LOOKED_AT).round().astype(int))
+        seen = float(np.mean([psnr(self.render(state, train, int(view)), train.images[view]) for view in views]))
+        below = seen - float(np.mean(held_out))
+        if below < FAR_BELOW:
+            return ""
+        return (
+            f"held-out cameras show {np.mean(held_out):.1f} dB of frame 0, training cameras {seen:.1f} dB: poses, "
+            "lenses or clocks are probably wrong, or the held-out cameras see what no training camera sees"
+        )
+
     def remember(self, first: Frame, second: Frame | None) -> None:
         """Note what a resumed run must know of the frames it does not redo."""
         self._first = first
@@ -51,12 +80,12 @@ class HeldOut:
             self._sigma = [noise_sigma(a, b) for a, b in zip(first.images, second.images, strict=True)]
 
     def render(self, state: MethodState, frame: Frame, view: int) -> FloatArray:
-        """Return the decoded image [H, W, 3] of a test camera, in [0, 1].
+        """Return the decoded image [H, W, 3] of a camera, in [0, 1].
 
         Arguments:
             state: what players have.
-            frame: test images, for their cameras.
-            view: index of a test camera.
+            frame: images, for their cameras.
+            view: index of one of these cameras.
         """
         gaussians = state.player.gaussians.map(torch.from_numpy)
         with torch.no_grad():

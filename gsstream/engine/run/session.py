@@ -6,6 +6,7 @@ import itertools
 import signal
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,7 +24,8 @@ from gsstream.engine.run.metrics_log import append_metrics, last_written, trim_m
 from gsstream.engine.run.progress import RunProgress
 from gsstream.method.base import Step
 from gsstream.metrics import EnergyMeter
-from gsstream.packet import PlayerState, StreamWriter
+from gsstream.packet import PlayerState, StreamReader, StreamWriter
+from gsstream.packet.base import FILE_HEADER
 from gsstream.recipe.save import save_resolved
 from gsstream.source.base import FrameSource, GrowingSource, SourceInfo
 from gsstream.source.prefetch import Prefetcher
@@ -129,6 +131,10 @@ class _Run:
             metrics["joules"] = {name: value - joules[name] for name, value in self.energy.read().items()}
         if self.held_out and len(test.cameras):
             metrics |= self.held_out.measure(step.state, self.encoder.at_near(test))
+            if train.index == 0:
+                doubt = self.held_out.doubt(step.state, self.encoder.at_near(train), metrics["psnr"])
+                if doubt:
+                    warnings.warn(f"{doubt}: see 'gsstream scene validate {self.source.info.uri}'", stacklevel=2)
         append_metrics(self.out / METRICS, metrics)
         self.progress.frame(metrics)
 
@@ -150,6 +156,8 @@ class _Run:
         # without: such frames are encoded again, to the same bytes. A run without any line goes on from its packets.
         wanted = last_written(log, self.start) if planned or log.exists() else None
         last = self.encoder.resume(stream, lambda index: self.source.frame(index, "train"), wanted)
+        if wanted is not None:
+            _say_what_is_lost(stream, self.start - 1 if last is None else last)
         self.encoder.controller.remember(trim_metrics(log, -1 if last is None else last))
         if last is None and wanted is not None:
             stream.unlink()  # it may hold sound packets of frames that are made again
@@ -160,6 +168,20 @@ class _Run:
         if self.held_out and len(self.source.info.test):
             second = self.source.frame(1, "test") if done > 1 else None
             self.held_out.remember(self.source.frame(0, "test"), second)
+
+
+def _say_what_is_lost(stream: Path, last: int) -> None:
+    """Warn of packets whose lines a kill has lost: they are made again, and it may be for hours."""
+    if stream.stat().st_size < FILE_HEADER.size:
+        return
+    with StreamReader(stream) as reader:
+        held = [entry.frame for entry in reader.frames if entry.frame > last]
+    if held:
+        frames = f"frame {held[0]}" if len(held) == 1 else f"frames {held[0]} to {held[-1]}"
+        warnings.warn(
+            f"{METRICS} has no line of frame {held[0]}, though {stream.name} has its packet: {frames} of the stream "
+            f"{'is' if len(held) == 1 else 'are'} made again", stacklevel=2
+        )  # fmt: skip
 
 
 def _num_frames(info: SourceInfo, *wanted: int | None) -> int | None:

@@ -18,6 +18,11 @@ _MEANS = (
     "All quality is of frames decoded from packets. Means are over test cameras, then over the frames after the first; "
     "seconds are wall time, CPU s the time of the run's process."
 )
+_JUDGES = {
+    "reporting": "The cameras that judge are the test cameras (reporting split): choose no setting by this page.",
+    "tuning": "The cameras that judge are training cameras left out (tuning split); test cameras have no part in it. "
+    "What is best here is a choice, not a result: measure it with --split reporting.",
+}
 
 _WAITED = (
     "The machine had other work: frames took more than 1.5 times the processor time they used. So seconds (wall) are "
@@ -67,6 +72,7 @@ def _facts(data: SweepData) -> list[Block]:
     notes = [f"{count}: {len(data.failed)} failed, {len(data.missing)} not run."]
     variants = sorted({row["ssim_variant"] for row in rows.values() if "ssim_variant" in row})
     notes.append(f"{_MEANS} {'; '.join(variants)}.")
+    notes.append(_JUDGES[data.config.get("split", "reporting")])
     missing = [name for key, name in _NOT_MEASURED.items() if not any(math.isfinite(g.mean(key)) for g in data.groups)]
     if missing:
         notes.append(f"Not measured: {', '.join(missing)} (no counter on this machine, or several workers shared it).")
@@ -96,7 +102,8 @@ def _scene(data: SweepData, scene: str) -> list[Block]:
 
 def _noise(groups: Sequence[Group]) -> str:
     frames = sorted({len(run.records) for group in groups for run in group.runs})
-    length = f"{' or '.join(map(str, frames))} frames. "
+    judges = ", ".join(sorted({name for group in groups for run in group.runs for name in run.records[0].psnr}))
+    length = f"{' or '.join(map(str, frames))} frames, judged by {judges or 'no camera'}. "
     noise = {key: seed_noise(groups, key) for key in (*GOODS, "kb")}
     if not math.isfinite(noise["psnr"]):
         return length + "One seed each: which differences are noise is not known, and nothing is called a tie."

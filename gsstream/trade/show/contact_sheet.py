@@ -1,9 +1,13 @@
-"""Contact sheet: frames side by side; ground truth, decoded, error and what was allowed to change below each other."""
+"""Contact sheet: frames side by side; ground truth, decoded, error and what was allowed to change below each other.
+
+Below them, close up, what changed most since the first frame: ground truth, decoded, and the fresh reconstruction of
+the frame where there is one.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,11 +15,12 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from gsstream.core.cameras import Cameras
 from gsstream.core.changes import row_gates
 from gsstream.core.errors import InputError
 from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.core.shapes import FloatArray
-from gsstream.metrics import psnr
+from gsstream.metrics import changed_mask, psnr
 from gsstream.packet import PlayerState
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, render, to_bytes
@@ -25,16 +30,33 @@ from gsstream.source.base import FrameSource
 ERROR_GAIN = 4
 _CLOSED, _OPEN = (0.25, 0.27, 0.30), (1.0, 0.55, 0.0)
 _MARGIN, _GAP, _TEXT = 8, 4, 18
+#: What is shown close up is this share of a picture's width and height, enlarged to the whole.
+CLOSER = 3
+_LABELS = ("ground truth", "decoded", f"|error| x {ERROR_GAIN}", "allowed to change",
+           "ground truth, close", "decoded, close", "fresh, close")  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One frame: ``truth``, ``decoded`` [H, W, 3] in [0, 1]; ``active`` the same or None."""
+    """One frame: ``truth``, ``decoded`` [H, W, 3] in [0, 1]; ``active`` and ``fresh`` the same or None.
+
+    ``close``: rows and columns of the part that is shown close up; None: nothing changed.
+    """
 
     title: str
     truth: FloatArray
     decoded: FloatArray
     active: FloatArray | None = None
+    fresh: FloatArray | None = None
+    close: tuple[slice, slice] | None = None
+
+    @property
+    def pictures(self) -> tuple[FloatArray | None, ...]:
+        """The pictures of a column, in the order of ``_LABELS``."""
+        error = np.abs(self.truth - np.clip(self.decoded, 0, 1)) * ERROR_GAIN
+        close = [None if self.close is None or i is None else _enlarged(i[self.close])
+                 for i in (self.truth, self.decoded, self.fresh)]  # fmt: skip
+        return (self.truth, self.decoded, error, self.active, *close)
 
 
 def contact_sheet(columns: Sequence[Column]) -> Image.Image:
@@ -42,8 +64,10 @@ def contact_sheet(columns: Sequence[Column]) -> Image.Image:
     if not columns:
         raise InputError("a contact sheet needs at least one frame")
     height, width = columns[0].truth.shape[:2]
-    labels = ["ground truth", "decoded", f"|error| x {ERROR_GAIN}"]
-    labels += ["allowed to change"] if any(c.active is not None for c in columns) else []
+    pictures = [column.pictures for column in columns]
+    # Rows that no column has a picture for are left out.
+    shown = [row for row in range(len(_LABELS)) if any(column[row] is not None for column in pictures)]
+    labels = [_LABELS[row] for row in shown]
     left = 2 * _MARGIN + max(int(_font().getlength(label)) for label in labels)
     size = (left + len(columns) * (width + _GAP) + _MARGIN, _TEXT + len(labels) * (height + _GAP) + _MARGIN)
     sheet = Image.new("RGB", size, "white")
@@ -53,16 +77,15 @@ def contact_sheet(columns: Sequence[Column]) -> Image.Image:
     for index, column in enumerate(columns):
         x = left + index * (width + _GAP)
         draw.text((x, 3), column.title, "black", _font())
-        error = np.abs(column.truth - np.clip(column.decoded, 0, 1)) * ERROR_GAIN
-        for row, image in enumerate((column.truth, column.decoded, error, column.active)):
-            if image is not None:
+        for row, which in enumerate(shown):
+            if (image := pictures[index][which]) is not None:
                 sheet.paste(Image.fromarray(to_bytes(image)), (x, _TEXT + row * (height + _GAP)))
     return sheet
 
 
 def sheet_of_stream(
     stream: str | os.PathLike[str], source: FrameSource, frames: Sequence[int], out: str | os.PathLike[str], *,
-    camera: str | None = None, renderer: PlayerRenderer | None = None,
+    camera: str | None = None, renderer: PlayerRenderer | None = None, fresh: Mapping[int, Path] | None = None,
 ) -> Path:  # fmt: skip
     """Render a contact sheet of a stream's frames against its recording and save it as PNG.
 
@@ -73,6 +96,7 @@ def sheet_of_stream(
         out: picture to write.
         renderer: that draws.
         camera: id of a test or train camera; default the first test camera.
+        fresh: frame -> stream that begins with its fresh reconstruction (``gsstream gap``).
 
     Raises InputError for an unknown camera or frame.
     """
@@ -83,18 +107,48 @@ def sheet_of_stream(
         recorded = source.info.test if split == "test" else source.info.train
         if rig.ids[0] not in recorded.ids:
             raise InputError(f"camera {rig.ids[0]!r} is not in the recording, which has {list(recorded.ids)}")
-        columns = []
+        columns, place = [], recorded.ids.index(rig.ids[0])
+        first = source.frame(playback.frames[0], split).images[place]
         for frame in frames:
             state = playback.player_state(frame)
             image = np.clip(render(state.gaussians, rig, 0, meta.background, renderer), 0, 1)
-            truth = source.frame(frame, split).images[recorded.ids.index(rig.ids[0])]
+            truth = source.frame(frame, split).images[place]
             painted = paint_gates(state)
             active = None if frame == playback.frames[0] else render(painted, rig, 0, (0.0, 0.0, 0.0), renderer)
-            columns.append(Column(f"frame {frame}   {psnr(image, truth):.2f} dB", truth, image, active))
+            alone = _alone(fresh[frame], frame, rig, renderer) if fresh and frame in fresh else None
+            title = f"frame {frame}   {psnr(image, truth):.2f} dB"
+            columns.append(Column(title, truth, image, active, alone, changed_most(truth, first)))
     out = Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     contact_sheet(columns).save(out)
     return out
+
+
+def changed_most(truth: FloatArray, first: FloatArray) -> tuple[slice, slice] | None:
+    """Return rows and columns of the window with the most changed pixels; None when there are none.
+
+    Arguments:
+        truth, first: [H, W, 3] ground truth of a frame and of the first one; the window is a ``CLOSER``th of that size.
+    """
+    changed = changed_mask(truth, first)
+    if not changed.any():
+        return None
+    height, width = (max(1, side // CLOSER) for side in changed.shape)
+    # Sums over all windows, by differences of a two-dimensional running sum.
+    total = np.pad(changed.astype(np.int64).cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    inside = total[height:, width:] - total[:-height, width:] - total[height:, :-width] + total[:-height, :-width]
+    top, left = (int(i) for i in np.unravel_index(inside.argmax(), inside.shape))
+    return slice(top, top + height), slice(left, left + width)
+
+
+def _enlarged(image: FloatArray) -> FloatArray:
+    return image.repeat(CLOSER, 0).repeat(CLOSER, 1)
+
+
+def _alone(path: Path, frame: int, rig: Cameras, renderer: PlayerRenderer | None) -> FloatArray:
+    """What a camera sees of a frame's fresh reconstruction."""
+    with Playback(path) as playback:
+        return np.clip(render(playback.state_at(frame), rig, 0, playback.meta.background, renderer), 0, 1)
 
 
 def paint_gates(state: PlayerState) -> Gaussians[FloatArray]:

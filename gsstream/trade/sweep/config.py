@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from gsstream.core.errors import RecipeError
 from gsstream.recipe.check import Model, join_problems, validate
 from gsstream.recipe.document import Empty, Origin, read_file
+from gsstream.source.options import JudgedBy
 
 SCHEMA_VERSION = "1.0"
 _NAME = r"^[A-Za-z0-9][\w.+-]*$"
@@ -130,6 +131,11 @@ class SweepConfig(Section):
     samples: int | None = Field(default=None, ge=1, description="random: draws per variant")
     search_seed: int = Field(default=0, ge=0, description="random: seed of the draws")
     first_frame: FirstFrame = Field(default=FirstFrame(), description="how frame 0 is shared")
+    split: JudgedBy = Field(
+        default="tuning",
+        description="which cameras judge (data.split of every cell): tuning, to choose settings by the sweep; "
+        "reporting: the test cameras, for a table of results",
+    )
     measure: Measure = Field(default=Measure(), description="what else is measured")
 
     @field_validator("seeds")
@@ -174,12 +180,19 @@ class SceneList(Section):
     scenes: list[Scene] = Field(min_length=1, description="recordings")
 
 
-def read_sweep(path: Path, scenes: Path | None = None) -> SweepConfig:
-    """Read a sweep's YAML file; ``scenes``: a file whose recordings take the place of the sweep's.
+def read_sweep(path: Path, scenes: Path | None = None, split: JudgedBy | None = None) -> SweepConfig:
+    """Read a sweep's YAML file.
+
+    Arguments:
+        path: the file.
+        scenes: a file whose recordings take the place of the sweep's.
+        split: which cameras judge, in place of what the sweep says.
 
     Raises RecipeError with file and line of every problem.
     """
     config = _read(path, SweepConfig)
+    if split is not None:
+        config = config.model_copy(update={"split": split})
     if scenes is None:
         return config
     found = [

@@ -14,14 +14,9 @@ from typing import Any
 
 from gsstream.recipe.document import Layer, Leaf, Origin
 from gsstream.recipe.load import FindMethod, ResolvedRecipe, recipe_hash, resolve_recipe
+from gsstream.recipe.model import LATER_KEYS
 from gsstream.trade.sweep.config import Axis, Range, Scene, SweepConfig, Variant, flat_settings
 from gsstream.trade.sweep.rows import with_bases
-
-#: Sections of a recipe that do not influence frame 0. A section that is not listed counts as one that does.
-LATER_KEYS = (
-    "schema_version", "method", "seed", "frames", "confidence", "propagation", "gate", "regularizer", "update",
-    "stepper", "stream", "gate_training", "codec", "motion", "growth",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,9 +157,10 @@ def _resolve(
     config: SweepConfig, scene: Scene, variant: Variant, axes: Mapping[str, Any], seed: int, folder: Path,
     find_method: FindMethod,
 ) -> ResolvedRecipe:  # fmt: skip
-    """Method <- variant's file <- scene's file <- set of all, of the scene, of the variant <- axes <- seed and size."""
+    """Method <- variant's file <- scene's file <- split <- set of all, scene, variant <- axes <- seed and size."""
     size = {"seed": seed, "scale": scene.scale, "frames": scene.frames}
     written = [
+        ("split", {"data.split": config.split}),
         ("set", config.set),
         (f"scene {scene.name}: set", scene.set),
         (f"variant {variant.name}: set", variant.set),

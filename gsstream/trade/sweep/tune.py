@@ -150,7 +150,7 @@ def choose(trials: Sequence[Trial]) -> Trial | None:
     fitting = [trial for trial in trials if trial.fits]
     if any(not math.isfinite(trial.quality) for trial in fitting):
         raise InputError(
-            "nothing to choose by: the recording has no test cameras; hold some out with "
+            "nothing to choose by: no camera judges; leave --set data.split=reporting out, or hold cameras out with "
             "--set 'data.test_cameras=[NAME, ...]'"
         )
     if not fitting:
@@ -183,6 +183,11 @@ def tune_table(trials: Sequence[Trial], chosen: Trial | None) -> str:
 
 
 def tuned_recipe(resolved: ResolvedRecipe) -> str:
-    """Return the chosen recipe as ``gsstream run --recipe`` takes it: whole, without the pilot's number of frames."""
-    recipe = resolved.recipe.model_copy(update={"frames": None})
+    """Return the chosen recipe as ``gsstream run --recipe`` takes it.
+
+    It is whole, without the pilot's number of frames, and trains on all training cameras: the tuning split was there to
+    choose.
+    """
+    data = resolved.recipe.data.model_copy(update={"split": "reporting"})
+    recipe = resolved.recipe.model_copy(update={"frames": None, "data": data})
     return to_yaml(ResolvedRecipe(recipe, resolved.origins))

@@ -1,0 +1,172 @@
+"""Joins: the state in the middle of a segment, in a file beside the stream, so that nobody replays it from its key.
+
+A join says in which bits a state differs from that of the key packet before it. The stream is not touched, and a player
+reaches the very state that its deltas lead to. Layout of the bytes: docs/reference/package-format.md.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import zstandard
+
+from gsstream.core.changes import Displacement, Groups, Layout, Scene, gather_rows
+from gsstream.core.errors import PacketError
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.packet import PlayerState
+from gsstream.packet.bulk import decompress
+
+MAGIC = b"GSSJ"
+VERSION = 1
+_HEADER = 24
+_LEVEL = 15
+_LIMIT = 1 << 30
+
+
+def follow(source: IntArray, state: PlayerState) -> IntArray:
+    """Return [N'] int64: which row of the key packet each row is after the packet that led to ``state``; -1 is none.
+
+    Arguments:
+        source: [N] the same of the frame before.
+        state: after the packet.
+    """
+    if state.delta is None or not state.delta.edits_rows:
+        return source
+    assert state.before is not None
+    births = state.delta.births
+    gathered = gather_rows(state.before.node_of, births, state.delta.deaths)
+    born = np.full(0 if births is None else len(births), -1, np.int64)
+    return np.concatenate([source, born])[gathered]
+
+
+def encode_join(key: PlayerState, state: PlayerState, source: IntArray) -> bytes:
+    """Return the file that leads from the state of a key packet to a later one.
+
+    Arguments:
+        key: after the key packet.
+        state: the state to join at, without another key packet between the two.
+        source: [N] which row of ``key`` each row of ``state`` was, -1 for rows born since (see :func:`follow`).
+    """
+    facts: dict[str, Any] = {"number": len(state.gaussians), "decoders": {}, "groups": None}
+    arrays: list[IntArray | FloatArray] = []
+    same_rows = np.array_equal(source, np.arange(len(key.gaussians)))
+    facts["rows"] = None if same_rows else {"nodes": len(state.layout.node_counts)}
+    if not same_rows:
+        arrays += [_steps(source), state.layout.node_counts.astype("<i4"), state.layout.unit_of.astype(np.uint8)]
+    for name, before, now in _tables(key, state):
+        difference = (_bits(now) - _origin(_bits(before), source)).astype(np.int32)
+        changed = difference.any(axis=1)
+        arrays += [np.packbits(changed), _planes(difference[changed])]
+        facts.setdefault("changed", {})[name] = int(changed.sum())
+    for name, decoder in state.decoders.items():
+        facts["decoders"][name] = list(decoder.shape)
+        arrays.append(decoder.astype("<f4"))
+    if (groups := state.scene.groups) is not None:
+        facts["groups"] = {"cell": groups.cell, "shades": groups.shades, "count": groups.count}
+        arrays.append(_steps(groups.group_of))
+    moved = state.scene.moved
+    facts["moved"] = None if moved is None else len(moved.rows)
+    if moved is not None:
+        arrays += [_steps(moved.rows), _planes(_bits(moved.shift)), _planes(_bits(moved.turn))]
+    head = json.dumps(facts, separators=(",", ":")).encode()
+    body = len(head).to_bytes(4, "little") + head + b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)
+    packed = zstandard.ZstdCompressor(level=_LEVEL, write_content_size=True).compress(body)
+    numbers = np.array([VERSION, key.frame, state.frame, len(packed), zlib.crc32(packed)], "<u4")
+    return MAGIC + numbers.tobytes() + packed
+
+
+def decode_join(key: PlayerState, data: bytes) -> PlayerState:
+    """Return the state that a join leads to. Raises PacketError when it is damaged or belongs to another key packet.
+
+    Arguments:
+        key: after the key packet that the join refers to.
+        data: the file.
+    """
+    if len(data) < _HEADER or data[:4] != MAGIC:
+        raise PacketError("not a join of a gsstream package", 0)
+    version, key_frame, frame, size, checksum = (int(v) for v in np.frombuffer(data, "<u4", 5, 4))
+    packed = data[_HEADER:]
+    if version != VERSION or key_frame != key.frame or len(packed) != size or zlib.crc32(packed) != checksum:
+        raise PacketError(f"join of frame {frame} is damaged, of another version, or of another key packet", 4)
+    cursor = _Cursor(decompress(packed, _LIMIT))
+    facts = json.loads(cursor.take(int.from_bytes(cursor.take(4), "little")))
+    number = facts["number"]
+    source, layout = np.arange(number, dtype=np.int64), key.layout
+    if facts["rows"] is not None:
+        source = cursor.steps(number)
+        counts = cursor.array("<i4", facts["rows"]["nodes"]).astype(np.int32)
+        layout = Layout(counts, cursor.array(np.uint8, number), key.layout.units)
+    values: dict[str, FloatArray] = {}
+    for name, before in key.gaussians.items():
+        width = int(np.prod(before.shape[1:]))
+        changed = np.unpackbits(cursor.array(np.uint8, (number + 7) // 8), count=number).astype(bool)
+        bits = _origin(_bits(before), source)
+        bits[changed] += cursor.planes(facts["changed"][name], width)
+        values[name] = bits.view(np.float32).reshape(number, *before.shape[1:])
+    decoders = {name: cursor.array("<f4", a * b).reshape(a, b) for name, (a, b) in facts["decoders"].items()}
+    groups, moved = None, None
+    if (said := facts["groups"]) is not None:
+        groups = Groups(said["cell"], said["shades"], cursor.steps(number).astype(np.int32), said["count"])
+    if (count := facts["moved"]) is not None:
+        rows = cursor.steps(count)
+        shift, turn = (cursor.planes(count, 3).view(np.float32) for _ in range(2))
+        moved = Displacement(rows, shift, turn)
+    return PlayerState(frame, Scene(Gaussians(**values), layout, moved, groups), key.meta, decoders)
+
+
+def _tables(key: PlayerState, state: PlayerState) -> Iterator[tuple[str, FloatArray, FloatArray]]:
+    for (name, before), (_, now) in zip(key.gaussians.items(), state.gaussians.items(), strict=True):
+        yield name, before, now
+
+
+def _bits(values: FloatArray) -> IntArray:
+    """Return the bits of float32 values as int32, [N, W]; near values have near bits."""
+    table = np.ascontiguousarray(values, np.float32)
+    return table.reshape(len(table), int(np.prod(table.shape[1:]))).view(np.int32)
+
+
+def _origin(bits: IntArray, source: IntArray) -> IntArray:
+    """Return the bits [N, W] that each row had in the key packet, zeros for rows that were not there."""
+    out = np.zeros((len(source), bits.shape[1]), np.int32)
+    out[source >= 0] = bits[source[source >= 0]]
+    return out
+
+
+def _steps(values: IntArray) -> IntArray:
+    """Return each value's difference to the one before, less one: zeros where values count up."""
+    return np.diff(np.asarray(values, np.int64), prepend=-1).astype("<i4") - np.int32(1)
+
+
+def _planes(values: IntArray) -> IntArray:
+    """Return signed values [A, W], zigzag, as bytes by significance, channel after channel."""
+    folded = ((values << 1) ^ (values >> 31)).view(np.uint32).T.ravel()
+    return np.stack([(folded >> shift).astype(np.uint8) for shift in (0, 8, 16, 24)])
+
+
+class _Cursor:
+    """Takes arrays from bytes, one after the other."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.at = data, 0
+
+    def take(self, size: int) -> bytes:
+        if size < 0 or size > len(self.data) - self.at:
+            raise PacketError(f"join: {size} bytes announced, {len(self.data) - self.at} left")
+        self.at += size
+        return self.data[self.at - size : self.at]
+
+    def array(self, kind: str | type[np.generic], count: int) -> Any:
+        return np.frombuffer(self.take(count * np.dtype(kind).itemsize), kind).copy()
+
+    def steps(self, count: int) -> IntArray:
+        return np.cumsum(self.array("<i4", count).astype(np.int64) + 1) - 1
+
+    def planes(self, count: int, width: int) -> IntArray:
+        planes = self.array(np.uint8, 4 * count * width).reshape(4, width, count).astype(np.uint32)
+        folded = planes[0] | planes[1] << 8 | planes[2] << 16 | planes[3] << 24
+        return np.ascontiguousarray(((folded >> 1) ^ -(folded & 1)).T).view(np.int32)

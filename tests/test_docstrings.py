@@ -18,7 +18,7 @@ Composite Compute Concatenate Continue Convert Copy Count Cut Decode Decorate Di
 Enter Evaluate Fill Find Fit Fold Forget Freeze Give Go Group Grow Hold Import Join Judge Keep Kill Lay Leave Let
 List Look Make Map Match Measure Merge Minimise Move Name Note Open Parse Place Plan Play Precompute Print Project
 Propose Pull Put Quantise Raise Ray-cast Read Reconstruct Record Refuse Register Release Remove Render Reorder
-Replace Resolve Return Run Save Say See Select Send Shift Show Sort Split Stack Start Stop Sum Summarise Take Tell
+Replace Resolve Return Run Save Say See Select Send Serve Shift Show Sort Split Stack Start Stop Sum Summarise Take Tell
 Time Triangulate Try Turn Update Use Validate Verify Wait Walk Write Yield
 """
 #: The start of a noun phrase that describes a class or a property fully: a capital, a shape, a name, a number, a quote.

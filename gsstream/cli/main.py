@@ -28,6 +28,7 @@ from gsstream.cli import (
     scaffold,
     scene,
     segments,
+    serve,
     streams,
     sweep,
     tune,
@@ -85,6 +86,7 @@ app.command(name="export")(deliver.export)
 app.command(name="manifest")(deliver.manifest)
 app.command(name="view")(deliver.view)
 app.command(name="package")(package.package)
+app.command(name="serve")(serve.serve)
 app.command(name="run-segments")(segments.run_segments)
 app.command(name="sweep")(sweep.sweep)
 app.command(name="tune")(tune.tune)

@@ -35,8 +35,16 @@ Ray = Annotated[
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue the run that --out holds.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the run that --out holds.")]
+Diagnose = Annotated[
+    bool, typer.Option("--diagnose", help="Count Gaussians left behind by moving bodies, in metrics.jsonl.")
+]
 NoVideo = Annotated[bool, typer.Option("--no-video", help="Write no video, only still pictures.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print only warnings and errors.")]
+
+Serve = Annotated[
+    int | None,
+    typer.Option("--serve", metavar="PORT", min=0, max=65535, help="Show the frames live at this port (extra: serve)."),
+]
 
 
 def workers(jobs: str, default: str = "one for each processor") -> Any:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gsstream.cli import options
+from gsstream.cli.serve import server_beside, serving
 from gsstream.cli.streams import stream_file
 from gsstream.core.errors import ComponentError, GsstreamError, SourceError
 
@@ -38,14 +39,15 @@ def run(
     resume: options.Resume = False,
     overwrite: options.Overwrite = False,
     checks: Annotated[str | None, typer.Option("--checks", help="Look at parts: off, frame (default), step.")] = None,
+    diagnose: options.Diagnose = False,
     no_video: options.NoVideo = False,
     quiet: options.Quiet = False,
+    serve: options.Serve = None,
 ) -> None:
     """Encode a recording as a stream of 3D Gaussians.
 
-    The recipe of the run is the method's, changed by --recipe FILE, then by --set and the short options. Ctrl-C ends
-    after the current frame with a valid stream (exit code 130), SIGTERM does so too (143); --resume continues it to the
-    same bytes.
+    The recipe is the method's, changed by --recipe FILE, then by --set and the short options. Ctrl-C (exit code 130)
+    and SIGTERM (143) end after the current frame with a valid stream; --resume continues it to the same bytes.
     """
     from gsstream.engine.run.output import claim_output, disk_errors, ended_by_signals
     from gsstream.plugins.catalog import load_catalog
@@ -53,11 +55,11 @@ def run(
 
     changes = options.overrides(settings, budget=budget, frames=frames, scale=scale, seed=seed, renderer=renderer)
     catalog = load_catalog()
-    resolved = resolve_recipe(method, catalog.recipe_path, recipe or (), changes)
+    resolved, server = resolve_recipe(method, catalog.recipe_path, recipe or (), changes), server_beside(out, serve)
     # The slow imports come last: a mistake on the command line is answered at once.
     from gsstream.engine.assembly.assemble import assemble
     from gsstream.engine.run.recording import open_recording, read_first_frame
-    from gsstream.engine.run.session import run as run_session
+    from gsstream.engine.run.session import run as encode
 
     assembly = assemble(resolved, catalog, checks)
     # Read before the folder is touched: --overwrite must not delete a run for the sake of a faulty recording.
@@ -68,16 +70,16 @@ def run(
         _what_is_taken(say, resolved.recipe, recording.info, named=bool(method or recipe), catalog=catalog)
         if not resume:
             _first_look(recording, source)
-        slow = assembly.recipe.renderer.name == "reference"
-        with claim_output(out, resume=resume, overwrite=overwrite), ended_by_signals() as came:
+        with claim_output(out, resume=resume, overwrite=overwrite), ended_by_signals() as came, serving(server):
             try:
                 with disk_errors(out):
-                    result = run_session(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first)
+                    result = encode(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first,
+                                    diagnose=diagnose)  # fmt: skip
             except GsstreamError as error:
                 _what_there_is(error, out, recording, not no_video, quiet)
                 raise
             with disk_errors(out):
-                _pictures(result, recording, not no_video, quiet, slow)
+                _pictures(result, recording, not no_video, quiet, assembly.recipe.renderer.name == "reference")
     finally:
         recording.close()
     if result.interrupted:

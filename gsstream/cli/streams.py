@@ -40,6 +40,10 @@ def play(
         ),
     ] = None,
     frames: Frames = None,
+    fps: Annotated[
+        float | None,
+        typer.Option("--fps", help="Pictures per second, moments between frames included; default: the recording's."),
+    ] = None,
     size: Annotated[
         str | None, typer.Option("--size", metavar="WxH", help="Pixels of the pictures; default: those of the camera.")
     ] = None,
@@ -68,7 +72,7 @@ def play(
         target = out if len(cameras) == 1 else _one_of_many(out, name or "")
         played = play_stream(
             file, target, camera=name, frames=chosen, progress=progress_on(name or "camera"), max_memory=most,
-            size=pixels, renderer=chosen_renderer,
+            size=pixels, renderer=chosen_renderer, fps=fps,
         )  # fmt: skip
         typer.echo(f"{played.path}: {plural(played.frames, 'picture')}")
     fail_with(damage)

@@ -8,11 +8,13 @@ import numpy as np
 from pydantic import Field
 
 from gsstream.core.changes import Motion, Scene
+from gsstream.core.changes.motion import moves_of
 from gsstream.core.context import FrameWork
 from gsstream.core.part import PartConfig
 from gsstream.core.rng import Rng
 from gsstream.motion.base import MotionPart
 from gsstream.motion.groups import changed_groups, displaced_groups, known_groups
+from gsstream.motion.switch import gains, some_views
 
 
 @final
@@ -30,6 +32,12 @@ class Coasting(MotionPart):
             default=0.5, ge=0, le=1, description="share of its views in which a Gaussian must lie in changed tiles"
         )
         share: float = Field(default=0.5, ge=0, le=1, description="share of a group's Gaussians that must lie there")
+        displaced: float = Field(
+            default=0.1, ge=0, le=1, description="share of a group's Gaussians that the last frame must have displaced"
+        )
+        asked: float = Field(
+            default=0.5, ge=0, le=1, description="share of the cameras that judge each group, in turn; 0: none does"
+        )
 
     source: ClassVar[str] = "gsstream"
 
@@ -37,6 +45,12 @@ class Coasting(MotionPart):
         if scene.moved is None:
             return ()
         groups = known_groups(scene, work.cameras, self.config.pixels, self.config.shades)
-        moving = displaced_groups(groups, scene) & changed_groups(groups, work, self.config.votes, self.config.share)
+        config = self.config
+        moving = displaced_groups(groups, scene, config.displaced)
+        moving &= changed_groups(groups, work, config.votes, config.share)
+        if config.asked and moving.any():
+            moves = moves_of(scene, groups, moving.astype(np.uint8), predicted=True)
+            change = gains(scene, work, moves, some_views(len(work.cameras), config.asked, work.index))
+            moving[np.flatnonzero(moving)[change >= 0]] = False
         symbols = np.zeros((int(moving.sum()), 6), np.int32)
         return (Motion(groups.cell, groups.shades, moving.astype(np.uint8), symbols),)

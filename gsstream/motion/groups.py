@@ -51,9 +51,16 @@ def changed_groups(groups: Groups, work: FrameWork, votes: float, share: float) 
     return np.asarray((total > 0) & (hit > 0) & (hit >= share * total))
 
 
-def displaced_groups(groups: Groups, scene: Scene) -> IntArray:
-    """Return [G] bool: groups of which some row was displaced by the last frame."""
-    out = np.zeros(groups.count, bool)
-    if scene.moved is not None:
-        out[groups.group_of[scene.moved.rows]] = True
-    return out
+def displaced_groups(groups: Groups, scene: Scene, share: float) -> IntArray:
+    """Return [G] bool: groups of which the last frame displaced some row, and at least this share of them.
+
+    Arguments:
+        groups: G groups of the rows of the scene.
+        scene: decoded, as both ends have it.
+        share: 0 to 1.
+    """
+    if scene.moved is None:
+        return np.zeros(groups.count, bool)
+    total = np.bincount(groups.group_of, minlength=groups.count)
+    hit = np.bincount(groups.group_of[scene.moved.rows], minlength=groups.count)
+    return np.asarray((hit > 0) & (hit >= share * total))

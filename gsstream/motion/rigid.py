@@ -9,14 +9,14 @@ import torch
 from pydantic import Field
 
 from gsstream.core.changes import Motion, Scene
-from gsstream.core.changes.motion import Moves, moves_of, transformed
+from gsstream.core.changes.motion import Moves, moves_of
 from gsstream.core.context import FrameWork
-from gsstream.core.gaussians import Gaussians
 from gsstream.core.part import PartConfig
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.motion.base import MotionPart
 from gsstream.motion.groups import changed_groups, known_groups, pixel_size
+from gsstream.motion.pull_back import slope_of
 
 BETAS, EPSILON = (0.9, 0.99), 1e-12
 
@@ -38,9 +38,9 @@ class Units(NamedTuple):
 class Rigid(MotionPart):
     """Fits one rigid transform per group, starting from the last frame's, and codes what corrects the prediction.
 
-    A few passes over the training cameras move the groups' six numbers each, with Adam and a falling rate; only the
-    Gaussians of groups that lie in what changed are rendered anew. A group that ends within ``least`` pixels of where
-    it stood is left alone.
+    A few passes over the training cameras move the groups' six numbers each, with Adam's moments, one length of step
+    for all six, and a falling rate; only the Gaussians of groups that lie in what changed are rendered anew. A group
+    that ends within ``least`` pixels of where it stood is left alone.
     """
 
     class Config(PartConfig):
@@ -54,7 +54,7 @@ class Rigid(MotionPart):
         lr: float = Field(default=0.25, gt=0, le=10, description="first step, pixels per iteration")
         lr_final: float = Field(default=0.025, gt=0, le=10, description="last step, pixels per iteration")
         step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
-        least: float = Field(default=0.1, ge=0, le=10, description="motions below this many pixels are dropped")
+        least: float = Field(default=0.25, ge=0, le=10, description="motions below this many pixels are dropped")
 
     source: ClassVar[str] = "gsstream; groups of one rigid motion as in HiCoM"
 
@@ -92,35 +92,23 @@ class Rigid(MotionPart):
             if step % views == 0:
                 sequence = order.permutation(views)
             moves = local._replace(shift=values[:, :3] * units.shift, turn=values[:, 3:] * units.turn)
-            moved = transformed(base, moves)
-            leaves = moved.map(lambda value: torch.from_numpy(value).requires_grad_())
-            work.pull(int(sequence[step % views]), leaves)
-            slope = _pulled_back(leaves, moves) * units.row
+            slope = slope_of(work, int(sequence[step % views]), base, moves) * units.row
             first = BETAS[0] * first + (1 - BETAS[0]) * slope
             second = BETAS[1] * second + (1 - BETAS[1]) * slope**2
             rate = config.lr * (config.lr_final / config.lr) ** (step / total)
-            scale = np.sqrt(second / (1 - BETAS[1] ** (step + 1))) + EPSILON
+            scale = np.sqrt(_felt(second) / (1 - BETAS[1] ** (step + 1))) + EPSILON
             values = values - rate * (first / (1 - BETAS[0] ** (step + 1))) / scale
         return values * units.row
 
 
-def _pulled_back(leaves: Gaussians[torch.Tensor], moves: Moves) -> FloatArray:
-    """[K, 6] gradient with respect to shift and turn, from that of the moved centres and quaternions."""
-    number = len(moves.centre)
-    if leaves.means.grad is None:
-        return np.zeros((number, 6))
-    force = leaves.means.grad.numpy().astype(np.float64)
-    arm = leaves.means.detach().numpy() - (moves.centre + moves.shift)[moves.place]
-    torque = 2 * np.cross(arm, force)
-    if leaves.quats.grad is not None:
-        w, x, y, z = leaves.quats.detach().numpy().astype(np.float64).T
-        a, b, c, d = leaves.quats.grad.numpy().astype(np.float64).T
-        # A small turn v in front of a quaternion q adds (0, v) q to it.
-        torque += np.stack([
-            -a * x + b * w - c * z + d * y, -a * y + b * z + c * w - d * x, -a * z - b * y + c * x + d * w
-        ], 1)  # fmt: skip
-    both = np.concatenate([force, torque], 1)
-    return np.stack([np.bincount(moves.place, both[:, i], number) for i in range(6)], 1)
+def _felt(second: FloatArray) -> FloatArray:
+    """Return the squared slope [K, 1] that all six numbers of a group are measured by: that of the one felt most.
+
+    With a measure of its own every number would make steps of full size, those that the images say nothing about too
+    (depth, the turn of a ball), and so would groups that are hardly seen: noise, which the residual has to mend. A
+    group that feels less than the others do on average is measured by them.
+    """
+    return np.asarray(np.maximum(second.max(1, keepdims=True), second.mean()))
 
 
 def _units(scene: Scene, work: FrameWork, cell: float) -> Units:

@@ -17,6 +17,7 @@ from PIL import Image
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError, OutputError
 from gsstream.core.shapes import FloatArray
+from gsstream.player.between import Moments, moments
 from gsstream.player.camera_file import read_path
 from gsstream.player.paths import PATHS, camera_path, resized
 from gsstream.player.playback import Playback
@@ -52,7 +53,8 @@ def play(
         camera: id of a train or test camera, "orbit" or "spiral", or a JSON file with a path
             (``player.camera_file``); default: the first test, else the first train camera.
         frames: frame indices in the order to be shown; default: all up to the first damaged packet.
-        fps: pictures per second; default: that of the recording.
+        fps: pictures per second; default: that of the recording. Another rate shows moments between frames
+            (``player.between``), so that the speed stays; it needs frames that follow each other.
         progress: called with (done, total) after every picture.
         size: (width, height) of the pictures; default: that of the camera. The vertical field of view stays.
         max_memory: bytes that decoding and drawing may take at most; default: what the format allows.
@@ -66,17 +68,18 @@ def play(
         chosen = list(sound)
         if not chosen:
             raise InputError("no frames to play: expected at least one frame index")
-        cameras = choose_cameras(playback, camera, len(chosen))
-        cameras = cameras if size is None else resized(cameras, *size)
         for frame in chosen:
             playback.entry(frame)
-        if playback.limit is not None:
-            kept = len(chosen) if Path(out).suffix.lower() in _ANIMATED else 1
-            playback.limit.check_pictures(cameras.width, cameras.height, kept)
-        images = _images(playback, chosen, cameras, renderer, progress)
         rate = playback.meta.fps if fps is None else fps
+        times = moments(chosen, playback.meta.fps, rate) if fps is not None else [float(frame) for frame in chosen]
+        cameras = choose_cameras(playback, camera, len(times))
+        cameras = cameras if size is None else resized(cameras, *size)
+        if playback.limit is not None:
+            kept = len(times) if Path(out).suffix.lower() in _ANIMATED else 1
+            playback.limit.check_pictures(cameras.width, cameras.height, kept)
+        images = _images(playback, times, cameras, renderer, progress)
         try:
-            played = _write(Path(out), images, chosen, rate)
+            played = _write(Path(out), images, chosen if fps is None else range(len(times)), rate)
         except OSError as error:
             raise OutputError(f"cannot write {out}: {error.strerror or error}") from error
     if damage is not None:
@@ -117,19 +120,19 @@ def choose_cameras(playback: Playback, camera: str | None, number: int) -> Camer
 
 
 def _images(
-    playback: Playback, frames: Sequence[int], cameras: Cameras, renderer: PlayerRenderer | None,
+    playback: Playback, times: Sequence[float], cameras: Cameras, renderer: PlayerRenderer | None,
     progress: Callable[[int, int], None] | None,
 ) -> Iterator[Bytes]:  # fmt: skip
-    background = playback.meta.background
+    background, scenes = playback.meta.background, Moments(playback)
     last: tuple[object, int, FloatArray] | None = None
-    for i, frame in enumerate(frames):
-        scene, view = playback.state_at(frame), min(i, len(cameras) - 1)
+    for i, time in enumerate(times):
+        scene, view = scenes.at(time), min(i, len(cameras) - 1)
         # An empty packet keeps the very same scene object: nothing has to be rendered again.
         if last is None or last[0] is not scene or last[1] != view:
             last = (scene, view, render(scene, cameras, view, background, renderer))
         yield to_bytes(last[2])
         if progress is not None:
-            progress(i + 1, len(frames))
+            progress(i + 1, len(times))
 
 
 def _write(out: Path, images: Iterator[Bytes], frames: Sequence[int], fps: float) -> Played:

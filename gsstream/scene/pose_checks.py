@@ -19,6 +19,7 @@ from gsstream.scene.findings import Finding, error
 from gsstream.scene.match_checks import REPAIRS
 from gsstream.scene.rig_checks import check_axes, check_intrinsics, check_overlap, check_placement
 from gsstream.source.base import FrameSource
+from gsstream.source.canonical import as_filed
 
 #: Width of the pictures that are swept, and how many of them are.
 WIDTH, VIEWS = 64, 3
@@ -40,8 +41,9 @@ def first_look(source: FrameSource) -> list[Finding]:
 
     Raises SourceError when frame 0 cannot be read.
     """
-    train, unit = source.info.train, source.info.world.scale
-    found = [*check_intrinsics(train), *check_placement(train, len(train), None, unit), *check_axes(train)]
+    source = as_filed(source)
+    train = source.info.train
+    found = [*check_intrinsics(train), *check_placement(train, len(train), None), *check_axes(train)]
     if found:
         return found[:1]
     found = check_overlap(train, train.ids) if len(train) > 1 else []

@@ -41,9 +41,7 @@ def check_intrinsics(cameras: Cameras) -> list[Finding]:
     return found
 
 
-def check_placement(
-    cameras: Cameras, train: int, points: PointCloud | None, unit: float = 1.0
-) -> list[Finding]:
+def check_placement(cameras: Cameras, train: int, points: PointCloud | None) -> list[Finding]:
     """Find two cameras in one place, a camera far from all others, and points in another unit.
 
     ``train``: the first so many cameras train.
@@ -52,7 +50,6 @@ def check_placement(
         cameras: training cameras, then test cameras.
         train: how many of them train.
         points: that ship with the recording, or None.
-        unit: units of the recording's files per unit here, for what is said.
     """
     found = []
     centers = cameras.centers
@@ -73,24 +70,24 @@ def check_placement(
         usual = float(np.median(distance))
         found = [
             error("placement", (
-                f"camera {cameras.ids[i]!r} is {unit * distance[i]:.4g} units away from the middle of the rig, the "
-                f"others about {unit * usual:.4g}; its translation is probably in another unit (mm instead of m?)"
+                f"camera {cameras.ids[i]!r} is {distance[i]:.4g} units away from the middle of the rig, the others "
+                f"about {usual:.4g}; its translation is probably in another unit (mm instead of m?)"
             ))
             for i in np.flatnonzero(distance > FAR * max(usual, 1e-12))
         ]  # fmt: skip
     if not found and points is not None and len(points) > 10:
-        found = _points_unit(cameras, points, unit)
+        found = _points_unit(cameras, points)
     return found
 
 
-def _points_unit(cameras: Cameras, points: PointCloud, unit: float) -> list[Finding]:
+def _points_unit(cameras: Cameras, points: PointCloud) -> list[Finding]:
     spread = float(np.median(np.linalg.norm(points.xyz - np.median(points.xyz, axis=0), axis=1)))
     ratio = spread / cameras.extent
     if 1 / FAR < ratio < FAR:
         return []
     return [error("placement", (
-        f"the points of frame 0 spread over {unit * spread:.4g} units, the rig over {unit * cameras.extent:.4g}: one "
-        "of them is probably in mm and the other in m; bring poses and points to one unit"
+        f"the points of frame 0 spread over {spread:.4g} units, the rig over {cameras.extent:.4g}: one of them is "
+        "probably in mm and the other in m; bring poses and points to one unit"
     ))]  # fmt: skip
 
 

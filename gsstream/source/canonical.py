@@ -34,6 +34,17 @@ def world_of(source: FrameSource) -> World:
     return own_world(rig, source.points)
 
 
+def as_filed(source: FrameSource) -> FrameSource:
+    """Return a recording in the coordinates of its files, for checks of what the files say.
+
+    Poses that were written the wrong way round are mended by inverting them in those coordinates, and in no others.
+
+    Arguments:
+        source: an open recording; closing it closes the result.
+    """
+    return source.filed if isinstance(source, CanonicalSource) else source
+
+
 class CanonicalSource:
     """A frame source over another one: the same images, with cameras and points in the coordinates of a world.
 
@@ -53,6 +64,11 @@ class CanonicalSource:
     def info(self) -> SourceInfo:
         """The inner recording's, with cameras in this world."""
         return self._info
+
+    @property
+    def filed(self) -> FrameSource:
+        """The inner recording, in the coordinates of its files."""
+        return self._source
 
     def frame(self, index: int, split: Split = "train") -> Frame:
         """Read one instant. Raises SourceError as the inner source does."""

@@ -110,7 +110,11 @@ function firstByte(response, url, at) {
   }
   if (response.status === 200) return 0;
   if (response.status === 416) return null;
-  const error = new SourceError(`There is no stream at ${url}: the server answers ${response.status}.`);
+  const error = new SourceError(
+    response.status === 401
+      ? "This stream needs a token: add ?token=… to the address of the page."
+      : `There is no stream at ${url}: the server answers ${response.status}.`,
+  );
   error.final = response.status < 500;
   throw error;
 }

@@ -100,7 +100,7 @@ export class PlayerElement extends HTMLElement {
     try {
       await this.player.open(url);
       this._fillLists();
-      this._tell("");
+      this._tell(this.player.problem ?? "");
       if (this.hasAttribute("autoplay")) this.player.play();
     } catch (error) {
       if (error.name !== "AbortError") this._tell(error.message);
@@ -205,6 +205,11 @@ export class PlayerElement extends HTMLElement {
     parts.seek.min = player.first;
     parts.seek.max = Math.max(player.last, player.first + 1);
     parts.seek.value = player.frame;
+    parts.seek.hidden = parts.speed.hidden = Boolean(player.source.live);
+    if (player.source.live) {
+      parts.time.textContent = `live, frame ${player.frame}`;
+      return;
+    }
     const seconds = (frame) => ((frame - player.first) / player.fps).toFixed(1);
     parts.time.textContent = `${seconds(player.frame)} / ${seconds(player.last)} s`;
   }

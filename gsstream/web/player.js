@@ -62,9 +62,9 @@ export class Player extends EventTarget {
 
   _start(segments, frame) {
     this.snapshots.clear();
-    this.buffer = new PacketBuffer(segments, () => this._news());
+    this.buffer = this.source.follow?.(this) ?? new PacketBuffer(segments, () => this._news());
     this.buffer.fps = this.source.fps ?? 30;
-    this._target = frame ?? this.buffer.first ?? 0;
+    this._target = this.buffer.live ? null : (frame ?? this.buffer.first ?? 0);
     this.buffer.want(this._target);
     return new Promise((resolve, reject) => {
       this._opened = { resolve, reject };
@@ -91,7 +91,7 @@ export class Player extends EventTarget {
   play() {
     if (this.playing) return;
     if (this.frame !== null && this.buffer.last !== null && this.frame >= this.last) this.seek(this.first);
-    if (this.problem) this.buffer?.retry();
+    if (this.problem) this.buffer?.retry?.();
     this.problem = null;
     this.playing = true;
     this._clock = 0;
@@ -103,7 +103,7 @@ export class Player extends EventTarget {
     this._say("state");
   }
 
-  /** Show a frame as soon as it is there. */
+  /** Show a frame as soon as it is there. A live stream only shows its newest. */
   seek(frame) {
     const wanted = Math.max(this.first, Math.min(Math.round(frame), this.last));
     this._target = wanted;
@@ -144,6 +144,7 @@ export class Player extends EventTarget {
     this.renderer.draw(cameraOf(this.view, this.canvas.width, this.canvas.height), options);
     this.statistics.drawn += 1;
     this.statistics.uploaded += this.renderer.uploaded;
+    this.buffer?.shown?.(this.frame);
   }
 
   close() {
@@ -168,7 +169,8 @@ export class Player extends EventTarget {
     const seconds = this._then === null ? 0 : Math.min((now - this._then) / 1000, 0.25);
     this._then = now;
     this.options.beforeFrame?.(seconds);
-    if (this.buffer) this._advance(seconds);
+    if (this.buffer?.live) this.buffer.feed();
+    else if (this.buffer) this._advance(seconds);
     if (this._dirty && this.state) {
       this._dirty = false;
       this.draw();
@@ -279,10 +281,8 @@ export class Player extends EventTarget {
     this._target = next;
     this.playing &&= next !== null;
     this.problem = error.message;
-    if (this._opened) {
-      this._opened.reject(error);
-      this._opened = null;
-    }
+    this._opened?.reject(error);
+    this._opened = null;
     this.dispatchEvent(new CustomEvent("problem", { detail: error.message }));
     this._say("state");
   }

@@ -13,10 +13,12 @@ const TRAILER = 12;
  * A segment is `{ first, last, url, start, end, whole }`: a key packet and what follows, bytes `start` to `end` of a
  * file, or the whole file. `last` and `frames` are null where only playing tells. Where a segment can be joined in its
  * middle, each piece is an entry of its own: those behind the first have `join`, the state they begin with, and `key`,
- * the key packet that it refers to; `all` says where their file ends. Throws SourceError or PacketError.
+ * the key packet that it refers to; `all` says where their file ends. Of a live stream
+ * there are no segments but `follow(player)`, which returns its buffer. Throws SourceError or PacketError.
  */
 export async function openSource(url, signal) {
   const address = new URL(url, globalThis.document?.baseURI);
+  if (/^wss?:$/.test(address.protocol)) return liveSource(address);
   if (address.pathname.endsWith("/")) address.pathname += "stream.json";
   return address.pathname.endsWith(".json") ? openManifest(address.href, signal) : openFile(address.href, signal);
 }
@@ -35,6 +37,7 @@ async function openManifest(url, signal) {
       `This stream has packet format ${version[1]}.${version[2]}; this player reads ${FORMAT_MAJOR}.${FORMAT_MINOR}.`,
     );
   }
+  if (typeof manifest?.live === "string") return liveSource(beside(manifest.live, url));
   const renditions = [manifest, ...(manifest.renditions ?? [])].map((entry, i) => ({
     name: entry.name ?? (i ? `rendition ${i}` : "full"),
     gaussians: entry.gaussians ?? null,
@@ -43,6 +46,24 @@ async function openManifest(url, signal) {
   const { segments } = renditions[0];
   const last = segments[segments.length - 1].last;
   return { segments, frames: last - segments[0].first + 1, fps: manifest.fps ?? null, renditions };
+}
+
+/** A stream as it is written, at the address of its socket. Only who looks at one loads what it takes. */
+async function liveSource(address) {
+  if (/^https?:$/.test(address.protocol)) address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
+  const { LiveBuffer } = await import("./live.js");
+  const follow = (player) => new LiveBuffer(address.href, player);
+  return { live: true, follow, segments: [], frames: null, fps: null, renditions: [] };
+}
+
+/** What a manifest names, with the token of its own address, if it has one. */
+function beside(name, base) {
+  const address = new URL(name, base);
+  const { origin, searchParams } = new URL(base);
+  if (origin === address.origin && searchParams.has("token")) {
+    address.searchParams.set("token", searchParams.get("token"));
+  }
+  return address;
 }
 
 function segmentsOf(entry, base) {
@@ -56,7 +77,7 @@ function piecesOf(segment, entry, base) {
   const whole = {
     first: segment.frames[0],
     last: segment.frames[1],
-    url: new URL(segment.file ?? entry.file, base).href,
+    url: beside(segment.file ?? entry.file, base).href,
     start: segment.file ? 0 : segment.range[0],
     end: segment.file ? (segment.bytes ?? null) && segment.bytes - 1 : segment.range[1],
     whole: Boolean(segment.file),

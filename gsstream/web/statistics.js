@@ -33,12 +33,15 @@ export class Statistics {
     const mean = (list) => (list.length ? list.reduce((sum, value) => sum + value, 0) / list.length : 0);
     const bytes = mean(this.frames);
     const rate = (bytes * 8 * player.fps) / 1e6;
-    const ahead = player.buffer.secondsAfter(player.frame);
+    const { buffer } = player;
+    const loaded = `${(buffer.received / 1e6).toFixed(2)} MB loaded`;
     return [
-      `frame ${player.frame} of ${player.first} to ${player.last}`,
+      buffer.live ? `live, frame ${player.frame}` : `frame ${player.frame} of ${player.first} to ${player.last}`,
       `${player.state.number.toLocaleString("en")} Gaussians`,
       `${(bytes / 1000).toFixed(1)} KB a frame between key packets, ${rate.toFixed(2)} Mbit/s`,
-      `${(player.buffer.received / 1e6).toFixed(2)} MB loaded, ${ahead.toFixed(1)} s ahead`,
+      buffer.live
+        ? `${loaded}, ${buffer.latency.text()}`
+        : `${loaded}, ${buffer.secondsAfter(player.frame).toFixed(1)} s ahead`,
       `decoding ${mean(this.decoding).toFixed(1)} ms, sorting ${player.renderer.sorter.milliseconds.toFixed(1)} ms`,
       `${(this.uploaded / 1000).toFixed(0)} KB to the graphics a picture, ${this.drawn.toFixed(0)} pictures/s`,
     ].join("\n");

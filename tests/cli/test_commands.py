@@ -40,10 +40,10 @@ OPTIONS = {
     "gsstream": ["--debug", "--version"],
     "gsstream run": [
         "--source", "--out", "--method", "--recipe", "--set", "--frames", "--scale", "--seed", "--renderer", "--resume",
-        "--first-frame", "--checks",
+        "--first-frame", "--checks", "--diagnose",
         "--overwrite", "--no-video", "--quiet", "--budget",
     ],
-    "gsstream play": ["STREAM", "--out", "--camera", "--frames", "--size", "--renderer", "--max-memory"],
+    "gsstream play": ["STREAM", "--out", "--camera", "--frames", "--fps", "--size", "--renderer", "--max-memory"],
     "gsstream evaluate": ["STREAM", "--source", "--lpips-onnx", "--lpips-range", "--json", "--max-memory"],
     "gsstream gap": ["RUN", "--at", "--cache", "--epochs", "--source", "--json", "--quiet"],
     "gsstream info": ["STREAM", "--json"],

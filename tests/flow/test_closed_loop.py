@@ -102,7 +102,7 @@ def test_training_and_transmission_apply_the_same_map(tmp_path: Path, monkeypatc
     original = step_module.harden
     monkeypatch.setattr(step_module, "harden", harden)
     witness = Witness(monkeypatch)
-    encode(tmp_path, "--frames", "4", method="s2gs-edge", codec__trim=0)
+    encode(tmp_path, "--frames", "4", method="s2gs-edge", motion="still", codec__trim=0)
     assert len(seen) == 3
     for problem, residual, rows in seen:
         before = witness.states[problem.frame - 1].player.scene
@@ -212,7 +212,10 @@ def test_a_run_repeats_from_its_saved_recipe(tmp_path: Path) -> None:
 MOTION = {
     "coasting": {"motion": "coasting"},
     "rigid": {"motion": "rigid", "motion__epochs": 1},
-    "growing": {"growth": "anchor-insertion", "growth__error": 0.05, "growth__least_views": 2, "growth__per_frame": 40},
+    "growing": {
+        "growth": "anchor-insertion", "growth__error": 0.05, "growth__least_views": 2, "growth__per_frame": 40,
+        "motion": "still",
+    },
 }  # fmt: skip
 MOTION["growing and coasting"] = {**MOTION["growing"], **MOTION["coasting"]}
 MOTION["growing and rigid"] = {**MOTION["growing"], **MOTION["rigid"]}
@@ -224,7 +227,7 @@ def test_motions_and_births_leave_both_ends_alike(tmp_path: Path, monkeypatch: p
     witness = Witness(monkeypatch)
     encode(tmp_path, "--frames", "4", method="s2gs-edge", **MOTION[case])
     lines = metrics(tmp_path)[1:]
-    assert any(line["moving_groups"] > 0 for line in lines) == ("motion" in MOTION[case])
+    assert any(line["moving_groups"] > 0 for line in lines) == (MOTION[case]["motion"] != "still")
     assert any(line["births"] > 0 for line in lines) == ("growth" in MOTION[case]) or case == "growing and rigid"
     with Playback(tmp_path / "stream.gss") as playback:
         for frame, state in enumerate(witness.states):

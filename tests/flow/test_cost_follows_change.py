@@ -29,7 +29,7 @@ def deltas(out: Path) -> list[bytes]:
 
 def test_threshold_zero_is_the_dense_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, world: str) -> None:
     """Without a threshold every Gaussian takes part and every pixel is drawn: bit for bit a plain render per step."""
-    encode(tmp_path / "ours", source=world, method="s2gs-edge", stream__change_threshold=0)
+    encode(tmp_path / "ours", source=world, method="s2gs-edge", motion="still", stream__change_threshold=0)
     lines = metrics(tmp_path / "ours")
     assert [line["candidate_gaussians"] for line in lines[1:]] == [lines[1]["num_gaussians"]] * 3
     opened = CpuRenderer.open
@@ -42,7 +42,7 @@ def test_threshold_zero_is_the_dense_path(tmp_path: Path, monkeypatch: pytest.Mo
             return native.screen_gradient(view, image_gradient)
 
     monkeypatch.setattr(CpuRenderer, "open", lambda *arguments: Plain(*arguments))
-    encode(tmp_path / "plain", source=world, method="s2gs-edge", stream__change_threshold=0)
+    encode(tmp_path / "plain", source=world, method="s2gs-edge", motion="still", stream__change_threshold=0)
     assert deltas(tmp_path / "ours") == deltas(tmp_path / "plain")
 
 
@@ -56,7 +56,7 @@ def test_what_the_renderer_keeps_changes_no_byte(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(CpuSession, "commit", counted)
     kept = encode(tmp_path / "kept", source=world, method="s2gs-edge")
-    assert len(commits) == 3
+    assert len(commits) >= 3, "one a frame, and one more where a motion was found"
     assert any(commits), "a stream in which nothing changes proves nothing"
     assert "cache" in metrics(tmp_path / "kept")[-1]
     monkeypatch.setattr(step_module, "kept_session", lambda *_: None)
@@ -85,7 +85,8 @@ def test_rows_behind_closed_gates_leave_and_stay_as_they_were(
 
     monkeypatch.setattr(CpuSession, "narrow", counted)
     witness = Witness(monkeypatch)
-    encode(tmp_path / "o", source=world, method="s2gs-edge", stream__release_closed="true", stream__epochs=4)
+    settings = {"motion": "still", "stream__release_closed": "true", "stream__epochs": 4}
+    encode(tmp_path / "o", source=world, method="s2gs-edge", **settings)
     assert len(sizes) > 3, "some frame let rows go"
     lines = metrics(tmp_path / "o")
     assert all(line["active_gaussians"] <= line["candidate_gaussians"] for line in lines[1:])

@@ -7,7 +7,8 @@ from flow_runs import encode, metrics
 
 from gsstream.player.playback import Playback
 
-EDGE = {"method": "s2gs-edge"}
+#: Motions give up nothing, so a share of the whole packet is one of the residual only without them.
+EDGE = {"method": "s2gs-edge", "motion": "still"}
 
 
 def sizes(out: Path) -> list[int]:

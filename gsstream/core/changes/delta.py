@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 
 from gsstream.core.changes.history import displacement
-from gsstream.core.changes.motion import Motion, apply_motions
+from gsstream.core.changes.motion import Motion, apply_motions, either
 from gsstream.core.changes.residual import Residual, apply_residual, sent_rows
 from gsstream.core.changes.rows import Births, Rows, apply_rows, gather_rows, join_rows
 from gsstream.core.changes.scene import Layout, Scene
@@ -99,7 +99,7 @@ def apply_delta(scene: Scene, delta: Delta) -> Scene:
     after, touched = apply_motions(scene, delta.motions)
     if delta.residual is not None:
         after = replace(after, gaussians=apply_residual(after.gaussians, after.layout, delta.residual))
-        touched = np.union1d(touched, sent_rows(after.layout, delta.residual.gates))
+        touched = either(len(after.gaussians), touched, sent_rows(after.layout, delta.residual.gates))
     after = replace(after, moved=displacement(scene.gaussians, after.gaussians, touched))
     return after if delta.rows is None else apply_rows(after, delta.rows)
 

@@ -54,8 +54,8 @@ def turn_between(before: FloatArray, after: FloatArray) -> FloatArray:
     float64, each sum from left to right, rounded to float32 at the end. A turn of more than 120 degrees counts as none:
     it is a Gaussian that was painted anew, not one that turned.
     """
-    w0, x0, y0, z0 = before.astype(np.float64).T
-    w1, x1, y1, z1 = after.astype(np.float64).T
+    w0, x0, y0, z0 = np.ascontiguousarray(before.T).astype(np.float64)
+    w1, x1, y1, z1 = np.ascontiguousarray(after.T).astype(np.float64)
     w = w1 * w0 + x1 * x0 + y1 * y0 + z1 * z0
     x = x1 * w0 - w1 * x0 - y1 * z0 + z1 * y0
     y = y1 * w0 - w1 * y0 + x1 * z0 - z1 * x0

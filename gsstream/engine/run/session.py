@@ -18,10 +18,12 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.auto.rules import lines
 from gsstream.engine.budget.memory import within_memory
 from gsstream.engine.frame0.points import gather_points, with_test_views
+from gsstream.engine.keys.resume import ended, since_key
 from gsstream.engine.run.encoder import Encoder, Listeners
 from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.run.metrics_log import append_metrics, last_written, trim_metrics
 from gsstream.engine.run.progress import RunProgress
+from gsstream.engine.run.travel import LeftBehind, displacement_pixels
 from gsstream.method.base import Step
 from gsstream.metrics import EnergyMeter
 from gsstream.packet import PlayerState, StreamReader, StreamWriter
@@ -56,6 +58,7 @@ def run(
     energy: EnergyMeter | None = None,
     witness: Witness | None = None,
     span: range | None = None,
+    diagnose: bool = False,
 ) -> RunResult:
     """Encode a recording into ``out`` (stream.gss, metrics.jsonl, recipe.yaml).
 
@@ -71,9 +74,11 @@ def run(
         energy: counters to read around every frame; their joules stand in its metrics.
         witness: called with every step once its packet is written.
         span: frames to encode, by default all; the first of them is the key packet that the stream begins with.
+        diagnose: count in every frame the Gaussians that stay behind their body (``engine.run.travel``).
     """
     parts = within_memory(parts, source.info)
-    return _Run(parts, source, out, quiet, measure, first_frame, energy, witness, span).encode(resume)
+    doing = _Run(parts, source, out, quiet, measure, first_frame, energy, witness, span, diagnose)
+    return doing.encode(resume)
 
 
 class _Run:
@@ -82,11 +87,13 @@ class _Run:
     def __init__(
         self, parts: Assembly, source: FrameSource, out: Path, quiet: bool, measure: bool,
         first_frame: PlayerState | None, energy: EnergyMeter | None, witness: Witness | None, span: range | None,
+        diagnose: bool,
     ) -> None:  # fmt: skip
         self.source, self.out, self.energy, self.witness = source, out, energy, witness
         self.start = 0 if span is None else span.start
         self.total = _num_frames(source.info, parts.recipe.frames, None if span is None else span.stop)
         self.held_out = HeldOut(parts.renderer, parts.recipe.background) if measure else None
+        self.left_behind = LeftBehind() if diagnose else None
         self.progress = RunProgress(self.total, quiet)
         listeners = Listeners(
             packet=lambda packet: self.writer.append(packet), chosen=self._chosen, progress=self.progress.first_frame,
@@ -102,6 +109,11 @@ class _Run:
             save_resolved(self.out / RECIPE, self.encoder.parts.resolved)
         if done > 0:
             self._remember(done)
+        if last is not None and self.left_behind is not None:
+            end = ended(self.out / STREAM, last)
+            key = self.source.frame(end.key_frame)
+            for player in since_key(self.out / STREAM, end):
+                self.left_behind.follow(player, key if player.frame == end.key_frame else None)
         indices = itertools.count(done) if self.total is None else range(done, self.total)
         recipe = self.encoder.parts.recipe
         with (
@@ -129,6 +141,9 @@ class _Run:
         metrics = {**step.metrics, "wait_seconds": waited}
         if self.energy and joules:
             metrics["joules"] = {name: value - joules[name] for name, value in self.energy.read().items()}
+        metrics["displacement_pixels"] = displacement_pixels(step.state.player, train.cameras)
+        if self.left_behind is not None:
+            metrics["left_behind"] = self.left_behind.after(step.state.player, train, step.status == "key")
         if self.held_out and len(test.cameras):
             metrics |= self.held_out.measure(step.state, self.encoder.at_near(test))
             if train.index == 0:

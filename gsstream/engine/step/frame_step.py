@@ -61,7 +61,7 @@ def frame_step(
         return still(state, frame, clock)
 
     with clock.phase("motion"):
-        motions, scene, view = moved(parts, state, frame, change, rng)
+        motions, scene, view = moved(parts, state, frame, change, rng, allowance)
     with clock.phase("confidence"):
         confidence = parts.propagation.propagate(parts.confidence.estimate(view), state.hierarchy)
         logits = parts.gate.init(confidence)

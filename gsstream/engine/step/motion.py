@@ -12,10 +12,14 @@ from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import blaming
+from gsstream.engine.budget.pace import Allowance
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.active.change import Change
 from gsstream.engine.step.context import FrameView
 from gsstream.packet.changes.motion import encode_motions
+
+#: Largest share of the bytes a frame may take that its motions may take.
+MOST_OF_SIZE = 0.5
 
 
 class Moved(NamedTuple):
@@ -26,7 +30,10 @@ class Moved(NamedTuple):
     view: FrameView
 
 
-def moved(parts: Assembly, state: StreamState, frame: Frame, change: Change | None, rng: Rng) -> Moved:
+def moved(
+    parts: Assembly, state: StreamState, frame: Frame, change: Change | None, rng: Rng,
+    allowance: Allowance | None = None,
+) -> Moved:  # fmt: skip
     """Ask the motion part, and apply what it proposes as every player will.
 
     Arguments:
@@ -35,6 +42,8 @@ def moved(parts: Assembly, state: StreamState, frame: Frame, change: Change | No
         frame: training images of this frame.
         change: what changed in them; None: everything counts as changed.
         rng: random streams by name and frame.
+        allowance: what the frame may spend. Motions that would take more than their share of its bytes are left out:
+            nothing trims them, and a frame that is too large for its residual too would be given up as a whole.
 
     Raises ComponentError when the part fails, or proposes motions that do not fit the scene or cannot be sent.
     """
@@ -46,7 +55,10 @@ def moved(parts: Assembly, state: StreamState, frame: Frame, change: Change | No
     if not motions:
         return Moved((), scene, view)
     with blaming("motion", parts.part("motion"), parts.where):
-        encode_motions(motions)  # what cannot be sent is refused before anything is learned on it
+        sections = encode_motions(motions)  # what cannot be sent is refused before anything is learned on it
+        most = None if allowance is None else allowance.plan.max_bytes
+        if most is not None and sum(len(data) for _, data in sections) > MOST_OF_SIZE * most:
+            return Moved((), scene, view)
         scene, touched = apply_motions(scene, motions)
     gaussians = scene.gaussians.map(torch.from_numpy)
     # The session is handed on to the moved scene, with its caches of all that stands still. The old session stays

@@ -1,0 +1,77 @@
+"""``gsstream serve``: a stream and its player from this machine, recorded or as it is written."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from gsstream.cli.streams import stream_file
+
+if TYPE_CHECKING:
+    from gsstream.serve.server import Server
+
+#: Environment variable with the token: unlike an option it is not in the list of processes.
+TOKEN = "GSSTREAM_TOKEN"
+
+
+def serve(
+    stream: Annotated[Path, typer.Argument(help="A stream (.gss), or the output folder of a run.")],
+    live: Annotated[
+        bool, typer.Option("--live", help="Show the newest frame as it is written; the stream may come later.")
+    ] = False,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the page; 0: any.")] = 8000,
+    host: Annotated[
+        str, typer.Option("--host", help="Address to serve at; 0.0.0.0 lets other machines look.")
+    ] = "127.0.0.1",
+    token: Annotated[
+        str | None,
+        typer.Option("--token", envvar=TOKEN, help="Only who adds ?token=TOKEN to the address may look."),
+    ] = None,
+    viewers: Annotated[int, typer.Option("--viewers", min=1, help="How many may watch live at a time.")] = 16,
+    origin: Annotated[
+        list[str] | None,
+        typer.Option("--origin", metavar="URL", help="Another web page that may use the stream; repeatable."),
+    ] = None,
+) -> None:
+    """Serve the player and a stream, recorded or live (extra: serve). Ctrl-C ends."""
+    file = _coming(stream) if live else stream_file(stream)
+    from gsstream.serve.server import Server
+
+    server = Server(
+        file, live=live, host=host, port=port, token=token or None, origins=origin or (), most_viewers=viewers
+    )
+    typer.echo(f"{file}: {server.url} (Ctrl-C ends)")
+    server.run()
+
+
+def server_beside(out: Path, port: int | None) -> Server | None:
+    """Take the address for ``run --serve``: what a run writes to ``out``, shown on this machine alone.
+
+    To be called before the folder is touched: a port in use must not cost the run that it holds.
+    """
+    if port is None:
+        return None
+    from gsstream.serve.server import Server
+
+    return Server(out / "stream.gss", live=True, port=port, token=os.environ.get(TOKEN) or None)
+
+
+@contextmanager
+def serving(server: Server | None) -> Iterator[None]:
+    """Serve meanwhile, and say where."""
+    if server is None:
+        yield
+        return
+    with server:
+        typer.echo(f"live at {server.url}")
+        yield
+
+
+def _coming(stream: Path) -> Path:
+    """The file that a run will write, when ``stream`` is its folder; else ``stream``."""
+    return stream if stream.suffix == ".gss" and not stream.is_dir() else stream / "stream.gss"

@@ -1,0 +1,103 @@
+"""Between two frames: what moved is on its way, by the displacement that packets carry; all else waits its frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gsstream.core.changes.rows import gather_rows
+from gsstream.core.errors import InputError
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.shapes import FloatArray
+from gsstream.packet import PlayerState
+from gsstream.player.playback import Playback
+
+
+def between(before: PlayerState, after: PlayerState, share: float) -> Gaussians[FloatArray]:
+    """Return the scene at a moment between two frames that follow each other.
+
+    The rows that the later frame displaced have gone and turned ``share`` of their way, at constant speed. Colours,
+    sizes, births and deaths wait for their frame; so does everything before a key packet, which carries no motion.
+
+    Arguments:
+        before, after: what players have at frame t and at t + 1.
+        share: of the time from t to t + 1, in [0, 1).
+    """
+    scene, moved = before.gaussians, after.scene.moved
+    if share == 0 or moved is None or after.frame != before.frame + 1:
+        return scene
+    rows, shift, turn = moved.rows, moved.shift, moved.turn
+    if after.delta is not None and after.delta.edits_rows:
+        source = gather_rows(before.layout.node_of, after.delta.births, after.delta.deaths)[rows]
+        known = source < len(scene)
+        rows, shift, turn = source[known], shift[known], turn[known]
+    means, quats = scene.means.copy(), scene.quats.copy()
+    means[rows] += np.float32(share) * shift
+    quats[rows] = _turned(quats[rows], turn, share)
+    return replace(scene, means=means, quats=quats)
+
+
+class Moments:
+    """Scenes of a stream at times in frames, whole or not; whole ones are the decoded scenes themselves.
+
+    Times are asked for in ascending order where that is possible: going back decodes from a key packet again.
+    """
+
+    def __init__(self, playback: Playback) -> None:
+        self._playback = playback
+        self._before: PlayerState | None = None
+        self._after: PlayerState | None = None
+
+    def at(self, time: float) -> Gaussians[FloatArray]:
+        """Return the scene at a time, in frames; after the last frame, that of the last.
+
+        Raises InputError outside the stream, PacketError when a packet on the way is damaged.
+        """
+        frame, share = int(np.floor(time)), float(time - np.floor(time))
+        if self._before is None or self._before.frame != frame:
+            follows = self._after is not None and self._after.frame == frame
+            self._before = self._after if follows else self._playback.player_state(frame)
+            self._after = None
+        assert self._before is not None
+        if share == 0 or frame + 1 not in self._playback.frames:
+            return self._before.gaussians
+        if self._after is None:
+            self._after = self._playback.player_state(frame + 1)
+        return between(self._before, self._after, share)
+
+
+def moments(frames: Sequence[int], recorded: float, wanted: float) -> list[float]:
+    """Return the times, in frames, of pictures at another rate than the recording's, from the first to the last frame.
+
+    Arguments:
+        frames: that are played.
+        recorded: frames per second of the recording.
+        wanted: pictures per second, 1 to 1000.
+
+    Raises InputError for another rate, and for frames that do not follow each other.
+    """
+    if not 1 <= wanted <= 1000:
+        raise InputError(f"pictures per second: expected 1 to 1000, got {wanted:g}")
+    if list(frames) != list(range(frames[0], frames[0] + len(frames))):
+        raise InputError("frames between frames: expected frames that follow each other; leave out fps or frames")
+    step = recorded / wanted
+    count = int(np.floor((frames[-1] - frames[0]) / step + 1e-6)) + 1
+    times = frames[0] + np.arange(count) * step
+    # A time within rounding of a frame is that frame: its scene is the decoded one, bit for bit.
+    whole = np.abs(times - times.round()) < 1e-6
+    return [float(time) for time in np.where(whole, times.round(), times)]
+
+
+def _turned(quats: FloatArray, turn: FloatArray, share: float) -> FloatArray:
+    """Quaternions [A, 4] turned by a share of a rotation [A, 3] given as axis * tan(angle / 2); lengths stay."""
+    tangent = np.linalg.norm(turn.astype(np.float64), axis=1)
+    part = np.tan(share * np.arctan(tangent))
+    x, y, z = (turn * np.divide(part, tangent, out=np.zeros_like(part), where=tangent > 0)[:, None]).T
+    w1, x1, y1, z1 = quats.astype(np.float64).T
+    product = np.stack(
+        [w1 - x * x1 - y * y1 - z * z1, x1 + x * w1 + y * z1 - z * y1,
+         y1 - x * z1 + y * w1 + z * x1, z1 + x * y1 - y * x1 + z * w1], 1)  # fmt: skip
+    turned: FloatArray = (product / np.sqrt(1 + part * part)[:, None]).astype(np.float32)
+    return turned

@@ -1,0 +1,241 @@
+// A stream as it is written: packets from a socket, decoded when they come, the newest one shown.
+
+import { FILE_HEADER, KIND, PACKET_HEADER, checkFileHeader, parseHeader } from "./container.js";
+import { PacketError } from "./errors.js";
+import { Latency } from "./latency.js";
+import { LiveSocket } from "./live-socket.js";
+
+/** Milliseconds of decoding between two pictures: for a viewer in time, and for one that has many packets waiting. */
+const BUDGET = 24;
+const CATCH_UP = 200;
+const MANY = 8;
+/** Milliseconds without a frame of which the viewer is told; longer where frames come seldom. */
+export const settings = { quiet: 10_000 };
+
+/** Stands where a recording has its buffer (see buffer.js); the player calls `feed` for every picture. */
+export class LiveBuffer {
+  constructor(url, player) {
+    this.live = true;
+    this.url = url;
+    this.player = player;
+    this.fps = 30;
+    this.received = 0;
+    this.first = null;
+    this.last = null;
+    this.lastLoaded = null;
+    this.latency = new Latency();
+    this.queue = [];
+    this.waiting = 0;
+    /** Bytes that may wait to be decoded. A page that is not shown takes no more and catches up later. */
+    this.most = 16 * 2 ** 20;
+    this.state = { name: "live", detail: "" };
+    this.trouble = null;
+    this.broken = null;
+    this.said = "";
+    this.before = null;
+    this.gaps = [];
+    this.socket = new LiveSocket({
+      address: () => this._address(),
+      opened: () => this._opened(),
+      message: (data) => this._message(data),
+      trouble: (sentence) => {
+        this.trouble = sentence;
+        this._tell();
+      },
+    });
+    this.heard = () => (player.playing ? this.resume() : this.pause());
+    player.addEventListener("state", this.heard);
+    player.playing = true;
+    this.socket.start();
+  }
+
+  /** Seconds of playing that wait; a live stream is shown at once. */
+  secondsAfter() {
+    return this.queue.length / this.fps;
+  }
+
+  /** Take packets again after `pause`, or after an error. */
+  resume() {
+    this.asleep = false;
+    this.at = null;
+    this.said = "";
+    this.socket.start();
+  }
+
+  /** Take no more packets; what comes meanwhile is caught up with later. */
+  pause() {
+    this.trouble = null;
+    this.socket.stop();
+    this._tell();
+  }
+
+  dispose() {
+    this.player.removeEventListener("state", this.heard);
+    this.socket.stop();
+  }
+
+  /** What only recordings have: parts to load, and a part after a damaged one. */
+  want() {}
+
+  nextSegment() {
+    return null;
+  }
+
+  /** Decode what came. The newest state is drawn; of those before it none is, unless decoding takes long. */
+  feed() {
+    const { player } = this;
+    if (!player.playing) return;
+    if (this.asleep && !this.queue.length) this.resume();
+    const started = performance.now();
+    const most = this.queue.length > MANY ? CATCH_UP : BUDGET;
+    let decoded = false;
+    while (this.queue.length && performance.now() - started < most) {
+      const packet = this.queue.shift();
+      this.waiting -= packet.data.length;
+      decoded = this._decode(packet) || decoded;
+    }
+    this._tell();
+    if (!decoded) return;
+    player.invalidate();
+    player._say("frame");
+  }
+
+  /** A picture was drawn. */
+  shown(frame) {
+    this.latency.shown(frame, Date.now() + this.socket.ahead);
+  }
+
+  _decode(packet) {
+    if (this.broken && packet.header.kind !== KIND.key) return false;
+    try {
+      this.player._take({ packet });
+      this.broken = null;
+      return true;
+    } catch (error) {
+      if (!(error instanceof PacketError)) {
+        this.player._stop(error);
+        return false;
+      }
+      this.broken = `${error.message}; the picture stands still until the next key packet.`;
+      return false;
+    }
+  }
+
+  /** Where to connect. Whoever comes again says what it has, and gets only what follows that. */
+  _address() {
+    const url = new URL(this.url);
+    if (this.before && !this.broken) {
+      url.searchParams.set("after", this.before.frame);
+      url.searchParams.set("packet", this.before.head);
+    }
+    return url.href;
+  }
+
+  _opened() {
+    this.begun = false;
+    this.at = null;
+  }
+
+  _message(data) {
+    if (!(data instanceof ArrayBuffer)) {
+      if ("state" in data) this._stateIs(data);
+      else if (Number.isFinite(data.written)) this.latency.written(data.frame, data.written, Date.now() + this.socket.ahead);
+      return;
+    }
+    const bytes = new Uint8Array(data);
+    this.received += bytes.length;
+    try {
+      if (!this.begun || bytes[0] === 0x89) this._begin(bytes);
+      else this._packet(bytes);
+    } catch (error) {
+      this._refuse(error);
+    }
+  }
+
+  _stateIs({ state, detail }) {
+    this.state = { name: state, detail: String(detail ?? "") };
+    this.trouble = null;
+    this._tell();
+  }
+
+  /** The header of a stream. A second one on a connection: another stream begins. */
+  _begin(bytes) {
+    checkFileHeader(bytes.subarray(0, FILE_HEADER));
+    if (this.begun) this.before = null;
+    this.begun = true;
+  }
+
+  _packet(data) {
+    const header = parseHeader(data, 0);
+    if (data.length !== PACKET_HEADER + header.body) {
+      throw new PacketError("the server sends something that is no stream");
+    }
+    if (header.kind !== KIND.key && header.frame !== (this.before?.frame ?? NaN) + 1) {
+      throw new PacketError(`the server sends frame ${header.frame} without the one before it`);
+    }
+    // What lies before a key packet need not be decoded any more.
+    if (header.kind === KIND.key) this._forget();
+    this.first ??= header.frame;
+    this.lastLoaded = header.frame;
+    this.before = { frame: header.frame, head: hex(data.subarray(0, PACKET_HEADER)) };
+    this.queue.push({ data, offset: 0, header });
+    this.waiting += data.length;
+    this.trouble = null;
+    this.socket.sound();
+    this._timed();
+    if (this.waiting > this.most && this.queue.length > 1) {
+      this.asleep = true;
+      this.socket.stop();
+    }
+  }
+
+  _forget() {
+    this.queue = [];
+    this.waiting = 0;
+  }
+
+  /** What cannot be read is no stream for this player: a newer format will not become older by waiting. */
+  _refuse(error) {
+    this._forget();
+    this.before = null;
+    if (this.begun) {
+      this.socket.again(sentence(error.message));
+      return;
+    }
+    this.socket.stop();
+    this.player._stop(new PacketError(sentence(error.message)));
+  }
+
+  _timed() {
+    const now = performance.now();
+    if (this.at) this.gaps = [...this.gaps.slice(-9), now - this.at];
+    this.at = now;
+  }
+
+  _sentence() {
+    if (this.trouble) return this.trouble;
+    if (this.broken) return sentence(this.broken);
+    const { name, detail } = this.state;
+    if (name === "ended") return "The stream has ended.";
+    if (name !== "live") return sentence(detail || "no frame is encoded yet.");
+    const silence = this.at ? performance.now() - this.at : 0;
+    if (!this.player.playing || silence < Math.max(settings.quiet, 3 * Math.max(0, ...this.gaps))) return "";
+    return `No new frame came for ${Math.floor(silence / 1000)} s.`;
+  }
+
+  _tell() {
+    const text = this._sentence();
+    if (text === this.said) return;
+    this.said = text;
+    this.player.problem = text || null;
+    this.player.dispatchEvent(new CustomEvent("problem", { detail: text }));
+  }
+}
+
+function sentence(text) {
+  return text.charAt(0).toUpperCase() + text.slice(1);
+}
+
+function hex(bytes) {
+  return Array.from(bytes, (byte) => byte.toString(16).padStart(2, "0")).join("");
+}

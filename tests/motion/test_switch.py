@@ -1,0 +1,100 @@
+"""Which groups a move helps: the answer has the sign and the size of what two renders say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from gsstream.core.changes import Displacement, Groups, Layout, Scene
+from gsstream.core.changes.motion import Moves, moves_of, transformed
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.rng import Rng
+from gsstream.engine.step.active.change import detect_change
+from gsstream.engine.step.context import FrameView
+from gsstream.motion.coasting import Coasting
+from gsstream.motion.groups import pixel_size
+from gsstream.motion.switch import gains, some_views
+from gsstream.testing.stepping import MethodUnderTest
+from gsstream.testing.working import at_work
+
+
+@cache
+def body() -> tuple[Scene, Moves]:
+    """Three soft balls some pixels apart, each a group, all displaced by a pixel to the side in the last frame."""
+    case = at_work()
+    pixel = pixel_size(case.scene.gaussians.means, case.work.cameras)
+    means = np.median(case.scene.gaussians.means, 0) + 9 * pixel * np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    gaussians = Gaussians(
+        means.astype(np.float32), np.tile(np.float32([1, 0, 0, 0]), (3, 1)),
+        np.full((3, 3), np.log(1.5 * pixel), np.float32), np.full(3, 3, np.float32),
+        np.float32([[[1, 0, 0]], [[0, 1, 0]], [[0, 0, 1]]]), np.zeros((3, 0, 3), np.float32),
+    )  # fmt: skip
+    layout = Layout(np.ones(3, np.int32), np.zeros(3, np.uint8), np.float32([1]))
+    shift = np.tile(np.float32([pixel, 0, 0]), (3, 1))
+    groups = Groups(float(np.float32(pixel)), 1, np.arange(3, dtype=np.int32), 3)
+    scene = Scene(gaussians, layout, Displacement(np.arange(3), shift, np.zeros_like(shift)), groups)
+    return scene, moves_of(scene, groups, np.ones(3, np.uint8), predicted=True)
+
+
+def frame_in_which(share: float) -> FrameView:
+    """Return the frame that shows this share of the last displacement once more."""
+    scene, moves = body()
+    method, case = MethodUnderTest("dense"), at_work()
+    there = transformed(scene.gaussians, moves._replace(shift=moves.shift * share))
+    cameras = case.work.cameras
+    stands, shows = (
+        np.stack([case.work.shown(gaussians.map(torch.from_numpy), view).numpy() for view in range(len(cameras))])
+        for gaussians in (scene.gaussians, there)
+    )
+    previous = replace(case.work._previous, images=stands.clip(0, 1))
+    frame = replace(previous, index=3, images=shows.clip(0, 1), cameras=cameras)
+    change, forest = (
+        detect_change(previous, frame, 6.0),
+        Hierarchy(torch.arange(3), torch.arange(3), torch.zeros(3).long()),
+    )
+    return FrameView(method.parts, scene.gaussians.map(torch.from_numpy), forest, frame, previous, None, change)
+
+
+def loss(work: FrameView, gaussians, view: int) -> float:  # type: ignore[no-untyped-def]
+    work.narrow(torch.arange(len(gaussians)))
+    return work.pull(view, gaussians.map(lambda value: torch.from_numpy(value).requires_grad_()))
+
+
+@pytest.mark.parametrize(("share", "sign"), [(1.0, -1), (-1.0, 1)])
+def test_the_switch_says_what_two_renders_say(share: float, sign: int) -> None:
+    scene, moves = body()
+    work = frame_in_which(share)
+    views = range(len(work.cameras))
+    expected = sum(
+        loss(work, transformed(scene.gaussians, moves), view) - loss(work, scene.gaussians, view) for view in views
+    )
+    found = gains(scene, frame_in_which(share), moves, views)
+    assert np.sign(found).tolist() == [sign] * 3
+    # The loss is no parabola, and one group hides another: the size is right within a factor of two.
+    assert 0.5 < found.sum() / expected < 2
+
+
+@pytest.mark.parametrize("share", [1.0, 0.0, -1.0])
+def test_coasting_goes_on_only_where_that_explains_the_images(share: float) -> None:
+    """What stops or turns back is not carried on: neither half of the groups, nor for one frame."""
+    scene, _ = body()
+    every = Coasting(Coasting.Config(votes=0.0, share=0.0, asked=1.0))
+    found = every.propose(scene, frame_in_which(share), Rng(0))
+    moving = sum(int(motion.moving.sum()) for motion in found)
+    assert moving == (3 if share == 1.0 else 0)
+    blind = Coasting(Coasting.Config(votes=0.0, share=0.0, asked=0.0))
+    went = sum(int(motion.moving.sum()) for motion in blind.propose(scene, frame_in_which(share), Rng(0)))
+    assert went == (3 if share else 0), "nobody is asked: whatever lies in what changed goes on"
+
+
+def test_views_take_turns() -> None:
+    for number, share in ((11, 0.5), (3, 0.01), (27, 1.0), (1, 0.5)):
+        turns = [some_views(number, share, frame) for frame in range(number)]
+        count = max(1, round(share * number))
+        assert all(len(views) == count and 0 <= views.min() <= views.max() < number for views in turns)
+        assert np.unique(np.concatenate(turns)).tolist() == list(range(number))

@@ -1,6 +1,8 @@
-# Two commands, nothing to prepare: 'make demo' and 'make test'. Both set up .venv first (Python >= 3.11, a C++ compiler).
+# Two commands, nothing to prepare: 'make demo' and 'make test'. All set up .venv first (Python >= 3.11, a C++ compiler).
 #   make demo            encode the recording that ships with gsstream; says where the pictures are
 #   make test            lint, types, import rules and all tests
+#   make check           the same with the quick tests alone: for every change, in under two minutes
+#   make dist            every distribution, as source archive and wheel, in dist/
 #   make PYTHON=python3.12 test    choose the interpreter .venv is made with
 #   make clean           remove .venv and what was built
 
@@ -13,6 +15,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO_METHOD ?= s2gs-fast
 DEMO_OUT ?= runs/demo
+WORKERS ?= $(shell echo $$(( $$(nproc) < 4 ? $$(nproc) + 1 : 4 )))
 
 # The stamps carry a checksum of what they were made from, so a change of contents, not of dates, sets up again.
 LISTS := requirements.txt $(wildcard pyproject.toml plugins/*/pyproject.toml)
@@ -21,7 +24,7 @@ checksum = $(firstword $(shell cat $(1) | cksum))
 INSTALLED := $(VENV)/.installed-$(call checksum,$(LISTS))
 BUILT := $(VENV)/.built-$(call checksum,$(NATIVE))
 
-.PHONY: demo test setup clean
+.PHONY: demo test check dist setup clean
 .DEFAULT_GOAL := demo
 
 demo: setup
@@ -30,13 +33,18 @@ demo: setup
 	@ls -1 $(DEMO_OUT)
 
 # Every check runs even when an earlier one failed; pytest comes last, so that its summary is the last thing printed.
-test: setup
+# conftest.py puts the longest files first, and one worker more than cores fills the time in which a test waits.
+check: PYTEST_ARGS := -m "quick and not slow"
+test check: setup
 	@status=0; \
 	for check in "ruff check ." "mypy" "lint-imports"; do \
 	  echo "== $$check"; $(BIN)/$$check || { echo "== FAILED: $$check"; status=1; }; \
 	done; \
-	echo "== pytest"; $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile || status=1; \
+	echo "== pytest"; $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS) || status=1; \
 	exit $$status
+
+dist: setup
+	$(BIN)/python -m tools.dist --out dist
 
 setup: $(BUILT)
 

@@ -1,7 +1,12 @@
 """Settings of every test of the project and its plugins."""
 
 import os
+import re
+from collections import Counter
+from pathlib import Path
+from typing import Any
 
+import pytest
 from hypothesis import settings
 
 # A submission is judged by the same examples as the one before it; everywhere else new ones are tried each time, and
@@ -10,3 +15,53 @@ from hypothesis import settings
 settings.register_profile("plain", deadline=None)
 settings.register_profile("ci", derandomize=True, deadline=None)
 settings.load_profile("ci" if os.environ.get("CI") else "plain")
+
+ROOT = Path(__file__).parent
+#: Files that take longest, longest first. They are begun first: a long file that is begun last keeps one core busy
+#: while the others wait. A name that is missing here costs only time.
+LONG = (
+    "contract/test_tutorial", "trade/test_sweep_real", "contract/test_shipped_plugins", "scene/test_prepare",
+    "contract/test_new_plugin", "contract/test_saboteurs", "plugins/test_six_rings", "flow/test_odd_runs",
+    "flow/test_growing_scene", "flow/test_cost_follows_change", "flow/test_key_refresh", "flow/test_repeat_and_resume",
+    "flow/test_data_options", "flow/test_trim", "flow/test_still_frames", "source/test_layout_runs", "tools/test_soak",
+    "packet/test_fuzz", "trade/test_tune", "flow/test_run_ends", "flow/test_segments", "init/test_init_sfm",
+    "s2gs/tests/test_s2gs_anchor_insertion", "tools/test_cost_scripts", "queen/tests/test_queen_stream",
+    "flow/test_light_process", "flow/test_auto_run", "flow/test_budget", "player/test_player_memory", "web/test_page",
+)  # fmt: skip
+#: What ``make check`` runs: rooms whose tests are cheap, and the one test of whole runs that must never fail.
+QUICK = ("core", "spec", "recipe", "residual", "render", "metrics", "cli", "packet", "player", "method", "plugins")
+QUICK_FILES = ("flow/test_closed_loop", "test_architecture", "test_docstrings", "test_readme", "contract/test_parts")
+#: Too slow for that in these rooms.
+NOT_QUICK = ("packet/test_fuzz", "player/test_player_memory", "plugins/test_six_rings")
+
+
+def name_of(path: Path) -> str:
+    """Return the name of a test file below ``tests`` or ``plugins``, without its suffix."""
+    return path.relative_to(ROOT).with_suffix("").as_posix().partition("/")[2]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the longest files, and mark what ``make check`` runs."""
+    places = {name: place for place, name in enumerate(LONG)}
+    for item in items:
+        room, _, file = name_of(item.path).rpartition("/")
+        if (room in QUICK or name_of(item.path) in QUICK_FILES) and f"{room}/{file}" not in NOT_QUICK:
+            item.add_marker("quick")
+    items.sort(key=lambda item: places.get(name_of(item.path), len(LONG)))
+
+
+#: A part that does not claim something is not checked for it: such skips are no loss, and are counted together.
+NOT_CLAIMED = re.compile(r"not claimed: |offers no 'auto'")
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Say what was not run, and why: a skipped test is a hole, and nobody sees it among thousands of dots."""
+    reasons: Counter[str] = Counter()
+    for report in terminalreporter.stats.get("skipped", []):
+        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
+        reason = reason.removeprefix("Skipped: ")
+        reasons["checks of claims that a part does not make" if NOT_CLAIMED.match(reason) else reason] += 1
+    if reasons:
+        terminalreporter.section("not run here, and why")
+        for reason, count in sorted(reasons.items(), key=lambda pair: (-pair[1], pair[0])):
+            terminalreporter.write_line(f"{count:5d}  {reason}")

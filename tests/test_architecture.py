@@ -27,7 +27,7 @@ TORCH_FREE = tuple(f"gsstream.{room}" for room in ("spec", "plugins", "recipe", 
 
 def test_import_contracts() -> None:
     command = [sys.executable, "-c", "from importlinter.cli import lint_imports_command as main; main()", "--no-cache"]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
     assert result.returncode == 0, result.stdout + result.stderr
     assert " 0 broken" in result.stdout
 
@@ -52,7 +52,7 @@ def test_these_rooms_import_no_torch() -> None:
         "    if 'torch' in sys.modules: sys.exit(f'{name} imports torch')\n"
     )
     command = [sys.executable, "-c", code, *names]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert (result.returncode, result.stderr) == (0, "")
     assert len(names) > 30
 

@@ -35,6 +35,7 @@ from gsstream.cli import (
 )
 from gsstream.cli.listing import printable
 from gsstream.core.errors import GsstreamError, InputError
+from gsstream.core.needs import missing_for_encoding
 
 #: Exit codes of runs that a service ended: 128 plus the number of the signal.
 _SIGNALS = {129: "SIGHUP", 143: "SIGTERM"}
@@ -128,6 +129,11 @@ def run_command(argv: Sequence[str]) -> int:
                 for note in getattr(error, "__notes__", ()):
                     typer.echo(printable(note, keep=_LINE), err=True)
             return 2 if isinstance(error, InputError) else 1
+        except ModuleNotFoundError as error:
+            if options.debug or (cure := missing_for_encoding(error)) is None:
+                raise
+            typer.echo(f"error: {printable(cure)}", err=True)
+            return 1
     if code == 130:
         return _interrupted()
     if code in _SIGNALS:

@@ -11,6 +11,7 @@ import typer
 
 import gsstream
 from gsstream.core.kinds import PART_KINDS
+from gsstream.core.needs import pip
 
 #: Kinds that a plugin can start from.
 STARTABLE = tuple(name for name, kind in PART_KINDS.items() if kind.use is not None)
@@ -42,7 +43,7 @@ def new_plugin(
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(text, encoding="utf-8")
         typer.echo(f"wrote {target}")
-    typer.echo(f"\nnext:\n  pip install -e {folder}\n  gsstream check {kind}/{name}")
+    typer.echo(f"\nnext:\n  {pip()} install -e {folder}\n  gsstream check {kind}/{name}")
 
 
 def files(name: str, kind: str) -> Mapping[str, str]:
@@ -88,7 +89,7 @@ version = "0.1.0"
 description = "<summary>"
 readme = "README.md"
 requires-python = ">=3.11"
-dependencies = ["gsstream"]
+dependencies = ["gsstream[encoder]"]
 
 [project.optional-dependencies]
 test = ["pytest"]

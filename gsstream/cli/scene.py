@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from gsstream.cli import options
+from gsstream.core.needs import page
 
 app = typer.Typer(help="Prepare and validate scenes.", no_args_is_help=True, rich_markup_mode=None)
 
@@ -90,7 +91,8 @@ def validate(
         typer.echo(f"{finding.severity}: [{finding.code}] {finding.message}")
     errors = sum(finding.severity == "error" for finding in found)
     if errors:
-        typer.echo(f"{scene}: {errors} error{'s' if errors > 1 else ''}; all checks: docs/reference/scene-checks.md")
+        checks = page("reference/scene-checks.md")
+        typer.echo(f"{scene}: {errors} error{'s' if errors > 1 else ''}; all checks: {checks}")
         raise typer.Exit(2)
     remarks = f", {len(found)} remark{'s' if len(found) > 1 else ''}" if found else ""
     typer.echo(f"{scene}: fine ({len(CHECKS) - no_features} checks{remarks})")

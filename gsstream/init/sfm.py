@@ -15,6 +15,7 @@ from PIL import Image
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
 from gsstream.core.frame import PointCloud
+from gsstream.core.needs import install_extra
 from gsstream.core.shapes import FloatArray, check_finite, check_shape
 
 
@@ -79,7 +80,7 @@ def run_pycolmap(task: str, folder: Path, timeout: float) -> None:
     """
     if importlib.util.find_spec("pycolmap") is None:
         raise InputError(
-            "structure from motion needs pycolmap, which is not installed: pip install 'gsstream[sfm]', "
+            f"structure from motion needs pycolmap, which is not installed: {install_extra('sfm')}, "
             "or give the recording a points_frame0.npz"
         )
     command = [sys.executable, "-m", "gsstream.init._pycolmap", task, str(folder)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsstream.core.errors import PluginUnavailable
+from gsstream.core.needs import install_extra
 from gsstream.core.shapes import FloatArray
 from gsstream.metrics.psnr import check_pair
 
@@ -23,7 +24,7 @@ def flip(image: FloatArray, target: FloatArray) -> float:
     try:
         from flip_evaluator import evaluate
     except ImportError as error:
-        raise PluginUnavailable("FLIP needs the package flip-evaluator: pip install 'gsstream[metrics]'") from error
+        raise PluginUnavailable(f"FLIP needs the package flip-evaluator: {install_extra('metrics')}") from error
     pair = (np.ascontiguousarray(target, np.float32), np.ascontiguousarray(image, np.float32))
     _, mean, _ = evaluate(
         *pair, "LDR", inputsRGB=True, applyMagma=False, computeMeanError=True, parameters={"ppd": _PIXELS_PER_DEGREE}

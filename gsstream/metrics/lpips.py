@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsstream.core.errors import InputError, ShapeError
+from gsstream.core.needs import install_extra, page
 from gsstream.core.shapes import FloatArray
 from gsstream.metrics.psnr import check_pair
 
@@ -87,9 +88,9 @@ def _open(path: Path) -> Any:
     try:
         runtime = importlib.import_module("onnxruntime")
     except ImportError as error:
-        raise InputError(f"LPIPS by {path} needs onnxruntime: pip install 'gsstream[onnx]'") from error
+        raise InputError(f"LPIPS by {path} needs onnxruntime: {install_extra('onnx')}") from error
     if not path.is_file():
-        raise InputError(f"no ONNX file at {path}; docs/howto/lpips.md says how to make one")
+        raise InputError(f"no ONNX file at {path}; {page('howto/lpips.md')} says how to make one")
     options = runtime.SessionOptions()
     options.log_severity_level = 4  # what goes wrong comes as an exception; its log would only repeat it
     try:

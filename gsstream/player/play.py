@@ -16,6 +16,7 @@ from PIL import Image
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError, OutputError
+from gsstream.core.needs import install_extra
 from gsstream.core.shapes import FloatArray
 from gsstream.player.between import Moments, moments
 from gsstream.player.camera_file import read_path
@@ -141,7 +142,7 @@ def _write(out: Path, images: Iterator[Bytes], frames: Sequence[int], fps: float
         if importlib.util.find_spec("av") is not None:
             return _write_video(out, images, fps)
         warnings.warn(
-            f"writing MP4 needs PyAV (pip install 'gsstream[video]'); PNGs go to {out.with_suffix('')} instead",
+            f"writing MP4 needs PyAV ({install_extra('video')}); PNGs go to {out.with_suffix('')} instead",
             stacklevel=3,
         )
         out = out.with_suffix("")

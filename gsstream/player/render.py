@@ -23,6 +23,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import PluginUnavailable, UnknownName
 from gsstream.core.gaussians import Gaussians
+from gsstream.core.needs import install_renderer
 from gsstream.core.shapes import FloatArray, check_finite, check_shape
 from gsstream.player.software import render_numpy
 
@@ -52,7 +53,7 @@ def find_renderer() -> PlayerRenderer:
     why = f". Reason: {'; '.join(problems)}" if problems else ""
     warnings.warn(
         "no compiled renderer works here, so pictures are drawn with plain numpy: about 100 times slower. To mend it, "
-        f"install a C++ compiler and gsstream-cpu-render{why}",
+        f"{install_renderer()}{why}",
         SlowRendererWarning,
         stacklevel=2,
     )

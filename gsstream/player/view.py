@@ -12,6 +12,7 @@ import numpy as np
 
 from gsstream.core.errors import InputError, OutputError
 from gsstream.core.gaussians import SH0, Gaussians
+from gsstream.core.needs import install_extra
 from gsstream.core.shapes import FloatArray
 from gsstream.player.playback import Playback
 from gsstream.player.software import rotation_matrices
@@ -36,7 +37,7 @@ class Viewer:
         nothing can be served at this address.
         """
         if importlib.util.find_spec("viser") is None:
-            raise InputError("viewing in the browser needs viser: pip install 'gsstream[viewer]'; or use gsstream play")
+            raise InputError(f"viewing in the browser needs viser: {install_extra('viewer')}; or use gsstream play")
         import viser
 
         self.playback = Playback(stream)
@@ -55,7 +56,8 @@ class Viewer:
         frames = self.playback.frames
         self._splats = self.server.scene.add_gaussian_splats("/scene", **splats(self.playback.state_at(frames[0])))
         last = max(frames[-1], frames[0] + 1)  # a slider needs two ends, also for one frame
-        self.slider = self.server.gui.add_slider(
+        # viser's types say its value is read-only; its documentation and its code say that it can be set.
+        self.slider: Any = self.server.gui.add_slider(
             "frame", min=frames[0], max=last, step=1, initial_value=frames[0], disabled=len(frames) == 1
         )
         self.playing = self.server.gui.add_checkbox("play", initial_value=False, disabled=len(frames) == 1)

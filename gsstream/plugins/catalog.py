@@ -12,6 +12,7 @@ from typing import Any
 
 from gsstream.core.errors import PluginUnavailable, UnknownName
 from gsstream.core.kinds import PART_KINDS
+from gsstream.core.needs import install_part
 from gsstream.plugins.discovery import Discovered, PluginFault, discover, spec_key
 from gsstream.spec import ComponentSpec, MethodSpec
 
@@ -69,6 +70,9 @@ class Catalog:
                 raise plugin.unavailable(f"{kind} {name!r}") from plugin.error
         broken = len(self.quarantine)
         hint = f" ({broken} plugin{'s'[: broken > 1]} could not be loaded: see 'gsstream plugins')" if broken else ""
+        cure = install_part(kind, name)
+        if cure is not None and not any(plugin.left_out for plugin in self.plugins):
+            hint = f". To install it: {cure}{hint}"
         raise UnknownName(kind, name, self.names(kind), hint)
 
     def resolve(self, kind: str, name: str) -> type[Any]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from gsstream.core.errors import ShapeError, SourceError
 from gsstream.core.names import check_camera_ids
+from gsstream.core.needs import install_extra
 from gsstream.core.shapes import FloatArray
 from gsstream.source.calibration import CALIBRATION_FILE, frame_path, read_calibration
 from gsstream.source.images import PICTURE_FORMATS, read_image
@@ -104,7 +105,7 @@ def _video_frames(path: Path, most: int | None) -> Iterator[FloatArray]:
     try:
         import av
     except ImportError as error:
-        raise SourceError(f"{path}: reading videos needs PyAV: pip install 'gsstream[video]'") from error
+        raise SourceError(f"{path}: reading videos needs PyAV: {install_extra('video')}") from error
     count = 0
     try:
         with av.open(str(path)) as container:

@@ -15,6 +15,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError, SourceError
 from gsstream.core.frame import Frame
+from gsstream.core.needs import install_extra
 from gsstream.init.matching import match_images
 from gsstream.scene.findings import Finding, error, note
 from gsstream.scene.match_checks import check_matches
@@ -116,7 +117,7 @@ def _thumbnails(source: FrameSource, open_scene: Open, rig: Cameras, frames: int
 
 def _matched(rig: Cameras, train: Frame, test: Frame, *, rig_only: bool = False) -> list[Finding]:
     if importlib.util.find_spec("pycolmap") is None:
-        return [note("epipolar", "the calibration was not compared with the pictures: pip install 'gsstream[sfm]'")]
+        return [note("epipolar", f"the calibration was not compared with the pictures: {install_extra('sfm')}")]
     images = np.concatenate([train.images, test.images])
     factor = -(-rig.width // LARGE)
     height, width = rig.height // factor, rig.width // factor

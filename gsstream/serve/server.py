@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import quote, urlsplit
 
 from gsstream.core.errors import InputError, OutputError
+from gsstream.core.needs import install_extra
 from gsstream.serve.app import Rules, make_app
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ class Server:
         """
         for name in ("starlette", "uvicorn", "websockets"):
             if importlib.util.find_spec(name) is None:
-                raise InputError(f"serving needs {name}: pip install 'gsstream[serve]'; or use gsstream package")
+                raise InputError(f"serving needs {name}: {install_extra('serve')}; or use gsstream package")
         names = [_checked_origin(origin) for origin in origins]
         loopback = host in _LOOPBACK_NAMES
         if not loopback and token is None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from gsstream.core.errors import SourceError
+from gsstream.core.needs import install_extra
 from gsstream.core.shapes import FloatArray
 from gsstream.source.images import shrink
 
@@ -212,5 +213,5 @@ def _load_av(path: Path) -> Any:
     try:
         import av
     except ImportError as error:
-        raise SourceError(f"{path}: reading videos needs PyAV: pip install 'gsstream[video]'") from error
+        raise SourceError(f"{path}: reading videos needs PyAV: {install_extra('video')}") from error
     return av

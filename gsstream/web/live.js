@@ -5,10 +5,12 @@ import { PacketError } from "./errors.js";
 import { Latency } from "./latency.js";
 import { LiveSocket } from "./live-socket.js";
 
-/** Milliseconds of decoding between two pictures: for a viewer in time, and for one that has many packets waiting. */
+/**
+ * Milliseconds of decoding between two pictures: at least, and at most. Between them it may take as long as the picture
+ * before took, or else a page that draws slowly would be later with every frame.
+ */
 const BUDGET = 24;
-const CATCH_UP = 200;
-const MANY = 8;
+const CATCH_UP = 1000;
 /** Milliseconds without a frame of which the viewer is told; longer where frames come seldom. */
 export const settings = { quiet: 10_000 };
 
@@ -87,7 +89,8 @@ export class LiveBuffer {
     if (!player.playing) return;
     if (this.asleep && !this.queue.length) this.resume();
     const started = performance.now();
-    const most = this.queue.length > MANY ? CATCH_UP : BUDGET;
+    const most = Math.min(CATCH_UP, Math.max(BUDGET, started - (this.fed ?? started)));
+    this.fed = started;
     let decoded = false;
     while (this.queue.length && performance.now() - started < most) {
       const packet = this.queue.shift();

@@ -27,7 +27,7 @@ def python(site: Path, *args: str, cwd: Path) -> subprocess.CompletedProcess[str
     path = os.pathsep.join([str(site), *sources, *filter(None, [os.environ.get("PYTHONPATH")])])
     environment = {**os.environ, "PYTHONPATH": path, "PYTHONIOENCODING": "utf-8", "OMP_NUM_THREADS": "2"}
     command = [sys.executable, *args]
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=180, check=False)
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=900, check=False)
 
 
 def gsstream(site: Path, *args: str, cwd: Path) -> subprocess.CompletedProcess[str]:

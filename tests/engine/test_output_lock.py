@@ -172,7 +172,7 @@ def test_signals_of_services_arrive_as_an_interrupt(name) -> None:
     try:
         with ended_by_signals() as came:
             os.kill(os.getpid(), number)
-            assert stopped.wait(5)
+            assert stopped.wait(60)
         assert came == [number]
     finally:
         signal.signal(signal.SIGINT, previous)

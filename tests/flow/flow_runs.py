@@ -53,7 +53,7 @@ def start(*command: str, **environment: str) -> subprocess.Popen[str]:
 def finish(*command: str, **environment: str) -> tuple[int, str, str]:
     """(exit code, stdout, stderr) of ``gsstream ...`` in a process of its own."""
     with start(*command, **environment) as process:
-        out, err = process.communicate(timeout=120)
+        out, err = process.communicate(timeout=600)
     return process.returncode, out, err
 
 

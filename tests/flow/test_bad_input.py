@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 import subprocess
 import textwrap
@@ -172,7 +173,7 @@ def test_without_the_native_module_everything_works_slowly_after_one_warning(tmp
     assert code == 0, err
     assert err.count("warning: ") == err.count("\n") == 1, err
     assert "about 500 times slower" in err
-    assert "install a C++ compiler and run 'pip install ./plugins/cpu_render'" in err
+    assert re.search(r"install a C\+\+20 compiler, then: \S.* install \S*/plugins/cpu_render", err)
     assert "no compiled module for this Python" in err
     assert [line["frame"] for line in metrics(tmp_path / "o")] == [0, 1]
     pictures = tmp_path / "pictures"
@@ -192,7 +193,7 @@ def test_make_says_that_a_compiler_is_missing(tmp_path: Path) -> None:
     python.write_text("#!/bin/sh\necho 'nothing may be installed' >&2\nexit 9\n")
     python.chmod(0o755)
     command = ["make", "setup", "CXX=/nowhere/c++"]
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)
     assert result.returncode != 0
     assert "builds its renderer with a C++20 compiler; '/nowhere/c++' is missing or too old" in result.stdout
     assert "make CXX=clang++" in result.stdout

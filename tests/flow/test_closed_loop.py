@@ -159,7 +159,7 @@ def test_decoding_and_rendering_need_no_torch(tmp_path: Path) -> None:
         "print(code, *loaded, file=sys.stderr)"
     )
     command = [sys.executable, "-c", code, str(tmp_path), str(tmp_path / "pictures")]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert result.stderr == "0 True False\n"
     assert sorted(p.name for p in (tmp_path / "pictures").iterdir()) == ["000000.png", "000001.png"]
 

@@ -42,7 +42,7 @@ def capturing(finished: Path, folder: Path, fps: float = 10, **options) -> Itera
     command = [sys.executable, str(CAPTURE), str(finished), str(folder), str(fps), json.dumps(options)]
     with subprocess.Popen(command) as process:
         yield folder
-        process.wait(timeout=60)
+        process.wait(timeout=600)
 
 
 def packets(stream: Path) -> list[bytes]:

@@ -40,7 +40,7 @@ class PluginLab:
         path = os.pathsep.join([str(self.folder), *filter(None, [os.environ.get("PYTHONPATH")])])
         environment = {**os.environ, "PYTHONPATH": path, "GSSTREAM_LOAD_PLUGINS": allowed, **env}
         command = [sys.executable, "-c", code, *args]
-        return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+        return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)
 
     def cli(self, *args: str, load: str | None = None, **env: str) -> subprocess.CompletedProcess[str]:
         """Run the command line in a fresh process."""

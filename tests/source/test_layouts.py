@@ -119,7 +119,7 @@ def test_models_written_by_pycolmap_are_read_as_pycolmap_reads_them(
     np.save(tmp_path / "points.npy", points)
     files = [str(sparse), str(tmp_path / "points.npy"), str(tmp_path / "at.npz")]
     command = [sys.executable, "-c", code, *files, extension]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stderr
     for old in sparse.glob("*.bin"):
         if extension == "txt":

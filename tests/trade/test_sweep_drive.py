@@ -149,7 +149,7 @@ def test_a_stopped_sweep_leaves_no_worker_and_can_go_on(plan_of, tmp_path, how):
     process, workers = start_hanging(tmp_path)
     with process:
         process.send_signal(how)
-        process.wait(30)
+        process.wait(300)
     assert all(gone(pid) for pid in workers)
     plan, out = plan_of(TWO_SEEDS + "first_frame: {share: own}\n"), tmp_path / "out"
     result, _ = sweep(plan, out)

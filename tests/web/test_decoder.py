@@ -41,7 +41,7 @@ def node(code: str, given: object, folder: Path) -> object:
         f"console.log(JSON.stringify(await (async () => {{ {code} }})()));\n"
     )
     done = subprocess.run(
-        [str(NODE), "--input-type=module", "-"], input=script, capture_output=True, text=True, timeout=60, check=False
+        [str(NODE), "--input-type=module", "-"], input=script, capture_output=True, text=True, timeout=600, check=False
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

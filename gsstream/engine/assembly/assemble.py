@@ -12,6 +12,7 @@ from gsstream.confidence.base import ConfidenceEstimator
 from gsstream.core.auto import AUTO, Choice
 from gsstream.core.errors import PluginUnavailable, UnknownName
 from gsstream.core.kinds import METHOD_SLOTS
+from gsstream.core.needs import install_renderer
 from gsstream.core.part import Part
 from gsstream.engine.assembly.checks import Checks, wanted_checks
 from gsstream.engine.assembly.guard import guard, plain
@@ -242,11 +243,15 @@ def _auto_renderer(
         try:
             cls = catalog.resolve("renderer", name)
             return name, _construct("renderer", name, cls, cls.Config(), catalog)
-        except (UnknownName, PluginUnavailable) as error:
+        except UnknownName:
+            reasons.append(f"no renderer named {name!r}")
+        except PluginUnavailable as error:
             reasons.append(str(error))
+    left_out = any(plugin.left_out and plugin.distribution == "gsstream-cpu-render" for plugin in catalog.plugins)
+    cure = "let GSSTREAM_LOAD_PLUGINS name gsstream-cpu-render" if left_out else install_renderer()
     warnings.warn(
-        "no fast renderer works here, so the reference renderer is used: about 500 times slower. To mend it, install a "
-        f"C++ compiler and run 'pip install ./plugins/cpu_render'. Reason: {'; '.join(reasons)}",
+        "no fast renderer works here, so the reference renderer is used: about 500 times slower. To mend it, "
+        f"{cure}. Reason: {'; '.join(reasons)}",
         SlowRendererWarning,
         stacklevel=3,
     )

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from gsstream.core.errors import InputError, PluginUnavailable
+from gsstream.core.needs import install_extra
 from gsstream.trade.jobs.base import Finished, Work, thread_environment
 
 #: What a worker must know of the environment that the sweep was started in.
@@ -76,5 +77,5 @@ def _import_ray() -> Any:
     try:
         import ray
     except ImportError as error:
-        raise PluginUnavailable("--ray needs Ray: pip install 'gsstream[ray]'") from error
+        raise PluginUnavailable(f"--ray needs Ray: {install_extra('ray')}") from error
     return ray

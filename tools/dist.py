@@ -1,0 +1,90 @@
+"""Build every distribution of this repository: ``make dist``, or ``python -m tools.dist --out dist``.
+
+Each gets a source archive and the wheel that is built from it, beside a list of their checksums. The same sources give
+the same bytes: times are those of the commit, and ``dist_constraints.txt`` pins what builds. ``--twice`` proves it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PINS = Path(__file__).with_name("dist_constraints.txt")
+SUMS = "SHA256SUMS"
+
+
+def projects() -> list[Path]:
+    """Return the folder of every distribution: gsstream itself, then its plugins by name."""
+    return [ROOT, *sorted(path.parent for path in ROOT.glob("plugins/*/pyproject.toml"))]
+
+
+def source_date() -> str:
+    """Return the time that goes into every archive, in seconds: SOURCE_DATE_EPOCH, else that of the last commit."""
+    wanted = os.environ.get("SOURCE_DATE_EPOCH")
+    if wanted is not None:
+        return wanted
+    command = ["git", "log", "-1", "--format=%ct"]
+    return subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def build(out: Path, chosen: Sequence[Path], *, isolated: bool = True) -> dict[str, str]:
+    """Build distributions into a folder.
+
+    Arguments:
+        out: must not hold archives yet.
+        chosen: folders of the projects.
+        isolated: each in an environment of its own with the pinned tools; else with what is installed here.
+
+    Returns file name -> SHA-256 of all that was built; ``out`` has them as ``SHA256SUMS`` too.
+
+    Raises FileExistsError when ``out`` is not empty, subprocess.CalledProcessError when a build fails.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    if any(out.iterdir()):
+        raise FileExistsError(f"{out} is not empty: expected a new folder, so that no archive of before stays in it")
+    environment = {**os.environ, "SOURCE_DATE_EPOCH": source_date(), "PIP_CONSTRAINT": str(PINS)}
+    for project in chosen:
+        print(f"== {project.relative_to(ROOT)}", flush=True)
+        command = [sys.executable, "-m", "build", "--outdir", str(out.resolve()), str(project)]
+        command += [] if isolated else ["--no-isolation"]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        if done.returncode:
+            print(done.stdout + done.stderr, file=sys.stderr)
+            done.check_returncode()
+    sums = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(out.iterdir())}
+    (out / SUMS).write_text("".join(f"{digest}  {name}\n" for name, digest in sums.items()), encoding="utf-8")
+    return sums
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Build, and with ``--twice`` build again elsewhere and compare. Returns 1 when the bytes differ."""
+    names = {"gsstream" if path == ROOT else path.name: path for path in projects()}
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder, new or empty (default: dist)")
+    parser.add_argument("--only", action="append", choices=names, help="gsstream or the folder of a plugin; repeatable")
+    parser.add_argument("--twice", action="store_true", help="build a second time and compare every byte")
+    options = parser.parse_args(argv)
+    chosen = [names[name] for name in options.only or names]
+    first = build(options.out, chosen)
+    for name in first:
+        print(f"{(options.out / name).stat().st_size:>10}  {name}")
+    if not options.twice:
+        return 0
+    with tempfile.TemporaryDirectory() as folder:
+        second = build(Path(folder), chosen)
+    differing = sorted(name for name in first.keys() | second.keys() if first.get(name) != second.get(name))
+    print(f"built twice: {len(first) - len(differing)} of {len(first)} archives have equal bytes")
+    for name in differing:
+        print(f"differs: {name}", file=sys.stderr)
+    return 1 if differing else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

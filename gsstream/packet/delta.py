@@ -14,7 +14,7 @@ from gsstream.packet.changes.residual import decode_residual, encode_residual
 from gsstream.packet.changes.rows import decode_rows_change, encode_rows_change
 
 #: Sections of a delta packet in the order in which they stand there.
-SECTIONS = ("motion", "gates", "decoders", *ATTRIBUTES, "deaths", "births")
+SECTIONS = ("motion", "gates", "pattern", "decoders", *ATTRIBUTES, "deaths", "births")
 
 
 def next_decoders(previous: Mapping[str, FloatArray], delta: Delta) -> dict[str, FloatArray]:

@@ -15,6 +15,7 @@ from gsstream.packet.base import MAX_GAUSSIANS, PacketKind, Section
 from gsstream.packet.bits import unpack_blobs
 from gsstream.packet.changes.rows import HEAD_PARTS, decode_births
 from gsstream.packet.gates import decode_gates, run_tokens
+from gsstream.packet.pattern import decode_pattern
 from gsstream.packet.symbols import decode_symbols
 
 _KEY_HEAD, _DELTA_HEAD, _MEANS_HEAD, _LAYOUT_HEAD = 2, 6, 3, 9
@@ -99,9 +100,14 @@ def _residual_tables(data: Mapping[str, bytes], layout: Layout) -> Iterator[Tabl
     levels = gates[gates != 0].astype(np.int32)[:, None] if num_levels > 1 else np.zeros((0, 1), np.int32)
     best = [table_entropy(part, table) for part, table in zip(parts, [*tokens, levels], strict=True)]
     yield Table("gates", len(data["gates"]), sum(best) + plain_bits)
-    for name in ATTRIBUTES:
-        if name in data:
-            yield _table(name, data[name][_DELTA_HEAD:], rows, data[name][1])
+    names = [name for name in ATTRIBUTES if name in data]
+    pattern = None
+    if "pattern" in data:
+        pattern = decode_pattern(data["pattern"], rows, len(names))
+        yield _table("pattern", data["pattern"], rows, 1)
+    for bit, name in enumerate(names):
+        number = rows if pattern is None else int(np.count_nonzero(pattern >> bit & 1))
+        yield _table(name, data[name][_DELTA_HEAD:], number, data[name][1])
 
 
 def _runs_table(name: str, data: bytes, marks: IntArray) -> Table:

@@ -41,10 +41,12 @@ class StructureTraits(Traits):
     Arguments:
         idempotent: building again from the same Gaussians, also stored node by node, gives the same forest.
         local: the members of a node lie within one root cell of each other, along every axis.
+        lays_grid: its groups follow a grid that it lays when it seeds; False: any grid serves it, as units of position.
     """
 
     idempotent: bool = False
     local: bool = False
+    lays_grid: bool = True
 
 
 class Structure(Part):
@@ -55,6 +57,9 @@ class Structure(Part):
     """
 
     traits: ClassVar[StructureTraits] = StructureTraits()
+    #: Settings of ``Config`` that decide how Gaussians are grouped on the grid; all others decide the grid itself. A
+    #: stream that takes over a frame 0 keeps its grid where the structure that laid it differs in none of the others.
+    grouping_settings: ClassVar[frozenset[str]] = frozenset()
 
     def claims(self) -> StructureTraits:
         return self.traits

@@ -19,6 +19,7 @@ export const SECTION_NAMES = {
   6: "deaths",
   7: "births",
   8: "motion",
+  9: "pattern",
   16: "means",
   17: "quats",
   18: "scales",

@@ -166,6 +166,8 @@ def test_a_line_without_room_leaves_no_half(tmp_path) -> None:
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_signals_of_services_arrive_as_an_interrupt(name) -> None:
     number = getattr(signal, name)
+    # Under nohup the tests themselves are started with SIGHUP ignored, and then a run ignores it too (see below).
+    outside = signal.signal(number, signal.SIG_DFL)
     before = signal.getsignal(number)
     stopped = threading.Event()
     previous = signal.signal(signal.SIGINT, lambda *_: stopped.set())
@@ -176,7 +178,8 @@ def test_signals_of_services_arrive_as_an_interrupt(name) -> None:
         assert came == [number]
     finally:
         signal.signal(signal.SIGINT, previous)
-    assert signal.getsignal(number) is before
+        after = signal.signal(number, outside)
+    assert after is before
 
 
 def test_nohup_stays_nohup() -> None:

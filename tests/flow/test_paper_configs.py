@@ -29,6 +29,7 @@ SAME = [
         "components 5-hfp", "structure-sparsity both", "confidence robust", "root-resolution 2-to-8", "log-base 1.5",
         "progressive full", "propagation full", "discretisation full", "weights full", "gradient-noise full",
         "illumination full", "first-frame-noise full", "main-n3dv full", "main-meetroom full", "main-enerf full",
+        "first-frame epochs-250",
     },
     {"main-n3dv fast", "main-meetroom fast", "main-enerf fast"},
     {"components 1-dense", "structure-sparsity neither"},
@@ -79,7 +80,7 @@ def test_every_row_is_assembled(catalog: Catalog, rows: dict[str, ResolvedRecipe
     assert len(TABLES) == 19
     for name, resolved in rows.items():
         recipe = recipe_of(resolved, catalog)
-        assert recipe.method == "s2gs", name
+        assert recipe.method == "s2gs-paper", name
         epochs = next((n for key, n in OTHER_EPOCHS.items() if key in name.split()), 20)
         assert recipe.stream.epochs == epochs, f"{name}: the paper's tables share one budget"
         assert recipe.stream.change_threshold == 0.0, f"{name}: the paper's tables know no active set"
@@ -106,14 +107,48 @@ def test_the_components_build_on_each_other(catalog: Catalog, rows: dict[str, Re
     assert changed[1] == {"regularizer"}
     assert changed[2] == {"structure", "stream"}  # the stream: progressive training goes by octree level
     assert changed[3] == {"structure", "propagation"}
-    # The paper has no bits in its loss, trims no packet and moves nothing before the residual; the shipped recipe does.
-    ours = (
-        "stream.rate_weight=0", "codec.trim=0", "motion=still", "update.means.step=0.02",
-        "update.sh0.decoder_std=0.01",
-    )  # fmt: skip
-    no_rate = [("--set", value) for value in ours]
-    shipped = assemble(resolve_recipe("s2gs", catalog.recipe_path, [], no_rate), catalog).recipe
-    assert recipe_hash(full(catalog, FOLDER / OVERLAY).recipe) == recipe_hash(shipped)
+
+
+def test_the_tables_stand_on_the_letter_of_the_paper(catalog: Catalog, rows: dict[str, ResolvedRecipe]) -> None:
+    """The base of all tables is the recipe ``s2gs-paper``, noise in the gates and 250 whole passes included."""
+    paper = assemble(resolve_recipe("s2gs-paper", catalog.recipe_path), catalog).recipe
+    found = full(catalog).recipe
+    assert recipe_hash(found) == recipe_hash(paper)
+    assert found.gate.params["noise"] == "logistic"
+    assert not found.stream.release_closed
+    views = 27
+    assert found.first_frame.epochs * views <= found.first_frame.max_iterations
+
+
+#: Root resolution and log base of the paper's scenes (its supplement, table of hyperparameters).
+OCTREES = {
+    "coffee_martini": (12, 2.0), "flame_salmon_1": (12, 2.0), "cook_spinach": (9, 2.0), "cut_roasted_beef": (9, 2.0),
+    "flame_steak": (9, 2.0), "sear_steak": (9, 2.0), "discussion": (8, 1.5), "trimming": (8, 1.5),
+    "vrheadset": (8, 1.5), "actor1_4": (9, 1.2), "actor2_3": (9, 1.2), "actor5_6": (9, 1.2),
+}  # fmt: skip
+
+
+def test_every_scene_of_the_paper_has_its_octree_and_three_seeds(catalog: Catalog) -> None:
+    seen = set()
+    for table in TABLES:
+        config = read_sweep(FOLDER / f"{table}.yaml")
+        if table == "extensions":  # no table of the paper
+            continue
+        assert config.seeds == ([0] if table == "edge-orin" else [0, 1, 2]), table
+        for scene in config.scenes:
+            found = scene.set.get("structure.root_exponent", 8), scene.set.get("structure.log_base", 1.5)
+            assert found == OCTREES[scene.name], f"{table} {scene.name}"
+            seen.add(scene.name)
+    assert seen == set(OCTREES)
+
+
+def test_the_octree_of_a_scene_reaches_its_rows_and_leaves_flat_ones_alone(catalog: Catalog) -> None:
+    config = read_sweep(FOLDER / "components.yaml")
+    one = config.model_copy(update={"seeds": [0], "scenes": config.scenes[:1]})
+    points = {point.variant: point.resolved.recipe for point in make_plan(one, FOLDER, catalog.recipe_path).points}
+    assert points["5-hfp"].structure.params == {"root_exponent": 12, "log_base": 2.0}
+    assert points["1-dense"].structure.params == {}
+    assert points["5-hfp"].data.test_cameras == ["cam00"]
 
 
 @pytest.mark.parametrize("name", CHEAP)

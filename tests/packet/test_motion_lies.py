@@ -199,7 +199,7 @@ def test_sections_in_another_order_are_refused():
     packet = encode_delta(delta, state.layout, {}, frame=1)
     header, sections = parse_packet(packet.data)
     names = list(sections)
-    assert names == ["motion", "gates", "means", "quats", "opacities", "sh0", "deaths", "births"]
+    assert names == ["motion", "gates", "pattern", "means", "quats", "opacities", "sh0", "deaths", "births"]
     for first, second in itertools.pairwise(range(len(names))):
         order = list(names)
         order[first], order[second] = order[second], order[first]

@@ -16,6 +16,7 @@ from gsstream.core.changes.motion import apply_motion as apply_motion
 from gsstream.core.changes.motion import groups_for as groups_for
 from gsstream.core.changes.residual import Residual as Residual
 from gsstream.core.changes.residual import apply_residual as apply_residual
+from gsstream.core.changes.residual import changing_rows as changing_rows
 from gsstream.core.changes.residual import decode_residual as decode_residual
 from gsstream.core.changes.residual import sent_rows as sent_rows
 from gsstream.core.changes.rows import Births as Births

@@ -48,11 +48,17 @@ def sent_rows(layout: Layout, gates: IntArray) -> IntArray:
     return np.asarray(np.repeat(starts - before, counts) + np.arange(int(counts.sum())))
 
 
+def changing_rows(residual: Residual) -> int:
+    """Return how many of the rows behind open gates have a symbol that is not zero, in whatever attribute."""
+    if not residual.symbols:
+        return 0
+    return int(np.count_nonzero(np.concatenate(list(residual.symbols.values()), axis=1).any(axis=1)))
+
+
 def apply_residual(gaussians: Gaussians[FloatArray], layout: Layout, residual: Residual) -> Gaussians[FloatArray]:
     """Return the Gaussians after a residual, in raw values.
 
-    a_t = a_{t-1} + g * (step * symbols) W. Rows behind closed gates keep their bits. All arithmetic is float32 in a
-    fixed order.
+    a_t = a_{t-1} + g * (step * symbols) W.
 
     Rows behind closed gates keep their bits. All arithmetic is float32 in a fixed order. Raises ShapeError when the
     residual does not fit the scene.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,14 +10,18 @@ import numpy as np
 import torch
 
 from gsstream.core.errors import OutputError, PacketError
+from gsstream.core.frame import Frame
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import decoded_anchors, exposure_from_meta
 from gsstream.engine.state.follow import follow
 from gsstream.engine.state.stream_state import StreamState
+from gsstream.engine.step.heal import remembered
+from gsstream.engine.still.memory import StillMemory
 from gsstream.packet import PacketKind, PlayerState, StreamMeta, StreamReader, decode_packet
 from gsstream.packet.base import FILE_HEADER
+from gsstream.recipe.model import Stream
 from gsstream.source.base import SourceInfo
 
 #: Keys that may differ when a run is resumed, by section; besides them, ``frames``.
@@ -111,6 +115,24 @@ def state_after(parts: Assembly, states: Iterable[PlayerState], rng: Rng) -> Str
         state = key_state_from_player(parts, player, rng) if state is None else follow(state, player)
     assert state is not None, "a stream without a key packet"
     return state
+
+
+def memory_after(stream: Stream, state: StreamState, images: Callable[[int], Frame]) -> StillMemory | None:
+    """Return what the cameras remember of still pixels: made again from the pictures since the last key packet.
+
+    Arguments:
+        stream: section ``stream`` of the recipe.
+        state: at the end of the stream.
+        images: frame index -> its training images.
+    """
+    memory: StillMemory | None = None
+    if not stream.remember or state.player.frame == state.key_frame:
+        return memory
+    previous = images(int(state.player.meta.extra.get("shown", state.key_frame)))
+    for index in range(state.key_frame + 1, state.player.frame + 1):
+        frame = images(index)
+        memory = remembered(stream, memory, previous, frame)
+    return memory
 
 
 def key_state_from_player(parts: Assembly, player: PlayerState, rng: Rng) -> StreamState:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gsstream.core.changes import row_gates
+from gsstream.core.changes import changing_rows, row_gates
 from gsstream.core.errors import ComponentError, ShapeError
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import ATTRIBUTES
@@ -134,17 +134,20 @@ def _same(want: float | np.ndarray[Any, Any], got: float | np.ndarray[Any, Any])
 
 def _facts(player: PlayerState, step: Step[Any]) -> dict[str, Any]:
     """Sizes and counts, from the packet alone."""
-    rows, gates = len(player.gaussians), 0
+    rows = sent = len(player.gaussians)
+    gates = 0
     if player.delta is not None and player.before is not None:
         born = 0 if player.delta.births is None else len(player.delta.births.parents)
-        rows = int((row_gates(player.before, player.delta) > 0).sum())
+        rows = born + (0 if player.delta.residual is None else changing_rows(player.delta.residual))
+        sent = int((row_gates(player.before, player.delta) > 0).sum())
         gates = int((player.delta.gates(player.before) != 0).sum()) + born
     elif step.status == "empty":
-        rows = 0
+        rows = sent = 0
     return {
         "bytes": dict(step.packet.sizes),
         "num_gaussians": len(player.gaussians),
         "active_gaussians": rows,
+        "sent_gaussians": sent,
         "num_gates": len(player.layout.node_counts),
         "active_gates": gates,
     }

@@ -8,9 +8,10 @@ from typing import Any, ClassVar, final
 from gsstream.core.frame import Frame
 from gsstream.engine.budget.controller import planned
 from gsstream.engine.budget.spent import spent
-from gsstream.engine.frame0.begin import begin, begin_from
+from gsstream.engine.frame0.begin import begin
+from gsstream.engine.frame0.taken import begin_from
 from gsstream.engine.keys.keyframes import refresh
-from gsstream.engine.keys.resume import state_after
+from gsstream.engine.keys.resume import memory_after, state_after
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.frame_step import frame_step
 from gsstream.engine.step.metrics import cache_metrics
@@ -48,4 +49,5 @@ class PartsMethod(StreamingMethod[StreamState]):
         return refresh(own, step, frame, tools)
 
     def resume(self, player: PlayerState, shown: Frame, tools: Any) -> StreamState:
-        return replace(state_after(tools.parts, tools.since_key(), tools.rng), previous=shown)
+        state = replace(state_after(tools.parts, tools.since_key(), tools.rng), previous=shown)
+        return replace(state, memory=memory_after(tools.parts.recipe.stream, state, tools.images))

@@ -19,10 +19,10 @@ from gsstream.engine.auto.rules import recall, record, stream_extra
 from gsstream.engine.auto.trials import choose
 from gsstream.engine.budget.controller import Controller
 from gsstream.engine.budget.pace import CLOCKS
-from gsstream.engine.frame0.begin import cloud_of
 from gsstream.engine.frame0.carried import in_world
 from gsstream.engine.frame0.optimise import Progress
 from gsstream.engine.frame0.points import gather_points
+from gsstream.engine.frame0.taken import cloud_of
 from gsstream.engine.keys.resume import check_stream, ended, since_key
 from gsstream.engine.method.held import begin_held, step_held
 from gsstream.engine.run.threads import one_torch_thread
@@ -130,7 +130,9 @@ class Encoder:
         if not check_stream(self.parts, stream, self.info) or (last is not None and last < 0):
             return None
         end = ended(stream, last)
-        tools = self._tools(replay=lambda: since_key(stream, end))
+        tools = self._tools(
+            replay=lambda: since_key(stream, end), images=lambda index: self.at_near(image(index))
+        )
         self.parts.where.enter(end.player.frame)
         with one_torch_thread():
             self.state = self.parts.stepper.resume(end.player, self.at_near(image(end.shown)), tools)

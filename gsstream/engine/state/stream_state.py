@@ -11,6 +11,7 @@ from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.engine.fit.exposure import Exposure
+from gsstream.engine.still.memory import StillMemory
 from gsstream.method.base import Step as MethodStep
 from gsstream.packet import PlayerState
 from gsstream.render.base import RenderSession
@@ -28,6 +29,8 @@ class StreamState:
         decoders: linear decoders to continue from; equal to the player's once they were sent.
         exposure: colour maps of the training cameras, or None.
         key_frame: frame of the last key packet.
+        memory: what the cameras remember of still pixels since the last key packet; None before the frame after it, or
+            when the recipe asks for none.
         session: what the renderer keeps of this scene from one frame to the next. Nothing but time depends on it: a
             state without one (the first, a resumed one) goes on to the same bytes.
     """
@@ -38,6 +41,7 @@ class StreamState:
     decoders: Mapping[str, torch.Tensor] = field(default_factory=dict)
     exposure: Exposure | None = None
     key_frame: int = 0
+    memory: StillMemory | None = None
     session: RenderSession | None = field(default=None, compare=False, repr=False)
 
     @property

@@ -9,6 +9,7 @@ from gsstream.core.context import ScreenGradient
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.shapes import FloatArray
 from gsstream.core.storage import unpacked
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.exposure import Exposure
@@ -17,7 +18,7 @@ from gsstream.engine.step.active.candidates import changed_rows
 from gsstream.engine.step.active.change import MOST_PIXEL_SIGMA, Change
 from gsstream.metrics.noise import noise_sigma
 from gsstream.optimiser.base import RowOptimiser
-from gsstream.render.base import RenderSession
+from gsstream.render.base import TILE, RenderSession
 
 
 class FrameView:
@@ -30,16 +31,19 @@ class FrameView:
         previous: training images that this scene shows.
         change: what changed since; None: everything counts as changed.
         session: a render session of this scene that is kept from before, or None.
+        targets: [V, H, W, 3] what renders are compared with; None: the images of the frame.
     """
 
     def __init__(
         self, parts: Assembly, gaussians: Gaussians[torch.Tensor], hierarchy: Hierarchy, frame: Frame, previous: Frame,
         exposure: Exposure | None, change: Change | None = None, session: RenderSession | None = None,
+        targets: FloatArray | None = None,
     ) -> None:  # fmt: skip
         self._parts, self._gaussians, self._hierarchy = parts, gaussians, hierarchy
         self._frame, self._previous, self._change = frame, previous, change
         self._background = parts.recipe.background
-        self.judge = Judge(parts.loss, parts.recipe.loss.dssim, frame.images, exposure)
+        self._targets = frame.images if targets is None else targets
+        self.judge = Judge(parts.loss, parts.recipe.loss.dssim, self._targets, exposure)
         self._session = session
 
     @property
@@ -113,6 +117,17 @@ class FrameView:
             return torch.ones(self.cameras.height, self.cameras.width, dtype=torch.bool)
         return self._change.pixels(view)[..., 0] > 0
 
+    def scene_image(self, view: int) -> torch.Tensor:
+        image, exposure = self.image(view), self.judge.exposure
+        return exposure.undo(view, image) if exposure else image
+
+    def drawn_rows(self) -> torch.Tensor:
+        tiles = torch.ones(-(-self.cameras.height // TILE), -(-self.cameras.width // TILE), dtype=torch.bool)
+        drawn = torch.zeros(len(self._gaussians), dtype=torch.bool)
+        for view in range(len(self.cameras)):
+            drawn |= self.session.visible(view, tiles)
+        return drawn
+
     def narrow(self, rows: torch.Tensor) -> None:
         self._session = self.session_for(rows)
 
@@ -127,5 +142,6 @@ class FrameView:
 
     def on(self, gaussians: Gaussians[torch.Tensor]) -> FrameView:
         return FrameView(
-            self._parts, gaussians, self._hierarchy, self._frame, self._previous, self.judge.exposure, self._change
-        )
+            self._parts, gaussians, self._hierarchy, self._frame, self._previous, self.judge.exposure, self._change,
+            targets=self._targets,
+        )  # fmt: skip

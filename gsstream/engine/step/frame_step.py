@@ -23,6 +23,7 @@ from gsstream.engine.step.clock import PhaseClock
 from gsstream.engine.step.encode import encode_frame
 from gsstream.engine.step.growth import grown
 from gsstream.engine.step.harden import harden
+from gsstream.engine.step.heal import mended_rows, raised, remembered
 from gsstream.engine.step.keep import kept_session
 from gsstream.engine.step.metrics import step_metrics
 from gsstream.engine.step.motion import moved
@@ -57,18 +58,24 @@ def frame_step(
     parts.where.enter(frame.index)
     with clock.phase("change"):
         change = detect_change(state.previous, frame, stream.change_threshold)
+        memory = remembered(stream, state.memory, state.previous, frame)
+        state = replace(state, memory=memory)
+        targets = frame.images if memory is None else memory.targets(frame.images)
     if frame.effort == 0 or (change is not None and change.share == 0):
         return still(state, frame, clock)
 
     with clock.phase("motion"):
-        motions, scene, view = moved(parts, state, frame, change, rng, allowance)
+        motions, scene, view = moved(parts, state, frame, change, rng, targets, allowance)
     with clock.phase("confidence"):
         confidence = parts.propagation.propagate(parts.confidence.estimate(view), state.hierarchy)
         logits = parts.gate.init(confidence)
         open_probability = parts.gate.open_probability(logits)
-        rows = candidates(
-            view.changed_rows(stream.change_votes), open_probability, state.hierarchy, stream.active_threshold
-        )
+        able = view.changed_rows(stream.change_votes)
+        if memory is not None and stream.heal:
+            mending = mended_rows(view, memory, stream.heal)
+            able, logits = able | mending, raised(logits, mending, state.hierarchy)
+            open_probability = parts.gate.open_probability(logits)
+        rows = candidates(able, open_probability, state.hierarchy, stream.active_threshold)
     with clock.phase("optimise"):
         problem = Problem(
             frame.index, frame.effort, scene.layout, state.hierarchy, rows, view.gaussians.rows(rows), logits,

@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from gsstream.core.shapes import IntArray
 from gsstream.recipe.model import Stream
 
 
-def level_schedule(stream: Stream, num_levels: int) -> tuple[tuple[float, int], ...]:
+def level_schedule(stream: Stream, unit_of: IntArray) -> tuple[tuple[float, int], ...]:
     """Return pairs (fraction of the frame until which, finest level that takes part) (paper, supplement).
 
-    Starts at level floor(H / 2); each finer level's stage is omega times longer, N_{i+1} = omega N_i. Empty when the
-    recipe does not ask for it or there is nothing to hold back. The paper leaves omega and the treatment of inactive
-    levels open: here they keep their previous attributes.
+    The H levels are those that hold Gaussians: a structure may lay more, of which the finest often stay empty, and a
+    schedule over empty levels would hold nobody back. It starts at level floor(H / 2); each finer level's stage is
+    omega times longer, N_{i+1} = omega N_i. Empty when the recipe does not ask for it or there is nothing to hold back.
+    The paper leaves omega and the treatment of inactive levels open: here they keep their previous attributes.
+
+    Arguments:
+        stream: of the recipe.
+        unit_of: [N] level of every Gaussian of the scene.
     """
-    first = num_levels // 2
-    if not stream.progressive or num_levels - first < 2:
+    levels = np.unique(unit_of).tolist()
+    waiting = levels[len(levels) // 2 :]
+    if not stream.progressive or len(waiting) < 2:
         return ()
-    weights = [stream.progressive_omega**i for i in range(num_levels - first)]
-    ends = [sum(weights[: i + 1]) / sum(weights) for i in range(len(weights))]
-    return tuple((end, first + i) for i, end in enumerate(ends))
+    weights = [stream.progressive_omega**i for i in range(len(waiting))]
+    ends = np.cumsum(weights) / sum(weights)
+    return tuple(zip(ends.tolist(), waiting, strict=True))
 
 
 def current_level(schedule: tuple[tuple[float, int], ...], fraction: float) -> int:

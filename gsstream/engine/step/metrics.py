@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gsstream.core.changes import Delta
+from gsstream.core.changes import Delta, changing_rows
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.problem import Solution
 from gsstream.packet import EncodedPacket
@@ -29,7 +29,8 @@ def step_metrics(
     gates = delta.gates(before)
     return {
         "bytes": dict(packet.sizes),
-        "active_gaussians": int(np.asarray(before.node_counts)[gates != 0].sum()),
+        "active_gaussians": 0 if delta.residual is None else changing_rows(delta.residual),
+        "sent_gaussians": int(np.asarray(before.node_counts)[gates != 0].sum()),
         "num_gaussians": len(after.player.gaussians),
         "active_gates": int((gates != 0).sum()),
         "num_gates": len(gates),

@@ -10,6 +10,7 @@ from gsstream.core.changes import Motion, Scene
 from gsstream.core.changes.motion import apply_motions
 from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
+from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import blaming
 from gsstream.engine.budget.pace import Allowance
@@ -31,7 +32,7 @@ class Moved(NamedTuple):
 
 
 def moved(
-    parts: Assembly, state: StreamState, frame: Frame, change: Change | None, rng: Rng,
+    parts: Assembly, state: StreamState, frame: Frame, change: Change | None, rng: Rng, targets: FloatArray,
     allowance: Allowance | None = None,
 ) -> Moved:  # fmt: skip
     """Ask the motion part, and apply what it proposes as every player will.
@@ -42,6 +43,7 @@ def moved(
         frame: training images of this frame.
         change: what changed in them; None: everything counts as changed.
         rng: random streams by name and frame.
+        targets: [V, H, W, 3] what renders are compared with: the images, or what the cameras remember of them.
         allowance: what the frame may spend. Motions that would take more than their share of its bytes are left out:
             nothing trims them, and a frame that is too large for its residual too would be given up as a whole.
 
@@ -49,8 +51,9 @@ def moved(
     """
     scene = state.player.scene
     view = FrameView(
-        parts, state.gaussians, state.hierarchy, frame, state.previous, state.exposure, change, state.session
-    )
+        parts, state.gaussians, state.hierarchy, frame, state.previous, state.exposure, change, state.session,
+        targets,
+    )  # fmt: skip
     motions = tuple(motion for motion in parts.motion.propose(scene, view, rng) if not motion.is_empty)
     if not motions:
         return Moved((), scene, view)
@@ -64,5 +67,7 @@ def moved(
     # The session is handed on to the moved scene, with its caches of all that stands still. The old session stays
     # correct, as it must until the frame has succeeded: should it be used again, it fills its caches anew.
     session = view.session.commit(gaussians, torch.from_numpy(touched)) if 2 * len(touched) <= len(gaussians) else None
-    after = FrameView(parts, gaussians, state.hierarchy, frame, state.previous, state.exposure, change, session)
+    after = FrameView(
+        parts, gaussians, state.hierarchy, frame, state.previous, state.exposure, change, session, targets
+    )
     return Moved(motions, scene, after)

@@ -75,7 +75,7 @@ class _FrameRun:
         self.hierarchy = _forest(node_of, len(self.nodes))
         self.units = torch.from_numpy(layout.units_of(rows))
         self.levels = torch.from_numpy(layout.unit_of[rows].astype("int64"))
-        self.schedule = level_schedule(parts.recipe.stream, len(layout.units))
+        self.schedule = level_schedule(parts.recipe.stream, layout.unit_of)
         codes = coarser(parts.update.codes(), problem.step_scale)
         latents = init_latents(parts.update, problem.base)
         self.decoder_names = {name: problem.decoders[name] for name in latents if name in problem.decoders}

@@ -12,8 +12,9 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.pace import Allowance
-from gsstream.engine.frame0.begin import begin, begin_from, exposure_from_meta
+from gsstream.engine.frame0.begin import begin, exposure_from_meta
 from gsstream.engine.frame0.optimise import Progress
+from gsstream.engine.frame0.taken import begin_from
 from gsstream.engine.step.context import FrameView
 from gsstream.method.tools import FirstFrame
 from gsstream.packet import PlayerState, StreamMeta
@@ -34,6 +35,7 @@ class RunTools:
         allowance: what a budget lets the next frame spend; None: what the recipe says.
         refuse_key: number of Gaussians -> why a key packet cannot be paid for now, or None.
         replay: the states of players since the last key packet, while a stream is being resumed.
+        images: frame index -> its training images, while a stream is being resumed.
     """
 
     parts: Assembly
@@ -45,6 +47,7 @@ class RunTools:
     allowance: Allowance | None = None
     refuse_key: Callable[[int], str | None] = lambda _: None
     replay: Callable[[], Iterator[PlayerState]] = lambda: iter(())
+    images: Callable[[int], Frame] | None = None
 
     @property
     def renderer(self) -> Renderer:

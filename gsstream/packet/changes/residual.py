@@ -1,4 +1,4 @@
-"""The residual of a delta packet: sections gates, decoders and the attributes that change."""
+"""The residual of a delta packet: sections gates, pattern, decoders and the attributes that change."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from gsstream.packet.base import (
     located,
 )  # fmt: skip
 from gsstream.packet.gates import decode_gates, encode_gates
+from gsstream.packet.pattern import decode_pattern, encode_pattern, pattern_of, spread
 from gsstream.packet.symbols import decode_symbols, encode_symbols
 
 _ATTRIBUTE = struct.Struct("<BBf")
@@ -60,12 +61,16 @@ def encode_residual(
     sent = [n for n in ATTRIBUTES if n in decoders and not _same(decoders[n], previous_decoders.get(n))]
     if sent:
         sections.append(("decoders", b"".join(_encode_decoder(name, decoders[name]) for name in sent)))
-    for name in ATTRIBUTES:
-        if name in residual.symbols:
-            symbols = residual.symbols[name]
-            mode = _LATENT if name in decoders else _DIRECT
-            head = _ATTRIBUTE.pack(mode, symbols.shape[1], residual.steps[name])
-            sections.append((name, head + encode_symbols(symbols)))
+    names = [name for name in ATTRIBUTES if name in residual.symbols]
+    if not names:
+        return sections
+    pattern = pattern_of(residual.symbols, names)
+    sections.insert(1, ("pattern", encode_pattern(pattern)))
+    for bit, name in enumerate(names):
+        symbols = residual.symbols[name]
+        mode = _LATENT if name in decoders else _DIRECT
+        head = _ATTRIBUTE.pack(mode, symbols.shape[1], residual.steps[name])
+        sections.append((name, head + encode_symbols(symbols[(pattern >> bit & 1) != 0])))
     return sections
 
 
@@ -80,7 +85,7 @@ def decode_residual(
         previous_decoders: the decoders last sent since the last key packet.
     """
     if "gates" not in sections:
-        strange = [name for name in ("decoders", *ATTRIBUTES) if name in sections]
+        strange = [name for name in ("pattern", "decoders", *ATTRIBUTES) if name in sections]
         if strange:
             raise PacketError(f"delta packet: section {strange[0]} without gates", sections[strange[0]].offset)
         return None
@@ -94,12 +99,18 @@ def decode_residual(
             sent = _decode_decoders(sections["decoders"])
     known.update(sent)
     symbols, steps, decoders = {}, {}, {}
-    for name in ATTRIBUTES:
-        if name in sections:
-            with located(sections[name].offset):
-                symbols[name], steps[name], mode = _decode_attribute(name, sections[name].data, rows, known)
-            if mode == _LATENT:
-                decoders[name] = known[name]
+    names = [name for name in ATTRIBUTES if name in sections]
+    pattern = None
+    if "pattern" in sections:
+        with located(sections["pattern"].offset):
+            pattern = decode_pattern(sections["pattern"].data, rows, len(names))
+    for bit, name in enumerate(names):
+        with located(sections[name].offset):
+            number = rows if pattern is None else int(np.count_nonzero(pattern >> bit & 1))
+            table, steps[name], mode = _decode_attribute(name, sections[name].data, number, known)
+            symbols[name] = table if pattern is None else spread(table, pattern, bit)
+        if mode == _LATENT:
+            decoders[name] = known[name]
     if not set(sent) <= set(decoders):
         raise PacketError("delta packet: a decoder is sent that no attribute uses", sections["decoders"].offset)
     return Residual(gates, num_levels, symbols, steps, decoders)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import zstandard
 
-from gsstream.core.changes import Residual, gather_rows, sent_rows
+from gsstream.core.changes import Delta, Residual, changing_rows, gather_rows, sent_rows
 from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.shapes import FloatArray, IntArray
@@ -29,7 +29,8 @@ class PacketStats:
     Arguments:
         kind: key, delta or empty.
         size: all bytes of the packet. sections: section -> bytes; ``header`` holds all headers.
-        active_gaussians, active_nodes: behind open gates; all of them in a key packet.
+        active_gaussians: rows with a residual that is not zero; all of them in a key packet.
+        active_nodes: nodes whose gate is open; all of them in a key packet.
         coded: bytes of the entropy-coded sections, the tables of their models included.
         entropy: empirical entropy of their symbols, each channel by itself or all together as they were modelled, and
             the bits sent plainly. coded / entropy is the coder's efficiency.
@@ -152,6 +153,10 @@ def stream_stats(
     return StreamStats(tuple(packets), len(state.gaussians), len(state.layout.node_counts), raw, state.meta.fps)
 
 
+def _changing(delta: Delta | None) -> int:
+    return 0 if delta is None or delta.residual is None else changing_rows(delta.residual)
+
+
 def paper_estimate(state: PlayerState, kind: PacketKind) -> float:
     """Return the bytes that the S2GS paper would report for this packet.
 
@@ -234,7 +239,7 @@ def _packet(entry: Entry, data: bytes, state: PlayerState, seconds: float) -> Pa
     return PacketStats(
         frame=entry.frame, kind=entry.kind.name.lower(), size=entry.size,
         sections={**sizes, "header": entry.size - sum(sizes.values())},
-        active_gaussians=0 if empty else len(rows),
+        active_gaussians=len(rows) if delta is None and not empty else _changing(delta),
         active_nodes=0 if empty else int(np.count_nonzero(delta.gates(layout))) if delta else len(layout.node_counts),
         coded=sum(table.size for table in tables),
         entropy=sum(table.entropy_bits for table in tables) / 8,

@@ -9,7 +9,7 @@ const LATENT = 1;
 const MAX_CHANGE = 1e18;
 
 /** Sections that this change is made of. */
-export const SECTIONS = ["gates", "decoders", ...ATTRIBUTES];
+export const SECTIONS = ["gates", "pattern", "decoders", ...ATTRIBUTES];
 
 /**
  * Decode the residual from sections by name. Nothing of `state` changes.
@@ -26,11 +26,17 @@ export function decodeResidual(sections, state, offset) {
     ? located(sections.decoders.offset, () => decodeDecoders(sections.decoders.data))
     : new Map();
   for (const [name, decoder] of sent) decoders.set(name, decoder);
-  const parts = [];
-  for (const name of ATTRIBUTES) {
-    const section = sections[name];
-    if (section) parts.push(located(section.offset, () => decodePart(name, section.data, rows.length, decoders)));
-  }
+  const names = ATTRIBUTES.filter((name) => sections[name]);
+  const pattern = sections.pattern
+    ? located(sections.pattern.offset, () => decodePattern(sections.pattern.data, rows.length, names.length))
+    : null;
+  const parts = names.map((name, bit) =>
+    located(sections[name].offset, () => {
+      const number = pattern ? pattern.reduce((sum, value) => sum + ((value >> bit) & 1), 0) : rows.length;
+      const part = decodePart(name, sections[name].data, number, decoders);
+      return pattern ? { ...part, symbols: spread(part.symbols, part.channels, pattern, bit) } : part;
+    }),
+  );
   for (const name of sent.keys()) {
     if (!parts.some((part) => part.name === name && part.decoder)) {
       throw new PacketError("delta packet: a decoder is sent that no attribute uses", sections.decoders.offset);
@@ -97,6 +103,26 @@ function openRows(counts, gates, levels) {
     row = end;
   }
   return { rows, gate };
+}
+
+/** For each row behind an open gate, a number: bit i is set where the i-th attribute that is sent has symbols for it. */
+function decodePattern(data, rows, attributes) {
+  if (attributes === 0) throw new PacketError("pattern of rows without an attribute that changes");
+  const pattern = decodeSymbols(data, rows, 1);
+  if (pattern.some((value) => value < 0 || value >= 1 << attributes)) {
+    throw new PacketError(`pattern of a row: expected 0 to ${(1 << attributes) - 1} for ${attributes} attributes`);
+  }
+  return pattern;
+}
+
+/** The symbols of all rows from those of the rows that have the bit; zeros elsewhere. Channel after channel. */
+function spread(symbols, channels, pattern, bit) {
+  const rows = pattern.length;
+  const out = new Int32Array(rows * channels);
+  for (let c = 0, at = 0; c < channels; c += 1) {
+    for (let row = 0; row < rows; row += 1) if ((pattern[row] >> bit) & 1) out[c * rows + row] = symbols[at++];
+  }
+  return out;
 }
 
 function decodeDecoders(data) {

@@ -142,6 +142,20 @@ class TestInvariances:
         torch.testing.assert_close(z[:3], part.estimate(told(gradient[:, :3])))
         assert z[3:].tolist() == [-3.0] * 4
 
+    @pytest.mark.parametrize("normalisation", ["robust", "ratio"])
+    def test_what_no_change_touches_does_not_enter_the_statistics(self, normalisation: str) -> None:
+        """A mask leaves most of what is seen without a gradient: the touched must spread as if they were alone."""
+        touched = magnitudes([1.0, 2.0, 3.0, 10.0])
+        gradient = torch.cat([touched, torch.zeros(1, 60, 2)], 1)
+        part = estimator(normalisation=normalisation, epsilon_mode="relative")
+        z = part.estimate(told(gradient))
+        torch.testing.assert_close(z[:4], part.estimate(told(touched)))
+        assert z[4:].tolist() == [pytest.approx(FLOOR)] * 60
+        assert float(z[:4].max() - z[:4].min()) > 1
+        # Counted with the others they all saturate: so it was, and so "seen" still is.
+        alike = estimator(normalisation=normalisation, epsilon_mode="relative", statistics="seen")
+        assert alike.estimate(told(gradient))[:4].tolist() == [50.0] * 4
+
     def test_gradient_of_an_invisible_gaussian_is_ignored(self) -> None:
         z = estimator().estimate(told(magnitudes([5.0, 1.0]), torch.tensor([[False, True]])))
         assert float(z[0]) == pytest.approx(FLOOR)

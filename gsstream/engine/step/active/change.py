@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -12,28 +11,12 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.core.storage import unpacked
-from gsstream.metrics.noise import MAD_TO_SIGMA, median_deviation
+from gsstream.engine.still.blocks import BLOCK, BoolArray, changed_blocks
 from gsstream.render.base import TILE
 
-BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
-#: Differences are averaged over BLOCK x BLOCK pixels first: noise of neighbouring pixels is mostly independent and
-#: averages out (rendered noise is heavy-tailed, so a threshold on single pixels finds it everywhere), motion does not.
-BLOCK = 4
 #: Blocks of a 16 x 16 tile (of 16) that must exceed the threshold.
 LEAST_BLOCKS = 2
-#: Lower bound on the estimated noise of a block's mean difference. Compressed video repeats still blocks exactly;
-#: without a floor the change of half a grey level by the encoder would count as motion.
-LEAST_SIGMA = 0.5 / 255
-#: Upper bound on the same estimate. The estimate holds while fewer than half of the blocks
-#: move; a flash or a cut moves all of them, and then the change itself would pass for noise and nothing would be seen
-#: to change. Recordings have about 1 / 255.
-MOST_SIGMA = 4 / 255
-#: Upper bound on the same estimate, in multiples of the differences between neighbouring blocks. Noise differs from
-#: block to block, a slow change of the light hardly does: at a gain of 1.03 the spread of the differences doubles,
-#: their second differences grow by 5 %. Without such a change the first is at most 1.2 times the second on the
-#: recordings at hand.
-MOST_OF_ROUGHNESS = 1.5
-#: The same for the noise of one pixel of one image.
+#: Upper bound on the noise of one pixel of one image; see MOST_SIGMA of blocks.
 MOST_PIXEL_SIGMA = 16 / 255
 
 
@@ -93,11 +76,16 @@ def detect_change(previous: Frame, frame: Frame, threshold: float) -> Change | N
 
 def _changed(before: FloatArray, after: FloatArray, threshold: float) -> BoolArray:
     """[rows, columns] bool of one view."""
-    means = _block_means(after - before)
-    sigma = min(max(min(MAD_TO_SIGMA * float(median_deviation(means)), _rough(means)), LEAST_SIGMA), MOST_SIGMA)
-    moved: BoolArray = np.asarray((np.abs(means) > threshold * sigma).any(-1))
+    moved = changed_blocks(after - before, threshold)
     count, blocks = marked_per_tile(moved, TILE // BLOCK)
     return np.asarray(count >= np.minimum(LEAST_BLOCKS, blocks))
+
+
+def tile_sums(blocks: FloatArray) -> FloatArray:
+    """Return [ceil(H / 16), ceil(W / 16)]: the sums over tiles of values [ceil(H / 4), ceil(W / 4)] of blocks."""
+    side = TILE // BLOCK
+    rows, columns = np.arange(0, blocks.shape[0], side), np.arange(0, blocks.shape[1], side)
+    return np.asarray(np.add.reduceat(np.add.reduceat(blocks, rows, 0), columns, 1))
 
 
 def marked_per_tile(marked: BoolArray, side: int = TILE) -> tuple[IntArray, IntArray]:
@@ -115,22 +103,3 @@ def marked_per_tile(marked: BoolArray, side: int = TILE) -> tuple[IntArray, IntA
     inside[: marked.shape[0], : marked.shape[1]] = True
     count, number = (x.reshape(rows, side, columns, side).sum((1, 3)) for x in (padded, inside))
     return count, number
-
-
-def _rough(means: FloatArray) -> float:
-    """Most noise of a block that its second differences along rows and columns admit; inf in a picture too small."""
-    second = [means[:-2] - 2 * means[1:-1] + means[2:], means[:, :-2] - 2 * means[:, 1:-1] + means[:, 2:]]
-    values = np.abs(np.concatenate([part.ravel() for part in second]))
-    if not values.size:
-        return np.inf
-    # The variance of a - 2 b + c is six times that of each.
-    return float(MOST_OF_ROUGHNESS * MAD_TO_SIGMA * np.median(values) / np.sqrt(6))
-
-
-def _block_means(difference: FloatArray) -> FloatArray:
-    """[ceil(H / 4), ceil(W / 4), 3] means; blocks at the border average the pixels they have."""
-    height, width = difference.shape[:2]
-    starts = np.arange(0, height, BLOCK), np.arange(0, width, BLOCK)
-    sums = np.add.reduceat(np.add.reduceat(difference, starts[0], 0), starts[1], 1)
-    sizes = [np.minimum(BLOCK, n - s) for n, s in zip((height, width), starts, strict=True)]
-    return np.asarray(sums / np.outer(*sizes)[..., None])

@@ -68,7 +68,8 @@ class AnchorInsertion(Growth):
     def propose(self, after: Scene, work: FrameWork, rng: Rng) -> Rows | None:
         settings, views = self.config, range(len(work.cameras))
         scene = after.gaussians.map(torch.from_numpy)
-        images = np.stack([work.image(view).numpy() for view in views])
+        # In the colours of the scene: cameras of different colour response would agree on no point otherwise.
+        images = np.stack([work.scene_image(view).numpy() for view in views])
         masks = np.stack([self._lacking(scene, work, view) for view in views])
         hull = hull_points(
             images, masks, work.cameras, depth_range(after.gaussians.means, work), rays=settings.rays,

@@ -98,6 +98,7 @@ class StreamingOctree(Structure):
             return self
 
     traits = StructureTraits(idempotent=True, local=True)
+    grouping_settings = frozenset({"gate_level", "grouping"})
     auto_rules = OCTREE_RULES
 
     def seed(self, points: PointCloud, cameras: Cameras) -> Anchors:

@@ -23,8 +23,10 @@ class ViewSpaceGradient(ConfidenceEstimator):
     itself cancels and is never needed: the upstream gradient is 2 (gt_{t-1} - gt_t) / (3 H W).
 
     The result is z itself, not sigmoid(z); MAD is the plain median absolute deviation (no 1.4826, as printed).
-    Medians are taken over Gaussians that some camera sees. Gaussians that no camera sees, and all Gaussians of a frame
-    in which nothing changed (all |m| = 0; the printed formula would give p = 0.5), get ``floor``.
+    Medians are taken over the Gaussians that a change touches (|m| > 0; ``statistics: touched``). The engine asks for
+    gradients of the tiles that changed alone, so most of the Gaussians that a camera sees have |m| = 0 exactly; counted
+    with the others, as ``statistics: seen`` does, they make median and MAD zero, and every touched Gaussian saturates.
+    Gaussians that no change touches get ``floor`` (the printed formula would give p = 0.5 in a frame without change).
 
     The absolute epsilon of the paper acts in the units of m: here gradients of a mean over all pixels with respect to
     positions in half image widths (as in the released code). Then |m| is well below epsilon nearly everywhere, most
@@ -55,6 +57,10 @@ class ViewSpaceGradient(ConfidenceEstimator):
             default="robust",
             description="robust: paper; ratio: ln(m / median), released; minmax: paper's ablation; "
             "noise: m in units of what camera noise alone would give, minus noise_threshold",
+        )
+        statistics: Literal["touched", "seen"] = Field(
+            default="touched",
+            description="whose median and MAD; touched: Gaussians that a change moves; seen: all that a camera sees",
         )
         epsilon: float = Field(
             default=2e-4, ge=0, le=1e6, description="added to the MAD (robust); paper: 2e-4, in units of |m|"
@@ -104,8 +110,10 @@ class ViewSpaceGradient(ConfidenceEstimator):
         config = self.config
         magnitude, expected, seen = self._magnitudes(context)
         logits = torch.full_like(magnitude, config.floor)
-        if not bool(seen.any()) or float(magnitude.max()) == 0.0:
+        if not bool((magnitude > 0).any()):
             return logits.float()
+        if config.statistics == "touched":
+            seen = magnitude > 0
         values = self._perturb(magnitude[seen], context.index)
         if config.normalisation == "robust":
             chosen = robust(values, config.epsilon, config.epsilon_mode == "relative", config.limit)

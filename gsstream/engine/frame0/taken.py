@@ -1,0 +1,125 @@
+"""Frame 0 of another stream, taken over: the same scene, grouped by this method, so that methods can be compared."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import InputError
+from gsstream.core.frame import Frame, PointCloud
+from gsstream.core.rng import Rng
+from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.assembly.pending import refuse_pending
+from gsstream.engine.frame0.begin import arrange, decoded_anchors, exposure_from_meta, key_state, make_layout
+from gsstream.engine.state.stream_state import Step
+from gsstream.packet import PlayerState, StreamMeta, quantise_key
+from gsstream.structure.base import Anchors
+
+
+def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
+    """Start from the decoded frame 0 of another stream, grouped by this method.
+
+    Methods can then be compared on the same scene.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        first: what players have of that frame 0.
+        frame: training images of frame 0.
+        meta: what the key packet says about the run.
+        rng: random streams by name and frame.
+
+    Raises InputError when the recipe asks for another degree of spherical harmonics than the stream has, when a camera
+    that judges here took part in it, or when its colour maps are of other cameras.
+    """
+    refuse_pending(parts)
+    started = time.perf_counter()
+    _check_views(first.meta, frame.cameras, () if parts.recipe.data.leak == "training" else meta.test.ids)
+    if first.gaussians.sh_degree != parts.recipe.first_frame.degree:
+        raise InputError(
+            f"the first frame has spherical harmonics of degree {first.gaussians.sh_degree}, the recipe asks for "
+            f"{parts.recipe.first_frame.degree}; set first_frame.sh_degree={first.gaussians.sh_degree}"
+        )
+    # A delta may have put Gaussians between the positions that a key packet can say. They are grouped as players will
+    # have them, or a resumed run would find other groups.
+    held = replace(first, scene=replace(first.scene, gaussians=quantise_key(first.gaussians)))
+    gaussians = held.gaussians.map(torch.from_numpy)
+    anchors = taken_anchors(parts, held, frame)
+    hierarchy, levels, gaussians = arrange(parts, gaussians, anchors.levels, anchors)
+    layout = make_layout(hierarchy, levels, anchors)
+    exposure = exposure_from_meta(first.meta)
+    state, packet = key_state(parts, gaussians, layout, hierarchy, frame, meta, exposure, anchors.origin, rng)
+    metrics = {
+        "bytes": dict(packet.sizes),
+        "num_gaussians": len(gaussians),
+        "active_gaussians": len(gaussians),
+        "num_gates": len(layout.node_counts),
+        "active_gates": 0,
+        "iterations": 0,
+        "seconds": {"code": time.perf_counter() - started},
+    }
+    return Step(state, packet, "key", metrics)
+
+
+def _check_views(theirs: StreamMeta, cameras: Cameras, judges: tuple[str, ...]) -> None:
+    """Refuse a frame 0 that has learned from cameras that judge here, or whose colour maps are of other cameras."""
+    if seen := [name for name in judges if name in theirs.train.ids]:
+        raise InputError(
+            f"the first frame was reconstructed with {', '.join(seen)}, which would judge here; take one of a run with "
+            "the same data.split and data.test_cameras"
+        )
+    if exposure_from_meta(theirs) is not None and theirs.train.ids != cameras.ids:
+        raise InputError(
+            f"the first frame has colour maps of the training cameras {', '.join(theirs.train.ids)}, got "
+            f"{', '.join(cameras.ids)}; take one of a run with the same training cameras"
+        )
+
+
+def taken_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
+    """Return the grid on which a frame 0 of another stream goes on.
+
+    It is that stream's own, bit for bit, if a structure of the same settings laid it, or if this method's structure
+    needs no grid: then rates, steps and gates of both streams have the same units. Otherwise it is the grid that this
+    structure lays around the decoded centres, and each Gaussian gets the level of the nearest cell size.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        first: the decoded scene.
+        frame: training images of frame 0.
+    """
+    theirs = decoded_anchors(first)
+    if keeps_grid(parts, first.meta.recipe):
+        return theirs
+    grid = parts.structure.seed(cloud_of(first), frame.cameras)
+    sizes = theirs.cell_sizes[theirs.levels]
+    levels = (sizes.log()[:, None] - grid.cell_sizes.log()[None]).abs().argmin(1)
+    return replace(theirs, levels=levels, cell_sizes=grid.cell_sizes, origin=grid.origin)
+
+
+def keeps_grid(parts: Assembly, recipe: Mapping[str, Any]) -> bool:
+    """Return whether the grid of a stream serves this method's structure as it is.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        recipe: of the stream, as its key packet holds it.
+    """
+    if not parts.structure.claims().lays_grid:
+        return True
+    mine, theirs = parts.recipe.structure, recipe.get("structure", {})
+    grouping = parts.structure.grouping_settings
+
+    def laying(params: Mapping[str, Any]) -> dict[str, Any]:
+        return {key: value for key, value in params.items() if key not in grouping}
+
+    return bool(theirs.get("name") == mine.name and laying(theirs.get("params", {})) == laying(mine.params))
+
+
+def cloud_of(first: PlayerState) -> PointCloud:
+    """Return the centres of a decoded scene as points; their colour is unknown, grey."""
+    means = first.gaussians.means
+    return PointCloud(means, np.full_like(means, 0.5), "frame 0 of another stream")

@@ -54,7 +54,7 @@ class World:
         return self == IDENTITY
 
     def is_near(self, other: World) -> bool:
-        """Whether two worlds put everything within about a rig's extent at the same place, up to rounding."""
+        """Say whether two worlds put everything within a rig's extent at the same place, up to rounding."""
         if abs(self.scale - other.scale) > 1e-6 * self.scale:
             return False
         apart = np.abs(self.points(np.eye(3)) - other.points(np.eye(3))).max()

@@ -37,7 +37,7 @@ def _describe(playback: Playback) -> str:
     frames = playback.frames
     size = f"{meta.train.width} x {meta.train.height} pixels"
     rows = [
-        ("method", f"{meta.method} (recipe {meta.recipe_hash})"),
+        ("method", f"{meta.title} (recipe {meta.recipe_hash})"),
         ("recording", f"{meta.source} ({meta.extra.get('source_uri', 'unknown')})"),
         ("cameras", f"{len(meta.train)} train, {len(meta.test)} test, {size}, {meta.fps:g} frames/s"),
         ("Gaussians", f"{len(playback.state_at(frames[0]))} in frame {frames[0]}"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
 from collections.abc import Iterable, Sequence
 
 
@@ -11,6 +13,13 @@ def table(heading: Sequence[str], rows: Iterable[Sequence[str]], indent: str = "
     widths = [max(len(line[column]) for line in lines) for column in range(len(heading))]
     padded = ([cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines)
     return "\n".join(indent + "  ".join(cells).rstrip() for cells in padded)
+
+
+def fitting(text: str) -> str:
+    """Return a text whose tables fit the terminal that it is printed on; elsewhere it stays as it is."""
+    from gsstream.trade.measure.summary import fitted
+
+    return fitted(text, shutil.get_terminal_size().columns) if sys.stdout.isatty() else text
 
 
 def printable(text: object, keep: str = "") -> str:

@@ -21,7 +21,7 @@ Settings = Annotated[
     typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change a value, e.g. gate.temperature=0.3; repeatable."),
 ]
 BUDGET = typer.Option(
-    "--budget", metavar="LIMITS", help="Any of time=1.0s,size=20KB,memory=2GB (howto/budget.md)."
+    "--budget", metavar="LIMITS", help="Any of time=1.0s,size=20KB,rate=2Mbit/s,memory=2GB."
 )
 Frames = Annotated[int | None, typer.Option("--frames", help="Number of frames; all by default.")]
 Scale = Annotated[float | None, typer.Option("--scale", help="Shrink images by this factor in (0, 1].")]

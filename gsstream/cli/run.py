@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gsstream.cli import options
+from gsstream.cli.listing import fitting
 from gsstream.cli.serve import server_beside, serving
 from gsstream.cli.streams import stream_file
 from gsstream.core.errors import ComponentError, GsstreamError, SourceError
@@ -156,7 +157,7 @@ def _pictures(result: RunResult, recording: FrameSource, video: bool, quiet: boo
             warnings.simplefilter("ignore", SlowRendererWarning)
         written = write_gallery(result.out, recording, video=video)
     if not quiet:
-        typer.echo((result.out / SUMMARY).read_text(encoding="utf-8").rstrip())
+        typer.echo(fitting((result.out / SUMMARY).read_text(encoding="utf-8").rstrip()))
         typer.echo("\n".join(f"wrote {path}" for path in (result.out / "stream.gss", *written)))
         if result.interrupted:
             typer.echo(f"stopped after frame {result.frames - 1}; continue with --resume")

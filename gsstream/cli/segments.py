@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gsstream.cli import options
-from gsstream.cli.listing import plural, table
+from gsstream.cli.listing import fitting, plural, table
 from gsstream.cli.streams import stream_file
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def _encode(
     finally:
         recording.close()
     if not quiet:
-        typer.echo((out / SUMMARY).read_text(encoding="utf-8").rstrip())
+        typer.echo(fitting((out / SUMMARY).read_text(encoding="utf-8").rstrip()))
         typer.echo("\n".join(f"wrote {path}" for path in (out / "stream.gss", *written)))
     return result
 

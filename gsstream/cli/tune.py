@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gsstream.cli import options
-from gsstream.cli.listing import plural
+from gsstream.cli.listing import fitting, plural
 from gsstream.cli.streams import stream_file
 
 if TYPE_CHECKING:
     from gsstream.recipe.budget import Budget
+    from gsstream.recipe.model import Recipe
     from gsstream.trade.sweep.plan import Plan
     from gsstream.trade.sweep.tune import Trial
 
@@ -61,7 +62,7 @@ def tune(
     from gsstream.trade.sweep.tune import METHODS, pilot
 
     catalog = load_catalog()
-    limits = resolve_recipe(None, catalog.recipe_path, (), budget_overrides(budget)).recipe.budget
+    limits = _limits(resolve_recipe(None, catalog.recipe_path, (), budget_overrides(budget)).recipe, scene, data)
     known = catalog.names("method")
     tried = methods or [name for name in METHODS if name in known]
     place = Scene(
@@ -71,6 +72,22 @@ def tune(
     plan = make_plan(pilot(place, tried, limits, seed), Path(), catalog.recipe_path)
     trials = _run(plan, limits, out, data, first_frame, workers, quiet)
     _tell(plan, trials, limits, out, recording_uri(scene, data))
+
+
+def _limits(recipe: Recipe, scene: str, data: Path | None) -> Budget:
+    """The budget, with a rate turned into the size of a packet of this recording."""
+    from gsstream.engine.run.recording import open_recording
+    from gsstream.plugins.catalog import load_catalog
+    from gsstream.recipe.budget import sized
+    from gsstream.trade.jobs.folder import recording_uri
+
+    if recipe.budget.rate is None:
+        return recipe.budget
+    recording = open_recording(recording_uri(scene, data), recipe, load_catalog())
+    try:
+        return sized(recipe.budget, recording.info.fps)
+    finally:
+        recording.close()
 
 
 def _values(settings: tuple[str, ...] | list[str]) -> dict[str, Any]:
@@ -110,7 +127,7 @@ def _tell(plan: Plan, trials: list[Trial], limits: Budget, out: Path, source: st
     from gsstream.trade.sweep.tune import choose, nearest, tune_table, tuned_recipe
 
     chosen = choose(trials)
-    typer.echo(tune_table(trials, chosen))
+    typer.echo(fitting(tune_table(trials, chosen)))
     if chosen is not None:
         resolved = next(point.resolved for point in plan.points if point.variant == chosen.name)
         (out / "tuned.yaml").write_text(tuned_recipe(resolved), encoding="utf-8")

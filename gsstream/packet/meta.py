@@ -64,6 +64,11 @@ class StreamMeta:
         """First 16 hex digits of the SHA-256 of the recipe's canonical JSON."""
         return hash_recipe(self.recipe)
 
+    @property
+    def title(self) -> str:
+        """The method, and what was changed of its recipe, as far as the encoder said so."""
+        return str(self.extra.get("title") or self.method)
+
     def camera(self, name: str) -> Cameras:
         """Return the one camera with this id, test cameras first. Raises ShapeError naming the known ones."""
         for rig in (self.test, self.train):

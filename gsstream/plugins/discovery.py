@@ -13,6 +13,7 @@ import importlib.metadata
 import os
 import sys
 import textwrap
+import threading
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -27,6 +28,10 @@ from gsstream.spec import ENTRY_POINT_GROUP, ComponentSpec, MethodSpec
 
 Spec = ComponentSpec | MethodSpec
 HOOKS: dict[str, type[Spec]] = {"gsstream_components": ComponentSpec, "gsstream_methods": MethodSpec}
+
+
+#: Seconds after which a plugin that is still being imported is named.
+SLOW = 5.0
 
 
 class PluginFault(Exception):
@@ -59,7 +64,7 @@ class Discovered:
         """The error in one line, with its type where the message alone would not say it."""
         if self.error is None:
             return ""
-        text = textwrap.shorten(str(self.error) or "no message", 300, placeholder=" ...")
+        text = textwrap.shorten(_message(self.error) or "no message", 300, placeholder=" ...")
         return text if isinstance(self.error, PluginFault) else f"{type(self.error).__name__}: {text}"
 
     def unavailable(self, what: str) -> PluginUnavailable:
@@ -104,12 +109,36 @@ def _entry_points() -> list[tuple[importlib.metadata.EntryPoint, str, str]]:
 
 def _inspect(name: str, distribution: str, version: str, load: Any) -> Discovered:
     declared: list[Spec] = []
+    late = threading.Timer(SLOW, _say_who_is_slow, (name, distribution))
+    late.daemon = True
+    late.start()
     try:
         module = load()
         _collect(module, declared)
-    except (Exception, SystemExit) as error:  # containing whatever a plugin raises is the purpose of this function
+    except KeyboardInterrupt:
+        raise  # Ctrl-C, and nobody can tell a plugin that raises it from a person who has had enough
+    except BaseException as error:  # containing whatever a plugin raises is the purpose of this function
         return Discovered(name, distribution, version, None, error, tuple(declared))
+    finally:
+        late.cancel()
     return Discovered(name, distribution, version, tuple(declared))
+
+
+def _say_who_is_slow(name: str, distribution: str) -> None:
+    """A plugin that hangs at import takes everything with it; so its name is said while it does."""
+    print(
+        f"gsstream: the plugin {name!r} (from {distribution}) has been loading for {SLOW:g} seconds; "
+        "GSSTREAM_LOAD_PLUGINS=OTHER,NAMES leaves it out",
+        file=sys.stderr, flush=True,
+    )  # fmt: skip
+
+
+def _message(error: BaseException) -> str:
+    """What an error says, in characters that can be printed; a plugin's own class may fail even at that."""
+    try:
+        return str(error).encode("utf-8", "backslashreplace").decode()
+    except Exception as failure:
+        return f"its message cannot be read: {type(failure).__name__}"
 
 
 def _collect(module: ModuleType, declared: list[Spec]) -> None:

@@ -13,7 +13,10 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from gsstream.core.errors import RecipeError, suggest
 
+#: Bytes of an empty packet.
+LEAST_SIZE = 16
 SECONDS = {"s": 1.0, "ms": 1e-3, "min": 60.0}
+BITS = {"bit/s": 1.0, "kbit/s": 1e3, "Mbit/s": 1e6, "Gbit/s": 1e9}
 BYTES = {"B": 1.0, "bytes": 1.0, "KB": 1e3, "MB": 1e6, "GB": 1e9}
 
 
@@ -21,7 +24,7 @@ def read_quantity(text: str, units: dict[str, float]) -> float:
     """Read ``"1.5KB"`` as 1500.0. Raises ValueError that names the nearest unit."""
     match = re.fullmatch(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([^\s\d.]\S*)?\s*", text)
     if match is None:
-        example = "1.5s" if "s" in units else "20KB"
+        example = "1.5s" if "s" in units else "20KB" if "KB" in units else "2Mbit/s"
         raise ValueError(f"expected a number and a unit ({', '.join(units)}), e.g. {example}")
     unit = match[2]
     if unit is not None and unit not in units:
@@ -44,6 +47,17 @@ def _bytes(value: Any) -> Any:
     return math.floor(read_quantity(value, BYTES) if isinstance(value, str) else value)
 
 
+def _packet(value: Any) -> Any:
+    size = _bytes(value)
+    if isinstance(size, int) and not isinstance(size, bool) and size < LEAST_SIZE:
+        raise ValueError(f"expected a size greater than or equal to {LEAST_SIZE} bytes, those of an empty packet")
+    return size
+
+
+def _bits(value: Any) -> Any:
+    return read_quantity(value, BITS) if isinstance(value, str) else value
+
+
 def _text(units: dict[str, float]) -> Any:
     """What a schema knows of the text: number and unit."""
     return Annotated[str, Field(pattern=rf"^\s*\+?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?\s*({'|'.join(units)})?\s*$")]
@@ -52,8 +66,13 @@ def _text(units: dict[str, float]) -> Any:
 Seconds = Annotated[
     float, BeforeValidator(_seconds, json_schema_input_type=Annotated[float, Field(gt=0)] | _text(SECONDS))
 ]
-Packet = Annotated[int, BeforeValidator(_bytes, json_schema_input_type=Annotated[float, Field(ge=16)] | _text(BYTES))]
+Packet = Annotated[
+    int, BeforeValidator(_packet, json_schema_input_type=Annotated[float, Field(ge=LEAST_SIZE)] | _text(BYTES))
+]
 Memory = Annotated[int, BeforeValidator(_bytes, json_schema_input_type=Annotated[float, Field(ge=1)] | _text(BYTES))]
+
+
+Rate = Annotated[float, BeforeValidator(_bits, json_schema_input_type=Annotated[float, Field(gt=0)] | _text(BITS))]
 
 
 class Budget(BaseModel):
@@ -70,8 +89,13 @@ class Budget(BaseModel):
         "depend on the clock",
     )  # fmt: skip
     size: Packet | None = Field(
-        default=None, ge=16, description="bytes of a frame's packet, e.g. 20KB; an empty packet has 16"
+        default=None, ge=LEAST_SIZE, description="bytes of a frame's packet, e.g. 20KB; an empty packet has 16"
     )
+    rate: Rate | None = Field(
+        default=None, gt=0,
+        description="bits per second of playback, e.g. 2Mbit/s: no packet after the first is larger than its share, "
+        "rate / 8 / frames per second; a run turns it into that size",
+    )  # fmt: skip
     memory: Memory | None = Field(
         default=None, ge=1, description="peak resident memory of the process, e.g. 2GB; limits Gaussians and caches"
     )
@@ -85,12 +109,32 @@ class Budget(BaseModel):
     @property
     def limits_frames(self) -> bool:
         """Whether a frame has a limit of its own."""
-        return self.time is not None or self.size is not None
+        return self.time is not None or self.size is not None or self.rate is not None
 
     @property
     def limits_anything(self) -> bool:
         """Whether there is any limit."""
         return self.limits_frames or self.memory is not None
+
+
+def sized(budget: Budget, fps: float) -> Budget:
+    """Return the budget with the rate turned into a size of every packet, the smaller one where both are given.
+
+    Arguments:
+        budget: of a recipe.
+        fps: frames per second of the recording.
+
+    Raises RecipeError when a frame's share is smaller than an empty packet.
+    """
+    if budget.rate is None:
+        return budget
+    share = math.floor(budget.rate / 8 / fps)
+    if share < LEAST_SIZE:
+        raise RecipeError(
+            f"budget.rate: {budget.rate:g} bit/s are {budget.rate / 8 / fps:.1f} bytes for each of {fps:g} frames a "
+            f"second, and an empty packet has {LEAST_SIZE}; give at least {LEAST_SIZE * 8 * fps / 1000:.1f} kbit/s"
+        )
+    return budget.model_copy(update={"rate": None, "size": min(share, budget.size or share)})
 
 
 def budget_overrides(text: str) -> list[tuple[str, str]]:
@@ -102,7 +146,7 @@ def budget_overrides(text: str) -> list[tuple[str, str]]:
     for piece in text.split(","):
         key, equals, value = (part.strip() for part in piece.partition("="))
         if not equals or not key or not value:
-            raise RecipeError(f"--budget {text}: expected KEY=QUANTITY, e.g. time=1.0s,size=20KB,memory=2GB")
+            raise RecipeError(f"--budget {text}: expected KEY=QUANTITY, e.g. time=1.0s,size=20KB,rate=2Mbit/s")
         if key not in Budget.model_fields:
             raise RecipeError(f"--budget {text}: unknown key {key!r}{suggest(key, Budget.model_fields)}")
         if key in out:

@@ -113,7 +113,8 @@ def validate(
             elif item["type"] == "missing":
                 text = f"{name!r} is missing{_description(model, path)}"
             else:
-                text = f"{name}: {item['msg'][0].lower()}{item['msg'][1:]}, got {item['input']!r}"
+                reason = item["msg"].removeprefix("Value error, ")
+                text = f"{name}: {reason[0].lower()}{reason[1:]}, got {item['input']!r}"
             problems.append(f"{origin(full).where}: {text}")
         return None
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from gsstream.cli.main import run_command
-from gsstream.core.errors import ComponentError, InputError, ShapeError
+from gsstream.core.errors import ComponentError, InputError, RecipeError, ShapeError
 from gsstream.core.frame import Frame
 from gsstream.encode import Encoder, Listeners, encoder_for, encoder_of_rig, open_recording
 from gsstream.engine.frame0.begin import decoded_anchors
@@ -135,6 +135,21 @@ def test_a_scene_taken_over_is_grouped_as_players_have_it() -> None:
         given = parts.structure.build(moved.map(torch.from_numpy), decoded_anchors(state.player))
         apart += given.num_nodes != again.num_nodes
     assert apart, "the positions that were given are grouped otherwise: else this proves nothing"
+
+
+def test_a_rate_is_a_size_of_every_packet() -> None:
+    """60 kbit/s at 30 frames a second are 250 bytes a frame, which bind here."""
+    with open_recording(WORLD) as source:
+        assert source.info.fps == 30
+        made = [
+            encoder_for("s2gs-edge", source, {**TINY, **limit})
+            for limit in ({"budget.rate": "60kbit/s"}, {"budget.size": 250}, {})
+        ]
+        with pytest.raises(RecipeError, match=r"16 bytes|at least 3.8 kbit/s"):
+            encoder_for("s2gs-edge", source, {"budget.rate": "1kbit/s"})
+    rated, sized, free = ([one.encode(frame).packet.data for frame in frames()[:4]][1:] for one in made)
+    assert rated == sized
+    assert max(map(len, rated)) <= 250 < max(map(len, free))
 
 
 class BrokenGrowth:

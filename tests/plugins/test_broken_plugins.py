@@ -12,6 +12,7 @@ BROKEN = Path(__file__).parent / "broken"
 REASONS = {
     "raises_at_import": "ModuleNotFoundError: No module named 'a_package_nobody_has'",
     "exits_at_import": "SystemExit: no licence found",
+    "unspeakable": "Unspeakable: its message cannot be read: RuntimeError",
     "other_major": "from-the-future: built for component API 2.0, this gsstream speaks 1.0: upgrade gsstream",
     "newer_minor": "newer-gate: built for component API 1.3, this gsstream speaks 1.0: upgrade gsstream",
     "older_major": "from-the-past: built for component API 0.9, this gsstream speaks 1.0: ask its author for a "

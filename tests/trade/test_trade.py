@@ -238,7 +238,7 @@ def test_contact_sheet_shows_truth_decoded_error_and_gates(tmp_path):
     stream = make_stream(tmp_path / "s.gss")
     out = sheet_of_stream(stream, Rendered(stream), [0, 1, 2], tmp_path / "sheet.png", camera="c", renderer=NUMPY)
     sheet = np.asarray(Image.open(out)).astype(int)
-    left, top = sheet.shape[1] - 8 - 3 * 52, 18
+    left, top = sheet.shape[1] - 8 - 3 * 52, 36
     rows, columns = (slice(top + r * 44, top + r * 44 + 40) for r in range(4)), range(3)
     cell = [[sheet[row, left + c * 52 : left + c * 52 + 48] for c in columns] for row in rows]
     for column in range(3):

@@ -17,6 +17,7 @@ from gsstream.core.part import Part
 from gsstream.engine.assembly.checks import Checks, wanted_checks
 from gsstream.engine.assembly.guard import guard, plain
 from gsstream.engine.assembly.heeded import unheeded
+from gsstream.engine.assembly.title import title
 from gsstream.engine.assembly.where import Where
 from gsstream.gate.base import GateSampler
 from gsstream.growth.base import Growth
@@ -61,6 +62,7 @@ class Assembly:
         pending: paths of values that are still ``auto``; the parts have their defaults there
             (``engine.auto.rules.settle``).
         chosen: key -> what the scene decided.
+        title: the method and what was changed of its recipe, for tables and pictures.
         where: the frame and iteration that errors name.
 
     Every part is behind a guard (:class:`gsstream.engine.assembly.guard.Guarded`), so no caller has to be careful.
@@ -84,6 +86,7 @@ class Assembly:
     checks: Checks = Checks.FRAME
     pending: tuple[KeyPath, ...] = ()
     chosen: Mapping[str, Choice] = field(default_factory=dict)
+    title: str = ""
     where: Where = field(default_factory=Where, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -136,10 +139,8 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
             refs[slot] = _written_out(slot, ref, built, pending)
     loss = _loss(resolved, catalog, problems)
     if "stepper" in parts:
-        name = resolved.recipe.stepper.name
-        hint = f"the stepper {name!r} does not read it; its own settings: gsstream plugins show stepper/{name}"
-        paths = unheeded(resolved.recipe.model_copy(update=refs), parts["stepper"], parts, pending)
-        problems += [f"{resolved.near(path).where}: {'.'.join(path)}: {hint}" for path in paths]
+        paths = list(unheeded(resolved.recipe.model_copy(update=refs), parts["stepper"], parts, pending))
+        problems += _unread(paths, resolved)
     join_problems(problems)
     parts["loss"] = loss
     parts["optimiser"] = _optimiser(catalog)
@@ -147,8 +148,23 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
     recipe = resolved.recipe.model_copy(update=refs)
     return Assembly(
         recipe=recipe, origins=resolved.origins, distributions=tuple(owners), pending=tuple(pending), checks=level,
-        **parts,
+        title=title(resolved.recipe, catalog), **parts,
     )  # fmt: skip
+
+
+def _unread(paths: list[KeyPath], resolved: ResolvedRecipe) -> list[str]:
+    """What to say about keys that the stepper does not read: each, or in one line where it is the whole method's."""
+    name, base = resolved.recipe.stepper.name, resolved.recipe.method
+    from_base = [path for path in paths if resolved.near(path).label == f"method {base}"]
+    if len(from_base) > 2:
+        where = resolved.near(("stepper", "name")).where
+        some = ", ".join(".".join(path) for path in from_base[:3])
+        return [
+            f"{where}: the stepper {name!r} reads none of {len(from_base)} settings that the method {base!r} brings "
+            f"({some}, ...); put it in place of another method: --method dense --set stepper={name}"
+        ]
+    hint = f"the stepper {name!r} does not read it; its own settings: gsstream plugins show stepper/{name}"
+    return [f"{resolved.near(path).where}: {'.'.join(path)}: {hint}" for path in paths]
 
 
 def _written_out(slot: str, ref: ComponentRef, part: Part, pending: list[KeyPath]) -> ComponentRef:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from inspect import getattr_static
+from pathlib import Path
+from traceback import walk_tb
 from typing import Any, TypeVar, cast
 
 from gsstream.core.errors import GsstreamError, InputError, ShapeError
@@ -38,7 +40,17 @@ def blaming(slot: str, part: object, where: Where) -> Iterator[None]:
             raise fault(str(error), slot, part, where) from error
         raise
     except Exception as error:
-        raise fault(f"{type(error).__name__}: {error}", slot, part, where) from error
+        raise fault(f"{type(error).__name__}: {error}{_line_of(error, part)}", slot, part, where) from error
+
+
+def _line_of(error: Exception, part: object) -> str:
+    """The line of the part's own package that was being run, as `` (gate.py:42)``."""
+    package = type(part).__module__.partition(".")[0]
+    found = ""
+    for frame, line in walk_tb(error.__traceback__):
+        if str(frame.f_globals.get("__name__", "")).partition(".")[0] == package:
+            found = f" ({Path(frame.f_code.co_filename).name}:{line})"
+    return found
 
 
 class Guarded:

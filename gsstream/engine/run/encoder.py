@@ -30,6 +30,7 @@ from gsstream.engine.step.tools import RunTools
 from gsstream.method.base import Step
 from gsstream.metrics import peak_memory_mb
 from gsstream.packet import EncodedPacket, PlayerState, StreamMeta
+from gsstream.recipe.budget import sized
 from gsstream.source.base import SourceInfo
 
 #: Makes the seeds of frame 0 from its training images.
@@ -72,12 +73,14 @@ class Encoder:
         self, parts: Assembly, info: SourceInfo, seeds: Seeds | None = None, *, first_frame: PlayerState | None = None,
         listeners: Listeners | None = None, place: bool = False,
     ) -> None:  # fmt: skip
-        self.parts, self.info, self._place = parts, info, place
+        held = sized(parts.recipe.budget, info.fps)
+        self.parts = replace(parts, recipe=parts.recipe.model_copy(update={"budget": held}))
+        self.info, self._place = info, place
         self.rng = Rng(parts.recipe.seed)
         self.near = parts.recipe.near * info.train.extent
         #: State after the last frame; None before frame 0.
         self.state: Any = None
-        self.controller = Controller(parts.recipe.budget, parts.recipe.stream)
+        self.controller = Controller(held, parts.recipe.stream)
         self._first = None if first_frame is None else in_world(first_frame, info.world)
         self._seeds, self._listeners = seeds or self._swept, listeners or Listeners()
 
@@ -125,7 +128,8 @@ class Encoder:
         Raises OutputError when the recipe or the recording is not the one the stream was written with.
         """
         if (extra := stream_extra(stream)) is not None:
-            self.parts = recall(self.parts, extra)
+            # The title, too, is what the stream says: equal recipes may be called otherwise by another version.
+            self.parts = replace(recall(self.parts, extra), title=str(extra.get("title", self.parts.title)))
         # Checked before the replay, which with the parts of another recipe would fail with a less helpful message.
         if not check_stream(self.parts, stream, self.info) or (last is not None and last < 0):
             return None
@@ -187,7 +191,7 @@ class Encoder:
             fps=info.fps,
             background=recipe.background,
             plugins={name: version(name) for name in sorted(distributions)},
-            extra={"source_uri": info.uri, "licence": info.licence, **record(self.parts)},
+            extra={"source_uri": info.uri, "licence": info.licence, "title": self.parts.title, **record(self.parts)},
             world=info.world,
         )
 

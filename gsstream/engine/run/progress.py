@@ -28,8 +28,8 @@ class RunProgress:
         if self._live:
             columns = [TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}")]
             self._bar = Progress(
-                *columns, TextColumn("{task.fields[note]}"), TimeElapsedColumn(), TimeRemainingColumn(),
-                console=self._console,
+                *columns, TextColumn("{task.fields[note]}"), TimeElapsedColumn(), TextColumn("gone,"),
+                TimeRemainingColumn(), TextColumn("left"), console=self._console,
             )  # fmt: skip
             self._bar.start()
         return self
@@ -87,7 +87,8 @@ def frame_line(metrics: Mapping[str, Any], total: int | None) -> str:
     if values:
         extra = f" (moving {sum(moving) / len(moving):.2f})" if moving else ""
         parts.append(f"{sum(values) / len(values):.2f} dB{extra}")
-    parts.append(f"{sum(metrics['bytes'].values()) / 1000:.1f} KB")
+    size = sum(metrics["bytes"].values())
+    parts.append(f"{size / 1000:.1f} KB" if size >= 100 else f"{size} B")
     parts.append(f"{sum(metrics['seconds'].values()):.2f} s")
     if metrics["num_gaussians"]:
         parts.append(f"{100 * metrics['active_gaussians'] / metrics['num_gaussians']:.1f} % active")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from gsstream.metrics import slope_per_100
 from gsstream.trade.measure.records import FrameRecord, mean
@@ -69,6 +69,8 @@ def summarise(records: Sequence[FrameRecord]) -> Summary:
     )
 
 
+#: Frames of the shortest run whose slope is shown: over fewer, dB per 100 frames is noise times a large number.
+LEAST_FOR_SLOPE = 10
 _COLUMNS: Mapping[str, tuple[str, str]] = {
     "frames": ("T", "{:d}"), "psnr_first": ("PSNR 0", "{:.2f}"), "psnr": ("PSNR", "{:.2f}"),
     "psnr_slope": ("dB/100", "{:+.2f}"), "psnr_moving": ("moving", "{:.2f}"),
@@ -83,8 +85,30 @@ def summary_table(runs: Mapping[str, Summary]) -> str:
     """Return a Markdown table, one row per run; "-" where nothing was measured."""
     rows = [["run", *(title for title, _ in _COLUMNS.values())]]
     for name, summary in runs.items():
-        rows.append([name, *(_cell(getattr(summary, key), form) for key, (_, form) in _COLUMNS.items())])
+        known = replace(summary, psnr_slope=math.nan) if summary.frames < LEAST_FOR_SLOPE else summary
+        rows.append([name, *(_cell(getattr(known, key), form) for key, (_, form) in _COLUMNS.items())])
     return format_table(rows)
+
+
+def fitted(text: str, width: float) -> str:
+    """Return a text whose Markdown tables that are wider than a terminal stand upright: a line for each column.
+
+    Arguments:
+        text: lines, some of which are tables as :func:`format_table` makes them.
+        width: characters of a line.
+    """
+    lines, out = text.splitlines(), list[str]()
+    while lines:
+        count = next((i for i, line in enumerate(lines) if not line.startswith("|")), len(lines))
+        if count > 1 and max(map(len, lines[:count])) > width:
+            rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[:count]]
+            upright = format_table(list(zip(rows[0], *rows[2:], strict=True)))
+            out += upright.splitlines()
+        else:
+            count = max(count, 1)
+            out += lines[:count]
+        lines = lines[count:]
+    return "\n".join(out)
 
 
 def format_table(rows: Sequence[Sequence[str]]) -> str:
@@ -100,4 +124,6 @@ def format_table(rows: Sequence[Sequence[str]]) -> str:
 
 
 def _cell(value: float, form: str) -> str:
+    if form == "{:.1f}" and 0 < value < 0.1:
+        form = "{:.3f}"  # a packet of 16 bytes is not one of none
     return form.format(value) if math.isfinite(value) else "-"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from gsstream.trade.report.document import Block, Heading, Picture, Table, Text
 from gsstream.trade.report.figures import curve_groups, frame_curves, measured_costs, pareto_figure
@@ -78,7 +79,7 @@ def _facts(data: SweepData) -> list[Block]:
         notes.append(f"Not measured: {', '.join(missing)} (no counter on this machine, or several workers shared it).")
     if waited(data.groups):
         notes.append(_WAITED)
-    if len(machines) > 1:
+    if not one_machine([data.table.machines[key]["facts"] for key in machines]):
         notes.append("The runs are of several machines or states of the code: their seconds do not compare.")
     return [Text(" ".join(notes)), Table("Where it ran", [head, *lines])]
 
@@ -96,8 +97,33 @@ def _scene(data: SweepData, scene: str) -> list[Block]:
         blocks.append(beside_ours(paper_table(name), groups, scene, rows))
     curves = curve_groups(groups)
     blocks.append(Picture(f"{scene}-frames.png", frame_curves(curves, f"{scene}, seed {curves[0].runs[0].seed}"),
-                          f"Quality, bytes and seconds of every frame on {scene}"))  # fmt: skip
+                          f"Quality, bytes and seconds of every frame on {scene}{_some(curves, groups)}"))  # fmt: skip
     return blocks
+
+
+def one_machine(facts: Sequence[Mapping[str, Any]]) -> bool:
+    """Say whether runs were made on one machine in one state.
+
+    Runs with other plugins list other distributions; they compare as long as those that both have are the same.
+
+    Arguments:
+        facts: of each machine that the table knows.
+    """
+    for name in {name for one in facts for name in one} - {"distributions"}:
+        if any(one.get(name) != facts[0].get(name) for one in facts):
+            return False
+    versions: dict[str, str] = {}
+    return all(versions.setdefault(n, v) == v for one in facts for n, v in one["distributions"].items())
+
+
+def _listed(names: Sequence[str], most: int = 8) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more if names else "none"
+
+
+def _some(curves: Sequence[Group], groups: Sequence[Group]) -> str:
+    """What a picture does not show."""
+    return "" if len(curves) == len(groups) else f": {len(curves)} of {len(groups)} recipes, the others would hide them"
 
 
 def _noise(groups: Sequence[Group]) -> str:
@@ -117,16 +143,16 @@ def _noise(groups: Sequence[Group]) -> str:
 
 def _fronts(groups: Sequence[Group]) -> Table:
     """Who is on which front, and where the variants as they are stand."""
-    rows = [["quality", "cost", "front, cheapest first (knee in brackets)", "variants not on it"]]
+    rows = [["quality", "cost", "front, cheapest first (knee in brackets)", "not on it"]]
     for good in GOODS:
         for cost in measured_costs(groups):
             points = [(group.mean(cost), group.mean(good)) for group in groups]
             front = pareto_front(points)
             at = knee([points[i] for i in front])
             names = [f"[{groups[i].label}]" if n == at else groups[i].label for n, i in enumerate(front)]
-            off = [groups[i].label for i in range(len(groups)) if i not in front and not groups[i].axes]
+            off = [groups[i].label for i in range(len(groups)) if i not in front]
             title = "whole image" if good == "psnr" else "moving pixels"
-            rows.append([title, BY_KEY[cost].title, " < ".join(names), ", ".join(off) or "none"])
+            rows.append([title, BY_KEY[cost].title, " < ".join(names), _listed(off)])
     return Table("Pareto fronts", rows)
 
 

@@ -59,8 +59,8 @@ class Column:
         return (self.truth, self.decoded, error, self.active, *close)
 
 
-def contact_sheet(columns: Sequence[Column]) -> Image.Image:
-    """Draw the sheet; images keep their pixels. Raises InputError for an empty list."""
+def contact_sheet(columns: Sequence[Column], heading: str = "") -> Image.Image:
+    """Draw the sheet under a heading; images keep their pixels. Raises InputError for an empty list."""
     if not columns:
         raise InputError("a contact sheet needs at least one frame")
     height, width = columns[0].truth.shape[:2]
@@ -69,17 +69,22 @@ def contact_sheet(columns: Sequence[Column]) -> Image.Image:
     shown = [row for row in range(len(_LABELS)) if any(column[row] is not None for column in pictures)]
     labels = [_LABELS[row] for row in shown]
     left = 2 * _MARGIN + max(int(_font().getlength(label)) for label in labels)
-    size = (left + len(columns) * (width + _GAP) + _MARGIN, _TEXT + len(labels) * (height + _GAP) + _MARGIN)
+    right = left + len(columns) * (width + _GAP) + _MARGIN
+    said = _wrapped(heading, right - 2 * _MARGIN)
+    top = _TEXT * (1 + len(said))
+    size = (right, top + len(labels) * (height + _GAP) + _MARGIN)
     sheet = Image.new("RGB", size, "white")
     draw = ImageDraw.Draw(sheet)
+    for number, line in enumerate(said):
+        draw.text((_MARGIN, 3 + number * _TEXT), line, "black", _font())
     for row, label in enumerate(labels):
-        draw.text((_MARGIN, _TEXT + row * (height + _GAP) + height // 2 - 6), label, "black", _font())
+        draw.text((_MARGIN, top + row * (height + _GAP) + height // 2 - 6), label, "black", _font())
     for index, column in enumerate(columns):
         x = left + index * (width + _GAP)
-        draw.text((x, 3), column.title, "black", _font())
+        draw.text((x, top - _TEXT + 3), column.title, "black", _font())
         for row, which in enumerate(shown):
             if (image := pictures[index][which]) is not None:
-                sheet.paste(Image.fromarray(to_bytes(image)), (x, _TEXT + row * (height + _GAP)))
+                sheet.paste(Image.fromarray(to_bytes(image)), (x, top + row * (height + _GAP)))
     return sheet
 
 
@@ -120,7 +125,7 @@ def sheet_of_stream(
             columns.append(Column(title, truth, image, active, alone, changed_most(truth, first)))
     out = Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
-    contact_sheet(columns).save(out)
+    contact_sheet(columns, f"{meta.title} on {meta.source}, camera {rig.ids[0]}").save(out)
     return out
 
 
@@ -165,6 +170,18 @@ def paint_gates(state: PlayerState) -> Gaussians[FloatArray]:
         gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities,
         ((color - 0.5) / SH0)[:, None].astype(np.float32), np.zeros_like(gaussians.shN),
     )  # fmt: skip
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    """A text in lines of at most ``width`` pixels, broken between words."""
+    lines: list[str] = []
+    for word in text.split():
+        longer = f"{lines[-1]} {word}" if lines else word
+        if lines and _font().getlength(longer) <= width:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    return lines
 
 
 def _font() -> Any:

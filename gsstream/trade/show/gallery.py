@@ -32,7 +32,7 @@ def write_gallery(out: Path, source: FrameSource, *, video: bool = True) -> list
         video: also an MP4 of the first camera, when PyAV is installed (extra ``video``).
     """
     with Playback(out / STREAM) as playback:
-        frames, method = playback.frames, playback.meta.method
+        frames, method = playback.frames, playback.meta.title
         name = (playback.meta.test.ids or playback.meta.train.ids)[0]
         judges = judges_line(playback.meta)
     records = read_records(out / METRICS)

@@ -172,14 +172,15 @@ def tune_table(trials: Sequence[Trial], chosen: Trial | None) -> str:
     order = sorted(trials, key=lambda t: (not t.fits, -t.quality if math.isfinite(t.quality) else math.inf))
     for trial in order:
         if trial.error is not None:
-            rows.append([trial.name, *["-"] * 8, f"failed: {trial.error}"])
+            rows.append([trial.name, *["-"] * 8, "failed"])
             continue
         kb, sec = [size / 1000 for size in trial.sizes], trial.seconds
         numbers = [trial.psnr, trial.moving, mean(kb), max(kb), mean(sec), max(sec), trial.memory / 1e6]
         forms = ["{:.2f}", "{:.2f}", "{:.1f}", "{:.1f}", "{:.2f}", "{:.2f}", "{:.0f}"]
         cells = [form.format(n) if math.isfinite(n) else "-" for n, form in zip(numbers, forms, strict=True)]
         rows.append([trial.name, f"{trial.inside}/{trial.frames}", *cells, "<- chosen" if trial is chosen else ""])
-    return format_table(rows)
+    failed = [f"{trial.name} failed: {trial.error}" for trial in trials if trial.error is not None]
+    return "\n".join([format_table(rows), *failed])
 
 
 def tuned_recipe(resolved: ResolvedRecipe) -> str:

@@ -18,6 +18,7 @@ from typing import Any
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame as Frame
+from gsstream.core.world import own_world, snapped
 from gsstream.engine.assembly.assemble import Assembly as Assembly
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.frame0.points import gather_points
@@ -31,6 +32,7 @@ from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe as Recipe
 from gsstream.source.base import FrameSource as FrameSource
 from gsstream.source.base import SourceInfo
+from gsstream.source.canonical import CanonicalSource, world_of
 
 
 def recipe_for(method: str, settings: Mapping[str, Any] | None = None) -> Recipe:
@@ -50,6 +52,8 @@ def recipe_for(method: str, settings: Mapping[str, Any] | None = None) -> Recipe
 def open_recording(uri: str, recipe: Recipe | None = None) -> Iterator[FrameSource]:
     """Open a recording, and close it at the end of the block.
 
+    Its cameras and points come in coordinates that its rig defines; ``source.info.world`` leads back to the files'.
+
     Arguments:
         uri: "demo", "synthetic:...", a folder: what ``--source`` takes.
         recipe: its scale and its split; None: everything as recorded.
@@ -63,6 +67,17 @@ def open_recording(uri: str, recipe: Recipe | None = None) -> Iterator[FrameSour
         source.close()
 
 
+def in_own_world(source: FrameSource) -> FrameSource:
+    """Return a recording in the coordinates that its rig defines, so that units and origin of its files do not matter.
+
+    :func:`open_recording` has done it already; a source of your own has not.
+
+    Arguments:
+        source: an open recording, in any coordinates.
+    """
+    return CanonicalSource(source, world_of(source))
+
+
 def encoder_for(
     method: str, source: FrameSource, settings: Mapping[str, Any] | None = None, listeners: Listeners | None = None
 ) -> Encoder:
@@ -70,7 +85,7 @@ def encoder_for(
 
     Arguments:
         method: a name of ``gsstream methods``.
-        source: an open recording; its points seed frame 0.
+        source: an open recording, of :func:`open_recording` or :func:`in_own_world`; its points seed frame 0.
         settings: as for :func:`recipe_for`.
         listeners: what is told of the work.
     """
@@ -88,6 +103,9 @@ def encoder_of_rig(
 ) -> Encoder:
     """Return an encoder of images that come from anywhere; frame 0 is seeded by a plane sweep over them.
 
+    The stream lies in coordinates that the rig defines: cameras of frames are taken there by :meth:`Encoder.at_near`,
+    and what a player shows is taken back by ``meta.world``.
+
     Arguments:
         method: a name of ``gsstream methods``.
         cameras: the training cameras; frames bring their images in this order.
@@ -95,5 +113,8 @@ def encoder_of_rig(
         settings: as for :func:`recipe_for`.
         name: what the stream says of its origin.
     """
-    info = SourceInfo(name, f"rig:{name}", None, fps, cameras, cameras.select([]))
-    return Encoder(assemble(recipe_for(method, settings), load_catalog()), info)
+    world = own_world(cameras)
+    info = SourceInfo(
+        name, f"rig:{name}", None, fps, snapped(world.cameras_back(cameras)), cameras.select([]), world=world
+    )
+    return Encoder(assemble(recipe_for(method, settings), load_catalog()), info, place=True)

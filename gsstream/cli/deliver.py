@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -20,6 +20,10 @@ def export(
     ] = "ply",
     frames: Frames = None,
     max_memory: MaxMemory = None,
+    origin: Annotated[
+        Literal["recording", "local"],
+        typer.Option("--origin", help="Positions in the recording's coordinates, or relative to the place of its rig."),
+    ] = "recording",
 ) -> None:
     """Write decoded frames to files that other programs open."""
     first, last = frame_range(frames)
@@ -30,7 +34,9 @@ def export(
 
     with Playback(file, max_memory=most) as playback:
         chosen, damage = playback.sound(first, last)
-    written = export_stream(file, out, kind, frames=chosen, progress=progress_on("frame"), max_memory=most)
+    written = export_stream(
+        file, out, kind, frames=chosen, progress=progress_on("frame"), max_memory=most, origin=origin
+    )
     size = sum(path.stat().st_size for path in written)
     typer.echo(f"{out}: {plural(len(written), 'file')}, {size / 1e6:.1f} MB")
     fail_with(damage)

@@ -57,7 +57,14 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class PointCloud:
-    """P coloured points. ``xyz`` [P, 3] float32 scene units, ``rgb`` [P, 3] float32 in [0, 1]; ``origin``: whence."""
+    """P coloured points.
+
+    Arguments:
+        xyz: [P, 3] scene units; float32 in a run, and as exact as its files in a source (far from the origin of its
+            coordinates float32 would round).
+        rgb: [P, 3] float32 in [0, 1].
+        origin: whence.
+    """
 
     xyz: FloatArray
     rgb: FloatArray

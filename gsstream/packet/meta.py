@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from gsstream import __version__
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.names import check_camera_ids
+from gsstream.core.world import IDENTITY, World
 
 MAX_SIDE, MAX_PIXELS = 1 << 16, 1 << 27
 LEAST_FPS, MOST_FPS = 0.01, 100_000.0
@@ -41,6 +42,7 @@ class StreamMeta:
         plugins: distribution -> version of every plugin that took part.
         conventions: how the numbers are to be read.
         version: gsstream that wrote the stream.
+        world: where the stream's coordinates lie in those of the recording.
         extra: anything else, plain JSON values.
     """
 
@@ -55,6 +57,7 @@ class StreamMeta:
     conventions: Mapping[str, str] = field(default_factory=lambda: dict(CONVENTIONS))
     version: str = __version__
     extra: Mapping[str, Any] = field(default_factory=dict)
+    world: World = IDENTITY
 
     @property
     def recipe_hash(self) -> str:
@@ -94,6 +97,8 @@ def meta_to_json(meta: StreamMeta) -> bytes:
         "recipe_hash": meta.recipe_hash, "plugins": meta.plugins, "fps": meta.fps, "background": meta.background,
         "conventions": meta.conventions, "train": _rig(meta.train), "test": _rig(meta.test), "extra": meta.extra,
     }  # fmt: skip
+    if not meta.world.is_identity:
+        data["world"] = asdict(meta.world)
     return json.dumps(data, separators=(",", ":"), allow_nan=False, default=_plain).encode()
 
 
@@ -106,6 +111,7 @@ def meta_from_json(data: bytes) -> StreamMeta:
             train=_cameras(value["train"]), test=_cameras(value["test"]), fps=_number(value["fps"]),
             background=_color(value["background"]), plugins=_object(value["plugins"]),
             conventions=_object(value["conventions"]), version=_text(value["version"]), extra=_object(value["extra"]),
+            world=_world(value["world"]) if "world" in value else IDENTITY,
         )  # fmt: skip
         _check(meta)
         recorded, computed = value["recipe_hash"], meta.recipe_hash
@@ -133,6 +139,7 @@ def _check(meta: StreamMeta) -> None:
                 raise ValueError(f"image size {rig.width} x {rig.height}: expected 1 to {MAX_SIDE} pixels a side")
         if rig.width * rig.height > MAX_PIXELS:
             raise ValueError(f"image size {rig.width} x {rig.height}: expected at most {MAX_PIXELS} pixels")
+    meta.world.validate()
     for name, version in meta.plugins.items():
         _text(name), _text(version)
     for key in ("source_uri", "licence", "title"):
@@ -182,6 +189,11 @@ def _cameras(value: Any) -> Cameras:
     cameras = Cameras(ids, viewmats, Ks, _whole(value["width"]), _whole(value["height"]), _number(value["near"]))
     cameras.validate()
     return cameras
+
+
+def _world(value: Any) -> World:
+    rotation, offset = (tuple(_number(v) for v in value[key]) for key in ("rotation", "offset"))
+    return World(rotation, offset, _number(value["scale"]))
 
 
 def _color(value: Any) -> tuple[float, float, float]:

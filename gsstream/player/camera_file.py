@@ -5,9 +5,9 @@
     {"width": 640, "height": 360, "K": [[600, 0, 320], [0, 600, 180], [0, 0, 1]],
      "cameras": [{"w2c": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]}, ...]}
 
-``w2c`` and ``K`` are those of cameras.json: world to camera, OpenCV axes, pixels. ``K`` may stand in a camera, too.
-Without width, height and K the cameras are those of the stream. With as many cameras as pictures each shows one;
-otherwise the path runs evenly from the first to the last.
+``w2c`` and ``K`` are those of cameras.json: world to camera in the recording's coordinates, OpenCV axes, pixels. ``K``
+may stand in a camera, too. Without width, height and K the cameras are those of the stream. With as many cameras as
+pictures each shows one; otherwise the path runs evenly from the first to the last.
 """
 
 from __future__ import annotations
@@ -22,17 +22,19 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError, ShapeError
 from gsstream.core.shapes import FloatArray
+from gsstream.core.world import IDENTITY, World
 
 _MOST = 1_000_000
 
 
-def read_path(path: Path, rig: Cameras, number: int) -> Cameras:
+def read_path(path: Path, rig: Cameras, number: int, world: World = IDENTITY) -> Cameras:
     """Return ``number`` cameras along the path of a file.
 
     Arguments:
         path: of the file.
         number: of cameras, at least 1.
         rig: cameras of the stream; size, intrinsics and near plane are its first camera's where the file has none.
+        world: where the stream's coordinates lie in the recording's, in which the file's poses are.
 
     Raises InputError naming file and camera for anything that is not such a path.
     """
@@ -51,7 +53,8 @@ def read_path(path: Path, rig: Cameras, number: int) -> Cameras:
         named.validate()
     except ShapeError as error:
         raise InputError(f"{path}: {error}") from error
-    return named if len(named) == number else _between(named, number)
+    placed = replace(world.cameras_back(named), near=rig.near)
+    return placed if len(placed) == number else _between(placed, number)
 
 
 def _load(path: Path) -> dict[str, Any]:

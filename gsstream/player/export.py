@@ -8,9 +8,16 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
+
+import numpy as np
 
 from gsstream.core.errors import InputError, OutputError
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.shapes import FloatArray
+from gsstream.core.world import IDENTITY, World
 from gsstream.player.playback import Playback
 from gsstream.player.ply import write_ply
 
@@ -23,6 +30,7 @@ _CONVERTER = "splat-transform"
 def export(
     stream: str | os.PathLike[str], out: str | os.PathLike[str], kind: str, *, frames: Sequence[int] | None = None,
     progress: Callable[[int, int], None] | None = None, max_memory: int | None = None,
+    origin: Literal["recording", "local"] = "recording",
 ) -> list[Path]:  # fmt: skip
     """Write one file per frame into the folder ``out``; returns the files.
 
@@ -34,10 +42,13 @@ def export(
             frame indices, times and the cameras.
         frames: frame indices; default: all up to the first damaged packet.
         max_memory: bytes that decoding a frame may take at most; default: what the format allows.
+        origin: ``recording``: the recording's coordinates; ``local``: the same axes and unit, but positions relative
+            to the world's offset, which ``sequence.json`` and the headers of the PLYs state. The files hold float32,
+            which is too coarse for a scene far from the recording's origin.
 
-    Raises InputError for an unknown format or frame and beyond ``max_memory``, PacketError for a damaged stream
-    (without ``frames``: once the files before the damage are written), OutputError when the folder cannot be written
-    or the converter is missing or fails.
+    Raises InputError for an unknown format or frame, for positions that float32 cannot hold and beyond ``max_memory``,
+    PacketError for a damaged stream (without ``frames``: once the files before the damage are written), OutputError
+    when the folder cannot be written or the converter is missing or fails.
     """
     if kind not in FORMATS:
         raise InputError(f"cannot export to {kind!r}: expected one of {', '.join(FORMATS)}")
@@ -50,19 +61,21 @@ def export(
         chosen = list(sound)
         for frame in chosen:
             playback.entry(frame)
+        world = _world_of_files(playback, chosen, origin)
+        comments = [f"offset {' '.join(map(repr, playback.meta.world.offset))}"] if origin == "local" else []
         try:
             folder.mkdir(parents=True, exist_ok=True)
             for done, frame in enumerate(chosen, 1):
                 file = folder / f"{frame:06d}.{'spz' if kind == 'spz' else 'ply'}"
                 if converter:
-                    _write_spz(file, playback, frame, converter)
+                    _write_spz(file, world.gaussians(playback.state_at(frame)), converter)
                 else:
-                    write_ply(file, playback.state_at(frame))
+                    write_ply(file, world.gaussians(playback.state_at(frame)), comments)
                 written.append(file)
                 if progress is not None:
                     progress(done, len(chosen))
             if kind == "sequence":
-                (folder / "sequence.json").write_text(_description(playback, chosen), encoding="utf-8")
+                (folder / "sequence.json").write_text(_description(playback, chosen, world), encoding="utf-8")
         except OSError as error:
             raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
     if damage is not None:
@@ -83,10 +96,31 @@ def find_converter() -> str:
     return found
 
 
-def _write_spz(file: Path, playback: Playback, frame: int, converter: str) -> None:
+def _world_of_files(playback: Playback, frames: Sequence[int], origin: str) -> World:
+    """The world that files are written in. Raises InputError where float32 would round positions visibly."""
+    world = playback.meta.world
+    if origin == "local":
+        return replace(world, offset=IDENTITY.offset)
+    if origin != "recording":
+        raise InputError(f"origin: expected recording or local, got {origin!r}")
+    scene = playback.state_at(frames[0]) if frames else None
+    if scene is None or len(scene) == 0 or world.is_identity:
+        return world
+    step = float(np.spacing(np.float32(np.abs(world.points(scene.means)).max())))
+    smallest = world.scale * float(np.exp(np.median(scene.scales.min(1))))
+    if step > smallest:
+        raise InputError(
+            f"files hold positions as float32; this far from the recording's origin they are rounded to {step:.2g} "
+            f"units, and half of the Gaussians are thinner than {smallest:.2g}: write positions relative to "
+            f"({', '.join(f'{value:.6g}' for value in world.offset)}) by --origin local"
+        )
+    return world
+
+
+def _write_spz(file: Path, scene: Gaussians[FloatArray], converter: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder) / "frame.ply"
-        write_ply(plain, playback.state_at(frame))
+        write_ply(plain, scene)
         done = subprocess.run(
             [converter, "--overwrite", str(plain), str(file)], capture_output=True, text=True, check=False
         )
@@ -95,19 +129,20 @@ def _write_spz(file: Path, playback: Playback, frame: int, converter: str) -> No
         raise OutputError(f"{converter} could not write {file} (exit code {done.returncode}): {' '.join(tail)}")
 
 
-def _description(playback: Playback, frames: Sequence[int]) -> str:
+def _description(playback: Playback, frames: Sequence[int], world: World) -> str:
     meta = playback.meta
     cameras = [
         {
             "id": name, "split": split, "width": rig.width, "height": rig.height, "viewmat": view.tolist(),
             "K": K.tolist(),
         }
-        for split, rig in (("train", meta.train), ("test", meta.test))
+        for split, rig in (("train", world.cameras(meta.train)), ("test", world.cameras(meta.test)))
         for name, view, K in zip(rig.ids, rig.viewmats, rig.Ks, strict=True)
     ]  # fmt: skip
     files = [{"frame": frame, "seconds": frame / meta.fps, "file": f"{frame:06d}.ply"} for frame in frames]
     data = {
         "format": "3DGS PLY, one file per frame", "fps": meta.fps, "background": list(meta.background),
         "viewmat": "world to camera, OpenCV axes", "frames": files, "cameras": cameras,
+        "offset": (np.array(meta.world.offset) - np.array(world.offset)).tolist(),
     }  # fmt: skip
     return json.dumps(data, indent=1) + "\n"

@@ -9,6 +9,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError
 from gsstream.core.shapes import FloatArray
+from gsstream.core.world import up_direction
 
 PATHS = ("orbit", "spiral")
 #: A rig with a larger gap than this between neighbouring cameras does not surround what it looks at, radians.
@@ -51,7 +52,7 @@ def orbit(rig: Cameras, number: int) -> Cameras:
     Where cameras stand all around, one full turn; else a swing over the arc that they span and back, because nothing
     was recorded of the other side.
     """
-    focus, up = focus_point(rig), _up(rig)
+    focus, up = focus_point(rig), up_direction(rig)
     offsets = rig.centers - focus
     height = float((offsets @ up).mean())
     radius = float(np.linalg.norm(offsets - np.outer(offsets @ up, up), axis=1).mean())
@@ -106,7 +107,7 @@ def spiral(rig: Cameras, number: int, turns: float = 2.0) -> Cameras:
         number: of cameras, at least 1.
         turns: around the mean position.
     """
-    focus, up, centers = focus_point(rig), _up(rig), rig.centers
+    focus, up, centers = focus_point(rig), up_direction(rig), rig.centers
     middle = centers.mean(0)
     forward = focus - middle
     if np.linalg.norm(forward) < 1e-3 * rig.extent:
@@ -125,24 +126,6 @@ def spiral(rig: Cameras, number: int, turns: float = 2.0) -> Cameras:
     size = np.sin(np.pi * along)  # opens and closes, so that the path loops
     moves = np.outer(size * np.cos(angle) * reach[0], right) + np.outer(size * np.sin(angle) * reach[1], above)
     return _look_at(rig, middle + moves, focus, up)
-
-
-def _up(rig: Cameras) -> FloatArray:
-    """Unit up direction: across the cameras' x axes, which are level unless a camera is rolled.
-
-    The mean of the cameras' own up directions would lean towards the side from which a half-circle rig looks down; it
-    only gives the sign, and the direction where all x axes are parallel.
-    """
-    mean = -rig.viewmats[:, 1, :3].mean(0)
-    if np.linalg.norm(mean) < 1e-3:
-        # The "up" directions of cameras that are rolled against each other cancel out; then that of the first one is
-        # taken.
-        mean = -rig.viewmats[0, 1, :3]
-    axes = rig.viewmats[:, 0, :3]
-    values, vectors = np.linalg.eigh(axes.T @ axes / len(rig))
-    up = vectors[:, 0] * np.sign(vectors[:, 0] @ mean)
-    level = values[0] < 0.05 * values[1] and values[1] > 1e-3 and up @ mean > 0.5 * np.linalg.norm(mean)
-    return np.asarray(up if level else mean / np.linalg.norm(mean))
 
 
 def _look_at(rig: Cameras, centers: FloatArray, target: FloatArray, up: FloatArray) -> Cameras:

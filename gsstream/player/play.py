@@ -116,7 +116,7 @@ def choose_cameras(playback: Playback, camera: str | None, number: int) -> Camer
     if camera in PATHS:
         return camera_path(camera, meta.train if len(meta.train) else meta.test, number)
     if camera is not None and camera.lower().endswith(".json") and camera not in (*meta.test.ids, *meta.train.ids):
-        return read_path(Path(camera), meta.test if len(meta.test) else meta.train, number)
+        return read_path(Path(camera), meta.test if len(meta.test) else meta.train, number, meta.world)
     return meta.camera((*meta.test.ids, *meta.train.ids)[0] if camera is None else camera)
 
 

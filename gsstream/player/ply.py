@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -23,11 +24,17 @@ def ply_properties(sh_rest: int) -> list[str]:
     return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
-def ply_bytes(gaussians: Gaussians[FloatArray]) -> bytes:
-    """Return a binary little-endian PLY of raw (pre-activation) values."""
+def ply_bytes(gaussians: Gaussians[FloatArray], comments: Sequence[str] = ()) -> bytes:
+    """Return a binary little-endian PLY of raw (pre-activation) values.
+
+    Arguments:
+        gaussians: N rows.
+        comments: lines for its header.
+    """
     number, rest = len(gaussians), gaussians.shN.shape[1]
     names = ply_properties(rest)
-    head = ["ply", "format binary_little_endian 1.0", f"element vertex {number}"]
+    head = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    head += [f"element vertex {number}"]
     head += [*(f"property float {name}" for name in names), "end_header\n"]
     columns = [
         gaussians.means, np.zeros((number, 3)), gaussians.sh0.reshape(number, 3),
@@ -38,7 +45,13 @@ def ply_bytes(gaussians: Gaussians[FloatArray]) -> bytes:
     return "\n".join(head).encode("ascii") + np.concatenate(columns, 1).astype("<f4").tobytes()
 
 
-def write_ply(path: str | os.PathLike[str], gaussians: Gaussians[FloatArray]) -> None:
-    """Write :func:`ply_bytes` to a file."""
+def write_ply(path: str | os.PathLike[str], gaussians: Gaussians[FloatArray], comments: Sequence[str] = ()) -> None:
+    """Write :func:`ply_bytes` to a file.
+
+    Arguments:
+        path: of the file.
+        gaussians: N rows.
+        comments: lines for its header.
+    """
     with open(path, "wb") as file:
-        file.write(ply_bytes(gaussians))
+        file.write(ply_bytes(gaussians, comments))

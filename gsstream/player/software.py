@@ -9,14 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsstream.core.gaussians import SH0
+from gsstream.core.harmonics import sh_basis
 from gsstream.core.shapes import FloatArray, IntArray
 
 BLUR, ALPHA_CUT, ALPHA_MAX, TRANSMITTANCE_MIN = 0.3, 1 / 255, 0.999, 1e-4
 TILE = 16
-_SH1 = 0.4886025119029199
-_SH2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
-_SH3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
 
 
 def render_numpy(
@@ -94,21 +91,10 @@ def _conics(covariance: FloatArray) -> FloatArray:
 
 def _colors(sh0: FloatArray, shN: FloatArray, directions: FloatArray) -> FloatArray:
     """[N, 3] view-dependent colour, clamped at 0."""
-    x, y, z = (directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-10)).T
-    basis = [np.full_like(x, SH0)]
-    if shN.shape[1] > 0:
-        basis += [-_SH1 * y, _SH1 * z, -_SH1 * x]
-    if shN.shape[1] > 3:
-        a, b, c = _SH2
-        basis += [a * x * y, -a * y * z, b * (2 * z * z - x * x - y * y), -a * x * z, c * (x * x - y * y)]
-    if shN.shape[1] > 8:
-        a, b, c, d, e = _SH3
-        basis += [
-            -a * y * (3 * x * x - y * y), b * x * y * z, -c * y * (5 * z * z - 1), d * z * (5 * z * z - 3),
-            -c * x * (5 * z * z - 1), e * z * (x * x - y * y), -a * x * (x * x - 3 * y * y),
-        ]  # fmt: skip
+    unit = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-10)
+    basis = sh_basis(unit, round((shN.shape[1] + 1) ** 0.5) - 1)
     coefficients = np.concatenate([sh0, shN], 1).astype(np.float64)
-    return np.asarray(np.maximum(np.einsum("kn,nkc->nc", np.stack(basis), coefficients) + 0.5, 0.0))
+    return np.asarray(np.maximum(np.einsum("kn,nkc->nc", basis, coefficients) + 0.5, 0.0))
 
 
 def _tile_lists(

@@ -19,6 +19,7 @@ from gsstream.scene.findings import Finding, error
 from gsstream.scene.match_checks import REPAIRS
 from gsstream.scene.rig_checks import check_axes, check_intrinsics, check_overlap, check_placement
 from gsstream.source.base import FrameSource
+from gsstream.source.canonical import as_filed
 
 #: Width of the pictures that are swept, and how many of them are.
 WIDTH, VIEWS = 64, 3
@@ -40,6 +41,7 @@ def first_look(source: FrameSource) -> list[Finding]:
 
     Raises SourceError when frame 0 cannot be read.
     """
+    source = as_filed(source)
     train = source.info.train
     found = [*check_intrinsics(train), *check_placement(train, len(train), None), *check_axes(train)]
     if found:

@@ -198,7 +198,7 @@ def _points(mapping: Mapping, rig: Cameras, options: PrepareOptions) -> tuple[Po
     bounds = np.stack([low - margin, high + margin])
     inside = ((xyz >= bounds[0]) & (xyz <= bounds[1])).all(1)
     colors = rgb[inside].astype(np.float32) / np.float32(255)
-    cloud = PointCloud(xyz[inside].astype(np.float32), colors, f"triangulated from {len(rig)} cameras")
+    cloud = PointCloud(xyz[inside].astype(np.float64), colors, f"triangulated from {len(rig)} cameras")
     return thin_points(cloud, options.max_points), bounds
 
 

@@ -24,6 +24,7 @@ from gsstream.scene.pose_checks import check_poses
 from gsstream.scene.rig_checks import check_axes, check_intrinsics, check_overlap, check_placement
 from gsstream.scene.sync_checks import check_sync
 from gsstream.source.base import FilesMissing, FrameSource
+from gsstream.source.canonical import as_filed
 
 #: Width of the pictures that are compared over time, and of those whose features are matched.
 SMALL, LARGE = 160, 640
@@ -74,6 +75,7 @@ def rig_of(source: FrameSource) -> Cameras:
 
 
 def _stages(source: FrameSource, open_scene: Open, frames: int, features: bool) -> Iterator[list[Finding]]:
+    source = as_filed(source)
     rig, train = rig_of(source), source.info.train
     yield check_intrinsics(rig)
     try:
@@ -108,7 +110,7 @@ def _thumbnails(source: FrameSource, open_scene: Open, rig: Cameras, frames: int
     small = open_scene(min(1.0, SMALL / rig.width))
     try:
         known = source.info.num_frames
-        return read_thumbnails(small, rig, frames if known is None else min(frames, known))
+        return read_thumbnails(as_filed(small), rig, frames if known is None else min(frames, known))
     finally:
         small.close()
 

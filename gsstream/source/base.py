@@ -10,6 +10,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.shapes import FloatArray
+from gsstream.core.world import IDENTITY, World
 
 Split = Literal["train", "test"]
 PointKind = Literal["recording", "sparse"]
@@ -30,6 +31,7 @@ class SourceInfo:
         fps: frames per second.
         train, test: cameras by split; test cameras never enter seeding or training.
         licence: licence or terms of the recording, as text.
+        world: where the coordinates of these cameras lie in those of the files; sources of files leave it alone.
     """
 
     name: str
@@ -39,6 +41,7 @@ class SourceInfo:
     train: Cameras
     test: Cameras
     licence: str = ""
+    world: World = IDENTITY
 
 
 class FrameSource(Protocol):

@@ -114,11 +114,11 @@ def read_points(path: Path, kind: PointKind) -> PointCloud:
             f"got {list(xyz.shape)} {xyz.dtype} and {list(rgb.shape)} {rgb.dtype}"
         )
     with np.errstate(over="ignore"):  # what does not fit into float32 becomes infinite and is refused
-        xyz = xyz.astype(np.float32)
-    if not np.isfinite(xyz).all():
-        raise SourceError(f"{path}: {int((~np.isfinite(xyz)).any(1).sum())} of {len(xyz)} points are not finite")
+        fits = np.isfinite(xyz.astype(np.float32))
+    if not fits.all():
+        raise SourceError(f"{path}: {int((~fits).any(1).sum())} of {len(xyz)} points are not finite")
     colors = rgb.astype(np.float32) / np.float32(255)
-    return PointCloud(xyz, colors, f"{path.name} ({kind})")
+    return PointCloud(xyz.astype(np.float64), colors, f"{path.name} ({kind})")
 
 
 def _check_files(folder: Path, calibration: Calibration) -> None:

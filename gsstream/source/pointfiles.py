@@ -38,13 +38,13 @@ def read_ply_points(path: Path) -> PointCloud:
     names = table.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
         raise SourceError(f"{path}: no x, y, z among the vertex properties {', '.join(names)}")
-    xyz = np.stack([table[axis] for axis in "xyz"], 1).astype(np.float32)
+    xyz = np.stack([table[axis] for axis in "xyz"], 1).astype(np.float64)
     if not np.isfinite(xyz).all():
         raise SourceError(f"{path}: {int((~np.isfinite(xyz)).any(1).sum())} of {count} points are not finite")
     if {"red", "green", "blue"} <= set(names):
         rgb = np.stack([table[channel] for channel in ("red", "green", "blue")], 1).astype(np.float32) / 255
     else:
-        rgb = np.full_like(xyz, 0.5)
+        rgb = np.full(xyz.shape, 0.5, np.float32)
     return PointCloud(xyz, rgb, path.name)
 
 

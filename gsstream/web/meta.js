@@ -3,6 +3,7 @@
 import { PacketError } from "./errors.js";
 import { MAX_META } from "./limits.js";
 import { decompress } from "./vendor/fzstd.js";
+import { isWorld } from "./world.js";
 
 /** Decode the meta section. What a player does not use (the recipe and its hash) is handed on unchecked. */
 export function decodeMeta(data) {
@@ -17,6 +18,9 @@ export function decodeMeta(data) {
   const rigs = [value.train, value.test];
   if (!rigs.every(isRig) || !isColour(value.background) || !(Number(value.fps) > 0 && Number.isFinite(value.fps))) {
     throw new PacketError("meta: expected cameras by split, a background and a positive frame rate");
+  }
+  if ("world" in value && !isWorld(value.world)) {
+    throw new PacketError("meta: world: expected a rotation, an offset and a scale above 0");
   }
   return value;
 }

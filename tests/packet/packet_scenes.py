@@ -21,6 +21,7 @@ from gsstream.core.changes import (
     sent_rows,
 )
 from gsstream.core.gaussians import Gaussians
+from gsstream.core.world import World
 from gsstream.packet import (
     EncodedPacket,
     KeyState,
@@ -64,6 +65,16 @@ def make_meta() -> StreamMeta:
 
 def make_key(rng: np.random.Generator, number: int = 40, nodes: int = 12, sh_rest: int = 3) -> KeyState:
     return KeyState(make_scene(rng, number, sh_rest), make_layout(rng, number, nodes), make_meta())
+
+
+#: A quarter turn and a bit, UTM coordinates, centimetres.
+WORLD = World((0.0, -0.8, 0.6, 1.0, 0.0, 0.0, 0.0, 0.6, 0.8), (500000.25, 5200000.5, 300.125), 100.0)
+
+
+def make_placed_key(seed: int, **sizes: int) -> EncodedPacket:
+    """A key packet whose scene lies in other coordinates than its recording."""
+    key = make_key(np.random.default_rng(seed), **sizes)
+    return encode_key(replace(key, meta=replace(key.meta, world=WORLD)))
 
 
 def make_delta(

@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 from test_player import make_scene, make_stream
 
+from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError, OutputError
+from gsstream.core.world import World
 from gsstream.player.export import CONVERTER_VARIABLE, export
 from gsstream.player.playback import Playback
 from gsstream.player.ply import ply_bytes
@@ -98,6 +100,50 @@ def test_mistakes_of_an_export_are_named(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="cannot write"):
         export(stream, tmp_path / "file", "ply")
+
+
+#: A turn about z whose cosine is 0.6, a world of 2.5 units, moved by so much.
+NEAR, FAR = ((10.0, -20.0, 5.0), (5e5, 5.2e6, 300.0))
+
+
+def turned(offset: tuple[float, float, float]) -> World:
+    return World((0.6, -0.8, 0.0, 0.8, 0.6, 0.0, 0.0, 0.0, 1.0), offset, 2.5)
+
+
+def test_exports_lie_in_the_recordings_coordinates(tmp_path):
+    stream = make_stream(tmp_path / "s.gss", 2, turned(NEAR))
+    (file, *_) = export(stream, tmp_path / "out", "sequence", frames=[1])
+    found, described = read_ply(file.read_bytes()), json.loads((tmp_path / "out" / "sequence.json").read_text())
+    with Playback(stream) as playback:
+        scene, rig = playback.state_at(1), playback.cameras("train")
+    x, y, z = scene.means.T.astype(np.float64)
+    moved = np.stack([2.5 * (0.6 * x - 0.8 * y) + 10, 2.5 * (0.8 * x + 0.6 * y) - 20, 2.5 * z + 5], 1)
+    assert columns(found, "x", "y", "z") == pytest.approx(moved, abs=1e-5)
+    assert columns(found, "scale_0", "scale_1", "scale_2") == pytest.approx(scene.scales + np.log(2.5), abs=1e-5)
+    shown = np.array(described["cameras"][0]["viewmat"])
+    # A point has the same pixel before and after: its place in the camera only grows by the unit.
+    before = rig.viewmats[0, :3, :3] @ scene.means[0] + rig.viewmats[0, :3, 3]
+    assert shown[:3, :3] @ moved[0] + shown[:3, 3] == pytest.approx(2.5 * before, abs=1e-5)
+    assert described["offset"] == [0, 0, 0]
+
+
+def test_what_float32_cannot_hold_is_refused_or_written_beside_its_offset(tmp_path):
+    """In UTM coordinates a float32 counts half metres."""
+    stream = make_stream(tmp_path / "s.gss", 2, turned(FAR))
+    with pytest.raises(InputError, match=r"float32.*5\.2e\+06.*--origin local"):
+        export(stream, tmp_path / "out", "ply")
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(InputError, match="recording or local"):
+        export(stream, tmp_path / "out", "ply", origin="away")
+    command = ["export", str(stream), "--out", str(tmp_path / "out"), "--format", "sequence", "--origin", "local"]
+    assert run_command(command) == 0
+    described = json.loads((tmp_path / "out" / "sequence.json").read_text())
+    assert described["offset"] == list(FAR)
+    data = (tmp_path / "out" / "000000.ply").read_bytes()
+    assert b"comment offset 500000.0 5200000.0 300.0\n" in data
+    with Playback(stream) as playback:
+        means = turned(FAR).points(playback.state_at(0).means)
+    assert columns(read_ply(data), "x", "y", "z") + np.array(FAR) == pytest.approx(means, abs=1e-5)
 
 
 @needs_converter

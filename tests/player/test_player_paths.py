@@ -12,6 +12,7 @@ from test_player import ARC, NUMPY, look_at, make_stream
 
 from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError, OutputError, PluginUnavailable, UnknownName
+from gsstream.core.world import World
 from gsstream.player.camera_file import read_path
 from gsstream.player.export import export
 from gsstream.player.paths import LEAST_SWING, camera_path, resized
@@ -79,6 +80,17 @@ def test_a_path_from_a_file_shows_its_cameras(tmp_path) -> None:
     play(stream, tmp_path / "b", camera="cam1", renderer=NUMPY)
     pictures = [(tmp_path / folder / "000001.png").read_bytes() for folder in "ab"]
     assert pictures[0] == pictures[1], "the second pose is that of cam1"
+
+
+def test_a_path_from_a_file_is_in_the_recordings_coordinates(tmp_path) -> None:
+    world = World((0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0), (5e5, 5.2e6, 300.0), 40.0)
+    stream, rig = make_stream(tmp_path / "s.gss", world=world), look_at(ARC)
+    file = write_path(tmp_path, world.cameras(rig).select([1]))
+    for out, camera in (("a", file), ("b", "cam1")):
+        play(stream, tmp_path / out, camera=camera, frames=[0], renderer=NUMPY)
+    pictures = [np.asarray(Image.open(tmp_path / out / "000000.png"), np.int16) for out in "ab"]
+    assert pictures[0].std() > 10
+    assert np.abs(pictures[0] - pictures[1]).max() <= 1
 
 
 def test_few_poses_are_run_between(tmp_path) -> None:

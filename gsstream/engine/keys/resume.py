@@ -180,6 +180,11 @@ def _deciding(section: str, values: Any) -> Any:
 
 
 def _check_recording(info: SourceInfo, meta: StreamMeta) -> None:
+    if not meta.world.is_near(info.world):
+        raise OutputError(
+            f"the stream lies in other coordinates than {info.name!r} ({info.uri}): the recording was moved since, or "
+            "an earlier version wrote the stream in the coordinates of the files; start again with --overwrite"
+        )
     for split, new, old in (("training", info.train, meta.train), ("test", info.test, meta.test)):
         same = new.ids == old.ids and (new.width, new.height) == (old.width, old.height)
         if not same or not np.allclose(new.viewmats, old.viewmats, atol=1e-6) or not np.allclose(new.Ks, old.Ks):

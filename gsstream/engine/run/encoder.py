@@ -13,11 +13,13 @@ from typing import Any
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.rng import Rng
+from gsstream.core.world import snapped
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.auto.rules import recall, record, stream_extra
 from gsstream.engine.auto.trials import choose
 from gsstream.engine.budget.controller import Controller
 from gsstream.engine.budget.pace import CLOCKS
+from gsstream.engine.frame0.carried import in_world
 from gsstream.engine.frame0.optimise import Progress
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.frame0.taken import cloud_of
@@ -64,21 +66,23 @@ class Encoder:
         seeds: makes the points that frame 0 starts from; None: a plane sweep over its training images.
         first_frame: frame 0 of another stream, taken over instead of being reconstructed.
         listeners: what is told of the work.
+        place: frames bring cameras in the recording's coordinates, which are taken to those of ``info``.
     """
 
     def __init__(
         self, parts: Assembly, info: SourceInfo, seeds: Seeds | None = None, *, first_frame: PlayerState | None = None,
-        listeners: Listeners | None = None,
+        listeners: Listeners | None = None, place: bool = False,
     ) -> None:  # fmt: skip
         held = sized(parts.recipe.budget, info.fps)
         self.parts = replace(parts, recipe=parts.recipe.model_copy(update={"budget": held}))
-        self.info = info
+        self.info, self._place = info, place
         self.rng = Rng(parts.recipe.seed)
         self.near = parts.recipe.near * info.train.extent
         #: State after the last frame; None before frame 0.
         self.state: Any = None
         self.controller = Controller(held, parts.recipe.stream)
-        self._seeds, self._first, self._listeners = seeds or self._swept, first_frame, listeners or Listeners()
+        self._first = None if first_frame is None else in_world(first_frame, info.world)
+        self._seeds, self._listeners = seeds or self._swept, listeners or Listeners()
 
     def encode(self, frame: Frame) -> Step[Any]:
         """Encode the next frame: the first as a key packet, later ones as the method decides.
@@ -139,8 +143,9 @@ class Encoder:
         return end.player.frame
 
     def at_near(self, frame: Frame) -> Frame:
-        """Return the frame with the near plane that the recipe gives this rig."""
-        return replace(frame, cameras=replace(frame.cameras, near=self.near))
+        """Return the frame with the near plane that the recipe gives this rig, in the stream's coordinates."""
+        cameras = snapped(self.info.world.cameras_back(frame.cameras)) if self._place else frame.cameras
+        return replace(frame, cameras=replace(cameras, near=self.near))
 
     def _begin(self, frame: Frame) -> Step[Any]:
         if self.parts.pending:
@@ -187,6 +192,7 @@ class Encoder:
             background=recipe.background,
             plugins={name: version(name) for name in sorted(distributions)},
             extra={"source_uri": info.uri, "licence": info.licence, "title": self.parts.title, **record(self.parts)},
+            world=info.world,
         )
 
 

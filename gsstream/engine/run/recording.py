@@ -14,6 +14,7 @@ from gsstream.packet import PlayerState, StreamReader, decode_packet
 from gsstream.plugins.catalog import Catalog
 from gsstream.recipe.model import Recipe
 from gsstream.source.base import FrameSource
+from gsstream.source.canonical import CanonicalSource, world_of
 from gsstream.source.open import open_source
 from gsstream.source.options import DataOptions
 from gsstream.source.transformed import transformed
@@ -21,6 +22,8 @@ from gsstream.source.transformed import transformed
 
 def open_recording(uri: str, recipe: Recipe, catalog: Catalog) -> FrameSource:
     """Open ``uri`` at the scale, with the split and through the transforms that a recipe asks for.
+
+    Cameras and points come in coordinates that the cameras define; ``info.world`` leads back to those of the files.
 
     Arguments:
         recipe: its scale and section ``data``.
@@ -56,7 +59,7 @@ def reopen_recording(uri: str, recipe: Mapping[str, Any], catalog: Catalog) -> F
 def _open(uri: str, scale: float, data: DataOptions, seed: int, catalog: Catalog) -> FrameSource:
     source = _open_plain(uri, scale, catalog)
     try:
-        return transformed(source, data, seed)
+        return CanonicalSource(transformed(source, data, seed), world_of(source))
     except BaseException:
         source.close()
         raise

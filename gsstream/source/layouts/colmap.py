@@ -155,6 +155,6 @@ def _points(model: Path, numbers: list[int]) -> SeenPoints | None:
     for row, track in enumerate(points.seen_by):
         seen[row, [place[int(number)] for number in track if int(number) in place]] = True
     cloud = PointCloud(
-        points.xyz.astype(np.float32), points.rgb.astype(np.float32) / np.float32(255), f"COLMAP model {model.name}"
+        points.xyz.astype(np.float64), points.rgb.astype(np.float32) / np.float32(255), f"COLMAP model {model.name}"
     )
     return SeenPoints(cloud, seen)

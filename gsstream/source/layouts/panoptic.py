@@ -138,5 +138,5 @@ def _points(path: Path, cameras: int) -> SeenPoints | None:
         raise SourceError(f"{path}: expected a numpy archive with an array 'data': {error}") from error
     if data.ndim != 2 or data.shape[1] not in (6, 7) or not np.isfinite(data).all():
         raise SourceError(f"{path}: expected 'data' [P, 7] of finite numbers, got {list(data.shape)}")
-    cloud = PointCloud(data[:, :3].astype(np.float32), data[:, 3:6].astype(np.float32), path.name)
+    cloud = PointCloud(data[:, :3].astype(np.float64), data[:, 3:6].astype(np.float32), path.name)
     return SeenPoints(cloud, np.zeros((len(cloud), cameras), bool))

@@ -1,5 +1,5 @@
 # Two commands, nothing to prepare: 'make demo' and 'make test'. All set up .venv first (Python >= 3.11, a C++ compiler).
-#   make demo            encode the recording that ships with gsstream; says where the pictures are
+#   make demo            encode the recording that ships with gsstream; says where the pictures are and how to open it
 #   make test            lint, types, import rules and all tests
 #   make check           the same with the quick tests alone: for every change, in under two minutes
 #   make dist            every distribution, as source archive and wheel, in dist/
@@ -31,6 +31,9 @@ demo: setup
 	$(BIN)/gsstream run --method $(DEMO_METHOD) --source demo --out $(DEMO_OUT) --overwrite
 	@echo "The stream, its measurements and the pictures are in $(abspath $(DEMO_OUT)):"
 	@ls -1 $(DEMO_OUT)
+	@$(BIN)/gsstream package $(DEMO_OUT) --out $(DEMO_OUT)/site >/dev/null
+	@echo "This line opens it in your browser (Ctrl-C ends):"
+	@echo "  (sleep 1; $(BIN)/python -m webbrowser http://127.0.0.1:8000) & $(BIN)/python -m http.server --directory $(DEMO_OUT)/site --bind 127.0.0.1 8000"
 
 # Every check runs even when an earlier one failed; pytest comes last, so that its summary is the last thing printed.
 # conftest.py puts the longest files first, and one worker more than cores fills the time in which a test waits.

@@ -142,7 +142,8 @@ export class LiveBuffer {
   _message(data) {
     if (!(data instanceof ArrayBuffer)) {
       if ("state" in data) this._stateIs(data);
-      else if (Number.isFinite(data.written)) this.latency.written(data.frame, data.written, Date.now() + this.socket.ahead);
+      else if (Number.isFinite(data.written))
+        this.latency.written(data.frame, data.written, Date.now() + this.socket.ahead);
       return;
     }
     const bytes = new Uint8Array(data);

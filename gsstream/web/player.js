@@ -5,15 +5,16 @@ import { cameraOf, pivotOf, viewsOf } from "./camera.js";
 import { KIND } from "./container.js";
 import { decodePacket } from "./decode.js";
 import { PacketError } from "./errors.js";
-import { decodeJoin } from "./joins.js";
+import { Snapshots, decodeJoin } from "./joins.js";
 import { Renderer } from "./renderer.js";
 import { openSource } from "./source.js";
-import { Snapshots } from "./snapshots.js";
 
 /** Decoding may take so many milliseconds of one picture's time before the page gets its turn. */
 const BUDGET = 24;
 
 /**
+ * `options.renderer` takes the place of the player's own; it has `update(state)`, `draw(camera)` and `dispose()`.
+ *
  * Events: `ready` (the first picture can be drawn), `frame`, `state` (playing, waiting, paused, ended), `problem`
  * (detail: a sentence), `view`.
  */
@@ -22,7 +23,8 @@ export class Player extends EventTarget {
     super();
     this.canvas = canvas;
     this.options = options;
-    this.renderer = new Renderer(canvas, { onChange: () => this.invalidate(), useWorker: options.worker !== false });
+    const drawing = { onChange: () => this.invalidate(), useWorker: options.worker !== false };
+    this.renderer = options.renderer ?? new Renderer(canvas, drawing);
     this.loop = options.loop ?? true;
     this.speed = options.speed ?? 1;
     this.playing = false;
@@ -268,11 +270,8 @@ export class Player extends EventTarget {
   /** A frame is not loaded: wait for it, or, when it will never come, say why and go on with what is sound. */
   _missing(frame) {
     const failure = this.buffer.failure(frame, this.frame);
-    if (!failure) {
-      this.buffer.want(frame, this.frame);
-      return;
-    }
-    this._stop(failure);
+    if (failure) this._stop(failure);
+    else this.buffer.want(frame, this.frame);
   }
 
   /** Say what is wrong. A damaged segment is left out where another one follows; anything else ends the playing. */

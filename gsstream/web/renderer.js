@@ -1,11 +1,9 @@
 // Draws a scene with WebGL2 from float32 textures, in the depth order that a worker finds.
 
 import { COPY_FRAGMENT_SHADER, COPY_VERTEX_SHADER, FRAGMENT_SHADER, vertexShader } from "./shaders.js";
-import { SceneTextures } from "./scene-textures.js";
-import { Slots } from "./slots.js";
+import { ResidentScene } from "./resident.js";
 import { SortQueue } from "./sort-queue.js";
 
-const GEOMETRY = new Set(["means", "quats", "scales", "opacities"]);
 /** Variance that every footprint gets, in pixels squared of the recording: a larger picture is not made of needles. */
 const BLUR = 0.3;
 /** Frames after which the mark of a change has faded to a third. */
@@ -34,7 +32,7 @@ export class Renderer {
     this.background = [0, 0, 0];
     this.marks = false;
     this.uploaded = 0;
-    this.slots = new Slots();
+    this.scene = new ResidentScene(gl);
     this.sorter = new SortQueue(onChange, useWorker);
     this.state = null;
     this._moved = new Set();
@@ -42,23 +40,23 @@ export class Renderer {
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
     canvas.addEventListener("webglcontextrestored", () => {
       this._setUp();
-      if (this.state) this._accept(this.state, true);
+      this.scene.restore(this.state);
+      if (this.state) this._fitProgram();
       onChange();
     });
   }
 
   /** Take note of what the packet just decoded into `state` changed. Call it once for every packet. */
   update(state) {
-    const { change } = state;
     this.state = state;
     this.background = state.meta.background;
-    if (change.kind === "key") {
-      this.slots.reset(state.number);
-      this.textures.stamps = new Float32Array(0);
-      this._accept(state, true);
-    } else if (change.kind === "delta") {
-      this._mark(change, state.frame);
-      this._follow(change, state);
+    const { anew, moved } = this.scene.update(state);
+    this._fitProgram();
+    if (anew) {
+      this.sorter.reset(this.scene.capacity);
+      this._moved = new Set(moved);
+    } else {
+      for (const slot of moved) this._moved.add(slot);
     }
   }
 
@@ -66,9 +64,9 @@ export class Renderer {
   draw(camera, { exact = false } = {}) {
     if (!this.state || this.gl.isContextLost()) return;
     this._sendPositions();
-    this.uploaded = this.textures.flush();
+    this.uploaded = this.scene.textures.flush();
     const axis = Array.from(camera.viewmat.slice(8, 12));
-    if (exact) this.sorter.sortNow(axis, camera.near, this.slots.slotOf);
+    if (exact) this.sorter.sortNow(axis, camera.near, this.scene.slots.slotOf);
     else this.sorter.request(axis, camera.near);
     this._fitTarget();
     this._drawSplats(camera);
@@ -96,7 +94,6 @@ export class Renderer {
     const { gl } = this;
     // Hundreds of layers are blended into one pixel: eight bits would round each of them.
     this.deep = Boolean(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
-    this.textures = new SceneTextures(gl, this.slots);
     this.program = null;
     this.degree = -1;
     this.copy = link(gl, COPY_VERTEX_SHADER, COPY_FRAGMENT_SHADER);
@@ -114,52 +111,11 @@ export class Renderer {
     gl.disable(gl.DITHER);
   }
 
-  /** Fit textures and sorter to a state; `anew`: send everything. */
-  _accept(state, anew) {
-    const capacity = this.textures.geometry.capacity;
-    const all = this.textures.fit(state, anew);
-    if (this.degree !== this.textures.degree) {
-      this.degree = this.textures.degree;
-      this.program = link(this.gl, vertexShader(this.degree), FRAGMENT_SHADER);
-    }
-    if (all && (anew || capacity !== this.textures.geometry.capacity)) {
-      this.sorter.reset(this.textures.geometry.capacity);
-      this._moved = new Set(this.slots.slotOf);
-    }
-  }
-
-  _mark(change, frame) {
-    const { slotOf } = this.slots;
-    const { geometry, colours, stamps } = this.textures;
-    for (const { rows, attributes } of change.moved) {
-      const moves = attributes.includes("means");
-      const shines = attributes.some((name) => !GEOMETRY.has(name));
-      for (const row of rows) {
-        const slot = slotOf[row];
-        stamps[slot] = frame;
-        geometry.mark(slot);
-        if (shines) colours.mark(slot);
-        if (moves) this._moved.add(slot);
-      }
-    }
-  }
-
-  _follow(change, state) {
-    if (!change.source) return;
-    const { born, dead } = this.slots.follow(change.source, change.before);
-    this._accept(state, false);
-    const { geometry, colours, stamps } = this.textures;
-    for (const slot of born) {
-      stamps[slot] = state.frame;
-      geometry.mark(slot);
-      colours.mark(slot);
-      this._moved.add(slot);
-    }
-    for (const slot of dead) {
-      stamps[slot] = -1;
-      geometry.mark(slot);
-      this._moved.add(slot);
-    }
+  /** The program for the degree of colour that the scene has. */
+  _fitProgram() {
+    if (this.degree === this.scene.textures.degree) return;
+    this.degree = this.scene.textures.degree;
+    this.program = link(this.gl, vertexShader(this.degree), FRAGMENT_SHADER);
   }
 
   _sendPositions() {
@@ -167,7 +123,7 @@ export class Renderer {
     const slots = Uint32Array.from(this._moved);
     const positions = new Float32Array(3 * slots.length).fill(NaN);
     slots.forEach((slot, i) => {
-      const row = this.slots.rowOf[slot];
+      const row = this.scene.slots.rowOf[slot];
       if (row >= 0) positions.set(this.state.scene.means.subarray(3 * row, 3 * row + 3), 3 * i);
     });
     this._moved = new Set();
@@ -211,8 +167,9 @@ export class Renderer {
     gl.uniform1f(at("near"), camera.near);
     gl.uniform1f(at("blur"), BLUR * Math.max(1, camera.scale ?? 1) ** 2);
     gl.uniform2f(at("marking"), this.marks ? this.state.frame : -1, MARK_LASTS);
-    gl.uniform2i(at("lines"), this.textures.geometry.shift, this.textures.colours.shift);
-    [this.textures.geometry, this.textures.colours].forEach(({ texture }, unit) => {
+    const { geometry, colours } = this.scene.textures;
+    gl.uniform2i(at("lines"), geometry.shift, colours.shift);
+    [geometry, colours].forEach(({ texture }, unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(gl.TEXTURE_2D, texture);
       gl.uniform1i(at(unit ? "colours" : "geometry"), unit);

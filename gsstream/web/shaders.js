@@ -34,6 +34,19 @@ function colourSum(degree) {
     .join("\n");
 }
 
+/** GLSL of `seenFromDEGREE(colours, direction, at, line)`: the colour from a direction, texels from `at` of a line. */
+export function colourFunction(degree) {
+  return `vec3 seenFrom${degree}(sampler2D colours, vec3 direction, int at, int line) {
+  vec4 v[${colourTexels(degree)}];
+  for (int i = 0; i < ${colourTexels(degree)}; i++) v[i] = texelFetch(colours, ivec2(at + i, line), 0);
+  vec3 unit = direction / max(length(direction), 1e-10);
+  float x = unit.x, y = unit.y, z = unit.z;
+  vec3 sum = vec3(0.5);
+${colourSum(degree)}
+  return max(sum, 0.0);
+}`;
+}
+
 /** The vertex shader for spherical harmonics of a degree: one quad for each Gaussian, as far as it is seen. */
 export function vertexShader(degree) {
   return `#version 300 es
@@ -66,15 +79,7 @@ mat3 rotationOf(vec4 q) {
     2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
 }
 
-vec3 seenFrom(vec3 direction, int at, int line) {
-  vec4 v[TEXELS];
-  for (int i = 0; i < TEXELS; i++) v[i] = texelFetch(colours, ivec2(at + i, line), 0);
-  vec3 unit = direction / max(length(direction), 1e-10);
-  float x = unit.x, y = unit.y, z = unit.z;
-  vec3 sum = vec3(0.5);
-${colourSum(degree)}
-  return max(sum, 0.0);
-}
+${colourFunction(degree)}
 
 vec3 marked(vec3 plain, float stamp) {
   if (marking.x < 0.0) return plain;
@@ -115,7 +120,8 @@ void main() {
     + corner.y * (sqrt(reach * small) + 0.01) * vec2(-along.y, along.x);
   vec2 place = (center + offset) / size;
   gl_Position = vec4(2.0 * place.x - 1.0, 1.0 - 2.0 * place.y, 0.0, 1.0);
-  colour = marked(seenFrom(first.xyz - eye, (s & ((1 << lines.y) - 1)) * TEXELS, s >> lines.y), third.w);
+  int at = (s & ((1 << lines.y) - 1)) * TEXELS;
+  colour = marked(seenFrom${degree}(colours, first.xyz - eye, at, s >> lines.y), third.w);
 }`;
 }
 

@@ -41,7 +41,7 @@ OPTIONS = {
     "gsstream run": [
         "--source", "--out", "--method", "--recipe", "--set", "--frames", "--scale", "--seed", "--renderer", "--resume",
         "--first-frame", "--checks", "--diagnose",
-        "--overwrite", "--no-video", "--quiet", "--budget",
+        "--overwrite", "--no-video", "--quiet", "--budget", "--serve",
     ],
     "gsstream play": ["STREAM", "--out", "--camera", "--frames", "--fps", "--size", "--renderer", "--max-memory"],
     "gsstream evaluate": ["STREAM", "--source", "--lpips-onnx", "--lpips-range", "--json", "--max-memory"],
@@ -50,7 +50,8 @@ OPTIONS = {
     "gsstream export": ["STREAM", "--out", "--format", "--frames", "--max-memory"],
     "gsstream manifest": ["STREAM", "--out"],
     "gsstream view": ["STREAM", "--port", "--host"],
-    "gsstream package": ["STREAM", "--out", "--rendition"],
+    "gsstream package": ["STREAM", "--out", "--rendition", "--join-every"],
+    "gsstream serve": ["STREAM", "--live", "--host", "--port", "--token", "--viewers", "--origin"],
     "gsstream run-segments": [
         "--source", "--out", "--segments", "--method", "--recipe", "--set", "--frames", "--scale", "--start",
         "--key-epochs", "--first-frame", "--workers", "--threads", "--ray", "--resume", "--overwrite", "--no-video",

@@ -107,7 +107,7 @@ def test_cut_points_are_those_of_the_entropy_coder_on_random_histograms(tmp_path
         words = coder.get_compressed().astype("<u4").tobytes()
         cases.append({"counts": counts.tolist(), "words": words.hex(), "symbols": chosen.tolist()})
     code = """
-        const { AnsDecoder, quantiseCounts } = await load('ans.js');
+        const { AnsDecoder, quantiseCounts } = await load('symbols.js');
         return given.map(({ counts, words, symbols }) => {
           const coder = new AnsDecoder(new Uint8Array(Buffer.from(words, 'hex')));
           const out = new Int32Array(symbols.length);

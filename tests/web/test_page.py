@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import shutil
 import zlib
@@ -12,13 +11,12 @@ import numpy as np
 import pytest
 from browser_runs import in_browser, needs_browser, serving, try_in_browser
 from moving_scenes import make_meta, moving_packets
+from pictures import decoded, drawn, psnr
 
 from gsstream.cli.main import run_command
 from gsstream.packet import StreamWriter
 from gsstream.packet.base import file_header
 from gsstream.player.playback import Playback
-from gsstream.player.render import PlayerRenderer, render, to_bytes
-from gsstream.player.software import render_numpy
 from gsstream.serve.package import package
 
 pytestmark = needs_browser
@@ -42,19 +40,8 @@ def site(tmp_path_factory):
     return folder
 
 
-def psnr(first: np.ndarray, second: np.ndarray) -> float:
-    error = np.mean((first.astype(np.float64) - second) ** 2)
-    return float(10 * np.log10(255**2 / max(error, 1e-9)))
-
-
 def pictures(encoded: list[str], width: int, height: int) -> list[np.ndarray]:
-    return [np.frombuffer(base64.b64decode(t), np.uint8).reshape(height, width, 4)[..., :3] for t in encoded]
-
-
-def drawn(playback: Playback, frame: int) -> np.ndarray:
-    """A frame from the first test camera by the player's reference renderer, 8 bits."""
-    renderer = PlayerRenderer("numpy", render_numpy)
-    return to_bytes(render(playback.state_at(frame), playback.cameras("test"), 0, playback.meta.background, renderer))
+    return [decoded(text, width, height) for text in encoded]
 
 
 def test_pictures_of_a_run_are_those_of_the_python_player(tmp_path):
@@ -267,8 +254,9 @@ def test_the_page_is_small():
         str(p.relative_to(folder)): len(gzip.compress(p.read_bytes()))
         for p in folder.rglob("*") if p.is_file() and "vendor" not in p.parts
     }  # fmt: skip
-    # What only a live stream takes is loaded only there.
+    # What only a live stream takes is loaded only there; the adapter for three.js never.
     live = [sizes.pop(name) for name in ("live.js", "live-socket.js", "latency.js")]
+    del sizes["gsstream-spark.js"]
     assert len(sizes) > 20
     assert sum(sizes.values()) <= 60_000
     assert sum(live) <= 6_000

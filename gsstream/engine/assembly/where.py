@@ -15,3 +15,11 @@ class Where:
     def enter(self, frame: int | None) -> None:
         """Begin a frame; no iteration of it has begun."""
         self.frame, self.iteration = frame, None
+
+    def count(self) -> None:
+        """Begin the next iteration of a part that fits something itself: the first is 1."""
+        self.iteration = 1 if self.iteration is None else self.iteration + 1
+
+    def pause(self) -> None:
+        """Note that no iteration goes on: a part has ended its own."""
+        self.iteration = None

@@ -132,12 +132,12 @@ class FrameView:
         self._session = self.session_for(rows)
 
     def pull(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
+        self._parts.where.count()
         output = self.session.render(view, rows)
         return self.judge.backward(view, output.image, output.tiles)[0]
 
     def backward(self, view: int, image: torch.Tensor, tile_mask: torch.Tensor | None = None) -> float:
-        where = self._parts.where
-        where.iteration = 1 if where.iteration is None else where.iteration + 1
+        self._parts.where.count()
         return self.judge.backward(view, image, tile_mask)[0]
 
     def on(self, gaussians: Gaussians[torch.Tensor]) -> FrameView:

@@ -3,7 +3,7 @@
 import { PacketError, located } from "../errors.js";
 import { decodeGates } from "../gates.js";
 import { ATTRIBUTES, MAX_CHANNELS, WIDTHS } from "../limits.js";
-import { decodeSymbols } from "../symbols.js";
+import { decodeSymbols, range } from "../symbols.js";
 
 const LATENT = 1;
 const MAX_CHANGE = 1e18;
@@ -60,29 +60,42 @@ export function applyResidual(state, residual) {
 }
 
 function addPart(values, rows, gate, part) {
-  const { symbols, channels, step, width } = part;
-  const latents = new Float32Array(symbols.length);
-  for (let i = 0; i < symbols.length; i += 1) latents[i] = Math.fround(symbols[i]) * step;
-  if (part.decoder) addDecoded(values, rows, gate, latents, part.decoder.values, channels, width);
-  else addDirect(values, rows, gate, latents, width);
+  const { name, symbols, channels, step, width } = part;
+  const signed = name === "means" || name === "quats";
+  if (part.decoder) addDecoded(values, rows, gate, symbols, step, part.decoder.values, channels, width, signed);
+  else addDirect(values, rows, gate, symbols, step, width, signed);
 }
 
-function addDirect(values, rows, gate, latents, width) {
-  const number = rows.length;
-  for (let i = 0; i < number; i += 1) {
-    const start = rows[i] * width;
-    for (let d = 0; d < width; d += 1) values[start + d] += Math.fround(latents[d * number + i] * gate[i]);
-  }
-}
+// Most symbols are 0. What they add is 0 or -0, which changes nothing but a value of -0. Of these there are none except
+// where a motion was (`signed`): key packets and births hold multiples of a step, and no sum of two others is -0.
 
-function addDecoded(values, rows, gate, latents, weights, channels, width) {
+function addDirect(values, rows, gate, symbols, step, width, signed) {
   const number = rows.length;
   for (let i = 0; i < number; i += 1) {
     const start = rows[i] * width;
     for (let d = 0; d < width; d += 1) {
-      let change = Math.fround(latents[i] * weights[d]);
+      const symbol = symbols[d * number + i];
+      if (symbol === 0 && (!signed || values[start + d] !== 0)) continue;
+      const latent = Math.fround(Math.fround(symbol) * step);
+      values[start + d] += Math.fround(latent * gate[i]);
+    }
+  }
+}
+
+function addDecoded(values, rows, gate, symbols, step, weights, channels, width, signed) {
+  const number = rows.length;
+  const latents = new Float32Array(channels);
+  for (let i = 0; i < number; i += 1) {
+    let some = 0;
+    for (let at = i; at < symbols.length; at += number) some |= symbols[at];
+    if (some === 0 && !signed) continue;
+    for (let c = 0; c < channels; c += 1) latents[c] = Math.fround(symbols[c * number + i]) * step;
+    const start = rows[i] * width;
+    for (let d = 0; d < width; d += 1) {
+      if (some === 0 && values[start + d] !== 0) continue;
+      let change = Math.fround(latents[0] * weights[d]);
       for (let c = 1; c < channels; c += 1) {
-        change = Math.fround(change + Math.fround(latents[c * number + i] * weights[c * width + d]));
+        change = Math.fround(change + Math.fround(latents[c] * weights[c * width + d]));
       }
       values[start + d] += Math.fround(change * gate[i]);
     }
@@ -105,7 +118,7 @@ function openRows(counts, gates, levels) {
   return { rows, gate };
 }
 
-/** For each row behind an open gate, a number: bit i is set where the i-th attribute that is sent has symbols for it. */
+/** For each row behind an open gate, a number: bit i is set where the i-th attribute sent has symbols for it. */
 function decodePattern(data, rows, attributes) {
   if (attributes === 0) throw new PacketError("pattern of rows without an attribute that changes");
   const pattern = decodeSymbols(data, rows, 1);
@@ -171,8 +184,8 @@ function decodePart(name, data, rows, known) {
   const fits = decoder ? channels === decoder.latents : WIDTHS[name].includes(channels);
   if (!fits || channels === 0) throw new PacketError(`symbols of ${name}: ${channels} channels do not fit`);
   const symbols = decodeSymbols(data.subarray(6), rows, channels);
-  let largest = 0;
-  for (let i = 0; i < symbols.length; i += 1) largest = Math.max(largest, Math.abs(symbols[i]));
+  const [low, high] = symbols.length ? range(symbols) : [0, 0];
+  const largest = Math.max(high, -low);
   const gain = decoder ? channels * decoder.values.reduce((most, v) => Math.max(most, Math.abs(v)), 0) : 1;
   if (largest * step * gain > MAX_CHANGE) {
     throw new PacketError(`${name}: a residual of ${largest * step * gain} cannot be`);

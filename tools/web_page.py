@@ -1,0 +1,105 @@
+"""Measure the page in a headless Chromium: first picture and seek on a slow line, uploads, sorting, pictures.
+
+Usage: python -m tools.web_page STREAM --out DIR [--mbit 20] [--join-every SECONDS] [--frames 5]
+
+Packages the stream into DIR/site and plays it there; prints JSON. Times are wall times in the page, from the request of
+the page on. DIR gets the pictures of the held-out camera and views between the cameras, to be looked at.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "web"))
+
+P = "document.querySelector('gsstream-player')?.player"
+#: Milliseconds since the page was asked for, once a picture is drawn and read back.
+DRAWN = f"(async () => {{ {P}.draw(); {P}.renderer.readPixels(); return performance.now(); }})()"
+SEEK = f"""(async () => {{
+  const started = performance.now(), before = {P}.buffer.received;
+  {P}.seek(FRAME);
+  while ({P}.frame !== FRAME) await new Promise((resolve) => setTimeout(resolve, 5));
+  {P}.draw(); {P}.renderer.readPixels();
+  return [performance.now() - started, {P}.buffer.received - before];
+}})()"""
+STEPS = f"""(async () => {{
+  const found = [];
+  for (let frame = {P}.frame + 1; frame <= Math.min({P}.last, {P}.first + 8); frame += 1) {{
+    const uploaded = {P}.statistics.uploaded;
+    {P}.seek(frame);
+    while ({P}.frame !== frame) await new Promise((resolve) => setTimeout(resolve, 5));
+    const rows = new Set(({P}.state.change.moved ?? []).flatMap((part) => [...part.rows])).size;
+    {P}.draw();
+    await new Promise((resolve) => setTimeout(resolve, 30));
+    found.push([rows, {P}.statistics.uploaded - uploaded, {P}.renderer.sorter.milliseconds]);
+  }}
+  return found;
+}})()"""
+TURN = """import('./camera.js').then(({{ orbited }}) => {{
+  {p}.look(0);
+  {p}.view = orbited({p}.view, {p}.pivot, {yaw}, {tip});
+  {p}.moved();
+}})"""
+
+
+def main() -> int:
+    """Measure and print JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("stream")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--mbit", type=float, default=20.0)
+    parser.add_argument("--join-every", type=float, default=10.0)
+    parser.add_argument("--frames", type=int, default=5, help="pictures that are compared")
+    parser.add_argument("--size", type=int, nargs=2, default=(320, 180), help="of the page; software graphics are slow")
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    print(json.dumps(measure(given), indent=1))
+    return 0
+
+
+def measure(given: argparse.Namespace) -> dict[str, object]:
+    """Play the stream in the page and return what was found."""
+    from browser_runs import in_browser, serving
+    from pictures import decoded, drawn, psnr
+
+    from gsstream.player.playback import Playback
+    from gsstream.serve.package import package
+
+    done = package(given.stream, given.out / "site", join_every=given.join_every)
+    with Playback(given.stream) as playback, serving(given.out / "site") as (url, _):
+        rig, frames = playback.cameras("test"), playback.frames
+        last = frames[-1]
+        shown = [frames[i] for i in np.linspace(0, len(frames) - 1, given.frames).astype(int)]
+        ready = ["until", f"{P}?.state && {P}._target === null", 120]
+        steps = [
+            ["throttle", given.mbit * 1e6 / 8], ["go", f"{url}/index.html"], ready, ["evaluate", DRAWN],
+            ["evaluate", f"{P}.buffer.received"], ["evaluate", SEEK.replace("FRAME", str(last))],
+            ["evaluate", SEEK.replace("FRAME", str(frames[0]))], ["evaluate", STEPS],
+            *(["picture", frame, rig.width, rig.height] for frame in shown),
+        ]  # fmt: skip
+        for name, yaw, tip in (("left", 0.35, 0.0), ("right", -0.35, 0.1), ("above", 0.1, -0.25)):
+            steps += [["evaluate", f"{P}.canvas.parentNode.host._fit()"]]
+            steps += [["evaluate", TURN.format(p=P.replace("?.", "."), yaw=yaw, tip=tip)], ["pause", 3000]]
+            steps += [["screenshot", str(given.out / f"orbit-{name}.png")]]
+        results = in_browser(steps, given.out, size=tuple(given.size))
+        psnrs = []
+        for frame, text in zip(shown, results[8 : 8 + len(shown)], strict=True):
+            ours, theirs = drawn(playback, frame), decoded(text, rig.width, rig.height)
+            Image.fromarray(np.concatenate([ours, theirs])).save(given.out / f"frame-{frame}.png")
+            psnrs.append(round(psnr(ours, theirs), 2))
+    uploads = results[7]
+    return {
+        "join_bytes": done.join_bytes, "first_picture_ms": results[3], "first_bytes": results[4],
+        "seek_last": results[5], "seek_first": results[6], "rows_uploaded_bytes_sort_ms": uploads,
+        "frames": shown, "psnr": psnrs,
+    }  # fmt: skip
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -102,8 +102,6 @@ def _write_stream(path: Path, folder: Path, join_every: float) -> dict[str, Any]
     """Write the segments of a stream; returns its entry in the manifest."""
     with StreamReader(path) as reader:
         reader.check()
-        if reader.version != FORMAT_VERSION:
-            raise InputError(f"{path}: expected packet format {FORMAT_VERSION}, got {reader.version}; encode it again")
         starts = [i for i, entry in enumerate(reader.frames) if entry.kind == PacketKind.KEY]
         if not starts:
             raise InputError(f"{path}: expected at least one complete frame, got none")
@@ -122,8 +120,10 @@ def _write_stream(path: Path, folder: Path, join_every: float) -> dict[str, Any]
 
 def _write_segment(reader: StreamReader, entries: Sequence[Entry], folder: Path, every: int) -> dict[str, Any]:
     """Write a key packet with what follows, and a join after every so many frames; returns the segment's entry."""
-    data = file_header() + b"".join(reader.read(entry) for entry in entries)
-    shift = len(file_header()) - entries[0].offset
+    with reader.path.open("rb") as file:  # its own header: a stream may be of an older minor version
+        header = file.read(len(file_header()))
+    data = header + b"".join(reader.read(entry) for entry in entries)
+    shift = len(header) - entries[0].offset
     segment: dict[str, Any] = {
         "frames": [entries[0].frame, entries[-1].frame], "file": _write(folder, entries[0].frame, ".gss", data),
         "bytes": len(data), "key_bytes": shift + entries[0].offset + entries[0].size, "joins": [],

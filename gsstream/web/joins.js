@@ -3,8 +3,8 @@
 
 import { crc32 } from "./container.js";
 import { PacketError } from "./errors.js";
+import { inflate } from "./key.js";
 import { ATTRIBUTES, MAX_GAUSSIANS } from "./limits.js";
-import { inflate } from "./meta.js";
 
 const MAGIC = 0x4a535347;
 const VERSION = 1;

@@ -9,7 +9,7 @@ import { Snapshots, decodeJoin } from "./joins.js";
 import { Renderer } from "./renderer.js";
 import { openSource } from "./source.js";
 
-/** Decoding may take so many milliseconds of one picture's time before the page gets its turn. */
+/** Decoding may take so many milliseconds before the page gets its turn; what lies before the target is not drawn. */
 const BUDGET = 24;
 
 /**
@@ -40,7 +40,7 @@ export class Player extends EventTarget {
     this._clock = 0;
     this._dirty = false;
     this._then = null;
-    this._closed = false;
+    this._closed = this._behind = false;
     this._tick = (now) => this._turn(now);
     requestAnimationFrame(this._tick);
   }
@@ -74,7 +74,7 @@ export class Player extends EventTarget {
   }
 
   get frame() {
-    return this.state ? this.state.frame : null;
+    return this.state?.frame ?? null;
   }
 
   get fps() {
@@ -173,7 +173,7 @@ export class Player extends EventTarget {
     this.options.beforeFrame?.(seconds);
     if (this.buffer?.live) this.buffer.feed();
     else if (this.buffer) this._advance(seconds);
-    if (this._dirty && this.state) {
+    if (this._dirty && this.state && !this._behind) {
       this._dirty = false;
       this.draw();
     }
@@ -209,13 +209,14 @@ export class Player extends EventTarget {
 
   _decodeTo(frame) {
     const started = performance.now();
+    this._behind = false;
     let step = null;
     try {
       while (this.state === null || this.state.frame !== frame) {
         step = this.buffer.towards(frame, this.frame);
         if (!step) return this._missing(frame);
         this._take(step);
-        if (performance.now() - started > BUDGET && this.state.frame !== frame) return undefined;
+        if ((this._behind = performance.now() - started > BUDGET && this.state.frame !== frame)) return undefined;
       }
     } catch (error) {
       // What is damaged was not applied. A join may be done without.

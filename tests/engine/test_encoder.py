@@ -25,8 +25,8 @@ from gsstream.play import Playback
 #: A body that moves two pixels a frame: motions have something to say.
 WORLD = "synthetic:frames=6&views=3&width=32&height=24&supersample=1"
 TINY: Mapping[str, Any] = {
-    "first_frame.max_iterations": 12, "first_frame.max_points": 250, "first_frame.fill_points": 0,
-    "stream.epochs": 1,
+    "first_frame.max_iterations": 40, "first_frame.points": "recording", "first_frame.max_points": 250,
+    "first_frame.fill_points": 0, "stream.epochs": 1,
 }  # fmt: skip
 #: Anchor insertion finds nothing in so small a world unless it is easily pleased.
 GROWING: Mapping[str, Any] = {
@@ -264,8 +264,8 @@ def test_a_listener_that_fails_is_not_hidden_and_the_frame_can_be_sent_again() -
 
 def test_a_rig_needs_no_recording(tmp_path: Path) -> None:
     """Images from anywhere: the seeds are swept from them, and the stream plays."""
-    rig = frames()[0].cameras
-    made = encoder_of_rig("s2gs-edge", rig, fps=25.0, settings={**TINY, "motion": "coasting"}, name="studio")
+    rig, settings = frames()[0].cameras, {**TINY, "first_frame.points": "auto", "motion": "coasting"}
+    made = encoder_of_rig("s2gs-edge", rig, fps=25.0, settings=settings, name="studio")
     steps = tuple(made.encode(frame) for frame in frames()[:3])
     assert steps[0].status == "key"
     with Playback(write(tmp_path / "rig.gss", steps)) as stream:
@@ -275,7 +275,7 @@ def test_a_rig_needs_no_recording(tmp_path: Path) -> None:
         assert len(stream.cameras("test")) == 0
         for frame, step in enumerate(steps):
             same_bits(stream.player_state(frame).gaussians, step.state.player.gaussians)
-    again = encoder_of_rig("s2gs-edge", rig, fps=25.0, settings={**TINY, "motion": "coasting"}, name="studio")
+    again = encoder_of_rig("s2gs-edge", rig, fps=25.0, settings=settings, name="studio")
     assert packets([again.encode(frame) for frame in frames()[:3]]) == packets(steps)
 
 

@@ -42,6 +42,16 @@ def test_segments_hold_the_bytes_of_the_stream(tmp_path):
     assert sorted(p.name for p in (tmp_path / "site" / "segments").iterdir()) == sorted(Path(n).name for n in names)
 
 
+def test_streams_of_an_older_minor_version_keep_their_bytes(tmp_path):
+    """Regression: with packet format 2.1 a stream of 2.0 was refused, although every player reads it."""
+    stream = Path(__file__).parents[1] / "packet" / "samples" / "2.0" / "stream.gss"
+    package(stream, tmp_path / "site")
+    first = (tmp_path / "site" / segments(tmp_path / "site")[0]).read_bytes()
+    assert first == stream.read_bytes()[: len(first)]
+    with StreamReader(stream) as reader:
+        assert reader.version == "2.0"
+
+
 def test_the_page_finds_every_module_that_it_names(tmp_path):
     package(write(tmp_path / "s.gss"), tmp_path / "site")
     for file in (tmp_path / "site").rglob("*.js"):

@@ -254,9 +254,10 @@ def test_the_page_is_small():
         str(p.relative_to(folder)): len(gzip.compress(p.read_bytes()))
         for p in folder.rglob("*") if p.is_file() and "vendor" not in p.parts
     }  # fmt: skip
-    # What only a live stream takes is loaded only there; the adapter for three.js never.
+    # What only a live stream takes is loaded only there; the adapter for three.js and what
+    # is for scripts alone never.
     live = [sizes.pop(name) for name in ("live.js", "live-socket.js", "latency.js")]
-    del sizes["gsstream-spark.js"]
+    del sizes["gsstream-spark.js"], sizes["world.js"]
     assert len(sizes) > 20
     assert sum(sizes.values()) <= 60_000
     assert sum(live) <= 6_000

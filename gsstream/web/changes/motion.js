@@ -2,8 +2,7 @@
 
 import { unpackParts } from "../bits.js";
 import { PacketError } from "../errors.js";
-import { decodeGates } from "../gates.js";
-import { decodeSymbols } from "../symbols.js";
+import { decodeGates, decodeSymbols } from "../symbols.js";
 
 /** Sections that this change is made of. */
 export const SECTIONS = ["motion"];

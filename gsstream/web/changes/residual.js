@@ -1,9 +1,8 @@
 // The residual of a delta packet: the Gaussians behind open gates change by decoded symbols.
 
 import { PacketError, located } from "../errors.js";
-import { decodeGates } from "../gates.js";
 import { ATTRIBUTES, MAX_CHANNELS, WIDTHS } from "../limits.js";
-import { decodeSymbols, range } from "../symbols.js";
+import { decodeGates, decodeSymbols, range } from "../symbols.js";
 
 const LATENT = 1;
 const MAX_CHANGE = 1e18;

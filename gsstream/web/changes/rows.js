@@ -3,10 +3,9 @@
 import { decodeAttributes } from "../attributes.js";
 import { BitReader, unpackParts } from "../bits.js";
 import { PacketError, located } from "../errors.js";
-import { decodeGates } from "../gates.js";
 import { decodeUnits } from "../key.js";
 import { ATTRIBUTES, MAX_GAUSSIANS, MAX_GAUSSIANS_PER_BYTE } from "../limits.js";
-import { decodeSymbols } from "../symbols.js";
+import { decodeGates, decodeSymbols } from "../symbols.js";
 
 /** Sections that this change is made of. */
 export const SECTIONS = ["deaths", "births"];

@@ -13,7 +13,7 @@ from gsstream.cli import options
 from gsstream.cli.listing import fitting
 from gsstream.cli.serve import server_beside, serving
 from gsstream.cli.streams import stream_file
-from gsstream.core.errors import ComponentError, GsstreamError, SourceError
+from gsstream.core.errors import ComponentError, GsstreamError, OutputError, RecipeError, SourceError
 
 if TYPE_CHECKING:
     from gsstream.engine.run.session import RunResult
@@ -123,6 +123,8 @@ def _what_there_is(error: GsstreamError, out: Path, recording: FrameSource, vide
     from gsstream.engine.run.metrics_log import last_written
     from gsstream.engine.run.session import METRICS, RunResult
 
+    if isinstance(error, RecipeError | OutputError):
+        return  # refused before anything was done, or the folder takes no files: pictures would say nothing or fail
     try:
         done = last_written(out / METRICS) + 1 if (out / METRICS).exists() else 0
         if done == 0:

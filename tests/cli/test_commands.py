@@ -47,7 +47,7 @@ OPTIONS = {
     "gsstream evaluate": ["STREAM", "--source", "--lpips-onnx", "--lpips-range", "--json", "--max-memory"],
     "gsstream gap": ["RUN", "--at", "--cache", "--epochs", "--source", "--json", "--quiet"],
     "gsstream info": ["STREAM", "--json"],
-    "gsstream export": ["STREAM", "--out", "--format", "--frames", "--max-memory"],
+    "gsstream export": ["STREAM", "--out", "--format", "--frames", "--max-memory", "--origin"],
     "gsstream manifest": ["STREAM", "--out"],
     "gsstream view": ["STREAM", "--port", "--host"],
     "gsstream package": ["STREAM", "--out", "--rendition", "--join-every"],

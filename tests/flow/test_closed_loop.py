@@ -102,7 +102,8 @@ def test_training_and_transmission_apply_the_same_map(tmp_path: Path, monkeypatc
     original = step_module.harden
     monkeypatch.setattr(step_module, "harden", harden)
     witness = Witness(monkeypatch)
-    encode(tmp_path, "--frames", "4", method="s2gs-edge", motion="still", codec__trim=0)
+    keep = {"motion": "still", "codec__trim": 0, "stream__release_closed": "false"}
+    encode(tmp_path, "--frames", "4", method="s2gs-edge", **keep)
     assert len(seen) == 3
     for problem, residual, rows in seen:
         before = witness.states[problem.frame - 1].player.scene

@@ -148,7 +148,7 @@ def test_the_octree_of_a_scene_reaches_its_rows_and_leaves_flat_ones_alone(catal
     points = {point.variant: point.resolved.recipe for point in make_plan(one, FOLDER, catalog.recipe_path).points}
     assert points["5-hfp"].structure.params == {"root_exponent": 12, "log_base": 2.0}
     assert points["1-dense"].structure.params == {}
-    assert points["5-hfp"].data.test_cameras == ["cam00"]
+    assert points["5-hfp"].data.test_cameras == ("cam00",)
 
 
 @pytest.mark.parametrize("name", CHEAP)

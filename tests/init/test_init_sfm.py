@@ -15,7 +15,6 @@ from gsstream.core.errors import InputError
 from gsstream.init import sfm
 from gsstream.source.primitives import cast
 from gsstream.source.synthetic import SyntheticSource
-from gsstream.source.toyroom import moving_shapes
 
 needs_pycolmap = pytest.mark.skipif(importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed")
 
@@ -27,7 +26,7 @@ def test_points_lie_on_the_true_surfaces_and_repeat() -> None:
     images, cameras = source.frame(0).images, source.info.train
     points = sfm.triangulate_points(images, cameras)
     assert len(points) > 80
-    shapes = source._static + moving_shapes(0, source._phase(0))
+    shapes = source._static + source._scene.moving(0)
     error = np.full(len(points), np.inf)
     for center in cameras.centers:
         hits = cast(center, (points.xyz - center).astype(np.float32), shapes)

@@ -46,7 +46,9 @@ def documented(message: str) -> None:
 def one_line(result, code: int) -> str:
     """The message of a command that failed as it should: one line, no traceback."""
     assert result.returncode == code, result.stdout + result.stderr
-    lines = [line for line in result.stderr.splitlines() if not line.startswith("warning: no fast renderer")]
+    # A run that fails later on also says what there is and how to go on.
+    beside = ("warning: no fast renderer", "the stream in ")
+    lines = [line for line in result.stderr.splitlines() if not line.startswith(beside)]
     assert len(lines) == 1, result.stderr
     return lines[0].removeprefix("error: ")
 

@@ -139,7 +139,7 @@ def test_policies_decide_what_is_sent(tmp_path: Path) -> None:
     assert first.means.tobytes() == last.means.tobytes()
     assert first.sh0.tobytes() != last.sh0.tobytes()
     for line in metrics(tmp_path)[1:]:
-        assert set(line["bytes"]) <= {"gates", "decoders", "sh0", "header"}
+        assert set(line["bytes"]) <= {"gates", "pattern", "decoders", "sh0", "header"}
 
 
 def test_gates_close_where_they_cost(tmp_path: Path) -> None:

@@ -17,14 +17,21 @@ FARTHEST = 1e12
 
 
 def world_of(source: FrameSource) -> World:
-    """Return the world that the cameras of a recording define which it calls training cameras.
+    """Return the world that a recording's cameras define, training and test cameras together.
 
-    Its test cameras have no say in anything. A split that a recipe makes does not change the world.
+    So it does not depend on the split.
 
     Arguments:
         source: an open recording, in the coordinates of its files.
     """
-    return own_world(source.info.train, source.points)
+    train, test = source.info.train, source.info.test
+    rig = replace(
+        train,
+        ids=(*train.ids, *test.ids),
+        viewmats=np.concatenate([train.viewmats, test.viewmats]),
+        Ks=np.concatenate([train.Ks, test.Ks]),
+    )
+    return own_world(rig, source.points)
 
 
 def as_filed(source: FrameSource) -> FrameSource:

@@ -54,7 +54,8 @@ def test_a_split_over_a_disturbed_recording_keeps_its_points_honest() -> None:
     plain = open_source(WORLD)
     name = plain.info.train.ids[1]
     split = DataOptions(test_cameras=(name,))
-    assert transformed(open_source(f"disturbed:gain=0.9:{WORLD}"), split, 0).points() is None
+    fewer = transformed(open_source(f"disturbed:gain=0.9:{WORLD}"), split, 0).points()
+    assert fewer is None or len(fewer) <= len(plain.points())
     assert transformed(open_source(f"disturbed:gain=0.9:{WORLD}"), DataOptions(test_cameras=()), 0).points() is not None
 
 

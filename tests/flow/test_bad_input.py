@@ -242,9 +242,10 @@ def test_a_part_that_fails_is_named_and_costs_one_frame(
     plugins("failing", FAILING)
     out = tmp_path / "o"
     err = refused(capsys, arguments(out, confidence="failing"), code=1)
-    assert err == (
-        "confidence 'Failing' (from gsstream-failing) failed at frame 3: ZeroDivisionError: of my own making\n"
+    assert err.startswith(
+        "confidence 'Failing' (from gsstream-failing) failed at frame 3: ZeroDivisionError: of my own making"
     )
+    assert "complete up to frame 2" in err
     with StreamReader(out / "stream.gss") as reader:
         reader.check()
         assert [entry.frame for entry in reader.frames] == [0, 1, 2]

@@ -13,6 +13,7 @@ from gsstream.core.errors import EndOfRecording, GsstreamError, InputError, Sour
 from gsstream.core.frame import Frame
 from gsstream.core.storage import Storage, packed, unpacked
 from gsstream.source.base import FrameSource, GrowingSource
+from gsstream.source.canonical import as_filed
 
 FramePair = tuple[Frame, Frame]
 
@@ -104,6 +105,6 @@ def _read_pair(source: FrameSource, index: int, storage: Storage) -> tuple[Frame
     except GsstreamError:
         raise
     except Exception as error:  # a source may be a plugin's: its failure is reported with its name
-        name = type(source).__name__
+        name = type(as_filed(source)).__name__
         raise SourceError(f"{name} could not read frame {index}: {type(error).__name__}: {error}") from error
     return pair, time.perf_counter() - start

@@ -19,7 +19,6 @@ from gsstream.init.seeding import fill_volume, photo_consistent_seeds, thin_poin
 from gsstream.init.sweep import SweepSettings
 from gsstream.source.primitives import cast
 from gsstream.source.synthetic import SyntheticSource
-from gsstream.source.toyroom import moving_shapes
 
 QUICK = SweepSettings(planes=64, neighbours=4)
 
@@ -32,7 +31,7 @@ def scene() -> SyntheticSource:
 def surface_error(scene: SyntheticSource, points: np.ndarray) -> np.ndarray:
     """[P] relative depth error along the rays of the training camera that agrees best; inf where all are blocked."""
     cameras = scene.info.train
-    shapes = scene._static + moving_shapes(0, scene._phase(0))
+    shapes = scene._static + scene._scene.moving(0)
     error = np.full(len(points), np.inf)
     for center in cameras.centers:
         hits = cast(center, (points - center).astype(np.float32), shapes)

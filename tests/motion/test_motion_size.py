@@ -23,7 +23,8 @@ def within(max_bytes: int | None) -> Moved:
     state = method_with("motion", Coasting()).chain()[1].state
     frame = replace(open_source(SOURCE).frame(2), cameras=state.previous.cameras)
     plan = FramePlan(epochs=1, change_threshold=6.0, rate_weight=0.0, max_bytes=max_bytes)
-    return moved(parts, state, frame, detect_change(state.previous, frame, 6.0), Rng(0), Allowance(plan, 0.0, float))
+    change = detect_change(state.previous, frame, 6.0)
+    return moved(parts, state, frame, change, Rng(0), frame.images, Allowance(plan, 0.0, float))
 
 
 @pytest.mark.parametrize("spare", [0, -1])

@@ -82,12 +82,13 @@ def test_ring_three_construction(drill, tmp_path: Path) -> None:
 
 FAULTS = {
     "confidence=raises": "confidence 'Raises' (from gsstream-rings) failed at frame 3: ZeroDivisionError: division by "
-    "zero",
+    "zero (parts.py:60)",
     "confidence=undefined": "confidence 'Undefined' (from gsstream-rings) failed at frame 3: estimate(): expected "
-    "finite values, got nan at index [1] (1 of 24 values)",
+    "finite values, got nan at index [1] (1 of 23 values)",
     "propagation=short": "propagation 'Short' (from gsstream-rings) failed at frame 1: propagate(): expected shape "
-    "[24], got [23]",
-    "gate=tripping": "gate 'Tripping' (from gsstream-rings) failed at frame 1, iteration 0: RuntimeError: out of luck",
+    "[23], got [22]",
+    "gate=tripping": "gate 'Tripping' (from gsstream-rings) failed at frame 1, iteration 0: RuntimeError: out of luck "
+    "(parts.py:94)",
     "regularizer=taxing": "regularizer 'Taxing' (from gsstream-rings) failed at frame 1, iteration 0: penalty 'tax': "
     "expected one finite number, got inf",
 }

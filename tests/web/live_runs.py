@@ -99,7 +99,7 @@ def live_socket(url: str, **settings: Any) -> Any:
     address, _, query = url.partition("?")
     return connect(
         address.replace("http", "ws", 1) + "live" + (f"?{query}" if query else ""), compression=None, max_size=None,
-        legacy=True, open_timeout=60, **settings,
+        proxy=None, open_timeout=60, **settings,
     )  # fmt: skip
 
 

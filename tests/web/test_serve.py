@@ -166,7 +166,7 @@ def test_whoever_comes_again_gets_only_what_it_lacks(tmp_path, packets):
             from websockets.sync.client import connect
 
             address = f"{server.url.replace('http', 'ws', 1)}live?after={frame}&packet={head}"
-            with connect(address, legacy=True) as viewer:
+            with connect(address, proxy=None) as viewer:
                 got, _ = packets_from(viewer, until=10)
             assert got[0] == HEADER
             return [frame_of(packet) for packet in got[1:]]

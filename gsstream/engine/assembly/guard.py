@@ -98,6 +98,8 @@ class Guarded:
         def call(*args: Any, **kwargs: Any) -> Any:
             with blaming(slot, part, where):
                 result = method(*args, **kwargs)
+                if name == "propose":
+                    where.pause()  # what the part fitted is over: what is wrong with the result is of no iteration
                 if look is not None:
                     look(looking, args, result)
             return Guarded.session(result, self) if isinstance(result, RenderSession) else result

@@ -180,15 +180,23 @@ def _deciding(section: str, values: Any) -> Any:
 
 
 def _check_recording(info: SourceInfo, meta: StreamMeta) -> None:
+    """Raise OutputError for another recording, and for the same one in another place."""
+    pairs = (("training", info.train, meta.train), ("test", info.test, meta.test))
+    for split, new, old in pairs:
+        if new.ids != old.ids or (new.width, new.height) != (old.width, old.height) or not np.allclose(new.Ks, old.Ks):
+            raise _another_recording(info, meta, split)
     if not meta.world.is_near(info.world):
         raise OutputError(
             f"the stream lies in other coordinates than {info.name!r} ({info.uri}): the recording was moved since, or "
             "an earlier version wrote the stream in the coordinates of the files; start again with --overwrite"
         )
-    for split, new, old in (("training", info.train, meta.train), ("test", info.test, meta.test)):
-        same = new.ids == old.ids and (new.width, new.height) == (old.width, old.height)
-        if not same or not np.allclose(new.viewmats, old.viewmats, atol=1e-6) or not np.allclose(new.Ks, old.Ks):
-            raise OutputError(
-                f"the stream was made from the recording {meta.source!r} ({meta.extra.get('source_uri', 'unknown')}), "
-                f"whose {split} cameras are not those of {info.name!r} ({info.uri}); resume with the same --source"
-            )
+    for split, new, old in pairs:
+        if not np.allclose(new.viewmats, old.viewmats, atol=1e-6):
+            raise _another_recording(info, meta, split)
+
+
+def _another_recording(info: SourceInfo, meta: StreamMeta, split: str) -> OutputError:
+    return OutputError(
+        f"the stream was made from the recording {meta.source!r} ({meta.extra.get('source_uri', 'unknown')}), "
+        f"whose {split} cameras are not those of {info.name!r} ({info.uri}); resume with the same --source"
+    )

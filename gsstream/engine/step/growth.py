@@ -27,7 +27,6 @@ def grown(parts: Assembly, state: StreamState, delta: Delta, view: FrameView, rn
         return delta  # nobody looks at the scene after the residual, so it need not be made
     after = apply_delta(state.player.scene, delta)
     rows = parts.growth.propose(after, view, rng)
-    parts.where.pause()
     with blaming("growth", parts.part("growth"), parts.where):
         if rows is not None:
             apply_delta(after, Delta((rows,)))

@@ -55,7 +55,6 @@ def moved(
         targets,
     )  # fmt: skip
     motions = tuple(motion for motion in parts.motion.propose(scene, view, rng) if not motion.is_empty)
-    parts.where.pause()
     if not motions:
         return Moved((), scene, view)
     with blaming("motion", parts.part("motion"), parts.where):

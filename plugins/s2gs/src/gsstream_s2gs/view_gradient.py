@@ -123,7 +123,9 @@ class ViewSpaceGradient(ConfidenceEstimator):
             chosen = minmax(values, config.limit)
         else:
             chosen = noise_units(values, expected[seen], config.noise_threshold, config.floor)
-        logits[seen] = chosen.clamp(-config.limit, config.limit)
+        # Whatever a change touches is never less likely to change than what it does not touch.
+        least = config.floor if config.statistics == "touched" else -config.limit
+        logits[seen] = chosen.clamp(least, config.limit)
         return logits.float()
 
     def _magnitudes(self, context: FrameContext) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

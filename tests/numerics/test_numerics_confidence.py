@@ -90,8 +90,10 @@ def test_pixels_or_half_images_are_the_same_with_the_relative_epsilon(unit: floa
 
 def test_without_spread_the_sign_of_the_deviation_decides() -> None:
     """MAD 0 and epsilon 0: 0 / 0 and x / 0 have stated values."""
-    logits = estimated([1.0] * 5 + [2.0, 0.5], epsilon=0.0)
-    assert logits.tolist() == [0.0] * 5 + [LIMIT, -LIMIT]
+    values = [1.0] * 5 + [2.0, 0.5]
+    assert estimated(values, epsilon=0.0, statistics="seen").tolist() == [0.0] * 5 + [LIMIT, -LIMIT]
+    # What a change touches is never less likely to change than what it does not touch.
+    assert estimated(values, epsilon=0.0, floor=-3.0).tolist() == [0.0] * 5 + [LIMIT, -3.0]
 
 
 @pytest.mark.parametrize("part", [ViewSpaceGradient(), NoiseNormalised(), ErrorAware()])

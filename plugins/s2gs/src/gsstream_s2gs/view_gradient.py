@@ -81,7 +81,7 @@ class ViewSpaceGradient(ConfidenceEstimator):
         )  # fmt: skip
         seed: int = Field(default=0, ge=0, description="seed of perturbation and noise probes")
         floor: float = Field(
-            default=-math.log(1000.0), ge=-50, le=0, description="logit where nothing changes, -50 to 0"
+            default=-math.log(1000.0), ge=-50, le=0, description="logit where nothing changes, -50 to 0; with statistics touched, the least of all logits"
         )
         limit: float = Field(default=50.0, gt=0, le=1e4, description="logits are kept in [-limit, limit]")
 

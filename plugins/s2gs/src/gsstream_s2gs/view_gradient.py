@@ -26,7 +26,8 @@ class ViewSpaceGradient(ConfidenceEstimator):
     Medians are taken over the Gaussians that a change touches (|m| > 0; ``statistics: touched``). The engine asks for
     gradients of the tiles that changed alone, so most of the Gaussians that a camera sees have |m| = 0 exactly; counted
     with the others, as ``statistics: seen`` does, they make median and MAD zero, and every touched Gaussian saturates.
-    Gaussians that no change touches get ``floor`` (the printed formula would give p = 0.5 in a frame without change).
+    Gaussians that no change touches get ``floor`` (the printed formula would give p = 0.5 in a frame without change),
+    and with ``statistics: touched`` no other gets less.
 
     The absolute epsilon of the paper acts in the units of m: here gradients of a mean over all pixels with respect to
     positions in half image widths (as in the released code). Then |m| is well below epsilon nearly everywhere, most
@@ -81,7 +82,7 @@ class ViewSpaceGradient(ConfidenceEstimator):
         )  # fmt: skip
         seed: int = Field(default=0, ge=0, description="seed of perturbation and noise probes")
         floor: float = Field(
-            default=-math.log(1000.0), ge=-50, le=0, description="logit where nothing changes, -50 to 0; with statistics touched, the least of all logits"
+            default=-math.log(1000.0), ge=-50, le=0, description="logit where nothing changes, -50 to 0"
         )
         limit: float = Field(default=50.0, gt=0, le=1e4, description="logits are kept in [-limit, limit]")
 

@@ -17,12 +17,15 @@ from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.growth.base import Growth
 from gsstream.growth.fitting import finite, fitted, joined
 from gsstream.growth.judging import ErrorMap, error_map, gains, without
+from gsstream.growth.merging import closest_pairs, merged
 from gsstream.growth.nearest import alike
 from gsstream.growth.placing import Placed, one_per_cell, placed
 from gsstream.growth.splitting import halves, stretched
 
 #: Views are numbered round; of three in a row, which ones changes from frame to frame, one judges and two propose.
 OUT_OF = 3
+#: Pairs whose merge is tried out for every birth that needs room.
+TRIED = 4
 #: Opacity of a newborn before it is fitted, as a logit: 0.73.
 OPACITY = 1.0
 
@@ -34,7 +37,7 @@ class ErrorGrowth(Growth):
     Two thirds of the views propose: along rays through their worst pixels, the depth is taken at which they agree with
     one another, in the colours of the scene. What is proposed is fitted in these views, and what lowers the error of
     the other views is kept. Gaussians that are stretched over what is wrong are split. For every Gaussian that joins,
-    one that no view shows leaves, while there are such.
+    one leaves that no view shows; when there is none, two that look alike become one.
     """
 
     class Config(PartConfig):
@@ -61,6 +64,9 @@ class ErrorGrowth(Growth):
         growth: float = Field(
             default=0.0, ge=0, le=1, description="share of a frame's births that may exceed its deaths"
         )
+        merges: bool = Field(
+            default=True, description="merge Gaussians that look alike when births need room and all others are seen"
+        )
 
     source: ClassVar[str] = "gsstream; splits as in 3DGS (Kerbl et al. 2023)"
 
@@ -83,7 +89,7 @@ class ErrorGrowth(Growth):
         gain = self._gains(scene, born, parents, work, out)
         if not bool((gain > 0).any()):
             return None
-        return self._balanced(after, work, born, parents, gain)
+        return self._balanced(after, work, born, parents, gain, out)
 
     def _candidates(
         self, after: Scene, work: FrameWork, maps: dict[int, ErrorMap], rng: Rng
@@ -119,9 +125,14 @@ class ErrorGrowth(Growth):
         return np.zeros(len(born))
 
     def _balanced(
-        self, after: Scene, work: FrameWork, born: Gaussians[torch.Tensor], parents: IntArray, gain: FloatArray
-    ) -> Rows | None:
-        """The births that gain most, and a death for each: parents that are split, and what no view shows."""
+        self, after: Scene, work: FrameWork, born: Gaussians[torch.Tensor], parents: IntArray, gain: FloatArray,
+        out: list[int],
+    ) -> Rows | None:  # fmt: skip
+        """The births that gain most, and a death for each: parents that are split, and what no view shows.
+
+        When nothing of that is left, a pair of Gaussians that look alike is merged for each birth that gains more than
+        the merge costs.
+        """
         drawn = work.on(after.gaussians.map(torch.from_numpy)).drawn_rows().numpy()
         spare = np.setdiff1d(np.flatnonzero(~drawn), parents)
         # A birth alone makes one more, and so do two halves in the place of one parent.
@@ -130,13 +141,38 @@ class ErrorGrowth(Growth):
         ranked = list(dict.fromkeys(units[order].tolist()))
         dying = 1 - self.config.growth
         number = len(ranked) if dying == 0 else min(len(ranked), int(len(spare) / dying))
+        pairs: IntArray = np.zeros((0, 2), np.int64)
+        if self.config.merges and number < len(ranked):
+            wanted = [float(gain[units == unit][0]) for unit in ranked[number:]]
+            pairs = self._merges(after, work, np.concatenate([parents, spare]), wanted, out)
+        number += len(pairs)
         if number == 0:
             return None
         kept = np.flatnonzero(np.isin(units, ranked[:number]))
         split = np.unique(parents[kept][parents[kept] >= 0])
-        deaths = np.union1d(split, spare[: round(number * dying)]).astype(np.int64)
+        leaving = spare[: round((number - len(pairs)) * dying)]
+        deaths = np.unique(np.concatenate([split, leaving, pairs.ravel()])).astype(np.int64)
         births = born.rows(torch.from_numpy(kept)).map(lambda value: value.numpy())
-        return Rows(self._settled(after, births), deaths)
+        return Rows(self._settled(after, joined(births, merged(after.gaussians, pairs))), deaths)
+
+    def _merges(
+        self, after: Scene, work: FrameWork, busy: IntArray, wanted: list[float], out: list[int]
+    ) -> IntArray:
+        """[K, 2] rows: pairs whose merge costs less than the birth it makes room for gains, in the views left out.
+
+        Arguments:
+            busy: rows that leave or are split anyway.
+            wanted: gains of the births that have no room, falling.
+        """
+        pairs = closest_pairs(after, TRIED * len(wanted), busy)
+        if not len(pairs):
+            return pairs
+        scene = after.gaussians.map(torch.from_numpy)
+        one = merged(after.gaussians, pairs).map(torch.from_numpy)
+        cost = -gains(scene, one, pairs.ravel(), work, out)[0]
+        cheapest = np.argsort(cost, kind="stable")[: len(wanted)]
+        worth = cost[cheapest] < np.array(wanted[: len(cheapest)])
+        return pairs[cheapest[: int(np.argmin(np.append(worth, False)))]]
 
     def _settled(self, after: Scene, born: Gaussians[FloatArray]) -> Births:
         """Births in the node, and so in the gate and the group, of the nearest Gaussian of like colour."""

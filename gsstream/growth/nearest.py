@@ -24,9 +24,15 @@ def alike(born: Gaussians[FloatArray], scene: Scene) -> IntArray:
     # Imported here because it takes 30 MB, which a process that only plays or resumes a stream does not need.
     from scipy.spatial import KDTree
 
+    return np.asarray(KDTree(places(scene.gaussians, scene)).query(places(born, scene))[1], np.int64)
+
+
+def places(rows: Gaussians[FloatArray], scene: Scene) -> FloatArray:
+    """Return [R, 6]: place, in units of the layout, and colour of each, so that near means near and alike.
+
+    Arguments:
+        rows: R rows, raw values.
+        scene: whose layout has the units.
+    """
     unit = float(np.median(scene.layout.units))
-
-    def place(rows: Gaussians[FloatArray]) -> FloatArray:
-        return np.concatenate([rows.means / unit, rows.sh0[:, 0] * (SH0 * FAR)], 1)
-
-    return np.asarray(KDTree(place(scene.gaussians)).query(place(born))[1], np.int64)
+    return np.concatenate([rows.means / unit, rows.sh0[:, 0] * (SH0 * FAR)], 1)

@@ -127,7 +127,7 @@ def test_views_left_out_are_less_wrong_afterwards(entered: Entered, proposed) ->
 
 
 def test_as_many_leave_as_join_and_those_that_leave_are_not_seen(entered: Entered) -> None:
-    part = ErrorGrowth(ErrorGrowth.Config(per_frame=96, split=0.0))
+    part = ErrorGrowth(ErrorGrowth.Config(per_frame=96, split=0.0, merges=False))
     work = entered.work()
     drawn = work.drawn_rows().numpy()
     faint = entered.scene.gaussians.opacities.copy()
@@ -191,3 +191,28 @@ def test_nothing_is_born_with_two_views(entered: Entered) -> None:
     two = replace(entered.frame, images=entered.frame.images[:2], cameras=work.cameras.select([0, 1]))
     before = replace(entered.before, images=entered.before.images[:2], cameras=two.cameras)
     assert ErrorGrowth().propose(entered.scene, entered._replace(before=before).work(frame=two), Rng(0)) is None
+
+
+def test_where_all_are_seen_pairs_are_merged_and_views_left_out_are_less_wrong(entered: Entered) -> None:
+    seen = np.flatnonzero(entered.work().drawn_rows().numpy())
+    layout = entered.scene.layout
+    node_of, nodes = layout.node_of[seen], len(layout.node_counts)
+    counts = np.bincount(node_of, minlength=nodes).astype(np.int32)
+    kept = replace(layout, node_counts=counts, unit_of=layout.unit_of[seen])
+    crowded = entered._replace(scene=replace(entered.scene, gaussians=entered.scene.gaussians.rows(seen), layout=kept))
+    work = crowded.work()
+    for merges in (False, True):
+        rows = ErrorGrowth(ErrorGrowth.Config(per_frame=96, split=0.0, merges=merges)).propose(
+            crowded.scene, crowded.work(), Rng(0)
+        )
+        assert (rows is not None) == merges
+    assert rows is not None
+    assert len(rows.deaths) == len(rows.births) > 20
+    after = apply_rows(crowded.scene, rows).gaussians.map(torch.from_numpy)
+    before = crowded.scene.gaussians.map(torch.from_numpy)
+    out = [view for view in range(VIEWS) if (view + work.index) % OUT_OF == 0]
+    error = [
+        np.mean([(work.shown(scene, view) - work.image(view)).square().mean() for view in out])
+        for scene in (before, after)
+    ]
+    assert error[1] < 0.95 * error[0]

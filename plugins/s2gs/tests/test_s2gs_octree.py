@@ -324,3 +324,12 @@ class TestBuild:
         assert sorted(alone.node_of.tolist()) == list(range(50))
         by_cell = cells.node_of[torch.argsort(alone.node_of)]
         assert torch.equal(by_cell, by_cell.sort().values)  # the same spatial order as the cells
+
+
+def test_with_units_of_the_root_all_levels_travel_alike_and_nothing_else_differs() -> None:
+    points, cameras = cloud(), rig()
+    own, root = octree().seed(points, cameras), octree(unit="root").seed(points, cameras)
+    assert len(own.cell_sizes) > 1
+    assert root.cell_sizes.tolist() == [float(own.cell_sizes[0])] * len(own.cell_sizes)
+    for name in ("positions", "colors", "levels", "origin"):
+        assert torch.equal(getattr(own, name), getattr(root, name)), name

@@ -78,6 +78,11 @@ class StreamingOctree(Structure):
         color: Literal["mean", "max"] = Field(
             default="mean", description="colour of a cell from its points; mean: gsstream's own; max: released code"
         )
+        unit: Literal["cell", "root"] = Field(
+            default="cell",
+            description="what position residuals, and so their rates, are measured in; cell: a cell of the Gaussian's "
+            "own level (paper); root: a root cell for all, so that fine levels travel as far as coarse ones",
+        )
         padding: float = Field(
             default=0.05, ge=0, le=10, description="margin around the points, fraction of their extent, 0 to 10"
         )
@@ -124,7 +129,8 @@ class StreamingOctree(Structure):
             positions.append(where[keep])
             colors.append(_cell_colors(rgb, index, len(unique), self.config.color)[keep])
             level_of.append(torch.full((int(keep.sum()),), level))
-        sizes = side / 2.0 ** (self.config.root_exponent + torch.arange(levels, dtype=torch.float64))
+        depth = torch.arange(levels, dtype=torch.float64) if self.config.unit == "cell" else torch.zeros(levels)
+        sizes = side / 2.0 ** (self.config.root_exponent + depth.double())
         anchors = Anchors(
             torch.cat(positions).float(), torch.cat(colors).float(), torch.cat(level_of), sizes.float(), origin.float()
         )

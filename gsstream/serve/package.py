@@ -70,8 +70,11 @@ def package(
         _replace(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
         for name in old - new:
             (folder / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot write the package {folder}: {error.strerror or error}") from error
+    except BaseException as error:
+        _take_back(folder, old)
+        if isinstance(error, OSError):
+            raise OutputError(f"cannot write the package {folder}: {error.strerror or error}") from error
+        raise
     segments = {s["file"]: s["bytes"] for entry in (main, *others) for s in entry["segments"]}
     joins = {j["file"]: j["bytes"] for entry in (main, *others) for s in entry["segments"] for j in s["joins"]}
     return Package(folder, len(segments), len(joins), sum(segments.values()), sum(joins.values()), size)
@@ -96,6 +99,16 @@ def _old_files(folder: Path) -> set[str]:
         ) from error
     # Only what a package names there: a manifest that somebody else wrote removes nothing beyond its own segments.
     return {name for name in files if Path(name).parent == Path(SEGMENTS) and Path(name).suffix in (".gss", ".gsj")}
+
+
+def _take_back(folder: Path, old: set[str]) -> None:
+    """Remove what a package that failed had written beside the files of the one before."""
+    for path in (folder / SEGMENTS).glob("*"):
+        if f"{SEGMENTS}/{path.name}" not in old:
+            path.unlink(missing_ok=True)
+    for place in (folder / SEGMENTS, folder):
+        if place.is_dir() and not any(place.iterdir()):
+            place.rmdir()
 
 
 def _write_stream(path: Path, folder: Path, join_every: float) -> dict[str, Any]:

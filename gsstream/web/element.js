@@ -40,6 +40,7 @@ const PAGE = `
   <span class="time"></span>
   <select class="speed wide" title="Speed (+ and -)"></select>
   <select class="camera" title="Viewpoint (1 to 9)"></select>
+  <button class="loop wide" title="Begin again at the end (l)">loop</button>
   <select class="rendition wide" title="Rendition" hidden></select>
   <button class="marks wide" title="Mark what the frame changed (g)">changes</button>
   <button class="statistics wide" title="Statistics (i)">i</button>
@@ -64,6 +65,7 @@ export class PlayerElement extends HTMLElement {
         "speed",
         "camera",
         "rendition",
+        "loop",
         "marks",
         "statistics",
         "full",
@@ -148,6 +150,7 @@ export class PlayerElement extends HTMLElement {
     parts.camera.onchange = () => player.look(parts.camera.selectedIndex);
     // What goes wrong is told by the event `problem`.
     parts.rendition.onchange = () => player.choose(parts.rendition.selectedIndex).catch(() => {});
+    parts.loop.onclick = () => this._loop();
     parts.marks.onclick = () => this._marks();
     parts.statistics.onclick = () => this._statistics();
     parts.full.onclick = () => this._full();
@@ -160,6 +163,7 @@ export class PlayerElement extends HTMLElement {
     this._clock = setInterval(() => this._everySecond(), 500);
     if (this.hasAttribute("statistics")) this._statistics();
     this._marks(player.marks);
+    this._loop(player.loop);
     this._wake();
   }
 
@@ -174,6 +178,11 @@ export class PlayerElement extends HTMLElement {
   _marks(on = !this.player.marks) {
     this.player.marks = on;
     this.parts.marks.ariaPressed = String(on);
+  }
+
+  _loop(on = !this.player.loop) {
+    this.player.loop = on;
+    this.parts.loop.ariaPressed = String(on);
   }
 
   _statistics() {
@@ -205,7 +214,7 @@ export class PlayerElement extends HTMLElement {
     parts.seek.min = player.first;
     parts.seek.max = Math.max(player.last, player.first + 1);
     parts.seek.value = player.frame;
-    parts.seek.hidden = parts.speed.hidden = Boolean(player.source.live);
+    parts.seek.hidden = parts.speed.hidden = parts.loop.hidden = Boolean(player.source.live);
     if (player.source.live) {
       parts.time.textContent = `live, frame ${player.frame}`;
       return;
@@ -252,9 +261,7 @@ export class PlayerElement extends HTMLElement {
       f: () => this._full(),
       "+": () => speed(1),
       "-": () => speed(-1),
-      l: () => {
-        player.loop = !player.loop;
-      },
+      l: () => this._loop(),
       r: () => player.look(Math.max(0, this.parts.camera.selectedIndex)),
     };
     const number = Number(event.key) - 1;

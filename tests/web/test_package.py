@@ -122,6 +122,12 @@ def test_renditions_must_have_the_same_frames(tmp_path):
     assert [(r["name"], r["gaussians"]) for r in (manifest, *manifest["renditions"])] == [("main", 30), ("small", 10)]
     with pytest.raises(InputError, match="expected frames 6"):
         package(main, tmp_path / "other", renditions=[short])
+    assert not (tmp_path / "other").exists(), "a package that failed leaves nothing"
+    before = {path: path.read_bytes() for path in (tmp_path / "site").rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match="expected frames 6"):
+        package(write(tmp_path / "another.gss", seed=9), tmp_path / "site", renditions=[short])
+    after = {path: path.read_bytes() for path in (tmp_path / "site").rglob("*") if path.is_file()}
+    assert after == before, "and the package that was there as it was"
 
 
 def test_a_damaged_stream_is_not_packaged(tmp_path):
@@ -131,7 +137,7 @@ def test_a_damaged_stream_is_not_packaged(tmp_path):
     stream.write_bytes(bytes(data))
     with pytest.raises(PacketError):
         package(stream, tmp_path / "site")
-    assert not (tmp_path / "site" / "stream.json").exists()
+    assert not (tmp_path / "site").exists()
 
 
 def test_the_command_says_how_to_look(tmp_path, capsys):

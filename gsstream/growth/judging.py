@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from gsstream.core.cameras import Cameras
 from gsstream.core.context import FrameWork
 from gsstream.core.gaussians import Gaussians
+from gsstream.core.projection import BoolArray, inside, project
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.growth.fitting import joined
 
@@ -29,13 +30,13 @@ class ErrorMap(NamedTuple):
     wrong: torch.Tensor
 
 
-class Projected(NamedTuple):
+class Landing(NamedTuple):
     """Points in a view: ``column``, ``row`` [P] pixels, ``depth`` [P] scene units, ``inside`` [P] bool."""
 
     column: FloatArray
     row: FloatArray
     depth: FloatArray
-    inside: IntArray
+    inside: BoolArray
 
 
 def error_map(work: FrameWork, scene: Gaussians[torch.Tensor], view: int, sigmas: float) -> ErrorMap:
@@ -56,22 +57,16 @@ def error_map(work: FrameWork, scene: Gaussians[torch.Tensor], view: int, sigmas
     return ErrorMap(error, (error > sigmas) & work.changed_pixels(view))
 
 
-def project(points: FloatArray, cameras: Cameras, view: int) -> Projected:
-    """Return where points land in a view.
+def landing(points: FloatArray, cameras: Cameras, view: int) -> Landing:
+    """Return where points land in a view; those nearer than the near plane are not inside.
 
     Arguments:
         points: [P, 3] scene units.
         cameras: training cameras.
         view: index of one of them.
     """
-    pose, K = cameras.viewmats[view], cameras.Ks[view]
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    front = local[:, 2] > cameras.near
-    depth = np.where(front, local[:, 2], 1.0)
-    column = K[0, 0] * local[:, 0] / depth + K[0, 2]
-    row = K[1, 1] * local[:, 1] / depth + K[1, 2]
-    inside = front & (column >= 0) & (row >= 0) & (column < cameras.width) & (row < cameras.height)
-    return Projected(column, row, depth, inside)
+    uv, depth = project(points, cameras, view)
+    return Landing(uv[:, 0], uv[:, 1], depth, inside(uv, depth, cameras) & (depth > cameras.near))
 
 
 def gains(
@@ -96,7 +91,7 @@ def gains(
         before = ((work.shown(scene, view) - image) / noise).square().sum(-1)
         less = before - ((work.shown(with_them, view) - image) / noise).square().sum(-1)
         total += float(less.sum())
-        at = project(born.means.numpy(), work.cameras, view)
+        at = landing(born.means.numpy(), work.cameras, view)
         rows, columns = at.row[at.inside].astype(np.int64), at.column[at.inside].astype(np.int64)
         around, error = _around(less)[rows, columns], _around(before)[rows, columns]
         gain[at.inside] += around - LEAST_SHARE * error

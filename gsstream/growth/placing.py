@@ -11,8 +11,9 @@ import torch.nn.functional as F
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.context import FrameWork
+from gsstream.core.projection import unproject
 from gsstream.core.shapes import FloatArray, IntArray
-from gsstream.growth.judging import ErrorMap, project
+from gsstream.growth.judging import ErrorMap, landing
 
 #: Pixels beside a pixel whose colours are compared, too: (row, column).
 PATCH = ((0, 0), (-2, 0), (2, 0), (0, -2), (0, 2))
@@ -67,7 +68,7 @@ def placed(
         ray = np.arange(len(rows))
         good = (cost[ray, best] <= agreement) & (support[ray, best] >= 2)
         xyz = grid.reshape(len(rows), depths, 3)[ray, best][good]
-        depth = project(xyz, work.cameras, view).depth
+        depth = landing(xyz, work.cameras, view).depth
         found.append(Placed(xyz, reference[good, :3].numpy(), depth / work.cameras.Ks[view, 0, 0]))
         errors.append(one.error[rows, columns].numpy()[good])
     if not found:
@@ -117,7 +118,7 @@ def _worst(one: ErrorMap, most: int, generator: np.random.Generator) -> tuple[In
 
 def _depths(means: FloatArray, cameras: Cameras, view: int, number: int) -> FloatArray:
     """[D] depths to try, near first, evenly spaced in inverse depth."""
-    depth = project(means, cameras, view)
+    depth = landing(means, cameras, view)
     seen = depth.depth[depth.inside] if bool(depth.inside.any()) else np.ones(1)
     near, far = np.quantile(seen, SPREAD)
     return 1 / np.linspace(WIDER / max(near, cameras.near), 1 / (WIDER * far), number)
@@ -125,11 +126,8 @@ def _depths(means: FloatArray, cameras: Cameras, view: int, number: int) -> Floa
 
 def _along(cameras: Cameras, view: int, rows: IntArray, columns: IntArray, depths: FloatArray) -> FloatArray:
     """[R * D, 3] points on the rays through pixels."""
-    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], 1)
-    directions = pixels @ np.linalg.inv(cameras.Ks[view]).T
-    local = (directions[:, None] * depths[None, :, None]).reshape(-1, 3)
-    pose = cameras.viewmats[view]
-    return np.asarray((local - pose[:3, 3]) @ pose[:3, :3])
+    uv = np.stack([columns + 0.5, rows + 0.5], 1)
+    return unproject(np.repeat(uv, len(depths), 0), np.tile(depths, len(uv)), cameras, view)
 
 
 def _costs(
@@ -146,7 +144,7 @@ def _costs(
     for other in maps:
         if other == view:
             continue
-        at = project(grid, cameras, other)
+        at = landing(grid, cameras, other)
         spots = np.stack([2 * at.column / cameras.width - 1, 2 * at.row / cameras.height - 1], 1)
         where = torch.from_numpy(spots.astype(np.float32))[None, None]
         sampled = F.grid_sample(stacks[other], where, align_corners=False, padding_mode="border")[0, :, 0]

@@ -9,7 +9,7 @@ import numpy as np
 from gsstream.core.context import FrameWork
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray, IntArray
-from gsstream.growth.judging import ErrorMap, project
+from gsstream.growth.judging import ErrorMap, landing
 
 #: Halves stand this many standard deviations before and behind the centre, and are this much shorter: together they
 #: have the mean and the variance of the one they replace.
@@ -32,7 +32,7 @@ def stretched(
     longest = np.exp(gaussians.scales.astype(np.float64)).max(1)
     size, hits = np.zeros(len(gaussians)), np.zeros(len(gaussians), np.int64)
     for view, one in maps.items():
-        at = project(gaussians.means, work.cameras, view)
+        at = landing(gaussians.means, work.cameras, view)
         size[at.inside] = np.maximum(size, longest * work.cameras.Ks[view, 0, 0] / at.depth)[at.inside]
         rows, columns = at.row[at.inside].astype(np.int64), at.column[at.inside].astype(np.int64)
         hits[at.inside] += one.wrong.numpy()[rows, columns]

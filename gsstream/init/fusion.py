@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.projection import BoolArray, inside, project, unproject
 from gsstream.core.shapes import FloatArray, IntArray
-from gsstream.init.geometry import BoolArray, inside, pixel_centres, project, unproject
+from gsstream.init.geometry import pixel_centres
 
 
 @dataclass(frozen=True, slots=True)

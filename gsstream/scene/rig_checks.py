@@ -6,8 +6,9 @@ import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import PointCloud
+from gsstream.core.projection import unproject
 from gsstream.core.shapes import FloatArray
-from gsstream.init.geometry import depth_range, focus_point, unproject, visible_views
+from gsstream.init.geometry import depth_range, focus_point, visible_views
 from gsstream.scene.findings import Finding, error, warning
 
 FAR = 30.0

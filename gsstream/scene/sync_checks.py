@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.projection import BoolArray, inside, project
 from gsstream.core.shapes import FloatArray, IntArray
-from gsstream.init.geometry import BoolArray, depth_range, focus_point, inside, project
+from gsstream.init.geometry import depth_range, focus_point
 from gsstream.metrics.noise import noise_sigma
 from gsstream.scene.findings import Finding, error
 from gsstream.scene.match_checks import REPAIRS

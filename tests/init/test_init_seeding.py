@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError, ShapeError
 from gsstream.core.frame import PointCloud
+from gsstream.core.projection import project, unproject
 from gsstream.init.aggregate import aggregate, best_plane
 from gsstream.init.fusion import agreement, color_gains, interpolate_depths
-from gsstream.init.geometry import depth_range, focus_point, neighbour_views, project, unproject
+from gsstream.init.geometry import depth_range, focus_point, neighbour_views
 from gsstream.init.seeding import fill_volume, photo_consistent_seeds, thin_points, visible_views
 from gsstream.init.sweep import SweepSettings
 from gsstream.source.primitives import cast

@@ -7,8 +7,8 @@ import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.gaussians import SH0
+from gsstream.core.projection import inside, project
 from gsstream.core.shapes import FloatArray
-from gsstream.init.geometry import inside, project
 from gsstream.render.reference import evaluate_sh
 
 #: Prior on every coefficient above degree 0, in observations. Frame 0 holds them back, too: their rate is a twentieth.

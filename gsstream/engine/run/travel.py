@@ -10,9 +10,9 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.changes.rows import gather_rows
 from gsstream.core.frame import Frame
+from gsstream.core.projection import inside, project
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.core.storage import packed, unpacked
-from gsstream.init.geometry import inside, project
 from gsstream.metrics.moving import changed_mask, dilate
 from gsstream.packet import PlayerState
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -267,7 +266,7 @@ def test_a_motion_that_does_not_fit_ends_in_one_sentence(
         found = sound(self, scene, work, rng)
         return spoil(found[0]) if found else found
 
-    options = {"method": "s2gs-edge", "motion": "coasting"}
+    options = {"method": "s2gs-edge", "motion": "coasting", "stream__epochs": 1}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Coasting, "propose", propose)
         assert run_command(arguments(tmp_path, "--frames", "4", **options)) == 1
@@ -279,10 +278,7 @@ def test_a_motion_that_does_not_fit_ends_in_one_sentence(
     with Playback(tmp_path / "stream.gss") as playback:
         assert list(playback.frames) == [0, 1]
     assert len(metrics(tmp_path)) == 2
+    if how != "numbers":
+        return  # to the stream and to those who resume it, all of these are the same
     resumed = encode(tmp_path, "--resume", "--frames", "4", **options)
-    assert resumed == _undisturbed(str(tmp_path.parent))
-
-
-@cache
-def _undisturbed(folder: str) -> bytes:
-    return encode(Path(folder) / "undisturbed", "--frames", "4", method="s2gs-edge", motion="coasting")
+    assert resumed == encode(tmp_path / "undisturbed", "--frames", "4", **options)

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from packet_scenes import decode_all, make_delta, make_key, make_layout, make_meta, make_packets, make_scene, same_bits
 
@@ -46,6 +46,7 @@ def test_key_round_trip_is_bitwise(seed, number, sh_rest):
 
 @settings(max_examples=40, deadline=None)
 @given(SEEDS, st.floats(1e-6, 1e6))
+@example(seed=0, norm=1.0078125)
 def test_quantising_twice_is_quantising_once_whatever_the_quaternion_norm(seed, norm):
     scene = make_scene(np.random.default_rng(seed), 20)
     unit = scene.quats / np.linalg.norm(scene.quats, axis=1, keepdims=True)
@@ -53,7 +54,8 @@ def test_quantising_twice_is_quantising_once_whatever_the_quaternion_norm(seed, 
     assert same_bits(quantise_key(once), once)
     cosine = np.abs((once.quats * unit).sum(1)) / np.linalg.norm(once.quats, axis=1)
     assert cosine.min() > 1 - 0.5 * (2.0 ** -KEY_BITS["quats"]) ** 2
-    assert np.abs(np.linalg.norm(once.quats, axis=1) - 1).max() <= 2.0 ** -KEY_BITS["quats"]
+    # Norms that are off by less than a quarter step more than rounding explains are left alone (packet.grids).
+    assert np.abs(np.linalg.norm(once.quats, axis=1) - 1).max() <= 1.25 * 2.0 ** -KEY_BITS["quats"]
 
 
 def test_quantisation_error_is_half_a_step():

@@ -53,7 +53,8 @@ class TestFormulas:
         np.testing.assert_allclose(torch.sigmoid(z).numpy(), p, rtol=1e-6)
 
     def test_minmax_is_the_logit_of_the_share_of_the_range(self) -> None:
-        z = estimator(units="pixel", normalisation="minmax").estimate(told(magnitudes(list(self.values))))
+        part = estimator(units="pixel", normalisation="minmax", statistics="seen")
+        z = part.estimate(told(magnitudes(list(self.values))))
         p = (np.array(self.values) - 1) / 9
         np.testing.assert_allclose(torch.sigmoid(z.double()).numpy(), p, atol=1e-9)
         assert z.tolist()[1] == -50

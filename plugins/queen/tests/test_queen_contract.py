@@ -8,16 +8,20 @@ import sys
 import pytest
 from gsstream_queen import plugin
 from gsstream_queen.method import Queen
-from gsstream_queen.settings import BirthSettings, QueenConfig
+from gsstream_queen.settings import BirthSettings, ChangeSettings, QueenConfig
 
 from gsstream.testing import parametrize_with_checks
 from gsstream.testing.kit import run_method_checks
 
 #: The kit gives a frame one epoch: then something must be born after it.
+EASY = ChangeSettings(dynamic=1e-8)
 FERTILE = BirthSettings(every=1, after=0, until=1, gradient=1e-6, most=20)
 
 
-@parametrize_with_checks([Queen(), Queen(QueenConfig(births=FERTILE, rows="dynamic", dynamic=1e-5))])
+OTHER = QueenConfig(births=FERTILE, rows="dynamic", change=EASY, rate=1e-3, sigma=1e-4)
+
+
+@parametrize_with_checks([Queen(), Queen(OTHER)])
 def test_contract(check) -> None:
     check()
 

@@ -10,13 +10,22 @@ import pytest
 import torch
 from gsstream_queen.births import densify, densify_epochs
 from gsstream_queen.change import changed_tiles, gradient_difference
-from gsstream_queen.gates import BOUND, gates, initial_logits, open_probability
-from gsstream_queen.latents import cosines, decoder, rounded, weight_of
-from gsstream_queen.settings import BirthSettings, GateSettings, LatentPolicy, MaskSettings, QueenConfig
+from gsstream_queen.gates import BOUND, gates, initial_logits, open_probability, shift
+from gsstream_queen.latents import cosines, decoder, initial_weights, rounded, weight_of
+from gsstream_queen.settings import (
+    BirthSettings,
+    ChangeSettings,
+    GateSettings,
+    LatentPolicy,
+    MaskSettings,
+    QueenConfig,
+)
+from gsstream_queen.trainable import OldRows
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from gsstream.api import Rng
 from gsstream.blocks import DensifyStatistics, children
 from gsstream.testing import world
 from gsstream.testing.cases import RENDERER, scene
@@ -153,23 +162,30 @@ class TestBirths:
 
 
 class TestChange:
-    def test_it_is_the_gradient_of_the_difference_of_two_distances(self) -> None:
+    @pytest.mark.parametrize("loss", ["mse", "l2norm"])
+    @pytest.mark.parametrize("aggregate", ["mean-vector", "sum-of-norms"])
+    def test_it_is_the_gradient_of_the_difference_of_two_distances(self, loss: str, aggregate: str) -> None:
         case = world("moving")
-        found = gradient_difference(case)  # type: ignore[arg-type]
-        expected = torch.zeros(len(case.gaussians))
+        found = gradient_difference(case, ChangeSettings(loss=loss, aggregate=aggregate))  # type: ignore[arg-type]
+        gradients = []
         for view in range(len(case.cameras)):
             shown = case.previous_render(view).requires_grad_()
-            truths = case.now[view], case.before[view]
-            now, before = ((shown - truth).square().sum(-1).add(1e-12).sqrt().mean() for truth in truths)
-            (upstream,) = torch.autograd.grad(now - before, shown)
+
+            def distance(truth: torch.Tensor, shown: torch.Tensor = shown) -> torch.Tensor:
+                squared = (shown - truth).square()
+                return squared.mean() if loss == "mse" else squared.sum(-1).add(1e-12).sqrt().mean()
+
+            (upstream,) = torch.autograd.grad(distance(case.now[view]) - distance(case.before[view]), shown)
             half = torch.tensor([case.cameras.width / 2, case.cameras.height / 2])
-            expected += (case.screen_gradient(view, upstream).gradient * half).norm(dim=1)
+            gradients.append(case.screen_gradient(view, upstream).gradient * half)
+        every = torch.stack(gradients)
+        expected = every.mean(0).norm(dim=1) if aggregate == "mean-vector" else every.norm(dim=2).sum(0)
         torch.testing.assert_close(found.difference, expected, atol=1e-6, rtol=1e-4)
         moved = found.difference[case.moved].mean()
         assert moved > 3 * found.difference[~case.moved].mean(), "what moved feels more than what did not"
 
     def test_still_images_change_nothing(self) -> None:
-        assert float(gradient_difference(world("moving").blended(0)).difference.max()) == 0  # type: ignore[arg-type]
+        assert float(gradient_difference(world("moving").blended(0), ChangeSettings()).difference.max()) == 0  # type: ignore[arg-type]
 
     def test_tiles_follow_the_dynamic_rows(self) -> None:
         case = world("moving")
@@ -200,3 +216,36 @@ def test_settings_that_contradict_themselves() -> None:
         }
     )
     assert set(frozen.latents()) == {"scales", "opacities", "shN"}
+
+
+def old_rows(number: int, **settings: object) -> OldRows:
+    config = QueenConfig(**settings)
+    base = scene(torch.zeros(number, 3))
+    weights = initial_weights(config.latents(), base, Rng(0))
+    return OldRows(config, base, torch.zeros(number), weights, 1.0, number, 100)
+
+
+def test_l0_is_a_sum_or_a_mean() -> None:
+    probability = float(torch.sigmoid(torch.tensor(-shift(GateSettings()))))
+    for over, factor in (("sum", 7.0), ("mean", 1.0)):
+        rows = old_rows(7, gate=GateSettings(l0=0.25, l0_over=over))
+        assert float(rows._penalty().detach()) == pytest.approx(0.25 * factor * probability, rel=1e-6)
+
+
+def test_sigma_weighs_the_spread_of_the_latents() -> None:
+    rows = old_rows(6, gate=GateSettings(l0=0), sigma=2.0)
+    generator, spreads = torch.Generator().manual_seed(0), []
+    for value in rows._latents.values():
+        value.data = torch.randn(value.shape, generator=generator)
+        spreads += value.detach().std(0).tolist()
+    assert float(rows._penalty().detach()) == pytest.approx(2 * sum(spreads) / len(spreads), rel=1e-5)
+
+
+def test_rate_pulls_latents_towards_zero_and_nothing_else_does() -> None:
+    for rate in (0.0, 1.0):
+        rows = old_rows(5, gate=GateSettings(l0=0), rate=rate)
+        for value in rows._latents.values():
+            value.data += 3.0
+        rows.step()
+        moved = [bool((value < 3.0).all()) for value in rows._latents.values()]
+        assert moved == [rate > 0] * len(moved)

@@ -21,7 +21,8 @@ from gsstream.player.playback import Playback
 SOURCE = "synthetic:frames=5&views=3&width=64&height=48&supersample=1"
 SETTINGS = {
     "first_frame.max_iterations": 40, "first_frame.fill_points": 100, "first_frame.max_points": 500, "stream.epochs": 3,
-    "stepper.births.every": 1, "stepper.births.gradient": 1e-4, "stepper.births.most": 30, "stepper.dynamic": 1e-4,
+    "stepper.births.every": 1, "stepper.births.gradient": 1e-4, "stepper.births.most": 30,
+    "stepper.change.dynamic": 1e-7,
 }  # fmt: skip
 
 

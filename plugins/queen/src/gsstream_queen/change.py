@@ -8,7 +8,7 @@ import torch
 
 from gsstream.api import FrameTools, Renderer
 from gsstream.blocks import marked_per_tile
-from gsstream_queen.settings import MaskSettings
+from gsstream_queen.settings import ChangeSettings, MaskSettings
 
 TILE = 16
 #: Inside the root of the colour distance, image units squared: no 0/0 where a pixel is exact.
@@ -16,30 +16,39 @@ EPSILON = 1e-12
 
 
 class Change(NamedTuple):
-    """``difference`` [N] sum over views of |d(E_t - E_{t-1}) / d centre|, half image widths; ``seen`` [N] bool."""
+    """``difference`` [N]: size of d(E_t - E_{t-1}) / d centre over the views, half image widths; ``seen`` [N] bool."""
 
     difference: torch.Tensor
     seen: torch.Tensor
 
 
-def gradient_difference(work: FrameTools) -> Change:
-    """The view-space gradient difference. E is the mean Euclidean distance of pixel colours between an image and the
-    scene as it was before the frame.
+def gradient_difference(work: FrameTools, settings: ChangeSettings) -> Change:
+    """The view-space gradient difference (paper, Eq. 9).
+
+    E compares an image with the scene as it was before the frame: their mean squared distance, or the mean Euclidean
+    distance of pixel colours.
     """
-    number = len(work.gaussians)
-    total, seen = torch.zeros(number), torch.zeros(number, dtype=torch.bool)
+    number, views = len(work.gaussians), len(work.cameras)
+    vector, norms, seen = torch.zeros(number, 2), torch.zeros(number), torch.zeros(number, dtype=torch.bool)
     half = torch.tensor([work.cameras.width / 2, work.cameras.height / 2])
-    for view in range(len(work.cameras)):
-        now, before = work.image(view), work.previous_image(view)
-        if torch.equal(now, before):
-            upstream = torch.zeros_like(now)
-        else:
-            shown = work.previous_render(view)
-            upstream = (_direction(shown, now) - _direction(shown, before)) / (now.shape[0] * now.shape[1])
-        found = work.screen_gradient(view, upstream)
-        total += (found.gradient * half).norm(dim=1)
+    for view in range(views):
+        found = work.screen_gradient(view, _upstream(work, view, settings))
+        gradient = found.gradient * half
+        vector += gradient
+        norms += gradient.norm(dim=1)
         seen |= found.visible
-    return Change(total, seen)
+    return Change(vector.norm(dim=1) / views if settings.aggregate == "mean-vector" else norms, seen)
+
+
+def _upstream(work: FrameTools, view: int, settings: ChangeSettings) -> torch.Tensor:
+    """[H, W, 3] derivative of E_t - E_{t-1} with respect to the render of frame t-1."""
+    now, before = work.image(view), work.previous_image(view)
+    if torch.equal(now, before):
+        return torch.zeros_like(now)
+    if settings.loss == "mse":  # the render itself cancels
+        return 2 * (before - now) / now.numel()
+    shown = work.previous_render(view)
+    return (_direction(shown, now) - _direction(shown, before)) / (now.shape[0] * now.shape[1])
 
 
 def _direction(image: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:

@@ -71,8 +71,9 @@ class _Frame:
         self._cameras: Cameras = problem.work.cameras
         self._extent = self._cameras.extent
         self._old = OldRows(
-            config, self._scene.rows(problem.active), problem.logits, problem.weights, self._extent, len(self._scene)
-        )
+            config, self._scene.rows(problem.active), problem.logits, problem.weights, self._extent, len(self._scene),
+            self._cameras.width * self._cameras.height,
+        )  # fmt: skip
         self._new: list[NewRows] = []
         #: Rows of the scene that a split replaced.
         self._gone = torch.zeros(len(self._scene), dtype=torch.bool)

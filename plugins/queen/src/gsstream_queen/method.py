@@ -81,12 +81,12 @@ class Queen(StreamingMethod[QueenState]):
         if frame.effort == 0:
             return self._send(state, frame, tools, Delta(), {})
         work = tools.open(state.player, state.previous, frame)
-        change = gradient_difference(work)
+        change = gradient_difference(work, self.config.change)
         clock.append(time.perf_counter())
         if not bool((change.difference > 0).any()):
             # Not a pixel differs from the images before: nothing to learn.
             return self._send(state, frame, tools, Delta(), {})
-        dynamic = change.difference > self.config.dynamic
+        dynamic = change.difference > self.config.change.dynamic
         active = torch.arange(len(dynamic)) if self.config.rows == "all" else dynamic.nonzero()[:, 0]
         if len(active) == 0:
             return self._send(state, frame, tools, Delta(), {})

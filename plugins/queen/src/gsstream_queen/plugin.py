@@ -30,6 +30,8 @@ def gsstream_methods() -> list[MethodSpec]:
         MethodSpec(
             name="queen-published",
             recipe="gsstream_queen:recipes/queen-published.yaml",
-            summary="QUEEN: 10 epochs, training everything, as published",
+            summary="QUEEN-l as printed: 10 epochs, training everything",
         ),
+        MethodSpec(name="queen-m", recipe="gsstream_queen:recipes/queen-m.yaml", summary="QUEEN-m: 8 epochs"),
+        MethodSpec(name="queen-s", recipe="gsstream_queen:recipes/queen-s.yaml", summary="QUEEN-s: 6 epochs"),
     ]

@@ -18,7 +18,7 @@ class PositionPolicy(PartConfig):
     step: float = Field(
         default=1e-4, gt=0, le=1, description="quantisation step, rig extents, to 1 (published: float32)"
     )
-    lr: float = Field(default=5e-4, ge=0, le=1, description="Adam learning rate, rig extents per iteration, to 1")
+    lr: float = Field(default=1.6e-4, ge=0, le=1, description="Adam learning rate, rig extents per iteration, to 1")
 
 
 class LatentPolicy(PartConfig):
@@ -36,6 +36,21 @@ class LatentPolicy(PartConfig):
     )
 
 
+class ChangeSettings(PartConfig):
+    """The view-space gradient difference, and from what on a Gaussian counts as dynamic."""
+
+    loss: Literal["mse", "l2norm"] = Field(
+        default="mse", description="E; mse: published; l2norm: mean Euclidean distance of pixel colours"
+    )
+    aggregate: Literal["mean-vector", "sum-of-norms"] = Field(
+        default="mean-vector", description="over views; mean-vector: norm of the mean gradient, published"
+    )
+    dynamic: float = Field(
+        default=3.5e-6, ge=0, le=1e6,
+        description="difference above which a Gaussian is dynamic, to 1e6; in the units of loss and aggregate",
+    )  # fmt: skip
+
+
 class GateSettings(PartConfig):
     """Hard-concrete gates (Louizos et al. 2018), without noise."""
 
@@ -43,7 +58,10 @@ class GateSettings(PartConfig):
     gamma: float = Field(default=-0.5, ge=-10, lt=0, description="lower end of the stretched interval, -10 to 0")
     eta: float = Field(default=1.01, gt=1, le=10, description="upper end of the stretched interval, 1 to 10")
     lr: float = Field(default=0.1, ge=0, le=10, description="Adam learning rate of the logits, to 10")
-    l0: float = Field(default=0.01, ge=0, le=100, description="weight of the mean probability to be open, to 100")
+    l0: float = Field(default=0.01, ge=0, le=100, description="weight of the probability to be open, to 100")
+    l0_over: Literal["sum", "mean"] = Field(
+        default="sum", description="of the probabilities of all Gaussians; sum: published; mean: their sum divided by N"
+    )
 
 
 class MaskSettings(PartConfig):
@@ -92,14 +110,21 @@ class QueenConfig(PartConfig):
         default=LatentPolicy(latent=8, lr=0.0125, decoder_lr=1e-3, decoder_std=1e-4), description="degree-0 colour"
     )
     shN: LatentPolicy = Field(
-        default=LatentPolicy(latent=4, lr=0.000125, decoder_lr=1e-4, decoder_std=1e-1), description="higher colour"
+        default=LatentPolicy(latent=4, lr=0.000625, decoder_lr=1e-4, decoder_std=1e-1), description="higher colour"
     )
     gate: GateSettings = Field(default=GateSettings(), description="gates of positions")
     mask: MaskSettings = Field(default=MaskSettings(), description="masked first part of a frame")
     births: BirthSettings = Field(default=BirthSettings(), description="masked densification")
-    dynamic: float = Field(
-        default=1e-3, ge=0, le=1e6, description="gradient difference above which a Gaussian is dynamic, to 1e6"
-    )
+    change: ChangeSettings = Field(default=ChangeSettings(), description="what changed")
+    sigma: float = Field(
+        default=0.0, ge=0, le=1e6,
+        description="weight of the mean standard deviation of the latents' channels, symbols, to 1e6; published, but "
+        "its value is not known to us",
+    )  # fmt: skip
+    rate: float = Field(
+        default=0.0, ge=0, le=10,
+        description="weight of the latents' bits per training pixel, as stream.rate_weight (ours), to 10",
+    )  # fmt: skip
     rows: Literal["all", "dynamic"] = Field(
         default="all", description="which Gaussians are trained; all: published; dynamic: only those"
     )

@@ -8,12 +8,15 @@ from dataclasses import dataclass
 import torch
 
 from gsstream.api import ATTRIBUTES, Gaussians
+from gsstream.blocks import rate_gradient
 from gsstream_queen.gates import BOUND, gates, open_probability
 from gsstream_queen.latents import Tensors, coded, decoder, rounded, width
 from gsstream_queen.settings import QueenConfig
 
 #: 3DGS, raw units per iteration (centres: fraction of the rig's extent from the settings).
 BORN_RATES = {"quats": 1e-3, "scales": 5e-3, "opacities": 0.05, "sh0": 2.5e-3, "shN": 1.25e-4}
+#: Under the root of the latents' variance, symbols squared.
+SPREAD_EPSILON = 1e-8
 ADAM_EPS = 1e-15  # 3DGS: tiny gradients of tiny Gaussians must still move them
 
 
@@ -35,10 +38,14 @@ class OldRows:
 
     def __init__(
         self, config: QueenConfig, base: Gaussians[torch.Tensor], logits: torch.Tensor,
-        weights: Mapping[str, torch.Tensor], extent: float, total: int,
+        weights: Mapping[str, torch.Tensor], extent: float, total: int, pixels: int,
     ) -> None:  # fmt: skip
-        """``base`` are the A rows, ``logits`` [A] their gates, ``total`` the N that the penalty is a mean over."""
+        """``base`` are the A rows, ``logits`` [A] their gates, ``total`` the N of the scene.
+
+        ``pixels`` of a training view: bits are weighed by them.
+        """
         self._config, self._base, self._total = config, base, total
+        self._rate = config.rate / pixels
         self._unit = config.means.step * extent
         self._policies = coded(config.latents(), base)
         self._latents = {n: torch.zeros(len(base), p.latent, requires_grad=True) for n, p in self._policies.items()}
@@ -75,12 +82,30 @@ class OldRows:
         """Add the pull of the L0 penalty, step everything once, keep the logits in their bounds."""
         if self._adam is None:
             return
-        if self._moving and self._config.means.policy == "gated" and self._config.gate.l0:
-            penalty = self._config.gate.l0 * open_probability(self._logits, self._config.gate).sum() / self._total
+        penalty = self._penalty()
+        if penalty.requires_grad:
             penalty.backward()  # type: ignore[no-untyped-call]
+        if self._rate:
+            for latents in self._latents.values():
+                number, channels = latents.shape
+                bits = rate_gradient(latents.detach(), torch.ones(channels), torch.ones(number), self._rate)
+                latents.grad = bits if latents.grad is None else latents.grad + bits
         self._adam.step()
         self._adam.zero_grad(set_to_none=True)
         self._logits.data.clamp_(-BOUND, BOUND)
+
+    def _penalty(self) -> torch.Tensor:
+        """L0 of the gates (paper, Eq. 8) and the spread of the latents (paper, appendix A.2)."""
+        penalty, gate = torch.zeros(()), self._config.gate
+        if self._moving and self._config.means.policy == "gated" and gate.l0:
+            opened = open_probability(self._logits, gate).sum()
+            penalty = penalty + gate.l0 * (opened if gate.l0_over == "sum" else opened / self._total)
+        if self._config.sigma and len(self._base) > 1 and self._latents:
+            # The root has no slope at a spread of 0, where every frame begins.
+            spread = [(value.var(0) + SPREAD_EPSILON).sqrt().sum() for value in self._latents.values()]
+            channels = sum(value.shape[1] for value in self._latents.values())
+            penalty = penalty + self._config.sigma * torch.stack(spread).sum() / channels
+        return penalty
 
     def solution(self) -> Solution:
         """The integers, and the decoders they go through."""

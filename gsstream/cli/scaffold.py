@@ -61,7 +61,8 @@ def files(name: str, kind: str) -> Mapping[str, str]:
     values["kit"] = ", ".join([*(["SourceUnderTest"] if kind in SUBJECTS else []), "parametrize_with_checks"])
     values["claims"] = CLAIMS.get(kind, CLAIMS[""])
     values["api"] = gsstream.API_VERSION  # stated, so that a later gsstream knows what it was written for
-    texts = {path: _fill(text, values) for path, text in TEMPLATES.items()}
+    templates = {**TEMPLATES, **METHOD_TEMPLATES} if kind == "stepper" else TEMPLATES
+    texts = {path: _fill(text, values) for path, text in templates.items()}
     return {
         **{_fill(path, values): text for path, text in texts.items()},
         f"src/{package}/{kind}.py": part,
@@ -149,5 +150,73 @@ from gsstream.testing import <kit>
 @parametrize_with_checks([<subject>])
 def test_contract(check) -> None:
     check()
+''',
+}
+#: A stepper is a whole method: it is shipped with a recipe, so that ``--method`` finds it.
+METHOD_TEMPLATES: Mapping[str, str] = {
+    "README.md": """\
+# gsstream-<name>
+
+<summary>
+
+One method for gsstream: `<name>`, as the stepper of that name and a recipe that takes it.
+
+```
+pip install -e .
+gsstream check <kind>/<name>
+gsstream check method/<name>
+gsstream run --method <name> --source demo --out run/
+```
+
+The method is in `src/<package>/<module>.py`, its recipe in `src/<package>/recipes/<name>.yaml`; more recipes make more
+methods of the same code, each with a `MethodSpec` in `plugin.py`. Change them, and check again: with `gsstream check`,
+or with `pytest` for one test per check. <claims>
+""",
+    "src/<package>/recipes/<name>.yaml": """\
+# The method as --method <name> finds it: what is not said here has its default (gsstream recipe show <name>).
+method: <name>
+stepper: {name: <name>}
+""",
+    "src/<package>/plugin.py": '''\
+"""What this plugin ships, described without importing torch."""
+
+from __future__ import annotations
+
+from gsstream.spec import ComponentSpec, MethodSpec, hookimpl
+
+
+@hookimpl
+def gsstream_components() -> list[ComponentSpec]:
+    return [
+        ComponentSpec(
+            kind="<kind>",
+            name="<name>",
+            target="<package>.<module>:<cls>",
+            summary="<summary>",
+            api="<api>",
+        )
+    ]
+
+
+@hookimpl
+def gsstream_methods() -> list[MethodSpec]:
+    return [MethodSpec(name="<name>", recipe="<package>:recipes/<name>.yaml", summary="<summary>")]
+''',
+    "tests/test_<package>_contract.py": '''\
+"""The method keeps the contract of parts and of whole methods."""
+
+from <package>.<module> import <cls>
+
+from gsstream.testing import parametrize_with_checks
+from gsstream.testing.kit import run_method_checks
+
+
+@parametrize_with_checks([<subject>])
+def test_contract(check) -> None:
+    check()
+
+
+def test_as_a_method() -> None:
+    assert [result for result in run_method_checks("<name>") if not result.ok] == []
 ''',
 }

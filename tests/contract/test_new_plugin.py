@@ -22,6 +22,12 @@ def test_passes_the_contract_untouched(kind: str, tmp_path: Path) -> None:
     skipped = [line.split()[1] for line in result.stdout.splitlines() if "(skipped)" in line]
     assert skipped == ([] if kind == "source" else ["auto_rules"]), "only settings that a scene could choose"
     assert "✓ cheap_spec" in result.stdout
+    if kind == "stepper":  # a whole method, which its recipe makes one of --method
+        result = gsstream(site, "check", "method/my-own", cwd=tmp_path)
+        assert result.returncode == 0, result.stdout + result.stderr
+        assert "(skipped)" not in result.stdout
+        shown = gsstream(site, "recipe", "show", "my-own", cwd=tmp_path)
+        assert "method: my-own" in shown.stdout, shown.stderr
 
 
 def test_its_own_test_suite_and_lint_are_green(tmp_path: Path) -> None:

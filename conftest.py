@@ -26,13 +26,17 @@ ROOT = Path(__file__).parent
 #: Files that take longest, longest first. They are begun first: a long file that is begun last keeps one core busy
 #: while the others wait. A name that is missing here costs only time.
 LONG = (
-    "contract/test_tutorial", "trade/test_sweep_real", "contract/test_shipped_plugins", "scene/test_prepare",
-    "contract/test_new_plugin", "contract/test_saboteurs", "plugins/test_six_rings", "flow/test_odd_runs",
-    "flow/test_growing_scene", "flow/test_cost_follows_change", "flow/test_key_refresh", "flow/test_repeat_and_resume",
-    "flow/test_data_options", "flow/test_trim", "flow/test_still_frames", "source/test_layout_runs", "tools/test_soak",
-    "packet/test_fuzz", "trade/test_tune", "flow/test_run_ends", "flow/test_segments", "init/test_init_sfm",
-    "s2gs/tests/test_s2gs_anchor_insertion", "tools/test_cost_scripts", "queen/tests/test_queen_stream",
-    "flow/test_light_process", "flow/test_auto_run", "flow/test_budget", "player/test_player_memory", "web/test_page",
+    "flow/test_closed_loop", "flow/test_repeat_and_resume", "flow/test_segments", "flow/test_key_refresh",
+    "trade/test_sweep_ray", "contract/test_new_plugin", "contract/test_tutorial", "plugins/test_six_rings",
+    "flow/test_paper_configs", "web/test_page", "engine/test_trials", "flow/test_budget", "contract/test_saboteurs",
+    "contract/test_shipped_plugins", "flow/test_no_overshoot", "web/test_live_page", "flow/test_odd_runs",
+    "flow/test_data_options", "web/test_decoder", "scene/test_prepare", "flow/test_cost_follows_change",
+    "flow/test_bad_input", "flow/test_growing_scene", "flow/test_trim", "flow/test_auto_run", "web/test_page_joins",
+    "flow/test_checks", "packet/test_fuzz", "flow/test_run_ends", "flow/test_watch", "flow/test_worlds",
+    "scene/test_validate", "trade/test_tune", "queen/tests/test_queen_stream", "tools/test_soak",
+    "flow/test_still_frames", "packet/test_corrupt", "init/test_init_sfm", "source/test_layout_runs",
+    "trade/test_sweep_real", "s2gs/tests/test_s2gs_anchor_insertion", "tools/test_cost_scripts",
+    "flow/test_light_process", "player/test_player_memory",
 )  # fmt: skip
 #: What ``make check`` runs: rooms whose tests are cheap, and the one test of whole runs that must never fail.
 QUICK = ("core", "spec", "recipe", "residual", "render", "metrics", "cli", "packet", "player", "method", "plugins")

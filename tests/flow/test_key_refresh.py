@@ -95,7 +95,7 @@ def test_who_joins_at_any_key_packet_sees_the_same_frames(tmp_path):
                 assert same(seeking.state_at(frame), other.state_at(frame))
 
 
-@pytest.mark.parametrize("cut", [1, 2, 3, 5])
+@pytest.mark.parametrize("cut", [2, 5])
 def test_a_run_with_key_packets_resumes_to_the_same_bytes(tmp_path, cut):
     once = encode(tmp_path, method="s2gs-edge", **PERIOD)
     stream = tmp_path / "stream.gss"

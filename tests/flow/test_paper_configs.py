@@ -43,10 +43,9 @@ TINY = [
     "first_frame.max_points=600", "stream.epochs=1", "frames=2",
 ]  # fmt: skip
 CHEAP = [
-    "components 1-dense", "components 2-ste", "components 4-octree", "structure-sparsity structure",
-    "propagation ft-0.80", "discretisation binary-released", "confidence uniform-random", "confidence constant-zero",
-    "confidence released-ratio", "illumination 0.5", "first-frame-noise noise-30", "extensions noise-normalised",
-    "extensions error-aware", "extensions selective-leaf", "extensions insertion",
+    "components 1-dense", "components 4-octree", "structure-sparsity structure", "propagation ft-0.80",
+    "discretisation binary-released", "confidence constant-zero", "first-frame-noise noise-30",
+    "extensions selective-leaf", "extensions insertion",
 ]  # fmt: skip
 
 

@@ -50,7 +50,7 @@ def kill_first_worker(marks: Path, killed: list[int]) -> None:
             if pid not in killed:
                 os.kill(pid, signal.SIGKILL)
                 killed.append(pid)
-        if len(killed) >= 4:
+        if len(killed) >= 2:
             return
         time.sleep(0.05)
 
@@ -58,16 +58,16 @@ def kill_first_worker(marks: Path, killed: list[int]) -> None:
 @needs_ray
 @pytest.mark.slow
 def test_ray_workers_killed_in_a_cell_are_replaced(plan_of, tmp_path, marks):
-    plan, out = plan_of(TWO_SEEDS + "first_frame: {share: own}\n"), tmp_path / "out"
+    plan, out = plan_of(TWO_SEEDS.replace("[0, 1]", "[0]") + "first_frame: {share: own}\n"), tmp_path / "out"
     said: list[str] = []
     killed: list[int] = []
     thread = threading.Thread(target=kill_first_worker, args=(marks, killed))
     thread.start()
     result = run_sweep(plan, out, RayExecutor("local", 2, 1, sweep_works.hang_once), say=said.append)
     thread.join()
-    assert len(killed) == 4
-    assert (result.made, dict(result.failed)) == (4, {})
-    assert sum("Ray worker was lost" in line and "once more" in line for line in said) == 4
+    assert len(killed) == 2
+    assert (result.made, dict(result.failed)) == (2, {})
+    assert sum("Ray worker was lost" in line and "once more" in line for line in said) == 2
     rows = [json.loads(line) for line in (out / "table.jsonl").read_text().splitlines()]
     assert sorted(row["id"] for row in rows if row["record"] == "cell") == sorted(plan.cells)
 

@@ -23,7 +23,8 @@ SHIPPED: Mapping[str, tuple[str, ...]] = {
     ),
     "player": ("renderer/cpu", "loss/cpu", "optimiser/cpu"),
     "methods": (
-        "method/queen", "method/queen-published", "stepper/queen", "propagation/ft-pruning", "gate/binary-ste",
+        "method/queen", "method/queen-published", "method/queen-m", "method/queen-s", "stepper/queen",
+        "propagation/ft-pruning", "gate/binary-ste",
         "confidence/onnx",
     ),
 }  # fmt: skip

@@ -191,8 +191,7 @@ def test_step_looks_at_frame_0_and_at_whole_methods_too(tmp_path: Path) -> None:
     COUNTER.calls = 0
     error = failure(assembly("step", "queen", loss=WrongLoss()), tmp_path / "b")
     assert isinstance(error, ComponentError)
-    # Nothing changed that QUEEN calls dynamic in frame 1.
-    assert (error.slot, error.part, error.frame, error.iteration) == ("loss", "WrongLoss", 2, 4)
+    assert (error.slot, error.part, error.frame, error.iteration) == ("loss", "WrongLoss", 1, 4)
 
 
 def test_frame_finds_at_the_end_of_the_frame_what_step_finds_at_once(tmp_path: Path) -> None:

@@ -60,9 +60,13 @@ def plot_runs(runs: Mapping[str, Sequence[FrameRecord]], out: str | os.PathLike[
             curves[label] = (lines, zero)
     if not curves:
         raise InputError("nothing to plot: no run has a measured frame")
-    figure = Figure(figsize=(8, 0.6 + 1.7 * len(curves)), dpi=120, layout="constrained")
+    # Margins in inches, by hand: matplotlib's own layout draws everything twice, a second and a half for every run.
+    below, height = (0.85 if len(runs) > 1 else 0.55), 1.7 * len(curves)
+    total = height + below + 0.45
+    figure = Figure(figsize=(8, total), dpi=120)
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(curves), 1, sharex=True, squeeze=False)[:, 0]
+    figure.subplots_adjust(left=0.08, right=0.98, bottom=below / total, top=1 - 0.7 / total, hspace=0.3)
     colors = {name: COLORS[i % len(COLORS)] for i, name in enumerate(runs)}
     for axis, (label, (lines, zero)) in zip(axes, curves.items(), strict=True):
         for name, (x, y) in lines.items():
@@ -75,7 +79,7 @@ def plot_runs(runs: Mapping[str, Sequence[FrameRecord]], out: str | os.PathLike[
     axes[-1].set_xlabel("frame", fontsize=9)
     if len(runs) > 1:
         handles = axes[0].get_legend_handles_labels()
-        figure.legend(*handles, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
+        figure.legend(*handles, loc="lower center", ncols=4, fontsize=9, frameon=False)
     if title:
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     out = Path(out)

@@ -73,3 +73,10 @@ def test_after_a_sudden_stop_nothing_goes_on(motion: str, first: PlayerState) ->
 def test_after_a_bounce_it_is_as_good_as_before() -> None:
     bounce = changed("bounce", "rigid", None, EVENT + 5)[1]
     assert max(bounce[EVENT + 2 : EVENT + 4]) > bounce[EVENT - 1] - MARGIN
+
+
+@pytest.mark.parametrize("event", ["flash", "dropout", "occlusion"])
+def test_three_frames_after_a_disturbance_it_is_as_good_as_before(event: str, first: PlayerState) -> None:
+    """One overexposed frame, a camera that shows an old picture for some, a body behind another one."""
+    disturbed = changed(event, "rigid", None if event == "occlusion" else first, EVENT + 5)[1]
+    assert min(disturbed[EVENT + 3 :]) > disturbed[EVENT - 1] - MARGIN

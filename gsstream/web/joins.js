@@ -43,7 +43,7 @@ export function decodeJoin(key, data) {
   const groups = facts.groups && { ...facts.groups, groupOf: body.steps(number) };
   const moved = facts.moved === null ? null : body.displacement(facts.moved);
   const change = { kind: "key" };
-  return { ...key, frame, number, scene, layout, decoders, groups, moved, change };
+  return { ...key, frame, number, scene, layout, decoders, groups, moved, turned: true, change };
 }
 
 /** The values of one attribute: those of the key packet, plus differences of their bits. */
@@ -125,7 +125,7 @@ class Body {
 /** A copy of a state that later packets do not touch. */
 function copied(state) {
   const scene = Object.fromEntries(Object.entries(state.scene).map(([name, values]) => [name, values.slice()]));
-  return { ...state, scene, decoders: new Map(state.decoders) };
+  return { ...state, scene, decoders: new Map(state.decoders), spare: null };
 }
 
 /** The first key packet and the one used last. */

@@ -55,8 +55,8 @@ export function applyResidual(state, residual) {
   const scale = new Float32Array(rows.length);
   for (let i = 0; i < rows.length; i += 1) scale[i] = gate[i] * units[unitOf[rows[i]]];
   for (const part of parts) {
-    // A symbol of 0 adds 0 or -0, which changes nothing but a value of -0. Of these there are none except where a motion
-    // was: key packets and births hold multiples of a step, and no sum of two others is -0.
+    // A symbol of 0 adds 0 or -0, which changes nothing but a value of -0. Of these there are none except where a
+    // motion was: key packets and births hold multiples of a step, and no sum of two others is -0.
     const zeros = state.turned && (part.name === "means" || part.name === "quats");
     const sent = zeros && part.places ? { ...part, symbols: spread(part, rows.length), places: null } : part;
     const add = part.decoder ? addDecoded : addDirect;

@@ -16,6 +16,7 @@ from gsstream import API_VERSION, __version__
 from gsstream.cli import (
     bench,
     check,
+    compare,
     deliver,
     gap,
     info,
@@ -92,6 +93,7 @@ app.command(name="run-segments")(segments.run_segments)
 app.command(name="sweep")(sweep.sweep)
 app.command(name="tune")(tune.tune)
 app.command(name="report")(report.report)
+app.command(name="compare")(compare.compare)
 app.command(name="check")(check.check)
 app.command(name="new-plugin")(scaffold.new_plugin)
 app.add_typer(bench.app, name="bench")

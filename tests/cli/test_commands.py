@@ -30,6 +30,7 @@ CHEAP = [
     ["sweep", "--help"],
     ["tune", "--help"],
     ["report", "--help"],
+    ["compare", "--help"],
     ["recipe", "show", "dense"],
 ]
 
@@ -65,6 +66,10 @@ OPTIONS = {
         "--first-frame", "--workers", "--quiet",
     ],
     "gsstream report": ["FOLDER", "--out", "--data", "--sheets"],
+    "gsstream compare": [
+        "METHODS", "--source", "--out", "--at", "--epochs", "--seconds", "--recipe", "--set", "--frames", "--scale",
+        "--seeds", "--split", "--workers", "--threads", "--ray", "--pictures", "--quiet",
+    ],
     "gsstream check": ["NAME", "--quiet", "--set", "--source"],
     "gsstream new-plugin": ["NAME", "--kind", "--out"],
     "gsstream bench": [],

@@ -40,7 +40,7 @@ def build_report(data: SweepData, sheets: Mapping[str, Picture]) -> list[Block]:
     blocks: list[Block] = []
     if data.config["description"]:
         blocks.append(Text(data.config["description"]))
-    blocks += _facts(data)
+    blocks += where_it_ran(data)
     for scene in data.scenes:
         blocks += _scene(data, scene)
         if scene in sheets:
@@ -51,8 +51,8 @@ def build_report(data: SweepData, sheets: Mapping[str, Picture]) -> list[Block]:
     return blocks
 
 
-def _facts(data: SweepData) -> list[Block]:
-    """What ran where, and what was not measured."""
+def where_it_ran(data: SweepData) -> list[Block]:
+    """Return what ran where, by which cameras it was judged, and what was not measured."""
     runs = [run for group in data.groups for run in group.runs]
     rows = {run.id: run.row for run in runs}
     machines = {row["machine"] for row in rows.values()}
@@ -89,7 +89,7 @@ def _scene(data: SweepData, scene: str) -> list[Block]:
     blocks: list[Block] = [Heading(scene), Text(_noise(groups))]
     blocks.append(Picture(f"{scene}-pareto.png", pareto_figure(groups, f"{scene}: quality against cost"),
                           f"Quality against cost on {scene}, one point per recipe"))  # fmt: skip
-    blocks += [_fronts(groups), _all_runs(groups, data.measured())]
+    blocks += [_fronts(groups), all_runs(groups, data.measured())]
     found = effects(groups, [*GOODS, *measured_costs(groups)])
     if found:
         blocks += [_knobs(found, groups), Text(_READING)]
@@ -156,7 +156,13 @@ def _fronts(groups: Sequence[Group]) -> Table:
     return Table("Pareto fronts", rows)
 
 
-def _all_runs(groups: Sequence[Group], keys: Sequence[str]) -> Table:
+def all_runs(groups: Sequence[Group], keys: Sequence[str]) -> Table:
+    """Return a table with a row for each group.
+
+    Arguments:
+        groups: rows.
+        keys: of the quantities, columns.
+    """
     rows = [["recipe", "seeds", *(BY_KEY[key].title for key in keys)]]
     for group in groups:
         cells = [cell(key, group.mean(key), group.spread(key)) for key in keys]

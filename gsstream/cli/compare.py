@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,8 +15,8 @@ from gsstream.cli.listing import plural
 if TYPE_CHECKING:
     from gsstream.plugins.catalog import Catalog
     from gsstream.trade.compare.plan import Wanted
+    from gsstream.trade.jobs.base import Executor
     from gsstream.trade.sweep.config import SweepConfig
-    from gsstream.trade.sweep.drive import SweepResult
 
 
 class At(StrEnum):
@@ -76,7 +77,7 @@ def compare(
     """
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.document import read_override
-    from gsstream.trade.compare.plan import Wanted, own
+    from gsstream.trade.compare.plan import Wanted
 
     changes = [read_override(text) for text in settings or ()]
     names = tuple(name.strip() for name in methods.split(",") if name.strip())
@@ -86,26 +87,33 @@ def compare(
     )  # fmt: skip
     catalog, limits = load_catalog(), _limits(at, epochs, seconds)
 
-    def run(config: SweepConfig) -> SweepResult:
-        from gsstream.trade.jobs.executor import make_executor
-        from gsstream.trade.sweep.drive import run_sweep
-        from gsstream.trade.sweep.job import run_job
-        from gsstream.trade.sweep.plan import make_plan
+    from gsstream.trade.jobs.executor import make_executor
+    from gsstream.trade.sweep.job import run_job
 
-        plan = make_plan(config, Path(), catalog.recipe_path)
-        executor = make_executor(run_job, workers, threads, ray)
-        return run_sweep(plan, out, executor, say=(lambda _: None) if quiet else typer.echo)
+    say = (lambda _: None) if quiet else typer.echo
+    failed = _run(wanted, at, limits, out, catalog, lambda: make_executor(run_job, workers, threads, ray), say)
+    _write_page(out, source, catalog, pictures, quiet)
+    if failed:
+        typer.echo(f"{plural(failed, 'run')} failed; the page says why", err=True)
+        raise typer.Exit(1)
+
+
+def _run(
+    wanted: Wanted, at: At, limits: list[float], out: Path, catalog: Catalog, executor: Callable[[], Executor],
+    say: Callable[[str], None],
+) -> int:  # fmt: skip
+    """Make every run that is not there yet; returns the number of those that failed."""
+    from gsstream.trade.compare.plan import own
+    from gsstream.trade.sweep.drive import run_sweep
+    from gsstream.trade.sweep.plan import make_plan
+
+    def made(config: SweepConfig) -> int:
+        return len(run_sweep(make_plan(config, Path(), catalog.recipe_path), out, executor(), say=say).failed)
 
     if at is At.epochs:
-        result = run(_at_epochs(wanted, [int(number) for number in limits], catalog))
-    else:
-        result = run(own(wanted))
-    if at is At.time:
-        result = run(_at_time(wanted, limits, out, catalog))
-    _write_page(out, source, catalog, pictures, quiet)
-    if result.failed:
-        typer.echo(f"{plural(len(result.failed), 'run')} failed; the page says why", err=True)
-        raise typer.Exit(1)
+        return made(_at_epochs(wanted, [int(number) for number in limits], catalog))
+    failed = made(own(wanted))
+    return made(_at_time(wanted, limits, out, catalog)) if at is At.time else failed
 
 
 def _limits(at: At, epochs: str | None, seconds: str | None) -> list[float]:

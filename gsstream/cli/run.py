@@ -67,12 +67,10 @@ def run(
     # Read before the folder is touched: --overwrite must not delete a run for the sake of a faulty recording.
     first = None if first_frame is None else read_first_frame(stream_file(first_frame))
     recording = open_recording(source, assembly.recipe, catalog)
-    wanted = {"pictures": not no_pictures, "video": not no_video}
+    wanted, say = {"pictures": not no_pictures, "video": not no_video}, _silent if quiet else _note
     try:
-        say = _silent if quiet else _note
         _what_is_taken(say, resolved.recipe, recording.info, named=bool(method or recipe), catalog=catalog)
-        if not resume:
-            _first_look(recording, source)
+        _first_look(recording, source, again=resume)
         with claim_output(out, resume=resume, overwrite=overwrite), ended_by_signals() as came, serving(server):
             try:
                 with disk_errors(out):
@@ -112,8 +110,10 @@ def _what_is_taken(
         say(f"no camera is held out, so no quality is measured{some}")
 
 
-def _first_look(recording: FrameSource, uri: str) -> None:
-    """Warn of poses that cannot be right, before an hour is spent on them."""
+def _first_look(recording: FrameSource, uri: str, *, again: bool) -> None:
+    """Warn of poses that cannot be right, before an hour is spent on them; who comes ``again`` has been warned."""
+    if again:
+        return
     from gsstream.scene.pose_checks import first_look
 
     for finding in first_look(recording):

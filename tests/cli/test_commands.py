@@ -42,7 +42,7 @@ OPTIONS = {
     "gsstream run": [
         "--source", "--out", "--method", "--recipe", "--set", "--frames", "--scale", "--seed", "--renderer", "--resume",
         "--first-frame", "--checks", "--diagnose",
-        "--overwrite", "--no-video", "--quiet", "--budget", "--serve",
+        "--overwrite", "--no-video", "--no-pictures", "--quiet", "--budget", "--serve",
     ],
     "gsstream play": ["STREAM", "--out", "--camera", "--frames", "--fps", "--size", "--renderer", "--max-memory"],
     "gsstream evaluate": ["STREAM", "--source", "--lpips-onnx", "--lpips-range", "--json", "--max-memory"],
@@ -56,7 +56,7 @@ OPTIONS = {
     "gsstream run-segments": [
         "--source", "--out", "--segments", "--method", "--recipe", "--set", "--frames", "--scale", "--start",
         "--key-epochs", "--first-frame", "--workers", "--threads", "--ray", "--resume", "--overwrite", "--no-video",
-        "--quiet",
+        "--no-pictures", "--quiet",
     ],
     "gsstream sweep": [
         "CONFIG", "--out", "--scenes", "--data", "--workers", "--threads", "--ray", "--split", "--dry-run", "--quiet",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
@@ -78,20 +79,18 @@ def compare(
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.document import read_override
     from gsstream.trade.compare.plan import Wanted
-
-    changes = [read_override(text) for text in settings or ()]
-    names = tuple(name.strip() for name in methods.split(",") if name.strip())
-    wanted = Wanted(
-        names, source, recipe, frames, scale, tuple(int(seed) for seed in _numbers(seeds, "--seeds", 0, whole=True)),
-        {".".join(path): leaf.value for path, leaf in changes}, split.value,
-    )  # fmt: skip
-    catalog, limits = load_catalog(), _limits(at, epochs, seconds)
-
     from gsstream.trade.jobs.executor import make_executor
     from gsstream.trade.sweep.job import run_job
 
-    say = (lambda _: None) if quiet else typer.echo
-    failed = _run(wanted, at, limits, out, catalog, lambda: make_executor(run_job, workers, threads, ray), say)
+    changes = [read_override(text) for text in settings or ()]
+    wanted = Wanted(
+        tuple(name.strip() for name in methods.split(",") if name.strip()), source, recipe, frames, scale,
+        tuple(int(seed) for seed in _numbers(seeds, "--seeds", 0, whole=True)),
+        {".".join(path): leaf.value for path, leaf in changes}, split.value,
+    )  # fmt: skip
+    catalog, limits = load_catalog(), _limits(at, epochs, seconds)
+    executor = functools.partial(make_executor, run_job, workers, threads, ray)
+    failed = _run(wanted, at, limits, out, catalog, executor, quiet)
     _write_page(out, source, catalog, pictures, quiet)
     if failed:
         typer.echo(f"{plural(failed, 'run')} failed; the page says why", err=True)
@@ -100,12 +99,14 @@ def compare(
 
 def _run(
     wanted: Wanted, at: At, limits: list[float], out: Path, catalog: Catalog, executor: Callable[[], Executor],
-    say: Callable[[str], None],
+    quiet: bool,
 ) -> int:  # fmt: skip
     """Make every run that is not there yet; returns the number of those that failed."""
     from gsstream.trade.compare.plan import own
     from gsstream.trade.sweep.drive import run_sweep
     from gsstream.trade.sweep.plan import make_plan
+
+    say = (lambda _: None) if quiet else typer.echo
 
     def made(config: SweepConfig) -> int:
         return len(run_sweep(make_plan(config, Path(), catalog.recipe_path), out, executor(), say=say).failed)

@@ -24,6 +24,7 @@ from gsstream.engine.step.active.change import Change as Change
 from gsstream.engine.step.active.change import detect_change as detect_change
 from gsstream.engine.step.active.change import marked_per_tile as marked_per_tile
 from gsstream.engine.step.harden import rows_of as rows_of
+from gsstream.growth.fitting import fitted_births as fitted_births
 from gsstream.growth.fitting import joined as joined
 from gsstream.motion.fitting import each_alone as each_alone
 from gsstream.motion.fitting import felt_most as felt_most

@@ -24,6 +24,7 @@ SHIPPED: Mapping[str, tuple[str, ...]] = {
     "player": ("renderer/cpu", "loss/cpu", "optimiser/cpu"),
     "methods": (
         "method/queen", "method/queen-published", "method/queen-m", "method/queen-s", "stepper/queen",
+        "method/hicom", "method/hicom-published", "stepper/hicom", "method/comgs-s", "method/comgs-l", "stepper/comgs",
         "propagation/ft-pruning", "gate/binary-ste",
         "confidence/onnx",
     ),

@@ -55,7 +55,7 @@ def pareto_figure(groups: Sequence[Group], title: str) -> bytes:
     figure.canvas.draw()
     for axis in axes.flat:
         _thin_names(axis)
-    return _png(figure)
+    return png(figure)
 
 
 def floor_of(values: Sequence[float]) -> float:
@@ -136,7 +136,8 @@ def curve_groups(groups: Sequence[Group]) -> list[Group]:
     return [groups[i] for i in front][:_CURVES] or list(groups)[:_CURVES]
 
 
-def _png(figure: Figure) -> bytes:
+def png(figure: Figure) -> bytes:
+    """Return a figure as the bytes of a PNG, the same for the same figure."""
     out = io.BytesIO()
     figure.savefig(out, format="png", metadata={"Software": None})
     return out.getvalue()

@@ -13,6 +13,7 @@ from gsstream.trade.report.fronts import Effect, effects, knee, pareto_front
 from gsstream.trade.report.groups import Group, SweepData, seed_noise, waited
 from gsstream.trade.report.paper import beside_ours, paper_table
 from gsstream.trade.report.quantities import BY_KEY, GOODS, cell
+from gsstream.trade.report.rate_curves import curve_blocks
 
 _NOT_MEASURED = {"joules": "energy"}
 _MEANS = (
@@ -93,6 +94,7 @@ def _scene(data: SweepData, scene: str) -> list[Block]:
     found = effects(groups, [*GOODS, *measured_costs(groups)])
     if found:
         blocks += [_knobs(found, groups), Text(_READING)]
+    blocks += curve_blocks(groups, scene)
     for name, rows in data.config.get("paper_tables", {}).items():
         blocks.append(beside_ours(paper_table(name), groups, scene, rows))
     curves = curve_groups(groups)

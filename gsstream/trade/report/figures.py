@@ -73,7 +73,7 @@ def pareto_figure(
     figure.canvas.draw()
     for axis in axes.flat:
         _thin_names(axis)
-    return _png(figure)
+    return png(figure)
 
 
 def floor_of(values: Sequence[float]) -> float:
@@ -154,7 +154,8 @@ def curve_groups(groups: Sequence[Group]) -> list[Group]:
     return [groups[i] for i in front][:_CURVES] or list(groups)[:_CURVES]
 
 
-def _png(figure: Figure) -> bytes:
+def png(figure: Figure) -> bytes:
+    """Return a figure as the bytes of a PNG, the same for the same figure."""
     out = io.BytesIO()
     figure.savefig(out, format="png", metadata={"Software": None})
     return out.getvalue()

@@ -112,7 +112,7 @@ class Wrong:
     def pull(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
         loss = (rows.sh0[:, 0] - self.aims[self.rows]).square().sum()
         loss.backward()
-        return float(loss)
+        return float(loss.detach())
 
 
 def test_corrections_mend_what_is_wrong_and_leave_the_rest() -> None:

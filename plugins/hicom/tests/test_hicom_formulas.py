@@ -51,7 +51,7 @@ class Pulled:
     def pull(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
         loss = (rows.means - self.aims[self.rows]).square().sum()
         loss.backward()
-        return float(loss)
+        return float(loss.detach())
 
     def on(self, gaussians: Gaussians[torch.Tensor]) -> Pulled:
         return Pulled(gaussians, self.aims.numpy())

@@ -18,6 +18,7 @@ from gsstream.cli import (
     check,
     compare,
     deliver,
+    evaluate,
     gap,
     info,
     methods,
@@ -81,7 +82,7 @@ def _root(
 
 app.command(name="run")(run.run)
 app.command(name="play")(streams.play)
-app.command(name="evaluate")(streams.evaluate)
+app.command(name="evaluate")(evaluate.evaluate)
 app.command(name="gap")(gap.gap)
 app.command(name="info")(info.info)
 app.command(name="export")(deliver.export)

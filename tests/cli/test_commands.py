@@ -45,7 +45,10 @@ OPTIONS = {
         "--overwrite", "--no-video", "--no-pictures", "--quiet", "--budget", "--serve",
     ],
     "gsstream play": ["STREAM", "--out", "--camera", "--frames", "--fps", "--size", "--renderer", "--max-memory"],
-    "gsstream evaluate": ["STREAM", "--source", "--lpips-onnx", "--lpips-range", "--json", "--max-memory"],
+    "gsstream evaluate": [
+        "STREAM", "--source", "--ply-sequence", "--renders", "--files", "--first", "--frames", "--recipe", "--scale",
+        "--lpips-onnx", "--lpips-range", "--json", "--max-memory",
+    ],
     "gsstream gap": ["RUN", "--at", "--cache", "--epochs", "--source", "--json", "--quiet"],
     "gsstream info": ["STREAM", "--json"],
     "gsstream export": ["STREAM", "--out", "--format", "--frames", "--max-memory", "--origin"],

@@ -31,7 +31,7 @@ from gsstream.testing.stepping import SOURCE, MethodUnderTest
 Follow: Any = ExampleStepper  # final: only what is wrong on purpose may inherit from it
 
 RUN = [
-    "run", "--source", SOURCE, "--method", "hold", "--quiet", "--no-video", "--set", "first_frame.max_iterations=5",
+    "run", "--source", SOURCE, "--method", "hold", "--quiet", "--no-pictures", "--set", "first_frame.max_iterations=5",
     "--set", "first_frame.points=recording", "--set", "first_frame.fill_points=0",
 ]  # fmt: skip
 

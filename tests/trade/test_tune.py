@@ -108,7 +108,7 @@ def test_a_pilot_writes_a_recipe_that_runs_inside_the_budget(
     assert any("s2gs-edge+budget" in row and " 2/2 " in row for row in rows)
     program, *said = shlex.split(out.rpartition("next: ")[2])
     assert program == "gsstream"
-    run_it = [*said, "--frames", "3", "--quiet", "--no-video", "--first-frame"]
+    run_it = [*said, "--frames", "3", "--quiet", "--no-pictures", "--first-frame"]
     assert run_command([*run_it, str(tmp_path / "choosing")]) == 0
     assert f"judged by {judge} (reporting split" in (tmp_path / "pilot" / "run" / "summary.txt").read_text()
     assert all(sum(line["bytes"].values()) <= 600 for line in metrics(tmp_path / "pilot" / "run")[1:])

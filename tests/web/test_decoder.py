@@ -74,7 +74,7 @@ def test_a_real_run_decodes_to_the_same_bits(tmp_path):
     source = "synthetic:frames=30&views=3&width=40&height=30"
     settings = ["--set", "first_frame.max_iterations=5", "--set", "first_frame.fill_points=200"]
     run = ["run", "--source", source, "--out", str(tmp_path / "run"), "--method", "s2gs-fast", *settings]
-    assert run_command([*run, "--quiet", "--no-video"]) == 0
+    assert run_command([*run, "--quiet", "--no-pictures"]) == 0
     stream = tmp_path / "run" / "stream.gss"
     (found,) = play_in_node([stream.read_bytes()], tmp_path)["streams"]
     assert found["error"] is None

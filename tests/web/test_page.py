@@ -48,7 +48,7 @@ def test_pictures_of_a_run_are_those_of_the_python_player(tmp_path):
     source = "synthetic:frames=6&views=3&width=64&height=48"
     settings = ["--set", "first_frame.max_iterations=60", "--set", "first_frame.fill_points=400"]
     run = ["run", "--source", source, "--out", str(tmp_path / "run"), "--method", "s2gs-fast", *settings]
-    assert run_command([*run, "--quiet", "--no-video"]) == 0
+    assert run_command([*run, "--quiet", "--no-pictures"]) == 0
     stream = tmp_path / "run" / "stream.gss"
     package(stream, tmp_path / "site")
     frames = [0, 1, 2, 4, 5]

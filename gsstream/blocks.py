@@ -4,6 +4,12 @@
 copy: densify, count changed tiles, learn residuals side by side, weigh their rate, judge a view, fit a packet.
 """
 
+from gsstream.core.changes.motion import Moves as Moves
+from gsstream.core.changes.motion import matrices_of as matrices_of
+from gsstream.core.changes.motion import moves_of as moves_of
+from gsstream.core.changes.motion import multiply as multiply
+from gsstream.core.changes.motion import quats_of as quats_of
+from gsstream.core.changes.motion import transformed as transformed
 from gsstream.engine.budget.trim import Fitted as Fitted
 from gsstream.engine.fit.backward import pull_back as pull_back
 from gsstream.engine.fit.densify import SPLIT_SIZE as SPLIT_SIZE
@@ -13,10 +19,17 @@ from gsstream.engine.fit.judge import Judge as Judge
 from gsstream.engine.fit.nearest import nearest_rows as nearest_rows
 from gsstream.engine.fit.nearest import neighbour_distance as neighbour_distance
 from gsstream.engine.fit.row_table import RowTable as RowTable
+from gsstream.engine.step.active.candidates import changed_rows as changed_rows
 from gsstream.engine.step.active.change import Change as Change
 from gsstream.engine.step.active.change import detect_change as detect_change
 from gsstream.engine.step.active.change import marked_per_tile as marked_per_tile
 from gsstream.engine.step.harden import rows_of as rows_of
+from gsstream.growth.fitting import fitted_births as fitted_births
+from gsstream.growth.fitting import joined as joined
+from gsstream.motion.fitting import each_alone as each_alone
+from gsstream.motion.fitting import felt_most as felt_most
+from gsstream.motion.fitting import fitted_moves as fitted_moves
+from gsstream.motion.groups import pixel_size as pixel_size
 from gsstream.render.activations import activate_opacities as activate_opacities
 from gsstream.render.activations import activate_scales as activate_scales
 from gsstream.render.activations import logit as logit

@@ -16,7 +16,9 @@ from gsstream import API_VERSION, __version__
 from gsstream.cli import (
     bench,
     check,
+    compare,
     deliver,
+    evaluate,
     gap,
     info,
     methods,
@@ -80,7 +82,7 @@ def _root(
 
 app.command(name="run")(run.run)
 app.command(name="play")(streams.play)
-app.command(name="evaluate")(streams.evaluate)
+app.command(name="evaluate")(evaluate.evaluate)
 app.command(name="gap")(gap.gap)
 app.command(name="info")(info.info)
 app.command(name="export")(deliver.export)
@@ -92,6 +94,7 @@ app.command(name="run-segments")(segments.run_segments)
 app.command(name="sweep")(sweep.sweep)
 app.command(name="tune")(tune.tune)
 app.command(name="report")(report.report)
+app.command(name="compare")(compare.compare)
 app.command(name="check")(check.check)
 app.command(name="new-plugin")(scaffold.new_plugin)
 app.add_typer(bench.app, name="bench")

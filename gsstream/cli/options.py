@@ -39,6 +39,9 @@ Diagnose = Annotated[
     bool, typer.Option("--diagnose", help="Count Gaussians left behind by moving bodies, in metrics.jsonl.")
 ]
 NoVideo = Annotated[bool, typer.Option("--no-video", help="Write no video, only still pictures.")]
+NoPictures = Annotated[
+    bool, typer.Option("--no-pictures", help="Write no contact sheet, plots or video, only the summary as text.")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print only warnings and errors.")]
 
 Serve = Annotated[

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -42,6 +42,7 @@ def run(
     checks: Annotated[str | None, typer.Option("--checks", help="Look at parts: off, frame (default), step.")] = None,
     diagnose: options.Diagnose = False,
     no_video: options.NoVideo = False,
+    no_pictures: options.NoPictures = False,
     quiet: options.Quiet = False,
     serve: options.Serve = None,
 ) -> None:
@@ -66,21 +67,20 @@ def run(
     # Read before the folder is touched: --overwrite must not delete a run for the sake of a faulty recording.
     first = None if first_frame is None else read_first_frame(stream_file(first_frame))
     recording = open_recording(source, assembly.recipe, catalog)
+    wanted, say = {"pictures": not no_pictures, "video": not no_video}, _silent if quiet else _note
     try:
-        say = _silent if quiet else _note
         _what_is_taken(say, resolved.recipe, recording.info, named=bool(method or recipe), catalog=catalog)
-        if not resume:
-            _first_look(recording, source)
+        _first_look(recording, source, again=resume)
         with claim_output(out, resume=resume, overwrite=overwrite), ended_by_signals() as came, serving(server):
             try:
                 with disk_errors(out):
                     result = encode(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first,
                                     diagnose=diagnose)  # fmt: skip
             except GsstreamError as error:
-                _what_there_is(error, out, recording, not no_video, quiet)
+                _what_there_is(error, out, recording, wanted, quiet)
                 raise
             with disk_errors(out):
-                _pictures(result, recording, not no_video, quiet, assembly.recipe.renderer.name == "reference")
+                _pictures(result, recording, wanted, quiet, assembly.recipe.renderer.name == "reference")
     finally:
         recording.close()
     if result.interrupted:
@@ -110,15 +110,19 @@ def _what_is_taken(
         say(f"no camera is held out, so no quality is measured{some}")
 
 
-def _first_look(recording: FrameSource, uri: str) -> None:
-    """Warn of poses that cannot be right, before an hour is spent on them."""
+def _first_look(recording: FrameSource, uri: str, *, again: bool) -> None:
+    """Warn of poses that cannot be right, before an hour is spent on them; who comes ``again`` has been warned."""
+    if again:
+        return
     from gsstream.scene.pose_checks import first_look
 
     for finding in first_look(recording):
         warnings.warn(f"[{finding.code}] {finding.message}. All checks: gsstream scene validate {uri}", stacklevel=2)
 
 
-def _what_there_is(error: GsstreamError, out: Path, recording: FrameSource, video: bool, quiet: bool) -> None:
+def _what_there_is(
+    error: GsstreamError, out: Path, recording: FrameSource, wanted: Mapping[str, bool], quiet: bool
+) -> None:
     """Summary and pictures of a run that failed, as far as it came; the error learns how to go on."""
     from gsstream.engine.run.metrics_log import last_written
     from gsstream.engine.run.session import METRICS, RunResult
@@ -129,25 +133,29 @@ def _what_there_is(error: GsstreamError, out: Path, recording: FrameSource, vide
         done = last_written(out / METRICS) + 1 if (out / METRICS).exists() else 0
         if done == 0:
             return
-        _pictures(RunResult(out, done, False), recording, video, quiet, True)
+        _pictures(RunResult(out, done, False), recording, wanted, quiet, True)
     except (GsstreamError, OSError) as trouble:
         error.add_note(f"its pictures could not be made: {trouble}")
         return
+    pictures = " and pictures are" if wanted["pictures"] else " is"
     advice = ""
     if isinstance(error, SourceError):
         advice = "; with --set data.bad_image=repeat (or drop) as well, it passes over pictures that cannot be read"
     elif isinstance(error, ComponentError):
         advice = "; with --set stream.on_error=repeat as well, a frame that fails repeats the one before it"
     error.add_note(
-        f"the stream in {out} is complete up to frame {done - 1}, and its summary and pictures are made. When the "
+        f"the stream in {out} is complete up to frame {done - 1}, and its summary{pictures} made. When the "
         f"cause is mended, the same command with --resume goes on{advice}"
     )
 
 
-def _pictures(result: RunResult, recording: FrameSource, video: bool, quiet: bool, warned: bool) -> None:
+def _pictures(
+    result: RunResult, recording: FrameSource, wanted: Mapping[str, bool], quiet: bool, warned: bool
+) -> None:
     """Contact sheet, plots, summary and video of what was written, and where to find them.
 
-    ``warned``: the run has said already that nothing fast renders here; the player need not say it again.
+    ``wanted``: as ``write_gallery`` takes it. ``warned``: the run has said already that nothing fast renders here; the
+    player need not say it again.
     """
     from gsstream.player.render import SlowRendererWarning
     from gsstream.trade.show.gallery import SUMMARY, write_gallery
@@ -157,7 +165,7 @@ def _pictures(result: RunResult, recording: FrameSource, video: bool, quiet: boo
     with warnings.catch_warnings():
         if warned:
             warnings.simplefilter("ignore", SlowRendererWarning)
-        written = write_gallery(result.out, recording, video=video)
+        written = write_gallery(result.out, recording, **wanted)
     if not quiet:
         typer.echo(fitting((result.out / SUMMARY).read_text(encoding="utf-8").rstrip()))
         typer.echo("\n".join(f"wrote {path}" for path in (result.out / "stream.gss", *written)))

@@ -78,6 +78,7 @@ CLAIMS: Mapping[str, str] = {
     "": "A claim in `traits` is a promise that is checked;\nwhat is not claimed is skipped.",
     "source": "Another recording:\n`gsstream check source/NAME --source NAME:PLACE`.",
 }
+PLUGIN = "src/<package>/plugin.py"
 TEMPLATES: Mapping[str, str] = {
     "pyproject.toml": """\
 [build-system]
@@ -119,7 +120,7 @@ The part is in `src/<package>/<module>.py`. Change it, its docstring and its `so
 `gsstream check <kind>/<name>`, or `pytest` for one test per check. <claims>
 """,
     "src/<package>/__init__.py": '"""<summary> Importing this package imports no torch."""\n',
-    "src/<package>/plugin.py": '''\
+    PLUGIN: '''\
 """What this plugin ships, described without importing torch."""
 
 from __future__ import annotations
@@ -177,43 +178,17 @@ or with `pytest` for one test per check. <claims>
 method: <name>
 stepper: {name: <name>}
 """,
-    "src/<package>/plugin.py": '''\
-"""What this plugin ships, described without importing torch."""
-
-from __future__ import annotations
-
-from gsstream.spec import ComponentSpec, MethodSpec, hookimpl
-
-
-@hookimpl
-def gsstream_components() -> list[ComponentSpec]:
-    return [
-        ComponentSpec(
-            kind="<kind>",
-            name="<name>",
-            target="<package>.<module>:<cls>",
-            summary="<summary>",
-            api="<api>",
-        )
-    ]
-
+    PLUGIN: TEMPLATES[PLUGIN].replace("ComponentSpec,", "ComponentSpec, MethodSpec,")
+    + '''
 
 @hookimpl
 def gsstream_methods() -> list[MethodSpec]:
     return [MethodSpec(name="<name>", recipe="<package>:recipes/<name>.yaml", summary="<summary>")]
 ''',
-    "tests/test_<package>_contract.py": '''\
-"""The method keeps the contract of parts and of whole methods."""
+    "tests/test_<package>_method.py": '''\
+"""The method keeps the contract of whole methods."""
 
-from <package>.<module> import <cls>
-
-from gsstream.testing import parametrize_with_checks
 from gsstream.testing.kit import run_method_checks
-
-
-@parametrize_with_checks([<subject>])
-def test_contract(check) -> None:
-    check()
 
 
 def test_as_a_method() -> None:

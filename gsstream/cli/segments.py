@@ -54,6 +54,7 @@ def run_segments(
     resume: options.Resume = False,
     overwrite: options.Overwrite = False,
     no_video: options.NoVideo = False,
+    no_pictures: options.NoPictures = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Encode a recording in segments, several at a time, and join them into one stream.
@@ -65,16 +66,17 @@ def run_segments(
 
     changes = options.overrides(settings, frames=frames, scale=scale)
     wanted = Wanted(source, out, segments, start.value, key_epochs, first_frame, workers, threads, ray)
-    result = _encode(wanted, method, recipe or (), changes, (resume, overwrite), (quiet, not no_video))
+    gallery = {"pictures": not no_pictures, "video": not no_video}
+    result = _encode(wanted, method, recipe or (), changes, (resume, overwrite), (quiet, gallery))
     if not quiet:
         typer.echo(_seams(result))
 
 
 def _encode(
     wanted: Wanted, method: str | None, recipe: Sequence[Path], changes: Sequence[tuple[str, str]],
-    again: tuple[bool, bool], shown: tuple[bool, bool],
+    again: tuple[bool, bool], shown: tuple[bool, dict[str, bool]],
 ) -> SegmentsResult:  # fmt: skip
-    """``again``: resume, overwrite; ``shown``: quiet, video."""
+    """``again``: resume, overwrite; ``shown``: quiet, what ``write_gallery`` takes."""
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
 
@@ -93,7 +95,7 @@ def _encode(
     assembly = assemble(resolved, catalog)
     first = None if wanted.first_frame is None else first_frame_of(stream_file(wanted.first_frame))
     recording = open_recording(wanted.source, assembly.recipe, catalog)
-    out, (quiet, video) = wanted.out, shown
+    out, (quiet, gallery) = wanted.out, shown
     try:
         work = make_work(wanted, first, resolved, assembly, recording)
         say = (lambda _: None) if quiet else typer.echo
@@ -103,7 +105,7 @@ def _encode(
             with only_one(out, "run"):
                 prepare_folder(out, work.facts, first, resume=again[0], overwrite=again[1])
                 result = drive(work.plan, work.setting, out, executor, say=say)
-        written = write_gallery(out, recording, video=video)
+        written = write_gallery(out, recording, **gallery)
     finally:
         recording.close()
     if not quiet:

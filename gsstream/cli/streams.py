@@ -78,56 +78,6 @@ def play(
     fail_with(damage)
 
 
-def evaluate(
-    stream: Stream,
-    source: Annotated[
-        str | None, typer.Option("--source", help="Recording to compare with; default: the one it was made from.")
-    ] = None,
-    lpips_onnx: Annotated[
-        Path | None,
-        typer.Option("--lpips-onnx", help="LPIPS as an ONNX file (docs/howto/lpips.md); default: not measured."),
-    ] = None,
-    lpips_range: Annotated[
-        str | None,
-        typer.Option(
-            "--lpips-range", metavar="-1|0", help="Lower end of the range that file is given; default: its metadata."
-        ),
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Every view of every frame as JSON, for scripts.")] = False,
-    max_memory: MaxMemory = None,
-) -> None:
-    """Render the decoded frames and compare them with the recording's test cameras."""
-    most = size_of(max_memory)
-    file = stream_file(stream)
-    from gsstream.core.errors import InputError
-    from gsstream.engine.run.recording import reopen_recording
-    from gsstream.metrics import OnnxLpips
-    from gsstream.player.playback import Playback
-    from gsstream.plugins.catalog import load_catalog
-    from gsstream.trade.measure.evaluate import evaluate as evaluate_stream
-
-    if lpips_range is not None and lpips_onnx is None:
-        raise InputError(f"--lpips-range {lpips_range}: without --lpips-onnx there is no LPIPS to give it to")
-    lpips = None if lpips_onnx is None else OnnxLpips(lpips_onnx, lpips_range)
-    with Playback(file, max_memory=most) as playback:
-        meta = playback.meta
-        frames, damage = playback.sound()
-        if playback.limit is not None:
-            playback.limit.check_pictures(meta.test.width, meta.test.height, len(meta.test))
-            for frame in frames:
-                playback.state_at(frame)
-    catalog = load_catalog()
-    uri = source or named_recording(file, meta, catalog)
-    check_recipe(file, meta.recipe)
-    recording = reopen_recording(uri, meta.recipe, catalog)
-    try:
-        evaluation = evaluate_stream(file, recording, frames=frames, lpips=lpips, progress=progress_on("frame"))
-    finally:
-        recording.close()
-    typer.echo(evaluation.to_json() if as_json else evaluation.table())
-    fail_with(damage)
-
-
 def stream_file(path: Path) -> Path:
     """Return the stream file meant by ``path``.
 

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 #: What only the extra ``encoder`` brings: everything that imports one of these encodes, measures or plots.
-ENCODER = ("torch", "kornia", "scipy", "matplotlib")
+ENCODER = ("torch", "kornia", "scipy", "matplotlib", "bjontegaard")
 #: Extra -> the parts and methods of this project's other distributions that it brings.
 SHIPPED: Mapping[str, tuple[str, ...]] = {
     "s2gs": (
@@ -24,8 +24,8 @@ SHIPPED: Mapping[str, tuple[str, ...]] = {
     "player": ("renderer/cpu", "loss/cpu", "optimiser/cpu"),
     "methods": (
         "method/queen", "method/queen-published", "method/queen-m", "method/queen-s", "stepper/queen",
-        "propagation/ft-pruning", "gate/binary-ste",
-        "confidence/onnx",
+        "method/hicom", "method/hicom-published", "stepper/hicom", "method/comgs-s", "method/comgs-l", "stepper/comgs",
+        "propagation/ft-pruning", "gate/binary-ste", "confidence/onnx",
     ),
 }  # fmt: skip
 #: Parts whose distribution is in no extra, because it needs a GPU.

@@ -15,7 +15,7 @@ from gsstream.core.part import PartConfig
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.growth.base import Growth
-from gsstream.growth.fitting import finite, fitted, joined
+from gsstream.growth.fitting import finite, fitted_births, joined
 from gsstream.growth.judging import ErrorMap, error_map, gains, without
 from gsstream.growth.merging import closest_pairs, merged
 from gsstream.growth.nearest import alike
@@ -83,7 +83,7 @@ class ErrorGrowth(Growth):
         born, parents = self._candidates(after, work, maps, rng)
         if not len(born):
             return None
-        born = fitted(without(scene, parents), born, work, proposing, self.config.epochs, rng)
+        born = fitted_births(without(scene, parents), born, work, proposing, self.config.epochs, rng)
         sound = finite(born)
         born, parents = born.rows(sound), parents[sound]
         gain = self._gains(scene, born, parents, work, out)

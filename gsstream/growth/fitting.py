@@ -28,7 +28,7 @@ def joined(scene: Gaussians[Array], born: Gaussians[Array]) -> Gaussians[Array]:
     return cast("Gaussians[Array]", Gaussians(**values))
 
 
-def fitted(
+def fitted_births(
     scene: Gaussians[torch.Tensor], born: Gaussians[torch.Tensor], work: FrameWork, views: Sequence[int], epochs: int,
     rng: Rng,
 ) -> Gaussians[torch.Tensor]:  # fmt: skip

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import ClassVar, NamedTuple, final
 
 import numpy as np
-import torch
 from pydantic import Field
 
 from gsstream.core.changes import Motion, Scene
@@ -15,10 +14,8 @@ from gsstream.core.part import PartConfig
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.motion.base import MotionPart
+from gsstream.motion.fitting import felt_most, fitted_moves
 from gsstream.motion.groups import changed_groups, known_groups, pixel_size
-from gsstream.motion.pull_back import slope_of
-
-BETAS, EPSILON = (0.9, 0.99), 1e-12
 
 
 class Units(NamedTuple):
@@ -79,36 +76,10 @@ class Rigid(MotionPart):
 
     def _fitted(self, scene: Scene, work: FrameWork, start: Moves, units: Units, rng: Rng) -> FloatArray:
         """[K, 6] shift and turn of the groups that explain the images best."""
-        config, views = self.config, len(work.cameras)
-        rows = torch.from_numpy(start.rows)
-        work.narrow(rows)
-        base = scene.gaussians.rows(start.rows)
-        local = start._replace(rows=np.arange(len(start.rows)))
-        values = np.concatenate([start.shift, start.turn], 1) / units.row
-        first, second = np.zeros_like(values), np.zeros_like(values)
-        total = config.epochs * views
-        order = rng.numpy("motion", work.index)
-        for step in range(total):
-            if step % views == 0:
-                sequence = order.permutation(views)
-            moves = local._replace(shift=values[:, :3] * units.shift, turn=values[:, 3:] * units.turn)
-            slope = slope_of(work, int(sequence[step % views]), base, moves) * units.row
-            first = BETAS[0] * first + (1 - BETAS[0]) * slope
-            second = BETAS[1] * second + (1 - BETAS[1]) * slope**2
-            rate = config.lr * (config.lr_final / config.lr) ** (step / total)
-            scale = np.sqrt(_felt(second) / (1 - BETAS[1] ** (step + 1))) + EPSILON
-            values = values - rate * (first / (1 - BETAS[0] ** (step + 1))) / scale
-        return values * units.row
-
-
-def _felt(second: FloatArray) -> FloatArray:
-    """Return the squared slope [K, 1] that all six numbers of a group are measured by: that of the one felt most.
-
-    With a measure of its own every number would make steps of full size, those that the images say nothing about too
-    (depth, the turn of a ball), and so would groups that are hardly seen: noise, which the residual has to mend. A
-    group that feels less than the others do on average is measured by them.
-    """
-    return np.asarray(np.maximum(second.max(1, keepdims=True), second.mean()))
+        config = self.config
+        total = config.epochs * len(work.cameras)
+        rates = [config.lr * (config.lr_final / config.lr) ** (step / total) for step in range(total)]
+        return fitted_moves(scene, work, start, units.row, rates, rng.numpy("motion", work.index), felt_most)
 
 
 def _units(scene: Scene, work: FrameWork, cell: float) -> Units:

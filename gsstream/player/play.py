@@ -80,7 +80,7 @@ def play(
             playback.limit.check_pictures(cameras.width, cameras.height, kept)
         images = _images(playback, times, cameras, renderer, progress)
         try:
-            played = _write(Path(out), images, chosen if fps is None else range(len(times)), rate)
+            played = write_pictures(Path(out), images, chosen if fps is None else range(len(times)), rate)
         except OSError as error:
             raise OutputError(f"cannot write {out}: {error.strerror or error}") from error
     if damage is not None:
@@ -136,7 +136,15 @@ def _images(
             progress(i + 1, len(times))
 
 
-def _write(out: Path, images: Iterator[Bytes], frames: Sequence[int], fps: float) -> Played:
+def write_pictures(out: Path, images: Iterator[Bytes], frames: Sequence[int], fps: float) -> Played:
+    """Write pictures as the suffix of a file says: a video, an animated picture, or a folder of PNGs.
+
+    Arguments:
+        out: file or folder to write.
+        images: [H, W, 3] uint8 each, all of one size.
+        frames: indices, which name the PNGs.
+        fps: pictures per second.
+    """
     suffix = out.suffix.lower()
     if suffix == ".mp4":
         if importlib.util.find_spec("av") is not None:

@@ -66,6 +66,11 @@ class FirstFrame(Section):
     fill_points: int = Field(default=5_000, ge=0, description="random seeds in uncovered common view volume")
     lr_means: float = Field(default=1.6e-4, ge=0, description="learning rate of centres, fraction of the rig's extent")
     lr_means_final: float = Field(default=1.6e-6, ge=0, description="the same at the last iteration (log-linear)")
+    noise: float = Field(
+        default=0.0, ge=0, le=0.1,
+        description="standard deviation of noise on every centre, drawn anew in every iteration, fraction of the rig's "
+        "extent (HiCoM): Gaussians that few cameras see fit them less closely",
+    )  # fmt: skip
     densify_from: int = Field(default=300, ge=0, description="first iteration of densification and pruning")
     densify_every: int = Field(default=100, ge=1, description="iterations between two densifications")
     densify_gradient: float = Field(

@@ -30,6 +30,7 @@ CHEAP = [
     ["sweep", "--help"],
     ["tune", "--help"],
     ["report", "--help"],
+    ["compare", "--help"],
     ["recipe", "show", "dense"],
 ]
 
@@ -41,10 +42,13 @@ OPTIONS = {
     "gsstream run": [
         "--source", "--out", "--method", "--recipe", "--set", "--frames", "--scale", "--seed", "--renderer", "--resume",
         "--first-frame", "--checks", "--diagnose",
-        "--overwrite", "--no-video", "--quiet", "--budget", "--serve",
+        "--overwrite", "--no-video", "--no-pictures", "--quiet", "--budget", "--serve",
     ],
     "gsstream play": ["STREAM", "--out", "--camera", "--frames", "--fps", "--size", "--renderer", "--max-memory"],
-    "gsstream evaluate": ["STREAM", "--source", "--lpips-onnx", "--lpips-range", "--json", "--max-memory"],
+    "gsstream evaluate": [
+        "STREAM", "--source", "--ply-sequence", "--renders", "--files", "--first", "--frames", "--recipe", "--scale",
+        "--lpips-onnx", "--lpips-range", "--json", "--max-memory",
+    ],
     "gsstream gap": ["RUN", "--at", "--cache", "--epochs", "--source", "--json", "--quiet"],
     "gsstream info": ["STREAM", "--json"],
     "gsstream export": ["STREAM", "--out", "--format", "--frames", "--max-memory", "--origin"],
@@ -55,7 +59,7 @@ OPTIONS = {
     "gsstream run-segments": [
         "--source", "--out", "--segments", "--method", "--recipe", "--set", "--frames", "--scale", "--start",
         "--key-epochs", "--first-frame", "--workers", "--threads", "--ray", "--resume", "--overwrite", "--no-video",
-        "--quiet",
+        "--no-pictures", "--quiet",
     ],
     "gsstream sweep": [
         "CONFIG", "--out", "--scenes", "--data", "--workers", "--threads", "--ray", "--split", "--dry-run", "--quiet",
@@ -65,6 +69,10 @@ OPTIONS = {
         "--first-frame", "--workers", "--quiet",
     ],
     "gsstream report": ["FOLDER", "--out", "--data", "--sheets"],
+    "gsstream compare": [
+        "METHODS", "--source", "--out", "--at", "--epochs", "--seconds", "--recipe", "--set", "--frames", "--scale",
+        "--seeds", "--split", "--workers", "--threads", "--ray", "--pictures", "--quiet",
+    ],
     "gsstream check": ["NAME", "--quiet", "--set", "--source"],
     "gsstream new-plugin": ["NAME", "--kind", "--out"],
     "gsstream bench": [],

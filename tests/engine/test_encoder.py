@@ -80,7 +80,7 @@ def same_bits(ours: Any, theirs: Any) -> None:
 @pytest.mark.parametrize("case", ["still", "growing rigid with keys"])
 def test_it_makes_the_packets_of_a_run_on_disk(tmp_path: Path, case: str) -> None:
     sets = [item for key, value in {**TINY, **CASES[case]}.items() for item in ("--set", f"{key}={value}")]
-    run = ["run", "--source", WORLD, "--method", "s2gs-edge", "--out", str(tmp_path / "o"), "--quiet", "--no-video"]
+    run = ["run", "--source", WORLD, "--method", "s2gs-edge", "--out", str(tmp_path / "o"), "--quiet", "--no-pictures"]
     assert run_command([*run, *sets]) == 0
     with StreamReader(tmp_path / "o" / "stream.gss") as reader:
         assert [reader.read(entry) for entry in reader.frames] == packets(whole(case))

@@ -72,7 +72,7 @@ def test_resume_takes_the_values_from_the_stream(
     monkeypatch.setattr(encoder, "choose", never)
     if saved:
         recipe = (tmp_path / "o" / "recipe.yaml").rename(tmp_path / "recipe.yaml")
-        command = ["run", "--source", WORLD, "--recipe", str(recipe), "--out", str(tmp_path / "o"), "--no-video"]
+        command = ["run", "--source", WORLD, "--recipe", str(recipe), "--out", str(tmp_path / "o"), "--no-pictures"]
     assert run_command([*command, "--resume"]) == 0
     assert (tmp_path / "o" / "stream.gss").read_bytes() == (whole / "stream.gss").read_bytes()
 

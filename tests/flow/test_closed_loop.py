@@ -130,7 +130,7 @@ def test_a_static_scene_costs_almost_nothing(tmp_path: Path) -> None:
 def test_one_camera_one_frame_no_colour_bands_no_test_camera(tmp_path: Path, method: str) -> None:
     folder = demo_copy(tmp_path / "r", train=1, frames=1, edit=without_test_cameras)
     out = tmp_path / "o"
-    encode(out, source=str(folder), method=method, scale=0.4, first_frame__sh_degree=0)
+    encode(out, source=str(folder), method=method, scale=0.4, first_frame__sh_degree=0, pictures=True)
     (line,) = metrics(out)
     assert line["status"] == "key"
     assert "psnr" not in line
@@ -184,7 +184,7 @@ def test_training_never_sees_test_cameras(tmp_path: Path) -> None:
 
 def test_the_run_folder_is_complete(tmp_path: Path) -> None:
     out = tmp_path / "o"
-    encode(out, "--frames", "3", method="s2gs-edge")
+    encode(out, "--frames", "3", method="s2gs-edge", pictures=True)
     assert {path.name for path in out.iterdir()} == {
         "stream.gss", "metrics.jsonl", "recipe.yaml", "contact_sheet.png", "frames.png", "summary.txt"
     }  # fmt: skip
@@ -202,10 +202,29 @@ def test_the_run_folder_is_complete(tmp_path: Path) -> None:
         assert line["peak_memory_mb"] > 0
 
 
+def test_without_pictures_a_run_is_the_same_and_they_can_follow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, pictures = tmp_path / "o", {"contact_sheet.png", "frames.png"}
+    with monkeypatch.context() as patch:
+        for name in ("matplotlib.figure", "gsstream.trade.show.contact_sheet", "gsstream.player.play"):
+            patch.setitem(sys.modules, name, None)  # importing it anywhere fails
+        without = encode(out, "--frames", "3", method="s2gs-edge")
+    names = {path.name for path in out.iterdir()}
+    assert names == {"stream.gss", "metrics.jsonl", "recipe.yaml", "summary.txt"}
+    recipe = (out / "recipe.yaml").read_bytes()
+    assert encode(out, "--frames", "3", "--resume", method="s2gs-edge", pictures=True) == without
+    assert {path.name for path in out.iterdir()} == names | pictures
+    assert (out / "recipe.yaml").read_bytes() == recipe
+    sheet = (out / "contact_sheet.png").read_bytes()
+    encode(out, "--frames", "3", "--resume", method="s2gs-edge")
+    assert (out / "contact_sheet.png").read_bytes() == sheet, "what is there stays"
+
+
 def test_a_run_repeats_from_its_saved_recipe(tmp_path: Path) -> None:
     first = encode(tmp_path / "a", "--frames", "2", method="s2gs-edge")
     again = ["run", "--source", WORLD, "--recipe", str(tmp_path / "a" / "recipe.yaml"), "--out", str(tmp_path / "b")]
-    assert run_command([*again, "--quiet", "--no-video"]) == 0
+    assert run_command([*again, "--quiet", "--no-pictures"]) == 0
     assert (tmp_path / "b" / "stream.gss").read_bytes() == first
 
 

@@ -155,7 +155,7 @@ def test_two_frames_of_the_demo(name: str, rows: dict[str, ResolvedRecipe], tmp_
     recipe, out = tmp_path / "row.yaml", tmp_path / "out"
     recipe.write_text(to_yaml(rows[name]))
     sets = [item for value in TINY for item in ("--set", value)]
-    command = ["run", "--source", "demo", "--recipe", str(recipe), "--out", str(out), "--quiet", "--no-video"]
+    command = ["run", "--source", "demo", "--recipe", str(recipe), "--out", str(out), "--quiet", "--no-pictures"]
     assert run_command([*command, "--scale", "0.5", *sets]) == 0
     later = metrics(out)[1]
     assert later["frame"] == 1

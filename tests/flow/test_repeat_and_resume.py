@@ -167,7 +167,7 @@ def test_interrupt_ends_after_the_current_frame(tmp_path: Path, moment: str) -> 
     """Ctrl-C: code 130, a stream that plays, and --resume goes on to the bytes of an undisturbed run."""
     source, out = WORLD.replace("frames=6", "frames=40"), tmp_path / "o"
     options = {"source": source, "stream__epochs": 10}
-    process = start(*arguments(out, **options))
+    process = start(*arguments(out, pictures=True, **options))
     wait_for((out / ("stream.gss" if moment == "frame 0" else "metrics.jsonl")).exists, process)
     os.kill(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=600)

@@ -76,7 +76,7 @@ def broken(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, bytes]
     picture.write_bytes(sound[:200])
     err = io.StringIO()
     with redirect_stderr(err):
-        assert run_command(arguments(out, source=str(folder), scale=0.5)) == 2
+        assert run_command(arguments(out, source=str(folder), scale=0.5, pictures=True)) == 2
     (folder.parent / "err.txt").write_text(err.getvalue())
     return folder, out, sound
 
@@ -89,15 +89,17 @@ def test_a_run_that_fails_at_its_last_frame_shows_the_others_and_how_to_go_on(br
     first, note = (folder.parent / "err.txt").read_text().strip().splitlines()[-2:]
     assert first.startswith("error: ")
     assert "000003.jpg" in first
-    assert "complete up to frame 2" in note
+    assert "complete up to frame 2, and its summary and pictures are made" in note
     assert "--resume" in note
     assert "data.bad_image=repeat" in note
 
 
-def test_the_advice_can_be_followed(broken, tmp_path) -> None:
+def test_the_advice_can_be_followed(broken, tmp_path, capsys) -> None:
     """The same command with --resume and the policy goes on; so does the command alone, when the picture is mended."""
     folder, out, sound = broken
     other = Path(shutil.copytree(out, tmp_path / "o"))
+    assert run_command(arguments(other, "--resume", source=str(folder), scale=0.5)) == 2
+    assert "its summary is made" in capsys.readouterr().err
     passing = ("--resume", "--set", "data.bad_image=repeat")
     assert run_command(arguments(other, *passing, source=str(folder), scale=0.5)) == 0
     assert [line["frame"] for line in metrics(other)] == [0, 1, 2, 3]

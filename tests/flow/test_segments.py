@@ -227,7 +227,7 @@ def test_without_ray_nothing_is_touched(
 def test_a_killed_run_resumes_and_keeps_what_is_finished(tmp_path: Path) -> None:
     sets = [item for key, value in TINY.items() for item in ("--set", f"{key}={value}")]
     command = ["run-segments", "--source", WORLD, "--method", "dense", "--segments", "3", "--workers", "2", *sets]
-    command += ["--no-video", "--out"]
+    command += ["--no-pictures", "--out"]
     code, _, err = finish(*command, str(tmp_path / "once"), "--quiet")
     assert (code, err) == (0, "")
     out = tmp_path / "o"
@@ -246,6 +246,7 @@ def test_a_killed_run_resumes_and_keeps_what_is_finished(tmp_path: Path) -> None
     assert " kept" in said
     assert " 0 kept" not in said
     assert "SEAM" in said
+    assert not (out / "contact_sheet.png").exists()
 
 
 @pytest.mark.parametrize("lost", ["half a line", "the key frame's line"])
@@ -290,6 +291,7 @@ def test_frame_0_of_another_stream_is_its_first_frame_alone(tmp_path: Path) -> N
     assert run_command(command) == 0
     assert metrics(tmp_path / "o")[0]["psnr"] == metrics(tmp_path / "run")[0]["psnr"]
     assert not (tmp_path / "o" / "key-000").exists()
+    assert (tmp_path / "o" / "contact_sheet.png").exists()
 
 
 def test_streams_that_do_not_follow_each_other_are_not_joined(whole: tuple[str, Path, bytes], tmp_path: Path) -> None:
@@ -308,7 +310,7 @@ def test_streams_that_do_not_follow_each_other_are_not_joined(whole: tuple[str, 
 
 def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str], whole: tuple[str, Path, bytes]) -> None:
     def refused(*more: str) -> str:
-        assert run_command(["run-segments", "--method", "dense", "--quiet", "--no-video", *more]) == 2
+        assert run_command(["run-segments", "--method", "dense", "--quiet", "--no-pictures", *more]) == 2
         return capsys.readouterr().err
 
     world = ("--source", WORLD)

@@ -31,7 +31,7 @@ from gsstream.testing.stepping import SOURCE, MethodUnderTest
 Follow: Any = ExampleStepper  # final: only what is wrong on purpose may inherit from it
 
 RUN = [
-    "run", "--source", SOURCE, "--method", "hold", "--quiet", "--no-video", "--set", "first_frame.max_iterations=5",
+    "run", "--source", SOURCE, "--method", "hold", "--quiet", "--no-pictures", "--set", "first_frame.max_iterations=5",
     "--set", "first_frame.points=recording", "--set", "first_frame.fill_points=0",
 ]  # fmt: skip
 
@@ -83,6 +83,12 @@ def keep_decoder(step):
 
 def other_layout(step):
     return with_scene(step, layout=replace(step.state.player.layout, units=np.array([9.0], np.float32)))
+
+
+def test_a_decoder_of_its_own_is_refused_where_it_is_declared() -> None:
+    """Players would never call it."""
+    with pytest.raises(TypeError, match=r"Own\.decoder: every player decodes packets in the same way"):
+        type("Own", (Hold,), {"decoder": lambda _: None})
 
 
 def misname(step):

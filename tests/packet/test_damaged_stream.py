@@ -77,7 +77,7 @@ def test_frames_behind_the_damage_are_refused(damaged, tmp_path, capsys) -> None
 def test_evaluate_measures_what_is_sound_and_fails(tmp_path, capsys) -> None:
     """On a real run, because evaluate needs its recording."""
     out = tmp_path / "run"
-    arguments = ["run", "--source", "demo", "--method", "hold", "--scale", "0.25", "--frames", "4", "--no-video"]
+    arguments = ["run", "--source", "demo", "--method", "hold", "--scale", "0.25", "--frames", "4", "--no-pictures"]
     quick = ["--set", "first_frame.max_iterations=5"]
     assert run_command([*arguments, "--out", str(out), "--quiet", *quick]) == 0
     capsys.readouterr()

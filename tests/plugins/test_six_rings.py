@@ -16,7 +16,7 @@ from gsstream.player.playback import Playback
 BROKEN = Path(__file__).parent / "broken"
 PAGE = Path(__file__).parents[2] / "docs" / "plugin-failures.md"
 RUN = [
-    "run", "--source", "synthetic:frames=5&views=2&width=32&height=24&supersample=1", "--quiet", "--no-video",
+    "run", "--source", "synthetic:frames=5&views=2&width=32&height=24&supersample=1", "--quiet", "--no-pictures",
     "--renderer", "reference", "--set", "loss.backend=reference", "--set", "first_frame.max_iterations=3",
     "--set", "first_frame.fill_points=0", "--set", "first_frame.max_points=60", "--set", "stream.epochs=1",
 ]  # fmt: skip

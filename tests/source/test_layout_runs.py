@@ -30,7 +30,7 @@ def test_three_frames(tmp_path: Path, world: World, name: str) -> None:
     if not layout.test:
         settings += ["--set", f'data.test_cameras=["{layout.names(0)}"]']
     out = tmp_path / "out"
-    command = ["run", "--source", str(folder), "--method", "s2gs-edge", "--out", str(out), "--quiet", "--no-video"]
+    command = ["run", "--source", str(folder), "--method", "s2gs-edge", "--out", str(out), "--quiet", "--no-pictures"]
     assert run_command([*command, *settings]) == 0
     lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
     assert [line["frame"] for line in lines] == [0, 1, 2]

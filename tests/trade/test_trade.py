@@ -98,6 +98,9 @@ def test_a_perfect_stream_beats_holding_frame_0(tmp_path):
         if moved:
             assert view.hold_psnr_moving < view.hold_psnr < 50
             assert view.psnr_moving == math.inf
+            assert view.psnr_changed == math.inf
+            # Where something moves is where holding is worst, the more so without the rim.
+            assert view.hold_psnr_changed < view.hold_psnr_moving
     assert result.series("hold_psnr")[3] < result.series("hold_psnr")[1] == result.series("hold_psnr")[2]
 
 

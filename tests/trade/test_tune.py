@@ -11,6 +11,7 @@ import pytest
 from flow_runs import WORLD, encode, metrics
 
 from gsstream.cli.main import run_command
+from gsstream.cli.tune import _name
 from gsstream.core.errors import InputError
 from gsstream.recipe.budget import Budget
 from gsstream.recipe.load import load_recipe
@@ -81,6 +82,12 @@ def test_the_best_that_fits_is_chosen() -> None:
     assert "failed: it broke" in table[-1]
 
 
+def test_progress_calls_the_recording_by_its_name() -> None:
+    names = {"demo": "demo", "synthetic:frames=6&views=3": "synthetic", "n3dv:/data/coffee martini/": "coffee",
+             "../rec/k.1?missing=refuse": "k.1", "/": "scene"}  # fmt: skip
+    assert {uri: _name(uri) for uri in names} == names
+
+
 def command(out: Path, budget: str, *more: str) -> list[str]:
     sets = [item for setting in TINY for item in ("--set", setting)]
     return ["tune", "--scene", WORLD, "--out", str(out), "--budget", budget, "--method", "s2gs-edge", "--frames", "3",
@@ -108,7 +115,7 @@ def test_a_pilot_writes_a_recipe_that_runs_inside_the_budget(
     assert any("s2gs-edge+budget" in row and " 2/2 " in row for row in rows)
     program, *said = shlex.split(out.rpartition("next: ")[2])
     assert program == "gsstream"
-    run_it = [*said, "--frames", "3", "--quiet", "--no-video", "--first-frame"]
+    run_it = [*said, "--frames", "3", "--quiet", "--no-pictures", "--first-frame"]
     assert run_command([*run_it, str(tmp_path / "choosing")]) == 0
     assert f"judged by {judge} (reporting split" in (tmp_path / "pilot" / "run" / "summary.txt").read_text()
     assert all(sum(line["bytes"].values()) <= 600 for line in metrics(tmp_path / "pilot" / "run")[1:])

@@ -92,7 +92,7 @@ def end_to_end(page: Any, folder: Path, frames: int, fps: float, method: str) ->
     capture.begin(finished, folder / "watched")
     run = [
         sys.executable, "-c", "from gsstream.cli.main import main; main()", "run", "--method", method,
-        "--source", f"watch:{folder / 'watched'}?ready=rename", "--out", str(out), "--quiet", "--no-video",
+        "--source", f"watch:{folder / 'watched'}?ready=rename", "--out", str(out), "--quiet", "--no-pictures",
         "--set", "first_frame.max_iterations=100",
     ]  # fmt: skip
     with served(out, "--live", "--port", 0) as (url, _):

@@ -258,7 +258,7 @@ def test_cameras_to_browser_with_real_processes(page, tmp_path):
     out = tmp_path / "run"
     run = [
         sys.executable, "-c", "from gsstream.cli.main import main; main()", "run", "--method", "dense",
-        "--source", f"watch:{tmp_path / 'watched'}", "--out", str(out), "--scale", "0.5", "--quiet", "--no-video",
+        "--source", f"watch:{tmp_path / 'watched'}", "--out", str(out), "--scale", "0.5", "--quiet", "--no-pictures",
         *(part for key, value in settings.items() for part in ("--set", f"{key}={value}")),
     ]  # fmt: skip
 

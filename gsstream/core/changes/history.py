@@ -42,10 +42,11 @@ def displacement(
         rows: [A] int64, ascending, all that the frame may have touched.
     """
     with np.errstate(over="ignore"):  # beyond float32 it is infinite; a motion predicted from that is refused
-        shift = after.means[rows] - before.means[rows]
-    turn = turn_between(before.quats[rows], after.quats[rows])
-    some = (shift != 0).any(1) | (turn != 0).any(1)
-    return Displacement(rows[some], shift[some], turn[some]) if bool(some.any()) else None
+        shift = after.means.take(rows, 0) - before.means.take(rows, 0)
+    turn = turn_between(before.quats.take(rows, 0), after.quats.take(rows, 0))
+    # Number by number: any(1) over rows of three takes six times as long.
+    some = np.flatnonzero(np.logical_or.reduce([column != 0 for column in (*shift.T, *turn.T)]))
+    return Displacement(rows.take(some), shift.take(some, 0), turn.take(some, 0)) if len(some) else None
 
 
 def turn_between(before: FloatArray, after: FloatArray) -> FloatArray:
@@ -54,8 +55,8 @@ def turn_between(before: FloatArray, after: FloatArray) -> FloatArray:
     float64, each sum from left to right, rounded to float32 at the end. A turn of more than 120 degrees counts as none:
     it is a Gaussian that was painted anew, not one that turned.
     """
-    w0, x0, y0, z0 = np.ascontiguousarray(before.T).astype(np.float64)
-    w1, x1, y1, z1 = np.ascontiguousarray(after.T).astype(np.float64)
+    w0, x0, y0, z0 = before.T.astype(np.float64, order="C")
+    w1, x1, y1, z1 = after.T.astype(np.float64, order="C")
     w = w1 * w0 + x1 * x0 + y1 * y0 + z1 * z0
     x = x1 * w0 - w1 * x0 - y1 * z0 + z1 * y0
     y = y1 * w0 - w1 * y0 + x1 * z0 - z1 * x0
@@ -63,5 +64,5 @@ def turn_between(before: FloatArray, after: FloatArray) -> FloatArray:
     size = (w0 * w0 + x0 * x0 + y0 * y0 + z0 * z0) * (w1 * w1 + x1 * x1 + y1 * y1 + z1 * z1)
     known = (w != 0) & (4 * (w * w) >= size)
     scale = np.where(known, w, 1.0)
-    turn = np.stack([x / scale, y / scale, z / scale], 1)
-    return np.where(known[:, None], turn, 0.0).astype(np.float32)
+    turn = [np.where(known, part / scale, 0.0).astype(np.float32) for part in (x, y, z)]
+    return np.stack(turn, 1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -133,7 +133,7 @@ class _FirstFrameRun:
         view, self.parts.where.iteration = self._next_view(), iteration
         last = schedule.DENSIFY_UNTIL * self.iterations
         densify = s.densify_from <= iteration + s.densify_every and iteration <= last
-        rows = self.gaussians()
+        rows = self._disturbed(self.gaussians())
         probe = torch.zeros(len(rows), 2, requires_grad=True) if densify else None
         session = self.renderer.open(rows, None, self.frame.cameras, self.recipe.background)
         value = self._backward(view, session.render(view, rows, probe=probe).image)
@@ -147,6 +147,13 @@ class _FirstFrameRun:
                 self._densify()
         self.smooth = value if math.isnan(self.smooth) else 0.98 * self.smooth + 0.02 * value
         return self.smooth
+
+    def _disturbed(self, rows: Gaussians[torch.Tensor]) -> Gaussians[torch.Tensor]:
+        """The scene with noise on its centres, through which gradients pass; as it is where none is wanted."""
+        if self.settings.noise == 0:
+            return rows
+        noise = torch.randn(rows.means.shape, generator=self.generator) * (self.settings.noise * self.extent)
+        return replace(rows, means=rows.means + noise)
 
     def _backward(self, view: int, image: torch.Tensor) -> float:
         """Loss, its gradient into the leaves, and the exposure step."""

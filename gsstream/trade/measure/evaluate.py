@@ -7,14 +7,23 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
 from gsstream.core.shapes import FloatArray
-from gsstream.metrics import SSIM_VARIANT, OnnxLpips, moving_mask, noise_sigma, psnr, slope_per_100, ssim
+from gsstream.metrics import (
+    SSIM_VARIANT,
+    OnnxLpips,
+    changed_mask,
+    moving_mask,
+    noise_sigma,
+    psnr,
+    slope_per_100,
+    ssim,
+)
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, find_renderer, render
 from gsstream.source.base import FrameSource
@@ -46,7 +55,8 @@ ViewMetric = Callable[[ViewPair], float]
 class ViewQuality:
     """One test camera at one frame; dB, SSIM, LPIPS; nan where nothing moves or not measured, inf for equal images.
 
-    ``extra``: name -> value of what was asked for besides.
+    ``psnr_changed``: on pixels that differ from the first frame by more than 0.1. ``extra``: name -> value of what was
+    asked for besides.
     """
 
     frame: int
@@ -58,6 +68,8 @@ class ViewQuality:
     hold_psnr: float
     hold_ssim: float
     hold_psnr_moving: float
+    psnr_changed: float = math.nan
+    hold_psnr_changed: float = math.nan
     lpips: float = math.nan
     hold_lpips: float = math.nan
     extra: Mapping[str, float] = field(default_factory=dict)
@@ -101,8 +113,8 @@ class Evaluation:
 
         Columns: frame 0, mean of later frames, slope, SSIM, moving pixels, LPIPS if measured.
         """
-        names, forms = ["ssim", "psnr_moving"], [".2f", ".2f", "+.2f", ".4f", ".2f"]
-        rows = [["", "PSNR 0", "PSNR", "dB/100", "SSIM", "moving"]]
+        names, forms = ["ssim", "psnr_moving", "psnr_changed"], [".2f", ".2f", "+.2f", ".4f", ".2f", ".2f"]
+        rows = [["", "PSNR 0", "PSNR", "dB/100", "SSIM", "moving", "changed"]]
         if self.lpips_variant:
             names, forms, rows = [*names, "lpips"], [*forms, ".4f"], [[*rows[0], "LPIPS"]]
         for label, prefix in (("decoded", ""), ("frame 0 held", "hold_")):
@@ -119,6 +131,44 @@ class Evaluation:
         return f"{format_table(rows)}\n\n{notes}"
 
 
+class Shown(Protocol):
+    """Pictures to be judged: of a stream, or of files that another program wrote."""
+
+    @property
+    def frames(self) -> Sequence[int]:
+        """Indices of frames, in the numbering of the recording."""
+
+    @property
+    def rig(self) -> Cameras:
+        """The cameras that the pictures are seen from."""
+
+    @property
+    def renderer(self) -> str:
+        """What drew them."""
+
+    def images(self, frame: int) -> Sequence[FloatArray]:
+        """Return a picture [H, W, 3] in [0, 1] for each camera of the rig; the same list where nothing changed."""
+
+
+class StreamShown:
+    """What the player shows of a stream."""
+
+    def __init__(self, playback: Playback, rig: Cameras, renderer: PlayerRenderer) -> None:
+        self.rig, self.renderer, self.frames = rig, renderer.name, playback.frames
+        self._playback, self._with = playback, renderer
+        self._last: tuple[Any, list[FloatArray]] | None = None
+
+    def images(self, frame: int) -> list[FloatArray]:
+        """Return the pictures of a frame; those of a scene that did not change are not drawn again."""
+        scene, background = self._playback.state_at(frame), self._playback.meta.background
+        if self._last is None or self._last[0] is not scene:
+            views = range(len(self.rig))
+            self._last = (
+                scene, [np.clip(render(scene, self.rig, view, background, self._with), 0, 1) for view in views]
+            )  # fmt: skip
+        return self._last[1]
+
+
 def evaluate(
     stream: str | os.PathLike[str], source: FrameSource, *, frames: Sequence[int] | None = None,
     split: Literal["train", "test"] = "test", renderer: PlayerRenderer | None = None,
@@ -127,63 +177,77 @@ def evaluate(
 ) -> Evaluation:  # fmt: skip
     """Render a stream's packets with the player and compare every test view with the recording.
 
-    Colours are clamped to [0, 1] first, as a screen would (3DGS convention). Noise is measured between the first two
-    evaluated frames; "moving" is relative to the first evaluated frame, which is also the one held.
-
     Arguments:
         stream: file to read.
         source: an open recording.
         split: "test" or "train".
         renderer: that draws.
-        frames: frame indices; default all of the stream.
-        lpips, extras: measured besides the rest; default: not measured.
-        progress: called with (done, total) after every frame.
+        frames, lpips, extras, progress: as for :func:`evaluate_shown`.
 
     Raises InputError when the recording's cameras are not those of the stream, PacketError for a damaged stream.
     """
     renderer = find_renderer() if renderer is None else renderer
     with Playback(stream) as playback:
-        rig = playback.cameras(split)
-        chosen = sorted(set(playback.frames if frames is None else frames))
-        if not chosen or len(rig) == 0:
-            raise InputError(f"nothing to evaluate: {len(chosen)} frames, {len(rig)} {split} cameras")
-        order = _match(rig, source.info.test if split == "test" else source.info.train, split)
-        truth_first = _truth(source, chosen[0], split, order)
-        truth_next = _truth(source, chosen[1], split, order) if len(chosen) > 1 else truth_first
-        sigmas = [noise_sigma(a, b) for a, b in zip(truth_first, truth_next, strict=True)]
-        held = _rendered(playback, chosen[0], rig, renderer)
-        scene, images, views = playback.state_at(chosen[0]), held, []
-        last: tuple[Sequence[FloatArray | None], Sequence[FloatArray | None]] = ([None] * len(rig), [None] * len(rig))
-        for done, frame in enumerate(chosen, 1):
-            if playback.state_at(frame) is not scene:
-                scene, images = playback.state_at(frame), _rendered(playback, frame, rig, renderer)
-            truth = _truth(source, frame, split, order)
-            for i, name in enumerate(rig.ids):
-                mask = moving_mask(truth[i], truth_first[i], sigmas[i])
-                pair = ViewPair(images[i], truth[i], last[0][i], last[1][i], sigmas[i])
-                found = {key: metric(pair) for key, metric in (extras or {}).items()}
-                views.append(replace(_compare(frame, name, pair, held[i], mask, lpips), extra=found))
-            last = (images, list(truth))
-            if progress is not None:
-                progress(done, len(chosen))
+        shown = StreamShown(playback, playback.cameras(split), renderer)
+        return evaluate_shown(
+            shown, source, frames=frames, split=split, lpips=lpips, extras=extras, progress=progress
+        )
+
+
+def evaluate_shown(
+    shown: Shown, source: FrameSource, *, frames: Sequence[int] | None = None,
+    split: Literal["train", "test"] = "test", lpips: OnnxLpips | None = None,
+    extras: Mapping[str, ViewMetric] | None = None, progress: Callable[[int, int], None] | None = None,
+) -> Evaluation:  # fmt: skip
+    """Compare pictures of every test view with the recording.
+
+    Colours are clamped to [0, 1] first, as a screen would (3DGS convention). Noise is measured between the first two
+    evaluated frames; "moving" and "changed" are relative to the first evaluated frame, which is also the one held.
+
+    Arguments:
+        shown: the pictures.
+        source: an open recording.
+        frames: frame indices; default all that are shown.
+        split: "test" or "train".
+        lpips, extras: measured besides the rest; default: not measured.
+        progress: called with (done, total) after every frame.
+
+    Raises InputError when the recording's cameras are not those of the pictures.
+    """
+    rig, chosen = shown.rig, sorted(set(shown.frames if frames is None else frames))
+    if not chosen or len(rig) == 0:
+        raise InputError(f"nothing to evaluate: {len(chosen)} frames, {len(rig)} {split} cameras")
+    order = _match(rig, source.info.test if split == "test" else source.info.train, split)
+    truth_first = _truth(source, chosen[0], split, order)
+    truth_next = _truth(source, chosen[1], split, order) if len(chosen) > 1 else truth_first
+    sigmas = [noise_sigma(a, b) for a, b in zip(truth_first, truth_next, strict=True)]
+    held, views = list(shown.images(chosen[0])), []
+    last: tuple[Sequence[FloatArray | None], Sequence[FloatArray | None]] = ([None] * len(rig), [None] * len(rig))
+    for done, frame in enumerate(chosen, 1):
+        truth, images = _truth(source, frame, split, order), shown.images(frame)
+        for i, name in enumerate(rig.ids):
+            masks = (moving_mask(truth[i], truth_first[i], sigmas[i]), changed_mask(truth[i], truth_first[i]))
+            pair = ViewPair(images[i], truth[i], last[0][i], last[1][i], sigmas[i])
+            found = {key: metric(pair) for key, metric in (extras or {}).items()}
+            views.append(replace(_compare(frame, name, pair, held[i], masks, lpips), extra=found))
+        last = (images, list(truth))
+        if progress is not None:
+            progress(done, len(chosen))
     variant = None if lpips is None else lpips.variant
-    return Evaluation(tuple(views), dict(zip(rig.ids, sigmas, strict=True)), renderer.name, variant)
+    return Evaluation(tuple(views), dict(zip(rig.ids, sigmas, strict=True)), shown.renderer, variant)
 
 
 def _compare(
-    frame: int, name: str, pair: ViewPair, held: FloatArray, mask: Any, lpips: OnnxLpips | None
+    frame: int, name: str, pair: ViewPair, held: FloatArray, masks: tuple[Any, Any], lpips: OnnxLpips | None
 ) -> ViewQuality:
-    image, truth = pair.image, pair.truth
+    """``masks``: moving pixels, changed pixels."""
+    image, truth, (moving, changed) = pair.image, pair.truth, masks
     distances = () if lpips is None else (lpips(image, truth), lpips(held, truth))
     return ViewQuality(
-        frame, name, psnr(image, truth), ssim(image, truth), psnr(image, truth, mask), float(mask.mean()),
-        psnr(held, truth), ssim(held, truth), psnr(held, truth, mask), *distances,
+        frame, name, psnr(image, truth), ssim(image, truth), psnr(image, truth, moving), float(moving.mean()),
+        psnr(held, truth), ssim(held, truth), psnr(held, truth, moving), psnr(image, truth, changed),
+        psnr(held, truth, changed), *distances,
     )  # fmt: skip
-
-
-def _rendered(playback: Playback, frame: int, rig: Cameras, renderer: PlayerRenderer) -> list[FloatArray]:
-    scene, background = playback.state_at(frame), playback.meta.background
-    return [np.clip(render(scene, rig, view, background, renderer), 0, 1) for view in range(len(rig))]
 
 
 def _truth(source: FrameSource, frame: int, split: Literal["train", "test"], order: Sequence[int]) -> FloatArray:

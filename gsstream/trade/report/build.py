@@ -13,6 +13,7 @@ from gsstream.trade.report.fronts import Effect, effects, knee, pareto_front
 from gsstream.trade.report.groups import Group, SweepData, seed_noise, waited
 from gsstream.trade.report.paper import beside_ours, paper_table
 from gsstream.trade.report.quantities import BY_KEY, GOODS, cell
+from gsstream.trade.report.rate_curves import curve_blocks
 
 _NOT_MEASURED = {"joules": "energy"}
 _MEANS = (
@@ -40,7 +41,7 @@ def build_report(data: SweepData, sheets: Mapping[str, Picture]) -> list[Block]:
     blocks: list[Block] = []
     if data.config["description"]:
         blocks.append(Text(data.config["description"]))
-    blocks += _facts(data)
+    blocks += where_it_ran(data)
     for scene in data.scenes:
         blocks += _scene(data, scene)
         if scene in sheets:
@@ -51,8 +52,8 @@ def build_report(data: SweepData, sheets: Mapping[str, Picture]) -> list[Block]:
     return blocks
 
 
-def _facts(data: SweepData) -> list[Block]:
-    """What ran where, and what was not measured."""
+def where_it_ran(data: SweepData) -> list[Block]:
+    """Return what ran where, by which cameras it was judged, and what was not measured."""
     runs = [run for group in data.groups for run in group.runs]
     rows = {run.id: run.row for run in runs}
     machines = {row["machine"] for row in rows.values()}
@@ -89,10 +90,11 @@ def _scene(data: SweepData, scene: str) -> list[Block]:
     blocks: list[Block] = [Heading(scene), Text(_noise(groups))]
     blocks.append(Picture(f"{scene}-pareto.png", pareto_figure(groups, f"{scene}: quality against cost"),
                           f"Quality against cost on {scene}, one point per recipe"))  # fmt: skip
-    blocks += [_fronts(groups), _all_runs(groups, data.measured())]
+    blocks += [_fronts(groups), all_runs(groups, data.measured())]
     found = effects(groups, [*GOODS, *measured_costs(groups)])
     if found:
         blocks += [_knobs(found, groups), Text(_READING)]
+    blocks += curve_blocks(groups, scene)
     for name, rows in data.config.get("paper_tables", {}).items():
         blocks.append(beside_ours(paper_table(name), groups, scene, rows))
     curves = curve_groups(groups)
@@ -156,7 +158,13 @@ def _fronts(groups: Sequence[Group]) -> Table:
     return Table("Pareto fronts", rows)
 
 
-def _all_runs(groups: Sequence[Group], keys: Sequence[str]) -> Table:
+def all_runs(groups: Sequence[Group], keys: Sequence[str]) -> Table:
+    """Return a table with a row for each group.
+
+    Arguments:
+        groups: rows.
+        keys: of the quantities, columns.
+    """
     rows = [["recipe", "seeds", *(BY_KEY[key].title for key in keys)]]
     for group in groups:
         cells = [cell(key, group.mean(key), group.spread(key)) for key in keys]

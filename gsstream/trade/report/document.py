@@ -45,7 +45,7 @@ class Picture:
 
 
 Block = Heading | Text | Table | Picture
-_TYPES = {".png": "image/png", ".jpg": "image/jpeg"}
+_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".webp": "image/webp"}
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1180px; margin: 2em auto; padding: 0 1em }
 h1 { font-size: 1.6em } h3 { font-size: 1.05em }

@@ -20,6 +20,9 @@ from gsstream.trade.report.quantities import BY_KEY, COSTS, GOODS
 from gsstream.trade.show.plots import COLORS, plot_runs
 
 _CURVES = len(COLORS)
+_QUALITY = {
+    "psnr": "PSNR, dB", "psnr_moving": "PSNR on moving pixels, dB", "psnr_changed": "PSNR on changed pixels, dB",
+}  # fmt: skip
 
 
 def measured_costs(groups: Sequence[Group]) -> list[str]:
@@ -28,34 +31,49 @@ def measured_costs(groups: Sequence[Group]) -> list[str]:
     return [key for key in COSTS if key not in useless and all(math.isfinite(group.mean(key)) for group in groups)]
 
 
-def pareto_figure(groups: Sequence[Group], title: str) -> bytes:
+def pareto_figure(
+    groups: Sequence[Group], title: str, goods: Sequence[str] = GOODS, costs: Sequence[str] | None = None,
+    joined: bool = False,
+) -> bytes:  # fmt: skip
     """Draw one panel per quality and cost: every group, its spread, the front as a line, the knee in a ring.
 
     The spread is that over seeds.
 
     Points far below the rest stand at the lower edge as triangles with their value. Names that would cover one another
     are left out, those of the front last.
+
+    Arguments:
+        groups: what is drawn.
+        title: of the figure.
+        goods: qualities, a row of panels each.
+        costs: a column each; default: those that are measured.
+        joined: whether a thin line joins the groups of one variant.
     """
-    costs = measured_costs(groups)
+    costs = measured_costs(groups) if costs is None else costs
     figure = Figure(figsize=(3.6 * len(costs), 6.8), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(len(GOODS), len(costs), squeeze=False, sharey="row", sharex="col")
+    axes = figure.subplots(len(goods), len(costs), squeeze=False, sharey="row", sharex="col")
     variants = list(dict.fromkeys(group.variant for group in groups))
     colors = {name: COLORS[i % len(COLORS)] for i, name in enumerate(variants)}
-    for row, good in enumerate(GOODS):
+    for row, good in enumerate(goods):
         for column, cost in enumerate(costs):
             axis = axes[row, column]
             _panel(axis, groups, good, cost, colors)
-            if row == len(GOODS) - 1:
+            for name in variants if joined else ():
+                line = sorted((group.mean(cost), group.mean(good)) for group in groups if group.variant == name)
+                axis.plot(*zip(*line, strict=True), color=colors[name], linewidth=1, alpha=0.6)
+                if len(line) > 1:
+                    _name(axis, name, line[-1], True)
+            if row == len(goods) - 1:
                 axis.set_xlabel(BY_KEY[cost].title, fontsize=9)
-        axes[row, 0].set_ylabel("PSNR, dB" if good == "psnr" else "PSNR on moving pixels, dB", fontsize=9)
+        axes[row, 0].set_ylabel(_QUALITY.get(good, BY_KEY[good].title), fontsize=9)
     handles = [axes[0, 0].scatter([], [], s=24, color=colors[name], label=name) for name in variants]
     figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=9, frameon=False)
     figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     figure.canvas.draw()
     for axis in axes.flat:
         _thin_names(axis)
-    return _png(figure)
+    return png(figure)
 
 
 def floor_of(values: Sequence[float]) -> float:
@@ -136,7 +154,8 @@ def curve_groups(groups: Sequence[Group]) -> list[Group]:
     return [groups[i] for i in front][:_CURVES] or list(groups)[:_CURVES]
 
 
-def _png(figure: Figure) -> bytes:
+def png(figure: Figure) -> bytes:
+    """Return a figure as the bytes of a PNG, the same for the same figure."""
     out = io.BytesIO()
     figure.savefig(out, format="png", metadata={"Software": None})
     return out.getvalue()

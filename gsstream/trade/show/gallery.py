@@ -3,52 +3,66 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from gsstream.engine.budget.report import budget_lines
 from gsstream.packet import StreamMeta
-from gsstream.player.play import play
 from gsstream.player.playback import Playback
 from gsstream.source.base import FrameSource
 from gsstream.trade.measure.gap import fresh_files
-from gsstream.trade.measure.records import read_lines, read_records
+from gsstream.trade.measure.records import FrameRecord, read_lines, read_records
 from gsstream.trade.measure.summary import summarise, summary_table
-from gsstream.trade.show.contact_sheet import sheet_of_stream
-from gsstream.trade.show.plots import plot_runs
 
 STREAM, METRICS = "stream.gss", "metrics.jsonl"
 SHEET, PLOTS, SUMMARY, VIDEO = "contact_sheet.png", "frames.png", "summary.txt", "video.mp4"
 COLUMNS = 5
 
 
-def write_gallery(out: Path, source: FrameSource, *, video: bool = True) -> list[Path]:
-    """Write every picture a person would look for first; return what was written.
+def write_gallery(out: Path, source: FrameSource, *, pictures: bool = True, video: bool = True) -> list[Path]:
+    """Write the summary and every picture a person would look for first; return what was written.
 
     Arguments:
         out: a run folder with a stream and metrics.
         source: the recording, at the scale of the run.
-        video: also an MP4 of the first camera, when PyAV is installed (extra ``video``).
+        pictures: without them only the summary is written, what draws them is not imported, and pictures that the
+            folder holds from before stay as they are.
+        video: among the pictures also an MP4 of the first camera, when PyAV is installed (extra ``video``).
     """
     with Playback(out / STREAM) as playback:
-        frames, method = playback.frames, playback.meta.title
-        name = (playback.meta.test.ids or playback.meta.train.ids)[0]
-        judges = judges_line(playback.meta)
+        frames, meta = playback.frames, playback.meta
     records = read_records(out / METRICS)
+    written = [_write_summary(out, meta, records)]
+    if not pictures:
+        return written
+    written += _still_pictures(out, source, meta, records)
+    if video and len(frames) > 1 and importlib.util.find_spec("av") is not None:
+        from gsstream.player.play import play
+
+        play(out / STREAM, out / VIDEO, camera=(meta.test.ids or meta.train.ids)[0])
+        written.append(out / VIDEO)
+    return written
+
+
+def _still_pictures(out: Path, source: FrameSource, meta: StreamMeta, records: Sequence[FrameRecord]) -> list[Path]:
+    from gsstream.trade.show.plots import plot_runs
+
     written = [write_sheet(out, source)]
     # Frame 0 alone, and no test camera to measure it: there is no curve to draw.
     if len(records) > 1 or records[0].psnr:
-        written.append(plot_runs({method: records}, out / PLOTS, title=f"{method} on {source.info.name}"))
-    text = [summary_table({method: summarise(records)}), "", judges]
+        title = f"{meta.title} on {source.info.name}"
+        written.append(plot_runs({meta.title: records}, out / PLOTS, title=title))
+    return written
+
+
+def _write_summary(out: Path, meta: StreamMeta, records: Sequence[FrameRecord]) -> Path:
+    text = [summary_table({meta.title: summarise(records)}), "", judges_line(meta)]
     budget = budget_lines(read_lines(out / METRICS))
     text += ["", *budget] if budget else []
     (out / SUMMARY).write_text("\n".join(text) + "\n", encoding="utf-8")
-    written.append(out / SUMMARY)
-    if video and len(frames) > 1 and importlib.util.find_spec("av") is not None:
-        play(out / STREAM, out / VIDEO, camera=name)
-        written.append(out / VIDEO)
-    return written
+    return out / SUMMARY
 
 
 def write_sheet(out: Path, source: FrameSource) -> Path:
@@ -58,6 +72,8 @@ def write_sheet(out: Path, source: FrameSource) -> Path:
         out: a run folder with a stream.
         source: the recording, at the scale of the run.
     """
+    from gsstream.trade.show.contact_sheet import sheet_of_stream
+
     with Playback(out / STREAM) as playback:
         frames = playback.frames
     fresh = {frame: path for frame, path in fresh_files(out).items() if frame in frames}

@@ -112,6 +112,7 @@ def test_the_residual_table_has_the_same_bits_for_any_number_of_threads() -> Non
         set_num_threads(number)
         table, g = CpuAdam().residual_table(code, base, units, matrix), torch.Generator().manual_seed(5)
         for _ in range(3):
+            assert table is not None, "the kernels are older than the plugin: install it again"
             table.rows(torch.rand(1500, generator=g))
             table.pull(base.map(lambda value, g=g: torch.randn(value.shape, generator=g)), 1e-3)
             table.step()
@@ -123,6 +124,7 @@ def test_the_residual_table_has_the_same_bits_for_any_number_of_threads() -> Non
 def test_the_residual_table_refuses_gradients_of_other_rows_and_a_step_without_a_pull() -> None:
     code, base, units, matrix = _residual_case()
     table = CpuAdam().residual_table(code, base, units, matrix)
+    assert table is not None, "the kernels are older than the plugin: install it again"
     table.rows(torch.ones(300))
     with pytest.raises(ShapeError, match="gradient of means: expected shape"):
         table.pull(base.rows(torch.arange(10)), 0.0)

@@ -29,8 +29,8 @@ SETTINGS = {
 def encode(out: Path, *more: str, source: str = SOURCE, **changes: Any) -> bytes:
     values = {**SETTINGS, **{key.replace("__", "."): value for key, value in changes.items()}}
     sets = [item for key, value in values.items() for item in ("--set", f"{key}={value}")]
-    command = ["run", "--source", source, "--method", "queen", "--out", str(out), "--quiet", "--no-video", *sets, *more]
-    assert run_command(command) == 0
+    command = ["run", "--source", source, "--method", "queen", "--out", str(out), "--quiet", "--no-pictures", *sets]
+    assert run_command([*command, *more]) == 0
     return (out / "stream.gss").read_bytes()
 
 

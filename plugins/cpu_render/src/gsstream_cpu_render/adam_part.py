@@ -8,6 +8,7 @@ from typing import final
 import torch
 
 from gsstream.api import AdamState, Gaussians, JointCode, ResidualTable, RowOptimiser
+from gsstream_cpu_render import _native
 from gsstream_cpu_render.adam_step import step_table
 from gsstream_cpu_render.residual import CpuResidualTable
 
@@ -30,5 +31,8 @@ class CpuAdam(RowOptimiser):
 
     def residual_table(
         self, code: JointCode, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor
-    ) -> ResidualTable:
+    ) -> ResidualTable | None:
+        # An editable install is rebuilt only by installing again: kernels of before do without the short cut.
+        if not hasattr(_native, "ResidualTable"):
+            return None
         return CpuResidualTable(code, base, units, matrix)

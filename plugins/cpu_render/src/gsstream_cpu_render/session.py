@@ -21,6 +21,7 @@ from gsstream.api import (
     ScreenGradient,
     check_tiles,
 )
+from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import SplatArrays
 from gsstream_cpu_render.autograd import differentiable, splats_of
 from gsstream_cpu_render.checks import Float32, as_array
@@ -100,7 +101,9 @@ class CpuSession(RenderSession):
 
     def pull(self, view: int, rows: Gaussians[torch.Tensor], comparison: Comparison) -> Pulled | None:
         # In a wide session nothing stands still that could be left out; rows in another order are rare.
-        if self._ids is None or self._order is not None or type(comparison.loss) is not CpuLoss:
+        # Kernels that were built before this call existed do without it, until the plugin is installed again.
+        known = type(comparison.loss) is CpuLoss and hasattr(_native.Rasterizer, "pull_active")
+        if self._ids is None or self._order is not None or not known:
             return None
         cached = self._view(view)  # its owner while the native call runs
         cached.freeze(self._ids, None)

@@ -1,0 +1,69 @@
+"""Fitting the transforms of groups to the images, one view at a time, with Adam's moments."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+
+from gsstream.core.changes import Scene
+from gsstream.core.changes.motion import Moves
+from gsstream.core.context import FrameWork
+from gsstream.core.shapes import FloatArray
+from gsstream.motion.pull_back import slope_of
+
+BETAS, EPSILON = (0.9, 0.99), 1e-12
+#: Squared slopes [K, 6] -> by what every number's slope is measured, squared.
+Measure = Callable[[FloatArray], FloatArray]
+
+
+def fitted_moves(
+    scene: Scene, work: FrameWork, start: Moves, unit: FloatArray, rates: Sequence[float], order: np.random.Generator,
+    measure: Measure, pull: float = 0.0,
+) -> FloatArray:  # fmt: skip
+    """Return the shifts and turns [K, 6] of groups that explain the images best.
+
+    Arguments:
+        scene: decoded, as both ends have it.
+        work: the frame, seen from this scene; it is narrowed to the rows that move.
+        start: where the fit begins.
+        unit: [6] what a rate of 1 means for shift x, y, z [scene units] and turn x, y, z [tan(angle / 2)].
+        rates: length of the step of every iteration, in units; their number is that of the iterations.
+        order: draws the order of the views, anew for each pass.
+        measure: what the steps of each number are divided by, squared.
+        pull: weight of the mean absolute value of all numbers, in units, beside the photometric loss.
+    """
+    views = len(work.cameras)
+    work.narrow(torch.from_numpy(start.rows))
+    base = scene.gaussians.rows(start.rows)
+    local = start._replace(rows=np.arange(len(start.rows)))
+    values = np.concatenate([start.shift, start.turn], 1) / unit
+    first, second = np.zeros_like(values), np.zeros_like(values)
+    for step, rate in enumerate(rates):
+        if step % views == 0:
+            sequence = order.permutation(views)
+        moves = local._replace(shift=values[:, :3] * unit[:3], turn=values[:, 3:] * unit[3:])
+        slope = slope_of(work, int(sequence[step % views]), base, moves) * unit
+        if pull:
+            slope = slope + pull * np.sign(values) / values.size
+        first = BETAS[0] * first + (1 - BETAS[0]) * slope
+        second = BETAS[1] * second + (1 - BETAS[1]) * slope**2
+        scale = np.sqrt(measure(second) / (1 - BETAS[1] ** (step + 1))) + EPSILON
+        values = values - rate * (first / (1 - BETAS[0] ** (step + 1))) / scale
+    return np.asarray(values * unit)
+
+
+def each_alone(second: FloatArray) -> FloatArray:
+    """Return the squared slopes as they are: every number is measured by itself, as Adam does."""
+    return second
+
+
+def felt_most(second: FloatArray) -> FloatArray:
+    """Return the squared slope [K, 1] that all six numbers of a group are measured by: that of the one felt most.
+
+    With a measure of its own every number would make steps of full size, those that the images say nothing about too
+    (depth, the turn of a ball), and so would groups that are hardly seen: noise, which the residual has to mend. A
+    group that feels less than the others do on average is measured by them.
+    """
+    return np.asarray(np.maximum(second.max(1, keepdims=True), second.mean()))

@@ -1,0 +1,1 @@
+"""ComGS for gsstream. Importing this package imports no torch."""

@@ -1,0 +1,95 @@
+"""The field of a few key points: every Gaussian near them moves by the weighted sum of their rigid motions."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+
+from gsstream.api import Gaussians
+
+
+class KeyPoints(NamedTuple):
+    """K key points; ``centre`` is fixed, the others are trained.
+
+    ``centre``, ``shift`` [K, 3] scene units, ``turn`` [K, 3] axis * tan(angle / 2); of the ellipsoid that they
+    influence: ``size`` [K, 3] log of the standard deviations, ``quat`` [K, 4].
+    """
+
+    centre: torch.Tensor
+    shift: torch.Tensor
+    turn: torch.Tensor
+    size: torch.Tensor
+    quat: torch.Tensor
+
+
+class Field(NamedTuple):
+    """What becomes of A Gaussians: ``shift`` [A, 3] of their centres, ``turn`` [A, 3] axis * tan(angle / 2)."""
+
+    shift: torch.Tensor
+    turn: torch.Tensor
+
+
+def weights_of(means: torch.Tensor, points: KeyPoints) -> torch.Tensor:
+    """Return [A, K]: how much each key point moves each Gaussian, 0 to 1; the sum over key points is at most 1.
+
+    Arguments:
+        means: [A, 3] centres.
+        points: K key points.
+    """
+    turned = matrices(points.quat).transpose(1, 2) / points.size.exp()[:, :, None]  # [K, 3, 3]
+    local = torch.einsum("kij,akj->aki", turned, means[:, None] - points.centre)
+    weights = torch.exp(-0.5 * local.square().sum(-1))
+    return weights / weights.sum(1, keepdim=True).clamp_min(1)
+
+
+def field_of(means: torch.Tensor, points: KeyPoints) -> Field:
+    """Return how key points move Gaussians.
+
+    Arguments:
+        means: [A, 3] centres.
+        points: K key points.
+    """
+    weights = weights_of(means, points)
+    unit = torch.cat([torch.ones_like(points.turn[:, :1]), points.turn], 1)
+    turning = matrices(unit) - torch.eye(3)
+    # sum_k w (R_k - 1)(x - c_k) + w t_k, without the table [A, K, 3] of every key point's own displacement.
+    blended = torch.einsum("ak,kij->aij", weights, turning)
+    fixed = points.shift - torch.einsum("kij,kj->ki", turning, points.centre)
+    shift = torch.einsum("aij,aj->ai", blended, means) + weights @ fixed
+    return Field(shift, weights @ points.turn)
+
+
+def moved_by(gaussians: Gaussians[torch.Tensor], field: Field) -> Gaussians[torch.Tensor]:
+    """Return Gaussians, raw values, moved and turned by a field.
+
+    Arguments:
+        gaussians: A rows.
+        field: of these rows.
+    """
+    quats = product(torch.cat([torch.ones_like(field.turn[:, :1]), field.turn], 1), gaussians.quats)
+    values = dict(gaussians.items())
+    return Gaussians(**{**values, "means": gaussians.means + field.shift, "quats": quats})
+
+
+def matrices(quats: torch.Tensor) -> torch.Tensor:
+    """Return rotation matrices [K, 3, 3] of quaternions [K, 4], w first, of any length."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, 1).reshape(-1, 3, 3)
+
+
+def product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Return the quaternion products a b [A, 4], with the first made a unit: first the rotation b, then a."""
+    w0, x0, y0, z0 = torch.nn.functional.normalize(a, dim=1).unbind(1)
+    w1, x1, y1, z1 = b.unbind(1)
+    return torch.stack([
+        w0 * w1 - x0 * x1 - y0 * y1 - z0 * z1,
+        w0 * x1 + x0 * w1 + y0 * z1 - z0 * y1,
+        w0 * y1 - x0 * z1 + y0 * w1 + z0 * x1,
+        w0 * z1 + x0 * y1 - y0 * x1 + z0 * w1,
+    ], 1)  # fmt: skip

@@ -1,0 +1,107 @@
+"""ComGS (NeurIPS 2025) as a method of its own."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+import torch
+
+from gsstream.api import (
+    Delta,
+    Frame,
+    FrameTools,
+    IntArray,
+    Layout,
+    PlayerState,
+    Step,
+    StreamingMethod,
+    Tools,
+    apply_motion,
+    send_delta,
+    send_key,
+)
+from gsstream.blocks import changed_rows, detect_change
+from gsstream_comgs.correction import corrected
+from gsstream_comgs.motion import fitted_motion
+from gsstream_comgs.settings import ComGSConfig
+
+
+@dataclass(frozen=True)
+class ComGSState:
+    """``player``: what every player has. ``previous``: the images its scene shows."""
+
+    player: PlayerState
+    previous: Frame
+
+
+@final
+class ComGS(StreamingMethod[ComGSState]):
+    """Moves Gaussians by a few key points and corrects them at key frames (ComGS, NeurIPS 2025).
+
+    In every frame about two hundred Gaussians are key points, each with a rigid motion and an ellipsoid of influence.
+    Every so many frames Gaussians in error are corrected behind a learned mask. What is sent are rigid motions of small
+    cells, which come nearest to the field of the key points, and residuals. Where this differs from what is published,
+    and why: README of this plugin.
+    """
+
+    source = "ComGS (NeurIPS 2025)"
+
+    Config = ComGSConfig
+    heeds = ("stream.epochs",)
+
+    def begin(self, frame: Frame, tools: Tools) -> Step[ComGSState]:
+        first = tools.first_frame(frame)
+        number = len(first.gaussians)
+        extent = np.array([frame.cameras.extent], np.float32)
+        layout = Layout(np.ones(number, np.int32), np.zeros(number, np.uint8), extent)
+        packet, player = send_key(first.gaussians, layout, first.meta, frame.index)
+        return Step(ComGSState(player, frame), packet, "key", first.metrics)
+
+    def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> ComGSState:
+        return ComGSState(player, shown)
+
+    def step(self, state: ComGSState, frame: Frame, tools: Tools) -> Step[ComGSState]:
+        clock = [time.perf_counter()]
+        still = np.array_equal(state.previous.images, frame.images)
+        # At a key frame what is still wrong is corrected, whether something moves or not.
+        key = frame.index % self.config.correction.every == 0
+        if frame.effort == 0 or (still and not key):
+            return self._send(state, frame, Delta())
+        epochs, order = tools.epochs(frame), tools.rng.numpy("comgs", frame.index)
+        scene, delta = state.player.scene, Delta()
+        work = tools.open(state.player, state.previous, frame)
+        rows = self._changed(work, state.previous, frame)
+        motion = fitted_motion(scene, work, rows, epochs, self.config.motion, order) if len(rows) else None
+        if motion is not None:
+            delta = Delta((motion,))
+            scene = apply_motion(scene, motion)[0]
+        clock.append(time.perf_counter())
+        if key:
+            passes = max(1, round(epochs * self.config.correction.passes))
+            inner = work.on(scene.gaussians.map(torch.from_numpy))
+            residual = corrected(inner, scene.layout, passes, self.config.correction, order)
+            delta = delta.with_residual(residual)
+        clock.append(time.perf_counter())
+        step = self._send(state, frame, delta)
+        clock.append(time.perf_counter())
+        facts = {
+            "moving_groups": 0 if motion is None else int(motion.moving.sum()), "corrected": key,
+            "seconds": dict(zip(("motion", "optimise", "code"), np.diff(clock).tolist(), strict=True)),
+        }  # fmt: skip
+        return replace(step, metrics={**step.metrics, **facts})
+
+    def _changed(self, work: FrameTools, previous: Frame, frame: Frame) -> IntArray:
+        """Rows that may move."""
+        settings = self.config.motion
+        change = detect_change(previous, frame, settings.change)
+        means = work.gaussians.means
+        return changed_rows(change, means, frame.cameras, work.session, settings.votes).nonzero()[:, 0].numpy()
+
+    def _send(self, state: ComGSState, frame: Frame, delta: Delta) -> Step[ComGSState]:
+        packet, player = send_delta(state.player, delta)
+        if delta.is_empty:
+            return Step(replace(state, player=player), packet, "empty")
+        return Step(ComGSState(player, frame), packet, "delta")

@@ -1,0 +1,108 @@
+"""Fitting key points to the images, and saying their field as rigid motions of small cells."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gsstream.api import FloatArray, FrameWork, IntArray, Motion, Scene, groups_for
+from gsstream.blocks import neighbour_distance, pixel_size
+from gsstream_comgs.influence import Field, KeyPoints, field_of, moved_by
+from gsstream_comgs.settings import MotionSettings
+
+
+def gradient_difference(work: FrameWork) -> torch.Tensor:
+    """Return [N]: the size of the change, from the frame before to this one, of the pull at every Gaussian's centre.
+
+    It is that of the mean over the views of the gradient of the squared error; the render itself cancels.
+    """
+    total: torch.Tensor = torch.zeros(len(work.gaussians), 2)
+    for view in range(len(work.cameras)):
+        now = work.image(view)
+        total += work.screen_gradient(view, 2 * (work.previous_image(view) - now) / now.numel()).gradient
+    difference: torch.Tensor = total.norm(dim=1) / len(work.cameras)
+    return difference
+
+
+def fitted_motion(
+    scene: Scene, work: FrameWork, rows: IntArray, epochs: int, settings: MotionSettings, order: np.random.Generator
+) -> Motion | None:
+    """Return the motion of a frame; None where nothing moves.
+
+    Arguments:
+        scene: decoded, as both ends have it.
+        work: the frame, seen from this scene.
+        rows: [A] Gaussians that may move, ascending.
+        epochs: passes over the training cameras.
+        settings: of key points.
+        order: draws the order of the views.
+    """
+    difference = gradient_difference(work)[torch.from_numpy(rows)]
+    number = min(settings.keypoints, int((difference > 0).sum()))
+    if number == 0:
+        return None
+    pixel = pixel_size(scene.gaussians.means, work.cameras)
+    side = float(np.float32(settings.pixels * pixel))
+    chosen = torch.topk(difference, number).indices.sort().values
+    base = scene.gaussians.rows(rows).map(torch.from_numpy)
+    work.narrow(torch.from_numpy(rows))
+    shape = _start(base.means[chosen], pixel)
+    # Shifts and turns are trained in pixels: a turn of one unit moves what lies at the rim of the influence by a pixel.
+    lever = pixel / float(shape.size.exp().mean())
+    leaves = {name: torch.zeros(number, 3, requires_grad=True) for name in ("shift", "turn")}
+    shapes = {"size": shape.size.requires_grad_(), "quat": shape.quat.requires_grad_()}
+    adam = torch.optim.Adam([
+        {"params": list(leaves.values()), "lr": settings.lr},
+        {"params": list(shapes.values()), "lr": settings.lr_influence},
+    ])  # fmt: skip
+
+    def points() -> KeyPoints:
+        return KeyPoints(shape.centre, leaves["shift"] * pixel, leaves["turn"] * lever, **shapes)
+
+    views = len(work.cameras)
+    for _ in range(epochs):
+        for view in order.permutation(views):
+            work.pull(int(view), moved_by(base, field_of(base.means, points())))
+            adam.step()
+            adam.zero_grad()
+    with torch.no_grad():
+        field = field_of(base.means, points())
+    return said_by_cells(scene, rows, field, side, settings.step * pixel)
+
+
+def said_by_cells(scene: Scene, rows: IntArray, field: Field, side: float, step: float) -> Motion | None:
+    """Return the rigid motions of small cells that come nearest to a field; None where no cell moves.
+
+    A cell moves when at least half of its Gaussians may.
+
+    Arguments:
+        scene: decoded, as both ends have it.
+        rows: [A] Gaussians that the field is of.
+        field: their motions.
+        side: of a cell, scene units; a float32.
+        step: of quantisation, scene units.
+    """
+    groups = groups_for(scene, side, 1, regroup=True)
+    total = np.bincount(groups.group_of, minlength=groups.count)
+    place = groups.group_of[rows]
+    hits = np.bincount(place, minlength=groups.count)
+    able = np.flatnonzero((hits > 0) & (2 * hits >= total))
+    values: FloatArray = np.concatenate([field.shift.numpy(), field.turn.numpy()], 1).astype(np.float64)
+    means = np.stack([np.bincount(place, values[:, i], groups.count) / np.maximum(hits, 1) for i in range(6)], 1)
+    steps = float(np.float32(step)), float(np.float32(step / side))
+    symbols = np.rint(means[able] / np.array([steps[0]] * 3 + [steps[1]] * 3)).astype(np.int32)
+    moved = symbols.any(1)
+    marks = np.zeros(groups.count, np.uint8)
+    marks[able[moved]] = 1
+    if not moved.any():
+        return None
+    return Motion(side, 1, marks, symbols[moved], *steps, predicted=False, regroup=True)
+
+
+def _start(centres: torch.Tensor, pixel: float) -> KeyPoints:
+    """Key points at rest; each influences what lies about as far as its neighbours do."""
+    number = len(centres)
+    spacing = neighbour_distance(centres).clamp_min(2 * pixel) if number > 1 else torch.full((1,), 10 * pixel)
+    rest, quat = torch.zeros(number, 3), torch.zeros(number, 4)
+    quat[:, 0] = 1
+    return KeyPoints(centres.clone(), rest, rest, spacing.log()[:, None].repeat(1, 3), quat)

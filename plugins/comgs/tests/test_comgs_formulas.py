@@ -1,0 +1,137 @@
+"""The field of key points against a sum over them by hand, and cells that say it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from gsstream_comgs.correction import corrected
+from gsstream_comgs.influence import Field, KeyPoints, field_of, matrices, moved_by, weights_of
+from gsstream_comgs.motion import said_by_cells
+from gsstream_comgs.settings import CorrectionSettings
+from scipy.spatial.transform import Rotation
+
+from gsstream.api import Gaussians, Layout, Scene, apply_motion
+
+RNG = np.random.default_rng(0)
+
+
+def points(number: int) -> KeyPoints:
+    def draw(*shape: int, scale: float = 1.0) -> torch.Tensor:
+        return torch.from_numpy(RNG.normal(0, scale, shape))
+
+    return KeyPoints(
+        draw(number, 3), draw(number, 3, scale=0.1), draw(number, 3, scale=0.2), draw(number, 3, scale=0.3),
+        draw(number, 4),
+    )  # fmt: skip
+
+
+def turned(turn: np.ndarray) -> Rotation:
+    """A rotation given as axis * tan(angle / 2)."""
+    return Rotation.from_quat([*turn, 1.0])
+
+
+def scene_of(means: np.ndarray) -> Scene:
+    number = len(means)
+    gaussians = Gaussians(
+        means=means.astype(np.float32), quats=RNG.normal(size=(number, 4)).astype(np.float32),
+        scales=np.zeros((number, 3), np.float32), opacities=np.zeros(number, np.float32),
+        sh0=np.zeros((number, 1, 3), np.float32), shN=np.zeros((number, 0, 3), np.float32),
+    )  # fmt: skip
+    layout = Layout(np.ones(number, np.int32), np.zeros(number, np.uint8), np.float32([1]))
+    return Scene(gaussians, layout)
+
+
+def test_the_field_is_the_weighted_sum_of_rigid_motions() -> None:
+    means, keys = torch.from_numpy(RNG.normal(size=(7, 3))), points(4)
+    weights, field = weights_of(means, keys), field_of(means, keys)
+    for a, x in enumerate(means.numpy()):
+        raw = []
+        for k in range(4):
+            axes = Rotation.from_quat(np.roll(keys.quat[k].numpy(), -1)).as_matrix()
+            spread = axes @ np.diag(np.exp(2 * keys.size[k].numpy())) @ axes.T
+            away = x - keys.centre[k].numpy()
+            raw.append(np.exp(-0.5 * away @ np.linalg.solve(spread, away)))
+        expected = np.array(raw) / max(1.0, sum(raw))
+        np.testing.assert_allclose(weights[a], expected, atol=1e-9)
+        shift = np.zeros(3)
+        for k, w in enumerate(expected):
+            centre = keys.centre[k].numpy()
+            shift += w * (turned(keys.turn[k].numpy()).apply(x - centre) + centre + keys.shift[k].numpy() - x)
+        np.testing.assert_allclose(field.shift[a], shift, atol=1e-9)
+        np.testing.assert_allclose(field.turn[a], expected @ keys.turn.numpy(), atol=1e-9)
+
+
+def test_gaussians_turn_with_the_field() -> None:
+    scene = scene_of(RNG.normal(size=(5, 3))).gaussians.map(torch.from_numpy)
+    turn = torch.from_numpy(RNG.normal(0, 0.3, (5, 3)).astype(np.float32))
+    after = moved_by(scene, Field(torch.zeros(5, 3), turn))
+    for i in range(5):
+        before = Rotation.from_quat(np.roll(scene.quats[i].numpy(), -1)).as_matrix()
+        expected = turned(turn[i].numpy()).as_matrix() @ before
+        np.testing.assert_allclose(matrices(after.quats[i : i + 1])[0].numpy(), expected, atol=1e-5)
+
+
+def test_cells_say_a_field_that_is_the_same_everywhere_to_half_a_step() -> None:
+    scene, rows = scene_of(RNG.uniform(-1, 1, (200, 3))), np.arange(200)
+    shift = torch.tensor([0.33, -0.21, 0.05]).repeat(200, 1)
+    motion = said_by_cells(scene, rows, Field(shift, torch.zeros(200, 3)), 0.5, 0.02)
+    assert motion is not None
+    after, touched = apply_motion(scene, motion)
+    assert len(touched) == 200
+    np.testing.assert_allclose(after.gaussians.means - scene.gaussians.means, shift.numpy(), atol=0.0101)
+
+
+def test_cells_of_which_most_may_not_move_stay() -> None:
+    scene = scene_of(np.array([[0.1, 0.1, 0.1], [0.2, 0.1, 0.1], [0.3, 0.1, 0.1], [5.1, 0.1, 0.1]]))
+    field = Field(torch.ones(2, 3), torch.zeros(2, 3))
+    motion = said_by_cells(scene, np.array([0, 3]), field, 1.0, 0.1)
+    assert motion is not None
+    assert apply_motion(scene, motion)[1].tolist() == [3]
+    assert said_by_cells(scene, np.array([0]), Field(torch.ones(1, 3), torch.zeros(1, 3)), 1.0, 0.1) is None
+    assert said_by_cells(scene, np.array([3]), Field(torch.zeros(1, 3), torch.zeros(1, 3)), 1.0, 0.1) is None
+
+
+class Wrong:
+    """A frame in which some Gaussians have a wrong colour; the loss is the squared error of colours."""
+
+    def __init__(self, gaussians: Gaussians[torch.Tensor], aims: torch.Tensor) -> None:
+        self.gaussians, self.aims, self.cameras = gaussians, aims, [None]
+
+    def previous_render(self, view: int) -> torch.Tensor:
+        return torch.zeros(1, 1, 3)
+
+    image = previous_render
+
+    def screen_gradient(self, view: int, upstream: torch.Tensor):
+        error = (self.gaussians.sh0[:, 0] - self.aims).norm(dim=1)
+        return type("Found", (), {"gradient": torch.stack([error, error], 1)})
+
+    def narrow(self, rows: torch.Tensor) -> None:
+        self.rows = rows
+
+    def pull(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
+        loss = (rows.sh0[:, 0] - self.aims[self.rows]).square().sum()
+        loss.backward()
+        return float(loss.detach())
+
+
+def test_corrections_mend_what_is_wrong_and_leave_the_rest() -> None:
+    scene = scene_of(RNG.normal(size=(10, 3)))
+    aims = torch.zeros(10, 3)
+    aims[[2, 5]] = 0.4
+    work = Wrong(scene.gaussians.map(torch.from_numpy), aims)
+    settings = CorrectionSettings(step=0.01)
+    residual = corrected(work, scene.layout, 400, settings, np.random.default_rng(0))
+    assert residual is not None
+    assert residual.gates.tolist() == [0, 0, 1, 0, 0, 1, 0, 0, 0, 0]
+    assert set(residual.symbols) == {"sh0"}
+    np.testing.assert_allclose(residual.symbols["sh0"] * 0.01, 0.4, atol=0.03)
+    nothing = Wrong(scene.gaussians.map(torch.from_numpy), torch.zeros(10, 3))
+    assert corrected(nothing, scene.layout, 3, settings, np.random.default_rng(0)) is None
+
+
+def test_a_correction_that_does_not_pay_is_masked() -> None:
+    scene = scene_of(RNG.normal(size=(4, 3)))
+    work = Wrong(scene.gaussians.map(torch.from_numpy), torch.full((4, 3), 1e-3))
+    settings = CorrectionSettings(step=1e-4, mask_weight=10.0, share=1.0)
+    assert corrected(work, scene.layout, 100, settings, np.random.default_rng(0)) is None

@@ -1,0 +1,1 @@
+"""HiCoM for gsstream. Importing this package imports no torch."""

@@ -1,0 +1,114 @@
+"""HiCoM (Gao et al., NeurIPS 2024) as a method of its own."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+import torch
+
+from gsstream.api import (
+    Delta,
+    Frame,
+    FrameTools,
+    IntArray,
+    Layout,
+    PlayerState,
+    Rows,
+    Scene,
+    Step,
+    StreamingMethod,
+    Tools,
+    own_nodes,
+    send_delta,
+    send_key,
+)
+from gsstream.blocks import changed_rows, detect_change
+from gsstream_hicom.births import added
+from gsstream_hicom.motion import fitted_motions
+from gsstream_hicom.settings import HiCoMConfig
+
+
+@dataclass(frozen=True)
+class HiCoMState:
+    """``player``: what every player has. ``previous``: the images its scene shows. ``number``: that of Gaussians kept.
+    """
+
+    player: PlayerState
+    previous: Frame
+    number: int
+
+
+@final
+class HiCoM(StreamingMethod[HiCoMState]):
+    """Moves the cells of nested grids rigidly and adds Gaussians (paper: Gao et al., NeurIPS 2024).
+
+    Half of a frame's passes fit the motion, from the coarsest grid to the finest; the other half fits Gaussians that
+    are copied where the images pull at the scene. In the next frame as many of the least opaque leave, so the number
+    stays that of frame 0. What is sent are motions, births and deaths: attributes of what is there never change.
+    Where this differs from what is published, and why: README of this plugin.
+    """
+
+    source = "HiCoM (Gao et al. 2024)"
+
+    Config = HiCoMConfig
+    heeds = ("stream.epochs",)
+
+    def begin(self, frame: Frame, tools: Tools) -> Step[HiCoMState]:
+        first = tools.first_frame(frame)
+        number = len(first.gaussians)
+        extent = np.array([frame.cameras.extent], np.float32)
+        layout = Layout(np.ones(number, np.int32), np.zeros(number, np.uint8), extent)
+        packet, player = send_key(first.gaussians, layout, first.meta, frame.index)
+        return Step(HiCoMState(player, frame, number), packet, "key", first.metrics)
+
+    def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> HiCoMState:
+        return HiCoMState(player, shown, len(next(tools.since_key()).gaussians))
+
+    def step(self, state: HiCoMState, frame: Frame, tools: Tools) -> Step[HiCoMState]:
+        clock = [time.perf_counter()]
+        if frame.effort == 0 or np.array_equal(state.previous.images, frame.images):
+            return self._send(state, frame, Delta())
+        epochs = tools.epochs(frame)
+        for_births = max(1, round(self.config.births.share * epochs)) if self.config.births.share else 0
+        scene = state.player.scene
+        work = tools.open(state.player, state.previous, frame)
+        rows = self._changed(work.gaussians.means, work, state.previous, frame)
+        order = tools.rng.numpy("hicom", frame.index)
+        motions, moved = fitted_motions(
+            scene, work, rows, max(1, epochs - for_births), self.config.motion, order
+        )
+        clock.append(time.perf_counter())
+        change = self._rows(moved, state.number, work, for_births, tools) if for_births else Rows()
+        clock.append(time.perf_counter())
+        step = self._send(state, frame, Delta(motions).with_rows(change))
+        clock.append(time.perf_counter())
+        facts = {
+            "iterations": epochs * len(frame.cameras), "births": 0 if change.births is None else len(change.births),
+            "deaths": len(change.deaths), "moving_groups": [int(motion.moving.sum()) for motion in motions],
+            "seconds": dict(zip(("motion", "growth", "code"), np.diff(clock).tolist(), strict=True)),
+        }  # fmt: skip
+        return replace(step, metrics={**step.metrics, **facts})
+
+    def _changed(self, means: torch.Tensor, work: FrameTools, previous: Frame, frame: Frame) -> IntArray:
+        """Rows that may move."""
+        settings = self.config.motion
+        change = detect_change(previous, frame, settings.change)
+        return changed_rows(change, means, frame.cameras, work.session, settings.votes).nonzero()[:, 0].numpy()
+
+    def _rows(self, scene: Scene, number: int, work: FrameTools, epochs: int, tools: Tools) -> Rows:
+        """As many of the least opaque leave as there are more than in frame 0; then this frame's are born."""
+        deaths = np.sort(np.argsort(scene.gaussians.opacities, kind="stable")[: len(scene.gaussians) - number])
+        kept = scene.gaussians.rows(np.delete(np.arange(len(scene.gaussians)), deaths)).map(torch.from_numpy)
+        born = added(kept, work, epochs, self.config.births, tools.rng).map(lambda value: value.numpy())
+        if not len(born):
+            return Rows(deaths=deaths)
+        return Rows(own_nodes(born, np.zeros(len(born), np.uint8), len(scene.layout.node_counts)), deaths)
+
+    def _send(self, state: HiCoMState, frame: Frame, delta: Delta) -> Step[HiCoMState]:
+        packet, player = send_delta(state.player, delta)
+        if delta.is_empty:
+            return Step(replace(state, player=player), packet, "empty")
+        return Step(HiCoMState(player, frame, state.number), packet, "delta")

@@ -1,0 +1,98 @@
+"""Hierarchical coherent motion: from coarse cells to fine ones, every grid on the scene that the last one left."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gsstream.api import FloatArray, FrameWork, Groups, IntArray, Motion, Scene, apply_motion, groups_for
+from gsstream.blocks import Moves, each_alone, felt_most, fitted_moves, moves_of, pixel_size
+from gsstream_hicom.settings import MotionSettings
+
+#: The box whose volume the cells share holds this part of the Gaussians along each axis.
+BOX = (0.05, 0.95)
+
+
+def cell_sides(means: FloatArray, settings: MotionSettings) -> list[float]:
+    """Return the side of the cells of every grid, scene units, the coarsest first.
+
+    Arguments:
+        means: [N, 3] centres, N > 0.
+        settings: number of grids and of Gaussians in a cell of the finest.
+    """
+    low, high = np.quantile(means.astype(np.float64), BOX, axis=0)
+    volume = float(np.prod(np.maximum(high - low, 1e-6)))
+    finest = max((volume * settings.per_cell / len(means)) ** (1 / 3), 1e-6)
+    return [float(np.float32(finest * 2**level)) for level in reversed(range(settings.levels))]
+
+
+def fitted_motions(
+    scene: Scene, work: FrameWork, rows: IntArray, epochs: int, settings: MotionSettings, order: np.random.Generator
+) -> tuple[tuple[Motion, ...], Scene]:
+    """Return the motions of a frame, one for each grid, and the scene after them.
+
+    Arguments:
+        scene: decoded, as both ends have it.
+        work: the frame, seen from this scene.
+        rows: [A] Gaussians that may move; a cell moves when at least half of its Gaussians are among them.
+        epochs: passes over the training cameras, spread over the grids.
+        settings: of the motion.
+        order: draws the order of the views.
+    """
+    pixel = pixel_size(scene.gaussians.means, work.cameras)
+    start, motions = scene, []
+    total = epochs * len(work.cameras)
+    for level, side in enumerate(cell_sides(scene.gaussians.means, settings)):
+        groups = groups_for(scene, side, 1, regroup=True)
+        able = np.flatnonzero(_able(groups, rows))
+        iterations = total * (level + 1) // settings.levels - total * level // settings.levels
+        if not len(able) or not iterations:
+            continue
+        motion = _fitted(scene, start, work, groups, able, iterations, pixel, settings, order)
+        if motion.is_empty:
+            continue
+        motions.append(motion)
+        scene = apply_motion(scene, motion)[0]
+        work = work.on(scene.gaussians.map(torch.from_numpy))
+    return tuple(motions), scene
+
+
+def _fitted(
+    scene: Scene, start: Scene, work: FrameWork, groups: Groups, able: IntArray, iterations: int, pixel: float,
+    settings: MotionSettings, order: np.random.Generator,
+) -> Motion:  # fmt: skip
+    """One grid: the transforms of its cells, rounded."""
+    marks = np.zeros(groups.count, np.uint8)
+    marks[able] = 1
+    moves = _warm(scene, start, moves_of(scene, groups, marks, predicted=False), settings.momentum)
+    # Half a cell from its centre, a turn of one unit moves a Gaussian by a pixel, too.
+    turn = pixel / groups.cell
+    unit = np.array([pixel] * 3 + [turn] * 3)
+    measure = each_alone if settings.measure == "each" else felt_most
+    rates = [settings.lr] * iterations
+    found = fitted_moves(scene, work, moves, unit, rates, order, measure, settings.pull)
+    steps = float(np.float32(settings.step * pixel)), float(np.float32(settings.step * turn))
+    symbols = np.rint(found / np.array([steps[0]] * 3 + [steps[1]] * 3)).astype(np.int32)
+    moved = symbols.any(1)
+    marks[able[~moved]] = 0
+    return Motion(groups.cell, 1, marks, symbols[moved], *steps, predicted=False, regroup=True)
+
+
+def _able(groups: Groups, rows: IntArray) -> IntArray:
+    """[G] bool: cells of which at least half of the Gaussians may move."""
+    total = np.bincount(groups.group_of, minlength=groups.count)
+    hit = np.bincount(groups.group_of[rows], minlength=groups.count)
+    return np.asarray((hit > 0) & (2 * hit >= total))
+
+
+def _warm(scene: Scene, start: Scene, moves: Moves, momentum: float) -> Moves:
+    """Moves that begin with a share of the last frame's motion, less what coarser cells have moved by already."""
+    if start.moved is None or momentum == 0:
+        return moves
+    past: FloatArray = np.zeros((len(scene.gaussians), 3))
+    past[start.moved.rows] = momentum * start.moved.shift
+    left = (past - (scene.gaussians.means.astype(np.float64) - start.gaussians.means))[moves.rows]
+    counts = np.bincount(moves.place, minlength=len(moves.centre))
+    columns = [np.bincount(moves.place, left[:, i], len(moves.centre)) / counts for i in range(3)]
+    return moves._replace(shift=np.stack(columns, 1))
+

@@ -1,0 +1,142 @@
+"""Grids and their motion against hand-made scenes; the number of Gaussians; what is born where."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from gsstream_hicom.births import wanted
+from gsstream_hicom.method import HiCoM
+from gsstream_hicom.motion import cell_sides, fitted_motions
+from gsstream_hicom.settings import BirthSettings, HiCoMConfig, MotionSettings
+
+from gsstream.api import Cameras, Displacement, Gaussians, Layout, Scene, apply_motion
+from gsstream.testing.stepping import MethodUnderTest
+
+RNG = np.random.default_rng(0)
+RIG = Cameras(
+    ("a", "b"), np.stack([np.eye(4), np.eye(4)]), np.tile(np.diag([50.0, 50, 1]), (2, 1, 1)), 32, 24
+)  # fmt: skip
+CELL = MotionSettings(measure="cell")
+
+
+def cloud(number: int, at: tuple[float, float, float], width: float = 0.02) -> np.ndarray:
+    return RNG.normal(at, width, (number, 3))
+
+
+def scene_of(means: np.ndarray, moved: Displacement | None = None) -> Scene:
+    number = len(means)
+    quats = np.zeros((number, 4), np.float32)
+    quats[:, 0] = 1
+    gaussians = Gaussians(
+        means=means.astype(np.float32), quats=quats, scales=np.zeros((number, 3), np.float32),
+        opacities=np.zeros(number, np.float32), sh0=np.zeros((number, 1, 3), np.float32),
+        shN=np.zeros((number, 0, 3), np.float32),
+    )  # fmt: skip
+    layout = Layout(np.ones(number, np.int32), np.zeros(number, np.uint8), np.float32([1]))
+    return Scene(gaussians, layout, moved)
+
+
+class Pulled:
+    """A frame whose loss is the squared distance of every Gaussian to where it belongs."""
+
+    cameras = RIG
+
+    def __init__(self, gaussians: Gaussians[torch.Tensor], aims: np.ndarray) -> None:
+        self.gaussians, self.aims = gaussians, torch.from_numpy(aims.astype(np.float32))
+
+    def narrow(self, rows: torch.Tensor) -> None:
+        self.rows = rows
+
+    def pull(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
+        loss = (rows.means - self.aims[self.rows]).square().sum()
+        loss.backward()
+        return float(loss.detach())
+
+    def on(self, gaussians: Gaussians[torch.Tensor]) -> Pulled:
+        return Pulled(gaussians, self.aims.numpy())
+
+
+def test_the_finest_cells_hold_as_many_as_asked_for_and_each_grid_is_twice_as_wide() -> None:
+    means = RNG.uniform(0, 1, (20_000, 3))
+    sides = cell_sides(means, MotionSettings(per_cell=5, levels=3))
+    assert sides == pytest.approx([4 * sides[2], 2 * sides[2], sides[2]])
+    # 90 % along each axis lie in the box whose volume is shared by all.
+    assert 20_000 * sides[2] ** 3 / 0.9**3 == pytest.approx(5, rel=0.02)
+
+
+@pytest.mark.parametrize("levels", [1, 3])
+def test_two_bodies_find_their_own_ways(levels: int) -> None:
+    """Two clouds far apart move differently; a coarse cell holds both, and finer ones tell them apart."""
+    one, two = cloud(40, (0, 0, 3)), cloud(40, (0.5, 0, 3))
+    means = np.concatenate([one, two])
+    aims = means + np.repeat([[0.03, 0, 0.01], [-0.02, 0.04, 0]], 40, 0)
+    scene = scene_of(means)
+    work = Pulled(scene.gaussians.map(torch.from_numpy), aims)
+    settings = MotionSettings(measure="cell", levels=levels, lr=0.1, step=0.01)
+    motions, after = fitted_motions(scene, work, np.arange(80), 60, settings, np.random.default_rng(0))
+    assert np.abs(after.gaussians.means - aims).mean() < 0.3 * np.abs(means - aims).mean()
+    again = scene
+    for motion in motions:
+        again = apply_motion(again, motion)[0]
+    assert again.gaussians.means.tobytes() == after.gaussians.means.tobytes(), "what was fitted on is what is sent"
+
+
+def test_a_frame_begins_with_a_share_of_the_last_ones_motion() -> None:
+    means = cloud(60, (0, 0, 3), 0.05)
+    shift = np.tile(np.float32([0.05, 0, 0]), (60, 1))
+    moved = Displacement(np.arange(60), shift, np.zeros_like(shift))
+    scene = scene_of(means, moved)
+    work = Pulled(scene.gaussians.map(torch.from_numpy), means + 0.6 * shift)
+    settings = MotionSettings(measure="cell", momentum=0.6, lr=1e-6, step=0.01)
+    _, after = fitted_motions(scene, work, np.arange(60), 3, settings, np.random.default_rng(0))
+    np.testing.assert_allclose(after.gaussians.means, means + 0.6 * shift, atol=1e-3)
+    _, still = fitted_motions(
+        scene, work, np.arange(60), 3, settings.model_copy(update={"momentum": 0.0}), np.random.default_rng(0)
+    )
+    np.testing.assert_array_equal(still.gaussians.means, scene.gaussians.means)
+
+
+def test_only_cells_in_what_changed_move() -> None:
+    means = np.concatenate([cloud(30, (0, 0, 3)), cloud(30, (1, 0, 3))])
+    scene = scene_of(means)
+    work = Pulled(scene.gaussians.map(torch.from_numpy), means + np.array([0.05, 0, 0]))
+    _, after = fitted_motions(scene, work, np.arange(30), 9, CELL, np.random.default_rng(0))
+    assert (after.gaussians.means[:30] != scene.gaussians.means[:30]).any(1).mean() > 0.5
+    np.testing.assert_array_equal(after.gaussians.means[30:], scene.gaussians.means[30:])
+
+
+def test_as_many_leave_as_were_born_in_the_frame_before() -> None:
+    births = BirthSettings(gradient=1e-7, rounds=1, most=7, prune_opacity=0.0)
+    method = MethodUnderTest("hicom", HiCoM(HiCoMConfig(motion=CELL, births=births)))
+    first, second, third = method.steps
+    number = len(first.state.player.gaussians)
+    assert second.metrics["births"] == 7
+    assert second.metrics["deaths"] == 0
+    assert third.metrics["deaths"] == 7
+    assert len(third.state.player.gaussians) == number + third.metrics["births"]
+    faint = np.argsort(second.state.player.gaussians.opacities, kind="stable")[:7]
+    assert sorted(third.state.player.delta.deaths) == sorted(faint)
+
+
+class Shown:
+    """One view of three Gaussians with given screen gradients."""
+
+    cameras = RIG.select([0])
+    gaussians = scene_of(np.zeros((3, 3))).gaussians.map(torch.from_numpy)
+
+    def previous_render(self, view: int) -> torch.Tensor:
+        return torch.ones(2, 2, 3)
+
+    def image(self, view: int) -> torch.Tensor:
+        return torch.zeros(2, 2, 3)
+
+    def screen_gradient(self, view: int, upstream: torch.Tensor):
+        assert upstream.unique().tolist() == pytest.approx([1 / 12]), "the gradient of a mean absolute difference"
+        return type("Found", (), {"gradient": torch.tensor([[0.0, 0.001], [0.01, 0.0], [0.0, 0.0]])})
+
+
+def test_copies_are_made_where_the_gradient_in_half_widths_exceeds_the_bound() -> None:
+    assert wanted(Shown(), 0.01).tolist() == [1, 0], "0.16 and 0.012; the largest first"
+    assert wanted(Shown(), 0.1).tolist() == [1]
+    assert wanted(Shown(), 0.2).tolist() == []

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import torch
+if TYPE_CHECKING:
+    import torch
 
 Columns = Mapping[str, slice]
 
@@ -39,10 +41,10 @@ class JointCode:
 
     def join_decoders(self, decoders: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """Return the decoders of all attributes as one matrix [L, D]; identity for attributes without one."""
-        matrix = torch.zeros_like(self.trained)
+        matrix = self.trained.new_zeros(self.trained.shape)
         for name, rows in self.latent.items():
             block = matrix[rows, self.feature[name]]
-            block.copy_(decoders[name] if name in decoders else torch.eye(len(block)))
+            block.copy_(decoders[name] if name in decoders else block.new_ones(len(block)).diag())
         return matrix
 
     def split_decoders(self, matrix: torch.Tensor, names: Mapping[str, object]) -> dict[str, torch.Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -66,7 +67,7 @@ def tune(
     known = catalog.names("method")
     tried = methods or [name for name in METHODS if name in known]
     place = Scene(
-        name="scene", uri=scene, recipe=str(recipe.resolve()) if recipe else None, scale=scale, frames=frames,
+        name=_name(scene), uri=scene, recipe=str(recipe.resolve()) if recipe else None, scale=scale, frames=frames,
         set=_values(settings or ()),
     )  # fmt: skip
     plan = make_plan(pilot(place, tried, limits, seed), Path(), catalog.recipe_path)
@@ -115,6 +116,12 @@ def _run(
     run_sweep(plan, out, executor, data=data, say=(lambda _: None) if quiet else typer.echo)
     rows = read_table(out).cells
     return [trial_of(point.variant, rows.get(point.id, {"status": "missing"}), limits) for point in plan.points]
+
+
+def _name(uri: str) -> str:
+    """What progress lines and the table call the recording: the last word of where it is."""
+    found = re.search(r"[A-Za-z0-9][\w.+-]*", re.split(r"[/\\]", uri.partition("?")[0].rstrip("/"))[-1])
+    return found[0] if found else "scene"
 
 
 def _next(source: str, out: Path) -> str:

@@ -68,6 +68,14 @@ class StreamingMethod(Part, Generic[State]):
     least_cameras: ClassVar[int] = 1
     decodes_its_packets: ClassVar[bool] = False
 
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "decoder" in vars(cls):
+            raise TypeError(
+                f"{cls.__name__}.decoder: every player decodes packets in the same way, so no method has a decoder of "
+                "its own; take it out (docs/adr/0015-whole-methods.md)"
+            )
+
     def reads(self, key: str) -> bool:
         """Say whether this method reads a recipe key: a slot ("gate"), or a setting ("stream.epochs")."""
         return key in self.heeds

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 import zlib
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _RGB_COLOR_TYPE = 2
 #: The only decoders that Pillow may try: others are many, some start programs (EPS: Ghostscript), none is documented.
 PICTURE_FORMATS = ("PNG", "JPEG")
+#: The EXIF tag that says how viewers turn a picture, and its value for "not at all".
+_ORIENTATION, _UPRIGHT = 0x0112, 1
 _READABLE = "8-bit JPEG or PNG, or 16-bit PNG, without transparency"
 
 
@@ -82,6 +85,7 @@ def _decode(path: Path) -> tuple[np.ndarray[Any, Any], float]:
             return _decode_rgb16(path), 65535.0
         with Image.open(path, formats=PICTURE_FORMATS) as image:
             image.load()
+            _say_if_turned(image)
             return _to_rgb(path, image)
     except FileNotFoundError as error:
         raise SourceError(f"{path}: the image is missing; every declared frame must exist ({_READABLE})") from error
@@ -91,6 +95,17 @@ def _decode(path: Path) -> tuple[np.ndarray[Any, Any], float]:
             f"{path}: the image cannot be decoded ({error}); expected {_READABLE}. "
             "It is probably truncated or not an image: copy or export it again"
         ) from error
+
+
+def _say_if_turned(image: Image.Image) -> None:
+    """Warn, once for a recording, of pictures that viewers turn and this reader does not: the poses decide."""
+    turned = image.getexif().get(_ORIENTATION, _UPRIGHT) if "exif" in image.info else _UPRIGHT
+    if turned != _UPRIGHT:
+        warnings.warn(
+            f"pictures of this recording ask viewers to turn them (EXIF orientation {turned}); their pixels are used "
+            "as they are stored, as COLMAP does. If the calibration was made of turned pictures, turn the files too",
+            stacklevel=2,
+        )
 
 
 def _decode_rgb16(path: Path) -> np.ndarray[Any, Any]:

@@ -23,7 +23,7 @@ class Behaviour:
 
     Arguments:
         outputs: every output of every method on a world, tensor by tensor.
-        poison: put a value into something that the part reads, in place.
+        poison: put a value into something that the part reads, in place; returns what that is.
         keeps_precision: outputs have the precision of the logits given; otherwise they are float32.
         by_gaussian: outputs have a row per Gaussian, which moves with it.
         no_order: outputs whose names begin so are not compared after a permutation: the kind has a check of its own.
@@ -31,7 +31,7 @@ class Behaviour:
     """
 
     outputs: Callable[[Any, World], Outputs]
-    poison: Callable[[World, float], None]
+    poison: Callable[[World, float], str]
     keeps_precision: bool = True
     by_gaussian: bool = False
     no_order: str | None = None
@@ -60,6 +60,7 @@ def draw(part: GateSampler, number: int, seed: int = 7) -> torch.Tensor | None:
     return part.noise(number, torch.Generator().manual_seed(seed))
 
 
-def poison_logits(world: World, value: float) -> None:
+def poison_logits(world: World, value: float) -> str:
     """Change the logit of one Gaussian to a value that no logit has."""
     world.logits[5] = value
+    return "one logit"

@@ -8,6 +8,8 @@ import sys
 import tomllib
 from pathlib import Path
 
+import forked
+
 
 def install(project: Path, site: Path) -> None:
     """Make a project's ``src`` importable and its entry points known to processes that have ``site`` on their path."""
@@ -21,15 +23,19 @@ def install(project: Path, site: Path) -> None:
         paths.write(f"{project / 'src'}\n")
 
 
+def sources(site: Path) -> list[str]:
+    """The folders of sources that were installed."""
+    return (site / "paths").read_text().split() if (site / "paths").exists() else []
+
+
 def python(site: Path, *args: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     """A fresh interpreter that has what was installed into ``site``."""
-    sources = (site / "paths").read_text().split() if (site / "paths").exists() else []
-    path = os.pathsep.join([str(site), *sources, *filter(None, [os.environ.get("PYTHONPATH")])])
+    path = os.pathsep.join([str(site), *sources(site), *filter(None, [os.environ.get("PYTHONPATH")])])
     environment = {**os.environ, "PYTHONPATH": path, "PYTHONIOENCODING": "utf-8", "OMP_NUM_THREADS": "2"}
     command = [sys.executable, *args]
     return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=900, check=False)
 
 
 def gsstream(site: Path, *args: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """The command line in a fresh process."""
-    return python(site, "-c", "from gsstream.cli.main import main; main()", *args, cwd=cwd)
+    """The command line in a fresh process that has torch."""
+    return forked.gsstream(args, path=[str(site), *sources(site)], cwd=cwd, env={**os.environ, "OMP_NUM_THREADS": "2"})

@@ -2,32 +2,59 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
-from fresh import gsstream, install, python
+from fresh import install, python
 
 from gsstream.cli.main import run_command
 from gsstream.cli.scaffold import STARTABLE
 
+#: Commands in a process that has a plugin of every kind; what each prints goes with its exit code to one JSON file.
+ALL = """
+import contextlib, io, json, sys
+from gsstream.cli.main import run_command
+results = {}
+for command in json.loads(sys.argv[1]):
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:
+        code = run_command(command.split())
+    results[command] = [code, out.getvalue(), err.getvalue()]
+with open(sys.argv[2], "w") as file:
+    json.dump(results, file)
+"""
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, str, str]]:
+    """Command -> (exit code, stdout, stderr), in one fresh process: most of the time of one is that it starts."""
+    folder = tmp_path_factory.mktemp("new")
+    for kind in STARTABLE:
+        assert run_command(["new-plugin", f"my-{kind}", "--kind", kind, "--out", str(folder / kind)]) == 0
+        install(folder / kind, folder / "site")
+    commands = [f"check {kind}/my-{kind}" for kind in STARTABLE]
+    commands += ["check method/my-stepper", "recipe show my-stepper"]  # a whole method is one of --method
+    done = python(folder / "site", "-c", ALL, json.dumps(commands), str(folder / "results.json"), cwd=folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return json.loads((folder / "results.json").read_text())
+
 
 @pytest.mark.parametrize("kind", STARTABLE)
-def test_passes_the_contract_untouched(kind: str, tmp_path: Path) -> None:
-    project, site = tmp_path / "project", tmp_path / "site"
-    assert run_command(["new-plugin", "my-own", "--kind", kind, "--out", str(project)]) == 0
-    install(project, site)
-    result = gsstream(site, "check", f"{kind}/my-own", cwd=tmp_path)
-    assert result.returncode == 0, result.stdout + result.stderr
-    assert f"{kind} my-own (from gsstream-my-own 0.1.0)" in result.stdout
-    skipped = [line.split()[1] for line in result.stdout.splitlines() if "(skipped)" in line]
+def test_passes_the_contract_untouched(kind: str, results: dict[str, tuple[int, str, str]]) -> None:
+    code, out, err = results[f"check {kind}/my-{kind}"]
+    assert code == 0, out + err
+    assert f"{kind} my-{kind} (from gsstream-my-{kind} 0.1.0)" in out
+    skipped = [line.split()[1] for line in out.splitlines() if "(skipped)" in line]
     assert skipped == ([] if kind == "source" else ["auto_rules"]), "only settings that a scene could choose"
-    assert "✓ cheap_spec" in result.stdout
-    if kind == "stepper":  # a whole method, which its recipe makes one of --method
-        result = gsstream(site, "check", "method/my-own", cwd=tmp_path)
-        assert result.returncode == 0, result.stdout + result.stderr
-        assert "(skipped)" not in result.stdout
-        shown = gsstream(site, "recipe", "show", "my-own", cwd=tmp_path)
-        assert "method: my-own" in shown.stdout, shown.stderr
+    assert "✓ cheap_spec" in out
+
+
+def test_a_whole_method_is_one_of_the_methods(results: dict[str, tuple[int, str, str]]) -> None:
+    code, out, err = results["check method/my-stepper"]
+    assert code == 0, out + err
+    assert "(skipped)" not in out
+    _, out, err = results["recipe show my-stepper"]
+    assert "method: my-stepper" in out, err
 
 
 def test_its_own_test_suite_and_lint_are_green(tmp_path: Path) -> None:

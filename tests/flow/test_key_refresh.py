@@ -126,8 +126,9 @@ def test_killed_at_any_moment_a_run_with_key_packets_resumes(tmp_path):
     once = encode(tmp_path / "whole", method="s2gs-edge", **PERIOD)
     out = tmp_path / "o"
     process = start(*arguments(out, method="s2gs-edge", **PERIOD))
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 600
     while not (out / "stream.gss").exists():
+        assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.01)
     delay = random.uniform(0, 2.5)

@@ -85,6 +85,12 @@ def other_layout(step):
     return with_scene(step, layout=replace(step.state.player.layout, units=np.array([9.0], np.float32)))
 
 
+def test_a_decoder_of_its_own_is_refused_where_it_is_declared() -> None:
+    """Players would never call it."""
+    with pytest.raises(TypeError, match=r"Own\.decoder: every player decodes packets in the same way"):
+        type("Own", (Hold,), {"decoder": lambda _: None})
+
+
 def misname(step):
     return replace(step, status="delta")
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import forked
 import pytest
 
 BROKEN = Path(__file__).parent / "broken"
@@ -35,15 +36,22 @@ class PluginLab:
 
     def python(self, code: str, *args: str, load: str | None = None, **env: str) -> subprocess.CompletedProcess[str]:
         """Run code in a fresh process; ``load`` limits the plugins so that others on this machine play no part."""
+        environment = self.environment(load, env)
+        path = os.pathsep.join([str(self.folder), *filter(None, [os.environ.get("PYTHONPATH")])])
+        command = [sys.executable, "-c", code, *args]
+        return subprocess.run(
+            command, env={**environment, "PYTHONPATH": path}, capture_output=True, text=True, timeout=600, check=False
+        )
+
+    def environment(self, load: str | None, env: dict[str, str]) -> dict[str, str]:
         names = sorted(path.name.split("-")[0].removeprefix("gsstream_") for path in self.folder.glob("*.dist-info"))
         allowed = ",".join(names) if load is None else load
-        path = os.pathsep.join([str(self.folder), *filter(None, [os.environ.get("PYTHONPATH")])])
-        environment = {**os.environ, "PYTHONPATH": path, "GSSTREAM_LOAD_PLUGINS": allowed, **env}
-        command = [sys.executable, "-c", code, *args]
-        return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)
+        return {**os.environ, "GSSTREAM_LOAD_PLUGINS": allowed, **env}
 
     def cli(self, *args: str, load: str | None = None, **env: str) -> subprocess.CompletedProcess[str]:
-        """Run the command line in a fresh process."""
+        """Run the command line in a fresh process; a run in one that has torch."""
+        if args[0] == "run":
+            return forked.gsstream(args, path=[str(self.folder)], env=self.environment(load, env))
         return self.python("from gsstream.cli.main import main; main()", *args, load=load, **env)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import stat
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -68,3 +69,19 @@ def test_no_picture_is_opened_without_naming_its_formats() -> None:
     opened = [(path, line) for path, line in lines if re.search(r"Image\.open\(", line)]
     assert len(opened) >= 3
     assert [str(path) for path, line in opened if "formats=PICTURE_FORMATS" not in line] == []
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG"])
+def test_a_picture_that_viewers_turn_is_read_as_stored_and_that_is_said(kind, tmp_path) -> None:
+    pixels = np.zeros((6, 8, 3), np.uint8)
+    pixels[:, 4:] = 255
+    tags = Image.Exif()
+    for orientation in (1, 6):
+        tags[0x0112] = orientation
+        Image.fromarray(pixels).save(tmp_path / f"{orientation}.x", format=kind, exif=tags, quality=100, subsampling=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        upright = read_image(tmp_path / "1.x", (8, 6), (8, 6))
+    with pytest.warns(UserWarning, match="EXIF orientation 6"):
+        turned = read_image(tmp_path / "6.x", (8, 6), (8, 6))
+    assert (turned == upright).all()

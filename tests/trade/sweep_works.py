@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import signal
 import sys
 import time
+import warnings
 from pathlib import Path
 
 from gsstream.trade.sweep.job import Job, Outcome
@@ -64,8 +67,11 @@ def hang_once(job: Job) -> Outcome:
 
 
 def threads(job: Job) -> Outcome:
-    """Tells what the libraries in a worker will see."""
-    return Outcome(job.id, run={name: value for name, value in os.environ.items() if name.endswith("_THREADS")})
+    """Tells what the libraries in a worker will see, and what its user sees of a warning."""
+    with contextlib.redirect_stderr(io.StringIO()) as said:
+        warnings.warn("so many threads", UserWarning, stacklevel=1)
+    seen = {name: value for name, value in os.environ.items() if name.endswith("_THREADS")}
+    return Outcome(job.id, run={**seen, "said": said.getvalue()})
 
 
 if __name__ == "__main__":

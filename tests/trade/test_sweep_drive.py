@@ -99,7 +99,7 @@ def test_a_cell_that_kills_every_worker_ends_as_a_record(plan_of, tmp_path):
     assert sum("once more" in line for line in said) == 4
 
 
-def test_workers_have_the_threads_that_were_asked_for(plan_of, tmp_path, monkeypatch):
+def test_workers_have_the_threads_that_were_asked_for_and_warn_in_one_line(plan_of, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     plan = plan_of(TWO_SEEDS)
     executor = LocalExecutor(1, 3, sweep_works.threads)
@@ -109,6 +109,7 @@ def test_workers_have_the_threads_that_were_asked_for(plan_of, tmp_path, monkeyp
     seen = executor.next().outcome.run
     assert {seen[name] for name in ("GSSTREAM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")} == {"3"}
     assert os.environ["OMP_NUM_THREADS"] == "7"
+    assert seen["said"] == "warning: so many threads\n"
 
 
 def start_hanging(tmp_path: Path) -> tuple[subprocess.Popen[str], list[int]]:

@@ -11,6 +11,7 @@ import pytest
 from flow_runs import WORLD, encode, metrics
 
 from gsstream.cli.main import run_command
+from gsstream.cli.tune import _name
 from gsstream.core.errors import InputError
 from gsstream.recipe.budget import Budget
 from gsstream.recipe.load import load_recipe
@@ -79,6 +80,12 @@ def test_the_best_that_fits_is_chosen() -> None:
     assert "<- chosen" in table[2]
     assert "| good" in table[2]
     assert "failed: it broke" in table[-1]
+
+
+def test_progress_calls_the_recording_by_its_name() -> None:
+    names = {"demo": "demo", "synthetic:frames=6&views=3": "synthetic", "n3dv:/data/coffee martini/": "coffee",
+             "../rec/k.1?missing=refuse": "k.1", "/": "scene"}  # fmt: skip
+    assert {uri: _name(uri) for uri in names} == names
 
 
 def command(out: Path, budget: str, *more: str) -> list[str]:

@@ -88,6 +88,7 @@ def hooks() -> str:
             if not name.startswith("_") and (inspect.isfunction(member) or isinstance(member, property)):
                 function = member.fget if isinstance(member, property) else member
                 must = "abstract" if getattr(member, "__isabstractmethod__", False) else "has a default"
+                must = "final" if getattr(member, "__final__", False) else must
                 must = "expected" if contract is FrameSource else must
                 how = "property " if isinstance(member, property) else ""
                 about = (inspect.getdoc(function) or "").splitlines()

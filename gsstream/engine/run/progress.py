@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
+import warnings
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rich.console import Console
@@ -12,12 +13,21 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from gsstream.engine.budget.report import violations
 
+#: Seconds between plain lines, and those after which the pace of frame 0 is known.
+_EVERY = 10
+#: A frame 0 that takes longer than this, in seconds, is announced, to those who asked for quiet too.
+_LONG = 3600
+
 
 class RunProgress:
     """Frame 0 as a bar over iterations, later frames as a bar over frames with PSNR, KB, seconds and active share."""
 
-    def __init__(self, total_frames: int | None, quiet: bool) -> None:
-        self._total, self._quiet = total_frames, quiet
+    def __init__(
+        self, total_frames: int | None, quiet: bool, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._total, self._quiet, self._clock = total_frames, quiet, clock
+        self._begun: tuple[int, float] | None = None
+        self._announced = False
         self._console = Console(stderr=True)
         self._live = not quiet and sys.stderr.isatty()
         self._bar: Progress | None = None
@@ -42,19 +52,36 @@ class RunProgress:
         """Show an iteration of frame 0.
 
         Arguments:
-            iteration: from 0.
+            iteration: from 1.
             iterations: of frame 0 in all.
             loss: of this iteration.
             count: Gaussians there are.
         """
         note = f"loss {loss:.4f}, {count} Gaussians"
+        now, left = self._clock(), self._seconds_left(iteration, iterations)
+        if left is not None and left > _LONG and not self._announced:
+            self._announced = True
+            warnings.warn(
+                f"frame 0 takes about {_duration(left)} more at this pace ({iteration} of {iterations} iterations are "
+                "done). Smaller pictures (--scale) and fewer iterations (--set first_frame.max_iterations=N) make it "
+                "shorter", stacklevel=2
+            )  # fmt: skip
         if self._bar:
             if self._task is None:
                 self._task = self._bar.add_task("frame 0", total=iterations, note=note)
             self._bar.update(self._task, completed=iteration, note=note)
-        elif not self._quiet and (iteration == iterations or time.monotonic() - self._last > 10):
-            self._last = time.monotonic()
-            self.say(f"frame 0: iteration {iteration}/{iterations}, {note}")
+        elif not self._quiet and (iteration == iterations or now - self._last > _EVERY):
+            self._last = now
+            rest = f", about {_duration(left)} left" if left else ""
+            self.say(f"frame 0: iteration {iteration}/{iterations}, {note}{rest}")
+
+    def _seconds_left(self, iteration: int, iterations: int) -> float | None:
+        """Return how long the iterations that are left take at the pace so far; None while nobody can tell."""
+        if self._begun is None:
+            self._begun = (iteration, self._clock())
+        first, begun = self._begun
+        gone = self._clock() - begun
+        return None if gone < _EVERY or iteration == first else gone / (iteration - first) * (iterations - iteration)
 
     def frame(self, metrics: Mapping[str, Any]) -> None:
         """Show a frame that was written."""
@@ -74,6 +101,13 @@ class RunProgress:
         if not self._quiet:
             console = self._bar.console if self._bar else self._console
             console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _duration(seconds: float) -> str:
+    for unit, length in (("hours", 3600), ("minutes", 60)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.1f} {unit}" if seconds < 10 * length else f"{seconds / length:.0f} {unit}"
+    return f"{seconds:.0f} seconds"
 
 
 def frame_line(metrics: Mapping[str, Any], total: int | None) -> str:

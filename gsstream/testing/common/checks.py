@@ -195,9 +195,9 @@ def check_empty_and_one(part: Part) -> None:
 
 @check("common", kinds=BEHAVED)
 def check_rejects_nonfinite(part: Part) -> None:
-    """NaN and Inf are refused with a message, or come out again; they are never silently repaired."""
+    """NaN and Inf are refused with a message; a regularizer may hand them on. They are never silently repaired."""
     for bad in (float("nan"), float("inf")):
-        clean, spoilt, other = (_poisoned(part, value) for value in (9.0, bad, -9.0))
+        (clean, _), (spoilt, where), (other, _) = (_poisoned(part, value) for value in (9.0, bad, -9.0))
         try:
             got = outputs(part, spoilt)
         except InputError as error:
@@ -206,21 +206,21 @@ def check_rejects_nonfinite(part: Part) -> None:
             continue
         if all(bool((~torch.isfinite(value)).any()) for value in got.values() if value.dtype.is_floating_point):
             # Seams called once per iteration may hand it on: it shows in the loss.
-            assert behaviour_of(part).hands_on or not got, f"{bad} was passed on; expected an InputError naming it"
+            allowed = behaviour_of(part).hands_on or not got
+            assert allowed, f"{where} was {bad}, and it was passed on; expected an InputError"
             continue
         ignored = _same(outputs(part, clean), outputs(part, other))
-        assert ignored, f"{bad} in the input was repaired silently; expected an InputError naming the argument"
+        assert ignored, f"{where} was {bad}, and it was repaired silently; expected an InputError"
 
 
 def _same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bool:
     return all(torch.equal(value, second[name]) for name, value in first.items())
 
 
-def _poisoned(part: Part, value: float) -> World:
-    """The cloud with one value of what the part reads replaced."""
+def _poisoned(part: Part, value: float) -> tuple[World, str]:
+    """The cloud with one value of what the part reads replaced, and which."""
     case = world("cloud")
-    behaviour_of(part).poison(case, value)
-    return case
+    return case, behaviour_of(part).poison(case, value)
 
 
 @check("common", kinds=BEHAVED)

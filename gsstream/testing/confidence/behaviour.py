@@ -15,10 +15,11 @@ def outputs(part: ConfidenceEstimator, world: World) -> Outputs:
     return {"estimate()": part.estimate(world)}
 
 
-def poison(world: World, value: float) -> None:
+def poison(world: World, value: float) -> str:
     """Change one pixel of every image of the frame to a value that no image has."""
     for image in world.now:
         image[SPOT] = value
+    return "one pixel of every image"
 
 
 BEHAVIOUR = Behaviour(outputs, poison, keeps_precision=False, by_gaussian=True)

@@ -16,9 +16,10 @@ def outputs(part: Regularizer, world: World) -> Outputs:
     return {f"penalty()[{name!r}]": value for name, value in terms.items()}
 
 
-def poison(world: World, value: float) -> None:
+def poison(world: World, value: float) -> str:
     """Change one coordinate of one residual to a value that none has."""
     world.residual[5, 0] = value
+    return "one coordinate of one residual"
 
 
 BEHAVIOUR = Behaviour(outputs, poison, hands_on=True)

@@ -18,9 +18,10 @@ def outputs(part: Structure, world: World) -> Outputs:
     return {**found, "build().node_of": forest.node_of, "build().parent": forest.parent, "build().level": forest.level}
 
 
-def poison(world: World, value: float) -> None:
+def poison(world: World, value: float) -> str:
     """Change one coordinate of one Gaussian to a value that none has."""
     world.gaussians.means[5, 0] = value
+    return "one coordinate of one mean"
 
 
 #: Node names may change with the order: check_structure_label_free compares partitions.

@@ -6,7 +6,9 @@ import multiprocessing
 import multiprocessing.connection
 import os
 import signal
+import sys
 import threading
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from multiprocessing import forkserver
@@ -105,6 +107,8 @@ def _serve(pipe: Connection, work: Work, job: Any, environment: Mapping[str, str
     # Ctrl-C reaches the whole group; the sweep decides what becomes of its workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_die_with_parent, daemon=True).start()
+    # One line, as the command says its own warnings, without a place in somebody's installation.
+    warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr)
     pipe.send(work(job))
 
 

@@ -1,0 +1,60 @@
+"""What a person is told while frame 0 is made, which may take hours: nobody should have to guess that."""
+
+from __future__ import annotations
+
+import warnings
+
+import pytest
+
+from gsstream.engine.run.progress import RunProgress
+
+
+class Clock:
+    """Seconds that pass only when they are told to."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def told(
+    capsys: pytest.CaptureFixture[str], pace: float, iterations: int, *, quiet: bool
+) -> tuple[list[str], list[str]]:
+    """(lines, warnings) of a frame 0 whose every iteration takes ``pace`` seconds."""
+    clock = Clock()
+    progress = RunProgress(1, quiet, clock)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for iteration in range(1, iterations + 1):
+            clock.now += pace
+            progress.first_frame(iteration, iterations, 0.1, 100)
+    return capsys.readouterr().err.splitlines(), [str(warning.message) for warning in caught]
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_hours_are_announced_once_and_early(capsys, quiet) -> None:
+    lines, announced = told(capsys, 9.0, 2000, quiet=quiet)
+    assert announced == [
+        "frame 0 takes about 5.0 hours more at this pace (3 of 2000 iterations are done). Smaller pictures (--scale) "
+        "and fewer iterations (--set first_frame.max_iterations=N) make it shorter"
+    ]
+    assert bool(lines) != quiet
+
+
+def test_lines_say_what_is_left_once_the_pace_is_known(capsys) -> None:
+    lines, announced = told(capsys, 0.5, 400, quiet=False)
+    assert announced == []
+    assert "left" not in lines[0], "nobody knows after one iteration"
+    assert lines[1] == "frame 0: iteration 22/400, loss 0.1000, 100 Gaussians, about 3.1 minutes left"
+    assert lines[-1] == "frame 0: iteration 400/400, loss 0.1000, 100 Gaussians"
+    left = [float(line.split("about ")[1].split()[0]) for line in lines[1:-1] if "minutes" in line]
+    assert left == sorted(left, reverse=True)
+    assert any("seconds left" in line for line in lines)
+
+
+def test_a_fast_frame_0_says_nothing_of_time(capsys) -> None:
+    lines, announced = told(capsys, 0.001, 300, quiet=False)
+    assert announced == []
+    assert not any("left" in line for line in lines)

@@ -20,7 +20,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "web"))
 
 P = "document.querySelector('gsstream-player')?.player"
 #: Milliseconds since the page was asked for, once a picture is drawn and read back.
-DRAWN = f"(async () => {{ {P}.draw(); {P}.renderer.readPixels(); return performance.now(); }})()"
+DRAWN = f"""(async () => {{
+  while (!{P}.renderer.sorter.order.length) await new Promise((resolve) => setTimeout(resolve, 5));
+  {P}.draw(); {P}.renderer.readPixels();
+  return performance.now();
+}})()"""
 SEEK = f"""(async () => {{
   const started = performance.now(), before = {P}.buffer.received;
   {P}.seek(FRAME);

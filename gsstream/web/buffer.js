@@ -55,13 +55,14 @@ export class PacketBuffer {
 
   /**
    * What leads from the state after frame `from` (null: there is none) towards `frame`: `{ packet }`, the next one or a
-   * key packet to start from; `{ key, join }`, a key packet and the data of a join; or null while that is not loaded.
+   * key packet to start from; `{ key, join, decode }`, a key packet, the data of a join and its decoder; or null while
+   * that is not loaded.
    */
   towards(frame, from) {
     const { part, join } = this._way(frame, from);
     if (join) {
       const key = this._keyPacket(part);
-      return key && join.data ? { key, join: join.data } : null;
+      return key && join.data ? { key, join: join.data, decode: join.decode } : null;
     }
     const key = this._keyOf(frame);
     if (key === null) return null;
@@ -226,7 +227,10 @@ export class PacketBuffer {
       for await (const packet of packetsOf(key, signal)) part.home.key = packet;
       this.received += part.home.key.data.length;
     }
-    part.join.data = await fileOf(join.url, { bytes: join.bytes, signal });
+    // Only who seeks needs this module.
+    const { decodeJoin } = await import("./joins.js");
+    const data = await fileOf(join.url, { bytes: join.bytes, signal });
+    Object.assign(part.join, { data, decode: decodeJoin });
     this.received += part.join.data.length;
   }
 

@@ -16,8 +16,8 @@ import { ATTRIBUTES } from "./limits.js";
  * is decoded as a whole first, so after a PacketError the state still is that of the frame before.
  *
  * A state has `frame`, `number` (Gaussians), `scene` (attribute -> Float32Array), `widths` (values a row), `layout`,
- * `meta`, `decoders`, `groups` and `moved` (what the next packet may refer to), and `change`: what this packet did, for
- * whoever shows it.
+ * `meta`, `decoders`, `groups` and `moved` (what the next packet may refer to), `turned` (whether a motion was since
+ * the key packet), `spare` (memory for motions), and `change`: what this packet did, for whoever shows it.
  */
 export function decodePacket(state, data, offset = 0) {
   const { header, sections } = parsePacket(data, offset);
@@ -52,6 +52,8 @@ function keyState(header, sections, size, offset) {
     decoders: new Map(),
     groups: null,
     moved: null,
+    turned: false,
+    spare: null,
     change: { kind: KIND_NAMES[KIND.key] },
   };
 }
@@ -86,8 +88,10 @@ function applyDelta(state, { motions, residual, rows }) {
   const quats = pick(state.scene.quats, touched, 4);
   const change = { kind: "delta", moved: [], source: null, before: state.number };
   if (motions) {
+    state.spare = { means: state.scene.means, quats: state.scene.quats };
     Object.assign(state.scene, { means: motions.means, quats: motions.quats });
     state.groups = motions.groups;
+    state.turned = true;
     change.moved.push({ rows: motions.rows, gate: null, attributes: ["means", "quats"] });
   }
   if (residual) {
@@ -124,4 +128,32 @@ export function sceneBytes(state) {
     at += array.byteLength;
   }
   return out;
+}
+
+/** A copy of a state that later packets do not touch. */
+function copied(state) {
+  const scene = Object.fromEntries(Object.entries(state.scene).map(([name, values]) => [name, values.slice()]));
+  return { ...state, scene, decoders: new Map(state.decoders), spare: null };
+}
+
+/** The first key packet and the one used last. */
+export class Snapshots {
+  constructor() {
+    this.kept = [];
+  }
+
+  clear() {
+    this.kept = [];
+  }
+
+  /** A fresh copy of the state after a key packet, or null. */
+  get(packet) {
+    const found = this.kept.find((entry) => entry.packet === packet);
+    return found ? copied(found.state) : null;
+  }
+
+  keep(packet, state) {
+    if (this.kept.length === 2) this.kept.pop();
+    this.kept.push({ packet, state: copied(state) });
+  }
 }

@@ -5,7 +5,6 @@
 
 import { Controls } from "./controls.js";
 import { Player } from "./player.js";
-import { Statistics } from "./statistics.js";
 
 const STYLE = `
 :host { display: block; position: relative; aspect-ratio: 16 / 9; background: #111; color: #eee; overflow: hidden;
@@ -56,24 +55,8 @@ export class PlayerElement extends HTMLElement {
   connectedCallback() {
     const root = this.shadowRoot ?? this.attachShadow({ mode: "open" });
     root.innerHTML = `<style>${STYLE}</style>${PAGE}`;
-    this.parts = Object.fromEntries(
-      [
-        "canvas",
-        "play",
-        "seek",
-        "time",
-        "speed",
-        "camera",
-        "rendition",
-        "loop",
-        "marks",
-        "statistics",
-        "full",
-        "facts",
-        "message",
-        "bar",
-      ].map((name) => [name, root.querySelector(name === "canvas" ? name : `.${name}`)]),
-    );
+    const named = [...root.querySelectorAll("[class]")].map((part) => [part.classList[0], part]);
+    this.parts = { canvas: root.querySelector("canvas"), ...Object.fromEntries(named) };
     this.parts.bar.hidden = this.getAttribute("controls") === "false";
     try {
       this._makePlayer();
@@ -119,7 +102,6 @@ export class PlayerElement extends HTMLElement {
     });
     this.player.marks = this.hasAttribute("marks");
     this.controls = new Controls(canvas, this, this.player);
-    this.facts = new Statistics(this.player);
     this._sizes = new ResizeObserver(() => this._fit());
     this._sizes.observe(canvas);
     this._fit();
@@ -185,9 +167,11 @@ export class PlayerElement extends HTMLElement {
     this.parts.loop.ariaPressed = String(on);
   }
 
-  _statistics() {
+  async _statistics() {
     this.parts.facts.hidden = !this.parts.facts.hidden;
     this.parts.statistics.ariaPressed = String(!this.parts.facts.hidden);
+    const { Statistics } = await import("./statistics.js");
+    this.facts ??= new Statistics(this.player);
     this._everySecond();
   }
 
@@ -228,8 +212,8 @@ export class PlayerElement extends HTMLElement {
       clearInterval(this._clock);
       return;
     }
-    this.facts.update();
-    if (!this.parts.facts.hidden) this.parts.facts.textContent = this.facts.text();
+    this.facts?.update();
+    if (this.facts && !this.parts.facts.hidden) this.parts.facts.textContent = this.facts.text();
     this._progress();
   }
 

@@ -3,8 +3,9 @@
 /** Values of `rows` in an array of `width` values a row. */
 export function pick(values, rows, width) {
   const out = new Float32Array(rows.length * width);
-  for (let i = 0; i < rows.length; i += 1) {
-    for (let d = 0; d < width; d += 1) out[i * width + d] = values[rows[i] * width + d];
+  for (let i = 0, to = 0; i < rows.length; i += 1) {
+    const from = rows[i] * width;
+    for (let d = 0; d < width; d += 1, to += 1) out[to] = values[from + d];
   }
   return out;
 }
@@ -19,13 +20,14 @@ export function displacement(rows, means, quats, scene) {
   const turn = new Float32Array(3 * rows.length);
   let at = 0;
   for (let i = 0; i < rows.length; i += 1) {
-    for (let axis = 0; axis < 3; axis += 1) {
-      shift[3 * at + axis] = scene.means[3 * rows[i] + axis] - means[3 * i + axis];
-    }
-    turnBetween(quats, 4 * i, scene.quats, 4 * rows[i], turn, 3 * at);
-    let moves = false;
-    for (let axis = 3 * at; axis < 3 * at + 3; axis += 1) moves ||= shift[axis] !== 0 || turn[axis] !== 0;
-    if (moves) kept[at++] = rows[i];
+    const a = 3 * rows[i];
+    const o = 3 * at;
+    shift[o] = scene.means[a] - means[3 * i];
+    shift[o + 1] = scene.means[a + 1] - means[3 * i + 1];
+    shift[o + 2] = scene.means[a + 2] - means[3 * i + 2];
+    turnBetween(quats, 4 * i, scene.quats, 4 * rows[i], turn, o);
+    const shifts = shift[o] !== 0 || shift[o + 1] !== 0 || shift[o + 2] !== 0;
+    if (shifts || turn[o] !== 0 || turn[o + 1] !== 0 || turn[o + 2] !== 0) kept[at++] = rows[i];
   }
   return at ? { rows: kept.slice(0, at), shift: shift.slice(0, 3 * at), turn: turn.slice(0, 3 * at) } : null;
 }
@@ -52,26 +54,27 @@ function turnBetween(before, b, after, a, out, o) {
 export function gatherDisplacement(moved, source, number) {
   if (!moved) return null;
   const place = new Int32Array(number).fill(-1);
-  moved.rows.forEach((row, i) => {
-    place[row] = i;
-  });
-  const rows = [];
-  const from = [];
+  for (let i = 0; i < moved.rows.length; i += 1) place[moved.rows[i]] = i;
+  const rows = new Uint32Array(moved.rows.length);
+  const from = new Uint32Array(moved.rows.length);
+  let at = 0;
   for (let i = 0; i < source.length; i += 1) {
-    if (source[i] < number && place[source[i]] >= 0) {
-      rows.push(i);
-      from.push(place[source[i]]);
-    }
+    if (source[i] >= number || place[source[i]] < 0) continue;
+    rows[at] = i;
+    from[at++] = place[source[i]];
   }
-  return { rows: Uint32Array.from(rows), shift: pick(moved.shift, from, 3), turn: pick(moved.turn, from, 3) };
+  const kept = from.subarray(0, at);
+  return { rows: rows.slice(0, at), shift: pick(moved.shift, kept, 3), turn: pick(moved.turn, kept, 3) };
 }
 
 /** The groups of rows after births and deaths: a birth joins the group of the row before it; without old rows, none. */
 export function gatherGroups(groups, source, number) {
-  const first = source.find((row) => row < number);
-  if (!groups || first === undefined) return null;
+  if (!groups) return null;
+  let first = 0;
+  while (first < source.length && source[first] >= number) first += 1;
+  if (first === source.length) return null;
   const groupOf = new Int32Array(source.length);
-  let last = groups.groupOf[first];
+  let last = groups.groupOf[source[first]];
   for (let i = 0; i < source.length; i += 1) {
     if (source[i] < number) last = groups.groupOf[source[i]];
     groupOf[i] = last;

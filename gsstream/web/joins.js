@@ -10,7 +10,6 @@ const MAGIC = 0x4a535347;
 const VERSION = 1;
 const HEADER = 24;
 const MAX_BYTES = 2 ** 30;
-const MOST = 2;
 
 /**
  * The state before frame `frame`, from `key`, a state after the key packet of its segment, which is used up.
@@ -43,7 +42,7 @@ export function decodeJoin(key, data) {
   const groups = facts.groups && { ...facts.groups, groupOf: body.steps(number) };
   const moved = facts.moved === null ? null : body.displacement(facts.moved);
   const change = { kind: "key" };
-  return { ...key, frame, number, scene, layout, decoders, groups, moved, change };
+  return { ...key, frame, number, scene, layout, decoders, groups, moved, turned: true, change };
 }
 
 /** The values of one attribute: those of the key packet, plus differences of their bits. */
@@ -119,33 +118,5 @@ class Body {
   displacement(count) {
     const rows = Uint32Array.from(this.steps(count));
     return { rows, shift: this.floats(count), turn: this.floats(count) };
-  }
-}
-
-/** A copy of a state that later packets do not touch. */
-function copied(state) {
-  const scene = Object.fromEntries(Object.entries(state.scene).map(([name, values]) => [name, values.slice()]));
-  return { ...state, scene, decoders: new Map(state.decoders) };
-}
-
-/** The first key packet and the one used last. */
-export class Snapshots {
-  constructor() {
-    this.kept = [];
-  }
-
-  clear() {
-    this.kept = [];
-  }
-
-  /** A fresh copy of the state after a key packet, or null. */
-  get(packet) {
-    const found = this.kept.find((entry) => entry.packet === packet);
-    return found ? copied(found.state) : null;
-  }
-
-  keep(packet, state) {
-    if (this.kept.length === MOST) this.kept.pop();
-    this.kept.push({ packet, state: copied(state) });
   }
 }

@@ -3,9 +3,8 @@
 import { PacketBuffer } from "./buffer.js";
 import { cameraOf, pivotOf, viewsOf } from "./camera.js";
 import { KIND } from "./container.js";
-import { decodePacket } from "./decode.js";
+import { Snapshots, decodePacket } from "./decode.js";
 import { PacketError } from "./errors.js";
-import { Snapshots, decodeJoin } from "./joins.js";
 import { Renderer } from "./renderer.js";
 import { openSource } from "./source.js";
 
@@ -230,10 +229,10 @@ export class Player extends EventTarget {
   }
 
   /** Decode one packet, or begin where a join says. */
-  _take({ packet, key, join }) {
+  _take({ packet, key, join, decode }) {
     const started = performance.now();
     if (join) {
-      this.state = decodeJoin(this._keyState(key), join);
+      this.state = decode(this._keyState(key), join);
     } else if (packet.header.kind === KIND.key) {
       this.state = this._keyState(packet);
     } else {

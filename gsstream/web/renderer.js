@@ -1,13 +1,9 @@
 // Draws a scene with WebGL2 from float32 textures, in the depth order that a worker finds.
 
-import { COPY_FRAGMENT_SHADER, COPY_VERTEX_SHADER, FRAGMENT_SHADER, vertexShader } from "./shaders.js";
 import { ResidentScene } from "./resident.js";
+import { COPY_FRAGMENT_SHADER, COPY_VERTEX_SHADER } from "./shaders.js";
 import { SortQueue } from "./sort-queue.js";
-
-/** Variance that every footprint gets, in pixels squared of the recording: a larger picture is not made of needles. */
-const BLUR = 0.3;
-/** Frames after which the mark of a change has faded to a third. */
-const MARK_LASTS = 3;
+import { Projection, Quads, link } from "./splats.js";
 
 /**
  * A camera is `{ viewmat, fx, fy, cx, cy, width, height, near }`: world to camera as 16 numbers row by row (x right, y
@@ -41,7 +37,6 @@ export class Renderer {
     canvas.addEventListener("webglcontextrestored", () => {
       this._setUp();
       this.scene.restore(this.state);
-      if (this.state) this._fitProgram();
       onChange();
     });
   }
@@ -51,7 +46,6 @@ export class Renderer {
     this.state = state;
     this.background = state.meta.background;
     const { anew, moved } = this.scene.update(state);
-    this._fitProgram();
     if (anew) {
       this.sorter.reset(this.scene.capacity);
       this._moved = new Set(moved);
@@ -69,7 +63,8 @@ export class Renderer {
     if (exact) this.sorter.sortNow(axis, camera.near, this.scene.slots.slotOf);
     else this.sorter.request(axis, camera.near);
     this._fitTarget();
-    this._drawSplats(camera);
+    this.projection.update(this.scene.textures, camera, this.canvas, this.marks ? this.state.frame : -1);
+    this._drawSplats();
     this._copyToCanvas();
   }
 
@@ -93,29 +88,18 @@ export class Renderer {
   _setUp() {
     const { gl } = this;
     // Hundreds of layers are blended into one pixel: eight bits would round each of them.
-    this.deep = Boolean(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
-    this.program = null;
-    this.degree = -1;
+    const floats = gl.getExtension("EXT_color_buffer_float");
+    this.deep = Boolean(floats || gl.getExtension("EXT_color_buffer_half_float"));
+    // A processor that has to draw takes as long to convert halves as for all the rest.
+    const software = /swiftshader|llvmpipe|software/i.test(rendererOf(gl));
+    this.format = software && floats && gl.getExtension("EXT_float_blend") ? gl.RGBA32F : gl.RGBA16F;
+    this.projection = new Projection(gl);
+    this.quads = new Quads(gl);
     this.copy = link(gl, COPY_VERTEX_SHADER, COPY_FRAGMENT_SHADER);
     this.target = null;
-    this.orderBuffer = gl.createBuffer();
-    this.splats = gl.createVertexArray();
-    gl.bindVertexArray(this.splats);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(0, 1);
     this.plain = gl.createVertexArray();
-    this.uploadedOrder = null;
     gl.disable(gl.DEPTH_TEST);
     gl.disable(gl.DITHER);
-  }
-
-  /** The program for the degree of colour that the scene has. */
-  _fitProgram() {
-    if (this.degree === this.scene.textures.degree) return;
-    this.degree = this.scene.textures.degree;
-    this.program = link(this.gl, vertexShader(this.degree), FRAGMENT_SHADER);
   }
 
   _sendPositions() {
@@ -140,7 +124,7 @@ export class Renderer {
     }
     const texture = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA16F, canvas.width, canvas.height);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, this.format, canvas.width, canvas.height);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
     const buffer = gl.createFramebuffer();
@@ -149,43 +133,13 @@ export class Renderer {
     this.target = { texture, buffer, width: canvas.width, height: canvas.height };
   }
 
-  _drawSplats(camera) {
-    const { gl, program, canvas } = this;
+  _drawSplats() {
+    const { gl, canvas } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target ? this.target.buffer : null);
     gl.viewport(0, 0, canvas.width, canvas.height);
     gl.clearColor(...this.background, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    gl.useProgram(program.handle);
-    const m = camera.viewmat;
-    const at = (name) => program.at(name);
-    gl.uniformMatrix3fv(at("rotation"), true, [m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]]);
-    gl.uniform3f(at("translation"), m[3], m[7], m[11]);
-    const eye = [0, 1, 2].map((i) => -(m[i] * m[3] + m[4 + i] * m[7] + m[8 + i] * m[11]));
-    gl.uniform3f(at("eye"), ...eye);
-    gl.uniform4f(at("intrinsics"), camera.fx, camera.fy, camera.cx, camera.cy);
-    gl.uniform2f(at("size"), canvas.width, canvas.height);
-    gl.uniform1f(at("near"), camera.near);
-    gl.uniform1f(at("blur"), BLUR * Math.max(1, camera.scale ?? 1) ** 2);
-    gl.uniform2f(at("marking"), this.marks ? this.state.frame : -1, MARK_LASTS);
-    const { geometry, colours } = this.scene.textures;
-    gl.uniform2i(at("lines"), geometry.shift, colours.shift);
-    [geometry, colours].forEach(({ texture }, unit) => {
-      gl.activeTexture(gl.TEXTURE0 + unit);
-      gl.bindTexture(gl.TEXTURE_2D, texture);
-      gl.uniform1i(at(unit ? "colours" : "geometry"), unit);
-    });
-    gl.activeTexture(gl.TEXTURE0);
-    gl.bindVertexArray(this.splats);
-    const { order } = this.sorter;
-    if (order !== this.uploadedOrder) {
-      gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
-      gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
-      this.uploadedOrder = order;
-    }
-    gl.enable(gl.BLEND);
-    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    if (order.length) gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, order.length);
-    gl.disable(gl.BLEND);
+    this.quads.draw(this.sorter.order, this.projection, canvas);
   }
 
   _copyToCanvas() {
@@ -200,29 +154,8 @@ export class Renderer {
   }
 }
 
-/** A program and its uniforms by name. Throws an Error with the compiler's words. */
-function link(gl, vertex, fragment) {
-  const handle = gl.createProgram();
-  for (const [kind, text] of [
-    [gl.VERTEX_SHADER, vertex],
-    [gl.FRAGMENT_SHADER, fragment],
-  ]) {
-    const shader = gl.createShader(kind);
-    gl.shaderSource(shader, text);
-    gl.compileShader(shader);
-    gl.attachShader(handle, shader);
-    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) {
-      throw new Error(`a shader does not compile: ${gl.getShaderInfoLog(shader)}`);
-    }
-  }
-  gl.linkProgram(handle);
-  if (!gl.getProgramParameter(handle, gl.LINK_STATUS) && !gl.isContextLost()) {
-    throw new Error(`the shaders do not fit together: ${gl.getProgramInfoLog(handle)}`);
-  }
-  const places = new Map();
-  const at = (name) => {
-    if (!places.has(name)) places.set(name, gl.getUniformLocation(handle, name));
-    return places.get(name);
-  };
-  return { handle, at };
+/** What draws, in the words of the browser. */
+function rendererOf(gl) {
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  return String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
 }

@@ -47,8 +47,12 @@ ${colourSum(degree)}
 }`;
 }
 
-/** The vertex shader for spherical harmonics of a degree: one quad for each Gaussian, as far as it is seen. */
-export function vertexShader(degree) {
+/**
+ * The fragment shader that projects: a pixel for each slot of the scene, for spherical harmonics of a degree. It writes
+ * two textures: bits of the centre [2] and of the long half axis [2] in pixels; then bits of the short half axis's
+ * length, of the opacity (0: not seen), and the colour as halves.
+ */
+export function projectionShader(degree) {
   return `#version 300 es
 precision highp float;
 precision highp int;
@@ -65,10 +69,8 @@ uniform vec2 size;
 uniform float near;
 uniform float blur;        // pixels squared
 uniform vec2 marking;      // frame shown, or -1 without marks; and how many frames a mark lasts
-layout(location = 0) in uint slot;
-flat out vec2 center;
-flat out vec4 conic;       // xx, xy, yy, opacity
-flat out vec3 colour;
+layout(location = 0) out uvec4 place;
+layout(location = 1) out uvec4 look;
 
 mat3 rotationOf(vec4 q) {
   q /= max(length(q), 1e-10);
@@ -90,16 +92,17 @@ vec3 marked(vec3 plain, float stamp) {
 }
 
 void main() {
-  gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
-  int s = int(slot);
-  ivec2 texel = ivec2((s & ((1 << lines.x) - 1)) * 3, s >> lines.x);
+  place = uvec4(0);
+  look = uvec4(0);
+  ivec2 slot = ivec2(gl_FragCoord.xy);
+  ivec2 texel = ivec2(slot.x * ${GEOMETRY_TEXELS}, slot.y);
   vec4 first = texelFetch(geometry, texel, 0);
-  vec4 third = texelFetch(geometry, texel + ivec2(2, 0), 0);
   float opacity = 1.0 / (1.0 + exp(-first.w));
   vec3 p = rotation * first.xyz + translation;
   if (!(p.z > near) || opacity < 1.0 / 255.0) return;
+  vec4 third = texelFetch(geometry, texel + ivec2(2, 0), 0);
   vec2 focal = intrinsics.xy;
-  center = focal * p.xy / p.z + intrinsics.zw;
+  vec2 center = focal * p.xy / p.z + intrinsics.zw;
   vec2 margin = 0.15 * size / focal;
   vec2 t = clamp(p.xy / p.z, -intrinsics.zw / focal - margin, (size - intrinsics.zw) / focal + margin);
   mat3 axes = rotation * rotationOf(texelFetch(geometry, texel + ivec2(1, 0), 0));
@@ -110,35 +113,64 @@ void main() {
   float a = dot(across, across) + blur, b = dot(across, down), c = dot(down, down) + blur;
   float determinant = a * c - b * b;
   if (!(determinant > 0.0)) return;
-  conic = vec4(vec3(c, -b, a) / determinant, opacity);
+  // As far as the opacity is above 1/255: what lies beside the picture need not be coloured.
+  float reach = 2.0 * log(opacity * 255.0);
+  vec2 extent = sqrt(reach * vec2(a, c)) + 1.0;
+  if (any(lessThan(center + extent, vec2(0))) || any(greaterThan(center - extent, size))) return;
   float middle = 0.5 * (a + c), radius = length(vec2(0.5 * (a - c), b));
   float large = middle + radius, small = max(determinant / large, 0.0);
   vec2 along = abs(b) < 1e-9 * large ? (a >= c ? vec2(1, 0) : vec2(0, 1)) : normalize(vec2(b, large - a));
-  float reach = 2.0 * log(max(opacity * 255.0, 1.0));
-  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
-  vec2 offset = corner.x * (sqrt(reach * large) + 0.01) * along
-    + corner.y * (sqrt(reach * small) + 0.01) * vec2(-along.y, along.x);
-  vec2 place = (center + offset) / size;
-  gl_Position = vec4(2.0 * place.x - 1.0, 1.0 - 2.0 * place.y, 0.0, 1.0);
-  int at = (s & ((1 << lines.y) - 1)) * TEXELS;
-  colour = marked(seenFrom${degree}(colours, first.xyz - eye, at, s >> lines.y), third.w);
+  int slots = slot.x + (slot.y << lines.x);
+  int at = (slots & ((1 << lines.y) - 1)) * TEXELS;
+  vec3 colour = marked(seenFrom${degree}(colours, first.xyz - eye, at, slots >> lines.y), third.w);
+  colour = min(colour, 65504.0);
+  place = floatBitsToUint(vec4(center, sqrt(large) * along));
+  look = uvec4(
+    floatBitsToUint(sqrt(small)), floatBitsToUint(opacity),
+    packHalf2x16(colour.xy), packHalf2x16(vec2(colour.z, 0.0)));
 }`;
 }
 
+/** One quad for each Gaussian, as far as it is seen. */
+export const VERTEX_SHADER = `#version 300 es
+precision highp float;
+precision highp int;
+precision highp usampler2D;
+uniform usampler2D places;
+uniform usampler2D looks;
+uniform usampler2D order;  // slots, farthest first
+uniform ivec2 lines;       // log2 of the Gaussians in one line of the order, and of the other two
+uniform vec2 size;
+out vec2 away;             // from the centre, in half axes
+flat out vec4 shade;       // colour, opacity
+
+void main() {
+  gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
+  int turn = gl_VertexID >> 2;
+  int s = int(texelFetch(order, ivec2(turn & ((1 << lines.x) - 1), turn >> lines.x), 0).x);
+  ivec2 texel = ivec2(s & ((1 << lines.y) - 1), s >> lines.y);
+  uvec4 look = texelFetch(looks, texel, 0);
+  float opacity = uintBitsToFloat(look.y);
+  if (opacity == 0.0) return;
+  vec4 place = uintBitsToFloat(texelFetch(places, texel, 0));
+  vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
+  away = corner * (sqrt(2.0 * log(max(opacity * 255.0, 1.0))) + 0.005);
+  vec2 across = vec2(-place.w, place.z) / length(place.zw) * uintBitsToFloat(look.x);
+  vec2 point = (place.xy + away.x * place.zw + away.y * across) / size;
+  gl_Position = vec4(2.0 * point.x - 1.0, 1.0 - 2.0 * point.y, 0.0, 1.0);
+  shade = vec4(unpackHalf2x16(look.z), unpackHalf2x16(look.w).x, opacity);
+}`;
+
 export const FRAGMENT_SHADER = `#version 300 es
 precision highp float;
-uniform vec2 size;
-flat in vec2 center;
-flat in vec4 conic;
-flat in vec3 colour;
+in vec2 away;
+flat in vec4 shade;
 out vec4 result;
 
 void main() {
-  vec2 d = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y) - center;
-  float power = 0.5 * (conic.x * d.x * d.x + conic.z * d.y * d.y) + conic.y * d.x * d.y;
-  float alpha = min(conic.w * exp(-power), 0.999);
+  float alpha = min(shade.w * exp(-0.5 * dot(away, away)), 0.999);
   if (alpha < 1.0 / 255.0) discard;
-  result = vec4(colour * alpha, alpha);
+  result = vec4(shade.xyz * alpha, alpha);
 }`;
 
 export const COPY_VERTEX_SHADER = `#version 300 es

@@ -169,19 +169,30 @@ export class AnsDecoder {
   /** Fill `out` with the next symbols of a model given by `quantiseCounts`, plus `low`. */
   decode(model, shift, out) {
     const guide = searchGuide(model);
+    const common = widest(model);
+    const begins = model[common];
+    const ends = model[common + 1];
     const { view } = this;
     let { low, high, left } = this;
     for (let i = 0; i < out.length; i += 1) {
       const quantile = low & (TOTAL - 1);
-      let symbol = guide[quantile >>> GUIDE_SHIFT];
-      let last = guide[(quantile >>> GUIDE_SHIFT) + 1];
-      while (symbol < last) {
-        const middle = (symbol + last + 1) >>> 1;
-        if (model[middle] <= quantile) symbol = middle;
-        else last = middle - 1;
+      let begin = begins;
+      let width = ends - begins;
+      if (quantile >= begins && quantile < ends) {
+        // The commonest symbol, mostly 0, needs no look at the tables: the processor foresees it.
+        out[i] = common + shift;
+      } else {
+        let symbol = guide[quantile >>> GUIDE_SHIFT];
+        let last = guide[(quantile >>> GUIDE_SHIFT) + 1];
+        while (symbol < last) {
+          const middle = (symbol + last + 1) >>> 1;
+          if (model[middle] <= quantile) symbol = middle;
+          else last = middle - 1;
+        }
+        begin = model[symbol];
+        width = model[symbol + 1] - begin;
+        out[i] = symbol + shift;
       }
-      const begin = model[symbol];
-      const width = model[symbol + 1] - begin;
       // state = (state >> 24) * width + rest, of which `high` gets what is above 2^32.
       const rest = quantile - begin;
       const shifted = (high << 8) | (low >>> 24);
@@ -199,12 +210,20 @@ export class AnsDecoder {
         high = low;
         low = view.getInt32(4 * left, true);
       }
-      out[i] = symbol + shift;
     }
     this.low = low;
     this.high = high;
     this.left = left;
   }
+}
+
+/** The symbol with the widest interval. */
+function widest(model) {
+  let best = 0;
+  for (let symbol = 1; symbol < model.length - 1; symbol += 1) {
+    if (model[symbol + 1] - model[symbol] > model[best + 1] - model[best]) best = symbol;
+  }
+  return best;
 }
 
 // Gates: alternating runs of closed and open entries, with a level for each open one.

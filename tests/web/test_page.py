@@ -208,13 +208,14 @@ def test_what_is_sound_is_played(site, tmp_path, name):
         except ValueError:
             pass
     steps = [
-        ["go", f"URL/index.html?src={name}&autoplay=1&loop=false"],
+        ["go", f"URL/index.html?src={name}&autoplay=1&loop=false&speed=0.25"],
         ["until", f"{PLAYER}?.state && {PLAYER}.frame >= {frames - 1} && !{PLAYER}.playing", 30],
         ["evaluate", f"{PLAYER}.frame"], ["evaluate", f"{PLAYER}.problem !== null"],
     ]  # fmt: skip
     with serving(site) as (url, _):
         results, _ = try_in_browser(_at(url, steps), tmp_path, size=SIZE)
     assert 0 < frames < 7
+    # Slowly, since a page that draws late leaves frames out, and might leave out all the damaged ones.
     # Of the damaged file the second segment is sound, which is said; a file that just ends is one being written.
     assert results[-2:] == ([11, True] if name == "damaged.gss" else [frames - 1, False])
 
@@ -254,13 +255,13 @@ def test_the_page_is_small():
         str(p.relative_to(folder)): len(gzip.compress(p.read_bytes()))
         for p in folder.rglob("*") if p.is_file() and "vendor" not in p.parts
     }  # fmt: skip
-    # What only a live stream takes is loaded only there; the adapter for three.js and what
-    # is for scripts alone never.
-    live = [sizes.pop(name) for name in ("live.js", "live-socket.js", "latency.js")]
+    # What only a live stream takes, a seek by a join and the statistics is loaded only there; the adapter for three.js
+    # and what is for scripts alone never.
+    later = [sizes.pop(name) for name in ("live.js", "live-socket.js", "latency.js", "joins.js", "statistics.js")]
     del sizes["gsstream-spark.js"], sizes["world.js"]
     assert len(sizes) > 20
     assert sum(sizes.values()) <= 60_000
-    assert sum(live) <= 6_000
+    assert sum(later) <= 9_000
 
 
 def test_a_segment_is_a_stream_of_its_own(site):

@@ -19,7 +19,7 @@ const SH0 = 0.28209479177387814;
  * Decode the motions of a frame and apply them, one after the other, to copies of what they change.
  *
  * Returns `{ means, quats, groups, rows }`: arrays of the whole scene after the motions, its groups, and the rows of
- * moving groups, ascending. Nothing of `state` changes.
+ * moving groups, ascending. Nothing of `state` changes but `state.spare`, the memory in which the copies lie.
  */
 export function decodeMotions(section, state) {
   const number = section.data.length ? section.data[0] : 0;
@@ -27,7 +27,12 @@ export function decodeMotions(section, state) {
     throw new PacketError(`motion: expected 1 to ${MAX_MOTIONS} motions, got ${number}`);
   }
   const { means, quats, sh0 } = state.scene;
-  const scene = { means: means.slice(), quats: quats.slice(), sh0, groups: state.groups };
+  if (!state.spare || state.spare.quats.length !== quats.length) {
+    state.spare = { means: new Float32Array(means.length), quats: new Float32Array(quats.length) };
+  }
+  state.spare.means.set(means);
+  state.spare.quats.set(quats);
+  const scene = { ...state.spare, sh0, groups: state.groups };
   const touched = new Uint8Array(state.number);
   for (const part of unpackParts(section.data.subarray(1), number)) {
     const motion = decodeMotion(part, scene);
@@ -39,7 +44,9 @@ export function decodeMotions(section, state) {
 
 /** Which rows carry a mark, ascending. */
 export function marked(marks) {
-  const rows = new Uint32Array(marks.reduce((sum, mark) => sum + mark, 0));
+  let number = 0;
+  for (let row = 0; row < marks.length; row += 1) number += marks[row];
+  const rows = new Uint32Array(number);
   for (let row = 0, at = 0; row < marks.length; row += 1) if (marks[row]) rows[at++] = row;
   return rows;
 }
@@ -81,11 +88,34 @@ function formGroups({ means, sh0 }, cell, shades) {
     const place = (index(means[3 * i]) * 2 * HALF_GRID + index(means[3 * i + 1])) * 2 * HALF_GRID;
     keys[i] = (place + index(means[3 * i + 2])) * MAX_SHADES + shade;
   }
-  const names = new Map();
-  for (const key of keys.slice().sort()) if (!names.has(key)) names.set(key, names.size);
-  const groupOf = new Int32Array(number);
-  for (let i = 0; i < number; i += 1) groupOf[i] = names.get(keys[i]);
-  return { cell, shades, groupOf, count: names.size };
+  return { cell, shades, ...ranked(keys) };
+}
+
+/** The rank of every key among the distinct ones, and how many of these there are. */
+function ranked(keys) {
+  const groupOf = new Int32Array(keys.length);
+  const found = new Map();
+  const distinct = [];
+  for (let i = 0; i < keys.length; i += 1) {
+    // Neighbours in storage often are neighbours in space.
+    if (i > 0 && keys[i] === keys[i - 1]) {
+      groupOf[i] = groupOf[i - 1];
+      continue;
+    }
+    let name = found.get(keys[i]);
+    if (name === undefined) {
+      name = distinct.length;
+      found.set(keys[i], name);
+      distinct.push(keys[i]);
+    }
+    groupOf[i] = name;
+  }
+  const rank = new Int32Array(distinct.length);
+  Float64Array.from(distinct).sort().forEach((key, i) => {
+    rank[found.get(key)] = i;
+  });
+  for (let i = 0; i < groupOf.length; i += 1) groupOf[i] = rank[groupOf[i]];
+  return { groupOf, count: distinct.length };
 }
 
 /** Move the rows of moving groups in place, in float64 and in the order of operations of the format. */
@@ -93,23 +123,30 @@ function moveRows(scene, motion, moved, touched) {
   const { groups, moving, number } = motion;
   const rank = new Int32Array(groups.count).fill(-1);
   for (let group = 0, k = 0; group < moving.length; group += 1) if (moving[group]) rank[group] = k++;
+  const { means, quats } = scene;
+  const { groupOf } = groups;
   const own = new Float64Array(3 * number);
   const counts = new Int32Array(number);
-  for (let row = 0; row < groups.groupOf.length; row += 1) {
-    const k = rank[groups.groupOf[row]];
+  const rows = new Uint32Array(groupOf.length);
+  let found = 0;
+  for (let row = 0; row < groupOf.length; row += 1) {
+    const k = rank[groupOf[row]];
     if (k < 0) continue;
+    rows[found++] = row;
     counts[k] += 1;
-    for (let axis = 0; axis < 3; axis += 1) own[3 * k + axis] += scene.means[3 * row + axis];
+    own[3 * k] += means[3 * row];
+    own[3 * k + 1] += means[3 * row + 1];
+    own[3 * k + 2] += means[3 * row + 2];
   }
   divide(own, counts);
   const { shift, turn } = transforms(motion, moved, rank);
-  const quats = unitQuats(turn);
-  for (let row = 0; row < groups.groupOf.length; row += 1) {
-    const k = rank[groups.groupOf[row]];
-    if (k < 0) continue;
+  const turns = unitQuats(turn);
+  for (let i = 0; i < found; i += 1) {
+    const row = rows[i];
+    const k = rank[groupOf[row]];
     touched[row] = 1;
-    moveCentre(scene.means, row, quats, own, shift, k);
-    turnQuat(scene.quats, row, quats, k);
+    moveCentre(means, row, turns, own, shift, k);
+    turnQuat(quats, row, turns, k);
   }
 }
 

@@ -14,7 +14,8 @@ export const SECTIONS = ["gates", "pattern", "decoders", ...ATTRIBUTES];
  * Decode the residual from sections by name. Nothing of `state` changes.
  *
  * Returns `{ rows: Uint32Array [A], gate: Float32Array [A], levels, parts, decoders }`: the rows that change with their
- * gates, for each attribute its symbols, step and decoder, and the decoders that hold from now on.
+ * gates, for each attribute its symbols, step and decoder, and the decoders that hold from now on. Symbols are those of
+ * the rows at `places` of `rows`, or of all of them where that is null.
  */
 export function decodeResidual(sections, state, offset) {
   const { counts } = state.layout;
@@ -31,9 +32,9 @@ export function decodeResidual(sections, state, offset) {
     : null;
   const parts = names.map((name, bit) =>
     located(sections[name].offset, () => {
-      const number = pattern ? pattern.reduce((sum, value) => sum + ((value >> bit) & 1), 0) : rows.length;
-      const part = decodePart(name, sections[name].data, number, decoders);
-      return pattern ? { ...part, symbols: spread(part.symbols, part.channels, pattern, bit) } : part;
+      const places = pattern && placesOf(pattern, bit);
+      const number = places ? places.length : rows.length;
+      return { ...decodePart(name, sections[name].data, number, decoders), places };
     }),
   );
   for (const name of sent.keys()) {
@@ -54,49 +55,54 @@ export function applyResidual(state, residual) {
   const scale = new Float32Array(rows.length);
   for (let i = 0; i < rows.length; i += 1) scale[i] = gate[i] * units[unitOf[rows[i]]];
   for (const part of parts) {
-    addPart(state.scene[part.name], rows, part.name === "means" ? scale : gate, part);
+    // A symbol of 0 adds 0 or -0, which changes nothing but a value of -0. Of these there are none except where a
+    // motion was: key packets and births hold multiples of a step, and no sum of two others is -0.
+    const zeros = state.turned && (part.name === "means" || part.name === "quats");
+    const sent = zeros && part.places ? { ...part, symbols: spread(part, rows.length), places: null } : part;
+    const add = part.decoder ? addDecoded : addDirect;
+    add(state.scene[part.name], rows, part.name === "means" ? scale : gate, sent, zeros);
   }
 }
 
-function addPart(values, rows, gate, part) {
-  const { name, symbols, channels, step, width } = part;
-  const signed = name === "means" || name === "quats";
-  if (part.decoder) addDecoded(values, rows, gate, symbols, step, part.decoder.values, channels, width, signed);
-  else addDirect(values, rows, gate, symbols, step, width, signed);
-}
-
-// Most symbols are 0. What they add is 0 or -0, which changes nothing but a value of -0. Of these there are none except
-// where a motion was (`signed`): key packets and births hold multiples of a step, and no sum of two others is -0.
-
-function addDirect(values, rows, gate, symbols, step, width, signed) {
-  const number = rows.length;
-  for (let i = 0; i < number; i += 1) {
-    const start = rows[i] * width;
-    for (let d = 0; d < width; d += 1) {
-      const symbol = symbols[d * number + i];
-      if (symbol === 0 && (!signed || values[start + d] !== 0)) continue;
+/** Add step * symbols * gate. With `zeros` also where the symbol is 0, which rids a value of -0 of its sign. */
+function addDirect(values, rows, gate, { symbols, places, step, width }, zeros) {
+  const number = symbols.length / width;
+  for (let d = 0, from = 0; d < width; d += 1, from += number) {
+    for (let j = 0; j < number; j += 1) {
+      const symbol = symbols[from + j];
+      if (symbol === 0 && !zeros) continue;
+      const i = places === null ? j : places[j];
+      const at = rows[i] * width + d;
+      if (symbol === 0 && values[at] !== 0) continue;
       const latent = Math.fround(Math.fround(symbol) * step);
-      values[start + d] += Math.fround(latent * gate[i]);
+      values[at] += Math.fround(latent * gate[i]);
     }
   }
 }
 
-function addDecoded(values, rows, gate, symbols, step, weights, channels, width, signed) {
-  const number = rows.length;
-  const latents = new Float32Array(channels);
-  for (let i = 0; i < number; i += 1) {
+/** Add the decoder's product of step * symbols, times gate; `zeros` as in `addDirect`. */
+function addDecoded(values, rows, gate, { symbols, places, channels, step, width, decoder }, zeros) {
+  const weights = decoder.values;
+  const number = symbols.length / channels;
+  const change = new Float32Array(width);
+  for (let j = 0; j < number; j += 1) {
     let some = 0;
-    for (let at = i; at < symbols.length; at += number) some |= symbols[at];
-    if (some === 0 && !signed) continue;
-    for (let c = 0; c < channels; c += 1) latents[c] = Math.fround(symbols[c * number + i]) * step;
+    for (let at = j; at < symbols.length; at += number) some |= symbols[at];
+    if (some === 0 && !zeros) continue;
+    // Terms of symbols that are 0 are left out unless their sign may count. Float32Array rounds what it is given.
+    let first = true;
+    for (let c = 0, at = j; c < channels; c += 1, at += number) {
+      if (symbols[at] === 0 && !zeros) continue;
+      const latent = Math.fround(Math.fround(symbols[at]) * step);
+      const from = c * width;
+      if (first) for (let d = 0; d < width; d += 1) change[d] = latent * weights[from + d];
+      else for (let d = 0; d < width; d += 1) change[d] += Math.fround(latent * weights[from + d]);
+      first = false;
+    }
+    const i = places === null ? j : places[j];
     const start = rows[i] * width;
     for (let d = 0; d < width; d += 1) {
-      if (some === 0 && values[start + d] !== 0) continue;
-      let change = Math.fround(latents[0] * weights[d]);
-      for (let c = 1; c < channels; c += 1) {
-        change = Math.fround(change + Math.fround(latents[c] * weights[c * width + d]));
-      }
-      values[start + d] += Math.fround(change * gate[i]);
+      if (some !== 0 || values[start + d] === 0) values[start + d] += Math.fround(change[d] * gate[i]);
     }
   }
 }
@@ -109,8 +115,11 @@ function openRows(counts, gates, levels) {
   for (let node = 0, row = 0, at = 0; node < gates.length; node += 1) {
     const end = row + counts[node];
     if (gates[node]) {
-      gate.fill(gates[node] / levels, at, at + counts[node]);
-      for (; row < end; row += 1) rows[at++] = row;
+      const value = gates[node] / levels;
+      for (; row < end; row += 1, at += 1) {
+        rows[at] = row;
+        gate[at] = value;
+      }
     }
     row = end;
   }
@@ -121,18 +130,28 @@ function openRows(counts, gates, levels) {
 function decodePattern(data, rows, attributes) {
   if (attributes === 0) throw new PacketError("pattern of rows without an attribute that changes");
   const pattern = decodeSymbols(data, rows, 1);
-  if (pattern.some((value) => value < 0 || value >= 1 << attributes)) {
-    throw new PacketError(`pattern of a row: expected 0 to ${(1 << attributes) - 1} for ${attributes} attributes`);
+  for (let i = 0; i < rows; i += 1) {
+    if (pattern[i] < 0 || pattern[i] >= 1 << attributes) {
+      throw new PacketError(`pattern of a row: expected 0 to ${(1 << attributes) - 1} for ${attributes} attributes`);
+    }
   }
   return pattern;
 }
 
-/** The symbols of all rows from those of the rows that have the bit; zeros elsewhere. Channel after channel. */
-function spread(symbols, channels, pattern, bit) {
-  const rows = pattern.length;
+/** The places of a pattern that have a bit, ascending. */
+function placesOf(pattern, bit) {
+  let number = 0;
+  for (let i = 0; i < pattern.length; i += 1) number += (pattern[i] >> bit) & 1;
+  const places = new Uint32Array(number);
+  for (let i = 0, at = 0; i < pattern.length; i += 1) if ((pattern[i] >> bit) & 1) places[at++] = i;
+  return places;
+}
+
+/** The symbols of all rows, zeros where there are none. Channel after channel. */
+function spread({ symbols, channels, places }, rows) {
   const out = new Int32Array(rows * channels);
-  for (let c = 0, at = 0; c < channels; c += 1) {
-    for (let row = 0; row < rows; row += 1) if ((pattern[row] >> bit) & 1) out[c * rows + row] = symbols[at++];
+  for (let c = 0, from = 0; c < channels; c += 1) {
+    for (let j = 0; j < places.length; j += 1) out[c * rows + places[j]] = symbols[from++];
   }
   return out;
 }
@@ -152,8 +171,8 @@ function decodeDecoders(data) {
     if (!WIDTHS[name].includes(width) || width === 0 || 2 * latents * width > data.length - at) {
       throw new PacketError(`decoder of ${name}: ${latents} x ${width} does not fit the section`);
     }
-    const start = at;
-    const values = Float32Array.from({ length: latents * width }, (_, i) => half(view.getUint16(start + 2 * i, true)));
+    const values = new Float32Array(latents * width);
+    for (let i = 0; i < values.length; i += 1) values[i] = half(view.getUint16(at + 2 * i, true));
     if (!values.every(Number.isFinite)) throw new PacketError(`decoder of ${name}: a value is not finite`);
     out.set(name, { values, latents, width });
     at += 2 * latents * width;

@@ -1,5 +1,5 @@
-// fzstd 0.1.1 by Arjun Barrett (MIT, see fzstd-LICENSE): its ES module, with two checks added that end loops on damaged
-// data; they are marked "gsstream:".
+// fzstd 0.1.1 by Arjun Barrett (MIT, see fzstd-LICENSE): its ES module, with checks added that end loops on damaged data
+// or refuse what is faulty by RFC 8878, and messages; they are marked "gsstream:".
 // Some numerical data is initialized as -1 even when it doesn't need initialization to help the JIT infer types
 // aliases for shorter compressed code (most minifers don't do this)
 var ab = ArrayBuffer, u8 = Uint8Array, u16 = Uint16Array, i16 = Int16Array, u32 = Uint32Array, i32 = Int32Array;
@@ -370,8 +370,9 @@ var mlbl = /*#__PURE__ */ b2bl(mlb, 3);
 // decode huffman stream
 var dhu = function (dat, out, hu) {
     var len = dat.length, ss = out.length, lb = dat[len - 1], msk = (1 << hu.b) - 1, eb = -hu.b;
+    // gsstream: libzstd plays some streams that end wrongly; this and the error below say so in their own words.
     if (!lb)
-        err(0);
+        err(0, 'Huffman-coded literals do not end with their bits');
     var st = 0, btr = hu.b, pos = (len << 3) - 8 + msb(lb) - btr, i = -1;
     for (; pos > eb && i < ss;) {
         var cbt = pos >> 3;
@@ -381,7 +382,7 @@ var dhu = function (dat, out, hu) {
         pos -= (btr = hu.n[st]);
     }
     if (pos != eb || i + 1 != ss)
-        err(0);
+        err(0, 'Huffman-coded literals do not end with their bits');
 };
 // decode huffman stream 4x
 // TODO: use workers to parallelize
@@ -524,6 +525,9 @@ var rzb = function (dat, st, out) {
                 var ml = mlbl[mlc] + (((dat[cbt] | (dat[cbt + 1] << 8) | (dat[cbt + 2] << 16)) >> (spos & 7)) & ((1 << mlb[mlc]) - 1));
                 cbt = (spos -= llb[llc]) >> 3;
                 var ll = llbl[llc] + (((dat[cbt] | (dat[cbt + 1] << 8) | (dat[cbt + 2] << 16)) >> (spos & 7)) & ((1 << llb[llc]) - 1));
+                // gsstream: the last sequence ends where its bits do, and updates no state.
+                if (ns == 1 && spos != bt << 3)
+                    err(0);
                 cbt = (spos -= lbtr) >> 3;
                 lst = llt.t[lst] + (((dat[cbt] | (dat[cbt + 1] << 8)) >> (spos & 7)) & ((1 << lbtr) - 1));
                 cbt = (spos -= mbtr) >> 3;
@@ -547,9 +551,11 @@ var rzb = function (dat, st, out) {
                     else
                         off = st.o[0];
                 }
-                // gsstream: sequences that write past the end would only cost time.
-                if (oubt + ll + ml > buf.length)
+                // gsstream: sequences that write past the end would only cost time, and none copies from outside.
+                if (oubt + ll + ml > buf.length || ll > buf.length - spl)
                     err(0);
+                if (off < 1 || off > oubt + ll + st.e)
+                    err(4);
                 for (var i = 0; i < ll; ++i) {
                     buf[oubt + i] = buf[spl + i];
                 }
@@ -648,6 +654,9 @@ export function decompress(dat, buf) {
                     st.w.set(blk, st.w.length - blk.length);
                 }
             }
+            // gsstream: content that ends early would be followed by zeros.
+            if (!nb && st.y != buf.length)
+                err(0);
             bt = st.b + (st.c * 4);
         }
         else

@@ -47,7 +47,14 @@ class GatePrice:
     def slopes(
         self, open_probability: torch.Tensor, residual: torch.Tensor, hierarchy: Hierarchy, num_gaussians: int
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the derivatives by the probabilities [M] and by the residual [A, 3]; arguments of ``penalty``."""
+        """Return the derivatives by the probabilities [M] and by the residual [A, 3].
+
+        Arguments:
+            open_probability: [M] probability that each node's gate is not zero.
+            residual: [A, 3] ungated position residual, cells.
+            hierarchy: of the A rows.
+            num_gaussians: N, the divisor of a mean.
+        """
         divisor = max(num_gaussians, 1) if self.mean else 1
         rows = self.gate + self.motion * residual.square().sum(1)
         by_probability = torch.zeros_like(open_probability).index_add_(0, hierarchy.node_of, rows) / divisor

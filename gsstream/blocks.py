@@ -24,8 +24,11 @@ from gsstream.engine.step.active.change import Change as Change
 from gsstream.engine.step.active.change import detect_change as detect_change
 from gsstream.engine.step.active.change import marked_per_tile as marked_per_tile
 from gsstream.engine.step.harden import rows_of as rows_of
+from gsstream.growth.copying import fitted_copies as fitted_copies
+from gsstream.growth.copying import pulled_rows as pulled_rows
 from gsstream.growth.fitting import fitted_births as fitted_births
 from gsstream.growth.fitting import joined as joined
+from gsstream.motion.field import said_by_cells as said_by_cells
 from gsstream.motion.fitting import each_alone as each_alone
 from gsstream.motion.fitting import felt_most as felt_most
 from gsstream.motion.fitting import fitted_moves as fitted_moves

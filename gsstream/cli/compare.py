@@ -151,12 +151,16 @@ def _at_epochs(wanted: Wanted, epochs: list[int], catalog: Catalog) -> SweepConf
 
 def _at_time(wanted: Wanted, seconds: list[float], out: Path, catalog: Catalog) -> SweepConfig:
     """The second half of --at time, once every method has run at its own settings."""
-    from gsstream.trade.compare.plan import equal_time, own_seconds
+    from gsstream.core.errors import InputError
+    from gsstream.trade.compare.plan import equal_time, own_epochs, own_seconds
     from gsstream.trade.report.groups import read_sweep_data
 
     measured = read_sweep_data(out)
-    took = [own_seconds(measured, group.variant) for group in measured.groups]
-    return equal_time(wanted, seconds or took[:1], measured, catalog)
+    took = [own_seconds(measured, name) for name, number in own_epochs(wanted, catalog).items() if number is not None]
+    known = [value for value in took if value > 0]
+    if not seconds and not known:
+        raise InputError("--at time: no method that makes passes over the cameras has run; say --seconds")
+    return equal_time(wanted, seconds or known[:1], measured, catalog)
 
 
 def _write_page(out: Path, source: str, catalog: Catalog, pictures: bool, quiet: bool) -> None:

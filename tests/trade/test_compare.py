@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gsstream.cli.compare import _at_time
 from gsstream.cli.main import run_command
-from gsstream.core.errors import RecipeError
+from gsstream.core.errors import InputError, RecipeError
 from gsstream.player.playback import Playback
 from gsstream.plugins.catalog import load_catalog
 from gsstream.trade.compare.pictures import Tile, tiles_in_rows
@@ -87,6 +88,16 @@ def test_equal_epochs_leaves_methods_alone_that_make_none() -> None:
     ]
     assert len(plan.firsts) == 2, "one for each seed, whatever the method"
     assert "no passes in hold" in config.description
+
+
+def test_without_seconds_the_first_method_that_makes_passes_sets_the_time(compared, monkeypatch) -> None:
+    out, data = compared
+    catalog, wanted = load_catalog(), Wanted(("hold", "dense"), SOURCE)
+    monkeypatch.setattr("gsstream.trade.report.groups.read_sweep_data", lambda _: data)
+    config = _at_time(wanted, [], out, catalog)
+    assert {variant.name: variant.axes for variant in config.variants} == {"hold": {}, "dense": {EPOCHS: [20]}}
+    with pytest.raises(InputError, match="no method that makes passes"):
+        _at_time(Wanted(("hold",), SOURCE), [], out, catalog)
 
 
 def test_equal_time_asks_for_at_least_one_pass(compared) -> None:

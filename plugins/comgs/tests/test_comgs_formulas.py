@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from gsstream_comgs.correction import corrected
 from gsstream_comgs.influence import Field, KeyPoints, field_of, matrices, moved_by, weights_of
-from gsstream_comgs.motion import said_by_cells
 from gsstream_comgs.settings import CorrectionSettings
 from scipy.spatial.transform import Rotation
 
 from gsstream.api import Gaussians, Layout, Scene, apply_motion
+from gsstream.blocks import said_by_cells
 
 RNG = np.random.default_rng(0)
 
@@ -73,22 +73,22 @@ def test_gaussians_turn_with_the_field() -> None:
 
 def test_cells_say_a_field_that_is_the_same_everywhere_to_half_a_step() -> None:
     scene, rows = scene_of(RNG.uniform(-1, 1, (200, 3))), np.arange(200)
-    shift = torch.tensor([0.33, -0.21, 0.05]).repeat(200, 1)
-    motion = said_by_cells(scene, rows, Field(shift, torch.zeros(200, 3)), 0.5, 0.02)
+    shift = np.tile([0.33, -0.21, 0.05], (200, 1))
+    motion = said_by_cells(scene, rows, shift, np.zeros((200, 3)), 0.5, 0.02)
     assert motion is not None
     after, touched = apply_motion(scene, motion)
     assert len(touched) == 200
-    np.testing.assert_allclose(after.gaussians.means - scene.gaussians.means, shift.numpy(), atol=0.0101)
+    np.testing.assert_allclose(after.gaussians.means - scene.gaussians.means, shift, atol=0.0101)
 
 
 def test_cells_of_which_most_may_not_move_stay() -> None:
     scene = scene_of(np.array([[0.1, 0.1, 0.1], [0.2, 0.1, 0.1], [0.3, 0.1, 0.1], [5.1, 0.1, 0.1]]))
-    field = Field(torch.ones(2, 3), torch.zeros(2, 3))
-    motion = said_by_cells(scene, np.array([0, 3]), field, 1.0, 0.1)
+    rest = np.zeros((1, 3))
+    motion = said_by_cells(scene, np.array([0, 3]), np.ones((2, 3)), np.zeros((2, 3)), 1.0, 0.1)
     assert motion is not None
     assert apply_motion(scene, motion)[1].tolist() == [3]
-    assert said_by_cells(scene, np.array([0]), Field(torch.ones(1, 3), torch.zeros(1, 3)), 1.0, 0.1) is None
-    assert said_by_cells(scene, np.array([3]), Field(torch.zeros(1, 3), torch.zeros(1, 3)), 1.0, 0.1) is None
+    assert said_by_cells(scene, np.array([0]), rest + 1, rest, 1.0, 0.1) is None
+    assert said_by_cells(scene, np.array([3]), rest, rest, 1.0, 0.1) is None
 
 
 class Wrong:

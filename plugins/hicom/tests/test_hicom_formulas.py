@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from gsstream_hicom.births import wanted
 from gsstream_hicom.method import HiCoM
 from gsstream_hicom.motion import cell_sides, fitted_motions
 from gsstream_hicom.settings import BirthSettings, HiCoMConfig, MotionSettings
 
 from gsstream.api import Cameras, Displacement, Gaussians, Layout, Scene, apply_motion
+from gsstream.blocks import pulled_rows
 from gsstream.testing.stepping import MethodUnderTest
 
 RNG = np.random.default_rng(0)
@@ -137,6 +137,6 @@ class Shown:
 
 
 def test_copies_are_made_where_the_gradient_in_half_widths_exceeds_the_bound() -> None:
-    assert wanted(Shown(), 0.01).tolist() == [1, 0], "0.16 and 0.012; the largest first"
-    assert wanted(Shown(), 0.1).tolist() == [1]
-    assert wanted(Shown(), 0.2).tolist() == []
+    assert pulled_rows(Shown(), 0.01).tolist() == [1, 0], "0.16 and 0.012; the largest first"
+    assert pulled_rows(Shown(), 0.1).tolist() == [1]
+    assert pulled_rows(Shown(), 0.2).tolist() == []

@@ -37,9 +37,15 @@ def weights_of(means: torch.Tensor, points: KeyPoints) -> torch.Tensor:
         means: [A, 3] centres.
         points: K key points.
     """
-    turned = matrices(points.quat).transpose(1, 2) / points.size.exp()[:, :, None]  # [K, 3, 3]
-    local = torch.einsum("kij,akj->aki", turned, means[:, None] - points.centre)
-    weights = torch.exp(-0.5 * local.square().sum(-1))
+    # Distances as one product of tables: squares of x against the metric of each key point, about the points' mean.
+    middle = points.centre.mean(0)
+    x, c = means - middle, points.centre - middle
+    turned = matrices(points.quat).transpose(1, 2) / points.size.exp()[:, :, None]
+    metric = turned.transpose(1, 2) @ turned
+    pulled = torch.einsum("kij,kj->ki", metric, c)
+    squares = (x[:, :, None] * x[:, None]).flatten(1)
+    distance = squares @ metric.flatten(1).T - 2 * x @ pulled.T + (pulled * c).sum(1)
+    weights = torch.exp(-0.5 * distance.clamp_min(0))
     return weights / weights.sum(1, keepdim=True).clamp_min(1)
 
 
@@ -54,9 +60,9 @@ def field_of(means: torch.Tensor, points: KeyPoints) -> Field:
     unit = torch.cat([torch.ones_like(points.turn[:, :1]), points.turn], 1)
     turning = matrices(unit) - torch.eye(3)
     # sum_k w (R_k - 1)(x - c_k) + w t_k, without the table [A, K, 3] of every key point's own displacement.
-    blended = torch.einsum("ak,kij->aij", weights, turning)
+    blended = (weights @ turning.flatten(1)).reshape(-1, 3, 3)
     fixed = points.shift - torch.einsum("kij,kj->ki", turning, points.centre)
-    shift = torch.einsum("aij,aj->ai", blended, means) + weights @ fixed
+    shift = (blended @ means[:, :, None])[:, :, 0] + weights @ fixed
     return Field(shift, weights @ points.turn)
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gsstream.api import FloatArray, FrameWork, IntArray, Motion, Scene, groups_for
-from gsstream.blocks import neighbour_distance, pixel_size
-from gsstream_comgs.influence import Field, KeyPoints, field_of, moved_by
+from gsstream.api import FrameWork, IntArray, Motion, Scene
+from gsstream.blocks import neighbour_distance, pixel_size, said_by_cells
+from gsstream_comgs.influence import KeyPoints, field_of, moved_by
 from gsstream_comgs.settings import MotionSettings
 
 
@@ -67,36 +67,7 @@ def fitted_motion(
             adam.zero_grad()
     with torch.no_grad():
         field = field_of(base.means, points())
-    return said_by_cells(scene, rows, field, side, settings.step * pixel)
-
-
-def said_by_cells(scene: Scene, rows: IntArray, field: Field, side: float, step: float) -> Motion | None:
-    """Return the rigid motions of small cells that come nearest to a field; None where no cell moves.
-
-    A cell moves when at least half of its Gaussians may.
-
-    Arguments:
-        scene: decoded, as both ends have it.
-        rows: [A] Gaussians that the field is of.
-        field: their motions.
-        side: of a cell, scene units; a float32.
-        step: of quantisation, scene units.
-    """
-    groups = groups_for(scene, side, 1, regroup=True)
-    total = np.bincount(groups.group_of, minlength=groups.count)
-    place = groups.group_of[rows]
-    hits = np.bincount(place, minlength=groups.count)
-    able = np.flatnonzero((hits > 0) & (2 * hits >= total))
-    values: FloatArray = np.concatenate([field.shift.numpy(), field.turn.numpy()], 1).astype(np.float64)
-    means = np.stack([np.bincount(place, values[:, i], groups.count) / np.maximum(hits, 1) for i in range(6)], 1)
-    steps = float(np.float32(step)), float(np.float32(step / side))
-    symbols = np.rint(means[able] / np.array([steps[0]] * 3 + [steps[1]] * 3)).astype(np.int32)
-    moved = symbols.any(1)
-    marks = np.zeros(groups.count, np.uint8)
-    marks[able[moved]] = 1
-    if not moved.any():
-        return None
-    return Motion(side, 1, marks, symbols[moved], *steps, predicted=False, regroup=True)
+    return said_by_cells(scene, rows, field.shift.numpy(), field.turn.numpy(), side, settings.step * pixel)
 
 
 def _start(centres: torch.Tensor, pixel: float) -> KeyPoints:

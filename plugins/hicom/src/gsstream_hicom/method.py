@@ -25,8 +25,7 @@ from gsstream.api import (
     send_delta,
     send_key,
 )
-from gsstream.blocks import changed_rows, detect_change
-from gsstream_hicom.births import added
+from gsstream.blocks import changed_rows, detect_change, fitted_copies
 from gsstream_hicom.motion import fitted_motions
 from gsstream_hicom.settings import HiCoMConfig
 
@@ -102,7 +101,11 @@ class HiCoM(StreamingMethod[HiCoMState]):
         """As many of the least opaque leave as there are more than in frame 0; then this frame's are born."""
         deaths = np.sort(np.argsort(scene.gaussians.opacities, kind="stable")[: len(scene.gaussians) - number])
         kept = scene.gaussians.rows(np.delete(np.arange(len(scene.gaussians)), deaths)).map(torch.from_numpy)
-        born = added(kept, work, epochs, self.config.births, tools.rng).map(lambda value: value.numpy())
+        births = self.config.births
+        born = fitted_copies(
+            kept, work, epochs, tools.rng, gradient=births.gradient, most=births.most, rounds=births.rounds,
+            prune_opacity=births.prune_opacity,
+        ).map(lambda value: value.numpy())  # fmt: skip
         if not len(born):
             return Rows(deaths=deaths)
         return Rows(own_nodes(born, np.zeros(len(born), np.uint8), len(scene.layout.node_counts)), deaths)

@@ -1,0 +1,64 @@
+"""Gaussians that are copied where the images pull at the scene, and fitted while the rest holds still."""
+
+from __future__ import annotations
+
+import torch
+
+from gsstream.core.context import FrameWork
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.rng import Rng
+from gsstream.growth.fitting import fitted_births, joined
+
+
+def fitted_copies(
+    scene: Gaussians[torch.Tensor], work: FrameWork, epochs: int, rng: Rng, *, gradient: float, most: int, rounds: int,
+    prune_opacity: float,
+) -> Gaussians[torch.Tensor]:  # fmt: skip
+    """Return the Gaussians that a frame adds to a scene, raw values.
+
+    Arguments:
+        scene: N rows, after the frame's motions and without those that leave.
+        work: the frame.
+        epochs: passes over the training cameras, spread over the rounds.
+        rng: random streams by name and frame.
+        gradient: as for :func:`pulled_rows`.
+        most: Gaussians that are added at most.
+        rounds: times that the scene is searched for places.
+        prune_opacity: opacity below which an added Gaussian is given up, 0 to 1.
+    """
+    born = scene.rows(slice(0, 0))
+    views = list(range(len(work.cameras)))
+    for round_ in range(rounds):
+        passes = epochs * (round_ + 1) // rounds - epochs * round_ // rounds
+        room = most - len(born)
+        if not passes or (room <= 0 and not len(born)):
+            continue
+        inner = work.on(joined(scene, born) if len(born) else scene)
+        copies = inner.gaussians.rows(pulled_rows(inner, gradient)[: max(0, room)].sort().values)
+        born = joined(born, copies) if len(born) else copies
+        if not len(born):
+            continue
+        born = fitted_births(scene, born, work, views, passes, rng)
+        born = born.rows(born.opacities.sigmoid() >= prune_opacity)
+    return born
+
+
+def pulled_rows(work: FrameWork, gradient: float) -> torch.Tensor:
+    """Return the rows [P] whose mean screen gradient exceeds a bound, the largest first.
+
+    The gradient is that of the mean absolute difference between what a view shows and what its camera recorded; the
+    mean is over the views in which it is not zero.
+
+    Arguments:
+        work: the frame, seen from the scene that is searched.
+        gradient: the bound, in half image widths.
+    """
+    half = torch.tensor([work.cameras.width / 2, work.cameras.height / 2])
+    total, count = torch.zeros(len(work.gaussians)), torch.zeros(len(work.gaussians))
+    for view in range(len(work.cameras)):
+        difference = work.previous_render(view) - work.image(view)
+        norm = (work.screen_gradient(view, difference.sign() / difference.numel()).gradient * half).norm(dim=1)
+        total, count = total + norm, count + (norm > 0)
+    pull = total / count.clamp_min(1)
+    hot = (pull > gradient).nonzero()[:, 0]
+    return hot[torch.argsort(pull[hot], descending=True, stable=True)]

@@ -1,0 +1,1 @@
+"""3DGStream for gsstream. Importing this package imports no torch."""

@@ -1,0 +1,123 @@
+"""3DGStream (Sun et al., CVPR 2024) as a method of its own."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+import torch
+
+from gsstream.api import (
+    Delta,
+    Frame,
+    FrameTools,
+    IntArray,
+    Layout,
+    PlayerState,
+    Rows,
+    Scene,
+    Step,
+    StreamingMethod,
+    Tools,
+    apply_motion,
+    own_nodes,
+    send_delta,
+    send_key,
+)
+from gsstream.blocks import changed_rows, detect_change, fitted_copies
+from gsstream_stream3dgs.motion import fitted_motion
+from gsstream_stream3dgs.settings import Stream3DGSConfig
+
+
+@dataclass(frozen=True)
+class Stream3DGSState:
+    """``player``: what every player has. ``previous``: the images its scene shows. ``number``: that of Gaussians kept.
+    """
+
+    player: PlayerState
+    previous: Frame
+    number: int
+
+
+@final
+class Stream3DGS(StreamingMethod[Stream3DGSState]):
+    """Moves Gaussians by a network and adds some for a frame (paper: Sun et al., CVPR 2024).
+
+    In every frame a hash grid with a small network is fitted, which gives every Gaussian in the box a shift and a turn;
+    then Gaussians are copied where the images still pull, fitted, and given up in the next frame. What is sent are
+    rigid motions of small cells, which come nearest to what the network does, births and deaths; not the network.
+    Where this differs from what is published, and why: README of this plugin.
+    """
+
+    source = "3DGStream (Sun et al. 2024)"
+
+    Config = Stream3DGSConfig
+    heeds = ("stream.epochs",)
+
+    def begin(self, frame: Frame, tools: Tools) -> Step[Stream3DGSState]:
+        first = tools.first_frame(frame)
+        number = len(first.gaussians)
+        extent = np.array([frame.cameras.extent], np.float32)
+        layout = Layout(np.ones(number, np.int32), np.zeros(number, np.uint8), extent)
+        packet, player = send_key(first.gaussians, layout, first.meta, frame.index)
+        return Step(Stream3DGSState(player, frame, number), packet, "key", first.metrics)
+
+    def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> Stream3DGSState:
+        return Stream3DGSState(player, shown, len(next(tools.since_key()).gaussians))
+
+    def step(self, state: Stream3DGSState, frame: Frame, tools: Tools) -> Step[Stream3DGSState]:
+        clock = [time.perf_counter()]
+        if frame.effort == 0 or np.array_equal(state.previous.images, frame.images):
+            return self._send(state, frame, Delta())
+        epochs = tools.epochs(frame)
+        for_births = max(1, round(self.config.births.share * epochs)) if self.config.births.share else 0
+        scene = state.player.scene
+        work = tools.open(state.player, state.previous, frame)
+        rows = self._changed(work.gaussians.means, work, state.previous, frame)
+        # Those of the frame before are given up: they neither move nor hide what does.
+        rows = rows[rows < state.number]
+        alone = work.on(work.gaussians.rows(slice(0, state.number)))
+        passes = max(1, epochs - for_births)
+        motion = fitted_motion(scene, alone, rows, passes, self.config.cache, tools.rng) if len(rows) else None
+        motions = () if motion is None else (motion,)
+        moved = scene if motion is None else apply_motion(scene, motion)[0]
+        clock.append(time.perf_counter())
+        change = self._rows(moved, state.number, work, for_births, tools)
+        clock.append(time.perf_counter())
+        step = self._send(state, frame, Delta(motions).with_rows(change))
+        clock.append(time.perf_counter())
+        facts = {
+            "iterations": epochs * len(frame.cameras), "births": 0 if change.births is None else len(change.births),
+            "deaths": len(change.deaths), "moving_groups": sum(int(motion.moving.sum()) for motion in motions),
+            "seconds": dict(zip(("motion", "growth", "code"), np.diff(clock).tolist(), strict=True)),
+        }  # fmt: skip
+        return replace(step, metrics={**step.metrics, **facts})
+
+    def _changed(self, means: torch.Tensor, work: FrameTools, previous: Frame, frame: Frame) -> IntArray:
+        """Rows that may move."""
+        settings = self.config.cache
+        change = detect_change(previous, frame, settings.change)
+        return changed_rows(change, means, frame.cameras, work.session, settings.votes).nonzero()[:, 0].numpy()
+
+    def _rows(self, scene: Scene, number: int, work: FrameTools, epochs: int, tools: Tools) -> Rows:
+        """Those of the frame before leave, which stand behind the rows of frame 0; then this frame's are born."""
+        deaths = np.arange(number, len(scene.gaussians))
+        kept = scene.gaussians.rows(np.delete(np.arange(len(scene.gaussians)), deaths)).map(torch.from_numpy)
+        births = self.config.births
+        if not epochs:
+            return Rows(deaths=deaths)
+        born = fitted_copies(
+            kept, work, epochs, tools.rng, gradient=births.gradient, most=births.most, rounds=births.rounds,
+            prune_opacity=births.prune_opacity,
+        ).map(lambda value: value.numpy())  # fmt: skip
+        if not len(born):
+            return Rows(deaths=deaths)
+        return Rows(own_nodes(born, np.zeros(len(born), np.uint8), len(scene.layout.node_counts)), deaths)
+
+    def _send(self, state: Stream3DGSState, frame: Frame, delta: Delta) -> Step[Stream3DGSState]:
+        packet, player = send_delta(state.player, delta)
+        if delta.is_empty:
+            return Step(replace(state, player=player), packet, "empty")
+        return Step(Stream3DGSState(player, frame, state.number), packet, "delta")

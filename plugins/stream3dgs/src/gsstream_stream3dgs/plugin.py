@@ -1,0 +1,30 @@
+"""What this plugin ships, described without importing torch."""
+
+from __future__ import annotations
+
+from gsstream.spec import ComponentSpec, MethodSpec, hookimpl
+
+
+@hookimpl
+def gsstream_components() -> list[ComponentSpec]:
+    """The method as one part."""
+    return [
+        ComponentSpec(
+            kind="stepper",
+            name="stream3dgs",
+            target="gsstream_stream3dgs.method:Stream3DGS",
+            summary="a hash grid and a small network move what is there; Gaussians that live for one frame",
+        )
+    ]
+
+
+@hookimpl
+def gsstream_methods() -> list[MethodSpec]:
+    """The paper's setting."""
+    return [
+        MethodSpec(
+            name="stream3dgs",
+            recipe="gsstream_stream3dgs:recipes/stream3dgs.yaml",
+            summary="3DGStream: 8 passes for motion, 5 for the frame's own Gaussians",
+        )
+    ]

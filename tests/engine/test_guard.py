@@ -63,13 +63,18 @@ FUNCTIONS: dict[tuple[str, str], tuple[bool, bool]] = {
 
 
 class Failing:
-    """A part that raises in one of its functions in one frame, and otherwise does what the sound one does."""
+    """A part that raises in one of its functions in one frame, and otherwise does what the sound one does.
+
+    It states no formulas: a part that does is not called in the inner loop.
+    """
 
     def __init__(self, part: Any, function: str, where: Where, frame: int = BAD) -> None:
         self.__dict__.update(part=part, function=function, where=where, frame=frame)
 
     def __getattr__(self, name: str) -> Any:
         value = getattr(self.part, name)
+        if name in ("law", "price"):
+            return lambda: None
         if name != self.function:
             return value
         if not callable(value):

@@ -24,7 +24,7 @@ input { flex: 1; min-width: 60px; accent-color: #e8a33d; }
 .message, .facts { position: absolute; left: 12px; top: 12px; max-width: calc(100% - 24px); padding: 6px 10px;
   border-radius: 4px;
   background: #000a; white-space: pre-line; pointer-events: none; }
-.message { left: 50%; top: 45%; transform: translate(-50%, -50%); text-align: center; }
+.message { inset: 0; margin: auto; width: fit-content; height: fit-content; text-align: center; }
 .facts { font-variant-numeric: tabular-nums; }
 [hidden] { display: none; }
 @media (max-width: 560px) { .wide { display: none; } }`;
@@ -57,7 +57,7 @@ export class PlayerElement extends HTMLElement {
     root.innerHTML = `<style>${STYLE}</style>${PAGE}`;
     const named = [...root.querySelectorAll("[class]")].map((part) => [part.classList[0], part]);
     this.parts = { canvas: root.querySelector("canvas"), ...Object.fromEntries(named) };
-    this.parts.bar.hidden = this.getAttribute("controls") === "false";
+    this.parts.bar.hidden = true;
     try {
       this._makePlayer();
     } catch (error) {
@@ -82,6 +82,7 @@ export class PlayerElement extends HTMLElement {
   /** Open a stream. What goes wrong is said in the page; the promise resolves in any case. */
   async load(url) {
     this._tell("Loading …");
+    this.parts.bar.hidden = true;
     try {
       await this.player.open(url);
       this._fillLists();
@@ -182,6 +183,7 @@ export class PlayerElement extends HTMLElement {
 
   _fillLists() {
     const { parts, player } = this;
+    parts.bar.hidden = this.getAttribute("controls") === "false";
     parts.camera.replaceChildren(
       ...player.views.map((view) => new Option(view.split === "test" ? `${view.id} (held out)` : view.id)),
     );

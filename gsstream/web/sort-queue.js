@@ -11,6 +11,7 @@ export class SortQueue {
     this.milliseconds = 0;
     this.busy = false;
     this.waiting = null;
+    this.asked = null;
     this.worker = useWorker ? startWorker() : null;
     this.local = this.worker ? null : new DepthSorter();
     if (this.worker) {
@@ -21,20 +22,29 @@ export class SortQueue {
   }
 
   reset(capacity) {
+    this.asked = null;
     this.mirror = { capacity, positions: new Float32Array(3 * capacity).fill(NaN) };
     if (this.worker) this.worker.postMessage({ reset: capacity });
     else this.local.reset(capacity);
   }
 
   update(slots, positions) {
+    this.asked = null;
     for (let i = 0; i < slots.length; i += 1)
       this.mirror.positions.set(positions.subarray(3 * i, 3 * i + 3), 3 * slots[i]);
     if (this.worker) this.worker.postMessage({ slots, positions }, [slots.buffer, positions.buffer]);
     else this.local.update(slots, positions);
   }
 
-  /** Ask for the order of a view; of several requests that wait only the last one is carried out. */
+  /** Ask for the order of a view, unless it is known; of several requests that wait only the last is carried out. */
   request(axis, near) {
+    const asked = [...axis, near].join();
+    if (asked === this.asked) return;
+    this.asked = asked;
+    this._send(axis, near);
+  }
+
+  _send(axis, near) {
     if (!this.worker) {
       this.order = this.local.sort(axis, near);
     } else if (this.busy) {
@@ -47,6 +57,7 @@ export class SortQueue {
 
   /** The exact order of a view at once, on this thread, equal depths as in `list`: for pictures that are measured. */
   sortNow(axis, near, list) {
+    this.asked = null;
     const sorter = new DepthSorter();
     sorter.reset(this.mirror.capacity);
     sorter.positions.set(this.mirror.positions);
@@ -63,7 +74,7 @@ export class SortQueue {
     this.busy = false;
     const { waiting } = this;
     this.waiting = null;
-    if (waiting) this.request(waiting.axis, waiting.near);
+    if (waiting) this._send(waiting.axis, waiting.near);
     this.onOrder();
   }
 
@@ -75,6 +86,7 @@ export class SortQueue {
     this.local.reset(this.mirror.capacity);
     this.local.positions.set(this.mirror.positions);
     this.busy = false;
+    this.asked = null;
     this.onOrder();
   }
 }

@@ -74,8 +74,8 @@ export class Projection {
 }
 
 /**
- * The second step: a quad for each Gaussian that is seen, all with one call and no instances. Graphics work on many
- * vertices at a time, and an instance of four wastes most of that: drawn by a processor it costs 40 microseconds.
+ * The second step: a quad for each Gaussian that is seen, all with one call and no instances. An instance of
+ * four vertices costs what one of many does: 40 microseconds where a processor draws.
  */
 export class Quads {
   constructor(gl) {

@@ -30,20 +30,28 @@ export class Statistics {
   text() {
     const { player } = this;
     if (!player.state) return "";
-    const mean = (list) => (list.length ? list.reduce((sum, value) => sum + value, 0) / list.length : 0);
-    const bytes = mean(this.frames);
-    const rate = (bytes * 8 * player.fps) / 1e6;
+    const mean = (list) => list.reduce((sum, value) => sum + value, 0) / list.length;
     const { buffer } = player;
     const loaded = `${(buffer.received / 1e6).toFixed(2)} MB loaded`;
-    return [
+    const lines = [
       buffer.live ? `live, frame ${player.frame}` : `frame ${player.frame} of ${player.first} to ${player.last}`,
       `${player.state.number.toLocaleString("en")} Gaussians`,
-      `${(bytes / 1000).toFixed(1)} KB a frame between key packets, ${rate.toFixed(2)} Mbit/s`,
       buffer.live
         ? `${loaded}, ${buffer.latency.text()}`
         : `${loaded}, ${buffer.secondsAfter(player.frame).toFixed(1)} s ahead`,
-      `decoding ${mean(this.decoding).toFixed(1)} ms, sorting ${player.renderer.sorter.milliseconds.toFixed(1)} ms`,
-      `${(this.uploaded / 1000).toFixed(0)} KB to the graphics a picture, ${this.drawn.toFixed(0)} pictures/s`,
-    ].join("\n");
+      `sorting ${player.renderer.sorter.milliseconds.toFixed(1)} ms`,
+    ];
+    // Of frames that were decoded since the statistics are shown; before there is one, there is nothing to say.
+    if (this.frames.length) {
+      const bytes = mean(this.frames);
+      const rate = (bytes * 8 * player.fps) / 1e6;
+      lines.push(`${(bytes / 1000).toFixed(1)} KB a frame between key packets, ${rate.toFixed(2)} Mbit/s`);
+      lines.push(`decoding ${mean(this.decoding).toFixed(1)} ms`);
+    }
+    if (this.drawn) {
+      const uploaded = (this.uploaded / 1000).toFixed(0);
+      lines.push(`${uploaded} KB to the graphics a picture, ${this.drawn.toFixed(1)} pictures/s`);
+    }
+    return lines.join("\n");
   }
 }

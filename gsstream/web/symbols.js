@@ -179,7 +179,7 @@ export class AnsDecoder {
       let begin = begins;
       let width = ends - begins;
       if (quantile >= begins && quantile < ends) {
-        // The commonest symbol, mostly 0, needs no look at the tables: the processor foresees it.
+        // The commonest symbol needs no tables.
         out[i] = common + shift;
       } else {
         let symbol = guide[quantile >>> GUIDE_SHIFT];

@@ -17,6 +17,7 @@ const actions = {
   until: (expression, seconds) => browser.until(expression, seconds),
   evaluate: (expression) => browser.evaluate(expression),
   pause,
+  processor: () => browser.processorTime(),
   throttle: (bytes) =>
     browser.send("Network.emulateNetworkConditions", {
       offline: false,

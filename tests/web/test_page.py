@@ -100,6 +100,19 @@ def test_playing_seeking_keys_and_views(site, tmp_path):
     assert cameras == 2
 
 
+def test_a_picture_that_does_not_change_is_not_drawn_again(site, tmp_path):
+    """Every picture asked for the order, and every order for a picture, without an end."""
+    drawn = ["evaluate", f"{PLAYER}.statistics.drawn"]
+    steps = [
+        ["go", "URL/index.html"], READY, ["pause", 1500], drawn, ["pause", 700], drawn,
+        ["evaluate", f"{PLAYER}.look(1)"], ["pause", 1000], drawn,
+    ]  # fmt: skip
+    with serving(site) as (url, _):
+        results = in_browser(_at(url, steps), tmp_path, size=SIZE)
+    first, later, turned = (results[i] for i in (3, 5, 8))
+    assert 0 < first == later < turned <= later + 2
+
+
 def _at(url: str, steps: list) -> list:
     return [[item.replace("URL", url) if isinstance(item, str) else item for item in step] for step in steps]
 

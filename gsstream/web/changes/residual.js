@@ -89,7 +89,7 @@ function addDecoded(values, rows, gate, { symbols, places, channels, step, width
     let some = 0;
     for (let at = j; at < symbols.length; at += number) some |= symbols[at];
     if (some === 0 && !zeros) continue;
-    // Terms of symbols that are 0 are left out unless their sign may count. Float32Array rounds what it is given.
+    // A symbol of 0 adds nothing but, perhaps, a sign.
     let first = true;
     for (let c = 0, at = j; c < channels; c += 1, at += number) {
       if (symbols[at] === 0 && !zeros) continue;

@@ -36,7 +36,7 @@ def to_codes(name: str, values: FloatArray, bits: int) -> IntArray:
     if name == "quats":
         scaled = _unit(flat, bits)
     elif name in _COLORS:
-        scaled = np.rint(_to_luma(flat) * _color_scale(bits, flat.shape[1]))
+        scaled = np.rint(color_codes(flat, bits))
     else:
         scaled = np.rint(flat * 2.0**bits)
     if scaled.size and float(np.abs(scaled).max()) >= MAX_CODE:
@@ -58,6 +58,31 @@ def from_codes(name: str, codes: IntArray, bits: int) -> FloatArray:
     if name in _COLORS:
         return _from_luma(codes / _color_scale(bits, codes.shape[1])).astype(np.float32)
     return codes.astype(np.float32) * np.float32(2.0**-bits)
+
+
+def color_codes(values: FloatArray, bits: int) -> FloatArray:
+    """Return the codes [N, width] float64 of colours before they are rounded.
+
+    Arguments:
+        values: [N, ...] coefficients, three channels each.
+        bits: fractional bits.
+    """
+    flat = np.asarray(values, np.float64).reshape(len(values), math.prod(values.shape[1:]))
+    return np.asarray(_to_luma(flat) * _color_scale(bits, flat.shape[1]))
+
+
+def color_slopes(gradients: FloatArray, bits: int) -> FloatArray:
+    """Return the derivative [N, width] float64 by the codes of colours, from that by the colours themselves.
+
+    Arguments:
+        gradients: [N, ...] derivative by the coefficients, three channels each.
+        bits: fractional bits.
+    """
+    flat = np.asarray(gradients, np.float64).reshape(len(gradients), math.prod(gradients.shape[1:]))
+    # A row for each of luma and the two chromas: the colour that one of it makes.
+    colors = _from_luma(np.eye(3))
+    by_code = (flat.reshape(len(flat), -1, 3) @ colors.T).reshape(flat.shape)
+    return np.asarray(by_code / _color_scale(bits, flat.shape[1]))
 
 
 def fold_quats(codes: IntArray, bits: int) -> IntArray:

@@ -179,6 +179,11 @@ class Codec(Section):
         description="share of each delta packet's bytes given up, the symbols and gates that explain least per bit; "
         "not read under a budget of size, which trims as far as it must",
     )  # fmt: skip
+    key_rate: float = Field(
+        default=0.0, ge=0,
+        description="squared error that a bit of frame 0's view-dependent colour must save, in mean squared errors "
+        "of one channel of a training image's pixel; 0: every coefficient is rounded to the nearest",
+    )  # fmt: skip
     fsync: bool = Field(default=False, description="force every packet to disk before the next frame starts")
 
 

@@ -44,6 +44,7 @@ from gsstream.core.gaussians import Gaussians as Gaussians
 from gsstream.core.hierarchy import Hierarchy as Hierarchy
 from gsstream.core.hierarchy import tree_max as tree_max
 from gsstream.core.hierarchy import tree_roots as tree_roots
+from gsstream.core.joint import JointCode as JointCode
 from gsstream.core.part import Part as Part
 from gsstream.core.part import PartConfig as PartConfig
 from gsstream.core.part import Traits as Traits
@@ -54,6 +55,7 @@ from gsstream.core.shapes import check_finite as check_finite
 from gsstream.core.shapes import check_shape as check_shape
 from gsstream.gate.base import GateSampler as GateSampler
 from gsstream.gate.base import GateTraits as GateTraits
+from gsstream.gate.base import RoundedSigmoid as RoundedSigmoid
 from gsstream.growth.base import Growth as Growth
 from gsstream.loss.base import Loss as Loss
 from gsstream.method.base import MethodState as MethodState
@@ -69,6 +71,7 @@ from gsstream.motion.base import MotionPart as MotionPart
 from gsstream.optimiser.base import ADAM_BETAS as ADAM_BETAS
 from gsstream.optimiser.base import ADAM_EPS as ADAM_EPS
 from gsstream.optimiser.base import AdamState as AdamState
+from gsstream.optimiser.base import ResidualTable as ResidualTable
 from gsstream.optimiser.base import RowOptimiser as RowOptimiser
 from gsstream.packet import EncodedPacket as EncodedPacket
 from gsstream.packet import PlayerState as PlayerState
@@ -76,8 +79,11 @@ from gsstream.packet import StreamMeta as StreamMeta
 from gsstream.packet import quantise_decoders as quantise_decoders
 from gsstream.propagation.base import Propagation as Propagation
 from gsstream.propagation.base import PropagationTraits as PropagationTraits
+from gsstream.regularizer.base import GatePrice as GatePrice
 from gsstream.regularizer.base import Regularizer as Regularizer
 from gsstream.regularizer.base import RegularizerTraits as RegularizerTraits
+from gsstream.render.base import Comparison as Comparison
+from gsstream.render.base import Pulled as Pulled
 from gsstream.render.base import RenderCache as RenderCache
 from gsstream.render.base import Renderer as Renderer
 from gsstream.render.base import RenderOutput as RenderOutput

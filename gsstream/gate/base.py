@@ -26,6 +26,37 @@ class GateTraits(Traits):
     temperature: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class RoundedSigmoid:
+    """A gate without noise whose formulas are known: a sigmoid rounded to levels, straight-through.
+
+    Arguments:
+        temperature: the soft gate is sigmoid(logit / temperature).
+        levels: non-zero values that it is rounded to; its gradient is that of the soft gate.
+        margin: logit at which a gate is open with probability one half; the probability is sigmoid(logit - margin).
+        bound: logits are kept within -bound to bound.
+    """
+
+    temperature: float
+    levels: int
+    margin: float
+    bound: float
+
+    def gates(self, logits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the gates [M] of logits [M], and their derivatives."""
+        x = logits / self.temperature
+        soft = torch.sigmoid(x)
+        # Divided by a tensor, as the decoder divides: a product with 1 / levels would be another number.
+        levels = soft.new_tensor(float(self.levels))
+        return torch.round(soft * levels) / levels, soft * torch.sigmoid(-x) / self.temperature
+
+    def probability(self, logits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the probabilities [M] that gates are open, and their derivatives by the logits [M]."""
+        x = logits - self.margin
+        open_probability = torch.sigmoid(x)
+        return open_probability, open_probability * torch.sigmoid(-x)
+
+
 class GateSampler(Part):
     """Samples gates in [0, 1] from trainable logits.
 
@@ -71,3 +102,10 @@ class GateSampler(Part):
     def bound(self, logits: torch.Tensor) -> torch.Tensor:
         """Return the logits projected into the bounds that the part keeps them in; say in its settings which they are.
         """
+
+    def law(self) -> RoundedSigmoid | None:
+        """Return the formulas of this gate as it is configured, where they are those of :class:`RoundedSigmoid`.
+
+        The engine then uses them in its inner loop and differentiates nothing; None: it calls the part.
+        """
+        return None

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
 
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.joint import JointCode
 from gsstream.core.part import Part
 
 ADAM_BETAS = (0.9, 0.999)
@@ -63,3 +65,64 @@ class RowOptimiser(Part):
             ShapeError: shapes that differ, a gradient that is not finite or beyond MAX_GRADIENT (that table is not
                 changed then).
         """
+
+    def residual_table(
+        self, code: JointCode, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor
+    ) -> ResidualTable | None:
+        """Return a faster :class:`ResidualTable` of zero latents; None: the engine makes its own from :meth:`step`.
+
+        Arguments:
+            code: columns of the attributes.
+            base: the A rows that the residual is added to.
+            units: [A] unit of the position of each row, scene units.
+            matrix: [L, D] decoders to start from.
+        """
+        return None
+
+
+class ResidualTable(ABC):
+    """The residual of A rows in one frame's optimisation: latents behind linear decoders, gated, trained by Adam.
+
+    It is ``gsstream.residual.joint`` (rounding counts as the identity), the rate of ``gsstream.residual.rate`` and
+    :meth:`RowOptimiser.step`, up to rounding, and a part may do all three at once. In every iteration ``rows``,
+    ``pull`` and ``step`` are called in this order.
+    """
+
+    @property
+    @abstractmethod
+    def latents(self) -> torch.Tensor:
+        """[A, L] leaf that requires grad: what waits in its ``grad`` is added to the gradient of the next step."""
+
+    @property
+    @abstractmethod
+    def matrix(self) -> torch.Tensor:
+        """[L, D] decoders as they are now."""
+
+    @property
+    @abstractmethod
+    def curvature(self) -> torch.Tensor:
+        """[A, L] running mean of the squared gradient of the latents."""
+
+    @abstractmethod
+    def rows(self, gates: torch.Tensor) -> Gaussians[torch.Tensor]:
+        """Return the A rows with their residual behind ``gates`` [A], contiguous, without a graph."""
+
+    @abstractmethod
+    def pull(self, gradients: Gaussians[torch.Tensor], rate_weight: float) -> torch.Tensor:
+        """Take the gradient by the rows that were returned last, and return that by their gates [A].
+
+        Arguments:
+            gradients: like the rows.
+            rate_weight: loss per bit of the latents behind open gates; 0: bits cost nothing.
+        """
+
+    @abstractmethod
+    def step(self) -> None:
+        """Make one step of Adam from what was pulled, and what waits on ``latents``.
+
+        Raises ShapeError where a gradient is not finite.
+        """
+
+    @abstractmethod
+    def keep(self, rows: torch.Tensor) -> None:
+        """Go on with these rows [K] of the A, and with the steps they have taken."""

@@ -30,6 +30,38 @@ class RegularizerTraits(Traits):
     gate_terms: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class GatePrice:
+    """Penalty whose formula is known: the sum over rows i of p_i (gate + motion |r_i|^2), p_i as of the row's node.
+
+    Arguments:
+        gate: price of a row behind an open gate.
+        motion: price of its squared position residual, per cell^2.
+        mean: divide the sum by the number of Gaussians of the scene.
+    """
+
+    gate: float
+    motion: float
+    mean: bool = True
+
+    def slopes(
+        self, open_probability: torch.Tensor, residual: torch.Tensor, hierarchy: Hierarchy, num_gaussians: int
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the derivatives by the probabilities [M] and by the residual [A, 3].
+
+        Arguments:
+            open_probability: [M] probability that each node's gate is not zero.
+            residual: [A, 3] ungated position residual, cells.
+            hierarchy: of the A rows.
+            num_gaussians: N, the divisor of a mean.
+        """
+        divisor = max(num_gaussians, 1) if self.mean else 1
+        rows = self.gate + self.motion * residual.square().sum(1)
+        by_probability = torch.zeros_like(open_probability).index_add_(0, hierarchy.node_of, rows) / divisor
+        weight = (2 * self.motion / divisor) * open_probability[hierarchy.node_of]
+        return by_probability, weight[:, None] * residual
+
+
 class Regularizer(Part):
     """Each term is a finite scalar >= 0; the total is their sum; all closed and zero residual costs exactly 0."""
 
@@ -50,3 +82,10 @@ class Regularizer(Part):
             hierarchy: the hierarchy seen by the A active rows.
             num_gaussians: N, the divisor of a mean over the whole scene (closed rows contribute nothing).
         """
+
+    def price(self) -> GatePrice | None:
+        """Return the formula of this penalty as it is configured, where it is that of :class:`GatePrice`.
+
+        The engine then uses it in its inner loop and differentiates nothing; None: it calls the part.
+        """
+        return None

@@ -8,7 +8,7 @@ from typing import final
 import torch
 
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.regularizer.base import Regularizer
+from gsstream.regularizer.base import GatePrice, Regularizer
 
 
 @final
@@ -21,3 +21,6 @@ class NoRegularizer(Regularizer):
         self, open_probability: torch.Tensor, residual: torch.Tensor, hierarchy: Hierarchy, num_gaussians: int
     ) -> Mapping[str, torch.Tensor]:
         return {}
+
+    def price(self) -> GatePrice:
+        return GatePrice(0.0, 0.0)

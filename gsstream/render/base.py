@@ -7,8 +7,8 @@ counts while the transmittance before it exceeds 1e-4, near plane ``cameras.near
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 
@@ -17,49 +17,11 @@ from gsstream.core.context import ScreenGradient
 from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.part import Part
-
-TILE = 16
-
-
-@dataclass(frozen=True, slots=True)
-class RenderOutput:
-    """One rendered view.
-
-    Arguments:
-        image: [H, W, 3] composited colour; with a tile mask only active tiles are defined (others hold the cached
-            render in a session, the background elsewhere).
-        alpha: [H, W] 1 - transmittance.
-        tiles: [ceil(H / 16), ceil(W / 16)] bool, in a session: the tiles that the active rows are in, now or as the
-            session was opened. All others hold the same image in every render of the session. None: any may differ.
-    """
-
-    image: torch.Tensor
-    alpha: torch.Tensor
-    tiles: torch.Tensor | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class RenderCache:
-    """Memory a session keeps for its cameras.
-
-    Arguments:
-        per_view: bytes of each view that is cached, scratch and images included; views drawn anew each time are absent.
-        gaussians: N of the scene.
-    """
-
-    per_view: Mapping[int, int] = field(default_factory=dict)
-    gaussians: int = 0
-
-    @property
-    def total(self) -> int:
-        """Bytes of all views."""
-        return sum(self.per_view.values())
-
-    @property
-    def per_camera_and_gaussian(self) -> float:
-        """Bytes per cached camera and Gaussian; 0 where nothing is cached."""
-        count = len(self.per_view) * self.gaussians
-        return self.total / count if count else 0.0
+from gsstream.render.output import TILE as TILE
+from gsstream.render.output import Comparison as Comparison
+from gsstream.render.output import Pulled as Pulled
+from gsstream.render.output import RenderCache as RenderCache
+from gsstream.render.output import RenderOutput as RenderOutput
 
 
 class RenderSession(ABC):
@@ -126,6 +88,22 @@ class RenderSession(ABC):
     @abstractmethod
     def narrow(self, active: torch.Tensor) -> None:
         """Freeze all rows but ``active`` [A], ascending. Replaces an earlier choice."""
+
+    def pull(self, view: int, rows: Gaussians[torch.Tensor], comparison: Comparison) -> Pulled | None:
+        """Render camera ``view``, compare it and differentiate, in one call; None where there is no such short cut.
+
+        It stands for ``render``, the loss's ``evaluate`` on the tiles that the rows can change, and the backward pass,
+        whose results it gives up to rounding; whoever gets None makes these calls.
+
+        Arguments:
+            view: index of a camera of the rig.
+            rows: the A active rows, raw parameters; no graph is looked at.
+            comparison: what the render is compared with.
+
+        Raises:
+            ShapeError: rows that cannot be rendered, or a loss that is not finite.
+        """
+        return None
 
     def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
         """Return the session of the next scene, equal bit for bit to one opened anew with ``gaussians``.

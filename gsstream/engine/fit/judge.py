@@ -9,10 +9,11 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
+from gsstream.engine.assembly.guard import plain
 from gsstream.engine.fit.backward import pull_back
 from gsstream.engine.fit.exposure import Exposure
 from gsstream.loss.base import Loss
-from gsstream.render.base import Renderer
+from gsstream.render.base import Comparison, Pulled, Renderer, RenderSession
 
 
 class Judge:
@@ -22,11 +23,35 @@ class Judge:
         loss: the photometric loss; dssim: its weight of 1 - SSIM.
         images: [V, H, W, 3] what the cameras recorded. What the loss makes of an image is made when it is first needed.
         exposure: colour maps of the cameras, or None.
+        in_one_go: let a session render, judge and differentiate in one call, where it can.
     """
 
-    def __init__(self, loss: Loss, dssim: float, images: FloatArray, exposure: Exposure | None) -> None:
+    def __init__(
+        self, loss: Loss, dssim: float, images: FloatArray, exposure: Exposure | None, in_one_go: bool = False
+    ) -> None:
         self._loss, self._dssim, self._images, self.exposure = loss, dssim, images, exposure
+        self._in_one_go = in_one_go
         self._targets: dict[int, Any] = {}
+
+    def pull(self, session: RenderSession, view: int, rows: Gaussians[torch.Tensor]) -> Pulled:
+        """Render a view, judge it, and pull the loss back to the rows that were rendered.
+
+        Arguments:
+            session: renders the scene.
+            view: index of a training camera.
+            rows: the active rows of the session; a graph of theirs is left alone.
+        """
+        if self._in_one_go:
+            exposure = self.exposure
+            maps = (exposure.matrix[view], exposure.offset[view]) if exposure else ()
+            comparison = Comparison(plain(self._loss), self._target(view), self._dssim, *maps)
+            pulled = session.pull(view, rows, comparison)
+            if pulled is not None:
+                return pulled
+        leaves = rows.map(lambda value: value.detach().requires_grad_())
+        output = session.render(view, leaves)
+        loss, _ = self.backward(view, output.image, output.tiles)
+        return Pulled(loss, leaves.map(_gradient))
 
     def backward(
         self, view: int, image: torch.Tensor, tiles: torch.Tensor | None = None
@@ -41,12 +66,15 @@ class Judge:
         Returns:
             The loss, and its gradient [H, W, 3] with respect to the recorded colours.
         """
-        if view not in self._targets:
-            self._targets[view] = self._loss.prepare(torch.from_numpy(self._images[view]))
         recorded = self.recorded(view, image.detach())
-        value, gradient = self._loss.evaluate(recorded, self._targets[view], self._dssim, tiles)
+        value, gradient = self._loss.evaluate(recorded, self._target(view), self._dssim, tiles)
         pull_back([image], [self.exposure.pull(view, gradient) if self.exposure else gradient])
         return value, gradient
+
+    def _target(self, view: int) -> Any:
+        if view not in self._targets:
+            self._targets[view] = self._loss.prepare(torch.from_numpy(self._images[view]))
+        return self._targets[view]
 
     def recorded(self, view: int, image: torch.Tensor) -> torch.Tensor:
         """Return [H, W, 3] scene colours as the camera of this view records them."""
@@ -70,3 +98,8 @@ def shown(
     with torch.no_grad():
         image = renderer.render(gaussians, cameras, view, background).image
     return exposure.apply(view, image) if exposure else image
+
+
+def _gradient(value: torch.Tensor) -> torch.Tensor:
+    """Gradient of a leaf; zeros where nothing reached it."""
+    return torch.zeros_like(value) if value.grad is None else value.grad

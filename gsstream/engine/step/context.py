@@ -12,6 +12,8 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.shapes import FloatArray
 from gsstream.core.storage import unpacked
 from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.assembly.checks import Checks
+from gsstream.engine.fit.backward import pull_back
 from gsstream.engine.fit.exposure import Exposure
 from gsstream.engine.fit.judge import Judge, shown
 from gsstream.engine.step.active.candidates import changed_rows
@@ -32,18 +34,21 @@ class FrameView:
         change: what changed since; None: everything counts as changed.
         session: a render session of this scene that is kept from before, or None.
         targets: [V, H, W, 3] what renders are compared with; None: the images of the frame.
+        judge: of the same targets and colour maps, which has made of them what it needs; None: a new one.
     """
 
     def __init__(
         self, parts: Assembly, gaussians: Gaussians[torch.Tensor], hierarchy: Hierarchy, frame: Frame, previous: Frame,
         exposure: Exposure | None, change: Change | None = None, session: RenderSession | None = None,
-        targets: FloatArray | None = None,
+        targets: FloatArray | None = None, judge: Judge | None = None,
     ) -> None:  # fmt: skip
         self._parts, self._gaussians, self._hierarchy = parts, gaussians, hierarchy
         self._frame, self._previous, self._change = frame, previous, change
         self._background = parts.recipe.background
         self._targets = frame.images if targets is None else targets
-        self.judge = Judge(parts.loss, parts.recipe.loss.dssim, self._targets, exposure)
+        # What the level "step" looks at, images and their gradients, is not seen where a session does all in one call.
+        in_one_go = parts.checks is not Checks.STEP
+        self.judge = judge or Judge(parts.loss, parts.recipe.loss.dssim, self._targets, exposure, in_one_go)
         self._session = session
 
     @property
@@ -133,15 +138,18 @@ class FrameView:
 
     def pull(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
         self._parts.where.count()
-        output = self.session.render(view, rows)
-        return self.judge.backward(view, output.image, output.tiles)[0]
+        loss, gradients = self.judge.pull(self.session, view, rows)
+        pairs = [(value, gradient) for (_, value), (_, gradient) in zip(rows.items(), gradients.items(), strict=True)]
+        if learned := [(value, gradient) for value, gradient in pairs if value.requires_grad]:
+            pull_back(*zip(*learned, strict=True))
+        return loss
 
     def backward(self, view: int, image: torch.Tensor, tile_mask: torch.Tensor | None = None) -> float:
         self._parts.where.count()
         return self.judge.backward(view, image, tile_mask)[0]
 
-    def on(self, gaussians: Gaussians[torch.Tensor]) -> FrameView:
+    def on(self, gaussians: Gaussians[torch.Tensor], session: RenderSession | None = None) -> FrameView:
         return FrameView(
             self._parts, gaussians, self._hierarchy, self._frame, self._previous, self.judge.exposure, self._change,
-            targets=self._targets,
+            session, self._targets, self.judge,
         )  # fmt: skip

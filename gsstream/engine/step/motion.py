@@ -67,7 +67,4 @@ def moved(
     # The session is handed on to the moved scene, with its caches of all that stands still. The old session stays
     # correct, as it must until the frame has succeeded: should it be used again, it fills its caches anew.
     session = view.session.commit(gaussians, torch.from_numpy(touched)) if 2 * len(touched) <= len(gaussians) else None
-    after = FrameView(
-        parts, gaussians, state.hierarchy, frame, state.previous, state.exposure, change, session, targets
-    )
-    return Moved(motions, scene, after)
+    return Moved(motions, scene, view.on(gaussians, session))

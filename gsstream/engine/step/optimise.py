@@ -6,18 +6,24 @@ from collections.abc import Mapping
 
 import torch
 
+from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.assembly.checks import Checks
+from gsstream.engine.assembly.guard import blaming
 from gsstream.engine.budget.pace import Pace, estimated_bytes
 from gsstream.engine.fit.backward import pull_back
+from gsstream.engine.fit.residual_table import JointTable
 from gsstream.engine.fit.row_table import RowTable
 from gsstream.engine.step.active.candidates import released
 from gsstream.engine.step.dead_gates import count_dead
 from gsstream.engine.step.levels import current_level, level_schedule
 from gsstream.engine.step.problem import Problem, Solution
+from gsstream.gate.base import RoundedSigmoid
+from gsstream.optimiser.base import ResidualTable
+from gsstream.regularizer.base import GatePrice
 from gsstream.residual.base import coarser, init_latents
-from gsstream.residual.joint import add_joint, decode_joint, join_features, joint_code, pull_back_joint
-from gsstream.residual.rate import rate_gradient
+from gsstream.residual.joint import JointCode, joint_code
 
 #: Rows leave only when at least a tenth of them can: each time, every view has to be frozen anew.
 WORTH_LEAVING = 0.9
@@ -66,47 +72,48 @@ class _FrameRun:
 
     def __init__(self, parts: Assembly, problem: Problem, generator: torch.Generator, pace: Pace) -> None:
         self.parts, self.problem, self.generator, self.pace = parts, problem, generator, pace
-        self.rows, self.base = problem.rows, problem.base
+        self.rows = problem.rows
         layout, rows = problem.layout, problem.rows.numpy()
         # Only gates with candidates behind them are sampled and trained. Sampling does not look at parents, so the
         # forest is replaced by roots.
         self.nodes, node_of = torch.unique(problem.hierarchy.node_of[problem.rows], return_inverse=True)
         self.logits = problem.logits
         self.hierarchy = _forest(node_of, len(self.nodes))
-        self.units = torch.from_numpy(layout.units_of(rows))
         self.levels = torch.from_numpy(layout.unit_of[rows].astype("int64"))
         self.schedule = level_schedule(parts.recipe.stream, layout.unit_of)
         codes = coarser(parts.update.codes(), problem.step_scale)
         latents = init_latents(parts.update, problem.base)
         self.decoder_names = {name: problem.decoders[name] for name in latents if name in problem.decoders}
         self.code = code = joint_code(codes, latents, self.decoder_names, problem.base)
-        self.features = join_features(code, problem.base)
-        start = torch.zeros(len(problem.base), code.width)
-        self.latents = RowTable({"latents": start}, {"latents": code.lrs}, parts.optimiser)
-        matrix = code.join_decoders(self.decoder_names)
-        self.decoders = RowTable({"matrix": matrix}, {"matrix": code.decoder_lrs}, parts.optimiser)
+        units = torch.from_numpy(layout.units_of(rows))
+        self.table = _table(parts, code, problem.base, units, code.join_decoders(self.decoder_names))
         rates = {"logits": parts.recipe.gate_training.lr}
         self.gate = RowTable({"logits": problem.logits[self.nodes]}, rates, parts.optimiser)
+        # Where both parts have known formulas nothing is differentiated; with the level "step" every call is looked at.
+        known = parts.checks is not Checks.STEP
+        self.law: RoundedSigmoid | None = parts.gate.law() if known else None
+        self.price: GatePrice | None = parts.regularizer.price() if known else None
 
     def step(self, view: int, iteration: int, fraction: float) -> float:
         """Make one iteration on one view; return the photometric loss."""
         self.parts.where.iteration = iteration
-        logits = self.gate["logits"]
-        gates = self._row_gates(logits, fraction)
+        logits, waiting = self.gate["logits"], self._waiting(fraction)
+        if self.law is None or self.price is None:
+            gates = self._row_gates(logits, waiting)
+        else:
+            gates = self._known_gates(self.law, waiting)
         shut = gates.detach()
-        latents, matrix = self.latents["latents"].detach(), self.decoders["matrix"].detach()
-        change = decode_joint(self.code, latents, matrix, self.units)
-        rows = add_joint(self.code, self.base, self.features, change, shut).map(_leaf)
-        output = self.problem.session.render(view, rows)
-        loss, _ = self.problem.judge.backward(view, output.image, output.tiles)
-        upstream = join_features(self.code, rows.map(_gradient))
-        back = pull_back_joint(self.code, upstream, change, matrix, shut, self.units)
-        if self.pace.rate_weight:
-            weight = self.pace.rate_weight / self.problem.pixels
-            back.latents.add_(rate_gradient(latents, self.code.steps, shut, weight))
-        self._step_gates(logits, gates, back.gates)
-        self.latents.step({"latents": back.latents})
-        self.decoders.step({"matrix": back.matrix})
+        with blaming("optimiser", self.parts.part("optimiser"), self.parts.where):
+            rows = self.table.rows(shut)
+        loss, gradients = self.problem.judge.pull(self.problem.session, view, rows)
+        with blaming("optimiser", self.parts.part("optimiser"), self.parts.where):
+            by_gate = self.table.pull(gradients, self.pace.rate_weight / self.problem.pixels)
+        if self.law is None or self.price is None:
+            self._step_gates(logits, gates, by_gate)
+        else:
+            self._step_known(self.law, self.price, by_gate if waiting is None else by_gate * ~waiting)
+        with blaming("optimiser", self.parts.part("optimiser"), self.parts.where):
+            self.table.step()
         return loss
 
     def _step_gates(self, logits: torch.Tensor, gates: torch.Tensor, upstream: torch.Tensor) -> None:
@@ -122,21 +129,44 @@ class _FrameRun:
         self.gate.step()
         self.gate["logits"].data.copy_(self.parts.gate.bound(self.gate["logits"].detach()))
 
-    def _row_gates(self, logits: torch.Tensor, fraction: float) -> torch.Tensor:
+    def _known_gates(self, law: RoundedSigmoid, waiting: torch.Tensor | None) -> torch.Tensor:
+        """What :meth:`_row_gates` returns, without a graph; how the gates change with the logits is kept."""
+        gates, self._slopes = law.gates(self.gate["logits"].detach())
+        per_row = gates[self.hierarchy.node_of]
+        return per_row if waiting is None else per_row * ~waiting
+
+    def _step_known(self, law: RoundedSigmoid, price: GatePrice, by_gate: torch.Tensor) -> None:
+        """Do what :meth:`_step_gates` does, by the formulas of the gate and of the penalty."""
+        logits, node_of = self.gate["logits"].detach(), self.hierarchy.node_of
+        upstream = torch.zeros_like(logits).index_add_(0, node_of, by_gate) * self._slopes
+        probability, slope = law.probability(logits)
+        total, residual = self.problem.hierarchy.num_gaussians, self._residual().detach()
+        by_probability, by_residual = price.slopes(probability, residual, self.hierarchy, total)
+        if price.motion and "means" in self.code.latent:
+            waits = torch.zeros(self.table.latents.shape)
+            waits[:, self.code.latent["means"]] = by_residual
+            self.table.latents.grad = waits
+        self.gate.step({"logits": upstream + slope * by_probability})
+        self.gate["logits"].data.clamp_(-law.bound, law.bound)
+
+    def _row_gates(self, logits: torch.Tensor, waiting: torch.Tensor | None) -> torch.Tensor:
         """[A] gate of every candidate; rows of levels that are not yet trained hold still."""
         noise = self.parts.gate.noise(self.hierarchy.num_nodes, self.generator)
         per_row = self.parts.gate.sample(logits, noise)[self.hierarchy.node_of]
-        waiting = self._waiting(fraction)
         return per_row if waiting is None else per_row * ~waiting
 
     def _waiting(self, fraction: float) -> torch.Tensor | None:
         """[A] bool: rows whose level is not trained yet at this share of the frame; None: all take part."""
         return self.levels > current_level(self.schedule, fraction) if self.schedule else None
 
-    def _penalty(self, logits: torch.Tensor) -> Mapping[str, torch.Tensor]:
+    def _residual(self) -> torch.Tensor:
+        """[A, 3] ungated position residual, in units of the rows: a view of the leaf."""
         columns = self.code.latent.get("means")
+        return torch.zeros(len(self.rows), 3) if columns is None else self.table.latents[:, columns]
+
+    def _penalty(self, logits: torch.Tensor) -> Mapping[str, torch.Tensor]:
         # The motion term also has a gradient with respect to the residual; it stays on the leaf until the latents step.
-        residual = torch.zeros(len(self.base), 3) if columns is None else self.latents["latents"][:, columns]
+        residual = self._residual()
         probability = self.parts.gate.open_probability(logits)
         total = self.problem.hierarchy.num_gaussians
         return self.parts.regularizer.penalty(probability, residual, self.hierarchy, total)
@@ -152,16 +182,15 @@ class _FrameRun:
         nodes, node_of = torch.unique(self.hierarchy.node_of[rows], return_inverse=True)
         self.nodes, self.hierarchy = self.nodes[nodes], _forest(node_of, len(nodes))
         self.gate.keep(nodes)
-        self.latents.keep(rows)
-        self.rows, self.base, self.features = self.rows[rows], self.base.rows(rows), self.features[rows]
-        self.units, self.levels = self.units[rows], self.levels[rows]
+        self.table.keep(rows)
+        self.rows, self.levels = self.rows[rows], self.levels[rows]
         self.problem.session.narrow(self.rows)
 
     def estimated_bytes(self) -> float:
         """What a packet would hold if this pass were the last: symbols behind open gates, and the gates."""
         gates = self.parts.gate.sample(self.gate["logits"].detach(), None)
         opened = torch.round(gates * self.parts.gate.num_levels) > 0
-        latents = self.latents["latents"].detach()[opened[self.hierarchy.node_of]]
+        latents = self.table.latents.detach()[opened[self.hierarchy.node_of]]
         return estimated_bytes(torch.round(latents / self.code.steps)) + float(opened.sum())
 
     def _all_logits(self) -> torch.Tensor:
@@ -175,12 +204,12 @@ class _FrameRun:
         self.pace.close()
         return Solution(
             rows=self.rows,
-            latents=self.code.split(self.latents["latents"].detach()),
-            decoders=self.code.split_decoders(self.decoders["matrix"].detach(), self.decoder_names),
+            latents=self.code.split(self.table.latents.detach()),
+            decoders=self.code.split_decoders(self.table.matrix, self.decoder_names),
             logits=self._all_logits(),
             loss=loss,
             iterations=iterations,
-            curvature=self.code.split(self.latents.moments("latents")["exp_avg_sq"]),
+            curvature=self.code.split(self.table.curvature),
             pace=self.pace,
             dead_gates=dead,
         )
@@ -192,10 +221,9 @@ def _forest(node_of: torch.Tensor, number: int) -> Hierarchy:
     return Hierarchy(node_of, roots, torch.zeros_like(roots))
 
 
-def _leaf(value: torch.Tensor) -> torch.Tensor:
-    return value.detach().requires_grad_()
-
-
-def _gradient(value: torch.Tensor) -> torch.Tensor:
-    """Gradient of a leaf; zeros where nothing reached it."""
-    return torch.zeros_like(value) if value.grad is None else value.grad
+def _table(
+    parts: Assembly, code: JointCode, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor
+) -> ResidualTable:
+    """The optimiser's own table of residuals where it has one; with the level "step", one whose every step is seen."""
+    fast = None if parts.checks is Checks.STEP else parts.optimiser.residual_table(code, base, units, matrix)
+    return JointTable(code, base, units, matrix, parts.optimiser) if fast is None else fast

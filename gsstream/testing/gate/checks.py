@@ -168,3 +168,23 @@ def check_gate_state_resume(part: GateSampler) -> None:
     assert got == (len(start),), f"init(): expected one logit per node, shape [{len(start)}], got {list(got)}"
     copy = torch.from_numpy(logits.detach().numpy().copy())
     all_equal("gates of copied logits", dict(_samples(part, copy)), dict(_samples(part, logits)))
+
+
+@check("gate")
+def check_gate_law(part: GateSampler) -> None:
+    """A gate that states its formulas keeps to them: gates, probabilities, their slopes, bounds, and no noise."""
+    law = part.law()
+    if law is None:
+        return
+    logits = torch.linspace(-9, 9, 181).requires_grad_()
+    seed = torch.Generator().manual_seed(1)
+    assert part.noise(len(logits), seed) is None, "law(): expected a gate without noise, got one that draws some"
+    assert part.num_levels == law.levels, f"law(): expected {part.num_levels} levels, got {law.levels}"
+    pairs = ((part.sample(logits, None), law.gates), (part.open_probability(logits), law.probability))
+    for name, (value, formula) in zip(("gates", "open probability"), pairs, strict=True):
+        (slope,) = torch.autograd.grad(value.sum(), logits)
+        stated, slopes = formula(logits.detach())
+        equal(name, value.detach(), stated, 2e-6, ROUNDING)
+        equal(f"slope of {name}", slope, slopes, 2e-6, ROUNDING)
+    far = 100 * logits.detach()
+    equal("bounds", part.bound(far), far.clamp(-law.bound, law.bound))

@@ -5,7 +5,12 @@ from __future__ import annotations
 import torch
 
 from gsstream.core.errors import ShapeError
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.joint import JointCode
+from gsstream.engine.fit.residual_table import JointTable
 from gsstream.optimiser.base import ADAM_BETAS, ADAM_EPS, AdamState, RowOptimiser
+from gsstream.residual.base import AttributeCode
+from gsstream.residual.joint import joint_code
 from gsstream.testing.compare import equal
 from gsstream.testing.registry import check
 
@@ -72,3 +77,50 @@ def check_optimiser_refuses(part: RowOptimiser) -> None:
             equal("the refused table", values["means"], before)
             continue
         raise AssertionError(f"a gradient of shape {list(wrong.shape)}, first value {wrong.flatten()[0]}, was accepted")
+
+
+def _residual_case() -> tuple[JointCode, Gaussians[torch.Tensor], torch.Tensor, torch.Tensor]:
+    """300 rows of which positions change directly, in units, and sizes and colours through decoders."""
+    g = torch.Generator().manual_seed(7)
+    shapes = (3,), (4,), (3,), (), (1, 3), (3, 3)
+    base = Gaussians(*(torch.randn(300, *shape, generator=g) for shape in shapes))
+    codes = {
+        "means": AttributeCode(0.05, 0.1), "scales": AttributeCode(1.0, 0.3, 8, 1e-3),
+        "opacities": AttributeCode(0.2, 0.1), "sh0": AttributeCode(0.5, 0.2, 4, 0.0),
+        "shN": AttributeCode(1.0, 0.2, 5, 1e-2),
+    }  # fmt: skip
+    latents = {name: torch.zeros(300, code.latent or (3 if name == "means" else 1)) for name, code in codes.items()}
+    widths = {"scales": 3, "sh0": 3, "shN": 9}
+    decoders = {name: 0.1 * torch.randn(codes[name].latent, width, generator=g) for name, width in widths.items()}
+    code = joint_code(codes, latents, decoders, base)
+    return code, base, 0.1 + torch.rand(300, generator=g), code.join_decoders(decoders)
+
+
+@check("optimiser")
+def check_residual_table(part: RowOptimiser) -> None:
+    """A residual table of its own does what the residual's formulas, the rate and Adam do, rows leaving included."""
+    code, base, units, matrix = _residual_case()
+    subject, truth = part.residual_table(code, base, units, matrix), JointTable(code, base, units, matrix, part)
+    if subject is None:
+        return
+    g, rows = torch.Generator().manual_seed(8), len(base)
+    for step in range(STEPS):
+        if step == STEPS // 2:
+            kept = torch.arange(0, rows, 3)
+            for table in (subject, truth):
+                table.keep(kept)
+            rows = len(kept)
+        gates = torch.randint(0, 4, (rows,), generator=g) / 3
+        ours, theirs = subject.rows(gates), truth.rows(gates)
+        for (name, one), (_, other) in zip(ours.items(), theirs.items(), strict=True):
+            equal(f"{name} of step {step}", one, other, 1e-5, WHY)
+        gradients = ours.map(lambda value: 1e-3 * torch.randn(value.shape, generator=g))
+        weight = 1e-4 if step % 2 else 0.0
+        equal("gradient of the gates", subject.pull(gradients, weight), truth.pull(gradients, weight), 1e-5, WHY)
+        for table in (subject, truth):
+            table.latents.grad = torch.full((rows, code.width), 1e-5)
+            table.step()
+            assert table.latents.grad is None, "step(): expected what waits on the latents to be taken, got it left"
+        equal("latents", subject.latents.detach(), truth.latents.detach(), 1e-4, WHY)
+        equal("decoders", subject.matrix, truth.matrix, 1e-4, WHY)
+        equal("curvature", subject.curvature, truth.curvature, 1e-4, WHY)

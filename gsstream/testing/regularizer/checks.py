@@ -156,3 +156,22 @@ def check_regularizer_uses_what_it_says(part: Regularizer) -> None:
     for name in part.claims().gate_terms:
         assert name in moving, f"RegularizerTraits.gate_terms names {name!r}; the terms are {', '.join(moving)}"
         equal(f"term {name!r}, with and without motion", moving[name], still[name])
+
+
+@check("regularizer")
+def check_regularizer_price(part: Regularizer) -> None:
+    """A penalty that states its formula keeps to it, in its slopes by probabilities and residuals."""
+    price = part.price()
+    if price is None:
+        return
+    case = world("cloud")
+    hierarchy, count = case.hierarchy, 3 * len(case.residual)
+    probability = torch.linspace(0.01, 0.99, hierarchy.num_nodes).requires_grad_()
+    residual = case.residual.clone().requires_grad_()
+    total = sum(part.penalty(probability, residual, hierarchy, count).values(), torch.zeros(()))
+    leaves = (probability, residual)
+    found = torch.autograd.grad(total, leaves, allow_unused=True) if total.requires_grad else (None, None)
+    stated = price.slopes(probability.detach(), residual.detach(), hierarchy, count)
+    for name, leaf, one, other in zip(("probabilities", "residuals"), leaves, found, stated, strict=True):
+        one = torch.zeros_like(leaf) if one is None else one
+        equal(f"slope by {name}", one, other, 2e-6, ROUNDING)

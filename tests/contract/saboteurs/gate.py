@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 
+from gsstream.gate.base import RoundedSigmoid
 from gsstream.testing.gate.example import ExampleGate
 from saboteurs.register import spoils
 
@@ -139,3 +140,11 @@ class Smuggler(Gate):
         shift = 0.3 if isinstance(logits, Smuggled) else 0.0
         gates: torch.Tensor = super().sample(logits.as_subclass(torch.Tensor) + shift, noise)
         return gates
+
+
+@spoils("check_gate_law")
+class Understated(Gate):
+    """States formulas without the noise that it draws."""
+
+    def law(self) -> RoundedSigmoid:
+        return RoundedSigmoid(0.3, self.num_levels, 0.0, 7.0)

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from gsstream.core.hierarchy import Hierarchy
+from gsstream.regularizer.base import GatePrice
 from gsstream.testing.regularizer.example import ExampleRegularizer
 from saboteurs.register import spoils
 
@@ -107,3 +108,11 @@ class Exchanged(Regularizer):
     def penalty(self, open_probability: torch.Tensor, residual: torch.Tensor, hierarchy: Hierarchy, n: int) -> Terms:
         terms: Terms = super().penalty(open_probability, residual, hierarchy, n)
         return {"gates": terms["motion"], "motion": terms["gates"]}
+
+
+@spoils("check_regularizer_price")
+class Cheaper(Regularizer):
+    """States a lower price than it asks for."""
+
+    def price(self) -> GatePrice:
+        return GatePrice(1e-6, 0.0)

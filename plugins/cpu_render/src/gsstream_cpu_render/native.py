@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gsstream_cpu_render import _native
-from gsstream_cpu_render.arrays import SplatArrays, SplatGradients, gradient_shapes, new_gradients, require_float32
-from gsstream_cpu_render.checks import Float32, refuse_value
+from gsstream_cpu_render.arrays import (
+    SplatArrays,
+    SplatGradients,
+    gradient_shapes,
+    new_gradients,
+    raise_on_faults,
+    require_float32,
+    require_splats,
+)
+from gsstream_cpu_render.checks import Float32, refuse, refuse_value
+from gsstream_cpu_render.loss import PhotometricTarget
 from gsstream_cpu_render.view import NEAR, Background, checked_view
 
 
@@ -77,6 +87,49 @@ class NativeRasterizer:
             "pairs": self._native.pair_count,
             "entries": self._native.entry_count,
         }
+
+    # ---- one iteration of a fit
+
+    def pull_active(
+        self, rows: SplatArrays, cached_image: Float32, target: PhotometricTarget, dssim_weight: float,
+        colours: Sequence[Float32 | None], out: SplatArrays,
+    ) -> float:  # fmt: skip
+        """Render the active rows, judge the picture and write the gradient by the rows: one iteration of a fit.
+
+        The bits are those of `forward_active` with ``touched_only``, `photometric_loss` with ``around`` and
+        `backward_active`, one after the other; whole images are neither made nor copied.
+
+        Arguments:
+            rows: raw parameters of the A active Gaussians, in the order of active_ids.
+            cached_image: [H, W, 3] the cached render.
+            target: what the picture is compared with. dssim_weight: w in [0, 1].
+            colours: [3, 3] and [3], the map from colours of the scene to those of the target; or twice None.
+            out: like ``rows``; the gradient is written here.
+
+        Returns:
+            The loss.
+
+        Raises:
+            InputError: as forward_active; a loss that is not finite.
+        """
+        self._expect("forward_active")
+        rows = require_splats(rows, self._native.active_count)
+        shape = (self.height, self.width, 3)
+        images = [require_float32("cached_image", cached_image, shape), target.image, target.mean, target.variance]
+        scale = 1.0 / target.image.size
+        weights = (1.0 - dssim_weight) * scale, -dssim_weight * scale
+        try:
+            result = self._native.pull_active(
+                native_scene(rows), self._view.background, *images, *colours, *weights, *out
+            )
+        except ValueError as error:
+            refuse_value(str(error))
+        faults, l1, dssim = result
+        raise_on_faults(faults, rows)
+        self._coefficients = rows.shN.shape[1] + 1
+        if not np.isfinite(l1 + dssim):
+            refuse("image: expected colours of ordinary size, got some so large that the loss is not finite")
+        return float((1.0 - dssim_weight) * (l1 * scale) + dssim_weight * (dssim * scale))
 
     # ---- checks
 

@@ -11,17 +11,22 @@ from numpy.typing import NDArray
 
 from gsstream.api import (
     Cameras,
+    Comparison,
     Gaussians,
     InputError,
+    Pulled,
     RenderCache,
     RenderOutput,
     RenderSession,
     ScreenGradient,
     check_tiles,
 )
+from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import SplatArrays
 from gsstream_cpu_render.autograd import differentiable, splats_of
 from gsstream_cpu_render.checks import Float32, as_array
+from gsstream_cpu_render.loss import PhotometricTarget
+from gsstream_cpu_render.loss_part import CpuLoss
 from gsstream_cpu_render.pool import Lease, Passes, lease
 from gsstream_cpu_render.view import Background
 
@@ -93,6 +98,16 @@ class CpuSession(RenderSession):
         active = _ActivePass(self._view(view), self._ids, mask)
         output = differentiable(active, rows, probe)
         return replace(output, tiles=torch.from_numpy(active.tiles))
+
+    def pull(self, view: int, rows: Gaussians[torch.Tensor], comparison: Comparison) -> Pulled | None:
+        # In a wide session nothing stands still that could be left out; rows in another order are rare.
+        # Kernels that were built before this call existed do without it, until the plugin is installed again.
+        known = type(comparison.loss) is CpuLoss and hasattr(_native.Rasterizer, "pull_active")
+        if self._ids is None or self._order is not None or not known:
+            return None
+        cached = self._view(view)  # its owner while the native call runs
+        cached.freeze(self._ids, None)
+        return cached.pull(rows, comparison)
 
     def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
         if len(gaussians) != len(self._gaussians):
@@ -182,6 +197,17 @@ class _CachedView:
         """Bring cache and render to the scene in which these rows have these values."""
         self.scenes += 1
         self.rasterizer.update(ids, rows, self.image, self.transmittance)
+
+    def pull(self, rows: Gaussians[torch.Tensor], comparison: Comparison) -> Pulled:
+        """Render the active rows, compare, differentiate."""
+        target: PhotometricTarget = comparison.target
+        gradients = rows.map(lambda value: torch.empty(value.shape))
+        colours = [None if value is None else value.contiguous().numpy() for value in
+                   (comparison.matrix, comparison.offset)]  # fmt: skip
+        loss = self.rasterizer.pull_active(
+            splats_of(rows), self.image, target, comparison.dssim, colours, splats_of(gradients)
+        )
+        return Pulled(loss, gradients)
 
     def bytes(self) -> int:
         return self.rasterizer.memory_bytes() + self.image.nbytes + self.transmittance.nbytes

@@ -10,7 +10,7 @@ from typing import Literal, final
 import torch
 from pydantic import Field
 
-from gsstream.api import GateSampler, GateTraits, PartConfig, check_finite
+from gsstream.api import GateSampler, GateTraits, PartConfig, RoundedSigmoid, check_finite
 
 #: Half the spacing of float32 uniforms: moves the lattice k / 2^24 into the open interval (0, 1), symmetrically.
 HALF_STEP = 2.0**-25
@@ -104,12 +104,23 @@ class GumbelSigmoid(GateSampler):
 
     def open_probability(self, logits: torch.Tensor) -> torch.Tensor:
         """[M] P(rounded gate > 0) under the noise law; without noise the logistic form (as the released code does)."""
-        eta = 0.5 / self.num_levels
-        margin = logits - self.config.temperature * math.log(eta / (1 - eta))
+        margin = logits - self._margin
         if self.config.noise == "gumbel":
             # Beyond 30 the probability is 1 in any float, while exp would overflow and its gradient become 0 * inf.
             return -torch.expm1(-torch.exp(margin.clamp_max(30.0)))
         return torch.sigmoid(margin)
+
+    def law(self) -> RoundedSigmoid | None:
+        """The formulas above, without noise and without the released clamp."""
+        if self.config.noise != "none" or self.config.clamp_gradient:
+            return None
+        return RoundedSigmoid(self.config.temperature, self.num_levels, self._margin, self.config.logit_bound)
+
+    @property
+    def _margin(self) -> float:
+        """The logit whose soft gate is eta."""
+        eta = 0.5 / self.num_levels
+        return self.config.temperature * math.log(eta / (1 - eta))
 
     def bound(self, logits: torch.Tensor) -> torch.Tensor:
         """Project the logits into [-logit_bound, logit_bound]."""

@@ -1,13 +1,16 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
 
 #include <algorithm>
 #include <initializer_list>
 #include <optional>
 #include <stdexcept>
 #include <string>
+#include <tuple>
 #include <vector>
 
+#include "fit/view_pull.hpp"
 #include "runtime/bindings.hpp"
 #include "raster/rasterizer.hpp"
 #include "raster/scene_arrays.hpp"
@@ -118,6 +121,31 @@ class PyRasterizer {
     rasterizer_.backward_active(v_image.data(), alpha, out);
   }
 
+  // (fault bits, sum of |I - G|, sum of 1 - SSIM); the gradients are written unless there is a fault.
+  std::tuple<uint32_t, double, double> pull_active(
+      const SceneArrays& rows, ConstFloatArray background, ConstFloatArray cached_image, ConstFloatArray target,
+      ConstFloatArray mean, ConstFloatArray variance, std::optional<ConstFloatArray> matrix,
+      std::optional<ConstFloatArray> offset, double l1_scale, double ssim_scale, FloatArray v_means, FloatArray v_quats,
+      FloatArray v_scales, FloatArray v_opacities, FloatArray v_sh0, FloatArray v_shN) {
+    require(rows.scene.count == rasterizer_.active_count(), "expected one row per active id");
+    require_shape(background, {3}, "background");
+    for (const ConstFloatArray* image : {&cached_image, &target, &mean, &variance}) upstream(*image, std::nullopt);
+    require(matrix.has_value() == offset.has_value(), "colour matrix and offset come together or not at all");
+    if (matrix) require_shape(*matrix, {3, 3}, "matrix");
+    if (offset) require_shape(*offset, {3}, "offset");
+    current_ = rows;
+    means2d_.require(2 * rows.scene.count);
+    GradientArrays out = gradients_of(rows.scene.count, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN);
+    out.means2d = means2d_.data();
+    const float* b = background.data();
+    const ViewComparison view{cached_image.data(), target.data(), mean.data(), variance.data(),
+                              matrix ? matrix->data() : nullptr, offset ? offset->data() : nullptr, {b[0], b[1], b[2]},
+                              static_cast<float>(l1_scale), static_cast<float>(ssim_scale)};
+    const nb::gil_scoped_release release;
+    const ViewPull pulled = pull_view(rasterizer_, rows.scene, view, out);
+    return {pulled.faults, pulled.sums.l1, pulled.sums.dssim};
+  }
+
   void freeze(std::optional<ByteArray> tile_mask, IndexArray active_ids) {
     require(active_ids.ndim() == 1, "active_ids must be [A]");
     const uint8_t* mask = mask_data(tile_mask, rasterizer_.width(), rasterizer_.height());
@@ -153,6 +181,14 @@ class PyRasterizer {
   GradientArrays gradients(std::size_t n, const FloatArray& means, const FloatArray& quats, const FloatArray& scales,
                            const FloatArray& opacities, const FloatArray& sh0, const FloatArray& shN,
                            const FloatArray& means2d) const {
+    GradientArrays out = gradients_of(n, means, quats, scales, opacities, sh0, shN);
+    require_shape(means2d, {n, 2}, "v_means2d");
+    out.means2d = means2d.data();
+    return out;
+  }
+
+  GradientArrays gradients_of(std::size_t n, const FloatArray& means, const FloatArray& quats, const FloatArray& scales,
+                              const FloatArray& opacities, const FloatArray& sh0, const FloatArray& shN) const {
     const std::size_t degree = static_cast<std::size_t>(current_.scene.sh_degree), bases = (degree + 1) * (degree + 1);
     require_shape(means, {n, 3}, "v_means");
     require_shape(quats, {n, 4}, "v_quats");
@@ -160,8 +196,7 @@ class PyRasterizer {
     require_shape(opacities, {n}, "v_opacities");
     require_shape(sh0, {n, 1, 3}, "v_sh0");
     require_shape(shN, {n, bases - 1, 3}, "v_shN");
-    require_shape(means2d, {n, 2}, "v_means2d");
-    return {means.data(), quats.data(), scales.data(), opacities.data(), sh0.data(), shN.data(), means2d.data()};
+    return {means.data(), quats.data(), scales.data(), opacities.data(), sh0.data(), shN.data(), nullptr};
   }
 
   const float* upstream(const ConstFloatArray& v_image, const std::optional<ConstFloatArray>& v_alpha) const {
@@ -175,6 +210,7 @@ class PyRasterizer {
 
   Rasterizer rasterizer_;
   SceneArrays current_;
+  Buffer<float> means2d_;  // gradients that nobody asked for
 };
 
 }  // namespace
@@ -210,6 +246,10 @@ void bind_rasterizer(nb::module_& module) {
            nb::arg("touched_only"))
       .def("backward_active", &PyRasterizer::backward_active, strict("v_image"), strict("v_alpha").none(),
            GSS_GRADIENTS)
+      .def("pull_active", &PyRasterizer::pull_active, nb::arg("scene"), strict("background"), strict("cached_image"),
+           strict("target"), strict("mean"), strict("variance"), strict("matrix").none(), strict("offset").none(),
+           nb::arg("l1_scale"), nb::arg("ssim_scale"), strict("v_means"), strict("v_quats"), strict("v_scales"),
+           strict("v_opacities"), strict("v_sh0"), strict("v_shN"))
       .def("update", &PyRasterizer::update, strict("changed"), nb::arg("scene"), strict("background"), GSS_TARGET)
       .def("backward_cached", &PyRasterizer::backward_cached, nb::arg("scene"), strict("v_image"), strict("v_means2d"))
       .def("visible_in_cache", &PyRasterizer::visible_in_cache, strict("out"))

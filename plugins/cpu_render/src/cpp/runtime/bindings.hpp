@@ -19,6 +19,7 @@ using IndexOutArray = nanobind::ndarray<uint32_t, nanobind::c_contig, nanobind::
 void bind_rasterizer(nanobind::module_& module);
 void bind_photometric(nanobind::module_& module);
 void bind_adam(nanobind::module_& module);
+void bind_residual(nanobind::module_& module);
 void bind_threads(nanobind::module_& module);
 
 }  // namespace gsstream_cpu

@@ -1,0 +1,147 @@
+#include "fit/view_pull.hpp"
+
+#include <algorithm>
+#include <cstring>
+#include <vector>
+
+#include "runtime/buffer.hpp"
+#include "runtime/parallel.hpp"
+
+namespace gsstream_cpu {
+namespace {
+
+// Memory of one calling thread, kept between calls.
+struct Workspace {
+  Buffer<float> image, transmittance, recorded, gradient;
+  std::vector<uint8_t> touched, around, read;  // by tiles of 16 x 16 pixels
+};
+
+Workspace& workspace() {
+  thread_local Workspace own;
+  return own;
+}
+
+struct Grid {
+  int width, height, columns, rows;
+};
+
+void dilate(const Grid& grid, const std::vector<uint8_t>& from, std::vector<uint8_t>& to) {
+  to.assign(from.size(), 0);
+  for (int y = 0; y < grid.rows; y++)
+    for (int x = 0; x < grid.columns; x++) {
+      if (!from[static_cast<std::size_t>(y) * grid.columns + x]) continue;
+      for (int v = std::max(0, y - 1); v <= std::min(grid.rows - 1, y + 1); v++)
+        for (int u = std::max(0, x - 1); u <= std::min(grid.columns - 1, x + 1); u++)
+          to[static_cast<std::size_t>(v) * grid.columns + u] = 1;
+    }
+}
+
+// The pixels of marked tiles, row by row: fn(first pixel, number of pixels).
+template <class Fn>
+void for_marked(const Grid& grid, const std::vector<uint8_t>& marked, Fn&& fn) {
+  parallel_for(static_cast<std::size_t>(grid.rows), 2, [&](std::size_t begin, std::size_t end) {
+    for (std::size_t row = begin; row < end; row++) {
+      const uint8_t* marks = &marked[row * static_cast<std::size_t>(grid.columns)];
+      const int top = static_cast<int>(row) * kTile, bottom = std::min(grid.height, top + kTile);
+      for (int first = 0; first < grid.columns;) {
+        int last = first;
+        while (last < grid.columns && marks[last]) last++;
+        if (last > first) {
+          const int left = first * kTile, right = std::min(grid.width, last * kTile);
+          for (int y = top; y < bottom; y++)
+            fn(static_cast<std::size_t>(y) * grid.width + left, static_cast<std::size_t>(right - left));
+        }
+        first = std::max(last, first + 1);
+      }
+    }
+  });
+}
+
+// What lies around the blocks that were rendered, as far as windows of the loss reach: it is as in the cache.
+void fill_around(const Grid& grid, const TileSelection& rendered, const std::vector<uint8_t>& read, const float* cached,
+                 float* image) {
+  parallel_for(static_cast<std::size_t>(rendered.tiles_y), 2, [&](std::size_t begin, std::size_t end) {
+    for (std::size_t tile_y = begin; tile_y < end; tile_y++)
+      for (int tile_x = 0; tile_x < rendered.tiles_x; tile_x++) {
+        const uint32_t done = rendered.blocks[tile_y * rendered.tiles_x + tile_x];
+        for (int b = 0; b < BLOCKS; b++) {
+          const int x = tile_x * TILE_WIDTH + b % BLOCKS_X * BLOCK_SIDE,
+                    y = static_cast<int>(tile_y) * TILE_HEIGHT + b / BLOCKS_X * BLOCK_SIDE;
+          if (done >> b & 1u || x >= grid.width || y >= grid.height) continue;
+          if (!read[static_cast<std::size_t>(y / kTile) * grid.columns + x / kTile]) continue;
+          const std::size_t floats = 3 * static_cast<std::size_t>(std::min(BLOCK_SIDE, grid.width - x));
+          for (int v = y; v < std::min(grid.height, y + BLOCK_SIDE); v++) {
+            const std::size_t at = 3 * (static_cast<std::size_t>(v) * grid.width + x);
+            std::memcpy(image + at, cached + at, floats * sizeof(float));
+          }
+        }
+      }
+  });
+}
+
+// out = matrix in + offset, pixel by pixel.
+void apply_colours(const float* matrix, const float* offset, const float* in, float* out, std::size_t pixels) {
+  for (std::size_t i = 0; i < 3 * pixels; i += 3)
+    for (int j = 0; j < 3; j++)
+      out[i + j] = offset[j] + (matrix[3 * j] * in[i] + matrix[3 * j + 1] * in[i + 1] + matrix[3 * j + 2] * in[i + 2]);
+}
+
+// gradient = gradient matrix, pixel by pixel.
+void pull_colours(const float* matrix, float* gradient, std::size_t pixels) {
+  for (std::size_t i = 0; i < 3 * pixels; i += 3) {
+    const float r = gradient[i], g = gradient[i + 1], b = gradient[i + 2];
+    for (int k = 0; k < 3; k++) gradient[i + k] = r * matrix[k] + g * matrix[3 + k] + b * matrix[6 + k];
+  }
+}
+
+}  // namespace
+
+ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparison& view, const GradientArrays& out) {
+  Workspace& work = workspace();
+  const Grid grid{rasterizer.width(), rasterizer.height(), (rasterizer.width() + kTile - 1) / kTile,
+                  (rasterizer.height() + kTile - 1) / kTile};
+  const std::size_t pixels = static_cast<std::size_t>(grid.width) * grid.height;
+  const std::size_t tiles = static_cast<std::size_t>(grid.columns) * grid.rows;
+  float* image = work.image.require(3 * pixels);
+  const Target target{{view.background[0], view.background[1], view.background[2]},
+                      image, work.transmittance.require(pixels)};
+  ViewPull result{};
+  result.faults = rasterizer.forward_active(rows, target, true);
+  if (result.faults) return result;
+  work.touched.resize(tiles);
+  rasterizer.touched().write_mask(grid.width, grid.height, work.touched.data());
+  dilate(grid, work.touched, work.around);
+  dilate(grid, work.around, work.read);
+  fill_around(grid, rasterizer.touched(), work.read, view.cached_image, image);
+  const float* recorded = image;
+  if (view.matrix) {
+    float* mapped = work.recorded.require(3 * pixels);
+    for_marked(grid, work.read, [&](std::size_t first, std::size_t count) {
+      apply_colours(view.matrix, view.offset, image + 3 * first, mapped + 3 * first, count);
+    });
+    recorded = mapped;
+  }
+  PhotometricJob job{};
+  job.height = grid.height;
+  job.width = grid.width;
+  job.tile_rows = grid.rows;
+  job.tile_columns = grid.columns;
+  job.image = recorded;
+  job.target = view.target;
+  job.target_mean = view.mean;
+  job.target_variance = view.variance;
+  job.active = work.around.data();
+  job.wanted = work.touched.data();
+  job.gradient = work.gradient.require(3 * pixels);
+  job.l1_scale = view.l1_scale;
+  job.ssim_scale = view.ssim_scale;
+  result.sums = photometric_run(job);
+  if (view.matrix)
+    for_marked(grid, work.touched, [&](std::size_t first, std::size_t count) {
+      pull_colours(view.matrix, job.gradient + 3 * first, count);
+    });
+  rasterizer.backward_active(job.gradient, nullptr, out);
+  return result;
+}
+
+}  // namespace gsstream_cpu

@@ -1,0 +1,28 @@
+// One view rendered, compared with what its camera recorded, and differentiated, in one call: what every iteration of
+// every fit does. The same kernels on the same numbers as forward_active, photometric_run and backward_active one after
+// the other, without copies of whole images in between.
+#pragma once
+#include <cstdint>
+
+#include "photometric/photometric.hpp"
+#include "raster/rasterizer.hpp"
+
+namespace gsstream_cpu {
+
+struct ViewComparison {
+  const float* cached_image;               // [H, W, 3] render of the cached scene
+  const float *target, *mean, *variance;   // [H, W, 3] each; photometric_target made the last two
+  const float *matrix, *offset;            // colour map [3, 3], [3] of the camera; or both null
+  float background[3];
+  float l1_scale, ssim_scale;
+};
+
+struct ViewPull {
+  uint32_t faults;       // Fault bits; if any is set, nothing else is written
+  PhotometricSums sums;  // over the touched tiles and those beside them
+};
+
+// `rows` are the active rows of `rasterizer`, which must be frozen. `out` has one row per active row.
+ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparison& view, const GradientArrays& out);
+
+}  // namespace gsstream_cpu

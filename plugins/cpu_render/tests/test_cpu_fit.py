@@ -1,0 +1,132 @@
+"""One call that renders, compares and differentiates, and the residual's table: as the calls they stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from gsstream_cpu_render.adam_part import CpuAdam
+from gsstream_cpu_render.loss_part import CpuLoss
+from gsstream_cpu_render.renderer import CpuRenderer
+from gsstream_cpu_render.threads import num_threads, set_num_threads
+from test_cpu_renderer import rig, scene
+
+from gsstream.api import Comparison, Gaussians, RenderSession, ShapeError
+from gsstream.loss.photometric import ReferenceLoss
+from gsstream.testing.optimiser.checks import _residual_case
+
+BACKGROUND = (0.2, 0.5, 0.9)
+ROWS = torch.tensor([2, 5, 11, 17])
+
+
+@pytest.fixture(params=[1, 2, 3])
+def threads(request: pytest.FixtureRequest) -> Iterator[int]:
+    before = num_threads()
+    set_num_threads(request.param)
+    yield request.param
+    set_num_threads(before)
+
+
+def opened() -> tuple[RenderSession, Gaussians[torch.Tensor]]:
+    """A narrowed session and other values of its rows."""
+    whole = scene()
+    session = CpuRenderer().open(whole, ROWS, rig(), BACKGROUND)
+    g = torch.Generator().manual_seed(3)
+    return session, whole.rows(ROWS).map(lambda value: value + 0.1 * torch.randn(value.shape, generator=g))
+
+
+def comparison(coloured: bool = False) -> Comparison:
+    cameras, g = rig(), torch.Generator().manual_seed(4)
+    target = CpuLoss().prepare(torch.rand(cameras.height, cameras.width, 3, generator=g))
+    maps = (torch.eye(3) + 0.2 * torch.rand(3, 3, generator=g), 0.1 * torch.rand(3, generator=g)) if coloured else ()
+    return Comparison(CpuLoss(), target, 0.2, *maps)
+
+
+def step_by_step(
+    session: RenderSession, rows: Gaussians[torch.Tensor], wanted: Comparison
+) -> tuple[float, Gaussians[torch.Tensor]]:
+    """The same by the calls that the engine makes where there is no short cut."""
+    leaves = rows.map(lambda value: value.clone().requires_grad_())
+    output = session.render(1, leaves)
+    image = output.image.detach()
+    if wanted.matrix is not None:
+        image = (image.reshape(-1, 3) @ wanted.matrix.T + wanted.offset).reshape(image.shape)
+    loss, gradient = CpuLoss().evaluate(image, wanted.target, wanted.dssim, output.tiles)
+    if wanted.matrix is not None:
+        gradient = (gradient.reshape(-1, 3) @ wanted.matrix).reshape(gradient.shape)
+    output.image.backward(gradient)
+    return loss, leaves.map(lambda value: value.grad)
+
+
+def test_pull_has_the_bits_of_the_calls_it_stands_for(threads: int) -> None:
+    session, rows = opened()
+    pulled = session.pull(1, rows, comparison())
+    loss, gradients = step_by_step(*opened(), comparison())
+    assert pulled is not None
+    assert pulled.loss == loss
+    assert all(float(value.abs().max()) > 0 for name, value in gradients.items() if name != "shN" or value.numel())
+    for (name, got), (_, want) in zip(pulled.gradients.items(), gradients.items(), strict=True):
+        assert got.numpy().tobytes() == want.numpy().tobytes(), name
+
+
+def test_pull_takes_colour_maps_into_account() -> None:
+    session, rows = opened()
+    pulled = session.pull(1, rows, comparison(coloured=True))
+    loss, gradients = step_by_step(*opened(), comparison(coloured=True))
+    assert pulled is not None
+    assert pulled.loss == pytest.approx(loss, rel=1e-6)
+    for (name, got), (_, want) in zip(pulled.gradients.items(), gradients.items(), strict=True):
+        np.testing.assert_allclose(got.numpy(), want.numpy(), rtol=0, atol=2e-6 * float(want.abs().max()), err_msg=name)
+
+
+def test_a_render_after_a_pull_is_that_of_the_scene() -> None:
+    session, rows = opened()
+    session.pull(1, rows, comparison())
+    fresh, _ = opened()
+    assert torch.equal(session.render(1, rows).image, fresh.render(1, rows).image)
+
+
+def test_pull_leaves_other_losses_and_wide_sessions_to_the_engine() -> None:
+    session, rows = opened()
+    wanted = comparison()
+    assert session.pull(1, rows, Comparison(ReferenceLoss(), wanted.target, 0.2)) is None
+    wide = CpuRenderer().open(scene(), None, rig(), BACKGROUND)
+    assert wide.pull(1, scene(), wanted) is None
+
+
+@pytest.mark.parametrize("name", ["means", "sh0"])
+def test_pull_names_a_value_that_is_not_finite(name: str) -> None:
+    session, rows = opened()
+    getattr(rows, name)[1] = torch.nan
+    with pytest.raises(ShapeError, match=f"{name}: expected finite values, got nan at index"):
+        session.pull(1, rows, comparison())
+
+
+def test_the_residual_table_has_the_same_bits_for_any_number_of_threads() -> None:
+    code, base, units, matrix = _residual_case()
+    base, units = base.rows(torch.arange(300).repeat(5)), units.repeat(5)
+    found, before = [], num_threads()
+    for number in (1, 2, 3):
+        set_num_threads(number)
+        table, g = CpuAdam().residual_table(code, base, units, matrix), torch.Generator().manual_seed(5)
+        for _ in range(3):
+            assert table is not None, "the kernels are older than the plugin: install it again"
+            table.rows(torch.rand(1500, generator=g))
+            table.pull(base.map(lambda value, g=g: torch.randn(value.shape, generator=g)), 1e-3)
+            table.step()
+        found.append((table.latents.detach().numpy().tobytes(), table.matrix.numpy().tobytes()))
+    set_num_threads(before)
+    assert found[0] == found[1] == found[2]
+
+
+def test_the_residual_table_refuses_gradients_of_other_rows_and_a_step_without_a_pull() -> None:
+    code, base, units, matrix = _residual_case()
+    table = CpuAdam().residual_table(code, base, units, matrix)
+    assert table is not None, "the kernels are older than the plugin: install it again"
+    table.rows(torch.ones(300))
+    with pytest.raises(ShapeError, match="gradient of means: expected shape"):
+        table.pull(base.rows(torch.arange(10)), 0.0)
+    with pytest.raises(ShapeError, match="expected a pull before it"):
+        table.step()

@@ -35,6 +35,13 @@ def test_the_quick_start_is_two_commands_that_make_knows() -> None:
         assert subprocess.run(dry, cwd=ROOT, capture_output=True, timeout=600, check=False).returncode == 0
 
 
+def test_the_tutorial_says_which_environment_it_means() -> None:
+    """Its commands are found only in an active one, and the system's pip would look for gsstream in an index."""
+    said = (ROOT / "docs" / "tutorial" / "first-gate.md").read_text(encoding="utf-8")
+    (folder,) = re.findall(r"source (\S+)/bin/activate", said)
+    assert f"VENV := {folder}\n" in (ROOT / "Makefile").read_text(encoding="utf-8")
+
+
 def test_the_python_examples_encode_and_play(tmp_path: Path) -> None:
     examples = blocks("README.md", "python")
     assert [len(example.splitlines()) <= 10 for example in examples] == [True, True]

@@ -158,7 +158,7 @@ class BrokenGrowth:
     def propose(self, *_: Any) -> None:
         raise RuntimeError("no room")
 
-    prepare = propose
+    prepare = evaluate = propose
 
 
 @pytest.mark.parametrize("case", list(CASES))

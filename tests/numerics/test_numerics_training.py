@@ -189,7 +189,7 @@ def test_a_spike_of_the_learning_rate_is_refused_or_survived_never_sent_as_garba
 
     def spiked(self: Any, *args: Any) -> None:
         plain(self, *args)
-        self.latents._lrs = {name: value * lr for name, value in self.latents._lrs.items()}
+        self.code.lrs.mul_(lr)
 
     monkeypatch.setattr(_FrameRun, "__init__", spiked)
     now = shown(frame, 1, lambda images: images * 0.6)

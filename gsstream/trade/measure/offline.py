@@ -16,6 +16,7 @@ from gsstream.core.shapes import FloatArray
 from gsstream.player.ply import read_ply
 from gsstream.player.render import find_renderer, render
 from gsstream.source.base import SourceInfo
+from gsstream.source.images import PICTURE_FORMATS
 
 _PICTURES = (".png", ".jpg", ".jpeg")
 
@@ -103,7 +104,7 @@ class Renders:
 
     def _image(self, path: Path) -> FloatArray:
         try:
-            with Image.open(path) as file:
+            with Image.open(path, formats=PICTURE_FORMATS) as file:
                 image = np.asarray(file.convert("RGB"), np.float32) / 255
         except OSError as error:
             raise InputError(f"{path} cannot be read as a picture: {error}") from error

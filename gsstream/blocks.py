@@ -26,6 +26,7 @@ from gsstream.engine.step.active.change import marked_per_tile as marked_per_til
 from gsstream.engine.step.harden import rows_of as rows_of
 from gsstream.growth.copying import fitted_copies as fitted_copies
 from gsstream.growth.copying import pulled_rows as pulled_rows
+from gsstream.growth.copying import replaced_by_copies as replaced_by_copies
 from gsstream.growth.fitting import fitted_births as fitted_births
 from gsstream.growth.fitting import joined as joined
 from gsstream.motion.field import said_by_cells as said_by_cells

@@ -2,12 +2,35 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
+from gsstream.core.changes import Rows, Scene, own_nodes
 from gsstream.core.context import FrameWork
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
+from gsstream.core.shapes import IntArray
 from gsstream.growth.fitting import fitted_births, joined
+
+
+def replaced_by_copies(
+    scene: Scene, deaths: IntArray, work: FrameWork, epochs: int, rng: Rng, *, gradient: float, most: int, rounds: int,
+    prune_opacity: float,
+) -> Rows:  # fmt: skip
+    """Return the change of rows in which some leave and the frame's copies are born, each a node of its own.
+
+    Arguments:
+        scene: N rows, after the frame's motions.
+        deaths: [D] int64 rows that leave, ascending.
+        work, epochs, rng, gradient, most, rounds, prune_opacity: as for :func:`fitted_copies`.
+    """
+    kept = scene.gaussians.rows(np.delete(np.arange(len(scene.gaussians)), deaths)).map(torch.from_numpy)
+    born = fitted_copies(
+        kept, work, epochs, rng, gradient=gradient, most=most, rounds=rounds, prune_opacity=prune_opacity
+    ).map(lambda value: value.numpy())
+    if not len(born):
+        return Rows(deaths=deaths)
+    return Rows(own_nodes(born, np.zeros(len(born), np.uint8), len(scene.layout.node_counts)), deaths)
 
 
 def fitted_copies(

@@ -29,6 +29,16 @@ class Layout:
     unit_of: IntArray
     units: FloatArray
 
+    @staticmethod
+    def flat(number: int, unit: float) -> Layout:
+        """Return the layout in which each of ``number`` Gaussians is a node of its own, with one unit for all.
+
+        Arguments:
+            number: N.
+            unit: above 0, scene units.
+        """
+        return Layout(np.ones(number, np.int32), np.zeros(number, np.uint8), np.array([unit], np.float32))
+
     def units_of(self, rows: IntArray) -> FloatArray:
         """Return the unit [A] float32 of each of the Gaussians ``rows`` [A]."""
         return np.asarray(self.units, np.float32).take(self.unit_of.take(rows))

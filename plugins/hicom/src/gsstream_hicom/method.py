@@ -21,11 +21,10 @@ from gsstream.api import (
     Step,
     StreamingMethod,
     Tools,
-    own_nodes,
     send_delta,
     send_key,
 )
-from gsstream.blocks import changed_rows, detect_change, fitted_copies
+from gsstream.blocks import changed_rows, detect_change, replaced_by_copies
 from gsstream_hicom.motion import fitted_motions
 from gsstream_hicom.settings import HiCoMConfig
 
@@ -58,8 +57,7 @@ class HiCoM(StreamingMethod[HiCoMState]):
     def begin(self, frame: Frame, tools: Tools) -> Step[HiCoMState]:
         first = tools.first_frame(frame)
         number = len(first.gaussians)
-        extent = np.array([frame.cameras.extent], np.float32)
-        layout = Layout(np.ones(number, np.int32), np.zeros(number, np.uint8), extent)
+        layout = Layout.flat(number, frame.cameras.extent)
         packet, player = send_key(first.gaussians, layout, first.meta, frame.index)
         return Step(HiCoMState(player, frame, number), packet, "key", first.metrics)
 
@@ -100,15 +98,11 @@ class HiCoM(StreamingMethod[HiCoMState]):
     def _rows(self, scene: Scene, number: int, work: FrameTools, epochs: int, tools: Tools) -> Rows:
         """As many of the least opaque leave as there are more than in frame 0; then this frame's are born."""
         deaths = np.sort(np.argsort(scene.gaussians.opacities, kind="stable")[: len(scene.gaussians) - number])
-        kept = scene.gaussians.rows(np.delete(np.arange(len(scene.gaussians)), deaths)).map(torch.from_numpy)
         births = self.config.births
-        born = fitted_copies(
-            kept, work, epochs, tools.rng, gradient=births.gradient, most=births.most, rounds=births.rounds,
+        return replaced_by_copies(
+            scene, deaths, work, epochs, tools.rng, gradient=births.gradient, most=births.most, rounds=births.rounds,
             prune_opacity=births.prune_opacity,
-        ).map(lambda value: value.numpy())  # fmt: skip
-        if not len(born):
-            return Rows(deaths=deaths)
-        return Rows(own_nodes(born, np.zeros(len(born), np.uint8), len(scene.layout.node_counts)), deaths)
+        )  # fmt: skip
 
     def _send(self, state: HiCoMState, frame: Frame, delta: Delta) -> Step[HiCoMState]:
         packet, player = send_delta(state.player, delta)

@@ -59,9 +59,7 @@ class Queen(StreamingMethod[QueenState]):
 
     def begin(self, frame: Frame, tools: Tools) -> Step[QueenState]:
         first = tools.first_frame(frame)
-        number = len(first.gaussians)
-        extent = np.array([frame.cameras.extent], np.float32)
-        layout = Layout(np.ones(number, np.int32), np.zeros(number, np.uint8), extent)
+        layout = Layout.flat(len(first.gaussians), frame.cameras.extent)
         packet, player = send_key(first.gaussians, layout, first.meta, frame.index)
         return Step(QueenState(player, frame, self._weights(player, tools)), packet, "key", first.metrics)
 

@@ -22,11 +22,10 @@ from gsstream.api import (
     StreamingMethod,
     Tools,
     apply_motion,
-    own_nodes,
     send_delta,
     send_key,
 )
-from gsstream.blocks import changed_rows, detect_change, fitted_copies
+from gsstream.blocks import changed_rows, detect_change, replaced_by_copies
 from gsstream_stream3dgs.motion import fitted_motion
 from gsstream_stream3dgs.settings import Stream3DGSConfig
 
@@ -59,8 +58,7 @@ class Stream3DGS(StreamingMethod[Stream3DGSState]):
     def begin(self, frame: Frame, tools: Tools) -> Step[Stream3DGSState]:
         first = tools.first_frame(frame)
         number = len(first.gaussians)
-        extent = np.array([frame.cameras.extent], np.float32)
-        layout = Layout(np.ones(number, np.int32), np.zeros(number, np.uint8), extent)
+        layout = Layout.flat(number, frame.cameras.extent)
         packet, player = send_key(first.gaussians, layout, first.meta, frame.index)
         return Step(Stream3DGSState(player, frame, number), packet, "key", first.metrics)
 
@@ -104,17 +102,13 @@ class Stream3DGS(StreamingMethod[Stream3DGSState]):
     def _rows(self, scene: Scene, number: int, work: FrameTools, epochs: int, tools: Tools) -> Rows:
         """Those of the frame before leave, which stand behind the rows of frame 0; then this frame's are born."""
         deaths = np.arange(number, len(scene.gaussians))
-        kept = scene.gaussians.rows(np.delete(np.arange(len(scene.gaussians)), deaths)).map(torch.from_numpy)
-        births = self.config.births
         if not epochs:
             return Rows(deaths=deaths)
-        born = fitted_copies(
-            kept, work, epochs, tools.rng, gradient=births.gradient, most=births.most, rounds=births.rounds,
+        births = self.config.births
+        return replaced_by_copies(
+            scene, deaths, work, epochs, tools.rng, gradient=births.gradient, most=births.most, rounds=births.rounds,
             prune_opacity=births.prune_opacity,
-        ).map(lambda value: value.numpy())  # fmt: skip
-        if not len(born):
-            return Rows(deaths=deaths)
-        return Rows(own_nodes(born, np.zeros(len(born), np.uint8), len(scene.layout.node_counts)), deaths)
+        )  # fmt: skip
 
     def _send(self, state: Stream3DGSState, frame: Frame, delta: Delta) -> Step[Stream3DGSState]:
         packet, player = send_delta(state.player, delta)

@@ -42,6 +42,7 @@ def test_the_tutorial_says_which_environment_it_means() -> None:
     assert f"VENV := {folder}\n" in (ROOT / "Makefile").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_python_examples_encode_and_play(tmp_path: Path) -> None:
     examples = blocks("README.md", "python")
     assert [len(example.splitlines()) <= 10 for example in examples] == [True, True]

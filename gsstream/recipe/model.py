@@ -77,6 +77,16 @@ class FirstFrame(Section):
         default=3e-4, gt=0, description="mean screen gradient (half-width units) above which a Gaussian is densified"
     )
     max_gaussians: int = Field(default=60_000, ge=1, description="upper bound on the number of Gaussians")
+    pixels_per_gaussian: float = Field(
+        default=0.0, ge=0,
+        description="at most one Gaussian per this many training pixels: more than the images can pin down describe "
+        "the training cameras, not the scene; 0: max_gaussians alone bounds them",
+    )  # fmt: skip
+    prune_share: float = Field(
+        default=0.0, ge=0, lt=1,
+        description="share of the images' blending weight that may go when growth ends, with the Gaussians that every "
+        "view shows least of; 0: none goes",
+    )  # fmt: skip
     exposure: bool = Field(
         default=False, description="fit an affine colour map per training camera while optimising frame 0"
     )

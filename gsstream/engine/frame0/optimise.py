@@ -26,6 +26,7 @@ from gsstream.engine.fit.exposure import Exposure, ExposureFit
 from gsstream.engine.fit.judge import Judge
 from gsstream.engine.fit.nearest import neighbour_distance
 from gsstream.engine.fit.row_table import RowTable
+from gsstream.engine.frame0.how_many import most_gaussians, shown, worth_keeping
 from gsstream.recipe.model import FirstFrame
 from gsstream.render.activations import logit, rgb_to_sh0
 from gsstream.structure.base import Anchors
@@ -111,7 +112,9 @@ class _FirstFrameRun:
     def __init__(
         self, start: Gaussians[torch.Tensor], levels: torch.Tensor, frame: Frame, parts: Assembly, rng: Rng
     ) -> None:
-        self.parts, self.settings, self.recipe, self.frame = parts, parts.recipe.first_frame, parts.recipe, frame
+        self.parts, self.recipe, self.frame = parts, parts.recipe, frame
+        first = parts.recipe.first_frame
+        self.settings = first.model_copy(update={"max_gaussians": most_gaussians(first, frame)})
         self.renderer, self.levels = parts.renderer, levels
         self.views = len(frame.cameras)
         self.extent = frame.cameras.extent
@@ -145,6 +148,8 @@ class _FirstFrameRun:
             self.statistics = self.statistics.add(probe.grad * size)
             if iteration >= s.densify_from and iteration % s.densify_every == 0:
                 self._densify()
+        if s.prune_share > 0 and iteration == int(last):
+            self._prune()
         self.smooth = value if math.isnan(self.smooth) else 0.98 * self.smooth + 0.02 * value
         return self.smooth
 
@@ -182,6 +187,16 @@ class _FirstFrameRun:
         self.table.edit(edit, values)
         self.levels = self.levels[edit.source]
         self.statistics = DensifyStatistics.zeros(len(self.levels))
+
+    def _prune(self) -> None:
+        """Drop what the images hardly show; growth has just ended, and what remains has time to close the gaps."""
+        gaussians = self.gaussians().map(torch.Tensor.detach)
+        pixels = shown(self.renderer, gaussians, self.frame.cameras)
+        rows = worth_keeping(pixels, self.settings.prune_share)
+        edit = TopologyEdit(rows, torch.zeros(len(rows), dtype=torch.bool))
+        self.table.edit(edit, dict(gaussians.rows(rows).items()))
+        self.levels = self.levels[rows]
+        self.statistics = DensifyStatistics.zeros(len(rows))
 
     def _next_view(self) -> int:
         if not self.order:

@@ -59,7 +59,8 @@ def shown(renderer: Renderer, gaussians: Gaussians[torch.Tensor], cameras: Camer
 def worth_keeping(shown_pixels: torch.Tensor, share: float) -> torch.Tensor:
     """Return the rows [K] int64, in order, of the Gaussians that remain when the least shown ones go.
 
-    Those go, beginning with the least, whose pixels together are at most ``share`` of the pixels of all.
+    Those go, beginning with the least, whose pixels together are at most ``share`` of the pixels of all. Where no view
+    shows anything, all remain.
 
     Arguments:
         shown_pixels: [N] as :func:`shown` gives it.
@@ -67,5 +68,6 @@ def worth_keeping(shown_pixels: torch.Tensor, share: float) -> torch.Tensor:
     """
     order = torch.argsort(shown_pixels, stable=True)
     lost = torch.cumsum(shown_pixels[order].double(), 0)
-    gone = int((lost <= share * lost[-1]).sum()) if len(order) else 0
-    return order[gone:].sort().values
+    if len(order) == 0 or lost[-1] == 0:
+        return torch.arange(len(order))
+    return order[int((lost <= share * lost[-1]).sum()) :].sort().values

@@ -55,8 +55,8 @@ export class Renderer {
 
   /**
    * Draw `camera` at the size of the canvas. With `exact` the order is found here and now. Otherwise it may be that of
-   * the picture before; while there is none, or with `patient` while the worker sorts, nothing is drawn. Returns whether
-   * it drew.
+   * the picture before; while there is none, or with `patient` while the worker sorts, nothing is drawn. Returns
+   * whether it drew.
    */
   draw(camera, { exact = false, patient = false } = {}) {
     if (!this.state || this.gl.isContextLost()) return false;

@@ -117,8 +117,11 @@ class ResidualTable(ABC):
         """
 
     @abstractmethod
-    def step(self) -> None:
+    def step(self, lr_factor: float = 1.0) -> None:
         """Make one step of Adam from what was pulled, and what waits on ``latents``.
+
+        Arguments:
+            lr_factor: on the learning rates of latents and decoders in this step, >= 0.
 
         Raises ShapeError where a gradient is not finite.
         """

@@ -105,6 +105,11 @@ class Stream(Section):
     """Every later frame."""
 
     epochs: int = Field(default=20, ge=1, description="passes over the training cameras per frame (fast: 10, edge: 6)")
+    lr_final_factor: float = Field(
+        default=1.0, gt=0, le=1,
+        description="factor on the learning rates of residuals at the last iteration of a frame, log-linear from 1 at "
+        "the first; the rate of gates stays",
+    )  # fmt: skip
     active_threshold: float = Field(
         default=0.0, ge=0, le=1, description="rows whose gate opens with at most this probability are left out"
     )

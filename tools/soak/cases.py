@@ -97,6 +97,7 @@ SOMETIMES: Mapping[str, Draw] = MappingProxyType({
     "stream.release_closed": _of(False, True),
     "stream.rate_weight": _of(0.0, 1e-5, 3e-4, 1e-2, 1.0), "stream.on_error": _of("raise", "repeat"),
     "stream.progressive": _of(False, True), "stream.progressive_omega": _of(1.0, 1.5, 8.0),
+    "stream.lr_final_factor": _of(1.0, 0.1, 1e-6),
     "loss.dssim": _of(0.0, 0.5, 1.0), "loss.backend": _of("auto", "reference"),
     "gate_training.lr": _of(0.0, 0.01, 1.0, 10.0), "codec.key_every": _of(0, 1, 2, 3), "codec.fsync": _of(True),
     "data.leak": _of("none", "points", "training"), "data.images": _of("float16", "uint8"),

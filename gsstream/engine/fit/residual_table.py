@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import final
 
 import torch
@@ -53,10 +54,21 @@ class JointTable(ResidualTable):
         self._pulled: JointPullback = back
         return back.gates
 
-    def step(self) -> None:
-        self._latents.step({"latents": self._pulled.latents})
-        self._decoders.step({"matrix": self._pulled.matrix})
+    def step(self, lr_factor: float = 1.0) -> None:
+        self._latents.step({"latents": self._pulled.latents}, lr_factor)
+        self._decoders.step({"matrix": self._pulled.matrix}, lr_factor)
 
     def keep(self, rows: torch.Tensor) -> None:
         self._latents.keep(rows)
         self._base, self._features, self._units = self._base.rows(rows), self._features[rows], self._units[rows]
+
+
+def lr_factor(final: float, iteration: int, iterations: int) -> float:
+    """Return the factor on the learning rates of a frame's residual at an iteration: it falls exponentially from 1.
+
+    Arguments:
+        final: factor at the last iteration, in (0, 1]; 1: the rates stay as they are.
+        iteration: counted from 0.
+        iterations: of the frame, as far as is known now; a frame of one iteration has the full rates.
+    """
+    return math.pow(final, iteration / max(1, iterations - 1))

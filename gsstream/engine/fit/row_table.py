@@ -26,14 +26,20 @@ class RowTable:
     def __getitem__(self, name: str) -> torch.Tensor:
         return self.leaves[name]
 
-    def step(self, gradients: Mapping[str, torch.Tensor] = EMPTY) -> None:
-        """Make one Adam step from ``gradients`` and whatever waits on the leaves, which is then dropped."""
+    def step(self, gradients: Mapping[str, torch.Tensor] = EMPTY, lr_factor: float = 1.0) -> None:
+        """Make one Adam step from ``gradients`` and whatever waits on the leaves, which is then dropped.
+
+        Arguments:
+            gradients: name -> gradient, like its leaf; leaves without one are not moved.
+            lr_factor: on all learning rates in this step.
+        """
         total = dict(gradients)
         for name, leaf in self.leaves.items():
             if leaf.grad is not None:
                 total[name] = total[name] + leaf.grad if name in total else leaf.grad
                 leaf.grad = None
-        self._optimiser.step(self.leaves, total, self._states, self._lrs)
+        lrs = {name: lr_factor * lr for name, lr in self._lrs.items()}
+        self._optimiser.step(self.leaves, total, self._states, lrs)
 
     def keep(self, rows: torch.Tensor) -> None:
         """Go on with these rows [K] of every leaf, and with the steps they have taken."""

@@ -13,7 +13,7 @@ from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.assembly.guard import blaming
 from gsstream.engine.budget.pace import Pace, estimated_bytes
 from gsstream.engine.fit.backward import pull_back
-from gsstream.engine.fit.residual_table import JointTable
+from gsstream.engine.fit.residual_table import JointTable, lr_factor
 from gsstream.engine.fit.row_table import RowTable
 from gsstream.engine.step.active.candidates import released
 from gsstream.engine.step.dead_gates import count_dead
@@ -113,7 +113,8 @@ class _FrameRun:
         else:
             self._step_known(self.law, self.price, by_gate if waiting is None else by_gate * ~waiting)
         with blaming("optimiser", self.parts.part("optimiser"), self.parts.where):
-            self.table.step()
+            iterations = self.pace.epochs * self.problem.views
+            self.table.step(lr_factor(self.parts.recipe.stream.lr_final_factor, iteration, iterations))
         return loss
 
     def _step_gates(self, logits: torch.Tensor, gates: torch.Tensor, upstream: torch.Tensor) -> None:

@@ -71,7 +71,7 @@ class CpuResidualTable(ResidualTable):
         self._pulled = latents, matrix
         return by_gate
 
-    def step(self) -> None:
+    def step(self, lr_factor: float = 1.0) -> None:
         if self._pulled is None:
             refuse("step: expected a pull before it, got none; call rows, pull and step in this order")
         latents, matrix = self._pulled
@@ -79,8 +79,9 @@ class CpuResidualTable(ResidualTable):
             latents += self._latents.grad
             self._latents.grad = None
         self._pulled = None
-        step_table("latents", self._latents.detach(), latents, self._states["latents"], self._code.lrs)
-        step_table("matrix", self._matrix, matrix, self._states["matrix"], self._code.decoder_lrs)
+        lrs, decoder_lrs = lr_factor * self._code.lrs, lr_factor * self._code.decoder_lrs
+        step_table("latents", self._latents.detach(), latents, self._states["latents"], lrs)
+        step_table("matrix", self._matrix, matrix, self._states["matrix"], decoder_lrs)
 
     def keep(self, rows: torch.Tensor) -> None:
         self._base, self._units = self._base.rows(rows), self._units[rows]

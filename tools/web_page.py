@@ -20,17 +20,17 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "web"))
 
 P = "document.querySelector('gsstream-player')?.player"
-#: Milliseconds since the page was asked for, once a picture is drawn and read back.
+#: Milliseconds since the page was asked for, once the graphics have finished the page's own first picture.
 DRAWN = f"""(async () => {{
-  while (!{P}.renderer.sorter.order.length) await new Promise((resolve) => setTimeout(resolve, 5));
-  {P}.draw(); {P}.renderer.readPixels();
+  while (!{P}.statistics.drawn) await new Promise((resolve) => setTimeout(resolve, 5));
+  {P}.renderer.readPixels();
   return performance.now();
 }})()"""
 SEEK = f"""(async () => {{
-  const started = performance.now(), before = {P}.buffer.received;
+  const started = performance.now(), before = {P}.buffer.received, drawn = {P}.statistics.drawn;
   {P}.seek(FRAME);
-  while ({P}.frame !== FRAME) await new Promise((resolve) => setTimeout(resolve, 5));
-  {P}.draw(); {P}.renderer.readPixels();
+  while ({P}.frame !== FRAME || {P}.statistics.drawn === drawn) await new Promise((resolve) => setTimeout(resolve, 5));
+  {P}.renderer.readPixels();
   return [performance.now() - started, {P}.buffer.received - before];
 }})()"""
 STEPS = f"""(async () => {{

@@ -1,6 +1,6 @@
 // The state that a stream of packets leads to, bit for bit the one of the encoder. See docs/reference/packet-format.md.
 
-import { decodeMotions, marked, SECTIONS as MOTION } from "./changes/motion.js";
+import { decodeMotions, united, SECTIONS as MOTION } from "./changes/motion.js";
 import { applyResidual, decodeResidual, SECTIONS as RESIDUAL } from "./changes/residual.js";
 import { applyRows, decodeRows, SECTIONS as ROWS } from "./changes/rows.js";
 import { KIND, KIND_NAMES, parsePacket } from "./container.js";
@@ -83,39 +83,33 @@ function decodeDelta(sections, state, offset) {
  * left; see `applyRows`).
  */
 function applyDelta(state, { motions, residual, rows }) {
-  const touched = touchedRows(state.number, motions, residual);
+  const touched = united(motions?.rows ?? [], residual?.rows ?? []);
   const means = pick(state.scene.means, touched, 3);
   const quats = pick(state.scene.quats, touched, 4);
   const change = { kind: "delta", moved: [], source: null, before: state.number };
   if (motions) {
-    state.spare = { means: state.scene.means, quats: state.scene.quats };
+    const { means, quats } = state.scene;
+    state.spare = { means, quats, rows: touched };
     Object.assign(state.scene, { means: motions.means, quats: motions.quats });
     state.groups = motions.groups;
     state.turned = true;
     change.moved.push({ rows: motions.rows, gate: null, attributes: ["means", "quats"] });
   }
   if (residual) {
+    if (!motions) state.spare = null;
     applyResidual(state, residual);
     const attributes = residual.parts.map((part) => part.name);
     change.moved.push({ rows: residual.rows, gate: residual.gate, attributes });
   }
   state.moved = displacement(touched, means, quats, state.scene);
   if (rows) {
+    state.spare = null;
     change.source = applyRows(state, rows);
     state.moved = gatherDisplacement(state.moved, change.source, change.before);
     state.groups = gatherGroups(state.groups, change.source, change.before);
     state.number = change.source.length;
   }
   return change;
-}
-
-/** Rows of moving groups and rows behind open gates, ascending. */
-function touchedRows(number, motions, residual) {
-  if (!motions) return residual ? residual.rows : new Uint32Array(0);
-  if (!residual) return motions.rows;
-  const marks = new Uint8Array(number);
-  for (const rows of [motions.rows, residual.rows]) for (const row of rows) marks[row] = 1;
-  return marked(marks);
 }
 
 /** The bytes of all attributes in their order: two states are the same when these are. */

@@ -9,7 +9,7 @@ import { Renderer } from "./renderer.js";
 import { openSource } from "./source.js";
 
 /** Decoding may take so many milliseconds before the page gets its turn; what lies before the target is not drawn. */
-const BUDGET = 24;
+const BUDGET = 80;
 
 /**
  * `options.renderer` takes the place of the player's own; it has `update(state)`, `draw(camera)` and `dispose()`.
@@ -28,18 +28,15 @@ export class Player extends EventTarget {
     this.speed = options.speed ?? 1;
     this.playing = false;
     this.state = null;
-    this.view = null;
+    this.view = this.pivot = null;
     this.views = [];
-    this.pivot = null;
-    this.buffer = null;
+    this.buffer = this.problem = null;
     this.snapshots = new Snapshots();
-    this.problem = null;
     this.statistics = { drawn: 0, decode: 0, bytes: 0, uploaded: 0 };
     this._target = null;
-    this._clock = 0;
-    this._dirty = false;
+    this._clock = this._taken = 0;
     this._then = null;
-    this._closed = this._behind = false;
+    this._dirty = this._closed = this._behind = false;
     this._tick = (now) => this._turn(now);
     requestAnimationFrame(this._tick);
   }
@@ -139,13 +136,15 @@ export class Player extends EventTarget {
     this._dirty = true;
   }
 
-  /** Draw now. With `exact` the depth order is found first; otherwise it may be that of the picture before. */
+  /** Draw now. `exact` finds the depth order first; else it may be that of before, and then `patient` draws nothing. */
   draw(options = {}) {
-    if (!this.state || !this.view) return;
-    this.renderer.draw(cameraOf(this.view, this.canvas.width, this.canvas.height), options);
-    this.statistics.drawn += 1;
+    if (!this.state || !this.view) return false;
+    const drew = this.renderer.draw(cameraOf(this.view, this.canvas.width, this.canvas.height), options);
     this.statistics.uploaded += this.renderer.uploaded;
+    if (drew === false) return false;
+    this.statistics.drawn += 1;
     this.buffer?.shown?.(this.frame);
+    return true;
   }
 
   close() {
@@ -174,7 +173,8 @@ export class Player extends EventTarget {
     else if (this.buffer) this._advance(seconds);
     if (this._dirty && this.state && !this._behind) {
       this._dirty = false;
-      this.draw();
+      // It waits once: packets may come faster than orders.
+      this._taken = this.draw({ patient: this._taken > 1 }) ? 0 : -Infinity;
     }
   }
 
@@ -239,6 +239,8 @@ export class Player extends EventTarget {
       this.state = decodePacket(this.state, packet.data, packet.offset);
     }
     this.renderer.update(this.state);
+    // After a jump, of more than one packet or to a key packet, the order of before is far from right.
+    this._taken += this.state.change.kind === "key" ? 2 : 1;
     this.statistics.decode = performance.now() - started;
     this.statistics.bytes = (packet?.data ?? join).length;
     this.statistics.key = this.state.change.kind === "key";
@@ -288,9 +290,8 @@ export class Player extends EventTarget {
 
   _news() {
     // The first frame of a file without an index is known only now.
-    if (this.state === null && this.buffer?.first !== null && this._target < this.buffer.first)
-      this._target = this.buffer.first;
-    this.invalidate();
+    const first = this.buffer?.first;
+    if (this.state === null && first !== null && this._target < first) this._target = first;
   }
 
   _say(name) {

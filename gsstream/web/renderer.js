@@ -48,24 +48,32 @@ export class Renderer {
     const { anew, moved } = this.scene.update(state);
     if (anew) {
       this.sorter.reset(this.scene.capacity);
-      this._moved = new Set(moved);
-    } else {
-      for (const slot of moved) this._moved.add(slot);
+      this._moved.clear();
     }
+    for (const slot of moved) this._moved.add(slot);
   }
 
-  /** Draw `camera` at the size of the canvas. With `exact` the order is found here and now. */
-  draw(camera, { exact = false } = {}) {
-    if (!this.state || this.gl.isContextLost()) return;
+  /**
+   * Draw `camera` at the size of the canvas. With `exact` the order is found here and now. Otherwise it may be that of
+   * the picture before; while there is none, or with `patient` while the worker sorts, nothing is drawn. Returns
+   * whether it drew.
+   */
+  draw(camera, { exact = false, patient = false } = {}) {
+    if (!this.state || this.gl.isContextLost()) return false;
+    const { sorter, scene } = this;
     this._sendPositions();
-    this.uploaded = this.scene.textures.flush();
     const axis = Array.from(camera.viewmat.slice(8, 12));
-    if (exact) this.sorter.sortNow(axis, camera.near, this.scene.slots.slotOf);
-    else this.sorter.request(axis, camera.near);
+    if (exact) sorter.sortNow(axis, camera.near, scene.slots.slotOf);
+    else sorter.request(axis, camera.near);
+    // While the worker sorts.
+    this.projection.fit(scene.textures);
+    this.uploaded = scene.textures.flush();
+    if (!exact && sorter.busy && (patient || !sorter.order.length)) return false;
     this._fitTarget();
     this.projection.update(this.scene.textures, camera, this.canvas, this.marks ? this.state.frame : -1);
     this._drawSplats();
     this._copyToCanvas();
+    return true;
   }
 
   /** The picture last drawn as RGBA bytes, top row first. */
@@ -105,12 +113,14 @@ export class Renderer {
   _sendPositions() {
     if (!this._moved.size) return;
     const slots = Uint32Array.from(this._moved);
-    const positions = new Float32Array(3 * slots.length).fill(NaN);
-    slots.forEach((slot, i) => {
-      const row = this.scene.slots.rowOf[slot];
-      if (row >= 0) positions.set(this.state.scene.means.subarray(3 * row, 3 * row + 3), 3 * i);
-    });
-    this._moved = new Set();
+    const positions = new Float32Array(3 * slots.length);
+    const { rowOf } = this.scene.slots;
+    const { means } = this.state.scene;
+    for (let i = 0; i < positions.length; i += 1) {
+      const row = rowOf[slots[Math.floor(i / 3)]];
+      positions[i] = row >= 0 ? means[3 * row + (i % 3)] : NaN;
+    }
+    this._moved.clear();
     this.sorter.update(slots, positions);
   }
 

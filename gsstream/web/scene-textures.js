@@ -5,8 +5,10 @@ import { GEOMETRY_TEXELS, colourTexels } from "./shaders.js";
 const LINE = 2048;
 /** Slots that did not change but lie between two that did are uploaded too when they are at most so many. */
 const GAP = 8;
+/** Lines that are sent at once when everything is. */
+const LINES = 32;
 
-/** One texture of `texels` RGBA texels a Gaussian; `fill(out, at, slot)` writes the 4 * texels values of a slot. */
+/** One texture of `texels` RGBA texels a Gaussian; `fill(out, start, stop)` writes 4 * texels values for each slot. */
 class AttributeTexture {
   constructor(gl, texels, fill) {
     Object.assign(this, { gl, texels, fill, capacity: 0, texture: null });
@@ -49,10 +51,13 @@ class AttributeTexture {
     let bytes = 0;
     if (runs.length) gl.bindTexture(gl.TEXTURE_2D, this.texture);
     for (const [start, stop] of runs) {
-      const data = new Float32Array((stop - start) * texels * 4);
-      for (let slot = start; slot < stop; slot += 1) this.fill(data, (slot - start) * texels * 4, slot);
+      const number = stop - start;
+      const data = new Float32Array(number * texels * 4);
+      this.fill(data, start, stop);
       const x = (start & (2 ** shift - 1)) * texels;
-      gl.texSubImage2D(gl.TEXTURE_2D, 0, x, start >> shift, (stop - start) * texels, 1, gl.RGBA, gl.FLOAT, data);
+      const lines = Math.max(1, number >> shift);
+      const width = (number / lines) * texels;
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, x, start >> shift, width, lines, gl.RGBA, gl.FLOAT, data);
       bytes += data.byteLength;
     }
     for (const slot of this.list) this.dirty[slot] = 0;
@@ -62,9 +67,10 @@ class AttributeTexture {
   }
 
   _lines(used) {
+    const line = 2 ** this.shift;
+    const stop = Math.ceil(used / line) * line;
     const runs = [];
-    for (let start = 0; start < used; start += 2 ** this.shift)
-      runs.push([start, Math.min(start + 2 ** this.shift, used)]);
+    for (let start = 0; start < stop; start += LINES * line) runs.push([start, Math.min(start + LINES * line, stop)]);
     return runs;
   }
 
@@ -87,7 +93,7 @@ export class SceneTextures {
     this.gl = gl;
     this.state = null;
     this.stamps = new Float32Array(0);
-    this.geometry = new AttributeTexture(gl, GEOMETRY_TEXELS, (out, at, slot) => this._fillGeometry(out, at, slot));
+    this.geometry = new AttributeTexture(gl, GEOMETRY_TEXELS, (...run) => this._fillGeometry(...run));
     this.colours = null;
     this.degree = -1;
   }
@@ -99,9 +105,7 @@ export class SceneTextures {
     const { used } = this.slots;
     if (degree !== this.degree) {
       if (this.colours && this.colours.texture) this.gl.deleteTexture(this.colours.texture);
-      this.colours = new AttributeTexture(this.gl, colourTexels(degree), (out, at, slot) =>
-        this._fillColour(out, at, slot),
-      );
+      this.colours = new AttributeTexture(this.gl, colourTexels(degree), (...run) => this._fillColours(...run));
       this.degree = degree;
     }
     const room = Math.ceil(used * 1.25) + 1;
@@ -124,29 +128,36 @@ export class SceneTextures {
     return this.geometry.flush(this.slots.used) + this.colours.flush(this.slots.used);
   }
 
-  _fillGeometry(out, at, slot) {
-    const row = this.slots.rowOf[slot];
-    if (row < 0) {
-      // A dead slot: a logit that no opacity cut lets through.
-      out[at + 3] = -1e9;
-      return;
-    }
+  _fillGeometry(out, start, stop) {
+    const { rowOf } = this.slots;
     const { means, quats, scales, opacities } = this.state.scene;
-    for (let i = 0; i < 3; i += 1) {
-      out[at + i] = means[3 * row + i];
-      out[at + 8 + i] = scales[3 * row + i];
+    for (let slot = start, at = 0; slot < stop; slot += 1, at += 4 * GEOMETRY_TEXELS) {
+      const row = rowOf[slot];
+      if (!(row >= 0)) {
+        // A dead slot: a logit that no opacity cut lets through.
+        out[at + 3] = -1e9;
+        continue;
+      }
+      for (let i = 0; i < 3; i += 1) {
+        out[at + i] = means[3 * row + i];
+        out[at + 8 + i] = scales[3 * row + i];
+      }
+      out[at + 3] = opacities[row];
+      for (let i = 0; i < 4; i += 1) out[at + 4 + i] = quats[4 * row + i];
+      out[at + 11] = this.stamps[slot];
     }
-    out[at + 3] = opacities[row];
-    for (let i = 0; i < 4; i += 1) out[at + 4 + i] = quats[4 * row + i];
-    out[at + 11] = this.stamps[slot];
   }
 
-  _fillColour(out, at, slot) {
-    const row = this.slots.rowOf[slot];
-    if (row < 0) return;
+  _fillColours(out, start, stop) {
+    const { rowOf } = this.slots;
     const { sh0, shN } = this.state.scene;
     const width = this.state.widths.shN;
-    for (let i = 0; i < 3; i += 1) out[at + i] = sh0[3 * row + i];
-    for (let i = 0; i < width; i += 1) out[at + 3 + i] = shN[width * row + i];
+    const step = 4 * this.colours.texels;
+    for (let slot = start, at = 0; slot < stop; slot += 1, at += step) {
+      const row = rowOf[slot];
+      if (!(row >= 0)) continue;
+      for (let i = 0; i < 3; i += 1) out[at + i] = sh0[3 * row + i];
+      for (let i = 0; i < width; i += 1) out[at + 3 + i] = shN[width * row + i];
+    }
   }
 }

@@ -13,27 +13,23 @@ export class SortQueue {
     this.waiting = null;
     this.asked = null;
     this.worker = useWorker ? startWorker() : null;
-    this.local = this.worker ? null : new DepthSorter();
+    this.local = new DepthSorter();
     if (this.worker) {
       this.worker.onmessage = ({ data }) => this._received(data);
       this.worker.onerror = (event) => this._withoutWorker(event);
     }
-    this.mirror = { capacity: 0, positions: new Float32Array(0) };
   }
 
   reset(capacity) {
     this.asked = null;
-    this.mirror = { capacity, positions: new Float32Array(3 * capacity).fill(NaN) };
-    if (this.worker) this.worker.postMessage({ reset: capacity });
-    else this.local.reset(capacity);
+    this.local.reset(capacity);
+    this.worker?.postMessage({ reset: capacity });
   }
 
   update(slots, positions) {
     this.asked = null;
-    for (let i = 0; i < slots.length; i += 1)
-      this.mirror.positions.set(positions.subarray(3 * i, 3 * i + 3), 3 * slots[i]);
-    if (this.worker) this.worker.postMessage({ slots, positions }, [slots.buffer, positions.buffer]);
-    else this.local.update(slots, positions);
+    this.local.update(slots, positions);
+    this.worker?.postMessage({ slots, positions }, [slots.buffer, positions.buffer]);
   }
 
   /** Ask for the order of a view, unless it is known; of several requests that wait only the last is carried out. */
@@ -58,14 +54,11 @@ export class SortQueue {
   /** The exact order of a view at once, on this thread, equal depths as in `list`: for pictures that are measured. */
   sortNow(axis, near, list) {
     this.asked = null;
-    const sorter = new DepthSorter();
-    sorter.reset(this.mirror.capacity);
-    sorter.positions.set(this.mirror.positions);
-    this.order = sorter.sort(axis, near, list);
+    this.order = this.local.sort(axis, near, list);
   }
 
   dispose() {
-    if (this.worker) this.worker.terminate();
+    this.worker?.terminate();
   }
 
   _received({ order, milliseconds }) {
@@ -82,9 +75,6 @@ export class SortQueue {
   _withoutWorker(event) {
     event.preventDefault();
     this.worker = null;
-    this.local = new DepthSorter();
-    this.local.reset(this.mirror.capacity);
-    this.local.positions.set(this.mirror.positions);
     this.busy = false;
     this.asked = null;
     this.onOrder();

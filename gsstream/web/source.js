@@ -1,11 +1,8 @@
 // What there is to play at an address: a manifest with segments, or a stream file with or without an index.
 
-import { FILE_HEADER, parseHeader, parseIndex } from "./container.js";
-import { SourceError, bytesOf, chunksOf, fileOf, request } from "./download.js";
+import { SourceError, bytesOf, fileOf } from "./download.js";
 import { FORMAT_MAJOR, FORMAT_MINOR } from "./limits.js";
 import { PacketWalker } from "./walker.js";
-
-const TRAILER = 12;
 
 /**
  * Find out what is at `url`: `{ segments, frames, fps, renditions }`.
@@ -20,7 +17,9 @@ export async function openSource(url, signal) {
   const address = new URL(url, globalThis.document?.baseURI);
   if (/^wss?:$/.test(address.protocol)) return liveSource(address);
   if (address.pathname.endsWith("/")) address.pathname += "stream.json";
-  return address.pathname.endsWith(".json") ? openManifest(address.href, signal) : openFile(address.href, signal);
+  if (address.pathname.endsWith(".json")) return openManifest(address.href, signal);
+  // Only who plays a file by itself needs this module.
+  return (await import("./file.js")).openFile(address.href, signal);
 }
 
 async function openManifest(url, signal) {
@@ -98,61 +97,10 @@ function piecesOf(segment, entry, base) {
   }));
 }
 
-async function openFile(url, signal) {
-  const sequential = { first: null, last: null, url, start: 0, end: null, whole: true };
-  const plain = (body = null) => ({ segments: [{ ...sequential, body }], frames: null, fps: null, renditions: [] });
-  const response = await request(url, { start: -TRAILER, signal }).catch((error) => {
-    throw error instanceof SourceError || signal?.aborted ? error : new SourceError(`There is no server at ${url}.`);
-  });
-  if (response.status === 200) return plain(response);
-  if (response.status === 416) return plain();
-  if (response.status !== 206)
-    throw new SourceError(`There is no stream at ${url}: the server answers ${response.status}.`);
-  const total = /\/(\d+)$/.exec(response.headers.get("Content-Range") ?? "");
-  const tail = new Uint8Array(await response.arrayBuffer());
-  if (!total || tail.length !== TRAILER || String.fromCharCode(...tail.subarray(8)) !== "GSSX") return plain();
-  const segments = await indexed(
-    url,
-    Number(new DataView(tail.buffer).getBigUint64(0, true)),
-    Number(total[1]),
-    signal,
-  );
-  if (!segments) return plain();
-  const last = segments[segments.length - 1].last;
-  return { segments, frames: last - segments[0].first + 1, fps: null, renditions: [] };
-}
-
-/** Segments by the index at the end of a file; null when it is none after all. */
-async function indexed(url, offset, total, signal) {
-  if (offset < FILE_HEADER || offset >= total) return null;
-  const parts = [];
-  for await (const chunk of bytesOf(url, { start: offset, end: total - 1, signal })) parts.push(chunk);
-  const data = new Uint8Array(await new Blob(parts).arrayBuffer());
-  try {
-    const keys = parseIndex(data, offset);
-    const last = parseHeader(data, offset).frame;
-    if (!keys.length) return null;
-    return keys.map((key, i) => ({
-      first: key.frame,
-      last: i + 1 < keys.length ? keys[i + 1].frame - 1 : last,
-      url,
-      start: i ? key.offset : 0,
-      end: (i + 1 < keys.length ? keys[i + 1].offset : offset) - 1,
-      whole: false,
-    }));
-  } catch {
-    // Whatever it is, reading the file from its beginning says what is wrong and plays what is sound.
-    return null;
-  }
-}
-
 /** Packets `{ data, offset, header }` of a segment as they arrive. Throws PacketError or SourceError. */
 export async function* packetsOf(segment, signal) {
-  const { body } = segment;
-  segment.body = null;
   const all = segment.all && { ...segment.all, sent: false };
-  const chunks =
-    body && !body.bodyUsed ? continued(body, segment, signal) : bytesOf(segment.url, { ...segment, all, signal });
+  const chunks = segment.opened?.(signal) ?? bytesOf(segment.url, { ...segment, all, signal });
   // Whether the server sends the piece or the whole file is known with the first bytes.
   const make = () => (all?.sent ? new PacketWalker(0) : new PacketWalker(segment.start, segment.join && segment.first));
   let walker = null;
@@ -162,19 +110,4 @@ export async function* packetsOf(segment, signal) {
     for (let packet = walker.next(); packet; packet = walker.next()) yield packet;
   }
   (walker ?? make()).finish();
-}
-
-/** The body of an answer that is there already; when it breaks off, the rest is asked for. */
-async function* continued(body, segment, signal) {
-  let at = 0;
-  try {
-    for await (const chunk of chunksOf(body, signal)) {
-      at += chunk.length;
-      yield chunk;
-    }
-    return;
-  } catch (error) {
-    if (signal?.aborted) throw error;
-  }
-  yield* bytesOf(segment.url, { start: at, signal });
 }

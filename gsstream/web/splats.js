@@ -22,11 +22,10 @@ export class Projection {
     this.shift = 0;
   }
 
-  /** Project `scene` (SceneTextures) for a camera and a size; `frame`: changes are marked as of it, or -1. */
+  /** Project `scene` for a camera and a size, after `fit`; `frame`: changes are marked as of it, or -1. */
   update(scene, camera, { width, height }, frame) {
     const { gl } = this;
-    const { geometry, colours, degree } = scene;
-    this._fit(geometry, degree);
+    const { geometry, colours } = scene;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.buffer);
     gl.viewport(0, 0, 2 ** this.shift, Math.ceil(scene.slots.used / 2 ** this.shift));
     const { program } = this;
@@ -48,7 +47,8 @@ export class Projection {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  _fit({ shift, capacity }, degree) {
+  /** Make room for `scene` (SceneTextures), and begin to compile what it takes. */
+  fit({ geometry: { shift, capacity }, degree }) {
     const { gl } = this;
     if (degree !== this.degree) {
       this.degree = degree;
@@ -138,27 +138,23 @@ export class Quads {
   }
 }
 
-/** A program and its uniforms by name. Throws an Error with the compiler's words. */
+/** A program and its uniforms by name. The page waits for the compiler only in `at`, whose Error has its words. */
 export function link(gl, vertex, fragment) {
   const handle = gl.createProgram();
-  for (const [kind, text] of [
-    [gl.VERTEX_SHADER, vertex],
-    [gl.FRAGMENT_SHADER, fragment],
-  ]) {
-    const shader = gl.createShader(kind);
+  const shaders = [vertex, fragment].map((text, i) => {
+    const shader = gl.createShader(i ? gl.FRAGMENT_SHADER : gl.VERTEX_SHADER);
     gl.shaderSource(shader, text);
     gl.compileShader(shader);
     gl.attachShader(handle, shader);
-    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) {
-      throw new Error(`a shader does not compile: ${gl.getShaderInfoLog(shader)}`);
-    }
-  }
+    return shader;
+  });
   gl.linkProgram(handle);
-  if (!gl.getProgramParameter(handle, gl.LINK_STATUS) && !gl.isContextLost()) {
-    throw new Error(`the shaders do not fit together: ${gl.getProgramInfoLog(handle)}`);
-  }
   const places = new Map();
   const at = (name) => {
+    if (!places.size && !gl.getProgramParameter(handle, gl.LINK_STATUS) && !gl.isContextLost()) {
+      const words = [gl.getProgramInfoLog(handle), ...shaders.map((shader) => gl.getShaderInfoLog(shader))];
+      throw new Error(`the shaders do not compile: ${words.join(" ")}`);
+    }
     if (!places.has(name)) places.set(name, gl.getUniformLocation(handle, name));
     return places.get(name);
   };

@@ -145,6 +145,51 @@ def test_half_precision_numbers_are_read_as_numpy_reads_them(tmp_path):
     assert got == values[finite].tolist()
 
 
+def test_zeros_below_zero_get_their_sign_as_in_numpy(tmp_path):
+    """After a motion a value may be -0, to which a symbol of 0 adds 0, or -0. Rows without symbols count as well."""
+    rng = np.random.default_rng(5)
+    rows, open_rows, f = 40, np.arange(0, 40, 2), np.float32
+    cases, expected = [], []
+    for zeros in ([], [0.0], [0.0, -0.0]):
+        gate, step = rng.choice([0.25, 1.0], 20).astype(f), f(0.1)
+        weights = rng.normal(size=(2, 4)).astype(f)
+        scene = {"means": rng.normal(size=(rows, 3)).astype(f), "quats": rng.normal(size=(rows, 4)).astype(f)}
+        parts, sums = [], {}
+        for name, values in scene.items():
+            if zeros:
+                drawn = rng.choice(np.array(zeros, f), values.shape)
+                values[...] = np.where(rng.random(values.shape) < 0.4, drawn, values)
+            symbols = rng.integers(-1, 2, (20, values.shape[1] if name == "means" else 2))
+            places = np.flatnonzero(rng.random(20) < 0.5)
+            symbols[np.setdiff1d(np.arange(20), places)] = 0
+            latent = symbols.astype(f) * step
+            change = latent if name == "means" else latent[:, :1] * weights[0] + latent[:, 1:] * weights[1]
+            sums[name] = values.copy()
+            sums[name][open_rows] += change * gate[:, None]
+            sent = {"symbols": symbols[places].T.ravel().tolist(), "places": places.tolist(), "step": float(step)}
+            parts.append({"name": name, **sent, "decoder": None if name == "means" else weights.ravel().tolist()})
+        bits = {name: values.view(np.int32).ravel().tolist() for name, values in scene.items()}
+        cases.append({"bits": bits, "rows": open_rows.tolist(), "gate": gate.tolist(), "parts": parts})
+        expected.append({name: values.view(np.int32).ravel().tolist() for name, values in sums.items()})
+    code = """
+        const { applyResidual } = await load('changes/residual.js');
+        return given.map(({ bits, rows, gate, parts }) => {
+          const floats = (list) => new Float32Array(Int32Array.from(list).buffer);
+          const scene = { means: floats(bits.means), quats: floats(bits.quats) };
+          const layout = { unitOf: new Uint8Array(40), units: Float32Array.of(1) };
+          const whole = parts.map((part) => ({
+            ...part, symbols: Int32Array.from(part.symbols), places: Uint32Array.from(part.places),
+            channels: part.decoder ? 2 : 3, width: part.decoder ? 4 : 3,
+            decoder: part.decoder && { values: Float32Array.from(part.decoder) },
+          }));
+          const residual = { rows: Uint32Array.from(rows), gate: Float32Array.from(gate), parts: whole };
+          applyResidual({ scene, layout, turned: true }, residual);
+          const bitsOf = (values) => [...new Int32Array(values.buffer)];
+          return { means: bitsOf(scene.means), quats: bitsOf(scene.quats) };
+        });"""
+    assert node(code, cases, tmp_path) == expected
+
+
 INFLATE = """
     const { inflate } = await load('key.js');
     return given.map((hex) => {

@@ -19,36 +19,54 @@ const SH0 = 0.28209479177387814;
  * Decode the motions of a frame and apply them, one after the other, to copies of what they change.
  *
  * Returns `{ means, quats, groups, rows }`: arrays of the whole scene after the motions, its groups, and the rows of
- * moving groups, ascending. Nothing of `state` changes but `state.spare`, the memory in which the copies lie.
+ * moving groups, ascending. Nothing of `state` changes but `state.spare`, the memory in which the copies lie: after the
+ * motions of a frame, the scene before it, which differs in its `rows`. Where it does not, it is null.
  */
 export function decodeMotions(section, state) {
   const number = section.data.length ? section.data[0] : 0;
   if (number < 1 || number > MAX_MOTIONS) {
     throw new PacketError(`motion: expected 1 to ${MAX_MOTIONS} motions, got ${number}`);
   }
-  const { means, quats, sh0 } = state.scene;
-  if (!state.spare || state.spare.quats.length !== quats.length) {
-    state.spare = { means: new Float32Array(means.length), quats: new Float32Array(quats.length) };
-  }
-  state.spare.means.set(means);
-  state.spare.quats.set(quats);
-  const scene = { ...state.spare, sh0, groups: state.groups };
-  const touched = new Uint8Array(state.number);
+  const { means, quats } = copied(state);
+  let { groups } = state;
+  let rows = new Uint32Array(0);
   for (const part of unpackParts(section.data.subarray(1), number)) {
+    const scene = { means, quats, sh0: state.scene.sh0, groups };
     const motion = decodeMotion(part, scene);
-    scene.groups = motion.groups;
-    moveRows(scene, motion, state.moved, touched);
+    ({ groups } = motion);
+    rows = united(rows, moveRows(scene, motion, state.moved));
   }
-  return { means: scene.means, quats: scene.quats, groups: scene.groups, rows: marked(touched) };
+  return { means, quats, groups, rows };
 }
 
-/** Which rows carry a mark, ascending. */
-export function marked(marks) {
-  let number = 0;
-  for (let row = 0; row < marks.length; row += 1) number += marks[row];
-  const rows = new Uint32Array(number);
-  for (let row = 0, at = 0; row < marks.length; row += 1) if (marks[row]) rows[at++] = row;
-  return rows;
+/** Copies of the centres and rotations of a state, in its spare memory if there is any, which then is used up. */
+function copied(state) {
+  const { scene, spare } = state;
+  // Until a motion is applied as a whole, nobody knows what is in there.
+  state.spare = null;
+  if (!spare) return { means: scene.means.slice(), quats: scene.quats.slice() };
+  for (const row of spare.rows) {
+    for (let i = 3 * row; i < 3 * row + 3; i += 1) spare.means[i] = scene.means[i];
+    for (let i = 4 * row; i < 4 * row + 4; i += 1) spare.quats[i] = scene.quats[i];
+  }
+  return spare;
+}
+
+/** The rows of two ascending lists, ascending. */
+export function united(a, b) {
+  const out = new Uint32Array(a.length + b.length);
+  let at = 0;
+  let i = 0;
+  let k = 0;
+  while (i < a.length && k < b.length) {
+    const row = Math.min(a[i], b[k]);
+    if (a[i] === row) i += 1;
+    if (b[k] === row) k += 1;
+    out[at++] = row;
+  }
+  for (; i < a.length; i += 1) out[at++] = a[i];
+  for (; k < b.length; k += 1) out[at++] = b[k];
+  return out.subarray(0, at);
 }
 
 function decodeMotion(data, scene) {
@@ -118,8 +136,8 @@ function ranked(keys) {
   return { groupOf, count: distinct.length };
 }
 
-/** Move the rows of moving groups in place, in float64 and in the order of operations of the format. */
-function moveRows(scene, motion, moved, touched) {
+/** Move the rows of moving groups, which are returned, in place, in float64 and in the format's order of operations. */
+function moveRows(scene, motion, moved) {
   const { groups, moving, number } = motion;
   const rank = new Int32Array(groups.count).fill(-1);
   for (let group = 0, k = 0; group < moving.length; group += 1) if (moving[group]) rank[group] = k++;
@@ -144,10 +162,10 @@ function moveRows(scene, motion, moved, touched) {
   for (let i = 0; i < found; i += 1) {
     const row = rows[i];
     const k = rank[groupOf[row]];
-    touched[row] = 1;
     moveCentre(means, row, turns, own, shift, k);
     turnQuat(quats, row, turns, k);
   }
+  return rows.subarray(0, found);
 }
 
 function divide(sums, counts) {

@@ -57,11 +57,21 @@ export function applyResidual(state, residual) {
   for (const part of parts) {
     // A symbol of 0 adds 0 or -0, which changes nothing but a value of -0. Of these there are none except where a
     // motion was: key packets and births hold multiples of a step, and no sum of two others is -0.
-    const zeros = state.turned && (part.name === "means" || part.name === "quats");
+    const values = state.scene[part.name];
+    const turned = state.turned && (part.name === "means" || part.name === "quats");
+    const zeros = turned && holdMinusZero(values, rows, part.width);
     const sent = zeros && part.places ? { ...part, symbols: spread(part, rows.length), places: null } : part;
     const add = part.decoder ? addDecoded : addDirect;
-    add(state.scene[part.name], rows, part.name === "means" ? scale : gate, sent, zeros);
+    add(values, rows, part.name === "means" ? scale : gate, sent, zeros);
   }
+}
+
+/** Whether a value of `rows` is -0, which is rare. */
+function holdMinusZero(values, rows, width) {
+  for (let i = 0; i < rows.length; i += 1) {
+    for (let at = rows[i] * width; at < (rows[i] + 1) * width; at += 1) if (Object.is(values[at], -0)) return true;
+  }
+  return false;
 }
 
 /** Add step * symbols * gate. With `zeros` also where the symbol is 0, which rids a value of -0 of its sign. */

@@ -1,7 +1,7 @@
 # Two commands, nothing to prepare: 'make demo' and 'make test'. All set up .venv first (Python >= 3.11, a C++ compiler).
 #   make demo            encode the recording that ships with gsstream; says where the pictures are and how to open it
 #   make test            lint, types, import rules and all tests
-#   make check           the same with the quick tests alone: for every change, in two minutes on two cores
+#   make check           the same with the quick tests alone: for every change, in a minute or two on two cores
 #   make dist            every distribution, as source archive and wheel, in dist/
 #   make PYTHON=python3.12 test    choose the interpreter .venv is made with
 #   make clean           remove .venv and what was built

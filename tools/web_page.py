@@ -85,7 +85,8 @@ def measure(given: argparse.Namespace) -> dict[str, object]:
         # A viewer's browser runs already: its own start, and the graphics' first picture, are not the page's.
         running = [["go", "about:blank"], ["pause", 3000]]
         steps = [
-            *running, ["throttle", given.mbit * 1e6 / 8], ["processor"], ["go", f"{url}/index.html"], ready, ["evaluate", DRAWN],
+            *running, ["throttle", given.mbit * 1e6 / 8],
+            ["processor"], ["go", f"{url}/index.html"], ready, ["evaluate", DRAWN],
             ["processor"], ["evaluate", f"{P}.buffer.received"], ["pause", 2000],
             ["processor"], ["evaluate", SEEK.replace("FRAME", str(last))], ["processor"],
             ["evaluate", SEEK.replace("FRAME", str(frames[0]))], ["processor"], ["evaluate", STEPS],

@@ -56,9 +56,6 @@ class RowTable:
         A new row starts without Adam's moments but keeps the step count of the row it was copied from. So the bias
         correction is off for it and its first step is about three times as large; frame 0 is 0.4 dB better for it
         (measured).
-
-        A fresh row has no moments, and the count of the row it came of: its first step is then three times as long as
-        one with a count of its own, and frame 0 is 0.4 dB better for it (measured).
         """
         for name, leaf in self.leaves.items():
             content = leaf.detach()[edit.source] if values is None else values[name].clone()

@@ -190,11 +190,9 @@ class _FirstFrameRun:
 
     def _prune(self) -> None:
         """Drop what the images hardly show; growth has just ended, and what remains has time to close the gaps."""
-        gaussians = self.gaussians().map(torch.Tensor.detach)
-        pixels = shown(self.renderer, gaussians, self.frame.cameras)
+        pixels = shown(self.renderer, self.gaussians().map(torch.Tensor.detach), self.frame.cameras)
         rows = worth_keeping(pixels, self.settings.prune_share)
-        edit = TopologyEdit(rows, torch.zeros(len(rows), dtype=torch.bool))
-        self.table.edit(edit, dict(gaussians.rows(rows).items()))
+        self.table.keep(rows)
         self.levels = self.levels[rows]
         self.statistics = DensifyStatistics.zeros(len(rows))
 

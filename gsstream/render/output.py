@@ -63,6 +63,8 @@ class Comparison:
         target: what its ``prepare`` made of the image that the camera recorded.
         dssim: weight of 1 - SSIM, 0 to 1.
         matrix, offset: [3, 3] and [3] colour map of the camera, recorded = matrix scene + offset; or both None.
+        tiles: [ceil(H / 16), ceil(W / 16)] float32 factors on the gradients of tiles; a tile of 0 is left out, and
+            shows the session's scene as it was. None: every tile counts once.
     """
 
     loss: object
@@ -70,6 +72,7 @@ class Comparison:
     dssim: float
     matrix: torch.Tensor | None = None
     offset: torch.Tensor | None = None
+    tiles: torch.Tensor | None = None
 
 
 class Pulled(NamedTuple):

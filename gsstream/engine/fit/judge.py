@@ -13,7 +13,7 @@ from gsstream.engine.assembly.guard import plain
 from gsstream.engine.fit.backward import pull_back
 from gsstream.engine.fit.exposure import Exposure
 from gsstream.loss.base import Loss
-from gsstream.render.base import Comparison, Pulled, Renderer, RenderSession
+from gsstream.render.base import TILE, Comparison, Pulled, Renderer, RenderSession
 
 
 class Judge:
@@ -33,28 +33,36 @@ class Judge:
         self._in_one_go = in_one_go
         self._targets: dict[int, Any] = {}
 
-    def pull(self, session: RenderSession, view: int, rows: Gaussians[torch.Tensor]) -> Pulled:
+    def pull(
+        self, session: RenderSession, view: int, rows: Gaussians[torch.Tensor], tiles: torch.Tensor | None = None
+    ) -> Pulled:
         """Render a view, judge it, and pull the loss back to the rows that were rendered.
 
         Arguments:
             session: renders the scene.
             view: index of a training camera.
             rows: the active rows of the session; a graph of theirs is left alone.
+            tiles: [ceil(H / 16), ceil(W / 16)] float32 factors on the gradients of tiles, 0: left out; None: all count.
         """
         if self._in_one_go:
             exposure = self.exposure
-            maps = (exposure.matrix[view], exposure.offset[view]) if exposure else ()
-            comparison = Comparison(plain(self._loss), self._target(view), self._dssim, *maps)
+            maps = (exposure.matrix[view], exposure.offset[view]) if exposure else (None, None)
+            comparison = Comparison(plain(self._loss), self._target(view), self._dssim, *maps, tiles)
             pulled = session.pull(view, rows, comparison)
             if pulled is not None:
                 return pulled
         leaves = rows.map(lambda value: value.detach().requires_grad_())
-        output = session.render(view, leaves)
-        loss, _ = self.backward(view, output.image, output.tiles)
+        if tiles is None:
+            output = session.render(view, leaves)
+            loss, _ = self.backward(view, output.image, output.tiles)
+            return Pulled(loss, leaves.map(_gradient))
+        output = session.render(view, leaves, tile_mask=tiles > 0)
+        counted = tiles > 0 if output.tiles is None else (tiles > 0) & output.tiles
+        loss, _ = self.backward(view, output.image, counted, tiles)
         return Pulled(loss, leaves.map(_gradient))
 
     def backward(
-        self, view: int, image: torch.Tensor, tiles: torch.Tensor | None = None
+        self, view: int, image: torch.Tensor, tiles: torch.Tensor | None = None, weights: torch.Tensor | None = None
     ) -> tuple[float, torch.Tensor]:
         """Judge a render and pull the loss back into whatever it was rendered from.
 
@@ -62,12 +70,17 @@ class Judge:
             view: index of a training camera.
             image: [H, W, 3] scene colours, with a graph.
             tiles: the only tiles that what is optimised can change (``RenderOutput.tiles``); None: all.
+            weights: [ceil(H / 16), ceil(W / 16)] factors on the gradients of tiles; None: 1.
 
         Returns:
             The loss, and its gradient [H, W, 3] with respect to the recorded colours.
         """
         recorded = self.recorded(view, image.detach())
         value, gradient = self._loss.evaluate(recorded, self._target(view), self._dssim, tiles)
+        if weights is not None:
+            height, width = image.shape[:2]
+            per_pixel = weights.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
+            gradient = gradient * per_pixel[..., None]
         pull_back([image], [self.exposure.pull(view, gradient) if self.exposure else gradient])
         return value, gradient
 

@@ -80,7 +80,7 @@ def frame_step(
         problem = Problem(
             frame.index, frame.effort, scene.layout, state.hierarchy, rows, view.gaussians.rows(rows), logits,
             state.decoders, view.session_for(rows), view.judge, len(frame.cameras),
-            frame.cameras.width * frame.cameras.height, allowance,
+            frame.cameras.width * frame.cameras.height, allowance, None if change is None else change.tiles,
         )  # fmt: skip
         solution = optimise(parts, problem, rng.stream("frame", frame.index))
         residual = harden(parts, problem, solution)

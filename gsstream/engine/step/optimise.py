@@ -19,6 +19,7 @@ from gsstream.engine.step.active.candidates import released
 from gsstream.engine.step.dead_gates import count_dead
 from gsstream.engine.step.levels import current_level, level_schedule
 from gsstream.engine.step.problem import Problem, Solution
+from gsstream.engine.step.quiet_tiles import QuietTiles
 from gsstream.gate.base import RoundedSigmoid
 from gsstream.optimiser.base import ResidualTable
 from gsstream.regularizer.base import GatePrice
@@ -73,6 +74,7 @@ class _FrameRun:
     def __init__(self, parts: Assembly, problem: Problem, generator: torch.Generator, pace: Pace) -> None:
         self.parts, self.problem, self.generator, self.pace = parts, problem, generator, pace
         self.rows = problem.rows
+        self.tiles = QuietTiles(problem.changed, parts.recipe.stream.quiet_tiles, generator)
         layout, rows = problem.layout, problem.rows.numpy()
         # Only gates with candidates behind them are sampled and trained. Sampling does not look at parents, so the
         # forest is replaced by roots.
@@ -105,7 +107,7 @@ class _FrameRun:
         shut = gates.detach()
         with blaming("optimiser", self.parts.part("optimiser"), self.parts.where):
             rows = self.table.rows(shut)
-        loss, gradients = self.problem.judge.pull(self.problem.session, view, rows)
+        loss, gradients = self.problem.judge.pull(self.problem.session, view, rows, self.tiles.weights(view))
         with blaming("optimiser", self.parts.part("optimiser"), self.parts.where):
             by_gate = self.table.pull(gradients, self.pace.rate_weight / self.problem.pixels)
         if self.law is None or self.price is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,8 +14,11 @@ from gsstream_cpu_render.renderer import CpuRenderer
 from gsstream_cpu_render.threads import num_threads, set_num_threads
 from test_cpu_renderer import rig, scene
 
-from gsstream.api import Comparison, Gaussians, RenderSession, ShapeError
+from gsstream.api import Comparison, Gaussians, InputError, RenderSession, ShapeError
+from gsstream.engine.fit.exposure import Exposure
+from gsstream.engine.fit.judge import Judge
 from gsstream.loss.photometric import ReferenceLoss
+from gsstream.render.base import TILE
 from gsstream.testing.optimiser.checks import _residual_case
 
 BACKGROUND = (0.2, 0.5, 0.9)
@@ -86,6 +90,56 @@ def test_a_render_after_a_pull_is_that_of_the_scene() -> None:
     session.pull(1, rows, comparison())
     fresh, _ = opened()
     assert torch.equal(session.render(1, rows).image, fresh.render(1, rows).image)
+
+
+def some_tiles(seed: int = 6) -> torch.Tensor:
+    """Factors of tiles, about half of them 0, the others unlike one another."""
+    cameras, g = rig(), torch.Generator().manual_seed(seed)
+    shape = -(-cameras.height // TILE), -(-cameras.width // TILE)
+    return torch.rand(shape, generator=g).sub(0.5).clamp(min=0) * 4
+
+
+@pytest.mark.parametrize("coloured", [False, True])
+def test_pull_with_weights_is_the_engines_own_way_with_a_mask(coloured: bool, threads: int) -> None:
+    wanted, tiles = comparison(coloured), some_tiles()
+    session, rows = opened()
+    pulled = session.pull(1, rows, replace(wanted, tiles=tiles))
+    other, _ = opened()
+    exposure = Exposure(wanted.matrix.expand(2, 3, 3), wanted.offset.expand(2, 3)) if coloured else None
+    images = np.stack([np.zeros_like(wanted.target.image), wanted.target.image])
+    judged = Judge(CpuLoss(), 0.2, images, exposure).pull(other, 1, rows, tiles)
+    assert pulled is not None
+    assert pulled.loss == pytest.approx(judged.loss, rel=1e-6)
+    for (name, got), (_, want) in zip(pulled.gradients.items(), judged.gradients.items(), strict=True):
+        assert name == "shN" or float(want.abs().max()) > 0
+        np.testing.assert_allclose(got.numpy(), want.numpy(), rtol=0, atol=2e-6 * float(want.abs().max()), err_msg=name)
+
+
+def test_the_gradients_of_two_halves_of_the_tiles_add_up_to_that_of_all() -> None:
+    """Without SSIM, whose windows look beyond a tile, every pixel speaks for itself."""
+    wanted, half = replace(comparison(), dssim=0.0), (some_tiles() > 0).float()
+    pulls = []
+    for tiles in (None, half, 1 - half):
+        session, rows = opened()
+        pulls.append(session.pull(1, rows, replace(wanted, tiles=tiles)))
+    for (name, whole), (_, one), (_, other) in zip(*(pull.gradients.items() for pull in pulls), strict=True):
+        np.testing.assert_allclose((one + other).numpy(), whole.numpy(), rtol=0, atol=1e-5 * float(whole.abs().max()),
+                                   err_msg=name)  # fmt: skip
+
+
+def test_a_pull_without_any_tile_says_nothing_and_leaves_the_session_as_it_was() -> None:
+    session, rows = opened()
+    pulled = session.pull(1, rows, replace(comparison(), tiles=torch.zeros_like(some_tiles())))
+    assert pulled.loss == 0
+    assert all(not bool(value.any()) for _, value in pulled.gradients.items())
+    fresh, _ = opened()
+    assert torch.equal(session.render(1, rows).image, fresh.render(1, rows).image)
+
+
+def test_pull_refuses_weights_of_another_shape() -> None:
+    session, rows = opened()
+    with pytest.raises(InputError, match="tile_weights"):
+        session.pull(1, rows, replace(comparison(), tiles=torch.ones(2, 2)))
 
 
 def test_pull_leaves_other_losses_and_wide_sessions_to_the_engine() -> None:

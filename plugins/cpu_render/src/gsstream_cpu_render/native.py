@@ -92,22 +92,24 @@ class NativeRasterizer:
 
     def pull_active(
         self, rows: SplatArrays, cached_image: Float32, target: PhotometricTarget, dssim_weight: float,
-        colours: Sequence[Float32 | None], out: SplatArrays,
+        colours: Sequence[Float32 | None], weights: Float32 | None, out: SplatArrays,
     ) -> float:  # fmt: skip
         """Render the active rows, judge the picture and write the gradient by the rows: one iteration of a fit.
 
         The bits are those of `forward_active` with ``touched_only``, `photometric_loss` with ``around`` and
-        `backward_active`, one after the other; whole images are neither made nor copied.
+        `backward_active`, one after the other; whole images are neither made nor copied. Tiles that are left out stay
+        as they are in the cache.
 
         Arguments:
             rows: raw parameters of the A active Gaussians, in the order of active_ids.
             cached_image: [H, W, 3] the cached render.
             target: what the picture is compared with. dssim_weight: w in [0, 1].
             colours: [3, 3] and [3], the map from colours of the scene to those of the target; or twice None.
+            weights: [ceil(H / 16), ceil(W / 16)] factors on the gradients of tiles, 0: left out; None: all count once.
             out: like ``rows``; the gradient is written here.
 
         Returns:
-            The loss.
+            The loss, of the tiles that are not left out.
 
         Raises:
             InputError: as forward_active; a loss that is not finite.
@@ -117,10 +119,10 @@ class NativeRasterizer:
         shape = (self.height, self.width, 3)
         images = [require_float32("cached_image", cached_image, shape), target.image, target.mean, target.variance]
         scale = 1.0 / target.image.size
-        weights = (1.0 - dssim_weight) * scale, -dssim_weight * scale
+        scales = (1.0 - dssim_weight) * scale, -dssim_weight * scale
         try:
             result = self._native.pull_active(
-                native_scene(rows), self._view.background, *images, *colours, *weights, *out
+                native_scene(rows), self._view.background, *images, *colours, *scales, weights, *out
             )
         except ValueError as error:
             refuse_value(str(error))

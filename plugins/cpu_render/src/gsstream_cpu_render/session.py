@@ -204,8 +204,9 @@ class _CachedView:
         gradients = rows.map(lambda value: torch.empty(value.shape))
         colours = [None if value is None else value.contiguous().numpy() for value in
                    (comparison.matrix, comparison.offset)]  # fmt: skip
+        weights = None if comparison.tiles is None else as_array("tiles", comparison.tiles)
         loss = self.rasterizer.pull_active(
-            splats_of(rows), self.image, target, comparison.dssim, colours, splats_of(gradients)
+            splats_of(rows), self.image, target, comparison.dssim, colours, weights, splats_of(gradients)
         )
         return Pulled(loss, gradients)
 

@@ -13,7 +13,7 @@ namespace {
 // Memory of one calling thread, kept between calls.
 struct Workspace {
   Buffer<float> image, transmittance, recorded, gradient;
-  std::vector<uint8_t> touched, around, read;  // by tiles of 16 x 16 pixels
+  std::vector<uint8_t> touched, around, read, counted;  // by tiles of 16 x 16 pixels
 };
 
 Workspace& workspace() {
@@ -94,6 +94,28 @@ void pull_colours(const float* matrix, float* gradient, std::size_t pixels) {
   }
 }
 
+// Tiles that are not left out; null where all count.
+const uint8_t* counted(const float* weights, std::size_t tiles, std::vector<uint8_t>& mask) {
+  if (!weights) return nullptr;
+  mask.resize(tiles);
+  for (std::size_t tile = 0; tile < tiles; tile++) mask[tile] = weights[tile] > 0.0f;
+  return mask.data();
+}
+
+// gradient = gradient times the weight of its tile.
+void weigh(const Grid& grid, const float* weights, const std::vector<uint8_t>& marked, float* gradient) {
+  for (int row = 0; row < grid.rows; row++)
+    for (int column = 0; column < grid.columns; column++) {
+      const std::size_t tile = static_cast<std::size_t>(row) * grid.columns + column;
+      if (!marked[tile] || weights[tile] == 1.0f) continue;
+      const int right = std::min(grid.width, (column + 1) * kTile), bottom = std::min(grid.height, (row + 1) * kTile);
+      for (int y = row * kTile; y < bottom; y++) {
+        float* line = gradient + 3 * (static_cast<std::size_t>(y) * grid.width + column * kTile);
+        for (int i = 0; i < 3 * (right - column * kTile); i++) line[i] *= weights[tile];
+      }
+    }
+}
+
 }  // namespace
 
 ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparison& view, const GradientArrays& out) {
@@ -106,7 +128,7 @@ ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparis
   const Target target{{view.background[0], view.background[1], view.background[2]},
                       image, work.transmittance.require(pixels)};
   ViewPull result{};
-  result.faults = rasterizer.forward_active(rows, target, true);
+  result.faults = rasterizer.forward_active(rows, target, true, counted(view.weights, tiles, work.counted));
   if (result.faults) return result;
   work.touched.resize(tiles);
   rasterizer.touched().write_mask(grid.width, grid.height, work.touched.data());
@@ -140,6 +162,7 @@ ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparis
     for_marked(grid, work.touched, [&](std::size_t first, std::size_t count) {
       pull_colours(view.matrix, job.gradient + 3 * first, count);
     });
+  if (view.weights) weigh(grid, view.weights, work.touched, job.gradient);
   rasterizer.backward_active(job.gradient, nullptr, out);
   return result;
 }

@@ -15,11 +15,13 @@ struct ViewComparison {
   const float *matrix, *offset;            // colour map [3, 3], [3] of the camera; or both null
   float background[3];
   float l1_scale, ssim_scale;
+  const float* weights;                    // [ceil(H/16), ceil(W/16)] factors on the gradients of tiles; 0: the tile is
+                                           // left out and stays as it is in the cache. Null: all count once
 };
 
 struct ViewPull {
   uint32_t faults;       // Fault bits; if any is set, nothing else is written
-  PhotometricSums sums;  // over the touched tiles and those beside them
+  PhotometricSums sums;  // over the touched tiles that count and those beside them
 };
 
 // `rows` are the active rows of `rasterizer`, which must be frozen. `out` has one row per active row.

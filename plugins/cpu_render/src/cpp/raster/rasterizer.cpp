@@ -191,19 +191,22 @@ uint32_t Rasterizer::list_active(const Scene& rows, const TileSelection& selecti
   return 0;
 }
 
-uint32_t Rasterizer::forward_active(const Scene& rows, const Target& target, bool touched_only) {
+uint32_t Rasterizer::forward_active(const Scene& rows, const Target& target, bool touched_only, const uint8_t* mask) {
   const Claim claim(busy_);
   expect("forward_active");
   drop_pass();
   passes_++;
-  const uint32_t faults = list_active(rows, selection_);
+  TileSelection fewer;
+  if (mask) fewer.build(camera_.width, camera_.height, mask);
+  const TileSelection& within = mask ? fewer : selection_;
+  const uint32_t faults = list_active(rows, within);
   if (faults) return faults;
   if (touched_only) {
     std::vector<uint32_t> touched = dropped_blocks_;
     add_touched_blocks(active_lists_, touched);
-    touched_.restrict(selection_, touched);
+    touched_.restrict(within, touched);
   } else {
-    touched_ = selection_;
+    touched_ = within;
   }
   const TileSelection& wanted = touched_;
   merge_tile_lists(frozen_lists_, active_lists_, wanted.blocks, records_.data(), static_cast<uint32_t>(scene_count_),

@@ -81,8 +81,8 @@ class Rasterizer {
   // The arrays of `scene` are read again by the matching backward.
   uint32_t forward(const Scene& scene, const Camera& camera, const uint8_t* mask, const Target& target);
   // With `touched_only`, only blocks that the active rows touch now or touched in the cache are rendered: all others
-  // would come out as they are in the cache.
-  uint32_t forward_active(const Scene& rows, const Target& target, bool touched_only);
+  // would come out as they are in the cache. `mask`, as forward's: tiles outside it are not rendered either.
+  uint32_t forward_active(const Scene& rows, const Target& target, bool touched_only, const uint8_t* mask = nullptr);
   // Renders from the cache alone (no projection, no gradients).
   void forward_cached(const uint8_t* mask, const Target& target);
 

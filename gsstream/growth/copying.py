@@ -20,7 +20,7 @@ Admitted = Callable[[FrameWork, torch.Tensor], torch.Tensor]
 
 def replaced_by_copies(
     scene: Scene, deaths: IntArray, work: FrameWork, epochs: int, rng: Rng, *, gradient: float, most: int, rounds: int,
-    prune_opacity: float, admitted: Admitted = lambda _, rows: rows,
+    prune_opacity: float, admitted: Admitted | None = None,
 ) -> Rows:  # fmt: skip
     """Return the change of rows in which some leave and the frame's copies are born, each a node of its own.
 
@@ -41,7 +41,7 @@ def replaced_by_copies(
 
 def fitted_copies(
     scene: Gaussians[torch.Tensor], work: FrameWork, epochs: int, rng: Rng, *, gradient: float, most: int, rounds: int,
-    prune_opacity: float, admitted: Admitted = lambda _, rows: rows,
+    prune_opacity: float, admitted: Admitted | None = None,
 ) -> Gaussians[torch.Tensor]:  # fmt: skip
     """Return the Gaussians that a frame adds to a scene, raw values.
 
@@ -54,7 +54,7 @@ def fitted_copies(
         most: Gaussians that are added at most.
         rounds: times that the scene is searched for places.
         prune_opacity: opacity below which an added Gaussian is given up, 0 to 1.
-        admitted: chooses among the places that are found; all of them unless told otherwise.
+        admitted: chooses among the places that are found; None: all of them.
     """
     born = scene.rows(slice(0, 0))
     views = list(range(len(work.cameras)))
@@ -64,8 +64,10 @@ def fitted_copies(
         if not passes or (room <= 0 and not len(born)):
             continue
         inner = work.on(joined(scene, born) if len(born) else scene)
-        places = admitted(inner, pulled_rows(inner, gradient))[: max(0, room)]
-        copies = inner.gaussians.rows(places.sort().values)
+        places = pulled_rows(inner, gradient)
+        if admitted is not None:
+            places = admitted(inner, places)
+        copies = inner.gaussians.rows(places[: max(0, room)].sort().values)
         born = joined(born, copies) if len(born) else copies
         if not len(born):
             continue

@@ -63,17 +63,21 @@ def fitted_copies(
         room = most - len(born)
         if not passes or (room <= 0 and not len(born)):
             continue
-        inner = work.on(joined(scene, born) if len(born) else scene)
-        places = pulled_rows(inner, gradient)
-        if admitted is not None:
-            places = admitted(inner, places)
-        copies = inner.gaussians.rows(places[: max(0, room)].sort().values)
+        copies = _copies(work.on(joined(scene, born) if len(born) else scene), gradient, max(0, room), admitted)
         born = joined(born, copies) if len(born) else copies
         if not len(born):
             continue
         born = fitted_births(scene, born, work, views, passes, rng)
         born = born.rows(born.opacities.sigmoid() >= prune_opacity)
     return born
+
+
+def _copies(work: FrameWork, gradient: float, room: int, admitted: Admitted | None) -> Gaussians[torch.Tensor]:
+    """Copies of at most ``room`` Gaussians. What is rendered for it, a render for every camera, goes with the call."""
+    places = pulled_rows(work, gradient)
+    if admitted is not None:
+        places = admitted(work, places)
+    return work.gaussians.rows(places[:room].sort().values)
 
 
 def pulled_rows(work: FrameWork, gradient: float) -> torch.Tensor:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
+import torch
 
 from gsstream.api import (
     Delta,
@@ -76,6 +77,7 @@ class AnchoredMethod(StreamingMethod[ReConState]):
             tools.rng.numpy("recon", frame.index), self.rounded,
         )  # fmt: skip
         moved = scene if motion is None else apply_motion(scene, motion)[0]
+        work = work.on(moved.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
         clock.append(time.perf_counter())
         change = self._rows(moved, state.number, work, for_births, tools) if for_births else Rows()
         clock.append(time.perf_counter())

@@ -76,11 +76,12 @@ class Stream3DGS(StreamingMethod[Stream3DGSState]):
         rows = self._changed(work.gaussians.means, work, state.previous, frame)
         # Those of the frame before are given up: they neither move nor hide what does.
         rows = rows[rows < state.number]
-        alone = work.on(work.gaussians.rows(slice(0, state.number)))
+        work = work.on(work.gaussians.rows(slice(0, state.number)))
         passes = max(1, epochs - for_births)
-        motion = fitted_motion(scene, alone, rows, passes, self.config.cache, tools.rng) if len(rows) else None
+        motion = fitted_motion(scene, work, rows, passes, self.config.cache, tools.rng) if len(rows) else None
         motions = () if motion is None else (motion,)
         moved = scene if motion is None else apply_motion(scene, motion)[0]
+        work = work.on(moved.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
         clock.append(time.perf_counter())
         change = self._rows(moved, state.number, work, for_births, tools)
         clock.append(time.perf_counter())

@@ -65,7 +65,14 @@ class Guarded:
 
     @classmethod
     def session(cls, session: RenderSession, renderer: object, where: Where, level: Checks) -> Guarded:
-        """Return a session of a renderer, behind a guard that names the renderer."""
+        """Return a session of a renderer, behind a guard that names the renderer.
+
+        Arguments:
+            session: that a renderer has opened.
+            renderer: the part itself.
+            where: the place that errors name.
+            level: how closely results are looked at.
+        """
         made = cls("renderer", renderer, where, level, SESSION)
         made._subject = session
         return made

@@ -13,6 +13,8 @@ from gsstream.core.cameras import Cameras as Cameras
 from gsstream.core.changes import Births as Births
 from gsstream.core.changes import Delta as Delta
 from gsstream.core.changes import Displacement as Displacement
+from gsstream.core.changes import Field as Field
+from gsstream.core.changes import FieldShape as FieldShape
 from gsstream.core.changes import Groups as Groups
 from gsstream.core.changes import Layout as Layout
 from gsstream.core.changes import Motion as Motion
@@ -20,7 +22,9 @@ from gsstream.core.changes import Residual as Residual
 from gsstream.core.changes import Rows as Rows
 from gsstream.core.changes import Scene as Scene
 from gsstream.core.changes import apply_delta as apply_delta
+from gsstream.core.changes import apply_field as apply_field
 from gsstream.core.changes import apply_motion as apply_motion
+from gsstream.core.changes import field_rows as field_rows
 from gsstream.core.changes import groups_for as groups_for
 from gsstream.core.changes import in_nodes as in_nodes
 from gsstream.core.changes import own_nodes as own_nodes

@@ -6,6 +6,7 @@ import numpy as np
 
 from gsstream.core.changes import Motion, Scene, groups_for
 from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.motion.groups import groups_within
 
 
 def said_by_cells(
@@ -24,10 +25,9 @@ def said_by_cells(
         step: of quantisation, scene units.
     """
     groups = groups_for(scene, side, 1, regroup=True)
-    total = np.bincount(groups.group_of, minlength=groups.count)
     place = groups.group_of[rows]
     hits = np.bincount(place, minlength=groups.count)
-    able = np.flatnonzero((hits > 0) & (2 * hits >= total))
+    able = np.flatnonzero(groups_within(groups, rows))
     values: FloatArray = np.concatenate([shift, turn], 1).astype(np.float64)
     means = np.stack([np.bincount(place, values[:, i], groups.count) / np.maximum(hits, 1) for i in range(6)], 1)
     # Half a cell from its centre, a turn of one step moves a Gaussian by a step, too.

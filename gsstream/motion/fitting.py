@@ -18,6 +18,27 @@ BETAS, EPSILON = (0.9, 0.99), 1e-12
 Measure = Callable[[FloatArray], FloatArray]
 
 
+class Descent:
+    """Descends along slopes with Adam's moments, in steps of given length.
+
+    Arguments:
+        values: [K, 6] where it begins.
+        measure: what the steps of each number are divided by, squared.
+    """
+
+    def __init__(self, values: FloatArray, measure: Measure) -> None:
+        self.values, self._measure = values, measure
+        self._first, self._second, self._steps = np.zeros_like(values), np.zeros_like(values), 0
+
+    def step(self, slope: FloatArray, rate: float) -> None:
+        """Replace ``values``: one step of length ``rate`` against a slope [K, 6]."""
+        self._steps += 1
+        self._first = BETAS[0] * self._first + (1 - BETAS[0]) * slope
+        self._second = BETAS[1] * self._second + (1 - BETAS[1]) * slope**2
+        scale = np.sqrt(self._measure(self._second) / (1 - BETAS[1] ** self._steps)) + EPSILON
+        self.values = self.values - rate * (self._first / (1 - BETAS[0] ** self._steps)) / scale
+
+
 def fitted_moves(
     scene: Scene, work: FrameWork, start: Moves, unit: FloatArray, rates: Sequence[float], order: np.random.Generator,
     measure: Measure, pull: float = 0.0,
@@ -38,20 +59,17 @@ def fitted_moves(
     work.narrow(torch.from_numpy(start.rows))
     base = scene.gaussians.rows(start.rows)
     local = start._replace(rows=np.arange(len(start.rows)))
-    values = np.concatenate([start.shift, start.turn], 1) / unit
-    first, second = np.zeros_like(values), np.zeros_like(values)
+    descent = Descent(np.concatenate([start.shift, start.turn], 1) / unit, measure)
     for step, rate in enumerate(rates):
         if step % views == 0:
             sequence = order.permutation(views)
+        values = descent.values
         moves = local._replace(shift=values[:, :3] * unit[:3], turn=values[:, 3:] * unit[3:])
         slope = slope_of(work, int(sequence[step % views]), base, moves) * unit
         if pull:
             slope = slope + pull * np.sign(values) / values.size
-        first = BETAS[0] * first + (1 - BETAS[0]) * slope
-        second = BETAS[1] * second + (1 - BETAS[1]) * slope**2
-        scale = np.sqrt(measure(second) / (1 - BETAS[1] ** (step + 1))) + EPSILON
-        values = values - rate * (first / (1 - BETAS[0] ** (step + 1))) / scale
-    return np.asarray(values * unit)
+        descent.step(slope, rate)
+    return np.asarray(descent.values * unit)
 
 
 def each_alone(second: FloatArray) -> FloatArray:

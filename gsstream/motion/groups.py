@@ -51,6 +51,13 @@ def changed_groups(groups: Groups, work: FrameWork, votes: float, share: float) 
     return np.asarray((total > 0) & (hit > 0) & (hit >= share * total))
 
 
+def groups_within(groups: Groups, rows: IntArray) -> IntArray:
+    """Return [G] bool: groups of which at least half of the rows, and at least one, are among ``rows`` [A]."""
+    total = np.bincount(groups.group_of, minlength=groups.count)
+    hit = np.bincount(groups.group_of[rows], minlength=groups.count)
+    return np.asarray((hit > 0) & (2 * hit >= total))
+
+
 def displaced_groups(groups: Groups, scene: Scene, share: float) -> IntArray:
     """Return [G] bool: groups of which the last frame displaced some row, and at least this share of them.
 

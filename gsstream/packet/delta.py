@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from gsstream.core.changes import Change, Delta, Layout, Scene
+from gsstream.core.changes import Delta, Layout, Scene
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.shapes import FloatArray
 from gsstream.packet.base import EncodedPacket, PacketKind, Section, build_packet, expect
+from gsstream.packet.changes.field import decode_field, encode_field
 from gsstream.packet.changes.motion import decode_motions, encode_motions
 from gsstream.packet.changes.residual import decode_residual, encode_residual
 from gsstream.packet.changes.rows import decode_rows_change, encode_rows_change
 
 #: Sections of a delta packet in the order in which they stand there.
-SECTIONS = ("motion", "gates", "pattern", "decoders", *ATTRIBUTES, "deaths", "births")
+SECTIONS = ("motion", "field", "gates", "pattern", "decoders", *ATTRIBUTES, "deaths", "births")
 
 
 def next_decoders(previous: Mapping[str, FloatArray], delta: Delta) -> dict[str, FloatArray]:
@@ -41,6 +42,8 @@ def encode_delta(
     Raises ShapeError when a change does not fit the layout, or when there is none: that is an empty packet.
     """
     sections = encode_motions(delta.motions)
+    if delta.field is not None:
+        sections += encode_field(delta.field)
     if delta.residual is not None:
         sections += encode_residual(delta.residual, layout, previous_decoders)
     if delta.rows is not None:
@@ -58,19 +61,18 @@ def decode_delta(
     Arguments:
         data: a complete packet.
         offset: place of the packet in the file, for errors.
-        scene: that of the frame before; the groups of a motion depend on it.
+        scene: that of the frame before; the groups of a motion and the rows of a field depend on it.
         previous_decoders: as for :func:`encode_delta`.
 
     Raises PacketError with the byte offset.
     """
     _, sections = expect(data, offset, PacketKind.DELTA)
     _check_sections(sections, offset)
-    changes: list[Change] = []
-    if "motion" in sections:
-        changes += decode_motions(sections["motion"], scene)
+    motions = decode_motions(sections["motion"], scene) if "motion" in sections else ()
+    field = decode_field(sections["field"], scene, motions) if "field" in sections else None
     residual = decode_residual(sections, scene.layout, previous_decoders)
     rows = decode_rows_change(sections, scene.layout)
-    return Delta((*changes, *(change for change in (residual, rows) if change is not None)))
+    return Delta((*motions, *(change for change in (field, residual, rows) if change is not None)))
 
 
 def _check_sections(sections: Mapping[str, Section], offset: int) -> None:

@@ -79,10 +79,10 @@ def _row_tables(data: Mapping[str, bytes], number: int) -> Iterator[Table]:
 
 
 def _delta_tables(data: Mapping[str, bytes], layout: Layout) -> Iterator[Table]:
-    if "motion" in data:
-        # Its tables depend on the groups of the whole scene, which are not at hand; its entropy is taken to be its
-        # size.
-        yield Table("motion", len(data["motion"]), 8.0 * len(data["motion"]))
+    for name in ("motion", "field"):
+        if name in data:
+            # Its tables depend on the whole scene, which is not at hand; its entropy is taken to be its size.
+            yield Table(name, len(data[name]), 8.0 * len(data[name]))
     if "gates" in data:
         yield from _residual_tables(data, layout)
     if "deaths" in data:

@@ -20,6 +20,7 @@ export const SECTION_NAMES = {
   7: "births",
   8: "motion",
   9: "pattern",
+  10: "field",
   16: "means",
   17: "quats",
   18: "scales",

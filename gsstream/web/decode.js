@@ -58,10 +58,12 @@ function keyState(header, sections, size, offset) {
   };
 }
 
-/** Sections of a delta packet in the order in which they stand there. */
+/** Sections of a delta packet in their order. */
 const ORDER = [...MOTION, ...RESIDUAL, ...ROWS];
 
 function decodeDelta(sections, state, offset) {
+  const field = sections.find(({ name }) => name === "field");
+  if (field) throw new PacketError("a network moves this frame: only gsstream play can show it", field.offset);
   const places = sections.map(({ name }) => ORDER.indexOf(name));
   if (!places.length || places.some((place, i) => place < 0 || (i > 0 && place < places[i - 1]))) {
     const names = sections.map(({ name }) => name).join(", ");
@@ -112,7 +114,7 @@ function applyDelta(state, { motions, residual, rows }) {
   return change;
 }
 
-/** The bytes of all attributes in their order: two states are the same when these are. */
+/** The bytes of all attributes in their order: equal for equal states. */
 export function sceneBytes(state) {
   const arrays = ATTRIBUTES.map((name) => state.scene[name]);
   const out = new Uint8Array(arrays.reduce((sum, array) => sum + array.byteLength, 0));

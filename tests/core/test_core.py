@@ -330,7 +330,8 @@ class TestDelta:
             Residual: self.delta().residual, Rows: Rows(deaths=np.array([0])),
         }  # fmt: skip
         names = ", ".join(kind.__name__ for kind in kinds)
-        with pytest.raises(ShapeError, match=f"motions, then one residual, then one change of rows; got {names}"):
+        wanted = f"motions, then one field, then one residual, then one change of rows; got {names}"
+        with pytest.raises(ShapeError, match=wanted):
             Delta(tuple(some[kind] for kind in kinds))
 
     def test_a_residual_or_rows_are_exchanged_in_their_place(self) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from packet_scenes import decode_all, make_moving_packets, make_packets
+from packet_scenes import decode_all, make_field_packets, make_moving_packets, make_packets
 
 from gsstream.core.gaussians import Gaussians
 from gsstream.packet import EncodedPacket, PacketKind
@@ -43,6 +43,7 @@ def bases() -> list[Base]:
         {"seed": 27, "number": 3, "nodes": 2, "sh_rest": 3},
     ]
     packets = [make_packets(**kwargs) for kwargs in settings] + [make_moving_packets(**kwargs) for kwargs in moving]
+    packets.append(make_field_packets(seed=28, number=30, nodes=9))
     return [_base(some) for some in packets]
 
 
@@ -109,8 +110,9 @@ def _sections(rng: np.random.Generator, base: Base) -> bytes:
         return _damage(rng, base)
     names = list(sections)
     target = names[int(rng.integers(len(names)))]
-    if "motion" in sections and rng.random() < 0.5:
-        target = "motion"
+    for name in ("motion", "field"):
+        if name in sections and rng.random() < 0.5:
+            target = name
     changed = [(n, _payload(rng, n, s.data) if n == target else s.data) for n, s in sections.items()]
     packets[at] = build_packet(header.kind, header.frame, changed)
     return _join(packets)
@@ -122,6 +124,8 @@ def _payload(rng: np.random.Generator, name: str, data: bytes) -> bytes:
         return compress(_scramble(rng, decompress(data, 1 << 24)))
     if name == "motion" and rng.random() < 0.5:
         return _heads(rng, data)
+    if name == "field" and rng.random() < 0.5:
+        return _shapes(rng, data)
     return _scramble(rng, data) if rng.random() < 0.95 else rng.bytes(int(rng.integers(40)))
 
 
@@ -134,6 +138,19 @@ def _heads(rng: np.random.Generator, data: bytes) -> bytes:
         if rng.random() < 0.4:
             data = data[: at + start] + head[start:end] + data[at + end :]
     return data
+
+
+def _shapes(rng: np.random.Generator, data: bytes) -> bytes:
+    """Numbers of a field's shape replaced by others, most of which could be."""
+    wholes, fields = list(data[:6]), list(struct.unpack_from("<HIII8f", data, 6))
+    at = int(rng.integers(18))
+    if at < 6:
+        wholes[at] = int(rng.choice([1, 2, 3, 4, 8, 16, 20, 128]))
+    elif at < 10:
+        fields[at - 6] = int(rng.choice([1, 7, 16, 1024, 1 << 15]))
+    else:
+        fields[at - 6] = float(rng.choice([-1e30, -1.0, 0.0, 1e-30, 1.0, 1.5, 4.0, 1e8, 3e38, np.nan, np.inf]))
+    return bytes(wholes) + struct.pack("<HIII8f", *fields) + data[52:]
 
 
 def _lying_sections(rng: np.random.Generator, base: Base) -> bytes:

@@ -1,7 +1,8 @@
 """Write the stored samples of the current format version. Run once per format version; old samples are never rewritten.
 
 ``stream.gss`` has every kind of packet, births and deaths; ``moving.gss`` has motions: from rest, predicted, corrected,
-of groups formed anew, two in a frame, and births after one; ``world.gss`` lies in other coordinates than its recording.
+of groups formed anew, two in a frame, and births after one; ``field.gss`` has fields; ``world.gss`` lies in other
+coordinates than its recording.
 
 Usage: python tests/packet/make_samples.py
 """
@@ -12,7 +13,14 @@ import hashlib
 import json
 from pathlib import Path
 
-from packet_scenes import decode_all, make_moving_packets, make_packets, make_placed_key, write_stream
+from packet_scenes import (
+    decode_all,
+    make_field_packets,
+    make_moving_packets,
+    make_packets,
+    make_placed_key,
+    write_stream,
+)
 
 from gsstream.core.gaussians import Gaussians
 from gsstream.packet import FORMAT_VERSION
@@ -29,6 +37,7 @@ def main() -> None:
     streams = {
         "stream": make_packets(seed=11, number=30, nodes=9, edits=(3, 6)),
         "moving": make_moving_packets(seed=12, number=30, nodes=9),
+        "field": make_field_packets(seed=14, number=30, nodes=9),
         "world": [make_placed_key(seed=13, number=20, nodes=6)],
     }
     folder = SAMPLES / FORMAT_VERSION

@@ -11,12 +11,15 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.changes import (
     Births,
     Delta,
+    Field,
+    FieldShape,
     Layout,
     Motion,
     Residual,
     Rows,
     Scene,
     apply_motion,
+    field_rows,
     groups_for,
     sent_rows,
 )
@@ -156,6 +159,49 @@ def make_moving_packets(seed: int = 0, **sizes: int) -> list[EncodedPacket]:
     add(make_motions(rng, state.scene, 2))
     add(Delta((moved(), *make_edit(rng, state).changes)))
     add(Delta((moved(),)))
+    return packets
+
+
+def make_field(
+    rng: np.random.Generator, scene: Scene, share: float | None = 0.6, size: int = 9, **said: float
+) -> Field:
+    """A field over the middle of the scene; ``share`` of its rows are marked, None: all in the box move.
+
+    ``size`` is that of the largest symbols; ``said`` are parts of the shape that are not to be small.
+    """
+    small = {"levels": 3, "entries": 6, "features": 2, "base": 3, "growth": 1.5, "width": 5, "layers": 2, "seed": 3}
+    shape = FieldShape((-1.25, -1.0, -1.0), (1.0, 1.0, 1.5), 0.5, **{**small, **said})
+    marks = None if share is None else (rng.random(len(scene.gaussians)) < share).astype(np.uint8)
+    _, unit = field_rows(scene, shape, marks)
+    sizes = [(len(which), shape.features) for which in shape.touched(unit)]
+    sizes += zip(shape.widths[:-1], shape.widths[1:], strict=True)
+    tables = tuple(rng.integers(-size, size + 1, each).astype(np.int32) for each in sizes)
+    return Field(shape, marks, tables[: shape.levels], tables[shape.levels :], 1 << 14, 1 << 8)
+
+
+def make_field_packets(seed: int = 0, **sizes: int) -> list[EncodedPacket]:
+    """Key, then frames with a field: of marked rows, of all rows, behind a motion and before the rest, a predicted
+    motion of what the field moved, and one of a single layer and level.
+    """
+    rng = np.random.default_rng(seed)
+    packets = [encode_key(make_key(rng, **sizes))]
+    state = decode_packet(None, packets[0].data)
+    for frame in range(1, 6):
+        scene = state.scene
+        if frame == 1:
+            delta = Delta((make_field(rng, scene),))
+        elif frame == 2:
+            delta = Delta((make_field(rng, scene, None),))
+        elif frame == 3:
+            motion = make_motion(rng, scene)
+            there = apply_motion(scene, motion)[0]
+            delta = Delta((motion, make_field(rng, there), *make_edit(rng, state, deaths=0.1).changes))
+        elif frame == 4:
+            delta = Delta((make_motion(rng, scene),))
+        else:
+            delta = Delta((make_field(rng, scene, None, levels=1, layers=1, features=1, base=1, growth=1.0),))
+        packets.append(encode_delta(delta, state.layout, state.decoders, frame=frame))
+        state = decode_packet(state, packets[-1].data)
     return packets
 
 

@@ -11,7 +11,7 @@ import constriction
 import numpy as np
 import pytest
 import zstandard
-from decoder_fuzz import FAULTY_FRAME, fuzz
+from decoder_fuzz import FAULTY_FRAME, NETWORK, fuzz
 from moving_scenes import moving_packets
 from node_runs import NODE, needs_node, play_in_node
 
@@ -60,6 +60,11 @@ def test_stored_streams_decode_to_the_bits_they_always_decoded_to(tmp_path):
     }
     found = play_in_node([path.read_bytes() for path in known], tmp_path)
     for (path, expected), stream in zip(known.items(), found["streams"], strict=True):
+        if path.stem == "field":
+            # Networks are for the Python player; the page says so at the frame, and shows what comes before it.
+            assert NETWORK in stream["error"]["message"]
+            assert (stream["error"]["expected"], stream["digests"]) == (True, expected[:1])
+            continue
         assert stream["error"] is None
         assert stream["digests"] == expected, path
 

@@ -9,6 +9,10 @@ from gsstream.core.changes.delta import Change as Change
 from gsstream.core.changes.delta import Delta as Delta
 from gsstream.core.changes.delta import apply_delta as apply_delta
 from gsstream.core.changes.delta import row_gates as row_gates
+from gsstream.core.changes.field import Field as Field
+from gsstream.core.changes.field import apply_field as apply_field
+from gsstream.core.changes.field import field_rows as field_rows
+from gsstream.core.changes.hashgrid import FieldShape as FieldShape
 from gsstream.core.changes.history import Displacement as Displacement
 from gsstream.core.changes.motion import Groups as Groups
 from gsstream.core.changes.motion import Motion as Motion

@@ -10,6 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from gsstream.core.changes.field import Field, apply_field
 from gsstream.core.changes.history import displacement
 from gsstream.core.changes.motion import Motion, apply_motions, either
 from gsstream.core.changes.residual import Residual, apply_residual, sent_rows
@@ -18,30 +19,37 @@ from gsstream.core.changes.scene import Layout, Scene
 from gsstream.core.errors import ShapeError
 from gsstream.core.shapes import FloatArray, IntArray
 
-Change: TypeAlias = Motion | Residual | Rows
+Change: TypeAlias = Motion | Field | Residual | Rows
 #: The order in which kinds of changes stand in a delta; only motions may stand there more than once.
-ORDER: tuple[type[Motion] | type[Residual] | type[Rows], ...] = (Motion, Residual, Rows)
+ORDER: tuple[type[Motion] | type[Field] | type[Residual] | type[Rows], ...] = (Motion, Field, Residual, Rows)
 
 
 @dataclass(frozen=True, slots=True)
 class Delta:
-    """One frame's changes, applied one after the other: motions, then at most one residual, then at most one of rows.
+    """One frame's changes, applied one after the other: motions, then at most one of each other kind.
 
-    Raises ShapeError for another order.
+    These are a field, a residual and a change of rows, in this order. Raises ShapeError for another order.
     """
 
     changes: tuple[Change, ...] = ()
 
     def __post_init__(self) -> None:
         ranks = [ORDER.index(type(change)) for change in self.changes]
-        if ranks != sorted(ranks) or ranks.count(1) > 1 or ranks.count(2) > 1:
+        if ranks != sorted(ranks) or max(map(ranks.count, (1, 2, 3))) > 1:
             names = ", ".join(type(change).__name__ for change in self.changes)
-            raise ShapeError(f"delta: expected motions, then one residual, then one change of rows; got {names}")
+            raise ShapeError(
+                f"delta: expected motions, then one field, then one residual, then one change of rows; got {names}"
+            )
 
     @property
     def motions(self) -> tuple[Motion, ...]:
         """The motions, in order."""
         return tuple(change for change in self.changes if isinstance(change, Motion))
+
+    @property
+    def field(self) -> Field | None:
+        """The field, if there is one."""
+        return next((change for change in self.changes if isinstance(change, Field)), None)
 
     @property
     def residual(self) -> Residual | None:
@@ -82,7 +90,7 @@ class Delta:
         """Return the same delta with another residual, or with none."""
         others: list[Change] = [change for change in self.changes if not isinstance(change, Residual)]
         if residual is not None:
-            others.insert(len(self.motions), residual)
+            others.insert(len(self.motions) + (self.field is not None), residual)
         return Delta(tuple(others))
 
     def with_rows(self, rows: Rows | None) -> Delta:
@@ -97,6 +105,9 @@ def apply_delta(scene: Scene, delta: Delta) -> Scene:
     Rows that no change touches keep their bits. Raises ShapeError when the delta does not fit the scene.
     """
     after, touched = apply_motions(scene, delta.motions)
+    if delta.field is not None:
+        after, rows = apply_field(after, delta.field)
+        touched = either(len(after.gaussians), touched, rows)
     if delta.residual is not None:
         after = replace(after, gaussians=apply_residual(after.gaussians, after.layout, delta.residual))
         touched = either(len(after.gaussians), touched, sent_rows(after.layout, delta.residual.gates))

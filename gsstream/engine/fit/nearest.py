@@ -24,7 +24,7 @@ def neighbour_distance(positions: torch.Tensor) -> torch.Tensor:
     count = len(positions)
     if count < 2:
         return torch.full((count,), ALONE)
-    distances, _ = _query(positions.numpy(), positions.numpy(), min(4, count))
+    distances, _ = nearest_among(positions.numpy(), positions.numpy(), min(4, count))
     # The nearest is the point itself, or one at the same place.
     return torch.from_numpy(np.sqrt(np.square(distances[:, 1:]).mean(1)).astype(np.float32))
 
@@ -33,11 +33,17 @@ def nearest_rows(points: FloatArray, means: FloatArray) -> tuple[FloatArray, Int
     """Return [B] the distance of each point to the nearest of ``means``, and its row; infinitely far without any."""
     if not len(means):
         return np.full(len(points), np.inf), np.zeros(len(points), np.int64)
-    distances, rows = _query(points, means, 1)
+    distances, rows = nearest_among(points, means, 1)
     return distances[:, 0], rows[:, 0]
 
 
-def _query(points: FloatArray, among: FloatArray, k: int) -> tuple[FloatArray, IntArray]:
+def nearest_among(points: FloatArray, among: FloatArray, k: int) -> tuple[FloatArray, IntArray]:
+    """Return the distances [B, k] of points to the ``k`` nearest of ``among``, nearest first, and their rows [B, k].
+
+    Arguments:
+        points: [B, 3]. among: [N, 3], N at least ``k``.
+        k: 1 or more.
+    """
     # Imported here because it takes 30 MB, which a process that only plays or resumes a stream does not need.
     from scipy.spatial import KDTree
 

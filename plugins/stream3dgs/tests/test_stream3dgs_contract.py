@@ -20,7 +20,10 @@ EAGER = Stream3DGSConfig(
 )
 
 
-@parametrize_with_checks([Stream3DGS(EAGER)])
+CELLS = EAGER.model_copy(update={"cache": EAGER.cache.model_copy(update={"sent": "cells"})})
+
+
+@parametrize_with_checks([Stream3DGS(EAGER), Stream3DGS(CELLS)])
 def test_contract(check) -> None:
     check()
 

@@ -1,15 +1,16 @@
-"""The hash grid against interpolation by hand, a body that is found again, and Gaussians that live for one frame."""
+"""The cache beside what players compute, a body that is found again, and Gaussians that live for one frame."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
-from gsstream_stream3dgs.cache import PRIMES, Cache, Lookup
+from gsstream_stream3dgs.cache import Cache, Lookup
 from gsstream_stream3dgs.method import Stream3DGS
-from gsstream_stream3dgs.motion import fitted_motion, in_box
+from gsstream_stream3dgs.motion import fitted_cache, moved, said_by, shape_of
 from gsstream_stream3dgs.settings import BirthSettings, CacheSettings, Stream3DGSConfig
 
-from gsstream.api import Cameras, Gaussians, Layout, Rng, Scene, apply_motion
+from gsstream.api import Cameras, Delta, Gaussians, Layout, Rng, Scene, apply_delta, apply_field, field_rows
 from gsstream.testing.stepping import MethodUnderTest
 
 RNG = np.random.default_rng(0)
@@ -19,47 +20,104 @@ RIG = Cameras(
 SMALL = CacheSettings(levels=5, entries=10, features=2, base=4, width=16, lr=0.01, box=0.0, step=0.01)
 
 
-def test_the_grid_interpolates_between_the_corners_of_a_cell() -> None:
-    unit = torch.from_numpy(RNG.random((20, 3)))
-    lookup = Lookup(unit, SMALL)
-    np.testing.assert_allclose(lookup.weight.sum(2), 1, atol=1e-6)
-    for a, at in enumerate(unit.numpy()):
-        for level in range(SMALL.levels):
-            cells = int(4 * 2.0**level)
-            low = np.floor(at * cells).astype(int)
-            for number in range(8):
-                step = np.array([number >> 2 & 1, number >> 1 & 1, number & 1])
-                near = np.prod(np.where(step == 1, at * cells - low, 1 - (at * cells - low)))
-                x, y, z = (int(v) for v in low + step)
-                dense = (cells + 1) ** 3 <= 1024
-                name = (x * (cells + 1) + y) * (cells + 1) + z if dense else (
-                    (x * PRIMES[0]) ^ (y * PRIMES[1]) ^ (z * PRIMES[2])) % 1024
-                assert int(lookup.index[a, level, number]) == name + level * 1024
-                np.testing.assert_allclose(float(lookup.weight[a, level, number]), near, atol=1e-6)
+def scene_of(means: np.ndarray) -> Scene:
+    number = len(means)
+    gaussians = Gaussians(
+        means=means.astype(np.float32), quats=np.tile(np.float32([1, 0, 0, 0]), (number, 1)),
+        scales=np.zeros((number, 3), np.float32), opacities=np.zeros(number, np.float32),
+        sh0=np.zeros((number, 1, 3), np.float32), shN=np.zeros((number, 0, 3), np.float32),
+    )  # fmt: skip
+    return Scene(gaussians, Layout(np.ones(number, np.int32), np.zeros(number, np.uint8), np.float32([1])))
 
 
-def test_a_position_on_the_far_face_of_the_box_is_inside() -> None:
-    lookup = Lookup(torch.ones(1, 3, dtype=torch.float64), SMALL)
-    assert lookup.weight[0].max(1).values.tolist() == [1.0] * 5
-    assert int(lookup.index.max()) < 5 * 1024
+def cache_of(means: np.ndarray, entry_step: float = 1e-6, weight_step: float = 1e-4) -> tuple[Scene, Cache]:
+    scene = scene_of(means)
+    shape = shape_of(scene, RIG.extent, SMALL, Rng(0))
+    _, unit = field_rows(scene, shape, None)
+    return scene, Cache(shape, Lookup(shape, unit), entry_step, weight_step)
+
+
+@pytest.mark.parametrize("rounded", [False, True])
+@pytest.mark.parametrize("step", [1e-5, 0.02])
+def test_what_is_trained_is_what_players_show(step, rounded):
+    """The cache in torch beside the numpy function of every player: equal but for rounding, coarse steps or fine."""
+    scene, cache = cache_of(RNG.normal(size=(60, 3)), step, max(step, 2.0**-14))
+    torch.manual_seed(0)
+    with torch.no_grad():
+        for value in cache.learned:
+            value += 0.1 * torch.randn_like(value)
+        shift, turn = cache(rounded)
+    after, rows = apply_field(scene, cache.field(None))
+    assert len(rows) == 60
+    wanted = moved(scene.gaussians.map(torch.from_numpy), cache.shape.reach * shift, turn)
+    there = np.abs(after.gaussians.means - wanted.means.numpy()).max() / cache.shape.reach
+    turned = np.abs(after.gaussians.quats - wanted.quats.numpy()).max()
+    assert float(shift.abs().max()) > 0.05
+    if rounded or step < 1e-3:
+        assert (there, turned) < (2e-3, 2e-3)
+    else:
+        assert there > 2e-3, "a coarse step would show if training did not know of it"
+
+
+def test_gradients_pass_the_rounding():
+    _, cache = cache_of(RNG.normal(size=(30, 3)), 0.5, 0.5)
+    shift, _ = cache(rounded=True)
+    shift.sum().backward()
+    assert all(value.grad is not None for value in cache.learned[1:])
+    assert float(cache.learned[-1].grad.abs().max()) > 0
+    cache.step(0.1)
+    assert float(cache.learned[-1].detach().abs().max()) == pytest.approx(0.1, rel=1e-3)
+    assert all(value.grad is None for value in cache.learned)
+
+
+def test_its_steps_are_those_of_adam():
+    """Against the formulas of Kingma and Ba in float64, over ten steps; what gets no gradient stays."""
+    _, cache = cache_of(RNG.normal(size=(5, 3)))
+    theirs = [value.detach().numpy().astype(np.float64) for value in cache.learned]
+    first, second = ([np.zeros_like(value) for value in theirs] for _ in range(2))
+    for count in range(1, 11):
+        for at, mine in enumerate(cache.learned):
+            if not at:
+                continue
+            slope = RNG.normal(size=mine.shape)
+            mine.grad = torch.from_numpy(slope.astype(np.float32))
+            first[at] = 0.9 * first[at] + 0.1 * slope
+            second[at] = 0.999 * second[at] + 0.001 * slope**2
+            step = (first[at] / (1 - 0.9**count)) / (np.sqrt(second[at] / (1 - 0.999**count)) + 1e-8)
+            theirs[at] -= 0.01 * step
+        cache.step(0.01)
+    assert not cache.learned[0].detach().any()
+    for mine, other in zip(cache.learned, theirs, strict=True):
+        np.testing.assert_allclose(mine.detach().numpy(), other, atol=1e-5)
 
 
 def test_a_cache_is_at_rest_at_first_and_every_frame_begins_with_the_same() -> None:
-    lookup = Lookup(torch.from_numpy(RNG.random((9, 3))), SMALL)
-    one, two = (Cache(SMALL, Rng(0).stream("stream3dgs", 0)) for _ in range(2))
-    shift, turn = one(lookup)
+    means = RNG.normal(size=(9, 3))
+    (_, one), (_, two) = cache_of(means), cache_of(means)
+    shift, turn = one()
     assert not shift.any()
     assert not turn.any()
-    for a, b in zip(one.parameters(), two.parameters(), strict=True):
+    for a, b in zip(one.starts, two.starts, strict=True):
         assert torch.equal(a, b)
+    other = shape_of(scene_of(means), RIG.extent, SMALL, Rng(1))
+    assert other.seed != one.shape.seed
 
 
 def test_the_box_leaves_out_what_lies_far_away() -> None:
     means = np.concatenate([RNG.uniform(0, 1, (98, 3)), [[50, 0.5, 0.5], [0.5, -50, 0.5]]])
-    unit, inside = in_box(means, 0.02)
-    assert not inside[98:].any()
-    assert inside[:98].mean() > 0.8
-    assert ((unit[inside] >= 0) & (unit[inside] <= 1)).all()
+    wide = SMALL.model_copy(update={"box": 0.02})
+    rows, unit = field_rows(scene_of(means), shape_of(scene_of(means), RIG.extent, wide, Rng(0)), None)
+    assert not set(rows) & {98, 99}
+    assert len(rows) > 80
+    assert ((unit >= 0) & (unit <= 1)).all()
+
+
+@pytest.mark.parametrize("means", [np.zeros((1, 3)), np.ones((7, 3)) * [[1e6, -1e6, 0.1]]])
+def test_a_scene_without_extent_has_a_box(means) -> None:
+    scene = scene_of(means)
+    shape = shape_of(scene, RIG.extent, SMALL, Rng(0))
+    assert shape.problem() is None
+    assert len(field_rows(scene, shape, None)[0]) == len(means)
 
 
 class Pulled:
@@ -79,20 +137,24 @@ class Pulled:
         return float(loss.detach())
 
 
-def test_two_bodies_find_their_own_ways() -> None:
+@pytest.mark.parametrize("sent", ["field", "cells"])
+def test_two_bodies_find_their_own_ways(sent) -> None:
     means = np.concatenate([RNG.normal((0, 0, 3), 0.02, (40, 3)), RNG.normal((0.5, 0, 3), 0.02, (40, 3))])
     aims = means + np.repeat([[0.03, 0, 0.01], [-0.02, 0.04, 0]], 40, 0)
-    quats = np.tile(np.float32([1, 0, 0, 0]), (80, 1))
-    gaussians = Gaussians(
-        means=means.astype(np.float32), quats=quats, scales=np.zeros((80, 3), np.float32),
-        opacities=np.zeros(80, np.float32), sh0=np.zeros((80, 1, 3), np.float32), shN=np.zeros((80, 0, 3), np.float32),
-    )  # fmt: skip
-    scene = Scene(gaussians, Layout(np.ones(80, np.int32), np.zeros(80, np.uint8), np.float32([1])))
-    motion = fitted_motion(scene, Pulled(aims), np.arange(80), 60, SMALL, Rng(0))
-    assert motion is not None
-    after = apply_motion(scene, motion)[0].gaussians.means
+    scene, settings = scene_of(means), SMALL.model_copy(update={"sent": sent})
+    found = fitted_cache(scene, Pulled(aims), np.arange(80), 40, settings, Rng(0))
+    assert found is not None
+    after = apply_delta(scene, Delta((said_by(scene, *found, RIG, settings),))).gaussians.means
     assert np.abs(after - aims).mean() < 0.3 * np.abs(means - aims).mean()
-    assert fitted_motion(scene, Pulled(means), np.zeros(0, np.int64), 1, SMALL, Rng(0)) is None
+    assert fitted_cache(scene, Pulled(means), np.zeros(0, np.int64), 1, settings, Rng(0)) is None
+
+
+def test_only_marked_rows_move() -> None:
+    means = RNG.normal((0, 0, 3), 0.02, (40, 3))
+    scene, some = scene_of(means), np.arange(0, 40, 3)
+    rows, cache = fitted_cache(scene, Pulled(means + 0.03), some, 5, SMALL, Rng(0))
+    after = apply_delta(scene, Delta((said_by(scene, rows, cache, RIG, SMALL),))).gaussians.means
+    assert np.flatnonzero((after != scene.gaussians.means).any(1)).tolist() == rows.tolist() == some.tolist()
 
 
 def test_births_live_for_one_frame() -> None:
@@ -105,3 +167,4 @@ def test_births_live_for_one_frame() -> None:
     assert third.state.player.delta.deaths.tolist() == list(range(number, number + 7))
     opacities = [step.state.player.gaussians.opacities[:number].tobytes() for step in (first, second, third)]
     assert len(set(opacities)) == 1, "those of frame 0 stay as they are, but for their places"
+    assert second.state.player.delta.field is not None

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from gsstream.api import FloatArray, FrameWork, Groups, IntArray, Motion, Scene, apply_motion, groups_for
-from gsstream.blocks import Moves, each_alone, felt_most, fitted_moves, moves_of, pixel_size
+from gsstream.blocks import Moves, each_alone, felt_most, fitted_moves, groups_within, moves_of, pixel_size
 from gsstream_hicom.settings import MotionSettings
 
 #: The box whose volume the cells share holds this part of the Gaussians along each axis.
@@ -44,7 +44,7 @@ def fitted_motions(
     total = epochs * len(work.cameras)
     for level, side in enumerate(cell_sides(scene.gaussians.means, settings)):
         groups = groups_for(scene, side, 1, regroup=True)
-        able = np.flatnonzero(_able(groups, rows))
+        able = np.flatnonzero(groups_within(groups, rows))
         iterations = total * (level + 1) // settings.levels - total * level // settings.levels
         if not len(able) or not iterations:
             continue
@@ -76,13 +76,6 @@ def _fitted(
     moved = symbols.any(1)
     marks[able[~moved]] = 0
     return Motion(groups.cell, 1, marks, symbols[moved], *steps, predicted=False, regroup=True)
-
-
-def _able(groups: Groups, rows: IntArray) -> IntArray:
-    """[G] bool: cells of which at least half of the Gaussians may move."""
-    total = np.bincount(groups.group_of, minlength=groups.count)
-    hit = np.bincount(groups.group_of[rows], minlength=groups.count)
-    return np.asarray((hit > 0) & (2 * hit >= total))
 
 
 def _warm(scene: Scene, start: Scene, moves: Moves, momentum: float) -> Moves:

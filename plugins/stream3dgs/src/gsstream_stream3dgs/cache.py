@@ -2,71 +2,128 @@
 
 from __future__ import annotations
 
-import itertools
+from typing import Any
 
+import numpy as np
 import torch
 from torch import nn
 
-from gsstream_stream3dgs.settings import CacheSettings
+from gsstream.api import Field, FieldShape, FloatArray, IntArray
 
-#: One prime for each axis; what a hash grid is usually hashed with.
-PRIMES = (1, 2_654_435_761, 805_459_861)
-#: Entries are drawn from this range at first.
-SPREAD = 1e-4
+#: What a whole number of the packet's stands for: of an entry, of a weight.
+ENTRY_UNIT, WEIGHT_UNIT = 2.0**-20, 2.0**-14
+BETAS, EPSILON = (0.9, 0.999), 1e-8
 
 
 class Lookup:
-    """Where positions lie in the grids: entries and weights, which stay while the weights are trained."""
+    """Where positions lie in the grids: entries and weights, which stay while the cache is trained."""
 
-    def __init__(self, unit: torch.Tensor, settings: CacheSettings) -> None:
+    def __init__(self, shape: FieldShape, unit: FloatArray) -> None:
         """Prepare the look-up.
 
         Arguments:
+            shape: of the grid.
             unit: [A, 3] positions, 0 to 1 along each axis of the box.
-            settings: of the cache.
         """
-        size = 1 << settings.entries
-        indices, weights = [], []
-        corners = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
-        for level in range(settings.levels):
-            cells = int(settings.base * settings.growth**level)
-            place = unit.double() * cells
-            low = place.floor().clamp(0, cells - 1)
-            part = (place - low)[:, None]
-            corner = low.long()[:, None] + corners
-            near = torch.where(corners.bool(), part, 1 - part)
-            if (cells + 1) ** 3 <= size:  # a grid this small has an entry for every corner
-                index = (corner[..., 0] * (cells + 1) + corner[..., 1]) * (cells + 1) + corner[..., 2]
-            else:
-                x, y, z = (corner[..., i] * PRIMES[i] for i in range(3))
-                index = (x ^ y ^ z) & (size - 1)
-            indices.append(index + level * size)
-            weights.append(near.prod(-1).float())
-        #: [A, L, 8] entries, and the weight of each.
-        self.index, self.weight = torch.stack(indices, 1), torch.stack(weights, 1)
+        from scipy.sparse import csr_array
+
+        #: For each level the entries that some position is interpolated from, ascending: only these are trained.
+        self.touched = shape.touched(unit)
+        places, nears, first = [], [], 0
+        for level, which in enumerate(self.touched):
+            index, near = shape.corners(unit, level)
+            places.append((first + np.searchsorted(which, index.T)).astype(np.int32))
+            nears.append(near.T.astype(np.float32))
+            first += len(which)
+        place, weight = (np.stack(parts, 1).reshape(-1) for parts in (places, nears))
+        ends = np.arange(0, len(place) + 1, 8, dtype=np.int32)
+        #: [A L, E] weights of the trained entries, eight in a row.
+        self.matrix = csr_array((weight, place, ends), shape=(len(ends) - 1, first))
 
 
-class Cache(nn.Module):
-    """Position -> shift [A, 3], in units of its reach, and turn [A, 3], axis * tan(angle / 2). At first: no motion."""
+class _Interpolated(torch.autograd.Function):
+    """Table [E, F] -> [A L, F], by sparse matrices: the backward of torch's own look-up sorts all places every time."""
 
-    def __init__(self, settings: CacheSettings, generator: torch.Generator) -> None:
-        super().__init__()
-        rows = settings.levels << settings.entries
-        start = torch.rand(rows, settings.features, generator=generator)
-        self.table = nn.Parameter((2 * start - 1) * SPREAD)
-        widths = [settings.levels * settings.features, settings.width, settings.width, 7]
-        self.layers = nn.ParameterList()
-        for inner, outer in itertools.pairwise(widths):
-            drawn = torch.randn(inner, outer, generator=generator) * (2 / inner) ** 0.5
-            self.layers.append(nn.Parameter(torch.zeros(inner, outer) if outer == 7 else drawn))
+    @staticmethod
+    def forward(ctx: Any, table: torch.Tensor, lookup: Lookup) -> torch.Tensor:
+        ctx.matrix = lookup.matrix
+        return torch.from_numpy(lookup.matrix @ table.detach().numpy())
 
-    def forward(self, lookup: Lookup) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return shifts and turns of the positions of a look-up."""
-        found = (self.table[lookup.index] * lookup.weight[..., None]).sum(2)
-        values = found.flatten(1)
-        for number, layer in enumerate(self.layers):
+    @staticmethod
+    def backward(ctx: Any, *slopes: torch.Tensor) -> tuple[torch.Tensor, None]:
+        return torch.from_numpy(ctx.matrix.T @ slopes[0].numpy()), None
+
+
+class Cache:
+    """Position -> shift [A, 3], in units of its reach, and turn [A, 3], axis * tan(angle / 2). At first: no motion.
+
+    Entries of the grid and layers of the network are trained by :meth:`step`, from where every player begins.
+    """
+
+    def __init__(self, shape: FieldShape, lookup: Lookup, entry_step: float, weight_step: float) -> None:
+        """Begin at rest.
+
+        Arguments:
+            shape: of the grid and the network.
+            lookup: of the positions that are asked.
+            entry_step, weight_step: quantisation steps of the packet.
+        """
+        self.shape, self.lookup = shape, lookup
+        self.entry_step = max(1, round(entry_step / ENTRY_UNIT))
+        self.weight_step = max(1, round(weight_step / WEIGHT_UNIT))
+        entries = [shape.start_entries(level, which) for level, which in enumerate(lookup.touched)]
+        starts = [(np.concatenate(entries), ENTRY_UNIT, self.entry_step)]
+        starts += [(layer, WEIGHT_UNIT, self.weight_step) for layer in shape.start_weights()]
+        self.starts = [torch.from_numpy((start * unit).astype(np.float32)) for start, unit, _ in starts]
+        self.steps = [unit * step for _, unit, step in starts]
+        self.learned = [nn.Parameter(torch.zeros_like(start)) for start in self.starts]
+        self._moments = [(torch.zeros_like(start), torch.zeros_like(start)) for start in self.starts]
+        self._count = 0
+
+    def symbols(self) -> list[torch.Tensor]:
+        """Return what was learned in whole quantisation steps: the table, then each layer."""
+        return [(value.detach() / step).round() for value, step in zip(self.learned, self.steps, strict=True)]
+
+    def __call__(self, rounded: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return shifts and turns of the positions.
+
+        Arguments:
+            rounded: with what is learned rounded as the packet has it; gradients pass the rounding as if it were not.
+        """
+        learned: list[torch.Tensor] = list(self.learned)
+        if rounded:
+            sent = [symbols * step for symbols, step in zip(self.symbols(), self.steps, strict=True)]
+            learned = [value + (said - value).detach() for value, said in zip(learned, sent, strict=True)]
+        table, *layers = (start + value for start, value in zip(self.starts, learned, strict=True))
+        found: torch.Tensor = _Interpolated.apply(table, self.lookup)  # type: ignore[no-untyped-call]
+        values = found.view(-1, self.shape.widths[0])
+        for number, layer in enumerate(layers):
             values = values @ layer
-            if number + 1 < len(self.layers):
+            if number + 1 < len(layers):
                 values = values.relu()
         # A quaternion (1 + a, b): its turn is b / (1 + a).
         return values[:, :3], values[:, 4:] / (1 + values[:, 3:4]).clamp_min(0.1)
+
+    @torch.no_grad()
+    def step(self, rate: float) -> None:
+        """Make one step of Adam with the gradients there are, and forget them."""
+        self._count += 1
+        for value, (first, second) in zip(self.learned, self._moments, strict=True):
+            if value.grad is None:
+                continue
+            first.lerp_(value.grad, 1 - BETAS[0])
+            second.mul_(BETAS[1]).addcmul_(value.grad, value.grad, value=1 - BETAS[1])
+            scale = (second / (1 - BETAS[1] ** self._count)).sqrt_().add_(EPSILON)
+            value.addcdiv_(first, scale, value=-rate / (1 - BETAS[0] ** self._count))
+            value.grad = None
+
+    def field(self, marks: IntArray | None) -> Field:
+        """Return the change of a frame that says what was learned.
+
+        Arguments:
+            marks: [N] uint8 rows that move, as the look-up has them; None: all in the box.
+        """
+        table, *layers = (symbols.numpy().astype(np.int32) for symbols in self.symbols())
+        ends = np.cumsum([len(which) for which in self.lookup.touched])[:-1]
+        entries = tuple(np.split(table, ends))
+        return Field(self.shape, marks, entries, tuple(layers), self.entry_step, self.weight_step)

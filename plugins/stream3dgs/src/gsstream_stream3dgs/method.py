@@ -21,12 +21,12 @@ from gsstream.api import (
     Step,
     StreamingMethod,
     Tools,
-    apply_motion,
+    apply_delta,
     send_delta,
     send_key,
 )
 from gsstream.blocks import changed_rows, detect_change, replaced_by_copies
-from gsstream_stream3dgs.motion import fitted_motion
+from gsstream_stream3dgs.motion import fitted_cache, said_by
 from gsstream_stream3dgs.settings import Stream3DGSConfig
 
 
@@ -76,19 +76,21 @@ class Stream3DGS(StreamingMethod[Stream3DGSState]):
         rows = self._changed(work.gaussians.means, work, state.previous, frame)
         # Those of the frame before are given up: they neither move nor hide what does.
         rows = rows[rows < state.number]
-        alone = work.on(work.gaussians.rows(slice(0, state.number)))
+        work = work.on(work.gaussians.rows(slice(0, state.number)))
         passes = max(1, epochs - for_births)
-        motion = fitted_motion(scene, alone, rows, passes, self.config.cache, tools.rng) if len(rows) else None
-        motions = () if motion is None else (motion,)
-        moved = scene if motion is None else apply_motion(scene, motion)[0]
+        found = fitted_cache(scene, work, rows, passes, self.config.cache, tools.rng) if len(rows) else None
+        said = None if found is None else said_by(scene, *found, frame.cameras, self.config.cache)
+        moves = Delta(() if said is None else (said,))
+        moved = apply_delta(scene, moves)
+        work = work.on(moved.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
         clock.append(time.perf_counter())
         change = self._rows(moved, state.number, work, for_births, tools)
         clock.append(time.perf_counter())
-        step = self._send(state, frame, Delta(motions).with_rows(change))
+        step = self._send(state, frame, moves.with_rows(change))
         clock.append(time.perf_counter())
         facts = {
             "iterations": epochs * len(frame.cameras), "births": 0 if change.births is None else len(change.births),
-            "deaths": len(change.deaths), "moving_groups": sum(int(motion.moving.sum()) for motion in motions),
+            "deaths": len(change.deaths), "moving_groups": sum(int(motion.moving.sum()) for motion in moves.motions),
             "seconds": dict(zip(("motion", "growth", "code"), np.diff(clock).tolist(), strict=True)),
         }  # fmt: skip
         return replace(step, metrics={**step.metrics, **facts})

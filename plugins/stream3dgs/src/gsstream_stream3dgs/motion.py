@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gsstream.api import FloatArray, FrameWork, Gaussians, IntArray, Motion, Rng, Scene
+from gsstream.api import Cameras, Field, FieldShape, FrameWork, Gaussians, IntArray, Motion, Rng, Scene, field_rows
 from gsstream.blocks import pixel_size, said_by_cells
 from gsstream_stream3dgs.cache import Cache, Lookup
 from gsstream_stream3dgs.settings import CacheSettings
 
 
-def fitted_motion(
+def fitted_cache(
     scene: Scene, work: FrameWork, rows: IntArray, epochs: int, settings: CacheSettings, rng: Rng
-) -> Motion | None:
-    """Return the motion of a frame; None where nothing moves.
+) -> tuple[IntArray, Cache] | None:
+    """Return the cache of a frame and the rows [A] that it moves; None where none may move.
 
     Arguments:
         scene: decoded, as both ends have it.
@@ -24,41 +24,70 @@ def fitted_motion(
         settings: of the cache.
         rng: random streams by name and frame.
     """
-    unit, inside = in_box(scene.gaussians.means, settings.box)
-    rows = rows[inside[rows]]
+    shape = shape_of(scene, work.cameras.extent, settings, rng)
+    marks = np.zeros(len(scene.gaussians), np.uint8)
+    marks[rows] = 1
+    rows, unit = field_rows(scene, shape, marks)
     if not len(rows):
         return None
-    pixel = pixel_size(scene.gaussians.means, work.cameras)
-    # The same weights in every frame: what the published method warms up once is drawn at rest here.
-    cache = Cache(settings, rng.stream("stream3dgs", 0))
-    lookup = Lookup(torch.from_numpy(unit[rows]), settings)
+    cache = Cache(shape, Lookup(shape, unit), settings.entry_step, settings.weight_step)
     base = scene.gaussians.rows(rows).map(torch.from_numpy)
     work.narrow(torch.from_numpy(rows))
-    adam = torch.optim.Adam(cache.parameters(), lr=settings.lr)
-    reach = settings.reach * work.cameras.extent
     order = rng.numpy("stream3dgs/order", work.index)
-    for _ in range(epochs):
+    for epoch in range(epochs):
+        rounded = settings.sent == "field" and epoch >= epochs * (1 - settings.rounded)
         for view in order.permutation(len(work.cameras)):
-            shift, turn = cache(lookup)
-            work.pull(int(view), moved(base, reach * shift, turn))
-            adam.step()
-            adam.zero_grad()
-    with torch.no_grad():
-        shift, turn = cache(lookup)
-    side = float(np.float32(settings.pixels * pixel))
-    return said_by_cells(scene, rows, (reach * shift).numpy(), turn.numpy(), side, settings.step * pixel)
+            shift, turn = cache(rounded)
+            work.pull(int(view), moved(base, shape.reach * shift, turn))
+            cache.step(settings.lr)
+    return rows, cache
 
 
-def in_box(means: FloatArray, left_out: float) -> tuple[FloatArray, IntArray]:
-    """Return [N, 3] positions, 0 to 1 within the box, and [N] bool who lies in it.
+def shape_of(scene: Scene, extent: float, settings: CacheSettings, rng: Rng) -> FieldShape:
+    """Return the shape of a frame's field: its box is that of most Gaussians, its first weights those of every frame.
 
     Arguments:
-        means: [N, 3] centres, N > 0.
-        left_out: share of them that lies beyond each face of the box.
+        scene: decoded, as both ends have it; N > 0.
+        extent: of the rig, scene units.
+        settings: of the cache.
+        rng: random streams by name and frame.
     """
-    low, high = np.quantile(means.astype(np.float64), [left_out, 1 - left_out], axis=0)
-    unit = (means - low) / np.maximum(high - low, 1e-9)
-    return unit, np.asarray(((unit >= 0) & (unit <= 1)).all(1))
+    means = scene.gaussians.means.astype(np.float64)
+    low, high = np.quantile(means, [settings.box, 1 - settings.box], axis=0).astype(np.float32)
+    # A scene that is flat along an axis has a box all the same.
+    high = np.maximum(high, low + np.maximum(np.float32(1e-3 * extent), np.float32(1e-6) * np.abs(low)))
+    return FieldShape(
+        (float(low[0]), float(low[1]), float(low[2])), (float(high[0]), float(high[1]), float(high[2])),
+        float(np.float32(settings.reach * extent)), settings.levels, settings.entries, settings.features, settings.base,
+        float(np.float32(settings.growth)), settings.width, 2, rng.key("stream3dgs", 0) & 0xFFFFFFFF,
+    )  # fmt: skip
+
+
+def said_by(
+    scene: Scene, rows: IntArray, cache: Cache, cameras: Cameras, settings: CacheSettings
+) -> Field | Motion | None:
+    """Return what is sent of a cache: the cache, or the rigid motions of cells; None where nothing moves.
+
+    Arguments:
+        scene: decoded, as both ends have it.
+        rows: [A] Gaussians that it moves, ascending.
+        cache: of the frame.
+        cameras: those of the frame.
+        settings: of the cache.
+    """
+    if settings.sent == "field":
+        if len(rows) == len(scene.gaussians):
+            return cache.field(None)
+        marks = np.zeros(len(scene.gaussians), np.uint8)
+        marks[rows] = 1
+        return cache.field(marks)
+    with torch.no_grad():
+        shift, turn = cache()
+    pixel = pixel_size(scene.gaussians.means, cameras)
+    side = float(np.float32(settings.pixels * pixel))
+    return said_by_cells(
+        scene, rows, (cache.shape.reach * shift).numpy(), turn.numpy(), side, settings.step * pixel
+    )
 
 
 def moved(gaussians: Gaussians[torch.Tensor], shift: torch.Tensor, turn: torch.Tensor) -> Gaussians[torch.Tensor]:

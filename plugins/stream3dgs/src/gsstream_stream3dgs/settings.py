@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from gsstream.api import PartConfig
@@ -10,12 +12,12 @@ from gsstream.api import PartConfig
 class CacheSettings(PartConfig):
     """The neural transformation cache: a hash grid behind a small network."""
 
-    levels: int = Field(default=16, ge=1, le=32, description="resolutions of the hash grid")
-    entries: int = Field(default=15, ge=4, le=24, description="log2 of the entries of a resolution")
-    features: int = Field(default=4, ge=1, le=16, description="numbers of an entry")
+    levels: int = Field(default=16, ge=1, le=16, description="resolutions of the hash grid")
+    entries: int = Field(default=15, ge=4, le=20, description="log2 of the entries of a resolution")
+    features: int = Field(default=4, ge=1, le=8, description="numbers of an entry")
     base: int = Field(default=16, ge=2, le=1024, description="cells along an axis at the coarsest resolution")
-    growth: float = Field(default=2.0, gt=1, le=4, description="ratio from one resolution to the next")
-    width: int = Field(default=64, ge=4, le=1024, description="neurons of each of the two hidden layers")
+    growth: float = Field(default=2.0, ge=1, le=4, description="ratio from one resolution to the next")
+    width: int = Field(default=64, ge=4, le=128, description="neurons of each of the two hidden layers")
     lr: float = Field(default=2e-3, gt=0, le=1, description="Adam learning rate of all weights")
     reach: float = Field(default=0.1, gt=0, description="shift of one unit of the network, fraction of the extent")
     box: float = Field(
@@ -27,10 +29,18 @@ class CacheSettings(PartConfig):
     votes: float = Field(
         default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in what changed"
     )
-    pixels: float = Field(
-        default=6.0, gt=0, le=1000, description="side of the cells as whose rigid motions the field is sent, pixels"
+    sent: Literal["field", "cells"] = Field(
+        default="field", description="field: the weights, as published; cells: rigid motions of cells, far fewer bytes"
     )
-    step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
+    entry_step: float = Field(default=0.01, gt=0, le=1, description="quantisation step of the grid's entries")
+    weight_step: float = Field(default=0.01, gt=0, le=1, description="quantisation step of the network's weights")
+    rounded: float = Field(
+        default=0.25, ge=0, le=1, description="share of the passes, the last, that learn with rounded weights"
+    )
+    pixels: float = Field(
+        default=6.0, gt=0, le=1000, description="sent as cells: side of a cell, pixels"
+    )
+    step: float = Field(default=0.1, gt=0, le=10, description="sent as cells: quantisation step, pixels")
 
 
 class BirthSettings(PartConfig):

@@ -1,0 +1,132 @@
+"""Field: a hash grid and a small network say of every place in a box how Gaussians there move (3DGStream).
+
+What is sent are the learned weights themselves, as differences from weights that both ends draw. Only entries of the
+grid are sent that some Gaussian of the field lies beside; both ends know which these are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from gsstream.core.changes.hashgrid import ENTRY_RANGE, WEIGHT_RANGE, FieldShape, evaluated
+from gsstream.core.changes.motion import columns, multiply, quats_of
+from gsstream.core.changes.scene import Scene
+from gsstream.core.errors import ShapeError
+from gsstream.core.shapes import FloatArray, IntArray
+
+#: Multiplications that one field may take, rows times the network: some seconds of a processor.
+MAX_EFFORT = 1 << 35
+MAX_ENTRY_STEP, MAX_WEIGHT_STEP = 1 << ENTRY_RANGE, 1 << WEIGHT_RANGE
+#: The real part of a quaternion stays above this, so that a turn is one.
+LEAST_REAL = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """What one frame learned.
+
+    Arguments:
+        shape: of the grid and the network.
+        marks: [N] uint8, 1 for rows that move where they lie in the box; None: all rows in the box.
+        entries: for each level [E, F] int32 symbols of the entries that those rows touch, ascending.
+        weights: for each layer [inputs, outputs] int32 symbols.
+        entry_step: of the symbols of entries, whole number of 2^-20.
+        weight_step: of the symbols of weights, whole number of 2^-14.
+    """
+
+    shape: FieldShape
+    marks: IntArray | None
+    entries: tuple[IntArray, ...] = field(repr=False)
+    weights: tuple[IntArray, ...] = field(repr=False)
+    entry_step: int
+    weight_step: int
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no row moves."""
+        return self.marks is not None and not bool(np.any(self.marks))
+
+
+def field_rows(scene: Scene, shape: FieldShape, marks: IntArray | None) -> tuple[IntArray, FloatArray]:
+    """Return the rows [A] that a field moves, ascending, and where they are [A, 3], 0 to 1 in its box.
+
+    Arguments:
+        scene: decoded, as both ends have it.
+        shape: of the field.
+        marks: [N] uint8, 1 for rows that move where they lie in the box; None: all rows in the box.
+
+    Raises ShapeError when the marks do not fit the scene or the field would take too long.
+    """
+    number = len(scene.gaussians)
+    if marks is not None and marks.shape != (number,):
+        raise ShapeError(
+            f"field: expected a mark for each of {number} Gaussians, got shape {list(marks.shape)}; the packet belongs "
+            "to another scene"
+        )
+    able = np.arange(number) if marks is None else np.flatnonzero(marks)
+    unit = shape.unit(scene.gaussians.means.take(able, 0))
+    inside = np.flatnonzero(((unit >= 0) & (unit <= 1)).all(1))
+    if len(inside) * shape.effort > MAX_EFFORT:
+        raise ShapeError(
+            f"field: {len(inside)} Gaussians by {shape.effort} multiplications are more than {MAX_EFFORT}; expected a "
+            "smaller network or fewer Gaussians"
+        )
+    return able.take(inside), unit.take(inside, 0)
+
+
+def learned(change: Field, unit: FloatArray) -> tuple[list[IntArray], list[IntArray]]:
+    """Return entries and weights after the frame's learning, whole numbers, as :func:`evaluated` takes them.
+
+    Arguments:
+        change: of the frame.
+        unit: [A, 3] places of the rows that it moves, 0 to 1 in its box.
+
+    Raises ShapeError when the symbols do not fit, or lead beyond the range of weights.
+    """
+    shape = change.shape
+    touched, widths = shape.touched(unit), shape.widths
+    wanted = [(f"entries of level {i}", (len(which), shape.features)) for i, which in enumerate(touched)]
+    wanted += [(f"layer {i}", (widths[i], widths[i + 1])) for i in range(shape.layers + 1)]
+    said = (*change.entries, *change.weights)
+    if len(said) != len(wanted):
+        raise ShapeError(f"field: expected tables of {len(wanted)} levels and layers, got {len(said)}")
+    starts = [shape.start_entries(level, which) for level, which in enumerate(touched)] + shape.start_weights()
+    out = []
+    for number, ((name, form), symbols, start) in enumerate(zip(wanted, said, starts, strict=True)):
+        if symbols.shape != form:
+            raise ShapeError(
+                f"field: expected {list(form)} symbols of {name}, got {list(symbols.shape)}; the packet belongs to "
+                "another scene"
+            )
+        grid = number < shape.levels
+        step, limit = (change.entry_step, ENTRY_RANGE) if grid else (change.weight_step, WEIGHT_RANGE)
+        value = start + symbols.astype(np.int64) * step
+        if value.size and int(np.abs(value).max()) >= 1 << limit:
+            raise ShapeError(f"field: {name} leads to {int(np.abs(value).max())} units, expected below {1 << limit}")
+        out.append(value)
+    return out[: shape.levels], out[shape.levels :]
+
+
+def apply_field(scene: Scene, change: Field) -> tuple[Scene, IntArray]:
+    """Return the scene after a field, and the rows [A] that it moved. What ``moved`` says stays.
+
+    A centre is shifted by the reach times the first three numbers that the network says of it; a row turns by the
+    quaternion (1 + a, b, c, d) of the other four. float64 in a fixed order, rounded to float32 at the end.
+
+    Raises ShapeError when the field does not fit the scene.
+    """
+    rows, unit = field_rows(scene, change.shape, change.marks)
+    entries, weights = learned(change, unit)
+    if not len(rows):
+        return scene, rows
+    said = evaluated(change.shape, unit, entries, weights)
+    gaussians = scene.gaussians
+    # By the limits of weights and reach no shift is above 10^15, so what is finite stays so.
+    there = gaussians.means.take(rows, 0).astype(np.float64) + said[:, :3] * change.shape.reach
+    turn = said[:, 4:] / np.maximum(1.0 + said[:, 3:4], LEAST_REAL)
+    means, quats = gaussians.means.copy(), gaussians.quats.copy()
+    means[rows] = there.astype(np.float32)
+    quats[rows] = multiply(quats_of(turn), columns(gaussians.quats, rows).T).astype(np.float32)
+    return replace(scene, gaussians=replace(gaussians, means=means, quats=quats)), rows

@@ -1,0 +1,1 @@
+"""ReCon-GS for gsstream. Importing this package imports no torch."""

@@ -1,0 +1,138 @@
+"""ReCon-GS (NeurIPS 2025) as a method of its own, and what a method that is built on it shares with it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+import torch
+
+from gsstream.api import (
+    Delta,
+    Frame,
+    FrameTools,
+    IntArray,
+    Layout,
+    PlayerState,
+    Rows,
+    Scene,
+    Step,
+    StreamingMethod,
+    Tools,
+    apply_motion,
+    send_delta,
+    send_key,
+)
+from gsstream.blocks import Admitted, changed_rows, detect_change, replaced_by_copies
+from gsstream_recon.anchors import AnchorLevels, anchors_after, due, followed
+from gsstream_recon.motion import fitted_motion
+from gsstream_recon.settings import ReConConfig
+
+
+@dataclass(frozen=True)
+class ReConState:
+    """``player``: what every player has. ``previous``: the images its scene shows. ``number``: that of Gaussians kept.
+    ``anchors``: of the last frame that changed something, as rows of the scene after it; None at first.
+    """
+
+    player: PlayerState
+    previous: Frame
+    number: int
+    anchors: AnchorLevels | None = None
+
+
+class AnchoredMethod(StreamingMethod[ReConState]):
+    """Moves Gaussians by anchors on several levels, then adds some at constant number."""
+
+    heeds = ("stream.epochs",)
+    Config = ReConConfig
+    #: Whether the motion of every anchor is rounded while it is fitted.
+    rounded = False
+
+    def begin(self, frame: Frame, tools: Tools) -> Step[ReConState]:
+        first = tools.first_frame(frame)
+        number = len(first.gaussians)
+        layout = Layout.flat(number, frame.cameras.extent)
+        packet, player = send_key(first.gaussians, layout, first.meta, frame.index)
+        return Step(ReConState(player, frame, number), packet, "key", first.metrics)
+
+    def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> ReConState:
+        anchors = anchors_after(tools.since_key(), self.config.motion, tools.rng)
+        return ReConState(player, shown, len(next(tools.since_key()).gaussians), anchors)
+
+    def step(self, state: ReConState, frame: Frame, tools: Tools) -> Step[ReConState]:
+        clock = [time.perf_counter()]
+        if frame.effort == 0 or np.array_equal(state.previous.images, frame.images):
+            return self._send(state, frame, Delta(), state.anchors)
+        epochs = tools.epochs(frame)
+        for_births = max(1, round(self.config.births.share * epochs)) if self.config.births.share else 0
+        scene, settings = state.player.scene, self.config.motion
+        work = tools.open(state.player, state.previous, frame)
+        rows = self._changed(work, state.previous, frame)
+        anchors = due(state.anchors, frame.index, len(scene.gaussians), settings, tools.rng)
+        motion = fitted_motion(
+            scene, work, rows, (state.anchors, anchors), max(1, epochs - for_births), settings,
+            tools.rng.numpy("recon", frame.index), self.rounded,
+        )  # fmt: skip
+        moved = scene if motion is None else apply_motion(scene, motion)[0]
+        work = work.on(moved.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
+        clock.append(time.perf_counter())
+        change = self._rows(moved, state.number, work, for_births, tools) if for_births else Rows()
+        clock.append(time.perf_counter())
+        step = self._send(state, frame, Delta(() if motion is None else (motion,)).with_rows(change), anchors)
+        clock.append(time.perf_counter())
+        facts = {
+            "iterations": epochs * len(frame.cameras), "births": 0 if change.births is None else len(change.births),
+            "deaths": len(change.deaths), "moving_groups": 0 if motion is None else int(motion.moving.sum()),
+            "anchors": [len(level) for level in anchors.rows],
+            "seconds": dict(zip(("motion", "growth", "code"), np.diff(clock).tolist(), strict=True)),
+        }  # fmt: skip
+        return replace(step, metrics={**step.metrics, **facts})
+
+    def _changed(self, work: FrameTools, previous: Frame, frame: Frame) -> IntArray:
+        """Rows that may move."""
+        settings = self.config.motion
+        change = detect_change(previous, frame, settings.change)
+        means = work.gaussians.means
+        return changed_rows(change, means, frame.cameras, work.session, settings.votes).nonzero()[:, 0].numpy()
+
+    def _rows(self, scene: Scene, number: int, work: FrameTools, epochs: int, tools: Tools) -> Rows:
+        """As many of the least opaque leave as there are more than in frame 0; then this frame's are born."""
+        deaths = np.sort(np.argsort(scene.gaussians.opacities, kind="stable")[: len(scene.gaussians) - number])
+        births = self.config.births
+        return replaced_by_copies(
+            scene, deaths, work, epochs, tools.rng, gradient=births.gradient, most=births.most, rounds=births.rounds,
+            prune_opacity=births.prune_opacity, admitted=self.admission(number),
+        )  # fmt: skip
+
+    def admission(self, kept: int) -> Admitted | None:
+        """Return what chooses which of the Gaussians that are pulled may be copied; None, as here: all of them.
+
+        Arguments:
+            kept: Gaussians that were there before the frame and stay.
+        """
+        return None
+
+    def _send(
+        self, state: ReConState, frame: Frame, delta: Delta, anchors: AnchorLevels | None
+    ) -> Step[ReConState]:
+        packet, player = send_delta(state.player, delta)
+        if delta.is_empty or anchors is None:
+            return Step(replace(state, player=player), packet, "empty")
+        return Step(ReConState(player, frame, state.number, followed(anchors, player)), packet, "delta")
+
+
+@final
+class ReCon(AnchoredMethod):
+    """Moves Gaussians by anchors drawn among them on three levels, and adds some (ReCon-GS, NeurIPS 2025).
+
+    Half of a frame's passes fit the motions of anchors; the other half fits Gaussians that are copied where the images
+    pull at the scene. In the next frame as many of the least opaque leave, so the number stays that of frame 0. Anchors
+    are drawn anew every second frame and inherit what the old ones knew. What is sent are rigid motions of small cells,
+    each the sum of its anchors' motions, births and deaths: attributes of what is there never change.
+    Where this differs from what is published, and why: README of this plugin.
+    """
+
+    source = "ReCon-GS (NeurIPS 2025)"

@@ -1,0 +1,35 @@
+"""What this plugin ships, described without importing torch."""
+
+from __future__ import annotations
+
+from gsstream.spec import ComponentSpec, MethodSpec, hookimpl
+
+
+@hookimpl
+def gsstream_components() -> list[ComponentSpec]:
+    """The method as one part."""
+    return [
+        ComponentSpec(
+            kind="stepper",
+            name="recon",
+            target="gsstream_recon.method:ReCon",
+            summary="motions of anchors on three levels add up, Gaussians added and removed at constant number",
+        )
+    ]
+
+
+@hookimpl
+def gsstream_methods() -> list[MethodSpec]:
+    """The letter, and what it costs less to do."""
+    return [
+        MethodSpec(
+            name="recon",
+            recipe="gsstream_recon:recipes/recon.yaml",
+            summary="ReCon-GS: 10 epochs, moving what changed",
+        ),
+        MethodSpec(
+            name="recon-published",
+            recipe="gsstream_recon:recipes/recon-published.yaml",
+            summary="ReCon-GS as printed: everything moves",
+        ),
+    ]

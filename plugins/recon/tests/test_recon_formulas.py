@@ -1,0 +1,191 @@
+"""Anchors against nearest neighbours by hand; what they inherit; bodies that are found again; rows that come and go."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from gsstream_recon.anchors import AnchorLevels, Level, anchors_after, bound, due, followed, inherited
+from gsstream_recon.method import ReCon
+from gsstream_recon.motion import fitted_motion
+from gsstream_recon.settings import BirthSettings, MotionSettings, ReConConfig
+
+from gsstream.api import Cameras, Displacement, Gaussians, Layout, Rng, Scene, apply_motion
+from gsstream.blocks import pixel_size
+from gsstream.testing.stepping import MethodUnderTest
+
+RNG = np.random.default_rng(0)
+RIG = Cameras(
+    ("a", "b"), np.stack([np.eye(4), np.eye(4)]), np.tile(np.diag([50.0, 50, 1]), (2, 1, 1)), 32, 24
+)  # fmt: skip
+ANCHOR = MotionSettings(measure="anchor", per_anchor=5, pixels=0.2, step=0.01, turn_step=0.001)
+
+
+def scene_of(means: np.ndarray, moved: Displacement | None = None) -> Scene:
+    number = len(means)
+    quats = np.zeros((number, 4), np.float32)
+    quats[:, 0] = 1
+    gaussians = Gaussians(
+        means=means.astype(np.float32), quats=quats, scales=np.zeros((number, 3), np.float32),
+        opacities=np.zeros(number, np.float32), sh0=np.zeros((number, 1, 3), np.float32),
+        shN=np.zeros((number, 0, 3), np.float32),
+    )  # fmt: skip
+    return Scene(gaussians, Layout.flat(number, 1.0), moved)
+
+
+class Pulled:
+    """A frame whose loss is the squared distance of every Gaussian to where it belongs."""
+
+    cameras = RIG
+
+    def __init__(self, aims: np.ndarray) -> None:
+        self.aims = torch.from_numpy(aims.astype(np.float32))
+        self.seen: list[np.ndarray] = []
+
+    def narrow(self, rows: torch.Tensor) -> None:
+        self.rows = rows
+
+    def pull(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
+        self.seen.append(rows.means.detach().numpy().copy())
+        loss = (rows.means - self.aims[self.rows]).square().sum()
+        loss.backward()
+        return float(loss.detach())
+
+
+def fitted(scene: Scene, aims: np.ndarray, rows: np.ndarray, settings: MotionSettings, epochs: int = 30, **more):
+    """(the frame, the scene after the motion that was found)."""
+    before = more.pop("before", None)
+    anchors = due(before, 1, len(scene.gaussians), settings, Rng(0))
+    work = Pulled(aims)
+    motion = fitted_motion(
+        scene, work, rows, (before, anchors), epochs, settings, np.random.default_rng(0), **more
+    )
+    return work, scene if motion is None else apply_motion(scene, motion)[0]
+
+
+def test_anchors_are_drawn_by_level_and_both_ends_could_draw_the_same() -> None:
+    settings = MotionSettings(per_anchor=24, levels=3, ratio=3, every=2)
+    first = due(None, 5, 2160, settings, Rng(7))
+    assert [len(rows) for rows in first.rows] == [10, 30, 90]
+    assert set(first.rows[0]) < set(first.rows[1]) < set(first.rows[2]), "a finer level adds to the coarser ones"
+    again = due(None, 5, 2160, settings, Rng(7))
+    assert [rows.tobytes() for rows in first.rows] == [rows.tobytes() for rows in again.rows]
+    assert due(first, 6, 2160, settings, Rng(7)) is first
+    assert due(first, 7, 2160, settings, Rng(7)).drawn == 7
+    assert not np.array_equal(due(first, 7, 2160, settings, Rng(7)).rows[2], first.rows[2])
+    lost = AnchorLevels(5, (np.zeros(0, np.int64), *first.rows[1:]))
+    assert due(lost, 6, 2160, settings, Rng(7)).drawn == 6, "a level without an anchor cannot be followed"
+    assert [len(rows) for rows in due(None, 1, 4, settings, Rng(7)).rows] == [1, 1, 1]
+
+
+def test_anchors_lie_where_gaussians_are_dense() -> None:
+    means = np.concatenate([RNG.normal(0, 0.01, (900, 3)), RNG.uniform(5, 9, (100, 3))])
+    rows = due(None, 1, 1000, MotionSettings(per_anchor=10), Rng(0)).rows[2]
+    assert (means[rows][:, 0] < 1).sum() == pytest.approx(90, abs=8)
+
+
+def test_each_cell_follows_the_nearest_anchor_of_each_level() -> None:
+    means, centres = RNG.normal(size=(50, 3)).astype(np.float32), RNG.normal(size=(20, 3))
+    anchors = due(None, 1, 50, MotionSettings(per_anchor=4), Rng(0))
+    for level, rows in zip(bound(centres, means, anchors), anchors.rows, strict=True):
+        distance = np.linalg.norm(centres[:, None] - means[rows][None], axis=2)
+        np.testing.assert_allclose(level.at[level.of], means[rows][distance.argmin(1)])
+        assert set(level.of) == set(range(len(level.at))), "only anchors that some cell follows are kept"
+
+
+def test_levels_say_the_past_together_and_new_anchors_inherit_it() -> None:
+    past = RNG.normal(size=(6, 6))
+    old = [Level(np.zeros((1, 3)), np.zeros(6, np.int64)), Level(np.eye(3)[:2] * 1.0, np.array([0, 0, 0, 1, 1, 1]))]
+    coarse, fine = inherited(past, old, old, 3)
+    np.testing.assert_allclose(coarse[0], past.mean(0))
+    np.testing.assert_allclose(coarse[0] + fine, [past[:3].mean(0), past[3:].mean(0)])
+    new = [old[0], Level(np.array([[0.75, 0.25, 0.0], [1.0, 0, 0]]), old[1].of)]
+    _, drawn = inherited(past, old, new, 2)
+    np.testing.assert_allclose(drawn[0], (3 * fine[0] + fine[1]) / 4, rtol=0.02)
+    np.testing.assert_allclose(drawn[1], fine[0], atol=0.01, err_msg="where an old anchor lay, as it moved")
+    np.testing.assert_allclose(inherited(past, old, new, 9)[1], drawn, err_msg="there are no more than two")
+
+
+def test_bodies_find_their_own_ways_and_what_is_sent_is_what_was_fitted() -> None:
+    """Two clouds far apart move differently; the coarsest anchor holds both, and finer ones tell them apart."""
+    means = np.concatenate([RNG.normal((0, 0, 3), 0.02, (40, 3)), RNG.normal((0.5, 0, 3), 0.02, (40, 3))])
+    aims = means + np.repeat([[0.03, 0, 0.01], [-0.02, 0.04, 0]], 40, 0)
+    settings = ANCHOR.model_copy(update={"lr": 0.1})
+    _, after = fitted(scene_of(means), aims, np.arange(80), settings, 60)
+    assert np.abs(after.gaussians.means - aims).mean() < 0.3 * np.abs(means - aims).mean()
+
+
+def test_only_cells_in_what_changed_move() -> None:
+    means = np.concatenate([RNG.normal((0, 0, 3), 0.02, (30, 3)), RNG.normal((1, 0, 3), 0.02, (30, 3))])
+    scene = scene_of(means)
+    _, after = fitted(scene, means + np.array([0.05, 0, 0]), np.arange(30), ANCHOR)
+    assert (after.gaussians.means[:30] != scene.gaussians.means[:30]).any(1).mean() > 0.5
+    np.testing.assert_array_equal(after.gaussians.means[30:], scene.gaussians.means[30:])
+    _, still = fitted(scene, means + 1, np.zeros(0, np.int64), ANCHOR)
+    assert still is scene
+
+
+@pytest.mark.parametrize("every", [1, 5])
+def test_a_frame_begins_with_a_share_of_the_last_ones_motion(every: int) -> None:
+    """Whether anchors are drawn anew or not; a body that moves as one leaves nothing to lose between them."""
+    means = RNG.normal((0, 0, 3), 0.05, (60, 3))
+    shift = np.tile(np.float32([0.05, 0, 0]), (60, 1))
+    scene = scene_of(means, Displacement(np.arange(60), shift, np.zeros_like(shift)))
+    settings = ANCHOR.model_copy(update={"lr": 1e-6, "every": every})
+    before = due(None, 0, 60, settings, Rng(0))
+    _, after = fitted(scene, means, np.arange(60), settings, 1, before=before)
+    np.testing.assert_allclose(after.gaussians.means, means + 0.6 * shift, atol=1e-3)
+    _, rest = fitted(scene, means, np.arange(60), settings.model_copy(update={"momentum": 0.0}), 1, before=before)
+    assert rest is scene
+
+
+def test_the_pull_to_rest_keeps_what_the_images_say_nothing_about() -> None:
+    means = RNG.normal((0, 0, 3), 0.05, (60, 3))
+    shift = np.tile(np.float32([0.05, 0, 0]), (60, 1))
+    scene = scene_of(means, Displacement(np.arange(60), shift, np.zeros_like(shift)))
+    before = due(None, 0, 60, ANCHOR, Rng(0))
+    settings = ANCHOR.model_copy(update={"pull": 1.0, "lr": 0.02})
+    _, after = fitted(scene, means + 0.6 * shift, np.arange(60), settings, 1, before=before)
+    assert np.abs(after.gaussians.means - means).mean() < np.abs(0.6 * shift).mean(), "the images alone hold it there"
+
+
+def test_rounded_motions_are_shown_while_they_are_fitted_and_sent_as_they_are() -> None:
+    """Cells hold one Gaussian each here, so none turns about a centre; shifts are the sums of whole steps."""
+    means = RNG.uniform((-0.3, -0.3, 2.7), (0.3, 0.3, 3.3), (80, 3))
+    settings = ANCHOR.model_copy(update={"step": 0.5, "turn_step": 1.0, "pixels": 0.01, "lr": 0.2})
+    scene = scene_of(means)
+    work, after = fitted(scene, means + 0.1 * means[:, :1], np.arange(80), settings, rounded=True)
+    step = 0.5 * pixel_size(scene.gaussians.means, RIG)
+    for seen in (*work.seen, after.gaussians.means):
+        whole = (seen - scene.gaussians.means) / step
+        np.testing.assert_allclose(whole, np.rint(whole), atol=1e-3)
+    assert not (work.seen[1] != scene.gaussians.means).any(), "after a step of 0.2 pixels every motion is still zero"
+    assert len(np.unique(np.rint((after.gaussians.means - scene.gaussians.means)[:, 0] / step))) > 1
+
+
+def test_anchors_stay_with_their_gaussians_and_a_resumed_run_finds_them() -> None:
+    births = BirthSettings(gradient=1e-7, rounds=1, most=7, prune_opacity=0.0)
+    settings = MotionSettings(measure="anchor", per_anchor=4, every=2, step=0.001)
+    method = MethodUnderTest("recon", ReCon(ReConConfig(motion=settings, births=births)))
+    states = [step.state for step in method.steps]
+    assert [state.anchors and state.anchors.drawn for state in states] == [None, 1, 1]
+    before, state = states[1:]
+    kept = np.delete(np.arange(len(before.player.gaussians)), state.player.delta.deaths)
+    assert len(state.player.delta.deaths) == 7
+    for old, new in zip(before.anchors.rows, state.anchors.rows, strict=True):
+        here = old[np.isin(old, kept)]
+        opacities = before.player.gaussians.opacities[here], state.player.gaussians.opacities[new]
+        assert opacities[0].tobytes() == opacities[1].tobytes()
+    again = anchors_after((state.player for state in states), settings, method.encoder().rng)
+    assert [rows.tolist() for rows in again.rows] == [rows.tolist() for rows in states[-1].anchors.rows]
+    assert followed(again, states[0].player) is again, "a key packet moves no row"
+
+
+def test_as_many_leave_as_were_born_in_the_frame_before() -> None:
+    births = BirthSettings(gradient=1e-7, rounds=1, most=7, prune_opacity=0.0)
+    first, second, third = MethodUnderTest("recon", ReCon(ReConConfig(births=births))).steps
+    number = len(first.state.player.gaussians)
+    assert (second.metrics["births"], second.metrics["deaths"], third.metrics["deaths"]) == (7, 0, 7)
+    assert len(third.state.player.gaussians) == number + third.metrics["births"]
+    faint = np.argsort(second.state.player.gaussians.opacities, kind="stable")[:7]
+    assert sorted(third.state.player.delta.deaths) == sorted(faint)

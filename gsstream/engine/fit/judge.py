@@ -46,8 +46,8 @@ class Judge:
         """
         if self._in_one_go:
             exposure = self.exposure
-            maps = (exposure.matrix[view], exposure.offset[view]) if exposure else (None, None)
-            comparison = Comparison(plain(self._loss), self._target(view), self._dssim, *maps, tiles)
+            matrix, offset = (exposure.matrix[view], exposure.offset[view]) if exposure else (None, None)
+            comparison = Comparison(plain(self._loss), self._target(view), self._dssim, matrix, offset, tiles)
             pulled = session.pull(view, rows, comparison)
             if pulled is not None:
                 return pulled

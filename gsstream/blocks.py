@@ -26,6 +26,7 @@ from gsstream.engine.step.active.change import Change as Change
 from gsstream.engine.step.active.change import detect_change as detect_change
 from gsstream.engine.step.active.change import marked_per_tile as marked_per_tile
 from gsstream.engine.step.harden import rows_of as rows_of
+from gsstream.growth.copying import Admitted as Admitted
 from gsstream.growth.copying import fitted_copies as fitted_copies
 from gsstream.growth.copying import pulled_rows as pulled_rows
 from gsstream.growth.copying import replaced_by_copies as replaced_by_copies

@@ -27,6 +27,7 @@ SHIPPED: Mapping[str, tuple[str, ...]] = {
         "method/hicom", "method/hicom-published", "stepper/hicom", "method/comgs-s", "method/comgs-l", "stepper/comgs",
         "method/stream3dgs", "method/stream3dgs-cells", "stepper/stream3dgs",
         "method/recon", "method/recon-published", "stepper/recon",
+        "method/quarc", "method/quarc-published", "stepper/quarc",
         "propagation/ft-pruning", "gate/binary-ste", "confidence/onnx",
     ),
 }  # fmt: skip

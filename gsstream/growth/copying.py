@@ -20,7 +20,7 @@ Admitted = Callable[[FrameWork, torch.Tensor], torch.Tensor]
 
 def replaced_by_copies(
     scene: Scene, deaths: IntArray, work: FrameWork, epochs: int, rng: Rng, *, gradient: float, most: int, rounds: int,
-    prune_opacity: float, admitted: Admitted = lambda _, rows: rows,
+    prune_opacity: float, admitted: Admitted | None = None,
 ) -> Rows:  # fmt: skip
     """Return the change of rows in which some leave and the frame's copies are born, each a node of its own.
 
@@ -41,7 +41,7 @@ def replaced_by_copies(
 
 def fitted_copies(
     scene: Gaussians[torch.Tensor], work: FrameWork, epochs: int, rng: Rng, *, gradient: float, most: int, rounds: int,
-    prune_opacity: float, admitted: Admitted = lambda _, rows: rows,
+    prune_opacity: float, admitted: Admitted | None = None,
 ) -> Gaussians[torch.Tensor]:  # fmt: skip
     """Return the Gaussians that a frame adds to a scene, raw values.
 
@@ -54,7 +54,7 @@ def fitted_copies(
         most: Gaussians that are added at most.
         rounds: times that the scene is searched for places.
         prune_opacity: opacity below which an added Gaussian is given up, 0 to 1.
-        admitted: chooses among the places that are found; all of them unless told otherwise.
+        admitted: chooses among the places that are found; None: all of them.
     """
     born = scene.rows(slice(0, 0))
     views = list(range(len(work.cameras)))
@@ -63,15 +63,21 @@ def fitted_copies(
         room = most - len(born)
         if not passes or (room <= 0 and not len(born)):
             continue
-        inner = work.on(joined(scene, born) if len(born) else scene)
-        places = admitted(inner, pulled_rows(inner, gradient))[: max(0, room)]
-        copies = inner.gaussians.rows(places.sort().values)
+        copies = _copies(work.on(joined(scene, born) if len(born) else scene), gradient, max(0, room), admitted)
         born = joined(born, copies) if len(born) else copies
         if not len(born):
             continue
         born = fitted_births(scene, born, work, views, passes, rng)
         born = born.rows(born.opacities.sigmoid() >= prune_opacity)
     return born
+
+
+def _copies(work: FrameWork, gradient: float, room: int, admitted: Admitted | None) -> Gaussians[torch.Tensor]:
+    """Copies of at most ``room`` Gaussians. What is rendered for it, a render for every camera, goes with the call."""
+    places = pulled_rows(work, gradient)
+    if admitted is not None:
+        places = admitted(work, places)
+    return work.gaussians.rows(places[:room].sort().values)
 
 
 def pulled_rows(work: FrameWork, gradient: float) -> torch.Tensor:

@@ -44,6 +44,12 @@ class FrameTools(FrameWork, Protocol):
     def session(self) -> RenderSession:
         """Opened on the scene of the frame before: ``narrow`` to the rows that may change, then ``render`` them."""
 
+    def on(self, gaussians: Gaussians[torch.Tensor]) -> FrameTools:
+        """Return the same frame, to be worked on from another scene, which gets a session of its own.
+
+        A session holds a render for every camera that was asked for, as long as something holds it.
+        """
+
     def backward(self, view: int, image: torch.Tensor, tile_mask: torch.Tensor | None = None) -> float:
         """Judge a rendered view against what its camera recorded, and pull the loss back into its graph.
 

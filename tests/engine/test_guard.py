@@ -6,7 +6,9 @@ packet where the function is called for those alone). Then the same with ``strea
 
 from __future__ import annotations
 
+import gc
 import warnings
+import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -28,6 +30,7 @@ from gsstream.gate.always_open import AlwaysOpen
 from gsstream.growth.base import Growth
 from gsstream.packet import decode_packet
 from gsstream.render.base import RenderSession
+from gsstream.testing.cases import rig, scene
 
 WORLD = "synthetic:frames=5&views=2&width=32&height=24&supersample=1"
 TINY = {
@@ -271,6 +274,18 @@ class TestGuard:
         again = guard("gate", self.part(), Where(), self.part()._level)
         assert isinstance(again, Guarded)
         assert type(plain(again)) is AlwaysOpen
+
+    def test_a_session_goes_with_its_owner_and_not_when_the_collector_comes(self) -> None:
+        renderer, cameras = encoder("gate", lambda part, _: part).parts.renderer, rig()
+        gc.disable()
+        try:
+            session = renderer.open(scene(torch.randn(9, 3)), None, cameras, (0.0, 0.0, 0.0))
+            session.narrow(torch.arange(3))
+            seen = weakref.ref(plain(session))
+            del session
+            assert seen() is None, "it holds a render of every camera: a few frames of them are a gigabyte"
+        finally:
+            gc.enable()
 
     def test_what_a_part_lacks_it_lacks(self) -> None:
         assert not hasattr(self.part(), "no_such_thing")

@@ -64,9 +64,16 @@ class Guarded:
         self._subject, self._kind = part, kind or slot
 
     @classmethod
-    def session(cls, session: RenderSession, guarded: Guarded) -> Guarded:
-        """Return a session of a guarded renderer, behind a guard that names the renderer."""
-        made = cls(guarded._slot, guarded._part, guarded._where, guarded._level, SESSION)
+    def session(cls, session: RenderSession, renderer: object, where: Where, level: Checks) -> Guarded:
+        """Return a session of a renderer, behind a guard that names the renderer.
+
+        Arguments:
+            session: that a renderer has opened.
+            renderer: the part itself.
+            where: the place that errors name.
+            level: how closely results are looked at.
+        """
+        made = cls("renderer", renderer, where, level, SESSION)
         made._subject = session
         return made
 
@@ -91,9 +98,11 @@ class Guarded:
                 raise
 
     def _guarding(self, name: str, method: Callable[..., Any]) -> Callable[..., Any]:
-        slot, part, where, kind = self._slot, self._part, self._where, self._kind
+        # Nothing here may hold ``self``, which holds what is returned: a session has to go when its owner lets go of
+        # it, not when the garbage collector comes by. It has the memory of a render for every camera.
+        slot, part, where, level, kind = self._slot, self._part, self._where, self._level, self._kind
         look = LOOKS.get((kind, name))
-        looking = Look(self._level, slot, part, where)
+        looking = Look(level, slot, part, where)
 
         def call(*args: Any, **kwargs: Any) -> Any:
             with blaming(slot, part, where):
@@ -102,7 +111,7 @@ class Guarded:
                     where.pause()  # what the part fitted is over: what is wrong with the result is of no iteration
                 if look is not None:
                     look(looking, args, result)
-            return Guarded.session(result, self) if isinstance(result, RenderSession) else result
+            return Guarded.session(result, part, where, level) if isinstance(result, RenderSession) else result
 
         return call
 

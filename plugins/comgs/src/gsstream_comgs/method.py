@@ -79,8 +79,8 @@ class ComGS(StreamingMethod[ComGSState]):
         clock.append(time.perf_counter())
         if key:
             passes = max(1, round(epochs * self.config.correction.passes))
-            inner = work.on(scene.gaussians.map(torch.from_numpy))
-            residual = corrected(inner, scene.layout, passes, self.config.correction, order)
+            work = work.on(scene.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
+            residual = corrected(work, scene.layout, passes, self.config.correction, order)
             delta = delta.with_residual(residual)
         clock.append(time.perf_counter())
         step = self._send(state, frame, delta)

@@ -77,6 +77,7 @@ class HiCoM(StreamingMethod[HiCoMState]):
         motions, moved = fitted_motions(
             scene, work, rows, max(1, epochs - for_births), self.config.motion, order
         )
+        work = work.on(moved.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
         clock.append(time.perf_counter())
         change = self._rows(moved, state.number, work, for_births, tools) if for_births else Rows()
         clock.append(time.perf_counter())

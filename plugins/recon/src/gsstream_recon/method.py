@@ -13,7 +13,6 @@ from gsstream.api import (
     Delta,
     Frame,
     FrameTools,
-    FrameWork,
     IntArray,
     Layout,
     PlayerState,
@@ -26,7 +25,7 @@ from gsstream.api import (
     send_delta,
     send_key,
 )
-from gsstream.blocks import changed_rows, detect_change, replaced_by_copies
+from gsstream.blocks import Admitted, changed_rows, detect_change, replaced_by_copies
 from gsstream_recon.anchors import AnchorLevels, anchors_after, due, followed
 from gsstream_recon.motion import fitted_motion
 from gsstream_recon.settings import ReConConfig
@@ -78,6 +77,7 @@ class AnchoredMethod(StreamingMethod[ReConState]):
             tools.rng.numpy("recon", frame.index), self.rounded,
         )  # fmt: skip
         moved = scene if motion is None else apply_motion(scene, motion)[0]
+        work = work.on(moved.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
         clock.append(time.perf_counter())
         change = self._rows(moved, state.number, work, for_births, tools) if for_births else Rows()
         clock.append(time.perf_counter())
@@ -104,12 +104,16 @@ class AnchoredMethod(StreamingMethod[ReConState]):
         births = self.config.births
         return replaced_by_copies(
             scene, deaths, work, epochs, tools.rng, gradient=births.gradient, most=births.most, rounds=births.rounds,
-            prune_opacity=births.prune_opacity, admitted=self.admitted,
+            prune_opacity=births.prune_opacity, admitted=self.admission(number),
         )  # fmt: skip
 
-    def admitted(self, work: FrameWork, rows: torch.Tensor) -> torch.Tensor:
-        """Return which of the Gaussians [P], the most pulled first, may be copied; here all of them."""
-        return rows
+    def admission(self, kept: int) -> Admitted | None:
+        """Return what chooses which of the Gaussians that are pulled may be copied; None, as here: all of them.
+
+        Arguments:
+            kept: Gaussians that were there before the frame and stay.
+        """
+        return None
 
     def _send(
         self, state: ReConState, frame: Frame, delta: Delta, anchors: AnchorLevels | None

@@ -76,12 +76,13 @@ class Stream3DGS(StreamingMethod[Stream3DGSState]):
         rows = self._changed(work.gaussians.means, work, state.previous, frame)
         # Those of the frame before are given up: they neither move nor hide what does.
         rows = rows[rows < state.number]
-        alone = work.on(work.gaussians.rows(slice(0, state.number)))
+        work = work.on(work.gaussians.rows(slice(0, state.number)))
         passes = max(1, epochs - for_births)
-        found = fitted_cache(scene, alone, rows, passes, self.config.cache, tools.rng) if len(rows) else None
+        found = fitted_cache(scene, work, rows, passes, self.config.cache, tools.rng) if len(rows) else None
         said = None if found is None else said_by(scene, *found, frame.cameras, self.config.cache)
         moves = Delta(() if said is None else (said,))
         moved = apply_delta(scene, moves)
+        work = work.on(moved.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
         clock.append(time.perf_counter())
         change = self._rows(moved, state.number, work, for_births, tools)
         clock.append(time.perf_counter())

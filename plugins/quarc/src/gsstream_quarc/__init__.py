@@ -1,0 +1,1 @@
+"""QuARC-GS for gsstream. Importing this package imports no torch."""

@@ -1,0 +1,72 @@
+"""Where Gaussians may be born: where some fixed views changed, and not too many in one place."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gsstream.api import FrameWork, IntArray
+from gsstream.blocks import pixel_size
+from gsstream_quarc.settings import GateSettings
+
+
+def change_scores(work: FrameWork, views: int) -> torch.Tensor:
+    """Return [N] the change score g / (g + median) of every Gaussian, 0 to 1; 0 where no view pulls.
+
+    g is the size of the change, from the frame before to this one, of the pull of the squared error at a Gaussian's
+    centre, summed over the views; the render itself cancels. The median is that of the Gaussians that are pulled.
+
+    Arguments:
+        work: the frame, seen from the scene that is searched.
+        views: training cameras that are asked, spread evenly over the rig; all when there are no more.
+    """
+    size = torch.zeros(len(work.gaussians))
+    number = len(work.cameras)
+    for view in np.unique(np.linspace(0, number - 1, min(views, number)).round().astype(int)):
+        now = work.image(int(view))
+        upstream = 2 * (work.previous_image(int(view)) - now) / now.numel()
+        size += work.screen_gradient(int(view), upstream).gradient.norm(dim=1)
+    pulled = size > 0
+    if not bool(pulled.any()):
+        return size
+    return size / (size + size[pulled].median())
+
+
+class ChangeGate:
+    """Chooses places for births: those that changed, at most some in a cell."""
+
+    def __init__(self, settings: GateSettings, kept: int) -> None:
+        """Prepare the choice.
+
+        Arguments:
+            settings: of the choice.
+            kept: Gaussians that were there before; those behind them were born in an earlier round of the frame.
+        """
+        self.settings, self.kept = settings, kept
+
+    def __call__(self, work: FrameWork, rows: torch.Tensor) -> torch.Tensor:
+        """Return the rows that may be copied, in the order in which they come.
+
+        Arguments:
+            work: the frame, seen from the scene that is searched.
+            rows: [P] Gaussians that are pulled, the most pulled first.
+        """
+        settings, means = self.settings, work.gaussians.means.numpy()
+        if settings.score:
+            rows = rows[change_scores(work, settings.views)[rows] >= settings.score]
+        side = settings.pixels * pixel_size(means, work.cameras)
+        index = np.floor(means.astype(np.float64) / side).astype(np.int64)
+        cell_of = np.unique(index, axis=0, return_inverse=True)[1].reshape(-1)
+        room = settings.per_cell - np.bincount(cell_of[self.kept :], minlength=int(cell_of.max(initial=0)) + 1)
+        cells = cell_of[rows.numpy()]
+        return rows[torch.from_numpy(_ranks(cells) < room[cells])]
+
+
+def _ranks(cells: IntArray) -> IntArray:
+    """[P]: how many before each are of the same cell."""
+    order = np.argsort(cells, kind="stable")
+    ordered = cells[order]
+    first = np.flatnonzero(np.diff(ordered, prepend=-1))
+    ranks = np.empty(len(cells), np.int64)
+    ranks[order] = np.arange(len(cells)) - np.repeat(first, np.diff(first, append=len(cells)))
+    return ranks

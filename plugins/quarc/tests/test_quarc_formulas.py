@@ -1,0 +1,91 @@
+"""Change scores and cells of births by hand; what is sent is what was fitted; births stay where something changed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from gsstream_quarc.births import ChangeGate, change_scores
+from gsstream_quarc.method import QuARC
+from gsstream_quarc.settings import GateSettings, QuARCConfig
+from gsstream_recon.settings import BirthSettings, MotionSettings
+
+from gsstream.api import Cameras, Gaussians
+from gsstream.blocks import pixel_size
+from gsstream.testing.stepping import MethodUnderTest
+
+RNG = np.random.default_rng(0)
+
+
+def rig(views: int) -> Cameras:
+    names = tuple(str(view) for view in range(views))
+    return Cameras(names, np.stack([np.eye(4)] * views), np.tile(np.diag([50.0, 50, 1]), (views, 1, 1)), 32, 24)
+
+
+class Seen:
+    """A frame in which every Gaussian is pulled along x by what its number says, in every view."""
+
+    def __init__(self, means: np.ndarray, pulls: list[float], views: int = 7) -> None:
+        zeros = torch.zeros(len(means))
+        self.gaussians = Gaussians(
+            means=torch.from_numpy(means.astype(np.float32)), quats=zeros[:, None].repeat(1, 4),
+            scales=zeros[:, None].repeat(1, 3), opacities=zeros, sh0=zeros[:, None, None].repeat(1, 1, 3),
+            shN=torch.zeros(len(means), 0, 3),
+        )  # fmt: skip
+        self.pulls, self.cameras, self.asked = torch.tensor(pulls), rig(views), []
+
+    def image(self, view: int) -> torch.Tensor:
+        return torch.zeros(2, 2, 3)
+
+    def previous_image(self, view: int) -> torch.Tensor:
+        return torch.ones(2, 2, 3)
+
+    def screen_gradient(self, view: int, upstream: torch.Tensor):
+        assert upstream.unique().tolist() == pytest.approx([2 / 12]), "the gradient of a mean squared error"
+        self.asked.append(view)
+        return type("Found", (), {"gradient": torch.stack([self.pulls, 0 * self.pulls], 1)})
+
+
+def test_scores_compare_with_the_median_of_what_is_pulled() -> None:
+    work = Seen(RNG.normal(size=(6, 3)), [0.0, 1.0, 2.0, 6.0, 0.0, 0.0])
+    assert change_scores(work, 4).tolist() == pytest.approx([0, 1 / 3, 1 / 2, 3 / 4, 0, 0])
+    assert work.asked == [0, 2, 4, 6], "four views, spread over the seven"
+    few = Seen(RNG.normal(size=(6, 3)), [1.0] * 6, views=2)
+    change_scores(few, 4)
+    assert few.asked == [0, 1]
+    still = change_scores(Seen(np.zeros((2, 3)), [0.0, 0.0]), 4)
+    assert still.tolist() == [0, 0]
+
+
+def test_only_what_changed_may_be_copied_in_the_order_in_which_it_came() -> None:
+    means = np.arange(15).reshape(5, 3) * 10.0 + 1
+    rows = torch.tensor([4, 0, 2, 1])
+    gate = ChangeGate(GateSettings(score=0.5), 5)
+    assert gate(Seen(means, [3.0, 1.0, 0.0, 1.2, 1.5]), rows).tolist() == [4, 0]
+    assert ChangeGate(GateSettings(score=0.0), 5)(Seen(means, [0.0] * 5), rows).tolist() == rows.tolist()
+    assert gate(Seen(means, [1.0] * 5), rows[:0]).tolist() == []
+
+
+def test_a_cell_takes_so_many_and_remembers_those_of_earlier_rounds() -> None:
+    near = np.array([[0.1, 0.1, 5.1]] * 6 + [[100.1, 0.1, 5.1]])
+    settings = GateSettings(score=0.0, per_cell=2, pixels=5)
+    work = Seen(near, [1.0] * 7)
+    assert 0.3 < 5 * pixel_size(near, work.cameras) < 5
+    rows = torch.tensor([3, 6, 0, 1])
+    assert ChangeGate(settings, 7)(work, rows).tolist() == [3, 6, 0]
+    assert ChangeGate(settings, 6)(work, rows).tolist() == [3, 6, 0], "the one born is in the other cell"
+    assert ChangeGate(settings, 5)(work, rows).tolist() == [3, 6], "row 5 was born there in this frame"
+    assert ChangeGate(settings, 3)(work, rows).tolist() == [6], "three were: no room is left"
+
+
+def test_a_gate_that_lets_everything_through_is_recon_with_rounded_motions() -> None:
+    births = BirthSettings(gradient=1e-7, rounds=2, most=9, prune_opacity=0.0)
+    motion = MotionSettings(measure="anchor", change=6.0, step=0.02)
+    some = {}
+    for name, gate in {
+        "open": GateSettings(score=0.0, per_cell=1000), "one": GateSettings(score=0.0, per_cell=1, pixels=1e3),
+    }.items():  # fmt: skip
+        method = MethodUnderTest("quarc", QuARC(QuARCConfig(motion=motion, births=births, gate=gate)))
+        some[name] = [step.metrics["births"] for step in method.steps[1:]]
+    assert some["open"] == [9, 9]
+    assert all(0 < number < 9 for number in some["one"])

@@ -25,7 +25,8 @@ SHIPPED: Mapping[str, tuple[str, ...]] = {
     "methods": (
         "method/queen", "method/queen-published", "method/queen-m", "method/queen-s", "stepper/queen",
         "method/hicom", "method/hicom-published", "stepper/hicom", "method/comgs-s", "method/comgs-l", "stepper/comgs",
-        "method/stream3dgs", "stepper/stream3dgs", "method/recon", "method/recon-published", "stepper/recon",
+        "method/stream3dgs", "method/stream3dgs-cells", "stepper/stream3dgs",
+        "method/recon", "method/recon-published", "stepper/recon",
         "method/quarc", "method/quarc-published", "stepper/quarc",
         "propagation/ft-pruning", "gate/binary-ste", "confidence/onnx",
     ),

@@ -54,10 +54,10 @@ def lies():
     for name, most in (("levels", 16), ("entries", 20), ("features", 8), ("width", 128), ("layers", 4), ("base", 1024)):
         for wrong in (0, most + 1):
             yield f"{name} {wrong}", headed(**{name: wrong}), f"{name}: expected 1 to {most}"
-    for name, most in (("entry", 1 << 26), ("weight", 1 << 18)):
+    for name, most in (("entry", 1 << 25), ("weight", 1 << 17)):
         for wrong in (0, most + 1, 2**32 - 1):
             yield f"{name} step {wrong}", headed(**{f"{name}_step": wrong}), f"step of {name} symbols"
-        yield f"the largest {name} step", headed(**{f"{name}_step": most}), "leads to"
+        yield f"the largest {name} step", headed(**{f"{name}_step": most}), "units in size"
     for wrong in (nan, inf, -1.0, 0.0, 4.5):
         yield f"growth {wrong}", headed(growth=wrong), "growth: expected a float32 from 1 to 4"
     for wrong in (nan, inf, 0.0, -0.0, -1.0, 1e9):
@@ -78,8 +78,9 @@ def lies():
     for at in (1, 2, 3):
         yield f"no entries in part {at}", parted(at, b""), "."
     yield "an entry more", parted(1, encode_symbols(np.arange(2 * rows + 2, dtype=np.int32).reshape(-1, 2))), "."
-    yield "entries beyond", parted(1, encode_symbols(np.full((rows, 2), 1 << 12, np.int32))), "level 0 leads to"
-    yield "weights beyond", parted(4, encode_symbols(np.full((6, 5), -(2**31), np.int32))), "layer 0 leads to"
+    beyond = encode_symbols(np.full((rows, 2), 1 << 11, np.int32))
+    yield "entries beyond", parted(1, beyond), "entries of level 0: expected below"
+    yield "weights beyond", parted(4, encode_symbols(np.full((6, 5), -(2**31), np.int32))), "layer 0: expected below"
     yield "a layer of another form", parted(5, encode_symbols(np.eye(6, dtype=np.int32))), "."
     for cut in range(0, HEAD.size, 7):
         yield f"cut after {cut} bytes", (HEAD.pack(*head))[:cut], "field cut short"
@@ -143,9 +144,8 @@ def test_the_largest_weights_and_positions_stay_finite():
     scene = dataclasses.replace(state.scene, gaussians=dataclasses.replace(state.gaussians, means=means))
     side = float(np.nextafter(corner, np.float32(0)))
     shape = dataclasses.replace(field.shape, low=(side,) * 3, high=(float(corner),) * 3, reach=float(np.float32(9e8)))
-    entries = [(1 << 26) - 1 - shape.start_entries(level, which) for level, which in
-               enumerate(shape.touched(shape.unit(means)))]  # fmt: skip
-    weights = [(1 << 18) - 1 - start for start in shape.start_weights()]
+    entries = [np.full((len(which), 2), (1 << 25) - 1) for which in shape.touched(shape.unit(means))]
+    weights = [np.full_like(start, (1 << 17) - 1) for start in shape.start_weights()]
     large = Field(shape, None, *(tuple(table.astype(np.int32) for table in some) for some in (entries, weights)), 1, 1)
     after, rows = apply_field(scene, large)
     assert len(rows) == len(means)
@@ -156,7 +156,7 @@ def test_an_encoder_refuses_fields_that_are_none():
     state, field = field_state()
     change = dataclasses.replace
     wrong = [
-        (change(field, entry_step=0), "step of entry"), (change(field, weight_step=2**18 + 1), "step of weight"),
+        (change(field, entry_step=0), "step of entry"), (change(field, weight_step=2**17 + 1), "step of weight"),
         (change(field, shape=change(field.shape, reach=0.1)), "reach: expected a float32"),
         (change(field, shape=change(field.shape, low=(0.1, 0.0, 0.0))), "box: expected float32"),
         (change(field, entries=field.entries[1:]), "expected tables of 3 levels and 3 layers, got 5"),
@@ -170,7 +170,7 @@ def test_an_encoder_refuses_fields_that_are_none():
         (change(field, marks=field.marks[1:]), "a mark for each of 30 Gaussians"),
         (change(field, entries=tuple(e[:-1] for e in field.entries)), "symbols of entries of level 0"),
         (change(field, weights=tuple(w.T for w in field.weights)), "symbols of layer 0"),
-        (change(field, weight_step=1 << 18), "leads to"),
+        (change(field, weight_step=1 << 17), "units in size"),
     ]
     for bad, message in fits:
         with pytest.raises(ShapeError, match=message):

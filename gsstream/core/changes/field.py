@@ -6,6 +6,7 @@ grid are sent that some Gaussian of the field lies beside; both ends know which 
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,7 +19,8 @@ from gsstream.core.shapes import FloatArray, IntArray
 
 #: Multiplications that one field may take, rows times the network: some seconds of a processor.
 MAX_EFFORT = 1 << 35
-MAX_ENTRY_STEP, MAX_WEIGHT_STEP = 1 << ENTRY_RANGE, 1 << WEIGHT_RANGE
+#: Symbols times their step stay below this, in units; with what learning starts from, below the range of weights.
+MAX_ENTRY_STEP, MAX_WEIGHT_STEP = 1 << ENTRY_RANGE - 1, 1 << WEIGHT_RANGE - 1
 #: The real part of a quaternion stays above this, so that a turn is one.
 LEAST_REAL = 0.1
 
@@ -76,37 +78,29 @@ def field_rows(scene: Scene, shape: FieldShape, marks: IntArray | None) -> tuple
     return able.take(inside), unit.take(inside, 0)
 
 
-def learned(change: Field, unit: FloatArray) -> tuple[list[IntArray], list[IntArray]]:
-    """Return entries and weights after the frame's learning, whole numbers, as :func:`evaluated` takes them.
+def misfit(change: Field, touched: list[IntArray]) -> str | None:
+    """Say why the symbols of a field cannot be; None when they can.
 
     Arguments:
         change: of the frame.
-        unit: [A, 3] places of the rows that it moves, 0 to 1 in its box.
-
-    Raises ShapeError when the symbols do not fit, or lead beyond the range of weights.
+        touched: for each level, the entries that its rows touch.
     """
     shape = change.shape
-    touched, widths = shape.touched(unit), shape.widths
     wanted = [(f"entries of level {i}", (len(which), shape.features)) for i, which in enumerate(touched)]
-    wanted += [(f"layer {i}", (widths[i], widths[i + 1])) for i in range(shape.layers + 1)]
+    wanted += [(f"layer {i}", pair) for i, pair in enumerate(itertools.pairwise(shape.widths))]
     said = (*change.entries, *change.weights)
     if len(said) != len(wanted):
-        raise ShapeError(f"field: expected tables of {len(wanted)} levels and layers, got {len(said)}")
-    starts = [shape.start_entries(level, which) for level, which in enumerate(touched)] + shape.start_weights()
-    out = []
-    for number, ((name, form), symbols, start) in enumerate(zip(wanted, said, starts, strict=True)):
+        return f"expected tables of {len(wanted)} levels and layers, got {len(said)}"
+    for number, ((name, form), symbols) in enumerate(zip(wanted, said, strict=True)):
         if symbols.shape != form:
-            raise ShapeError(
-                f"field: expected {list(form)} symbols of {name}, got {list(symbols.shape)}; the packet belongs to "
-                "another scene"
-            )
+            got = list(symbols.shape)
+            return f"expected {list(form)} symbols of {name}, got {got}; the packet belongs to another scene"
         grid = number < shape.levels
-        step, limit = (change.entry_step, ENTRY_RANGE) if grid else (change.weight_step, WEIGHT_RANGE)
-        value = start + symbols.astype(np.int64) * step
-        if value.size and int(np.abs(value).max()) >= 1 << limit:
-            raise ShapeError(f"field: {name} leads to {int(np.abs(value).max())} units, expected below {1 << limit}")
-        out.append(value)
-    return out[: shape.levels], out[shape.levels :]
+        step, limit = (change.entry_step, MAX_ENTRY_STEP) if grid else (change.weight_step, MAX_WEIGHT_STEP)
+        largest = step * int(np.abs(symbols.astype(np.int64)).max()) if symbols.size else 0
+        if largest >= limit:
+            return f"symbols of {name}: expected below {limit} units in size, got {largest}"
+    return None
 
 
 def apply_field(scene: Scene, change: Field) -> tuple[Scene, IntArray]:
@@ -117,14 +111,26 @@ def apply_field(scene: Scene, change: Field) -> tuple[Scene, IntArray]:
 
     Raises ShapeError when the field does not fit the scene.
     """
-    rows, unit = field_rows(scene, change.shape, change.marks)
-    entries, weights = learned(change, unit)
+    shape = change.shape
+    rows, unit = field_rows(scene, shape, change.marks)
+    touched = shape.touched(unit)
+    problem = misfit(change, touched)
+    if problem:
+        raise ShapeError(f"field: {problem}")
     if not len(rows):
         return scene, rows
-    said = evaluated(change.shape, unit, entries, weights)
+    entries: list[IntArray] = [
+        shape.start_entries(level, which) + symbols.astype(np.int64) * change.entry_step
+        for level, (which, symbols) in enumerate(zip(touched, change.entries, strict=True))
+    ]
+    weights: list[IntArray] = [
+        start + symbols.astype(np.int64) * change.weight_step
+        for start, symbols in zip(shape.start_weights(), change.weights, strict=True)
+    ]
+    said = evaluated(shape, unit, touched, entries, weights)
     gaussians = scene.gaussians
     # By the limits of weights and reach no shift is above 10^15, so what is finite stays so.
-    there = gaussians.means.take(rows, 0).astype(np.float64) + said[:, :3] * change.shape.reach
+    there = gaussians.means.take(rows, 0).astype(np.float64) + said[:, :3] * shape.reach
     turn = said[:, 4:] / np.maximum(1.0 + said[:, 3:4], LEAST_REAL)
     means, quats = gaussians.means.copy(), gaussians.quats.copy()
     means[rows] = there.astype(np.float32)

@@ -172,17 +172,20 @@ class FieldShape:
 BLOCK = 1 << 13
 
 
-def evaluated(shape: FieldShape, unit: FloatArray, entries: list[IntArray], weights: list[IntArray]) -> FloatArray:
+def evaluated(
+    shape: FieldShape, unit: FloatArray, touched: list[IntArray], entries: list[IntArray], weights: list[IntArray]
+) -> FloatArray:
     """Return what the network says of places: [A, 7] float64, multiples of 2^-34.
 
     Arguments:
         shape: of the field.
         unit: [A, 3] places in units of the box, 0 to 1.
-        entries: for each level, [E, F] whole numbers of 2^-20 at the entries that the places touch, ascending.
+        touched: for each level, [E] the entries that these places touch, or more, ascending.
+        entries: for each level, [E, F] whole numbers of 2^-20 at these entries.
         weights: for each layer, [inputs, outputs] whole numbers of 2^-14.
     """
     ranks = np.zeros((shape.levels, 1 << shape.entries), np.int32)
-    for rank, which in zip(ranks, shape.touched(unit), strict=True):
+    for rank, which in zip(ranks, touched, strict=True):
         rank[which] = np.arange(len(which))
     tables = [np.ascontiguousarray(table.T, np.float64) for table in entries]
     layers = [layer.astype(np.float64) for layer in weights]

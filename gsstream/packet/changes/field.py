@@ -8,7 +8,7 @@ import struct
 import numpy as np
 
 from gsstream.core.changes import Field, FieldShape, Motion, Scene, field_rows
-from gsstream.core.changes.field import MAX_ENTRY_STEP, MAX_WEIGHT_STEP, learned
+from gsstream.core.changes.field import MAX_ENTRY_STEP, MAX_WEIGHT_STEP, misfit
 from gsstream.core.changes.motion import apply_motions
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.shapes import IntArray
@@ -82,11 +82,14 @@ def _decode(data: bytes, scene: Scene) -> Field:
     elif blobs[0]:
         raise PacketError("field: marks of rows, though all in the box move")
     _, unit = field_rows(scene, shape, marks)
-    sizes = [(len(which), features) for which in shape.touched(unit)]
+    touched = shape.touched(unit)
+    sizes = [(len(which), features) for which in touched]
     sizes += list(itertools.pairwise(shape.widths))
     tables = tuple(decode_symbols(blob, *size) for blob, size in zip(blobs[1:], sizes, strict=True))
     change = Field(shape, marks, tables[:levels], tables[levels:], entry_step, weight_step)
-    learned(change, unit)
+    problem = misfit(change, touched)
+    if problem:
+        raise PacketError(f"field: {problem}")
     return change
 
 

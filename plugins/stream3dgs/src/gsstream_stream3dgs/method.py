@@ -45,8 +45,8 @@ class Stream3DGS(StreamingMethod[Stream3DGSState]):
     """Moves Gaussians by a network and adds some for a frame (paper: Sun et al., CVPR 2024).
 
     In every frame a hash grid with a small network is fitted, which gives every Gaussian in the box a shift and a turn;
-    then Gaussians are copied where the images still pull, fitted, and given up in the next frame. What is sent are
-    rigid motions of small cells, which come nearest to what the network does, births and deaths; not the network.
+    then Gaussians are copied where the images still pull, fitted, and given up in the next frame. What is sent are the
+    weights, births and deaths; or, instead of the weights, the rigid motions of small cells that come nearest to them.
     Where this differs from what is published, and why: README of this plugin.
     """
 

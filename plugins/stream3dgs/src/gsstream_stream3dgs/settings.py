@@ -32,10 +32,10 @@ class CacheSettings(PartConfig):
     sent: Literal["field", "cells"] = Field(
         default="field", description="field: the weights, as published; cells: rigid motions of cells, far fewer bytes"
     )
-    entry_step: float = Field(default=0.01, gt=0, le=1, description="quantisation step of the grid's entries")
-    weight_step: float = Field(default=0.01, gt=0, le=1, description="quantisation step of the network's weights")
+    entry_step: float = Field(default=0.05, gt=0, le=1, description="quantisation step of the grid's entries")
+    weight_step: float = Field(default=0.02, gt=0, le=1, description="quantisation step of the network's weights")
     rounded: float = Field(
-        default=0.25, ge=0, le=1, description="share of the passes, the last, that learn with rounded weights"
+        default=0.5, ge=0, le=1, description="share of the passes, the last, that learn with rounded weights"
     )
     pixels: float = Field(
         default=6.0, gt=0, le=1000, description="sent as cells: side of a cell, pixels"

@@ -20,6 +20,8 @@ from gsstream.trade.report.quantities import BY_KEY, COSTS, GOODS
 from gsstream.trade.show.plots import COLORS, plot_runs
 
 _CURVES = len(COLORS)
+#: With more variants than colours, the next ones have another shape.
+_SHAPES = "os^DPX"
 _QUALITY = {
     "psnr": "PSNR, dB", "psnr_moving": "PSNR on moving pixels, dB", "psnr_changed": "PSNR on changed pixels, dB",
 }  # fmt: skip
@@ -54,26 +56,36 @@ def pareto_figure(
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(goods), len(costs), squeeze=False, sharey="row", sharex="col")
     variants = list(dict.fromkeys(group.variant for group in groups))
-    colors = {name: COLORS[i % len(COLORS)] for i, name in enumerate(variants)}
+    looks = {name: _look(i) for i, name in enumerate(variants)}
     for row, good in enumerate(goods):
         for column, cost in enumerate(costs):
             axis = axes[row, column]
-            _panel(axis, groups, good, cost, colors)
+            _panel(axis, groups, good, cost, looks)
             for name in variants if joined else ():
                 line = sorted((group.mean(cost), group.mean(good)) for group in groups if group.variant == name)
-                axis.plot(*zip(*line, strict=True), color=colors[name], linewidth=1, alpha=0.6)
+                axis.plot(*zip(*line, strict=True), color=looks[name][0], linewidth=1, alpha=0.6)
                 if len(line) > 1:
                     _name(axis, name, line[-1], True)
             if row == len(goods) - 1:
                 axis.set_xlabel(BY_KEY[cost].title, fontsize=9)
         axes[row, 0].set_ylabel(_QUALITY.get(good, BY_KEY[good].title), fontsize=9)
-    handles = [axes[0, 0].scatter([], [], s=24, color=colors[name], label=name) for name in variants]
-    figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=9, frameon=False)
+    handles = [
+        axes[0, 0].scatter([], [], s=24, color=color, marker=shape, label=name) for name, (color, shape) in looks.items()
+    ]
+    # A letter is about a twelfth of an inch wide, and a mark with its gaps half an inch.
+    wide = 0.5 + max(map(len, variants)) / 12
+    columns = max(1, int(figure.get_figwidth() / wide))
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=9, frameon=False)
     figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     figure.canvas.draw()
     for axis in axes.flat:
         _thin_names(axis)
     return png(figure)
+
+
+def _look(place: int) -> tuple[str, str]:
+    """Colour and shape of a variant, unlike those of all others."""
+    return COLORS[place % len(COLORS)], _SHAPES[place // len(COLORS) % len(_SHAPES)]
 
 
 def floor_of(values: Sequence[float]) -> float:
@@ -99,20 +111,21 @@ def _thin_names(axis: Any) -> None:
             kept.append(box)
 
 
-def _panel(axis: Any, groups: Sequence[Group], good: str, cost: str, colors: dict[str, str]) -> None:
+def _panel(axis: Any, groups: Sequence[Group], good: str, cost: str, looks: dict[str, tuple[str, str]]) -> None:
     points = [(group.mean(cost), group.mean(good)) for group in groups]
     noise = seed_noise(groups, good)
     order = pareto_front(points)
     floor = floor_of([y for _, y in points])
     for index, (group, (x, y)) in enumerate(zip(groups, points, strict=True)):
         if y < floor:
-            axis.plot(x, floor, "v", markersize=6, color=colors[group.variant], clip_on=False)
+            axis.plot(x, floor, "v", markersize=6, color=looks[group.variant][0], clip_on=False)
             _name(axis, f"{group.variant} {y:.1f}", (x, floor), index in order)
             continue
         bars = {"xerr": group.spread(cost), "yerr": group.spread(good)} if len(group.runs) > 1 else {}
         size = 7 if not group.axes else 4
+        color, shape = looks[group.variant]
         axis.errorbar(
-            x, y, fmt="o", markersize=size, color=colors[group.variant], alpha=0.9 if not group.axes else 0.6,
+            x, y, fmt=shape, markersize=size, color=color, alpha=0.9 if not group.axes else 0.6,
             elinewidth=1, markeredgewidth=0, **bars,
         )  # fmt: skip
         if not group.axes:

@@ -70,7 +70,8 @@ def pareto_figure(
                 axis.set_xlabel(BY_KEY[cost].title, fontsize=9)
         axes[row, 0].set_ylabel(_QUALITY.get(good, BY_KEY[good].title), fontsize=9)
     handles = [
-        axes[0, 0].scatter([], [], s=24, color=color, marker=shape, label=name) for name, (color, shape) in looks.items()
+        axes[0, 0].scatter([], [], s=24, color=color, marker=shape, label=name)
+        for name, (color, shape) in looks.items()
     ]
     # A letter is about a twelfth of an inch wide, and a mark with its gaps half an inch.
     wide = 0.5 + max(map(len, variants)) / 12

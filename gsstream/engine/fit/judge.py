@@ -52,13 +52,12 @@ class Judge:
             if pulled is not None:
                 return pulled
         leaves = rows.map(lambda value: value.detach().requires_grad_())
-        if tiles is None:
-            output = session.render(view, leaves)
-            loss, _ = self.backward(view, output.image, output.tiles)
-            return Pulled(loss, leaves.map(_gradient))
-        output = session.render(view, leaves, tile_mask=tiles > 0)
-        counted = tiles > 0 if output.tiles is None else (tiles > 0) & output.tiles
-        loss, _ = self.backward(view, output.image, counted, tiles)
+        counted = None if tiles is None else tiles > 0
+        output = session.render(view, leaves, tile_mask=counted)
+        touched = output.tiles
+        if counted is not None:
+            touched = counted if touched is None else counted & touched
+        loss, _ = self.backward(view, output.image, touched, tiles)
         return Pulled(loss, leaves.map(_gradient))
 
     def backward(

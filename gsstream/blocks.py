@@ -22,6 +22,7 @@ from gsstream.engine.fit.nearest import nearest_rows as nearest_rows
 from gsstream.engine.fit.nearest import neighbour_distance as neighbour_distance
 from gsstream.engine.fit.row_table import RowTable as RowTable
 from gsstream.engine.step.active.candidates import changed_rows as changed_rows
+from gsstream.engine.step.active.candidates import rows_in_change as rows_in_change
 from gsstream.engine.step.active.change import Change as Change
 from gsstream.engine.step.active.change import detect_change as detect_change
 from gsstream.engine.step.active.change import marked_per_tile as marked_per_tile

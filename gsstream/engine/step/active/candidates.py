@@ -13,8 +13,10 @@ from __future__ import annotations
 import torch
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.frame import Frame
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.engine.step.active.change import Change
+from gsstream.core.shapes import IntArray
+from gsstream.engine.step.active.change import Change, detect_change
 from gsstream.render.base import RenderSession
 
 
@@ -53,6 +55,22 @@ def changed_rows(
     rows = seen.nonzero()[:, 0]
     seen[rows] = change.votes(means[rows], cameras) >= least_votes
     return seen
+
+
+def rows_in_change(
+    session: RenderSession, means: torch.Tensor, previous: Frame, frame: Frame, threshold: float, least_votes: float
+) -> IntArray:
+    """Return the rows [A] int64, ascending, in what changed between two frames; all where it is not detected.
+
+    Arguments:
+        session: of the scene that ``previous`` shows.
+        means: [N, 3] its centres.
+        previous, frame: training images before and now.
+        threshold: as for :func:`detect_change`.
+        least_votes: as for :func:`changed_rows`.
+    """
+    change = detect_change(previous, frame, threshold)
+    return changed_rows(change, means, frame.cameras, session, least_votes).nonzero()[:, 0].numpy()
 
 
 def released(gates: torch.Tensor, num_levels: int, hierarchy: Hierarchy, waiting: torch.Tensor | None) -> torch.Tensor:

@@ -12,8 +12,6 @@ import torch
 from gsstream.api import (
     Delta,
     Frame,
-    FrameTools,
-    IntArray,
     Layout,
     PlayerState,
     Step,
@@ -23,7 +21,7 @@ from gsstream.api import (
     send_delta,
     send_key,
 )
-from gsstream.blocks import changed_rows, detect_change
+from gsstream.blocks import rows_in_change
 from gsstream_comgs.correction import corrected
 from gsstream_comgs.motion import fitted_motion
 from gsstream_comgs.settings import ComGSConfig
@@ -71,7 +69,8 @@ class ComGS(StreamingMethod[ComGSState]):
         epochs, order = tools.epochs(frame), tools.rng.numpy("comgs", frame.index)
         scene, delta = state.player.scene, Delta()
         work = tools.open(state.player, state.previous, frame)
-        rows = self._changed(work, state.previous, frame)
+        settings, means = self.config.motion, work.gaussians.means
+        rows = rows_in_change(work.session, means, state.previous, frame, settings.change, settings.votes)
         motion = fitted_motion(scene, work, rows, epochs, self.config.motion, order) if len(rows) else None
         if motion is not None:
             delta = Delta((motion,))
@@ -90,13 +89,6 @@ class ComGS(StreamingMethod[ComGSState]):
             "seconds": dict(zip(("motion", "optimise", "code"), np.diff(clock).tolist(), strict=True)),
         }  # fmt: skip
         return replace(step, metrics={**step.metrics, **facts})
-
-    def _changed(self, work: FrameTools, previous: Frame, frame: Frame) -> IntArray:
-        """Rows that may move."""
-        settings = self.config.motion
-        change = detect_change(previous, frame, settings.change)
-        means = work.gaussians.means
-        return changed_rows(change, means, frame.cameras, work.session, settings.votes).nonzero()[:, 0].numpy()
 
     def _send(self, state: ComGSState, frame: Frame, delta: Delta) -> Step[ComGSState]:
         packet, player = send_delta(state.player, delta)

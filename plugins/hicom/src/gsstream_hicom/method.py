@@ -13,7 +13,6 @@ from gsstream.api import (
     Delta,
     Frame,
     FrameTools,
-    IntArray,
     Layout,
     PlayerState,
     Rows,
@@ -24,7 +23,7 @@ from gsstream.api import (
     send_delta,
     send_key,
 )
-from gsstream.blocks import changed_rows, detect_change, replaced_by_copies
+from gsstream.blocks import replaced_by_copies, rows_in_change
 from gsstream_hicom.motion import fitted_motions
 from gsstream_hicom.settings import HiCoMConfig
 
@@ -72,7 +71,8 @@ class HiCoM(StreamingMethod[HiCoMState]):
         for_births = max(1, round(self.config.births.share * epochs)) if self.config.births.share else 0
         scene = state.player.scene
         work = tools.open(state.player, state.previous, frame)
-        rows = self._changed(work.gaussians.means, work, state.previous, frame)
+        settings, means = self.config.motion, work.gaussians.means
+        rows = rows_in_change(work.session, means, state.previous, frame, settings.change, settings.votes)
         order = tools.rng.numpy("hicom", frame.index)
         motions, moved = fitted_motions(
             scene, work, rows, max(1, epochs - for_births), self.config.motion, order
@@ -89,12 +89,6 @@ class HiCoM(StreamingMethod[HiCoMState]):
             "seconds": dict(zip(("motion", "growth", "code"), np.diff(clock).tolist(), strict=True)),
         }  # fmt: skip
         return replace(step, metrics={**step.metrics, **facts})
-
-    def _changed(self, means: torch.Tensor, work: FrameTools, previous: Frame, frame: Frame) -> IntArray:
-        """Rows that may move."""
-        settings = self.config.motion
-        change = detect_change(previous, frame, settings.change)
-        return changed_rows(change, means, frame.cameras, work.session, settings.votes).nonzero()[:, 0].numpy()
 
     def _rows(self, scene: Scene, number: int, work: FrameTools, epochs: int, tools: Tools) -> Rows:
         """As many of the least opaque leave as there are more than in frame 0; then this frame's are born."""

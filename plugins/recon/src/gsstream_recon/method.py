@@ -13,7 +13,6 @@ from gsstream.api import (
     Delta,
     Frame,
     FrameTools,
-    IntArray,
     Layout,
     PlayerState,
     Rows,
@@ -25,7 +24,7 @@ from gsstream.api import (
     send_delta,
     send_key,
 )
-from gsstream.blocks import Admitted, changed_rows, detect_change, replaced_by_copies
+from gsstream.blocks import Admitted, replaced_by_copies, rows_in_change
 from gsstream_recon.anchors import AnchorLevels, anchors_after, due, followed
 from gsstream_recon.motion import fitted_motion
 from gsstream_recon.settings import ReConConfig
@@ -70,7 +69,8 @@ class AnchoredMethod(StreamingMethod[ReConState]):
         for_births = max(1, round(self.config.births.share * epochs)) if self.config.births.share else 0
         scene, settings = state.player.scene, self.config.motion
         work = tools.open(state.player, state.previous, frame)
-        rows = self._changed(work, state.previous, frame)
+        means = work.gaussians.means
+        rows = rows_in_change(work.session, means, state.previous, frame, settings.change, settings.votes)
         anchors = due(state.anchors, frame.index, len(scene.gaussians), settings, tools.rng)
         motion = fitted_motion(
             scene, work, rows, (state.anchors, anchors), max(1, epochs - for_births), settings,
@@ -90,13 +90,6 @@ class AnchoredMethod(StreamingMethod[ReConState]):
             "seconds": dict(zip(("motion", "growth", "code"), np.diff(clock).tolist(), strict=True)),
         }  # fmt: skip
         return replace(step, metrics={**step.metrics, **facts})
-
-    def _changed(self, work: FrameTools, previous: Frame, frame: Frame) -> IntArray:
-        """Rows that may move."""
-        settings = self.config.motion
-        change = detect_change(previous, frame, settings.change)
-        means = work.gaussians.means
-        return changed_rows(change, means, frame.cameras, work.session, settings.votes).nonzero()[:, 0].numpy()
 
     def _rows(self, scene: Scene, number: int, work: FrameTools, epochs: int, tools: Tools) -> Rows:
         """As many of the least opaque leave as there are more than in frame 0; then this frame's are born."""

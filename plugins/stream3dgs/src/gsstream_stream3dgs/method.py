@@ -13,7 +13,6 @@ from gsstream.api import (
     Delta,
     Frame,
     FrameTools,
-    IntArray,
     Layout,
     PlayerState,
     Rows,
@@ -25,7 +24,7 @@ from gsstream.api import (
     send_delta,
     send_key,
 )
-from gsstream.blocks import changed_rows, detect_change, replaced_by_copies
+from gsstream.blocks import replaced_by_copies, rows_in_change
 from gsstream_stream3dgs.motion import fitted_cache, said_by
 from gsstream_stream3dgs.settings import Stream3DGSConfig
 
@@ -73,7 +72,9 @@ class Stream3DGS(StreamingMethod[Stream3DGSState]):
         for_births = max(1, round(self.config.births.share * epochs)) if self.config.births.share else 0
         scene = state.player.scene
         work = tools.open(state.player, state.previous, frame)
-        rows = self._changed(work.gaussians.means, work, state.previous, frame)
+        rows = rows_in_change(
+            work.session, work.gaussians.means, state.previous, frame, self.config.cache.change, self.config.cache.votes
+        )
         # Those of the frame before are given up: they neither move nor hide what does.
         rows = rows[rows < state.number]
         work = work.on(work.gaussians.rows(slice(0, state.number)))
@@ -94,12 +95,6 @@ class Stream3DGS(StreamingMethod[Stream3DGSState]):
             "seconds": dict(zip(("motion", "growth", "code"), np.diff(clock).tolist(), strict=True)),
         }  # fmt: skip
         return replace(step, metrics={**step.metrics, **facts})
-
-    def _changed(self, means: torch.Tensor, work: FrameTools, previous: Frame, frame: Frame) -> IntArray:
-        """Rows that may move."""
-        settings = self.config.cache
-        change = detect_change(previous, frame, settings.change)
-        return changed_rows(change, means, frame.cameras, work.session, settings.votes).nonzero()[:, 0].numpy()
 
     def _rows(self, scene: Scene, number: int, work: FrameTools, epochs: int, tools: Tools) -> Rows:
         """Those of the frame before leave, which stand behind the rows of frame 0; then this frame's are born."""

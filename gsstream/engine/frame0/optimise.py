@@ -27,6 +27,7 @@ from gsstream.engine.fit.judge import Judge
 from gsstream.engine.fit.nearest import neighbour_distance
 from gsstream.engine.fit.row_table import RowTable
 from gsstream.engine.frame0.how_many import most_gaussians, shown, worth_keeping
+from gsstream.engine.frame0.left_out import Growth, judged, left_out_tiles
 from gsstream.recipe.model import FirstFrame
 from gsstream.render.activations import logit, rgb_to_sh0
 from gsstream.structure.base import Anchors
@@ -37,12 +38,16 @@ Progress = Callable[[int, int, float, int], None]
 
 @dataclass(frozen=True)
 class Reconstructed:
-    """Optimised frame 0. ``levels`` [N] is aligned with the Gaussians."""
+    """Optimised frame 0. ``levels`` [N] is aligned with the Gaussians.
+
+    ``growth_ended``: the iteration at which tiles that were left out ended growth; None: they did not.
+    """
 
     gaussians: Gaussians[torch.Tensor]
     levels: torch.Tensor
     exposure: Exposure | None
     iterations: int
+    growth_ended: int | None
 
 
 def initial_gaussians(anchors: Anchors, settings: FirstFrame) -> Gaussians[torch.Tensor]:
@@ -103,7 +108,7 @@ def optimise_first_frame(
     look = Look(parts.checks, "first frame", run.table, parts.where)
     for name, values in found.items():
         look.values(f"{name} after the last iteration ({VARIABLE}=step finds the first)", values)
-    return Reconstructed(found, run.levels, exposure, run.iterations)
+    return Reconstructed(found, run.levels, exposure, run.iterations, run.growth_ended)
 
 
 class _FirstFrameRun:
@@ -125,6 +130,8 @@ class _FirstFrameRun:
         self.judge = Judge(parts.loss, parts.recipe.loss.dssim, frame.images, None)
         self.exposure = ExposureFit.start(self.views) if self.settings.exposure else None
         self.statistics = DensifyStatistics.zeros(len(start))
+        self.left_out, self.growth = left_out_tiles(first, frame, rng), Growth()
+        self.growth_ended: int | None = None
         self.order: list[int] = []
         self.smooth = math.nan
 
@@ -147,9 +154,12 @@ class _FirstFrameRun:
             size = torch.tensor([self.frame.cameras.width / 2, self.frame.cameras.height / 2])
             self.statistics = self.statistics.add(probe.grad * size)
             if iteration >= s.densify_from and iteration % s.densify_every == 0:
+                self._judge_growth(iteration)
                 self._densify()
-        if s.prune_share > 0 and iteration == int(last):
-            self._prune()
+        if iteration == int(last):
+            self.left_out = None
+            if s.prune_share > 0:
+                self._prune()
         self.smooth = value if math.isnan(self.smooth) else 0.98 * self.smooth + 0.02 * value
         return self.smooth
 
@@ -163,7 +173,8 @@ class _FirstFrameRun:
     def _backward(self, view: int, image: torch.Tensor) -> float:
         """Loss, its gradient into the leaves, and the exposure step."""
         self.judge.exposure = self.exposure.exposure if self.exposure else None
-        value, gradient = self.judge.backward(view, image)
+        fitted = None if self.left_out is None else (~self.left_out[view]).float()
+        value, gradient = self.judge.backward(view, image, weights=fitted)
         self._penalise()
         if self.exposure:
             self.exposure = self.exposure.step(view, image.detach(), gradient, lr=0.005, pull=1e-3)
@@ -180,6 +191,22 @@ class _FirstFrameRun:
             opacities.grad.add_(p * (1 - p), alpha=schedule.OPACITY_PENALTY / count)
         if scales.grad is not None:
             scales.grad.add_(scales.detach().exp(), alpha=schedule.SCALE_PENALTY / (3 * count * self.extent))
+
+    def _judge_growth(self, iteration: int) -> None:
+        """Ask the tiles that were left out whether the births until now helped; if not, end growth, and fit them too.
+
+        A look comes just before births: those of the last round have had their iterations by then.
+        """
+        if self.left_out is None:
+            return
+        count, exposure = len(self.levels), self.exposure.exposure if self.exposure else None
+        gaussians = self.gaussians().map(torch.Tensor.detach)
+        found = judged(self.renderer, gaussians, self.frame, self.left_out, self.recipe.background, exposure)
+        self.growth = self.growth.look(count, found)
+        if not self.growth.pays:
+            # From now on births replace what is pruned.
+            self.settings = self.settings.model_copy(update={"max_gaussians": count})
+            self.growth_ended, self.left_out = iteration, None
 
     def _densify(self) -> None:
         gaussians = self.gaussians().map(torch.Tensor.detach)

@@ -77,10 +77,12 @@ def frame_step(
             open_probability = parts.gate.open_probability(logits)
         rows = candidates(able, open_probability, state.hierarchy, stream.active_threshold)
     with clock.phase("optimise"):
+        # What is mended stands still, so where a frame mends, every tile is looked at in every iteration.
+        looked_at = None if change is None or stream.heal else change.near
         problem = Problem(
             frame.index, frame.effort, scene.layout, state.hierarchy, rows, view.gaussians.rows(rows), logits,
             state.decoders, view.session_for(rows), view.judge, len(frame.cameras),
-            frame.cameras.width * frame.cameras.height, allowance, None if change is None else change.tiles,
+            frame.cameras.width * frame.cameras.height, allowance, looked_at,
         )  # fmt: skip
         solution = optimise(parts, problem, rng.stream("frame", frame.index))
         residual = harden(parts, problem, solution)

@@ -53,7 +53,7 @@ class Rigid(MotionPart):
         step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
         everywhere: bool = Field(
             default=False,
-            description="compare in all tiles that the groups are seen in; false: in those that changed and those beside",
+            description="compare in all tiles that the groups are seen in; false: in those that changed or lie beside",
         )
         least: float = Field(default=0.25, ge=0, le=10, description="motions below this many pixels are dropped")
 

@@ -40,7 +40,7 @@ def test_a_pull_near_the_change_leaves_out_all_else() -> None:
     case = at_work()
     assert case.work._change is not None
     tiles = torch.zeros_like(case.work._change.tiles)
-    loss, slope = pulled(case, tiles, True)
+    _, slope = pulled(case, tiles, True)
     assert float(slope.abs().max()) == 0, "nothing changed, so nothing is compared"
     everything, every_slope = pulled(case, torch.ones_like(tiles), True)
     without, slope_without = pulled(case, tiles, False)

@@ -106,7 +106,7 @@ def frame_step(
 
 
 def _near(change: Change | None, stream: Stream) -> torch.Tensor | None:
-    """Tiles that every iteration looks at; None: all. What is mended stands still, so a frame that mends looks at all."""
+    """Tiles that every iteration looks at; None: all. What is mended stands still: a frame that mends looks at all."""
     return None if change is None or stream.heal else change.near
 
 

@@ -94,6 +94,7 @@ class FrameWork(FrameContext, Protocol):
         """Render a view with these values of the rows that move, and compare it with what its camera recorded.
 
         Arguments:
+            view: index of a training camera.
             rows: the A rows of :meth:`narrow`, or all N; tensors with a graph get the gradient of the loss.
             near_change: leave out the tiles that did not change and lie beside none that did.
 

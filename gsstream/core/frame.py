@@ -15,6 +15,20 @@ ROUNDING = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
+class Arrival:
+    """How a frame of a recording that is still being written came in.
+
+    Arguments:
+        complete: when its last image was complete, by the time of modification of that file: seconds since 1970. None
+            when its files are gone already.
+        absent: training cameras whose image did not come.
+    """
+
+    complete: float | None
+    absent: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class Frame:
     """One instant.
 
@@ -25,6 +39,7 @@ class Frame:
         cameras: the C cameras, in the order of ``images``.
         effort: share of the recipe's epochs that this frame is worth, in [0, 1]. A live source lowers it when the run
             falls behind; 0 asks for an empty packet, so that numbering and time go on. Frame 0 is always done in full.
+        arrival: how it came in; None for a recording that is not live.
     """
 
     index: int
@@ -32,6 +47,7 @@ class Frame:
     images: FloatArray
     cameras: Cameras
     effort: float = 1.0
+    arrival: Arrival | None = None
 
     def validate(self) -> None:
         """Raise ShapeError when images disagree with the cameras, or hold a value that no image may have.

@@ -161,6 +161,14 @@ class Stream(Section):
         description="largest share of the tiles of all views that each frame opens where the scene differs from what "
         "the cameras remember (remember: true) by more than its noise, the worst first; 0: none",
     )  # fmt: skip
+    refine_frames: int = Field(
+        default=0, ge=0,
+        description="later frames in each of which a first frame that was made in few iterations goes on being "
+        "optimised, beside the stream; then a key packet brings the result. 0: none. For live recordings",
+    )  # fmt: skip
+    refine_iterations: int = Field(
+        default=0, ge=0, description="iterations that each of these frames gives to it; 0 where refine_frames is 0"
+    )
     on_error: Literal["raise", "repeat"] = Field(
         default="raise",
         description="when a part fails in a later frame; raise: the run ends, the stream holds every frame before it; "
@@ -175,6 +183,15 @@ class Stream(Section):
             raise ValueError(
                 f"expected remember: true with heal: {self.heal:g}, got false; what is to be mended is found in the "
                 "memory of still pixels"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _refines_in_frames_and_iterations(self) -> Stream:
+        if (self.refine_frames > 0) != (self.refine_iterations > 0):
+            raise ValueError(
+                "expected refine_frames and refine_iterations both 0 or both above 0, got "
+                f"{self.refine_frames} and {self.refine_iterations}; set both, as configs/live.yaml does"
             )
         return self
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import EndOfRecording, SourceError
-from gsstream.core.frame import Frame, PointCloud
+from gsstream.core.frame import Arrival, Frame, PointCloud
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.core.storage import rounded
@@ -119,7 +119,18 @@ class TransformedSource:
             cameras, images = cameras.select([]), images[:0]
         if bad and split == "train" and self._options.bad_image == "drop":
             effort = 0.0
-        return Frame(index, index / self._info.fps, images, cameras, effort)
+        return Frame(index, index / self._info.fps, images, cameras, effort, self._arrival(cache.values()))
+
+    def _arrival(self, read: Collection[Frame]) -> Arrival | None:
+        """How a frame came in that is made of these of the inner source: with the last of them."""
+        came = [frame.arrival for frame in read if frame.arrival is not None]
+        if not came:
+            return None
+        missing = {name for arrival in came for name in arrival.absent}
+        return Arrival(
+            max((arrival.complete for arrival in came if arrival.complete is not None), default=None),
+            tuple(name for name in self._info.train.ids if name in missing),
+        )
 
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
         """Return the inner source's points, unless a test camera of this split took part in them.

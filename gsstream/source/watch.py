@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 import warnings
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from gsstream.core.errors import EndOfRecording, SourceError, suggest
-from gsstream.core.frame import Frame, PointCloud
+from gsstream.core.frame import Arrival, Frame, PointCloud
 from gsstream.core.shapes import FloatArray
 from gsstream.source.base import PointKind, SourceInfo, Split
 from gsstream.source.calibration import CALIBRATION_FILE, Calibration, frame_path, read_calibration
@@ -119,7 +120,7 @@ class WatchSource:
         images: FloatArray = np.empty((len(cameras), self._target[1], self._target[0], 3), np.float32)
         for i, camera_id in enumerate(cameras.ids):
             images[i] = self._image(camera_id, held.get(camera_id, index))
-        return Frame(index, index / self._info.fps, images, cameras, plan.effort)
+        return Frame(index, index / self._info.fps, images, cameras, plan.effort, self._arrival(index, held))
 
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
         """Return points that were written beside cameras.json before the run began, or None."""
@@ -133,6 +134,11 @@ class WatchSource:
     def close(self) -> None:
         """End all waits; nothing stays open between reads."""
         self.interrupt()
+
+    def _arrival(self, index: int, held: Collection[str]) -> Arrival:
+        """How a frame came in; test cameras count as to when, for it was not handed over before they were there."""
+        came = self._newest_of(set(self._ids).difference(held), index)
+        return Arrival(came, tuple(name for name in self._info.train.ids if name in held))
 
     def _image(self, camera_id: str, index: int) -> FloatArray:
         """The image that was decoded to see that it is whole, while it is at hand; else read again."""

@@ -33,6 +33,11 @@ GROWING: Mapping[str, Any] = {
     "growth": "anchor-insertion", "growth.per_frame": 24, "growth.error": 0.02, "growth.votes": 0.5,
     "growth.least_views": 2, "growth.agreement": 0.5, "growth.least_opacity": 0.0, "growth.epochs": 1,
 }  # fmt: skip
+#: Gaussians are born and pruned in the first two of the three frames, so that all that goes on has to go on exactly.
+REFINING: Mapping[str, Any] = {
+    "stream.refine_frames": 3, "stream.refine_iterations": 6, "stream.remember": True,
+    "first_frame.densify_from": 5, "first_frame.densify_every": 4,
+}  # fmt: skip
 CASES: Mapping[str, Mapping[str, Any]] = {
     "still": {"motion": "still"},
     "coasting": {"motion": "coasting"},
@@ -40,6 +45,8 @@ CASES: Mapping[str, Mapping[str, Any]] = {
     "keys": {"motion": "coasting", "codec.key_every": 2},
     "growing": {**GROWING, "motion": "coasting"},
     "growing rigid with keys": {**GROWING, "motion": "rigid", "motion.epochs": 1, "codec.key_every": 3},
+    "refined": {**REFINING, "motion": "rigid", "motion.epochs": 1},
+    "growing refined with keys": {**GROWING, **REFINING, "motion": "coasting", "codec.key_every": 2},
 }
 
 
@@ -93,7 +100,15 @@ def test_the_cases_are_what_they_say() -> None:
         kinds = [step.status for step in whole(case)]
         assert any(line["moving_groups"] > 0 for line in later) == (settings["motion"] != "still"), case
         assert any(line["births"] > 0 for line in later) == ("growth" in settings), case
-        assert kinds.count("key") == 1 + (5 // settings.get("codec.key_every", 6)), case
+        # The refined first frame comes first, periods of key packets after it.
+        every, refined = settings.get("codec.key_every", 6), settings.get("stream.refine_frames")
+        due = range(0, 6, every) if refined is None else {0, *range(refined, 6, every)}
+        assert [frame for frame, kind in enumerate(kinds) if kind == "key"] == sorted(due), case
+        reasons = [line["key_reason"] for line in later if "key_reason" in line]
+        assert reasons == ["period" if refined is None else "refined", *["period"] * 5][: len(due) - 1], case
+        made = sum(line.get("refine_iterations", 0) for line in later)
+        assert made == settings.get("stream.refine_iterations", 0) * (refined or 0), case
+        assert refined is None or later[2]["num_gaussians"] != later[1]["num_gaussians"], case
 
 
 @pytest.mark.parametrize("wrong", [0, 1, 3, 5])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsstream.core.gaussians import Gaussians
-from gsstream.engine.frame0.optimise import _FirstFrameRun
+from gsstream.engine.frame0.optimise import FirstFrameRun
 from gsstream.recipe.model import FirstFrame
 
 NUMBER = 20_000
@@ -17,7 +17,7 @@ def disturbed(noise: float, seed: int = 0) -> tuple[Gaussians[torch.Tensor], Gau
         means=torch.zeros(NUMBER, 3, requires_grad=True), quats=torch.ones(NUMBER, 4), scales=torch.zeros(NUMBER, 3),
         opacities=torch.zeros(NUMBER), sh0=torch.zeros(NUMBER, 1, 3), shN=torch.zeros(NUMBER, 0, 3),
     )  # fmt: skip
-    run = object.__new__(_FirstFrameRun)
+    run = object.__new__(FirstFrameRun)
     run.settings, run.extent = FirstFrame(noise=noise), 2.0
     run.generator = torch.Generator().manual_seed(seed)
     return rows, run._disturbed(rows)

@@ -19,11 +19,11 @@ from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
 from gsstream.encode import Encoder, Listeners, encoder_for, open_recording
 from gsstream.engine.assembly.assemble import assemble
-from gsstream.engine.fit.exposure import Exposure
+from gsstream.engine.fit.exposure import Exposure, ExposureFit
 from gsstream.engine.frame0.begin import seeded
 from gsstream.engine.frame0.how_many import most_seeds
 from gsstream.engine.frame0.left_out import DOUBLED, PATIENCE, Growth, judged, left_out_tiles
-from gsstream.engine.frame0.optimise import _FirstFrameRun, initial_gaussians
+from gsstream.engine.frame0.optimise import FirstFrameRun, initial_gaussians
 from gsstream.method.base import Step
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
@@ -164,9 +164,9 @@ def test_a_tile_without_any_error_counts_as_one_that_is_rounded_to_8_bits() -> N
 # The fit.
 
 
-def running(frame: Frame, exposure: bool) -> _FirstFrameRun:
+def running(frame: Frame, exposure: bool) -> FirstFrameRun:
     """Frame 0 at its start; without SSIM, whose windows see across the rim of a tile."""
-    settings = {**GROWING, **ASKED, "first_frame.max_iterations": 20, "first_frame.exposure": exposure, "loss.dssim": 0}
+    settings = {**GROWING, **ASKED, "first_frame.exposure": exposure, "loss.dssim": 0}
     pairs = [("--set", f"{key}={str(value).lower()}") for key, value in settings.items()]
     catalog = load_catalog()
     parts = assemble(resolve_recipe("s2gs-edge", catalog.recipe_path, overrides=pairs), catalog)
@@ -174,7 +174,11 @@ def running(frame: Frame, exposure: bool) -> _FirstFrameRun:
         points = source.points()
     assert points is not None
     anchors = seeded(parts, points, frame)
-    return _FirstFrameRun(initial_gaussians(anchors, parts.recipe.first_frame), anchors.levels, frame, parts, Rng(0))
+    start = initial_gaussians(anchors, parts.recipe.first_frame)
+    run = FirstFrameRun(start, anchors.levels, frame, parts, Rng(0).stream("test", 0), 20)
+    run.exposure = ExposureFit.start(len(frame.cameras)) if exposure else None
+    run.left_out = left_out_tiles(parts.recipe.first_frame, frame, Rng(0))
+    return run
 
 
 @pytest.mark.parametrize("exposure", [False, True])
@@ -197,7 +201,7 @@ def test_a_tile_that_judges_gives_no_gradient_while_gaussians_grow_and_does_afte
         same_scene(true, other)
 
 
-def same_scene(one: _FirstFrameRun, other: _FirstFrameRun) -> None:
+def same_scene(one: FirstFrameRun, other: FirstFrameRun) -> None:
     for (name, ours), (_, theirs) in zip(one.gaussians().items(), other.gaussians().items(), strict=True):
         assert torch.equal(ours, theirs), name
     if one.exposure is not None and other.exposure is not None:

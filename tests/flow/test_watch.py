@@ -85,6 +85,22 @@ def test_the_stream_of_a_growing_folder_is_that_of_the_finished_one(finished: Pa
     (live / "cameras.json").write_text(json.dumps(complete))
     assert encode(tmp_path / "after", source=str(live), **QUICK) == (tmp_path / "followed/stream.gss").read_bytes()
     assert len(metrics(tmp_path / "followed")) == FRAMES
+    assert [line["live"] for line in metrics(tmp_path / "after")] == [None] * FRAMES
+    assert "latency" not in (tmp_path / "after/summary.txt").read_text()
+    live_entries = [line["live"] for line in metrics(tmp_path / "followed")]
+    assert all((entry["policy"], entry["effort"], entry["absent"]) == (None, 1, []) for entry in live_entries)
+    # When a packet was complete, told by its latency: after its images, in the order of frames, before its last line.
+    images = [max(path.stat().st_mtime for path in live.glob(f"*/{t:06d}.jpg")) for t in range(FRAMES)]
+    written = [image + entry["latency_seconds"] for image, entry in zip(images, live_entries, strict=True)]
+    assert all(entry["latency_seconds"] > 0 for entry in live_entries)
+    assert written == sorted(written)
+    # Times of files are those of the kernel's clock tick, which may lie a hundredth of a second back.
+    assert written[-1] <= (tmp_path / "followed/metrics.jsonl").stat().st_mtime + 0.02
+    seconds = [sum(line["seconds"].values()) for line in metrics(tmp_path / "followed")]
+    assert written[-1] - written[0] >= sum(seconds[1:]) - 0.02
+    said = (tmp_path / "followed/summary.txt").read_text()
+    assert f"frame 0 {live_entries[0]['latency_seconds']:.2f} s; later frames: median " in said
+    assert f"of {FRAMES - 1} later frames: none was dropped, hurried or held" in said
 
 
 def test_files_written_in_place_with_pauses_are_read_when_whole(
@@ -113,14 +129,16 @@ def test_a_late_camera_is_waited_for(finished: Path, tmp_path: Path, truth: list
         assert follow(live, tmp_path / "run") == truth
 
 
-@pytest.mark.parametrize(("policy", "status"), [("hold", "delta"), ("drop", "empty")])
+@pytest.mark.parametrize(("policy", "status", "done"), [("hold", "delta", "held"), ("drop", "empty", "missing")])
 def test_an_absent_camera_is_held_or_its_frame_is_dropped(
-    finished: Path, tmp_path: Path, truth: list[bytes], policy: str, status: str
+    finished: Path, tmp_path: Path, truth: list[bytes], policy: str, status: str, done: str
 ) -> None:
     with capturing(finished, tmp_path / "live", absent=["cam01", 2]) as live:
         got = follow(live, tmp_path / "run", f"?missing={policy}&grace=0.2")
     lines = metrics(tmp_path / "run")
     assert [line["status"] for line in lines] == ["key", "delta", status, "delta"]
+    assert [line["live"]["policy"] for line in lines] == [None, None, done, None]
+    assert [line["live"]["absent"] for line in lines] == [[], [], ["cam01"], []]
     assert got[0] == truth[0]
     assert got[1] != truth[1]
     assert all("psnr" in line for line in lines), "the test camera was there all the time"
@@ -155,8 +173,11 @@ def test_a_run_that_falls_behind_drops_or_hurries(
     # All frames are there at once: more wait than the queue may hold, from the first look on.
     shutil.copytree(finished, tmp_path / "live")
     follow(tmp_path / "live", tmp_path / "run", f"?behind={policy}&queue=1", stream__epochs=4)
-    done = [line["iterations"] / (4 * 3) for line in metrics(tmp_path / "run")[1:]]
-    assert done == effort
+    lines = metrics(tmp_path / "run")
+    assert [line["iterations"] / (4 * 3) for line in lines[1:]] == effort
+    assert [line["live"]["effort"] for line in lines[1:]] == effort
+    words = {0: "dropped", 0.5: "hurried", 1: None}
+    assert [line["live"]["policy"] for line in lines] == [None, *(words[value] for value in effort)]
 
 
 def test_interrupting_while_waiting_ends_at_once_and_resume_goes_on(

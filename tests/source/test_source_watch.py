@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from gsstream.core.errors import EndOfRecording, SourceError
+from gsstream.core.frame import Arrival
 from gsstream.source.base import GrowingSource
 from gsstream.source.multiview import MultiviewSource
 from gsstream.source.open import DEMO_FOLDER, open_source
@@ -57,6 +58,32 @@ def test_transforms_keep_what_a_dropped_frame_is_worth(folder: Path) -> None:
     live = open_source(f"watch:{folder}?behind=drop&queue=2", 0.25)
     assert [transformed(live, DataOptions(gain=0.5), 0).frame(t).effort for t in (0, 9, 10)] == [0, 0, 0]
     assert live.frame(11).effort == 1
+
+
+def test_a_frame_came_in_with_its_last_image_of_either_split(folder: Path, test_camera: str) -> None:
+    for image in folder.glob("cam*/*.jpg"):
+        os.utime(image, (0, 1000 + 10 * int(image.stem)))
+    live = open_source(f"watch:{folder}", 0.25)
+    late = live.info.train.ids[2]
+    os.utime(folder / late / "000001.jpg", (0, 1012.5))
+    gained = transformed(live, DataOptions(gain=0.5), 0)
+    came = [source.frame(1, split).arrival for source in (live, gained) for split in ("train", "test")]
+    assert came == [Arrival(1012.5)] * 4
+    os.utime(folder / test_camera / "000001.jpg", (0, 1013.5))
+    assert [source.frame(1).arrival for source in (live, gained)] == [Arrival(1013.5)] * 2
+    ahead = transformed(live, DataOptions(time_offset=[f"{late}=1"]), 0)
+    assert ahead.frame(1).arrival == Arrival(1020.0), "it waits for the next image of that camera"
+    assert open_source(str(folder), 0.25).frame(1).arrival is None
+
+
+def test_a_frame_says_which_training_cameras_are_absent(folder: Path, test_camera: str) -> None:
+    live = open_source(f"watch:{folder}?missing=hold&grace=0", 0.25)
+    name = live.info.train.ids[1]
+    for camera in (name, test_camera):
+        (folder / camera / "000001.jpg").unlink()
+    for source in (live, transformed(live, DataOptions(gain=0.5), 0)):
+        arrivals = [source.frame(t).arrival for t in range(3)]
+        assert [arrival and arrival.absent for arrival in arrivals] == [(), (name,), ()]
 
 
 def test_a_file_written_again_changes_no_frame_that_was_decided(folder: Path) -> None:

@@ -98,7 +98,12 @@ def optimise_first_frame(
         frame: training images of frame 0.
         progress: called with (iteration, iterations, smoothed loss, number of Gaussians).
     """
-    run = _FirstFrameRun(start, levels, frame, parts, rng)
+    settings = parts.recipe.first_frame
+    iterations = min(settings.epochs * len(frame.cameras), settings.max_iterations)
+    # The name of this random stream is that of older versions, so that a seed still gives the same frame 0.
+    run = FirstFrameRun(start, levels, frame, parts, rng.stream("root", frame.index), iterations)
+    run.exposure = ExposureFit.start(len(frame.cameras)) if settings.exposure else None
+    run.left_out = left_out_tiles(settings, frame, rng)
     for iteration in range(1, run.iterations + 1):
         value = run.step(iteration)
         progress(iteration, run.iterations, value, len(run.levels))
@@ -111,27 +116,40 @@ def optimise_first_frame(
     return Reconstructed(found, run.levels, exposure, run.iterations, run.growth_ended)
 
 
-class _FirstFrameRun:
-    """The moving state of the optimisation of frame 0; lives only inside :func:`optimise_first_frame`."""
+class FirstFrameRun:
+    """The moving state of an optimisation of all Gaussians; lives only inside the function that makes it.
+
+    Arguments:
+        start: [N] Gaussians; ``levels`` [N] their octree levels.
+        levels: see above.
+        frame: training images.
+        parts: the live parts of the recipe.
+        generator: of the order of views, of splits and of noise.
+        iterations: of the whole schedule, of which :meth:`step` makes one.
+    """
 
     def __init__(
-        self, start: Gaussians[torch.Tensor], levels: torch.Tensor, frame: Frame, parts: Assembly, rng: Rng
-    ) -> None:
+        self, start: Gaussians[torch.Tensor], levels: torch.Tensor, frame: Frame, parts: Assembly,
+        generator: torch.Generator, iterations: int,
+    ) -> None:  # fmt: skip
         self.parts, self.recipe, self.frame = parts, parts.recipe, frame
         first = parts.recipe.first_frame
         self.settings = first.model_copy(update={"max_gaussians": most_gaussians(first, frame)})
         self.renderer, self.levels = parts.renderer, levels
         self.views = len(frame.cameras)
         self.extent = frame.cameras.extent
-        self.iterations = min(self.settings.epochs * self.views, self.settings.max_iterations)
-        # The name of this random stream is that of older versions, so that a seed still gives the same frame 0.
-        self.generator = rng.stream("root", frame.index)
+        self.iterations, self.generator = iterations, generator
         self.table = RowTable(dict(start.items()), first_rates(self.settings, self.extent), parts.optimiser)
         self.judge = Judge(parts.loss, parts.recipe.loss.dssim, frame.images, None)
-        self.exposure = ExposureFit.start(self.views) if self.settings.exposure else None
+        #: Colour maps that are fitted along; None: those of the judge stay.
+        self.exposure: ExposureFit | None = None
         self.statistics = DensifyStatistics.zeros(len(start))
-        self.left_out, self.growth = left_out_tiles(first, frame, rng), Growth()
+        #: Tiles that judge growth and are not fitted until it ends; None: nothing judges it.
+        self.left_out: torch.Tensor | None = None
+        self.growth = Growth()
         self.growth_ended: int | None = None
+        #: [N] row of ``start`` that each Gaussian comes from.
+        self.came_from = torch.arange(len(start))
         self.order: list[int] = []
         self.smooth = math.nan
 
@@ -172,7 +190,8 @@ class _FirstFrameRun:
 
     def _backward(self, view: int, image: torch.Tensor) -> float:
         """Loss, its gradient into the leaves, and the exposure step."""
-        self.judge.exposure = self.exposure.exposure if self.exposure else None
+        if self.exposure:
+            self.judge.exposure = self.exposure.exposure
         fitted = None if self.left_out is None else (~self.left_out[view]).float()
         value, gradient = self.judge.backward(view, image, weights=fitted)
         self._penalise()
@@ -199,7 +218,7 @@ class _FirstFrameRun:
         """
         if self.left_out is None:
             return
-        count, exposure = len(self.levels), self.exposure.exposure if self.exposure else None
+        count, exposure = len(self.levels), self.judge.exposure
         gaussians = self.gaussians().map(torch.Tensor.detach)
         found = judged(self.renderer, gaussians, self.frame, self.left_out, self.recipe.background, exposure)
         self.growth = self.growth.look(count, found)
@@ -212,7 +231,7 @@ class _FirstFrameRun:
         gaussians = self.gaussians().map(torch.Tensor.detach)
         edit, values = grow_and_prune(gaussians, self.statistics, self.settings, self.extent, self.generator)
         self.table.edit(edit, values)
-        self.levels = self.levels[edit.source]
+        self.levels, self.came_from = self.levels[edit.source], self.came_from[edit.source]
         self.statistics = DensifyStatistics.zeros(len(self.levels))
 
     def _prune(self) -> None:
@@ -220,7 +239,7 @@ class _FirstFrameRun:
         pixels = shown(self.renderer, self.gaussians().map(torch.Tensor.detach), self.frame.cameras)
         rows = worth_keeping(pixels, self.settings.prune_share)
         self.table.keep(rows)
-        self.levels = self.levels[rows]
+        self.levels, self.came_from = self.levels[rows], self.came_from[rows]
         self.statistics = DensifyStatistics.zeros(len(rows))
 
     def _next_view(self) -> int:

@@ -12,12 +12,18 @@ from dataclasses import replace
 import torch
 
 from gsstream.core.frame import Frame
+from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import arrange, decoded_anchors, key_state, make_layout
+from gsstream.engine.frame0.cheaper import cheaper_colors
+from gsstream.engine.frame0.refine import SHOWN, is_refined
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.tools import RunTools
 from gsstream.packet import StreamMeta, quantise_key
+
+#: Why a frame became a key packet: the refined first frame is ready.
+REFINED = "refined"
 
 
 def refresh(parts: Assembly, step: Step, frame: Frame, tools: RunTools) -> Step:
@@ -32,26 +38,54 @@ def refresh(parts: Assembly, step: Step, frame: Frame, tools: RunTools) -> Step:
         frame: its training images.
         tools: what a key packet tells about the run, and what the budget says of one.
     """
-    every, state = parts.recipe.codec.key_every, step.state
-    if step.status == "key" or not every or state.player.frame - state.key_frame < every:
+    reason, state = _due(parts, step), step.state
+    if reason is None:
         return step
     # A skipped frame stays an empty packet: it must not fail, and a key packet would take the time that skipping saves.
     refused = "the frame is skipped" if frame.effort == 0 else tools.refuse_key(len(state.gaussians))
     if refused is not None:
-        return _postponed(step, refused)
+        return _postponed(step, reason, refused)
     started = time.perf_counter()
-    after = decoded_again(parts, state, frame, tools.meta(frame), tools.rng)
+    # A refined scene was fitted to the pictures of this frame; another may show older ones.
+    made, shown = (refined_key, frame) if reason == REFINED else (decoded_again, state.previous)
+    after = made(parts, state, frame, tools.meta(frame), tools.rng)
     max_bytes = None if tools.allowance is None else tools.allowance.plan.max_bytes
     if max_bytes is not None and len(after.packet.data) > max_bytes:
-        return _postponed(step, f"{len(after.packet.data)} bytes where {max_bytes} are allowed")
-    # A key packet does not change which images the scene shows: after still frames these are older ones.
-    metrics = {**step.metrics, **after.metrics, "key_reason": "period"}
+        return _postponed(step, reason, f"{len(after.packet.data)} bytes where {max_bytes} are allowed")
+    metrics = {**step.metrics, **after.metrics, "key_reason": reason}
     metrics["seconds"] = {**metrics["seconds"], "key": time.perf_counter() - started}
-    return Step(replace(after.state, previous=state.previous), after.packet, "key", metrics)
+    return Step(replace(after.state, previous=shown), after.packet, "key", metrics)
 
 
-def _postponed(step: Step, refused: str) -> Step:
-    return replace(step, metrics={**step.metrics, "key_postponed": f"period: {refused}"})
+def _due(parts: Assembly, step: Step) -> str | None:
+    """Why the frame is to become a key packet; None: it is not."""
+    every, state = parts.recipe.codec.key_every, step.state
+    if step.status == "key":
+        return None
+    if state.refinement is not None:  # a periodic one would end the refinement: it waits for the refined one
+        return REFINED if is_refined(parts.recipe.stream, state.refinement) else None
+    return "period" if every and state.player.frame - state.key_frame >= every else None
+
+
+def _postponed(step: Step, reason: str, refused: str) -> Step:
+    return replace(step, metrics={**step.metrics, "key_postponed": f"{reason}: {refused}"})
+
+
+def refined_key(parts: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
+    """Return the refined first frame, as it is now, as a key packet, and the state that follows from its bytes.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        state: after the frame, with a refinement.
+        frame: training images of the frame.
+        meta: what the key packet says about the run.
+        rng: random streams by name and frame.
+    """
+    found = state.refinement
+    assert found is not None
+    cheaper = cheaper_colors(parts, found.gaussians, frame, state.exposure, rng)
+    gaussians = quantise_key(cheaper.map(lambda t: t.numpy())).map(torch.from_numpy)
+    return _keyed(parts, state, gaussians, found.levels, frame, frame.index, meta, rng)
 
 
 def decoded_again(parts: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
@@ -64,13 +98,21 @@ def decoded_again(parts: Assembly, state: StreamState, frame: Frame, meta: Strea
         meta: what the key packet says about the run.
         rng: random streams by name and frame.
     """
-    player = state.player
-    gaussians = quantise_key(player.gaussians).map(torch.from_numpy)
-    anchors = decoded_anchors(player)
-    hierarchy, levels, gaussians = arrange(parts, gaussians, anchors.levels, anchors)
+    gaussians = quantise_key(state.player.gaussians).map(torch.from_numpy)
+    levels = decoded_anchors(state.player).levels
+    return _keyed(parts, state, gaussians, levels, frame, state.previous.index, meta, rng)
+
+
+def _keyed(
+    parts: Assembly, state: StreamState, gaussians: Gaussians[torch.Tensor], levels: torch.Tensor, frame: Frame,
+    shown: int, meta: StreamMeta, rng: Rng,
+) -> Step:  # fmt: skip
+    """A key packet of Gaussians on its grids, of these levels, which show the pictures of the frame ``shown``."""
+    anchors = decoded_anchors(state.player)
+    hierarchy, levels, gaussians = arrange(parts, gaussians, levels, anchors)
     layout = make_layout(hierarchy, levels, anchors)
     # A resumed run must compare the next frame with the picture this scene shows, which may be an older one.
-    meta = replace(meta, extra={**meta.extra, "shown": state.previous.index})
+    meta = replace(meta, extra={**meta.extra, SHOWN: shown})
     after, packet = key_state(
         parts, gaussians, layout, hierarchy, frame, meta, state.exposure, anchors.origin, rng
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,9 +16,12 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import decoded_anchors, exposure_from_meta
+from gsstream.engine.frame0.refine import SHOWN, advanced, begun, is_refining
 from gsstream.engine.state.follow import follow
+from gsstream.engine.state.refinement import Refinement
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.heal import remembered
+from gsstream.engine.step.tools import RunTools
 from gsstream.engine.still.memory import StillMemory
 from gsstream.packet import PacketKind, PlayerState, StreamMeta, StreamReader, decode_packet
 from gsstream.packet.base import FILE_HEADER
@@ -50,7 +54,7 @@ def ended(path: Path, last: int | None = None) -> Ended:
         if kind == PacketKind.KEY:
             key = player.frame
             # A key packet says which picture its scene shows: it may stand for an older one.
-            shown = int(player.meta.extra.get("shown", player.frame))
+            shown = int(player.meta.extra.get(SHOWN, player.frame))
         elif kind != PacketKind.EMPTY:
             shown = player.frame
     if player is None:
@@ -128,11 +132,39 @@ def memory_after(stream: Stream, state: StreamState, images: Callable[[int], Fra
     memory: StillMemory | None = None
     if not stream.remember or state.player.frame == state.key_frame:
         return memory
-    previous = images(int(state.player.meta.extra.get("shown", state.key_frame)))
+    previous = images(int(state.player.meta.extra.get(SHOWN, state.key_frame)))
     for index in range(state.key_frame + 1, state.player.frame + 1):
         frame = images(index)
         memory = remembered(stream, memory, previous, frame)
     return memory
+
+
+def refinement_after(parts: Assembly, state: StreamState, tools: RunTools) -> Refinement | None:
+    """Return the first frame as far as it was refined: made again from the packets and pictures since its key packet.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        state: at the end of the stream.
+        tools: which replay the stream and read its pictures.
+    """
+    stream = parts.recipe.stream
+    if not is_refining(stream, state) or state.player.frame == state.key_frame:
+        return None
+    assert tools.images is not None
+    found: Refinement | None = None
+    memory: StillMemory | None = None
+    first = before = state.player
+    for player in tools.since_key():
+        if found is None:
+            found, first = begun(player), player
+        else:
+            frame = tools.images(player.frame)
+            if stream.remember:
+                memory = remembered(stream, memory, frame if memory else tools.images(first.frame), frame)
+            seen = frame if memory is None else replace(frame, images=memory.targets(frame.images))
+            found = advanced(parts, found, before, player, seen, state.exposure, tools.rng)
+        before = player
+    return found
 
 
 def key_state_from_player(parts: Assembly, player: PlayerState, rng: Rng) -> StreamState:

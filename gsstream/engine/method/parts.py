@@ -9,9 +9,10 @@ from gsstream.core.frame import Frame
 from gsstream.engine.budget.controller import planned
 from gsstream.engine.budget.spent import spent
 from gsstream.engine.frame0.begin import begin
+from gsstream.engine.frame0.refine import refined
 from gsstream.engine.frame0.taken import begin_from
 from gsstream.engine.keys.keyframes import refresh
-from gsstream.engine.keys.resume import memory_after, state_after
+from gsstream.engine.keys.resume import memory_after, refinement_after, state_after
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.frame_step import frame_step
 from gsstream.engine.step.metrics import cache_metrics
@@ -46,8 +47,9 @@ class PartsMethod(StreamingMethod[StreamState]):
             epochs = step.metrics["iterations"] / len(frame.cameras)
             entry = spent(allowance, pace, fitted, own.recipe.stream, epochs)
             step = replace(step, metrics={**step.metrics, "budget": entry})
-        return refresh(own, step, frame, tools)
+        return refresh(own, refined(own, state, step, frame, tools.rng), frame, tools)
 
     def resume(self, player: PlayerState, shown: Frame, tools: Any) -> StreamState:
         state = replace(state_after(tools.parts, tools.since_key(), tools.rng), previous=shown)
-        return replace(state, memory=memory_after(tools.parts.recipe.stream, state, tools.images))
+        state = replace(state, memory=memory_after(tools.parts.recipe.stream, state, tools.images))
+        return replace(state, refinement=refinement_after(tools.parts, state, tools))

@@ -20,13 +20,14 @@ from gsstream.engine.budget.memory import within_memory
 from gsstream.engine.frame0.points import gather_points, with_test_views
 from gsstream.engine.keys.resume import ended, since_key
 from gsstream.engine.run.encoder import Encoder, Listeners
+from gsstream.engine.run.live import live_metrics
 from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.run.metrics_log import append_metrics, last_written, trim_metrics
 from gsstream.engine.run.progress import RunProgress
 from gsstream.engine.run.travel import LeftBehind, displacement_pixels
 from gsstream.method.base import Step
 from gsstream.metrics import EnergyMeter
-from gsstream.packet import PlayerState, StreamReader, StreamWriter
+from gsstream.packet import EncodedPacket, PlayerState, StreamReader, StreamWriter
 from gsstream.packet.base import FILE_HEADER
 from gsstream.recipe.save import save_resolved
 from gsstream.source.base import FrameSource, GrowingSource, SourceInfo
@@ -96,11 +97,13 @@ class _Run:
         self.left_behind = LeftBehind() if diagnose else None
         self.progress = RunProgress(self.total, quiet)
         listeners = Listeners(
-            packet=lambda packet: self.writer.append(packet), chosen=self._chosen, progress=self.progress.first_frame,
+            packet=self._write, chosen=self._chosen, progress=self.progress.first_frame,
             say=self.progress.say,
         )  # fmt: skip
         self.encoder = Encoder(parts, source.info, self._seeds, first_frame=first_frame, listeners=listeners)
         self.writer: StreamWriter
+        #: When the last packet was complete in the file, seconds since 1970.
+        self.written = 0.0
 
     def encode(self, resume: bool) -> RunResult:
         last = self._resume() if resume else None
@@ -138,7 +141,7 @@ class _Run:
         step = self.encoder.encode(train)
         if self.witness is not None:
             self.witness(step)
-        metrics = {**step.metrics, "wait_seconds": waited}
+        metrics = {**step.metrics, "wait_seconds": waited, "live": live_metrics(train, self.written)}
         if self.energy and joules:
             metrics["joules"] = {name: value - joules[name] for name, value in self.energy.read().items()}
         metrics["displacement_pixels"] = displacement_pixels(step.state.player, train.cameras)
@@ -152,6 +155,11 @@ class _Run:
                     warnings.warn(f"{doubt}: see 'gsstream scene validate {self.source.info.uri}'", stacklevel=2)
         append_metrics(self.out / METRICS, metrics)
         self.progress.frame(metrics)
+
+    def _write(self, packet: EncodedPacket) -> None:
+        self.writer.append(packet)
+        # The clock of files, not a monotonic one: images are dated by it.
+        self.written = time.time()
 
     def _seeds(self, frame: Frame) -> PointCloud:
         recipe = self.encoder.parts.recipe

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gsstream.engine.budget.report import budget_lines
+from gsstream.engine.run.live import live_lines
 from gsstream.packet import StreamMeta
 from gsstream.player.playback import Playback
 from gsstream.source.base import FrameSource
@@ -59,8 +60,9 @@ def _still_pictures(out: Path, source: FrameSource, meta: StreamMeta, records: S
 
 def _write_summary(out: Path, meta: StreamMeta, records: Sequence[FrameRecord]) -> Path:
     text = [summary_table({meta.title: summarise(records)}), "", judges_line(meta)]
-    budget = budget_lines(read_lines(out / METRICS))
-    text += ["", *budget] if budget else []
+    lines = read_lines(out / METRICS)
+    for part in (live_lines(lines), budget_lines(lines)):
+        text += ["", *part] if part else []
     (out / SUMMARY).write_text("\n".join(text) + "\n", encoding="utf-8")
     return out / SUMMARY
 

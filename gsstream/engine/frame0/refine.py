@@ -1,0 +1,164 @@
+"""A first frame that was made in few iterations goes on being optimised while later frames run (stream.refine_frames).
+
+The fit is that of frame 0, from the first key packet on: densification, pruning and falling rates over all of its
+iterations, some in every frame, each on the pictures of that frame. What the stream moves is moved here, too: a
+Gaussian that came of another one goes where that one goes. Nothing of it is sent before the last iteration: then a key
+packet brings the scene (``engine.keys.keyframes``).
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from gsstream.core.changes.rows import gather_rows
+from gsstream.core.frame import Frame
+from gsstream.core.gaussians import ATTRIBUTES, Gaussians
+from gsstream.core.rng import Rng
+from gsstream.core.shapes import FloatArray
+from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.fit.densify import DensifyStatistics
+from gsstream.engine.fit.exposure import Exposure
+from gsstream.engine.frame0.optimise import FirstFrameRun
+from gsstream.engine.state.refinement import Refinement
+from gsstream.engine.state.stream_state import Step, StreamState
+from gsstream.packet import PlayerState
+from gsstream.recipe.model import Stream
+from gsstream.render.activations import rotation_matrices
+
+#: Entry of the meta of every key packet but a stream's first: the frame whose pictures its scene shows.
+SHOWN = "shown"
+
+
+def refined(parts: Assembly, state: StreamState, step: Step, frame: Frame, rng: Rng) -> Step:
+    """Return a step whose state has the refinement after this frame; as it is where the recipe asks for none.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        state: before the frame.
+        step: the frame as it was encoded.
+        frame: its training images; one that is skipped only moves what is refined.
+        rng: random streams by name and frame.
+    """
+    if not is_refining(parts.recipe.stream, state):
+        return step
+    started = time.perf_counter()
+    after = step.state
+    before = state.refinement or begun(state.player)
+    images = frame.images if after.memory is None else after.memory.targets(frame.images)
+    found = advanced(parts, before, state.player, after.player, replace(frame, images=images), state.exposure, rng)
+    metrics = {**step.metrics, "refine_iterations": found.iterations - before.iterations}
+    metrics["seconds"] = {**metrics["seconds"], "refine": time.perf_counter() - started}
+    return replace(step, state=replace(after, refinement=found), metrics=metrics)
+
+
+def is_refining(stream: Stream, state: StreamState) -> bool:
+    """Say whether the first frame of a stream is still to be refined: only that one has a key packet like this."""
+    return stream.refine_frames > 0 and SHOWN not in state.player.meta.extra
+
+
+def is_refined(stream: Stream, refinement: Refinement) -> bool:
+    """Say whether all iterations are made."""
+    return refinement.iterations >= stream.refine_frames * stream.refine_iterations
+
+
+def begun(player: PlayerState) -> Refinement:
+    """Return the refinement of a first frame, before its first iteration.
+
+    Arguments:
+        player: what players have after the key packet.
+    """
+    gaussians = player.gaussians.map(torch.from_numpy)
+    count = len(gaussians)
+    levels = torch.from_numpy(player.layout.unit_of.astype(np.int64))
+    return Refinement(gaussians, levels, torch.arange(count), {}, DensifyStatistics.zeros(count), 0)
+
+
+def advanced(
+    parts: Assembly, refinement: Refinement, before: PlayerState, after: PlayerState, frame: Frame,
+    exposure: Exposure | None, rng: Rng,
+) -> Refinement:  # fmt: skip
+    """Return the refinement after a frame: moved as the stream moved, and optimised on the frame's pictures.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        refinement: after the frame before.
+        before: what players had then. after: what they have now.
+        frame: training images, or what takes their place as targets.
+        exposure: colour maps of the cameras, or None.
+        rng: random streams by name and frame.
+    """
+    start, stream = carried(refinement, before, after), parts.recipe.stream
+    if frame.effort == 0 or is_refined(stream, start):
+        return start
+    total = stream.refine_frames * stream.refine_iterations
+    run = FirstFrameRun(start.gaussians, start.levels, frame, parts, rng.stream("refine", frame.index), total)
+    run.judge.exposure, run.statistics = exposure, start.statistics
+    for name, held in start.moments.items():
+        run.table.load_moments(name, held)
+    last = start.iterations + stream.refine_iterations
+    for iteration in range(start.iterations + 1, last + 1):
+        run.step(iteration)
+    moments = {name: run.table.moments(name) for name in ATTRIBUTES}
+    found = run.gaussians().map(torch.Tensor.detach)
+    return Refinement(found, run.levels, start.ancestors[run.came_from], moments, run.statistics, last)
+
+
+def carried(refinement: Refinement, before: PlayerState, after: PlayerState) -> Refinement:
+    """Return the refinement with every Gaussian moved and turned as the one it came from was.
+
+    Arguments:
+        refinement: after the frame before.
+        before: what players had then. after: what they have now.
+    """
+    row_now = _rows_now(before, after)
+    ancestors = refinement.ancestors
+    alive = ancestors >= 0
+    now = torch.where(alive, row_now[ancestors.clamp_min(0)], -1)
+    kept = now >= 0
+    was, new = _poses(before.gaussians), _poses(after.gaussians)
+    moved = torch.zeros_like(kept)
+    for old_table, new_table in zip(was, new, strict=True):
+        moved[kept] |= (old_table[ancestors[kept]] != new_table[now[kept]]).any(1)
+    rows = moved.nonzero()[:, 0]
+    if len(rows) == 0:
+        return replace(refinement, ancestors=now)
+    old, there = ancestors[rows], now[rows]
+    turn = rotation_matrices(new[1][there]) @ rotation_matrices(was[1][old]).transpose(1, 2)
+    g = refinement.gaussians
+    means, quats = g.means.clone(), g.quats.clone()
+    offset = (turn @ (g.means[rows] - was[0][old])[..., None])[..., 0]
+    means[rows] = new[0][there] + offset
+    quats[rows] = _product(_product(new[1][there], _conjugate(was[1][old])), g.quats[rows])
+    return replace(refinement, gaussians=replace(g, means=means, quats=quats), ancestors=now)
+
+
+def _poses(gaussians: Gaussians[FloatArray]) -> tuple[torch.Tensor, torch.Tensor]:
+    quats = torch.from_numpy(gaussians.quats)
+    return torch.from_numpy(gaussians.means), quats / quats.norm(dim=1, keepdim=True).clamp_min(1e-12)
+
+
+def _rows_now(before: PlayerState, after: PlayerState) -> torch.Tensor:
+    """[N] int64: where each row of the players' scene is after a frame; -1 for one that has left."""
+    count = len(before.gaussians)
+    delta = after.delta
+    if delta is None or not delta.edits_rows:
+        return torch.arange(count)
+    source = gather_rows(before.layout.node_of, delta.births, delta.deaths)
+    out = torch.full((count,), -1)
+    old = torch.from_numpy(source) < count
+    out[torch.from_numpy(source)[old]] = old.nonzero()[:, 0]
+    return out
+
+
+def _conjugate(q: torch.Tensor) -> torch.Tensor:
+    return q * torch.tensor([1.0, -1.0, -1.0, -1.0])
+
+
+def _product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Hamilton product of quaternions [n, 4], wxyz."""
+    w, v, x, u = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
+    return torch.cat([w * x - (v * u).sum(1, keepdim=True), w * u + x * v + torch.linalg.cross(v, u)], 1)

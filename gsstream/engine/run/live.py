@@ -1,0 +1,84 @@
+"""How far a run lags behind the cameras of a recording that is still being written, and what its policies cost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from statistics import median
+from typing import Any
+
+from gsstream.core.frame import Frame
+
+#: What the summary, and what a frame's line, says of each policy.
+COUNTED: Mapping[str, str] = {
+    "dropped": "{} dropped because the run was behind", "missing": "{} dropped because a camera's image did not come",
+    "hurried": "{} hurried", "held": "{} with held images",
+}  # fmt: skip
+_WORDS: Mapping[str, str] = {
+    "dropped": "dropped", "missing": "dropped: a camera is missing", "hurried": "hurried", "held": "an image is held",
+}  # fmt: skip
+
+
+def live_metrics(frame: Frame, written: float) -> dict[str, Any] | None:
+    """Return the entry ``live`` of a frame's metrics; None for a recording that is not live.
+
+    ``latency_seconds``: from the moment when the frame's last image was complete to the moment when its packet was;
+    None when its files were gone by then. It is not bounded below: a negative one says that the clock which dates the
+    images is ahead. ``policy``: what the options of the source did to the frame, None for nothing.
+    ``effort``: share of the recipe's epochs that was asked for. ``absent``: training cameras without an image.
+
+    Arguments:
+        frame: as the source delivered it.
+        written: when its packet was complete in the stream file, seconds since 1970.
+    """
+    arrival = frame.arrival
+    if arrival is None:
+        return None
+    latency = None if arrival.complete is None else written - arrival.complete
+    return {
+        "latency_seconds": latency, "policy": _policy(frame), "effort": frame.effort, "absent": list(arrival.absent),
+    }  # fmt: skip
+
+
+def _policy(frame: Frame) -> str | None:
+    """What was done to a frame: its weightiest name; a frame that is dropped is neither hurried nor held."""
+    if frame.index == 0:
+        return None  # always done in full, of every camera
+    absent = bool(frame.arrival and frame.arrival.absent)
+    if frame.effort == 0:
+        return "missing" if absent else "dropped"
+    return "hurried" if frame.effort < 1 else "held" if absent else None
+
+
+def late_words(metrics: Mapping[str, Any]) -> list[str]:
+    """Return what a frame's line says of its latency; empty for a recording that is not live."""
+    live = metrics.get("live")
+    if live is None:
+        return []
+    latency = live["latency_seconds"]
+    words = ["latency unknown" if latency is None else f"{latency:.2f} s late"]
+    return words if live["policy"] is None else [*words, _WORDS[live["policy"]]]
+
+
+def live_lines(lines: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return what the summary of a run says of its latency; empty for a recording that was not live.
+
+    A dropped frame has a latency in its metrics, but it shows nothing new: median and worst are of the others.
+
+    Arguments:
+        lines: of ``metrics.jsonl``, in the order of frames.
+    """
+    live = {line["frame"]: line["live"] for line in lines if line.get("live") is not None}
+    if not live:
+        return []
+    known = {frame: entry["latency_seconds"] for frame, entry in live.items() if entry["latency_seconds"] is not None}
+    shown = {frame: known[frame] for frame in known if frame and live[frame]["policy"] not in ("dropped", "missing")}
+    parts = [f"frame 0 {known[0]:.2f} s"] if 0 in known else []
+    if shown:
+        worst = max(shown, key=lambda frame: shown[frame])
+        parts.append(f"later frames: median {median(shown.values()):.2f} s, worst {shown[worst]:.2f} s (frame {worst})")
+    out = ["latency from image to packet: " + ("; ".join(parts) or "unknown, the images were gone")]
+    later = [entry["policy"] for frame, entry in live.items() if frame]
+    done = [form.format(later.count(name)) for name, form in COUNTED.items() if name in later]
+    if later:
+        out.append(f"of {len(later)} later frames: " + (", ".join(done) or "none was dropped, hurried or held"))
+    return out

@@ -1,0 +1,167 @@
+"""A first frame that goes on being optimised beside the stream: it moves along, mends, waits and arrives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from gsstream.core.changes import Births, Delta, Layout, Rows, Scene
+from gsstream.core.frame import Frame
+from gsstream.core.gaussians import Gaussians
+from gsstream.encode import Encoder, encoder_for, open_recording
+from gsstream.engine.fit.densify import DensifyStatistics
+from gsstream.engine.frame0.refine import carried
+from gsstream.engine.keys import keyframes
+from gsstream.engine.run.measure import HeldOut
+from gsstream.engine.state.refinement import Refinement
+from gsstream.method.base import Step
+from gsstream.packet import PlayerState, quantise_key
+from gsstream.render.activations import rotation_matrices
+
+WORLD = "synthetic:frames=6&views=4&width=48&height=32&supersample=1&static=1"
+SETTINGS: Mapping[str, Any] = {
+    "first_frame.max_iterations": 10, "first_frame.points": "recording", "first_frame.max_points": 250,
+    "first_frame.fill_points": 0, "stream.epochs": 1, "motion": "still",
+    "stream.refine_frames": 3, "stream.refine_iterations": 20, "first_frame.densify_from": 1000,
+}  # fmt: skip
+
+
+@cache
+def frames(split: str = "train") -> tuple[Frame, ...]:
+    with open_recording(WORLD) as source:
+        return tuple(source.frame(index, split) for index in range(6))
+
+
+def encoder(**settings: Any) -> Encoder:
+    with open_recording(WORLD) as source:
+        return encoder_for("s2gs-edge", source, {**SETTINGS, **settings})
+
+
+def steps(efforts: tuple[float, ...] = (1,) * 6, **settings: Any) -> list[Step[Any]]:
+    made = encoder(**settings)
+    return [made.encode(replace(frame, effort=e)) for frame, e in zip(frames(), efforts, strict=True)]
+
+
+@cache
+def whole() -> tuple[Step[Any], ...]:
+    return tuple(steps())
+
+
+def iterations(made: Any) -> list[int]:
+    return [step.metrics.get("refine_iterations", 0) for step in made[1:]]
+
+
+def test_a_still_scene_is_refined_and_a_key_packet_brings_it() -> None:
+    made = whole()
+    assert [step.status for step in made] == ["key", "empty", "empty", "key", "empty", "empty"]
+    assert iterations(made) == [20, 20, 20, 0, 0]
+    assert made[3].metrics["key_reason"] == "refined"
+    assert [step.state.refinement is None for step in made] == [True, False, False, True, True, True]
+    judge = HeldOut(encoder().parts.renderer, (0.0, 0.0, 0.0))
+    before, after = (judge.measure(made[t].state, frames("test")[t])["psnr"] for t in (2, 3))
+    assert min(after[name] - before[name] for name in before) > 1, "sixty iterations after ten"
+
+
+def test_frames_that_are_skipped_cost_no_iteration_and_put_the_key_packet_off() -> None:
+    made = steps((1, 1, 0, 0, 1, 1))
+    assert iterations(made) == [20, 0, 0, 20, 20]
+    assert [step.status for step in made] == ["key", "empty", "empty", "empty", "empty", "key"]
+
+
+def test_a_size_that_no_key_packet_keeps_puts_it_off_and_says_so() -> None:
+    made = steps(**{"budget.size": "2KB"})
+    assert [step.status for step in made[1:]] == ["empty"] * 5
+    assert iterations(made) == [20, 20, 20, 0, 0]
+    said = [step.metrics.get("key_postponed", "") for step in made[1:]]
+    assert [text.startswith("refined: ") for text in said] == [False, False, True, True, True]
+
+
+def test_without_it_nothing_is_refined() -> None:
+    made = steps(**{"stream.refine_frames": 0, "stream.refine_iterations": 0})
+    assert all(step.state.refinement is None and "refine_iterations" not in step.metrics for step in made)
+    assert made[0].packet.sizes["means"] == whole()[0].packet.sizes["means"]
+
+
+def player(gaussians: Gaussians[np.ndarray], counts: list[int], delta: Delta | None = None) -> PlayerState:
+    layout = Layout(np.array(counts, np.int32), np.zeros(sum(counts), np.uint8), np.ones(1, np.float32))
+    return replace(whole()[0].state.player, scene=Scene(gaussians, layout), delta=delta)
+
+
+def some(number: int, seed: int) -> Gaussians[np.ndarray]:
+    draw = np.random.default_rng(seed)
+    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (0, 3)}
+    return Gaussians(**{k: draw.normal(size=(number, *v)).astype(np.float32) for k, v in shapes.items()})
+
+
+def refinement(gaussians: Gaussians[np.ndarray], ancestors: list[int]) -> Refinement:
+    count = len(ancestors)
+    return Refinement(
+        gaussians.map(torch.from_numpy), torch.zeros(count, dtype=torch.int64), torch.tensor(ancestors), {},
+        DensifyStatistics.zeros(count), 0,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_came_of_a_gaussian_keeps_its_place_and_turn_relative_to_it(seed: int) -> None:
+    before, after, mine = some(4, seed), some(4, seed + 50), some(6, seed + 99)
+    for name in ("means", "quats"):  # row 2 rests
+        getattr(after, name)[2] = getattr(before, name)[2]
+    ancestors = [0, 0, 1, 2, 3, -1]
+    got = carried(refinement(mine, ancestors), player(before, [4]), player(after, [4])).gaussians
+    was, now = (rotation_matrices(torch.from_numpy(g.quats)).double().numpy() for g in (before, after))
+    old, new = (rotation_matrices(torch.from_numpy(np.asarray(g.quats))).double().numpy() for g in (mine, got))
+    for row, ancestor in enumerate(ancestors[:5]):
+        there = now[ancestor].T @ (got.means[row].numpy() - after.means[ancestor])
+        assert there == pytest.approx(was[ancestor].T @ (mine.means[row] - before.means[ancestor]), abs=1e-5)
+        assert now[ancestor].T @ new[row] == pytest.approx(was[ancestor].T @ old[row], abs=1e-5)
+    for row in (3, 5):
+        for name in ("means", "quats"):
+            same = getattr(got, name)[row].numpy().tobytes() == getattr(mine, name)[row].tobytes()
+            assert same, "what came of a Gaussian that rests, or is gone, rests to the bit"
+    for name in ("scales", "opacities", "sh0", "shN"):
+        assert getattr(got, name).numpy().tobytes() == getattr(mine, name).tobytes()
+
+
+def test_rows_that_leave_and_join_are_followed() -> None:
+    before, mine, born = some(4, 0), some(4, 1), some(1, 2)
+    # Row 1, the last of the first node, leaves, and one is born in its place.
+    births = Births(born, np.zeros(1, np.int64), np.zeros(1, np.uint8), np.zeros(0, np.int64))
+    after = Gaussians(**{
+        name: np.concatenate([value[[0]], getattr(born, name), value[[2, 3]]]) for name, value in before.items()
+    })
+    after.means[3] += 1.0
+    delta = Delta((Rows(births, np.array([1], np.int64)),))
+    found = carried(refinement(mine, [0, 1, 2, 3]), player(before, [2, 2]), player(after, [2, 2], delta))
+    assert found.ancestors.tolist() == [0, -1, 2, 3]
+    assert found.gaussians.means[3].numpy() == pytest.approx(mine.means[3] + 1.0, abs=1e-5)
+    assert torch.equal(found.gaussians.means[:3], torch.from_numpy(mine.means[:3]))
+
+
+def test_the_key_packet_holds_the_refined_scene() -> None:
+    made = encoder()
+    for frame in frames()[:3]:
+        made.encode(frame)
+    before = made.state.refinement
+    found: list[Refinement] = []
+    original = keyframes.refined_key
+
+    def watched(parts: Any, state: Any, *rest: Any) -> Step[Any]:
+        found.append(state.refinement)
+        return original(parts, state, *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(keyframes, "refined_key", watched)
+        step = made.encode(frames()[3])
+    assert found[0].iterations == before.iterations + 20 == 60
+    ours = quantise_key(found[0].gaussians.map(lambda t: t.numpy()))
+    theirs = step.state.player.gaussians
+    assert np.array_equal(*(
+        np.unique(np.column_stack([v.reshape(len(v), -1) for _, v in g.items()]), axis=0) for g in (ours, theirs)
+    ))
+    assert step.state.player.meta.extra["shown"] == 3

@@ -86,7 +86,7 @@ class FirstFrame(Section):
         default="never",
         description="what ends growth before max_gaussians. left-out: one tile in eight of every training image is "
         "left out while Gaussians grow and only judges; growth ends when PSNR gains next to nothing there; such a "
-        "frame 0 starts from max_points Gaussians at most; never: nothing",
+        "frame 0 starts from max_points Gaussians at most (experimental: test cameras lose by it); never: nothing",
     )  # fmt: skip
     prune_share: float = Field(
         default=0.0, ge=0, lt=1,

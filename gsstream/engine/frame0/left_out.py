@@ -2,7 +2,7 @@
 
 What is left out are tiles, not cameras: a camera that joins when growth has ended has missed the iterations that move
 Gaussians far, and a rig of eight lost 0.8 dB by it. A tile is also seen under the exposure of its own camera, which the
-other tiles of that camera fit. What it is worth is in docs/results/frame0.md: nothing yet on real images, so it is off.
+other tiles of that camera fit. docs/results/frame0.md: test cameras lose by it yet, so it is off.
 """
 
 from __future__ import annotations

@@ -56,12 +56,14 @@ def frame_step(
     """
     clock, stream = PhaseClock(), parts.recipe.stream
     parts.where.enter(frame.index)
+    if frame.effort == 0:  # its pictures count for nothing: a source that is behind has not even read them
+        return still(state, frame, clock)
     with clock.phase("change"):
         change = detect_change(state.previous, frame, stream.change_threshold)
         memory = remembered(stream, state.memory, state.previous, frame)
         state = replace(state, memory=memory)
         targets = frame.images if memory is None else memory.targets(frame.images)
-    if frame.effort == 0 or (change is not None and change.share == 0):
+    if change is not None and change.share == 0:
         return still(state, frame, clock)
 
     with clock.phase("motion"):

@@ -36,6 +36,7 @@ from gsstream.trade.measure.records import mean, read_lines
 from tools.drift import there_and_back
 
 WATCH = "behind=drop&ready=rename"
+GSSTREAM = (sys.executable, "-c", "from gsstream.cli.main import main; main()")
 _POLICIES = ("dropped", "missing", "hurried", "held")
 
 
@@ -104,7 +105,7 @@ def drill(finished: Path, out: Path, fps: float, frames: int, watch: str, option
         raise OutputError(f"{out} exists; expected a new folder, choose another --out")
     capture = Capture(finished, out / "capture", fps, frames)
     source = f"watch:{out / 'capture'}?{watch}"
-    command = [sys.executable, "-c", "from gsstream.cli.main import main; main()", "run", "--source", source]
+    command = [*GSSTREAM, "run", "--source", source]
     machine, own, began = _busy(), _own(), time.monotonic()
     load = os.getloadavg()[0]
     try:
@@ -122,7 +123,8 @@ def drill(finished: Path, out: Path, fps: float, frames: int, watch: str, option
     others = None if machine is None or machine_now is None else max(0.0, machine_now - machine - used) / seconds
     lines = read_lines(out / "run" / METRICS)
     return {
-        "fps": fps, "watch": watch, "options": list(options), **reported(lines), "capture_late_s": capture.late,
+        "fps": fps, "watch": watch, "options": list(options), **reported(lines), **evaluated(out, len(lines)),
+        "capture_late_s": capture.late,
         "machine": {
             "processors": os.cpu_count(), "load_before": load, "load_after": os.getloadavg()[0],
             "used_by_the_run": used / seconds, "used_by_others": others,
@@ -142,14 +144,12 @@ def reported(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
     latency = sorted(line["live"]["latency_seconds"] for line in shown)
     half = [line["live"]["latency_seconds"] for line in shown if line["frame"] >= len(lines) / 2]
     deltas = [sum(line["bytes"].values()) for line in later if line["status"] != "key"]
-    quality = {name: mean(_mean(line, name) for line in later) for name in ("psnr", "psnr_moving", "psnr_changed")}
     numbers = {
         "latency_first_s": lines[0]["live"]["latency_seconds"],
         "latency_median_s": median(latency) if latency else math.nan,
         "latency_p90_s": latency[math.ceil(0.9 * len(latency)) - 1] if latency else math.nan,
         "latency_worst_s": latency[-1] if latency else math.nan,
         "latency_median_of_second_half_s": median(half) if half else math.nan,
-        **quality,
         "kb_per_frame": sum(deltas) / 1000 / len(deltas) if deltas else math.nan,
         "seconds_per_shown_frame": mean(sum(line["seconds"].values()) for line in shown),
         "cpu_seconds_per_shown_frame": mean(line["cpu_seconds"] for line in shown),
@@ -159,8 +159,22 @@ def reported(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return {"frames": len(lines), **policies, "keys_later": sum(line["status"] == "key" for line in later), **known}
 
 
-def _mean(line: dict[str, Any], name: str) -> float:
-    return mean(value for value in line.get(name, {}).values() if value is not None)
+def evaluated(out: Path, frames: int) -> dict[str, float | None]:
+    """Return the means of ``gsstream evaluate`` over all frames but the first, dropped ones too.
+
+    Arguments:
+        out: of the drill; its capture is finished.
+        frames: of the stream.
+    """
+    path = out / "capture" / CALIBRATION_FILE
+    data = json.loads(path.read_text(encoding="utf-8"))
+    path.write_text(json.dumps({**data, "frames": frames}), encoding="utf-8")
+    command = [*GSSTREAM, "evaluate", str(out / "run"), "--source", str(out / "capture"), "--json"]
+    views = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)["views"]
+    later = [view for view in views if view["frame"] > 0]
+    names = ("psnr", "psnr_moving", "psnr_changed", "hold_psnr", "hold_psnr_changed")
+    found = {name: mean(view[name] for view in later if view[name] is not None) for name in names}
+    return {name: None if math.isnan(value) else value for name, value in found.items()}
 
 
 def _own() -> float:

@@ -26,7 +26,7 @@ from gsstream.source.watch_options import WatchOptions
 class _Plan:
     """What is delivered as one frame: ``effort``, and from which earlier frame cameras are held.
 
-    ``skipped``: the run is behind, nobody looked at its files, and the last images of all training cameras stand in.
+    ``skipped``: the run is behind; nobody looks at its files, and the last images of all training cameras stand in.
     """
 
     effort: float = 1.0
@@ -100,16 +100,11 @@ class WatchSource:
         plan = self._plan(index)
         cameras = self._info.train if split == "train" else self._info.test
         held = dict(plan.held)
-        if split == "test" and any(camera_id in held for camera_id in cameras.ids):
+        if split == "test" and (plan.skipped or any(camera_id in held for camera_id in cameras.ids)):
             cameras = cameras.select([])
         images: FloatArray = np.empty((len(cameras), self._target[1], self._target[0], 3), np.float32)
-        try:
-            for i, camera_id in enumerate(cameras.ids):
-                images[i] = self._image(camera_id, held.get(camera_id, index))
-        except SourceError:
-            if not (plan.skipped and split == "test"):
-                raise
-            cameras, images = cameras.select([]), images[:0]
+        for i, camera_id in enumerate(cameras.ids):
+            images[i] = self._image(camera_id, held.get(camera_id, index))
         arrival = self._arrival(index, () if plan.skipped else held)
         return Frame(index, index / self._info.fps, images, cameras, plan.effort, arrival)
 

@@ -96,8 +96,7 @@ def test_a_frame_that_is_skipped_is_not_even_read(folder: Path, test_camera: str
         assert (skipped.effort, skipped.images.tobytes()) == (0, first.tobytes()), "the last pictures stand in"
         assert skipped.arrival is not None
         assert skipped.arrival.absent == (), "no camera is missing: the run is behind"
-        assert len(source.frame(5, "test").cameras) == 0, "nothing is measured against a picture that is none"
-        assert len(source.frame(4, "test").cameras) == 1
+        assert [len(source.frame(t, "test").cameras) for t in (0, 5, 11)] == [1, 0, 1], "nor is it measured"
     assert live.frame(11).effort == 1
     assert not np.array_equal(live.frame(11).images, first)
 

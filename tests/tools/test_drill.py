@@ -15,20 +15,20 @@ from gsstream.engine.run.metrics_log import read_metrics
 from tools.drill import Capture, main, reported
 
 
-def line(index: int, latency: float, policy: str | None = None, psnr: float = 30.0, **more: Any) -> dict[str, Any]:
+def line(index: int, latency: float, policy: str | None = None, **more: Any) -> dict[str, Any]:
     live = {"latency_seconds": latency, "policy": policy, "effort": 1.0, "absent": []}
     sizes = {"frame": index, "status": "delta", "bytes": {"header": 1000}, "seconds": {"code": 2.0}, "cpu_seconds": 1.0}
-    return {**sizes, "live": live, "psnr": {"a": psnr, "b": None}, "psnr_moving": {}, **more}
+    return {**sizes, "live": live, **more}
 
 
-def test_dropped_frames_count_for_quality_and_not_for_latency() -> None:
-    lines = [line(0, 50.0, psnr=90.0), line(1, 3.0), line(2, 9.0, "dropped", 20.0), line(3, 1.0, "hurried"),
+def test_dropped_frames_do_not_count_for_latency() -> None:
+    lines = [line(0, 50.0), line(1, 3.0), line(2, 9.0, "dropped"), line(3, 1.0, "hurried"),
              line(4, 2.0, status="key", bytes={"header": 5000}), line(5, 4.0, "held")]  # fmt: skip
     found = reported(lines)
     assert [found[name] for name in ("dropped", "missing", "hurried", "held", "keys_later")] == [1, 0, 1, 1, 1]
     assert (found["latency_first_s"], found["latency_median_s"], found["latency_worst_s"]) == (50.0, 2.5, 4.0)
     assert (found["latency_p90_s"], found["latency_median_of_second_half_s"]) == (4.0, 2.0)
-    assert (found["psnr"], found["psnr_moving"], found["kb_per_frame"]) == (28.0, None, 1.0)
+    assert found["kb_per_frame"] == 1.0
     assert reported(lines[:1])["latency_median_s"] is None
 
 
@@ -60,6 +60,11 @@ def test_a_drill_reports_what_its_run_wrote(tmp_path: Path, capfd: pytest.Captur
     assert found["dropped"] == sum(entry["live"]["policy"] == "dropped" for entry in lines) > 0
     assert found["latency_first_s"] == lines[0]["live"]["latency_seconds"] > 0
     assert found["said"][0] in (tmp_path / "o/run/summary.txt").read_text()
+    # Only frames that were not dropped have a number in the run, and evaluate has the same: the mean is of all.
+    evaluated = found["psnr"]
+    measured = {entry["frame"]: entry["psnr"]["cam03"] for entry in lines if "psnr" in entry}
+    assert set(measured) == {entry["frame"] for entry in lines if entry["live"]["policy"] is None}
+    assert 5 < evaluated < 60
     assert 0 < found["machine"]["used_by_the_run"] <= found["machine"]["processors"]
     with pytest.raises(OutputError, match="exists; expected a new folder"):
         main([*common, "--out", str(tmp_path / "o"), *run])

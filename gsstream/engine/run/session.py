@@ -147,7 +147,9 @@ class _Run:
         metrics["displacement_pixels"] = displacement_pixels(step.state.player, train.cameras)
         if self.left_behind is not None:
             metrics["left_behind"] = self.left_behind.after(step.state.player, train, step.status == "key")
-        if self.held_out and len(test.cameras):
+        # Who is behind does not spend time on the quality of what he drops: ``evaluate`` measures it.
+        dropped = metrics["live"] is not None and metrics["live"]["policy"] == "dropped"
+        if self.held_out and len(test.cameras) and not dropped:
             metrics |= self.held_out.measure(step.state, self.encoder.at_near(test))
             if train.index == 0:
                 doubt = self.held_out.doubt(step.state, self.encoder.at_near(train), metrics["psnr"])

@@ -65,7 +65,6 @@ def frame_step(
         targets = frame.images if memory is None else memory.targets(frame.images)
     if change is not None and change.share == 0:
         return still(state, frame, clock)
-
     with clock.phase("motion"):
         motions, scene, view = moved(parts, state, frame, change, rng, targets, allowance)
     with clock.phase("confidence"):
@@ -100,8 +99,7 @@ def frame_step(
         after = follow(replace(state, previous=shown, session=session), player)
     metrics = step_metrics(fitted.delta, after, fitted.packet, solution, len(rows))
     metrics |= {"changed_tiles": 1.0 if change is None else change.share, "seconds": clock.seconds}
-    step = Step(after, fitted.packet, "empty" if unchanged else "delta", metrics)
-    return Outcome(step, solution.pace, fitted)
+    return Outcome(Step(after, fitted.packet, "empty" if unchanged else "delta", metrics), solution.pace, fitted)
 
 
 def still(state: StreamState, frame: Frame, clock: PhaseClock) -> Outcome:

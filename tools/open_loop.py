@@ -36,6 +36,7 @@ from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.run.recording import open_recording
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step import frame_step
+from gsstream.engine.step.optimise import optimise
 from gsstream.engine.step.problem import Problem, Solution
 from gsstream.packet import PlayerState, decode_packet
 from gsstream.plugins.catalog import load_catalog
@@ -80,7 +81,7 @@ class Trainer:
     """
 
     def __init__(self, fine: Any) -> None:
-        self._fine, self._optimise = fine, frame_step.optimise
+        self._fine, self._optimise = fine, optimise
         self.trained: Gaussians[FloatArray] | None = None
         self._scene: Gaussians[FloatArray] | None = None
 

@@ -90,11 +90,13 @@ class FrameWork(FrameContext, Protocol):
     def narrow(self, rows: torch.Tensor) -> None:
         """Freeze all rows but [A] int64, ascending: from now on only these move."""
 
-    def pull(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
+    def pull(self, view: int, rows: Gaussians[torch.Tensor], near_change: bool = False) -> float:
         """Render a view with these values of the rows that move, and compare it with what its camera recorded.
 
         Arguments:
+            view: index of a training camera.
             rows: the A rows of :meth:`narrow`, or all N; tensors with a graph get the gradient of the loss.
+            near_change: leave out the tiles that did not change and lie beside none that did.
 
         Returns:
             (1 - w) L1 + w (1 - SSIM), on the tiles that the rows can change.

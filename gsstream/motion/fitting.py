@@ -41,7 +41,7 @@ class Descent:
 
 def fitted_moves(
     scene: Scene, work: FrameWork, start: Moves, unit: FloatArray, rates: Sequence[float], order: np.random.Generator,
-    measure: Measure, pull: float = 0.0,
+    measure: Measure, pull: float = 0.0, near_change: bool = False,
 ) -> FloatArray:  # fmt: skip
     """Return the shifts and turns [K, 6] of groups that explain the images best.
 
@@ -54,6 +54,7 @@ def fitted_moves(
         order: draws the order of the views, anew for each pass.
         measure: what the steps of each number are divided by, squared.
         pull: weight of the mean absolute value of all numbers, in units, beside the photometric loss.
+        near_change: compare only in tiles that changed and in those beside them.
     """
     views = len(work.cameras)
     work.narrow(torch.from_numpy(start.rows))
@@ -65,7 +66,7 @@ def fitted_moves(
             sequence = order.permutation(views)
         values = descent.values
         moves = local._replace(shift=values[:, :3] * unit[:3], turn=values[:, 3:] * unit[3:])
-        slope = slope_of(work, int(sequence[step % views]), base, moves) * unit
+        slope = slope_of(work, int(sequence[step % views]), base, moves, near_change) * unit
         if pull:
             slope = slope + pull * np.sign(values) / values.size
         descent.step(slope, rate)

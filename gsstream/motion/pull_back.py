@@ -11,7 +11,9 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
 
 
-def slope_of(work: FrameWork, view: int, base: Gaussians[FloatArray], moves: Moves) -> FloatArray:
+def slope_of(
+    work: FrameWork, view: int, base: Gaussians[FloatArray], moves: Moves, near_change: bool = False
+) -> FloatArray:
     """Return the gradient [K, 6] of a view's loss with respect to shift and turn of the groups, at these moves.
 
     Arguments:
@@ -19,9 +21,10 @@ def slope_of(work: FrameWork, view: int, base: Gaussians[FloatArray], moves: Mov
         view: index of a training camera.
         base: these A rows before they move.
         moves: of the rows of ``base``: its ``rows`` count from 0 to A - 1.
+        near_change: as for ``work.pull``.
     """
     leaves = transformed(base, moves).map(lambda value: torch.from_numpy(value).requires_grad_())
-    work.pull(view, leaves)
+    work.pull(view, leaves, near_change)
     return _pulled_back(leaves, moves)
 
 

@@ -51,6 +51,10 @@ class Rigid(MotionPart):
         lr: float = Field(default=0.25, gt=0, le=10, description="first step, pixels per iteration")
         lr_final: float = Field(default=0.025, gt=0, le=10, description="last step, pixels per iteration")
         step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
+        everywhere: bool = Field(
+            default=True,
+            description="compare in all tiles that the groups are seen in; false: in those that changed or lie beside",
+        )
         least: float = Field(default=0.25, ge=0, le=10, description="motions below this many pixels are dropped")
 
     source: ClassVar[str] = "gsstream; groups of one rigid motion as in HiCoM"
@@ -79,7 +83,8 @@ class Rigid(MotionPart):
         config = self.config
         total = config.epochs * len(work.cameras)
         rates = [config.lr * (config.lr_final / config.lr) ** (step / total) for step in range(total)]
-        return fitted_moves(scene, work, start, units.row, rates, rng.numpy("motion", work.index), felt_most)
+        order, near = rng.numpy("motion", work.index), not config.everywhere
+        return fitted_moves(scene, work, start, units.row, rates, order, felt_most, near_change=near)
 
 
 def _units(scene: Scene, work: FrameWork, cell: float) -> Units:

@@ -136,9 +136,10 @@ class FrameView:
     def narrow(self, rows: torch.Tensor) -> None:
         self._session = self.session_for(rows)
 
-    def pull(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
+    def pull(self, view: int, rows: Gaussians[torch.Tensor], near_change: bool = False) -> float:
         self._parts.where.count()
-        loss, gradients = self.judge.pull(self.session, view, rows)
+        tiles = self._change.near[view].float() if near_change and self._change is not None else None
+        loss, gradients = self.judge.pull(self.session, view, rows, tiles)
         pairs = [(value, gradient) for (_, value), (_, gradient) in zip(rows.items(), gradients.items(), strict=True)]
         if learned := [(value, gradient) for value, gradient in pairs if value.requires_grad]:
             pull_back(*zip(*learned, strict=True))

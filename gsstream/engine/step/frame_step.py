@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
+import torch
+
 from gsstream.core.changes import Delta
 from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
@@ -18,7 +20,7 @@ from gsstream.engine.budget.trim import Fitted
 from gsstream.engine.state.follow import follow
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.active.candidates import candidates
-from gsstream.engine.step.active.change import detect_change
+from gsstream.engine.step.active.change import Change, detect_change
 from gsstream.engine.step.clock import PhaseClock
 from gsstream.engine.step.encode import encode_frame
 from gsstream.engine.step.growth import grown
@@ -30,6 +32,7 @@ from gsstream.engine.step.motion import moved
 from gsstream.engine.step.optimise import optimise
 from gsstream.engine.step.problem import Problem
 from gsstream.packet import decode_packet, encode_empty
+from gsstream.recipe.model import Stream
 
 
 class Outcome(NamedTuple):
@@ -81,7 +84,7 @@ def frame_step(
         problem = Problem(
             frame.index, frame.effort, scene.layout, state.hierarchy, rows, view.gaussians.rows(rows), logits,
             state.decoders, view.session_for(rows), view.judge, len(frame.cameras),
-            frame.cameras.width * frame.cameras.height, allowance, None if change is None else change.tiles,
+            frame.cameras.width * frame.cameras.height, allowance, _near(change, stream),
         )  # fmt: skip
         solution = optimise(parts, problem, rng.stream("frame", frame.index))
         residual = harden(parts, problem, solution)
@@ -100,6 +103,11 @@ def frame_step(
     metrics = step_metrics(fitted.delta, after, fitted.packet, solution, len(rows))
     metrics |= {"changed_tiles": 1.0 if change is None else change.share, "seconds": clock.seconds}
     return Outcome(Step(after, fitted.packet, "empty" if unchanged else "delta", metrics), solution.pace, fitted)
+
+
+def _near(change: Change | None, stream: Stream) -> torch.Tensor | None:
+    """Tiles that every iteration looks at; None: all. What is mended stands still: a frame that mends looks at all."""
+    return None if change is None or stream.heal else change.near
 
 
 def still(state: StreamState, frame: Frame, clock: PhaseClock) -> Outcome:

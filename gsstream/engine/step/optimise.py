@@ -74,7 +74,7 @@ class _FrameRun:
     def __init__(self, parts: Assembly, problem: Problem, generator: torch.Generator, pace: Pace) -> None:
         self.parts, self.problem, self.generator, self.pace = parts, problem, generator, pace
         self.rows = problem.rows
-        self.tiles = QuietTiles(problem.changed, parts.recipe.stream.quiet_tiles, generator)
+        self.tiles = QuietTiles(problem.near, parts.recipe.stream.quiet_tiles, generator)
         layout, rows = problem.layout, problem.rows.numpy()
         # Only gates with candidates behind them are sampled and trained. Sampling does not look at parents, so the
         # forest is replaced by roots.

@@ -31,7 +31,7 @@ class Problem:
         judge: compares renders with what the V cameras recorded.
         pixels: of one view.
         allowance: what the frame may spend; None: what the recipe says.
-        changed: [V, ceil(H / 16), ceil(W / 16)] bool, tiles in which a view changed; None where it is not known.
+        near: [V, ceil(H / 16), ceil(W / 16)] bool, tiles that every iteration looks at; None: at all.
     """
 
     frame: int
@@ -47,7 +47,7 @@ class Problem:
     views: int
     pixels: int
     allowance: Allowance | None = None
-    changed: torch.Tensor | None = None
+    near: torch.Tensor | None = None
 
     @property
     def step_scale(self) -> float:

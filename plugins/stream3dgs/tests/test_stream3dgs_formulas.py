@@ -131,7 +131,7 @@ class Pulled:
     def narrow(self, rows: torch.Tensor) -> None:
         self.rows = rows
 
-    def pull(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
+    def pull(self, view: int, rows: Gaussians[torch.Tensor], near_change: bool = False) -> float:
         loss = (rows.means - self.aims[self.rows]).square().sum()
         loss.backward()
         return float(loss.detach())

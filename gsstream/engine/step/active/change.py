@@ -33,6 +33,11 @@ class Change:
         """Share of changed tiles over all views."""
         return float(self.tiles.float().mean()) if self.tiles.numel() else 0.0
 
+    @property
+    def near(self) -> torch.Tensor:
+        """[V, ceil(H / 16), ceil(W / 16)] bool: tiles that changed, and those beside one that did."""
+        return torch.nn.functional.max_pool2d(self.tiles[:, None].float(), 3, 1, 1)[:, 0] > 0
+
     def pixels(self, view: int) -> torch.Tensor:
         """Return [H, W, 1]: 1.0 where a pixel of this view lies in a changed tile, else 0.0."""
         grown = self.tiles[view].repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)
@@ -44,7 +49,7 @@ class Change:
         Arguments:
             means: [N, 3] centres. A centre that projects into no view gets 0.
         """
-        near = torch.nn.functional.max_pool2d(self.tiles[:, None].float(), 3, 1, 1)[:, 0]
+        near = self.near.float()
         hits, seen = torch.zeros(len(means)), torch.zeros(len(means))
         for view in range(len(cameras)):
             pose = torch.from_numpy(cameras.viewmats[view]).float()

@@ -52,7 +52,7 @@ class Rigid(MotionPart):
         lr_final: float = Field(default=0.025, gt=0, le=10, description="last step, pixels per iteration")
         step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
         everywhere: bool = Field(
-            default=False,
+            default=True,
             description="compare in all tiles that the groups are seen in; false: in those that changed or lie beside",
         )
         least: float = Field(default=0.25, ge=0, le=10, description="motions below this many pixels are dropped")

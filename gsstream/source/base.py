@@ -94,3 +94,11 @@ class GrowingSource(FrameSource, Protocol):
 
     def interrupt(self) -> None:
         """End all waits: frames that are not there yet raise EndOfRecording from now on."""
+
+
+@runtime_checkable
+class HurriedSource(GrowingSource, Protocol):
+    """A growing recording that may ask for less work on a frame when the run has fallen behind."""
+
+    def effort(self, index: int) -> float:
+        """Return the share of the epochs that a frame is worth, now that it is to be encoded; 0: an empty packet."""

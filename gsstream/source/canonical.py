@@ -10,7 +10,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.world import World, own_world, snapped
-from gsstream.source.base import FrameSource, GrowingSource, PointKind, SourceInfo, Split
+from gsstream.source.base import FrameSource, GrowingSource, HurriedSource, PointKind, SourceInfo, Split
 
 #: Points farther from the rig than this many of its extents leave the range in which positions can be coded.
 FARTHEST = 1e12
@@ -92,6 +92,10 @@ class CanonicalSource:
         """End the waits of an inner source that grows; others never wait."""
         if isinstance(self._source, GrowingSource):
             self._source.interrupt()
+
+    def effort(self, index: int) -> float:
+        """Return what a frame of an inner source that grows is worth now; 1 of any other."""
+        return self._source.effort(index) if isinstance(self._source, HurriedSource) else 1.0
 
     def close(self) -> None:
         """Close the inner source."""

@@ -18,6 +18,7 @@ from gsstream.source.base import (
     AttributedPoints,
     FrameSource,
     GrowingSource,
+    HurriedSource,
     PointKind,
     SingleImages,
     SourceInfo,
@@ -155,6 +156,10 @@ class TransformedSource:
         """End the waits of an inner source that grows; others never wait."""
         if isinstance(self._source, GrowingSource):
             self._source.interrupt()
+
+    def effort(self, index: int) -> float:
+        """Return what a frame of an inner source that grows is worth now; 1 of any other."""
+        return self._source.effort(self._start + index) if isinstance(self._source, HurriedSource) else 1.0
 
     def close(self) -> None:
         """Close the inner source."""

@@ -9,12 +9,10 @@ from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from urllib.parse import parse_qsl
 
 import numpy as np
-from pydantic import ValidationError
 
-from gsstream.core.errors import EndOfRecording, SourceError, suggest
+from gsstream.core.errors import EndOfRecording, SourceError
 from gsstream.core.frame import Arrival, Frame, PointCloud
 from gsstream.core.shapes import FloatArray
 from gsstream.source.base import PointKind, SourceInfo, Split
@@ -26,10 +24,14 @@ from gsstream.source.watch_options import WatchOptions
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """What is delivered as one frame: ``effort``, and from which earlier frame absent cameras are held."""
+    """What is delivered as one frame: ``effort``, and from which earlier frame cameras are held.
+
+    ``skipped``: the run is behind; nobody looks at its files, and the last images of all training cameras stand in.
+    """
 
     effort: float = 1.0
     held: tuple[tuple[str, int], ...] = ()
+    skipped: bool = False
 
 
 _WHOLE = _Plan()
@@ -80,24 +82,7 @@ class WatchSource:
         folder, _, query = rest.partition("?")
         if not folder:
             raise SourceError("watch source: expected watch:DIR or watch:DIR?key=value&..., got no folder")
-        known = ", ".join(WatchOptions.model_fields)
-        try:
-            pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
-        except ValueError as error:
-            raise SourceError(f"watch source: expected key=value&key=value, got {query!r}; keys: {known}") from error
-        for key, _value in pairs:
-            if key not in WatchOptions.model_fields:
-                near = suggest(key, WatchOptions.model_fields)
-                raise SourceError(f"watch source: unknown option {key!r}{near}; all: {known}")
-        try:
-            options = WatchOptions.model_validate(dict(pairs))
-        except ValidationError as error:
-            first = error.errors()[0]
-            name = str(first["loc"][0])
-            meaning = WatchOptions.model_fields[name].description
-            given = f"option {name!r} = {first['input']!r}"
-            raise SourceError(f"watch source: {given}: {first['msg']} ({meaning})") from error
-        return cls(Path(folder), options, scale=scale)
+        return cls(Path(folder), WatchOptions.from_query(query), scale=scale)
 
     @property
     def info(self) -> SourceInfo:
@@ -115,12 +100,17 @@ class WatchSource:
         plan = self._plan(index)
         cameras = self._info.train if split == "train" else self._info.test
         held = dict(plan.held)
-        if split == "test" and any(camera_id in held for camera_id in cameras.ids):
+        if split == "test" and (plan.skipped or any(camera_id in held for camera_id in cameras.ids)):
             cameras = cameras.select([])
         images: FloatArray = np.empty((len(cameras), self._target[1], self._target[0], 3), np.float32)
         for i, camera_id in enumerate(cameras.ids):
             images[i] = self._image(camera_id, held.get(camera_id, index))
-        return Frame(index, index / self._info.fps, images, cameras, plan.effort, self._arrival(index, held))
+        arrival = self._arrival(index, () if plan.skipped else held)
+        return Frame(index, index / self._info.fps, images, cameras, plan.effort, arrival)
+
+    def effort(self, index: int) -> float:
+        """Return what a frame is worth now that its turn has come: more may wait than when it was read ahead."""
+        return 1.0 if index == 0 else min(self._plan(index).effort, self._effort(index))
 
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
         """Return points that were written beside cameras.json before the run began, or None."""
@@ -155,14 +145,18 @@ class WatchSource:
                 while self._next <= index:
                     plan = self._decide(self._next)
                     if plan != _WHOLE:
-                        self._plans[self._next] = plan
-                    self._last |= dict.fromkeys(set(self._ids) - {name for name, _ in plan.held}, self._next)
+                        before = self._plans.get(self._next - 1)
+                        self._plans[self._next] = before if before == plan else plan
+                    if not plan.skipped:
+                        self._last |= dict.fromkeys(set(self._ids) - {name for name, _ in plan.held}, self._next)
                     self._next += 1
         return self._plans.get(index, _WHOLE)
 
     def _decide(self, index: int) -> _Plan:
         if self._info.num_frames is not None and index >= self._info.num_frames:
             raise EndOfRecording(f"the recording ended after {self._info.num_frames} frames")
+        if 0 < index < self._skip_to:  # images of all training cameras came, and newer ones
+            return _Plan(0.0, tuple((name, self._last[name]) for name in self._info.train.ids), skipped=True)
         absent = self._wait(index)
         untrained = [name for name in absent if name in self._train]
         held = tuple((name, self._last[name]) for name in absent)

@@ -176,6 +176,7 @@ def test_a_run_that_falls_behind_drops_or_hurries(
     lines = metrics(tmp_path / "run")
     assert [line["iterations"] / (4 * 3) for line in lines[1:]] == effort
     assert [line["live"]["effort"] for line in lines[1:]] == effort
+    assert ["psnr" in line for line in lines] == [True, *(value > 0 for value in effort)]
     words = {0: "dropped", 0.5: "hurried", 1: None}
     assert [line["live"]["policy"] for line in lines] == [None, *(words[value] for value in effort)]
 

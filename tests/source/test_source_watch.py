@@ -86,6 +86,40 @@ def test_a_frame_says_which_training_cameras_are_absent(folder: Path, test_camer
         assert [arrival and arrival.absent for arrival in arrivals] == [(), (name,), ()]
 
 
+def test_a_frame_that_is_skipped_is_not_even_read(folder: Path, test_camera: str) -> None:
+    live = open_source(f"watch:{folder}?behind=drop&queue=2", 0.25)
+    first = live.frame(0).images
+    for camera in (live.info.train.ids[0], test_camera):
+        (folder / camera / "000005.jpg").write_bytes(b"no picture")
+    for source in (live, transformed(live, DataOptions(gain=1.0, noise_frames=1), 0)):
+        skipped = source.frame(5)
+        assert (skipped.effort, skipped.images.tobytes()) == (0, first.tobytes()), "the last pictures stand in"
+        assert skipped.arrival is not None
+        assert skipped.arrival.absent == (), "no camera is missing: the run is behind"
+        assert [len(source.frame(t, "test").cameras) for t in (0, 5, 11)] == [1, 0, 1], "nor is it measured"
+    assert live.frame(11).effort == 1
+    assert not np.array_equal(live.frame(11).images, first)
+
+
+@pytest.mark.parametrize(("policy", "worth"), [("block", [1, 1, 1]), ("drop", [1, 0, 1]), ("hurry", [1, 0.2, 1])])
+def test_a_frame_that_was_read_ahead_is_judged_again_when_its_turn_comes(
+    folder: Path, tmp_path: Path, policy: str, worth: list[float]
+) -> None:
+    later = tmp_path / "later"
+    for camera in folder.glob("cam*/"):
+        (later / camera.name).mkdir(parents=True)
+        for t in range(2, 12):
+            (camera / f"{t:06d}.jpg").rename(later / camera.name / f"{t:06d}.jpg")
+    live = open_source(f"watch:{folder}?behind={policy}&queue=2", 0.25)
+    through = transformed(live, DataOptions(gain=0.5), 0)
+    assert [through.frame(t).effort for t in (0, 1)] == [1, 1], "nothing waits yet"
+    assert live.effort(1) == 1
+    for image in later.glob("*/*.jpg"):
+        image.rename(folder / image.parent.name / image.name)
+    # Ten frames wait behind frame 1; frame 0 is always made in full.
+    assert [live.effort(0), through.effort(1), through.effort(11)] == worth
+
+
 def test_a_file_written_again_changes_no_frame_that_was_decided(folder: Path) -> None:
     live = open_source(f"watch:{folder}?missing=hold&grace=0", 0.25)
     name = live.info.train.ids[0]

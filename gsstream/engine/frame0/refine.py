@@ -48,8 +48,8 @@ def refined(parts: Assembly, state: StreamState, step: Step, frame: Frame, rng: 
     started = time.perf_counter()
     after = step.state
     before = state.refinement or begun(state.player)
-    images = frame.images if after.memory is None else after.memory.targets(frame.images)
-    found = advanced(parts, before, state.player, after.player, replace(frame, images=images), state.exposure, rng)
+    seen = frame if after.memory is None else replace(frame, images=after.memory.targets(frame.images))
+    found = advanced(parts, before, state.player, after.player, seen, state.exposure, rng)
     metrics = {**step.metrics, "refine_iterations": found.iterations - before.iterations}
     metrics["seconds"] = {**metrics["seconds"], "refine": time.perf_counter() - started}
     return replace(step, state=replace(after, refinement=found), metrics=metrics)

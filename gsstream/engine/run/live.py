@@ -81,4 +81,6 @@ def live_lines(lines: Sequence[Mapping[str, Any]]) -> list[str]:
     done = [form.format(later.count(name)) for name, form in COUNTED.items() if name in later]
     if later:
         out.append(f"of {len(later)} later frames: " + (", ".join(done) or "none was dropped, hurried or held"))
+    if "dropped" in later:
+        out.append("frames dropped by a run that was behind are not measured above; gsstream evaluate measures all")
     return out

@@ -9,7 +9,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from gsstream.metrics import EnergyMeter
 from gsstream.packet import EncodedPacket, PlayerState, StreamReader, StreamWriter
 from gsstream.packet.base import FILE_HEADER
 from gsstream.recipe.save import save_resolved
-from gsstream.source.base import FrameSource, GrowingSource, SourceInfo
+from gsstream.source.base import FrameSource, GrowingSource, HurriedSource, SourceInfo
 from gsstream.source.prefetch import Prefetcher
 
 #: A function that is called with every step of a run.
@@ -129,7 +129,7 @@ class _Run:
         ):
             self.writer = writer
             for train, test, waited in _timed(frames):
-                self._advance(train, test, waited)
+                self._advance(_as_late(train, self.source), test, waited)
                 done = train.index + 1
                 if stop.is_set():
                     break
@@ -147,7 +147,9 @@ class _Run:
         metrics["displacement_pixels"] = displacement_pixels(step.state.player, train.cameras)
         if self.left_behind is not None:
             metrics["left_behind"] = self.left_behind.after(step.state.player, train, step.status == "key")
-        if self.held_out and len(test.cameras):
+        # Who is behind does not spend time on the quality of what he drops: ``evaluate`` measures it.
+        dropped = metrics["live"] is not None and metrics["live"]["policy"] == "dropped"
+        if self.held_out and len(test.cameras) and not dropped:
             metrics |= self.held_out.measure(step.state, self.encoder.at_near(test))
             if train.index == 0:
                 doubt = self.held_out.doubt(step.state, self.encoder.at_near(train), metrics["psnr"])
@@ -210,6 +212,13 @@ def _say_what_is_lost(stream: Path, last: int) -> None:
 def _num_frames(info: SourceInfo, *wanted: int | None) -> int | None:
     """None: until a growing recording ends."""
     return min((number for number in (info.num_frames, *wanted) if number is not None), default=None)
+
+
+def _as_late(frame: Frame, source: FrameSource) -> Frame:
+    """The frame with what it is worth now: it was read ahead, and the run may have fallen behind since."""
+    if frame.arrival is None or not isinstance(source, HurriedSource):
+        return frame
+    return replace(frame, effort=min(frame.effort, source.effort(frame.index)))
 
 
 def _timed(frames: Prefetcher) -> Iterator[tuple[Frame, Frame, float]]:

@@ -59,14 +59,15 @@ def frame_step(
     """
     clock, stream = PhaseClock(), parts.recipe.stream
     parts.where.enter(frame.index)
+    if frame.effort == 0:  # its pictures count for nothing: a source that is behind has not even read them
+        return still(state, frame, clock)
     with clock.phase("change"):
         change = detect_change(state.previous, frame, stream.change_threshold)
         memory = remembered(stream, state.memory, state.previous, frame)
         state = replace(state, memory=memory)
         targets = frame.images if memory is None else memory.targets(frame.images)
-    if frame.effort == 0 or (change is not None and change.share == 0):
+    if change is not None and change.share == 0:
         return still(state, frame, clock)
-
     with clock.phase("motion"):
         motions, scene, view = moved(parts, state, frame, change, rng, targets, allowance)
     with clock.phase("confidence"):
@@ -101,8 +102,7 @@ def frame_step(
         after = follow(replace(state, previous=shown, session=session), player)
     metrics = step_metrics(fitted.delta, after, fitted.packet, solution, len(rows))
     metrics |= {"changed_tiles": 1.0 if change is None else change.share, "seconds": clock.seconds}
-    step = Step(after, fitted.packet, "empty" if unchanged else "delta", metrics)
-    return Outcome(step, solution.pace, fitted)
+    return Outcome(Step(after, fitted.packet, "empty" if unchanged else "delta", metrics), solution.pace, fitted)
 
 
 def _near(change: Change | None, stream: Stream) -> torch.Tensor | None:

@@ -30,7 +30,7 @@ START = 0.0
 
 
 def remembered(stream: Stream, memory: StillMemory | None, previous: Frame, frame: Frame) -> StillMemory | None:
-    """Return the memory of still pixels after a frame; None where the recipe asks for none.
+    """Return the memory of still pixels after a frame; None where the recipe asks for none. Skipped frames add nothing.
 
     Arguments:
         stream: section ``stream`` of the recipe.
@@ -39,6 +39,8 @@ def remembered(stream: Stream, memory: StillMemory | None, previous: Frame, fram
     """
     if not stream.remember:
         return None
+    if frame.effort == 0:
+        return memory
     return (memory or StillMemory.start(unpacked(previous.images))).after(frame.images)
 
 

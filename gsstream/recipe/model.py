@@ -82,12 +82,6 @@ class FirstFrame(Section):
         description="at most one Gaussian per this many training pixels: more than the images can pin down describe "
         "the training cameras, not the scene; 0: max_gaussians alone bounds them",
     )  # fmt: skip
-    stop_growth: Literal["never", "left-out"] = Field(
-        default="never",
-        description="what ends growth before max_gaussians. left-out: one tile in eight of every training image is "
-        "left out while Gaussians grow and only judges; growth ends when PSNR gains next to nothing there; such a "
-        "frame 0 starts from max_points Gaussians at most (experimental: test cameras lose by it); never: nothing",
-    )  # fmt: skip
     prune_share: float = Field(
         default=0.0, ge=0, lt=1,
         description="share of the images' blending weight that may go when growth ends, with the Gaussians that every "

@@ -23,7 +23,7 @@ from gsstream.engine.assembly.guard import blaming
 from gsstream.engine.assembly.pending import refuse_pending
 from gsstream.engine.fit.exposure import Exposure
 from gsstream.engine.frame0.cheaper import cheaper_colors
-from gsstream.engine.frame0.how_many import most_seeds
+from gsstream.engine.frame0.how_many import most_gaussians
 from gsstream.engine.frame0.optimise import Progress, initial_gaussians, optimise_first_frame, sort_by_node
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.init.thinning import thin_points
@@ -66,14 +66,13 @@ def begin(
         "num_gates": len(layout.node_counts),
         "active_gates": 0,
         "iterations": found.iterations,
-        "growth_ended": found.growth_ended,
         "seconds": dict(zip(("seed", "optimise", "code"), np.diff(clock).tolist(), strict=True)),
     }
     return Step(state, packet, "key", metrics)
 
 
 def seeded(parts: Assembly, points: PointCloud, frame: Frame) -> Anchors:
-    """Return anchors, at most as many as frame 0 may start from.
+    """Return anchors, at most as many as frame 0 may have Gaussians.
 
     A structure places one or more for each point, so where there are too many it is given fewer points.
 
@@ -82,7 +81,7 @@ def seeded(parts: Assembly, points: PointCloud, frame: Frame) -> Anchors:
         points: seeds of the scene.
         frame: training images of frame 0.
     """
-    most = most_seeds(parts.recipe.first_frame, frame)
+    most = most_gaussians(parts.recipe.first_frame, frame)
     while True:
         anchors = parts.structure.seed(points, frame.cameras)
         if len(anchors.positions) <= most or len(points) == 1:

@@ -34,20 +34,6 @@ def most_gaussians(settings: FirstFrame, frame: Frame) -> int:
     return min(settings.max_gaussians, max(1, int(pixels / settings.pixels_per_gaussian)))
 
 
-def most_seeds(settings: FirstFrame, frame: Frame) -> int:
-    """Return the number of Gaussians that frame 0 may start from.
-
-    Where cameras judge growth, it begins small enough that they have something to say: a structure may place several
-    Gaussians for each point, and what is there from the beginning nobody judges.
-
-    Arguments:
-        settings: section ``first_frame`` of the recipe.
-        frame: training images of frame 0.
-    """
-    most = most_gaussians(settings, frame)
-    return most if settings.stop_growth == "never" else min(most, settings.max_points)
-
-
 def shown(renderer: Renderer, gaussians: Gaussians[torch.Tensor], cameras: Cameras) -> torch.Tensor:
     """Return [N] float32: the pixels of one view that each Gaussian fills, in the view that shows most of it.
 

@@ -27,7 +27,6 @@ from gsstream.engine.fit.judge import Judge
 from gsstream.engine.fit.nearest import neighbour_distance
 from gsstream.engine.fit.row_table import RowTable
 from gsstream.engine.frame0.how_many import most_gaussians, shown, worth_keeping
-from gsstream.engine.frame0.left_out import Growth, judged, left_out_tiles
 from gsstream.recipe.model import FirstFrame
 from gsstream.render.activations import logit, rgb_to_sh0
 from gsstream.structure.base import Anchors
@@ -38,16 +37,12 @@ Progress = Callable[[int, int, float, int], None]
 
 @dataclass(frozen=True)
 class Reconstructed:
-    """Optimised frame 0. ``levels`` [N] is aligned with the Gaussians.
-
-    ``growth_ended``: the iteration at which tiles that were left out ended growth; None: they did not.
-    """
+    """Optimised frame 0. ``levels`` [N] is aligned with the Gaussians."""
 
     gaussians: Gaussians[torch.Tensor]
     levels: torch.Tensor
     exposure: Exposure | None
     iterations: int
-    growth_ended: int | None
 
 
 def initial_gaussians(anchors: Anchors, settings: FirstFrame) -> Gaussians[torch.Tensor]:
@@ -103,7 +98,6 @@ def optimise_first_frame(
     # The name of this random stream is that of older versions, so that a seed still gives the same frame 0.
     run = FirstFrameRun(start, levels, frame, parts, rng.stream("root", frame.index), iterations)
     run.exposure = ExposureFit.start(len(frame.cameras)) if settings.exposure else None
-    run.left_out = left_out_tiles(settings, frame, rng)
     for iteration in range(1, run.iterations + 1):
         value = run.step(iteration)
         progress(iteration, run.iterations, value, len(run.levels))
@@ -113,7 +107,7 @@ def optimise_first_frame(
     look = Look(parts.checks, "first frame", run.table, parts.where)
     for name, values in found.items():
         look.values(f"{name} after the last iteration ({VARIABLE}=step finds the first)", values)
-    return Reconstructed(found, run.levels, exposure, run.iterations, run.growth_ended)
+    return Reconstructed(found, run.levels, exposure, run.iterations)
 
 
 class FirstFrameRun:
@@ -144,10 +138,6 @@ class FirstFrameRun:
         #: Colour maps that are fitted along; None: those of the judge stay.
         self.exposure: ExposureFit | None = None
         self.statistics = DensifyStatistics.zeros(len(start))
-        #: Tiles that judge growth and are not fitted until it ends; None: nothing judges it.
-        self.left_out: torch.Tensor | None = None
-        self.growth = Growth()
-        self.growth_ended: int | None = None
         #: [N] row of ``start`` that each Gaussian comes from.
         self.came_from = torch.arange(len(start))
         self.order: list[int] = []
@@ -172,12 +162,9 @@ class FirstFrameRun:
             size = torch.tensor([self.frame.cameras.width / 2, self.frame.cameras.height / 2])
             self.statistics = self.statistics.add(probe.grad * size)
             if iteration >= s.densify_from and iteration % s.densify_every == 0:
-                self._judge_growth(iteration)
                 self._densify()
-        if iteration == int(last):
-            self.left_out = None
-            if s.prune_share > 0:
-                self._prune()
+        if s.prune_share > 0 and iteration == int(last):
+            self._prune()
         self.smooth = value if math.isnan(self.smooth) else 0.98 * self.smooth + 0.02 * value
         return self.smooth
 
@@ -192,8 +179,7 @@ class FirstFrameRun:
         """Loss, its gradient into the leaves, and the exposure step."""
         if self.exposure:
             self.judge.exposure = self.exposure.exposure
-        fitted = None if self.left_out is None else (~self.left_out[view]).float()
-        value, gradient = self.judge.backward(view, image, weights=fitted)
+        value, gradient = self.judge.backward(view, image)
         self._penalise()
         if self.exposure:
             self.exposure = self.exposure.step(view, image.detach(), gradient, lr=0.005, pull=1e-3)
@@ -210,22 +196,6 @@ class FirstFrameRun:
             opacities.grad.add_(p * (1 - p), alpha=schedule.OPACITY_PENALTY / count)
         if scales.grad is not None:
             scales.grad.add_(scales.detach().exp(), alpha=schedule.SCALE_PENALTY / (3 * count * self.extent))
-
-    def _judge_growth(self, iteration: int) -> None:
-        """Ask the tiles that were left out whether the births until now helped; if not, end growth, and fit them too.
-
-        A look comes just before births: those of the last round have had their iterations by then.
-        """
-        if self.left_out is None:
-            return
-        count, exposure = len(self.levels), self.judge.exposure
-        gaussians = self.gaussians().map(torch.Tensor.detach)
-        found = judged(self.renderer, gaussians, self.frame, self.left_out, self.recipe.background, exposure)
-        self.growth = self.growth.look(count, found)
-        if not self.growth.pays:
-            # From now on births replace what is pruned.
-            self.settings = self.settings.model_copy(update={"max_gaussians": count})
-            self.growth_ended, self.left_out = iteration, None
 
     def _densify(self) -> None:
         gaussians = self.gaussians().map(torch.Tensor.detach)

@@ -31,6 +31,10 @@ class FrameContext(Protocol):
         """Frame index, from 1 (frame 0 has no predecessor)."""
 
     @property
+    def effort(self) -> float:
+        """Share of the usual passes that the frame is worth, above 0 to 1: less where a run is behind its recording."""
+
+    @property
     def gaussians(self) -> Gaussians[torch.Tensor]:
         """The scene of frame t-1 as the player has it."""
 

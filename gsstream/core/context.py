@@ -31,10 +31,6 @@ class FrameContext(Protocol):
         """Frame index, from 1 (frame 0 has no predecessor)."""
 
     @property
-    def effort(self) -> float:
-        """Share of the usual passes that the frame is worth, above 0 to 1: less where a run is behind its recording."""
-
-    @property
     def gaussians(self) -> Gaussians[torch.Tensor]:
         """The scene of frame t-1 as the player has it."""
 
@@ -66,6 +62,10 @@ class FrameWork(FrameContext, Protocol):
 
     Colour maps of the cameras are applied and pulled through where they belong; a part need not know them.
     """
+
+    @property
+    def effort(self) -> float:
+        """Share of the usual passes that the frame is worth, above 0 to 1: less where a run is behind its recording."""
 
     @property
     def optimiser(self) -> Any:

@@ -64,6 +64,10 @@ class FrameWork(FrameContext, Protocol):
     """
 
     @property
+    def effort(self) -> float:
+        """Share of the usual passes that the frame is worth, above 0 to 1: less where a run is behind its recording."""
+
+    @property
     def optimiser(self) -> Any:
         """The optimiser of the run (``gsstream.api.RowOptimiser``), for rows that a part fits on its own."""
 

@@ -16,8 +16,12 @@ def pixel_size(means: FloatArray, cameras: Cameras) -> float:
     Arguments:
         means: [N, 3] centres, N > 0.
     """
-    widths = [np.linalg.norm(means - at, axis=1) / K[0, 0] for at, K in zip(cameras.centers, cameras.Ks, strict=True)]
-    return float(np.median(np.concatenate(widths)))
+    columns = np.ascontiguousarray(means.T, np.float64)
+    widths = np.empty((len(cameras), len(means)))
+    for width, at, K in zip(widths, cameras.centers, cameras.Ks, strict=True):
+        x, y, z = columns - at[:, None]
+        width[:] = np.sqrt(x * x + y * y + z * z) / K[0, 0]
+    return float(np.median(widths))
 
 
 def known_groups(scene: Scene, cameras: Cameras, pixels: float, shades: int) -> Groups:

@@ -47,7 +47,9 @@ class Rigid(MotionPart):
             default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in changed tiles"
         )
         share: float = Field(default=0.5, ge=0, le=1, description="share of a group's Gaussians that must lie there")
-        epochs: int = Field(default=2, ge=1, le=100, description="passes over the training cameras")
+        epochs: int = Field(
+            default=2, ge=1, le=100, description="passes over the training cameras; a hurried frame makes its share"
+        )
         lr: float = Field(default=0.25, gt=0, le=10, description="first step, pixels per iteration")
         lr_final: float = Field(default=0.025, gt=0, le=10, description="last step, pixels per iteration")
         step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
@@ -81,7 +83,7 @@ class Rigid(MotionPart):
     def _fitted(self, scene: Scene, work: FrameWork, start: Moves, units: Units, rng: Rng) -> FloatArray:
         """[K, 6] shift and turn of the groups that explain the images best."""
         config = self.config
-        total = config.epochs * len(work.cameras)
+        total = max(1, round(config.epochs * len(work.cameras) * work.effort))
         rates = [config.lr * (config.lr_final / config.lr) ** (step / total) for step in range(total)]
         order, near = rng.numpy("motion", work.index), not config.everywhere
         return fitted_moves(scene, work, start, units.row, rates, order, felt_most, near_change=near)

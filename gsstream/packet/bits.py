@@ -30,8 +30,15 @@ class BitWriter:
         """Return the Exp-Golomb code of a signed value, after a zigzag."""
         self.gamma(2 * value if value >= 0 else -2 * value - 1)
 
+    def digits(self, text: str) -> None:
+        """Append fields that are written out already, as text of 0 and 1."""
+        self._parts.append(text)
+
     def __len__(self) -> int:
         return sum(map(len, self._parts))
+
+    def __str__(self) -> str:
+        return "".join(self._parts)
 
     def extend(self, other: BitWriter) -> None:
         self._parts.extend(other._parts)

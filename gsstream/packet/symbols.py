@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import constriction
 import numpy as np
@@ -151,14 +152,19 @@ def _write_model(head: BitWriter, model: Model) -> None:
     head.bits(int(model.escapes), 1)
     if model.constant:
         return
-    previous = 0
-    for count in model.counts.tolist():
-        length = count.bit_length()
-        head.signed(length - previous)
-        previous = length
-        if length > 1:
-            width = min(length - 1, 2)
-            head.bits(count >> (length - 1 - width) & ((1 << width) - 1), width)
+    counts = model.counts.tolist()
+    head.digits("".join(map(_count_code, [0, *counts], counts)))
+
+
+@lru_cache(1 << 14)
+def _count_code(before: int, count: int) -> str:
+    """The bits of a rounded count after another one; few pairs are different, and every frame has them often."""
+    field, length = BitWriter(), count.bit_length()
+    field.signed(length - before.bit_length())
+    if length > 1:
+        width = min(length - 1, 2)
+        field.bits(count >> (length - 1 - width) & ((1 << width) - 1), width)
+    return str(field)
 
 
 def _read_model(head: BitReader) -> Model:

@@ -70,6 +70,10 @@ class FrameView:
         return self._frame.index
 
     @property
+    def effort(self) -> float:
+        return self._frame.effort
+
+    @property
     def gaussians(self) -> Gaussians[torch.Tensor]:
         return self._gaussians
 

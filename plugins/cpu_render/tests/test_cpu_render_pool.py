@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from typing import Any
 
@@ -35,3 +37,17 @@ def test_a_lease_that_is_collected_while_the_pool_is_at_work(monkeypatch: pytest
     worker.join(30)
     assert made, "the pool waits for itself"
     assert held == []
+
+
+def test_a_lease_that_outlives_its_module_is_dropped_without_a_word() -> None:
+    """Python takes a module's names away at its end; the finaliser of before then raised a TypeError to stderr."""
+    program = """
+import numpy as np
+from gsstream.core.cameras import Cameras
+from gsstream_cpu_render import pool
+rig = Cameras(("one",), np.eye(4)[None], np.array([[[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]]), 16, 16)
+held = pool.lease(rig, 0, (0.0, 0.0, 0.0))
+pool._lock = None
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert (ended.returncode, ended.stderr) == (0, "")

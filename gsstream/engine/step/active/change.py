@@ -49,20 +49,21 @@ class Change:
         Arguments:
             means: [N, 3] centres. A centre that projects into no view gets 0.
         """
-        near = self.near.float()
-        hits, seen = torch.zeros(len(means)), torch.zeros(len(means))
+        near, centres = self.near.float().numpy(), means.numpy()
+        hits, seen = np.zeros(len(means), np.float32), np.zeros(len(means), np.float32)
+        # In numpy, and column by column: half of the time of torch, for most of it are calls on few numbers.
         for view in range(len(cameras)):
-            pose = torch.from_numpy(cameras.viewmats[view]).float()
-            K = torch.from_numpy(cameras.Ks[view]).float()
-            x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
+            pose, K = cameras.viewmats[view].astype(np.float32), cameras.Ks[view].astype(np.float32)
+            x, y, z = np.ascontiguousarray((centres @ pose[:3, :3].T + pose[:3, 3]).T)
             inside = z > cameras.near
-            depth = torch.where(inside, z, torch.ones_like(z))
+            depth = np.where(inside, z, np.float32(1))
             u, v = K[0, 0] * x / depth + K[0, 2], K[1, 1] * y / depth + K[1, 2]
             inside &= (u >= 0) & (v >= 0) & (u < self.width) & (v < self.height)
-            row, column = (v[inside] / TILE).long(), (u[inside] / TILE).long()
-            seen += inside
-            hits[inside] += near[view, row, column]
-        return hits / seen.clamp_min(1)
+            rows = inside.nonzero()[0]
+            row, column = ((of[rows] / np.float32(TILE)).astype(np.int64) for of in (v, u))
+            seen[rows] += 1
+            hits[rows] += near[view][row, column]
+        return torch.from_numpy(hits / np.maximum(seen, 1))
 
 
 def detect_change(previous: Frame, frame: Frame, threshold: float) -> Change | None:

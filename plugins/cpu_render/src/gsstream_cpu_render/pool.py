@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import weakref
 from abc import ABC, abstractmethod
 from typing import Any, Protocol
 
@@ -56,15 +57,17 @@ class Lease:
     """
 
     def __init__(self, rasterizer: NumpyRasterizer, own: bool) -> None:
-        self.rasterizer, self._own = rasterizer, own
+        self.rasterizer = rasterizer
+        if not own:
+            # Not __del__, which may run after this module's names are gone when Python ends. Nothing needs memory then.
+            weakref.finalize(self, _give_back, rasterizer).atexit = False
 
-    def __del__(self) -> None:
-        if self._own:
-            return
-        native = self.rasterizer.release()
-        with _lock:
-            if len(_idle) < MOST_IDLE and native.isa == _native.active_isa():
-                _idle.append(native)
+
+def _give_back(rasterizer: NumpyRasterizer) -> None:
+    native = rasterizer.release()
+    with _lock:
+        if len(_idle) < MOST_IDLE and native.isa == _native.active_isa():
+            _idle.append(native)
 
 
 def lease(cameras: Rig, view: int, background: Background, own: bool = False) -> Lease:

@@ -1,6 +1,8 @@
-"""What lies near a change, and comparing only there."""
+"""Where the fit of motion looks, and how often: near a change, and in a hurried frame less."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -50,6 +52,16 @@ def test_a_pull_near_the_change_leaves_out_all_else() -> None:
     unknown, slope_unknown = pulled(case, None, True)
     assert unknown == pytest.approx(without), "where change is not looked for, all is compared"
     torch.testing.assert_close(slope_unknown, slope_without)
+
+
+@pytest.mark.parametrize(("effort", "pulls"), [(1.0, 6), (0.5, 3), (0.2, 1), (0.01, 1)])
+def test_a_hurried_frame_fits_motion_in_its_share_of_the_passes(effort: float, pulls: int) -> None:
+    case = at_work()
+    case.work._frame = replace(case.work._frame, effort=effort)
+    made, pull = [], case.work.pull
+    case.work.pull = lambda *given: made.append(given[0]) or pull(*given)  # type: ignore[method-assign,func-returns-value]
+    Rigid(Rigid.Config(epochs=2)).propose(case.scene, case.work, case.rng)
+    assert len(made) == pulls, "two passes over three cameras, or a share of them"
 
 
 def test_motions_look_everywhere_unless_told_to_look_near_the_change() -> None:

@@ -44,8 +44,7 @@ class BitWriter:
         self._parts.extend(other._parts)
 
     def to_bytes(self) -> bytes:
-        text = "".join(self._parts).encode()
-        return np.packbits(np.frombuffer(text, np.uint8) - ord("0")).tobytes()
+        return np.packbits(np.frombuffer(str(self).encode(), np.uint8) - ord("0")).tobytes()
 
 
 class BitReader:

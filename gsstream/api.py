@@ -29,6 +29,7 @@ from gsstream.core.changes import groups_for as groups_for
 from gsstream.core.changes import in_nodes as in_nodes
 from gsstream.core.changes import own_nodes as own_nodes
 from gsstream.core.changes import sent_rows as sent_rows
+from gsstream.core.changes.motion import Moves as Moves
 from gsstream.core.context import FrameContext as FrameContext
 from gsstream.core.context import FrameWork as FrameWork
 from gsstream.core.context import ScreenGradient as ScreenGradient
@@ -75,6 +76,7 @@ from gsstream.motion.base import MotionPart as MotionPart
 from gsstream.optimiser.base import ADAM_BETAS as ADAM_BETAS
 from gsstream.optimiser.base import ADAM_EPS as ADAM_EPS
 from gsstream.optimiser.base import AdamState as AdamState
+from gsstream.optimiser.base import ResidualPass as ResidualPass
 from gsstream.optimiser.base import ResidualTable as ResidualTable
 from gsstream.optimiser.base import RowOptimiser as RowOptimiser
 from gsstream.packet import EncodedPacket as EncodedPacket

@@ -10,7 +10,9 @@ if TYPE_CHECKING:
     import torch
 
     from gsstream.core.cameras import Cameras
+    from gsstream.core.changes.motion import Moves
     from gsstream.core.gaussians import Gaussians
+    from gsstream.core.shapes import FloatArray
 
 
 class ScreenGradient(NamedTuple):
@@ -104,6 +106,20 @@ class FrameWork(FrameContext, Protocol):
 
         Returns:
             (1 - w) L1 + w (1 - SSIM), on the tiles that the rows can change.
+        """
+
+    def pull_moved(
+        self, view: int, rows: Gaussians[FloatArray], moves: Moves, near_change: bool = False
+    ) -> FloatArray | None:
+        """Return the gradient [K, 6] of a loss by shift and turn of groups, if the renderer has a call for it.
+
+        None where it has none; ``gsstream.blocks.slope_of`` asks this first and gives the gradient in any case.
+
+        Arguments:
+            view: index of a training camera.
+            rows: the A rows of :meth:`narrow` before they move.
+            moves: of these rows, which it counts from 0 to A - 1.
+            near_change: as for :meth:`pull`.
         """
 
     def shown(self, gaussians: Gaussians[torch.Tensor], view: int) -> torch.Tensor:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import final
 
 import torch
 
-from gsstream.gate.base import GateSampler
+from gsstream.gate.base import GateSampler, RoundedSigmoid
+
+#: Logits that a sigmoid of float32 takes for infinity.
+FAR = 100.0
 
 
 @final
@@ -33,3 +37,7 @@ class AlwaysOpen(GateSampler):
 
     def bound(self, logits: torch.Tensor) -> torch.Tensor:
         return logits
+
+    def law(self) -> RoundedSigmoid:
+        """Return a sigmoid so far up that it is 1 for every logit."""
+        return RoundedSigmoid(temperature=1.0, levels=1, margin=-FAR, bound=math.inf, shift=FAR)

@@ -31,20 +31,22 @@ class RoundedSigmoid:
     """A gate without noise whose formulas are known: a sigmoid rounded to levels, straight-through.
 
     Arguments:
-        temperature: the soft gate is sigmoid(logit / temperature).
+        temperature: the soft gate is sigmoid(logit / temperature + shift).
         levels: non-zero values that it is rounded to; its gradient is that of the soft gate.
         margin: logit at which a gate is open with probability one half; the probability is sigmoid(logit - margin).
-        bound: logits are kept within -bound to bound.
+        bound: logits are kept within -bound to bound; infinity: they are not.
+        shift: 100 makes a gate that is always open, whatever its logit, and has no slope.
     """
 
     temperature: float
     levels: int
     margin: float
     bound: float
+    shift: float = 0.0
 
     def gates(self, logits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the gates [M] of logits [M], and their derivatives."""
-        x = logits / self.temperature
+        x = logits / self.temperature + self.shift
         soft = torch.sigmoid(x)
         # Divided by a tensor, as the decoder divides: a product with 1 / levels would be another number.
         levels = soft.new_tensor(float(self.levels))

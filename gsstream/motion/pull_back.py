@@ -23,6 +23,9 @@ def slope_of(
         moves: of the rows of ``base``: its ``rows`` count from 0 to A - 1.
         near_change: as for ``work.pull``.
     """
+    slope = work.pull_moved(view, base, moves, near_change)
+    if slope is not None:
+        return slope
     leaves = transformed(base, moves).map(lambda value: torch.from_numpy(value).requires_grad_())
     work.pull(view, leaves, near_change)
     return _pulled_back(leaves, moves)

@@ -15,7 +15,7 @@ from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.motion.base import MotionPart
 from gsstream.motion.fitting import felt_most, fitted_moves
-from gsstream.motion.groups import changed_groups, known_groups, pixel_size
+from gsstream.motion.groups import changed_groups, known_groups
 
 
 class Units(NamedTuple):
@@ -67,7 +67,10 @@ class Rigid(MotionPart):
         able = changed_groups(groups, work, config.votes, config.share)
         if not able.any():
             return ()
-        units = _units(scene, work, groups.cell)
+        # The scene changes little between key packets, so a pixel is measured once, when its groups are formed.
+        pixel = groups.cell / config.pixels
+        # Half a cell from the centre, an angle a moves a point by a * cell / 2 = tan(a / 2) * cell.
+        units = Units(pixel, pixel / groups.cell)
         start = moves_of(scene, groups, able.astype(np.uint8), predicted=True)
         found = self._fitted(scene, work, start, units, rng)
         steps = np.float32(config.step * units.shift), np.float32(config.step * units.turn)
@@ -87,9 +90,3 @@ class Rigid(MotionPart):
         rates = [config.lr * (config.lr_final / config.lr) ** (step / total) for step in range(total)]
         order, near = rng.numpy("motion", work.index), not config.everywhere
         return fitted_moves(scene, work, start, units.row, rates, order, felt_most, near_change=near)
-
-
-def _units(scene: Scene, work: FrameWork, cell: float) -> Units:
-    pixel = pixel_size(scene.gaussians.means, work.cameras)
-    # Half a cell from the centre, an angle a moves a point by a * cell / 2 = tan(a / 2) * cell.
-    return Units(pixel, pixel / cell)

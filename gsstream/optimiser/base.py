@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -80,6 +81,42 @@ class RowOptimiser(Part):
         return None
 
 
+@dataclass(frozen=True)
+class ResidualPass:
+    """Some iterations of a frame's residual, in the order in which they are made: what one call may do for all of them.
+
+    Every iteration samples the gates, and calls ``rows``, the session's ``pull``, ``pull`` and ``step`` of the table,
+    and between the last two moves the logits by what images and price say.
+
+    Arguments:
+        session: ``gsstream.api.RenderSession``, narrowed to the A rows of the table; without a guard.
+        views: of each iteration, the index of its training camera.
+        comparisons: of each, what its render is compared with (``gsstream.api.Comparison``).
+        waiting: of each, [A] bool, rows that take no part yet; None: all do.
+        lr_factors: of each, a factor on the learning rates of latents and decoders.
+        law: formulas of the gates (``gsstream.api.RoundedSigmoid``).
+        price: formula of the penalty (``gsstream.api.GatePrice``).
+        logits: [M] float32 of the gates; changed in place. state: their Adam moments, too. gate_lr: their rate.
+        node_of: [A] int64 gate of each row.
+        num_gaussians: N, the divisor of a mean price.
+        rate_weight: loss per bit of latents behind open gates.
+    """
+
+    session: Any
+    views: Sequence[int]
+    comparisons: Sequence[Any]
+    waiting: Sequence[torch.Tensor | None]
+    lr_factors: Sequence[float]
+    law: Any
+    price: Any
+    logits: torch.Tensor
+    state: AdamState
+    gate_lr: float
+    node_of: torch.Tensor
+    num_gaussians: int
+    rate_weight: float
+
+
 class ResidualTable(ABC):
     """The residual of A rows in one frame's optimisation: latents behind linear decoders, gated, trained by Adam.
 
@@ -125,6 +162,18 @@ class ResidualTable(ABC):
 
         Raises ShapeError where a gradient is not finite.
         """
+
+    def run(self, work: ResidualPass) -> list[float]:
+        """Make iterations in one call; return the losses of those that were made, from the first on.
+
+        The others are left to whoever asks, who makes them by the calls above. A table that finds a fault (a value that
+        is not finite) stops before that iteration, so that the calls above raise the error that says where it is.
+        By default it makes none.
+
+        Arguments:
+            work: the iterations.
+        """
+        return []
 
     @abstractmethod
     def keep(self, rows: torch.Tensor) -> None:

@@ -13,10 +13,12 @@ from dataclasses import replace
 import torch
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.changes.motion import Moves
 from gsstream.core.context import ScreenGradient
 from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.part import Part
+from gsstream.core.shapes import FloatArray
 from gsstream.render.output import TILE as TILE
 from gsstream.render.output import Comparison as Comparison
 from gsstream.render.output import Pulled as Pulled
@@ -102,6 +104,25 @@ class RenderSession(ABC):
 
         Raises:
             ShapeError: rows that cannot be rendered, or a loss that is not finite.
+        """
+        return None
+
+    def pull_moved(
+        self, view: int, rows: Gaussians[FloatArray], moves: Moves, comparison: Comparison
+    ) -> tuple[float, FloatArray] | None:
+        """Render rows after their groups moved, compare, and pull the loss back to the groups, in one call.
+
+        None where there is no such short cut, or it finds a fault: whoever asks then makes the calls that it stands for
+        (``gsstream.blocks.slope_of``), which raise the error. Results are theirs up to rounding.
+
+        Arguments:
+            view: index of a camera of the rig.
+            rows: the A active rows before they move, raw parameters.
+            moves: of these rows, which it counts from 0 to A - 1.
+            comparison: what the render is compared with.
+
+        Returns:
+            The loss, and its gradient [K, 6] by the groups' shift and turn.
         """
         return None
 

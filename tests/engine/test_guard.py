@@ -68,7 +68,7 @@ FUNCTIONS: dict[tuple[str, str], tuple[bool, bool]] = {
 class Failing:
     """A part that raises in one of its functions in one frame, and otherwise does what the sound one does.
 
-    It states no formulas: a part that does is not called in the inner loop.
+    It states no formulas and has no table of its own: a part that does is not called in the inner loop.
     """
 
     def __init__(self, part: Any, function: str, where: Where, frame: int = BAD) -> None:
@@ -76,8 +76,8 @@ class Failing:
 
     def __getattr__(self, name: str) -> Any:
         value = getattr(self.part, name)
-        if name in ("law", "price"):
-            return lambda: None
+        if name in ("law", "price", "residual_table"):
+            return lambda *_: None
         if name != self.function:
             return value
         if not callable(value):

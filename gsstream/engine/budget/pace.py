@@ -102,6 +102,11 @@ class Pace:
             self.optimise = self._allowance.clock() - self._allowance.started - self.before
 
     @property
+    def is_timed(self) -> bool:
+        """Whether a clock is to be asked after every iteration."""
+        return self._timed is not None
+
+    @property
     def typical_weight(self) -> float:
         """Geometric mean over the last half of the passes: what the bytes of the frame answer to."""
         last = self._weights[len(self._weights) // 2 :] or [self.rate_weight]

@@ -30,7 +30,7 @@ class Judge:
         self, loss: Loss, dssim: float, images: FloatArray, exposure: Exposure | None, in_one_go: bool = False
     ) -> None:
         self._loss, self._dssim, self._images, self.exposure = loss, dssim, images, exposure
-        self._in_one_go = in_one_go
+        self.in_one_go = in_one_go
         self._targets: dict[int, Any] = {}
 
     def pull(
@@ -44,11 +44,8 @@ class Judge:
             rows: the active rows of the session; a graph of theirs is left alone.
             tiles: [ceil(H / 16), ceil(W / 16)] float32 factors on the gradients of tiles, 0: left out; None: all count.
         """
-        if self._in_one_go:
-            exposure = self.exposure
-            matrix, offset = (exposure.matrix[view], exposure.offset[view]) if exposure else (None, None)
-            comparison = Comparison(plain(self._loss), self._target(view), self._dssim, matrix, offset, tiles)
-            pulled = session.pull(view, rows, comparison)
+        if self.in_one_go:
+            pulled = session.pull(view, rows, self.comparison(view, tiles))
             if pulled is not None:
                 return pulled
         leaves = rows.map(lambda value: value.detach().requires_grad_())
@@ -59,6 +56,17 @@ class Judge:
             touched = counted if touched is None else counted & touched
         loss, _ = self.backward(view, output.image, touched, tiles)
         return Pulled(loss, leaves.map(_gradient))
+
+    def comparison(self, view: int, tiles: torch.Tensor | None = None) -> Comparison:
+        """Return what renders of a view are compared with.
+
+        Arguments:
+            view: index of a training camera.
+            tiles: as for :meth:`pull`.
+        """
+        exposure = self.exposure
+        matrix, offset = (exposure.matrix[view], exposure.offset[view]) if exposure else (None, None)
+        return Comparison(plain(self._loss), self._target(view), self._dssim, matrix, offset, tiles)
 
     def backward(
         self, view: int, image: torch.Tensor, tiles: torch.Tensor | None = None, weights: torch.Tensor | None = None

@@ -64,6 +64,10 @@ class RowTable:
             state.exp_avg[edit.fresh] = 0
             state.exp_avg_sq[edit.fresh] = 0
 
+    def state(self, name: str) -> AdamState:
+        """Return the Adam state of one leaf, which whoever moves the leaf changes in place."""
+        return self._states[name]
+
     def moments(self, name: str) -> dict[str, torch.Tensor]:
         """Return the Adam state of one leaf, row by row."""
         state = self._states[name]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.changes.motion import Moves
 from gsstream.core.context import ScreenGradient
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
@@ -140,9 +141,24 @@ class FrameView:
     def narrow(self, rows: torch.Tensor) -> None:
         self._session = self.session_for(rows)
 
+    def pull_moved(
+        self, view: int, rows: Gaussians[FloatArray], moves: Moves, near_change: bool = False
+    ) -> FloatArray | None:
+        if not self.judge.in_one_go:
+            return None
+        pulled = self.session.pull_moved(view, rows, moves, self.judge.comparison(view, self._tiles(view, near_change)))
+        if pulled is None:
+            return None
+        self._parts.where.count()
+        return pulled[1]
+
+    def _tiles(self, view: int, near_change: bool) -> torch.Tensor | None:
+        """Factors on the gradients of tiles; None: all count."""
+        return self._change.near[view].float() if near_change and self._change is not None else None
+
     def pull(self, view: int, rows: Gaussians[torch.Tensor], near_change: bool = False) -> float:
         self._parts.where.count()
-        tiles = self._change.near[view].float() if near_change and self._change is not None else None
+        tiles = self._tiles(view, near_change)
         loss, gradients = self.judge.pull(self.session, view, rows, tiles)
         pairs = [(value, gradient) for (_, value), (_, gradient) in zip(rows.items(), gradients.items(), strict=True)]
         if learned := [(value, gradient) for value, gradient in pairs if value.requires_grad]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 
@@ -10,7 +10,7 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import Checks
-from gsstream.engine.assembly.guard import blaming
+from gsstream.engine.assembly.guard import blaming, plain
 from gsstream.engine.budget.pace import Pace, estimated_bytes
 from gsstream.engine.fit.backward import pull_back
 from gsstream.engine.fit.residual_table import JointTable, lr_factor
@@ -21,7 +21,7 @@ from gsstream.engine.step.levels import current_level, level_schedule
 from gsstream.engine.step.problem import Problem, Solution
 from gsstream.engine.step.quiet_tiles import QuietTiles
 from gsstream.gate.base import RoundedSigmoid
-from gsstream.optimiser.base import ResidualTable
+from gsstream.optimiser.base import ResidualPass, ResidualTable
 from gsstream.regularizer.base import GatePrice
 from gsstream.residual.base import coarser, init_latents
 from gsstream.residual.joint import JointCode, joint_code
@@ -51,11 +51,12 @@ def optimise(parts: Assembly, problem: Problem, generator: torch.Generator) -> S
     while epoch < pace.epochs:
         losses: list[float] = []
         # Reversed, because older versions took views from the end of the list: so equal seeds still give equal bytes.
-        for place, view in enumerate(reversed(torch.randperm(views, generator=generator).tolist())):
-            iteration = epoch * views + place
-            losses.append(run.step(view, iteration, iteration / (pace.epochs * views)))
+        order = torch.randperm(views, generator=generator).tolist()[::-1]
+        at_a_time = 1 if pace.is_timed else views
+        for begin in range(0, views, at_a_time):
+            losses += run.iterate(order[begin : begin + at_a_time], epoch * views + begin)
             if pace.is_over():
-                return run.solution(sum(losses) / len(losses), iteration + 1)
+                return run.solution(sum(losses) / len(losses), epoch * views + len(losses))
         epoch += 1
         loss = sum(losses) / views
         pace.end_epoch(epoch)
@@ -96,10 +97,51 @@ class _FrameRun:
         self.law: RoundedSigmoid | None = parts.gate.law() if known else None
         self.price: GatePrice | None = parts.regularizer.price() if known else None
 
-    def step(self, view: int, iteration: int, fraction: float) -> float:
-        """Make one iteration on one view; return the photometric loss."""
+    def iterate(self, order: Sequence[int], first: int) -> list[float]:
+        """Make one iteration on each of these views, the first with this number; return the photometric losses.
+
+        Where the parts have a short cut for all of them it is taken; what it leaves is made here, one by one.
+        """
+        self.parts.where.iteration = first
+        weights = [self.tiles.weights(view) for view in order]
+        losses = self._in_one_go(order, first, weights)
+        left = range(len(losses), len(order))
+        return losses + [self.step(order[place], first + place, weights[place]) for place in left]
+
+    def _in_one_go(self, order: Sequence[int], first: int, weights: Sequence[torch.Tensor | None]) -> list[float]:
+        """Losses of the iterations that the table makes in one call; empty where it makes none."""
+        judge = self.problem.judge
+        if self.law is None or self.price is None or not judge.in_one_go:
+            return []
+        numbers = range(first, first + len(order))
+        with blaming("optimiser", self.parts.part("optimiser"), self.parts.where):
+            return self.table.run(ResidualPass(
+                session=plain(self.problem.session),
+                views=order,
+                comparisons=list(map(judge.comparison, order, weights)),
+                waiting=[self._waiting(self._fraction(number)) for number in numbers],
+                lr_factors=[self._lr_factor(number) for number in numbers],
+                law=self.law,
+                price=self.price,
+                logits=self.gate["logits"],
+                state=self.gate.state("logits"),
+                gate_lr=self.parts.recipe.gate_training.lr,
+                node_of=self.hierarchy.node_of,
+                num_gaussians=self.problem.hierarchy.num_gaussians,
+                rate_weight=self.pace.rate_weight / self.problem.pixels,
+            ))  # fmt: skip
+
+    def _fraction(self, iteration: int) -> float:
+        return iteration / (self.pace.epochs * self.problem.views)
+
+    def _lr_factor(self, iteration: int) -> float:
+        iterations = self.pace.epochs * self.problem.views
+        return lr_factor(self.parts.recipe.stream.lr_final_factor, iteration, iterations)
+
+    def step(self, view: int, iteration: int, weights: torch.Tensor | None) -> float:
+        """Make one iteration on one view, with these factors on its tiles; return the photometric loss."""
         self.parts.where.iteration = iteration
-        logits, waiting = self.gate["logits"], self._waiting(fraction)
+        logits, waiting = self.gate["logits"], self._waiting(self._fraction(iteration))
         if self.law is None or self.price is None:
             gates = self._row_gates(logits, waiting)
         else:
@@ -107,7 +149,7 @@ class _FrameRun:
         shut = gates.detach()
         with blaming("optimiser", self.parts.part("optimiser"), self.parts.where):
             rows = self.table.rows(shut)
-        loss, gradients = self.problem.judge.pull(self.problem.session, view, rows, self.tiles.weights(view))
+        loss, gradients = self.problem.judge.pull(self.problem.session, view, rows, weights)
         with blaming("optimiser", self.parts.part("optimiser"), self.parts.where):
             by_gate = self.table.pull(gradients, self.pace.rate_weight / self.problem.pixels)
         if self.law is None or self.price is None:
@@ -115,8 +157,7 @@ class _FrameRun:
         else:
             self._step_known(self.law, self.price, by_gate if waiting is None else by_gate * ~waiting)
         with blaming("optimiser", self.parts.part("optimiser"), self.parts.where):
-            iterations = self.pace.epochs * self.problem.views
-            self.table.step(lr_factor(self.parts.recipe.stream.lr_final_factor, iteration, iterations))
+            self.table.step(self._lr_factor(iteration))
         return loss
 
     def _step_gates(self, logits: torch.Tensor, gates: torch.Tensor, upstream: torch.Tensor) -> None:

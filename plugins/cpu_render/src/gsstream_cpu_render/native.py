@@ -90,6 +90,35 @@ class NativeRasterizer:
 
     # ---- one iteration of a fit
 
+    @property
+    def handle(self) -> Any:
+        """The native object, for calls that work on several rasterisers at once."""
+        return self._native
+
+    def comparison(
+        self, cached_image: Float32, target: PhotometricTarget, dssim_weight: float,
+        colours: Sequence[Float32 | None], weights: Float32 | None,
+    ) -> Any:  # fmt: skip
+        """What renders of the active rows are compared with, as the one handle that the kernels take.
+
+        Arguments:
+            cached_image: [H, W, 3] the cached render.
+            target: what the picture is compared with. dssim_weight: w in [0, 1].
+            colours: [3, 3] and [3], the map from colours of the scene to those of the target; or twice None.
+            weights: [ceil(H / 16), ceil(W / 16)] factors on the gradients of tiles, 0: left out; None: all count once.
+
+        Raises:
+            InputError: arrays of another shape.
+        """
+        images = [require_float32("cached_image", cached_image, (self.height, self.width, 3)), target.image,
+                  target.mean, target.variance]  # fmt: skip
+        scale = 1.0 / target.image.size
+        scales = (1.0 - dssim_weight) * scale, -dssim_weight * scale
+        try:
+            return _native.Comparison(self._view.background, *images, *colours, *scales, weights)
+        except ValueError as error:
+            refuse_value(str(error))
+
     def pull_active(
         self, rows: SplatArrays, cached_image: Float32, target: PhotometricTarget, dssim_weight: float,
         colours: Sequence[Float32 | None], weights: Float32 | None, out: SplatArrays,
@@ -102,10 +131,7 @@ class NativeRasterizer:
 
         Arguments:
             rows: raw parameters of the A active Gaussians, in the order of active_ids.
-            cached_image: [H, W, 3] the cached render.
-            target: what the picture is compared with. dssim_weight: w in [0, 1].
-            colours: [3, 3] and [3], the map from colours of the scene to those of the target; or twice None.
-            weights: [ceil(H / 16), ceil(W / 16)] factors on the gradients of tiles, 0: left out; None: all count once.
+            cached_image, target, dssim_weight, colours, weights: as for ``comparison``.
             out: like ``rows``; the gradient is written here.
 
         Returns:
@@ -116,14 +142,10 @@ class NativeRasterizer:
         """
         self._expect("forward_active")
         rows = require_splats(rows, self._native.active_count)
-        shape = (self.height, self.width, 3)
-        images = [require_float32("cached_image", cached_image, shape), target.image, target.mean, target.variance]
+        comparison = self.comparison(cached_image, target, dssim_weight, colours, weights)
         scale = 1.0 / target.image.size
-        scales = (1.0 - dssim_weight) * scale, -dssim_weight * scale
         try:
-            result = self._native.pull_active(
-                native_scene(rows), self._view.background, *images, *colours, *scales, weights, *out
-            )
+            result = self._native.pull_active(native_scene(rows), comparison, *out)
         except ValueError as error:
             refuse_value(str(error))
         faults, l1, dssim = result

@@ -7,10 +7,22 @@ from typing import final
 
 import torch
 
-from gsstream.api import AdamState, Gaussians, JointCode, ResidualTable
+from gsstream.api import (
+    ADAM_BETAS,
+    ADAM_EPS,
+    ATTRIBUTES,
+    AdamState,
+    Gaussians,
+    JointCode,
+    ResidualPass,
+    ResidualTable,
+)
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.adam_step import step_table
+from gsstream_cpu_render.autograd import splats_of
 from gsstream_cpu_render.checks import refuse
+from gsstream_cpu_render.native import native_scene
+from gsstream_cpu_render.session import CpuSession
 
 
 @final
@@ -83,12 +95,46 @@ class CpuResidualTable(ResidualTable):
         step_table("latents", self._latents.detach(), latents, self._states["latents"], lrs)
         step_table("matrix", self._matrix, matrix, self._states["matrix"], decoder_lrs)
 
+    def run(self, work: ResidualPass) -> list[float]:
+        session = work.session
+        # Kernels that were built before this call existed do without it, until the plugin is installed again.
+        if not isinstance(session, CpuSession) or not hasattr(self._native, "run"):
+            return []
+        ready = session.in_one_go(work.views, work.comparisons)
+        if ready is None:
+            return []
+        waiting = [None if rows is None else rows.numpy() for rows in work.waiting]
+        views = [(*pair, *rest) for pair, rest in zip(ready, zip(waiting, work.lr_factors, strict=True), strict=True)]
+        law, price, code = work.law, work.price, self._code
+        divisor = max(work.num_gaussians, 1) if price.mean else 1
+        rule = [law.temperature, law.shift, law.levels, law.margin, law.bound, price.gate, price.motion, divisor]
+        position = code.latent["means"].start if "means" in code.latent else -1
+        tables = [
+            _table(values, state)
+            for values, state in ((work.logits, work.state), (self._latents, self._states["latents"]),
+                                  (self._matrix, self._states["matrix"]))
+        ]  # fmt: skip
+        rates = work.gate_lr, code.lrs.numpy(), code.decoder_lrs[:, 0].contiguous().numpy()
+        losses: list[float] = self._native.run(
+            views, native_scene(splats_of(self._base)), [ATTRIBUTES.index(name) for name in code.feature],
+            self._units.numpy(), code.steps.numpy(), work.node_of.numpy(), [float(number) for number in rule],
+            work.rate_weight, position, *tables, *rates, (*ADAM_BETAS, ADAM_EPS),
+        )  # fmt: skip
+        return losses
+
     def keep(self, rows: torch.Tensor) -> None:
         self._base, self._units = self._base.rows(rows), self._units[rows]
         self._latents = self._latents.detach()[rows].requires_grad_()
         state = self._states["latents"]
         self._states["latents"] = AdamState(state.exp_avg[rows], state.exp_avg_sq[rows], state.steps[rows])
         self._pulled = None
+
+
+def _table(values: torch.Tensor, state: AdamState) -> tuple[object, ...]:
+    """A table of values [n, ...] and the state of Adam, as the kernels take them."""
+    rows = len(values)
+    parts = [part.detach().numpy().reshape(rows, -1) for part in (values, state.exp_avg, state.exp_avg_sq)]
+    return (*parts, state.steps.numpy())
 
 
 def _blocks(code: JointCode) -> list[tuple[int, int, int, int, bool, bool]]:

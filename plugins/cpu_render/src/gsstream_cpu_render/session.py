@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, final
 
@@ -14,6 +15,7 @@ from gsstream.api import (
     Comparison,
     Gaussians,
     InputError,
+    Moves,
     Pulled,
     RenderCache,
     RenderOutput,
@@ -27,6 +29,7 @@ from gsstream_cpu_render.autograd import differentiable, splats_of
 from gsstream_cpu_render.checks import Float32, as_array
 from gsstream_cpu_render.loss import PhotometricTarget
 from gsstream_cpu_render.loss_part import CpuLoss
+from gsstream_cpu_render.moved import moved_slope
 from gsstream_cpu_render.pool import Lease, Passes, lease
 from gsstream_cpu_render.view import Background
 
@@ -102,12 +105,37 @@ class CpuSession(RenderSession):
     def pull(self, view: int, rows: Gaussians[torch.Tensor], comparison: Comparison) -> Pulled | None:
         # In a wide session nothing stands still that could be left out; rows in another order are rare.
         # Kernels that were built before this call existed do without it, until the plugin is installed again.
-        known = type(comparison.loss) is CpuLoss and hasattr(_native.Rasterizer, "pull_active")
+        known = type(comparison.loss) is CpuLoss and hasattr(_native, "Comparison")
         if self._ids is None or self._order is not None or not known:
             return None
         cached = self._view(view)  # its owner while the native call runs
         cached.freeze(self._ids, None)
         return cached.pull(rows, comparison)
+
+    def pull_moved(
+        self, view: int, rows: Gaussians[NDArray[Any]], moves: Moves, comparison: Comparison
+    ) -> tuple[float, NDArray[Any]] | None:
+        ready = self.in_one_go([view], [comparison]) if hasattr(_native, "pull_moved") else None
+        return None if ready is None else moved_slope(*ready[0], rows, moves, comparison)
+
+    def in_one_go(self, views: Sequence[int], comparisons: Sequence[Comparison]) -> list[tuple[Any, Any]] | None:
+        """The native rasterisers of these views, frozen to the active rows, and what they are compared with.
+
+        None where iterations have to be made one by one: rows in no order, another loss, or caches that do not all fit
+        into the budget.
+
+        Arguments:
+            views: indices of cameras of the rig. comparisons: one for each.
+        """
+        known = all(type(comparison.loss) is CpuLoss for comparison in comparisons)
+        if self._ids is None or self._order is not None or not known:
+            return None
+        ready = []
+        for view, comparison in zip(views, comparisons, strict=True):
+            cached = self._view(view)
+            cached.freeze(self._ids, None)
+            ready.append((cached.rasterizer.handle, cached.comparison(comparison)))
+        return ready if all(view in self._views for view in views) else None
 
     def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
         if len(gaussians) != len(self._gaussians):
@@ -200,15 +228,20 @@ class _CachedView:
 
     def pull(self, rows: Gaussians[torch.Tensor], comparison: Comparison) -> Pulled:
         """Render the active rows, compare, differentiate."""
-        target: PhotometricTarget = comparison.target
         gradients = rows.map(lambda value: torch.empty(value.shape))
+        loss = self.rasterizer.pull_active(splats_of(rows), *self._compared(comparison), splats_of(gradients))
+        return Pulled(loss, gradients)
+
+    def comparison(self, comparison: Comparison) -> Any:
+        """What renders of this view are compared with, as the kernels take it."""
+        return self.rasterizer.comparison(*self._compared(comparison))
+
+    def _compared(self, comparison: Comparison) -> tuple[Any, PhotometricTarget, float, list[Any], Any]:
+        target: PhotometricTarget = comparison.target
         colours = [None if value is None else value.contiguous().numpy() for value in
                    (comparison.matrix, comparison.offset)]  # fmt: skip
         weights = None if comparison.tiles is None else as_array("tiles", comparison.tiles)
-        loss = self.rasterizer.pull_active(
-            splats_of(rows), self.image, target, comparison.dssim, colours, weights, splats_of(gradients)
-        )
-        return Pulled(loss, gradients)
+        return self.image, target, comparison.dssim, colours, weights
 
     def bytes(self) -> int:
         return self.rasterizer.memory_bytes() + self.image.nbytes + self.transmittance.nbytes

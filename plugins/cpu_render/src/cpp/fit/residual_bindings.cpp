@@ -1,12 +1,17 @@
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
+#include <optional>
 #include <stdexcept>
 #include <string>
 #include <tuple>
 #include <utility>
 #include <vector>
 
+#include "fit/comparison_arrays.hpp"
+#include "fit/residual_pass.hpp"
 #include "fit/residual_table.hpp"
 #include "runtime/bindings.hpp"
 
@@ -75,6 +80,8 @@ class PyResidualTable {
     table_.pull(job, matrix_out);
   }
 
+  ResidualTable& table() { return table_; }
+
  private:
   static std::vector<ResidualBlock> checked(const std::vector<Block>& blocks, std::size_t latents,
                                             std::size_t features) {
@@ -103,6 +110,94 @@ class PyResidualTable {
   ResidualTable table_;
 };
 
+using StepArray = nb::ndarray<int32_t, nb::c_contig, nb::device::cpu>;
+using NodeArray = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
+// Values [n, d], Adam's two moments of them, and the steps that each row has taken [n].
+using Trained = std::tuple<FloatArray, FloatArray, FloatArray, StepArray>;
+// A rasteriser, what its view is compared with, which rows wait, and a factor on the rates.
+using View = std::tuple<nb::object, nb::object, std::optional<ByteArray>, double>;
+
+AdamJob adam_of(const Trained& trained, const std::tuple<double, double, double>& betas_eps) {
+  const auto& [values, first, second, steps] = trained;
+  require(values.ndim() == 2 && first.size() == values.size() && second.size() == values.size() &&
+              steps.size() == values.shape(0),
+          "Adam's moments must have the shape of their table");
+  AdamJob job{};
+  job.rows = job.count = values.shape(0);
+  job.columns = values.shape(1);
+  job.param = values.data();
+  job.exp_avg = first.data();
+  job.exp_avg_sq = second.data();
+  job.step = steps.data();
+  std::tie(job.beta1, job.beta2, job.eps) = betas_eps;
+  return job;
+}
+
+// The views of a pass over `rows` rows, which their rasterisers are frozen to.
+std::vector<PassView> views_of(const std::vector<View>& views, std::size_t rows) {
+  std::vector<PassView> out;
+  for (const auto& [object, comparison, waiting, lr_factor] : views) {
+    Rasterizer& rasterizer = native_rasterizer(object);
+    rasterizer.expect("forward_active");
+    require(rasterizer.active_count() == rows, "every view must be frozen to the rows of the table");
+    require(!waiting || waiting->size() == rows, "waiting must be [A]");
+    const auto& arrays = nb::cast<const ComparisonArrays&>(comparison);
+    out.push_back({&rasterizer, arrays.view(rasterizer.width(), rasterizer.height()),
+                   waiting ? waiting->data() : nullptr, lr_factor});
+  }
+  return out;
+}
+
+std::vector<double> run(PyResidualTable& table, const std::vector<View>& views, const SceneArrays& base,
+                        std::vector<std::size_t> attributes, ConstFloatArray units, ConstFloatArray steps,
+                        NodeArray node_of, const std::vector<float>& rule, double weight, std::ptrdiff_t position,
+                        const Trained& logits, const Trained& latents, const Trained& matrix, double gate_lr,
+                        ConstFloatArray lrs, ConstFloatArray decoder_lrs,
+                        const std::tuple<double, double, double>& betas_eps) {
+  ResidualPass pass{};
+  pass.table = &table.table();
+  pass.rows = base.scene.count;
+  const GaussianArrays& rows = base.scene.arrays;
+  const float* const arrays[] = {rows.means, rows.quats, rows.scales, rows.opacities, rows.sh0, rows.shN};
+  const std::size_t degree = static_cast<std::size_t>(base.scene.sh_degree);
+  const std::size_t widths[] = {3, 4, 3, 1, 3, 3 * ((degree + 1) * (degree + 1) - 1)};
+  std::copy_n(arrays, ATTRIBUTES, pass.base);
+  std::copy_n(widths, ATTRIBUTES, pass.widths);
+  pass.sh_degree = base.scene.sh_degree;
+  const std::vector<ResidualBlock>& blocks = pass.table->blocks();
+  require(attributes.size() == blocks.size(), "one attribute for each block");
+  for (std::size_t b = 0; b < blocks.size(); b++)
+    require(attributes[b] < ATTRIBUTES && blocks[b].width == widths[attributes[b]], "blocks as wide as attributes");
+  pass.attribute = std::move(attributes);
+  pass.logits = adam_of(logits, betas_eps);
+  pass.latents = adam_of(latents, betas_eps);
+  pass.matrix = adam_of(matrix, betas_eps);
+  pass.nodes = pass.logits.rows;
+  require(pass.logits.columns == 1, "logits must be [M, 1]");
+  require(pass.latents.rows == pass.rows && pass.latents.columns == pass.table->latents(), "latents must be [A, L]");
+  require(pass.matrix.rows == pass.table->latents() && pass.matrix.columns == pass.table->features(),
+          "matrix must be [L, D]");
+  require(units.size() == pass.rows && node_of.size() == pass.rows, "units and nodes must be [A]");
+  for (std::size_t i = 0; i < pass.rows; i++)
+    require(node_of.data()[i] >= 0 && static_cast<std::size_t>(node_of.data()[i]) < pass.nodes, "a node beyond the gates");
+  for (const ConstFloatArray* array : {&steps, &lrs, &decoder_lrs})
+    require_floats(*array, pass.table->latents(), "steps and rates must be [L]");
+  require(rule.size() == 8, "a rule has eight numbers");
+  require(position >= -1 && position + 3 <= static_cast<std::ptrdiff_t>(pass.table->latents()), "a column beyond latents");
+  pass.units = units.data();
+  pass.steps = steps.data();
+  pass.node_of = node_of.data();
+  pass.rule = {rule[0], rule[1], rule[2], rule[3], rule[4], rule[5], rule[6], rule[7]};
+  pass.weight = static_cast<float>(weight);
+  pass.position = position;
+  pass.logits.lr = gate_lr;
+  pass.latents.lr_columns = lrs.data();
+  pass.matrix.lr_rows = decoder_lrs.data();
+  const std::vector<PassView> ready = views_of(views, pass.rows);
+  const nb::gil_scoped_release released;
+  return run_pass(pass, ready);
+}
+
 }  // namespace
 
 void bind_residual(nb::module_& module) {
@@ -113,7 +208,11 @@ void bind_residual(nb::module_& module) {
       .def("decode", &PyResidualTable::decode, strict("latents"), strict("matrix"), strict("steps"), strict("units"),
            strict("gates"), strict("base"), strict("out"))
       .def("pull", &PyResidualTable::pull, strict("latents"), strict("units"), strict("gates"), strict("gradients"),
-           nb::arg("weight"), strict("latent_gradient"), strict("matrix_gradient"), strict("gate_gradient"));
+           nb::arg("weight"), strict("latent_gradient"), strict("matrix_gradient"), strict("gate_gradient"))
+      .def("run", &run, nb::arg("views"), nb::arg("base"), nb::arg("attributes"), strict("units"), strict("steps"),
+           strict("node_of"), nb::arg("rule"), nb::arg("weight"), nb::arg("position"), strict("logits"),
+           strict("latents"), strict("matrix"), nb::arg("gate_lr"), strict("lrs"), strict("decoder_lrs"),
+           nb::arg("betas_eps"), "Losses of the iterations made: one for each view, or fewer before a fault.");
 }
 
 }  // namespace gsstream_cpu

@@ -10,6 +10,7 @@
 #include <tuple>
 #include <vector>
 
+#include "fit/comparison_arrays.hpp"
 #include "fit/view_pull.hpp"
 #include "runtime/bindings.hpp"
 #include "raster/rasterizer.hpp"
@@ -122,30 +123,15 @@ class PyRasterizer {
   }
 
   // (fault bits, sum of |I - G|, sum of 1 - SSIM); the gradients are written unless there is a fault.
-  std::tuple<uint32_t, double, double> pull_active(
-      const SceneArrays& rows, ConstFloatArray background, ConstFloatArray cached_image, ConstFloatArray target,
-      ConstFloatArray mean, ConstFloatArray variance, std::optional<ConstFloatArray> matrix,
-      std::optional<ConstFloatArray> offset, double l1_scale, double ssim_scale,
-      std::optional<ConstFloatArray> tile_weights, FloatArray v_means, FloatArray v_quats, FloatArray v_scales,
-      FloatArray v_opacities, FloatArray v_sh0, FloatArray v_shN) {
+  std::tuple<uint32_t, double, double> pull_active(const SceneArrays& rows, const ComparisonArrays& comparison,
+                                                   FloatArray v_means, FloatArray v_quats, FloatArray v_scales,
+                                                   FloatArray v_opacities, FloatArray v_sh0, FloatArray v_shN) {
     require(rows.scene.count == rasterizer_.active_count(), "expected one row per active id");
-    require_shape(background, {3}, "background");
-    for (const ConstFloatArray* image : {&cached_image, &target, &mean, &variance}) upstream(*image, std::nullopt);
-    require(matrix.has_value() == offset.has_value(), "colour matrix and offset come together or not at all");
-    if (matrix) require_shape(*matrix, {3, 3}, "matrix");
-    if (offset) require_shape(*offset, {3}, "offset");
-    const auto cells = [](int pixels) { return static_cast<std::size_t>((pixels + MASK_TILE - 1) / MASK_TILE); };
-    if (tile_weights)
-      require_shape(*tile_weights, {cells(rasterizer_.height()), cells(rasterizer_.width())}, "tile_weights");
+    const ViewComparison view = comparison.view(rasterizer_.width(), rasterizer_.height());
     current_ = rows;
     means2d_.require(2 * rows.scene.count);
     GradientArrays out = gradients_of(rows.scene.count, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN);
     out.means2d = means2d_.data();
-    const float* b = background.data();
-    const ViewComparison view{cached_image.data(), target.data(), mean.data(), variance.data(),
-                              matrix ? matrix->data() : nullptr, offset ? offset->data() : nullptr, {b[0], b[1], b[2]},
-                              static_cast<float>(l1_scale), static_cast<float>(ssim_scale),
-                              tile_weights ? tile_weights->data() : nullptr};
     const nb::gil_scoped_release release;
     const ViewPull pulled = pull_view(rasterizer_, rows.scene, view, out);
     return {pulled.faults, pulled.sums.l1, pulled.sums.dssim};
@@ -170,6 +156,7 @@ class PyRasterizer {
   }
 
   const Rasterizer& rasterizer() const { return rasterizer_; }
+  Rasterizer& rasterizer() { return rasterizer_; }
 
  private:
   template <class Pass>
@@ -220,6 +207,8 @@ class PyRasterizer {
 
 }  // namespace
 
+Rasterizer& native_rasterizer(nb::handle object) { return nb::cast<PyRasterizer&>(object).rasterizer(); }
+
 // Named arguments, none of which may be converted (see bindings.hpp).
 static auto strict(const char* name) { return nb::arg(name).noconvert(); }
 
@@ -235,6 +224,13 @@ void bind_rasterizer(nb::module_& module) {
       .def(nb::init<ConstFloatArray, ConstFloatArray, ConstFloatArray, ConstFloatArray, ConstFloatArray,
                     ConstFloatArray>(),
            strict("means"), strict("quats"), strict("scales"), strict("opacities"), strict("sh0"), strict("shN"));
+  nb::class_<ComparisonArrays>(module, "Comparison", "What a render of one view is compared with; not copied.")
+      .def(nb::init<ConstFloatArray, ConstFloatArray, ConstFloatArray, ConstFloatArray, ConstFloatArray,
+                    std::optional<ConstFloatArray>, std::optional<ConstFloatArray>, double, double,
+                    std::optional<ConstFloatArray>>(),
+           strict("background"), strict("cached_image"), strict("target"), strict("mean"), strict("variance"),
+           strict("matrix").none(), strict("offset").none(), nb::arg("l1_scale"), nb::arg("ssim_scale"),
+           strict("tile_weights").none());
   nb::class_<PyRasterizer>(module, "Rasterizer",
                            "Rasteriser of one camera; see gsstream_cpu_render.rasterizer for the checked interface.")
       .def(nb::init<>())
@@ -251,9 +247,7 @@ void bind_rasterizer(nb::module_& module) {
            nb::arg("touched_only"))
       .def("backward_active", &PyRasterizer::backward_active, strict("v_image"), strict("v_alpha").none(),
            GSS_GRADIENTS)
-      .def("pull_active", &PyRasterizer::pull_active, nb::arg("scene"), strict("background"), strict("cached_image"),
-           strict("target"), strict("mean"), strict("variance"), strict("matrix").none(), strict("offset").none(),
-           nb::arg("l1_scale"), nb::arg("ssim_scale"), strict("tile_weights").none(), strict("v_means"),
+      .def("pull_active", &PyRasterizer::pull_active, nb::arg("scene"), nb::arg("comparison"), strict("v_means"),
            strict("v_quats"), strict("v_scales"), strict("v_opacities"), strict("v_sh0"), strict("v_shN"))
       .def("update", &PyRasterizer::update, strict("changed"), nb::arg("scene"), strict("background"), GSS_TARGET)
       .def("backward_cached", &PyRasterizer::backward_cached, nb::arg("scene"), strict("v_image"), strict("v_means2d"))

@@ -1,0 +1,51 @@
+// What a render of one view is compared with, as it comes from Python, checked where it meets its rasteriser.
+#pragma once
+#include <optional>
+
+#include "fit/view_pull.hpp"
+#include "raster/scene_arrays.hpp"
+
+namespace gsstream_cpu {
+
+class ComparisonArrays {
+ public:
+  ComparisonArrays(ConstFloatArray background, ConstFloatArray cached_image, ConstFloatArray target,
+                   ConstFloatArray mean, ConstFloatArray variance, std::optional<ConstFloatArray> matrix,
+                   std::optional<ConstFloatArray> offset, double l1_scale, double ssim_scale,
+                   std::optional<ConstFloatArray> weights)
+      : images_{cached_image, target, mean, variance},
+        background_(background),
+        matrix_(matrix),
+        offset_(offset),
+        weights_(weights),
+        l1_scale_(static_cast<float>(l1_scale)),
+        ssim_scale_(static_cast<float>(ssim_scale)) {
+    require_shape(background_, {3}, "background");
+    require(matrix_.has_value() == offset_.has_value(), "colour matrix and offset come together or not at all");
+    if (matrix_) require_shape(*matrix_, {3, 3}, "matrix");
+    if (offset_) require_shape(*offset_, {3}, "offset");
+  }
+
+  // For a rasteriser of images of this size. Valid as long as this object.
+  ViewComparison view(int width, int height) const {
+    const std::size_t w = static_cast<std::size_t>(width), h = static_cast<std::size_t>(height);
+    const auto cells = [](std::size_t pixels) { return (pixels + MASK_TILE - 1) / MASK_TILE; };
+    for (const ConstFloatArray& image : images_) require_shape(image, {h, w, 3}, "image");
+    if (weights_) require_shape(*weights_, {cells(h), cells(w)}, "tile_weights");
+    const float* b = background_.data();
+    return {images_[0].data(), images_[1].data(), images_[2].data(), images_[3].data(),
+            matrix_ ? matrix_->data() : nullptr, offset_ ? offset_->data() : nullptr, {b[0], b[1], b[2]},
+            l1_scale_, ssim_scale_, weights_ ? weights_->data() : nullptr};
+  }
+
+ private:
+  ConstFloatArray images_[4];
+  ConstFloatArray background_;
+  std::optional<ConstFloatArray> matrix_, offset_, weights_;
+  float l1_scale_, ssim_scale_;
+};
+
+// The native objects behind those of Python.
+Rasterizer& native_rasterizer(nanobind::handle object);
+
+}  // namespace gsstream_cpu

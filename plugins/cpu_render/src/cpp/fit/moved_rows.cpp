@@ -1,0 +1,102 @@
+#include "fit/moved_rows.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "runtime/buffer.hpp"
+#include "runtime/parallel.hpp"
+
+namespace gsstream_cpu {
+namespace {
+
+constexpr std::size_t ROW_GRAIN = 1024;
+
+// Memory of one calling thread, kept between calls.
+struct Workspace {
+  Buffer<float> means, quats, gradient[6], means2d;
+};
+
+Workspace& workspace() {
+  thread_local Workspace own;
+  return own;
+}
+
+struct Turn {
+  double w, x, y, z;  // unit quaternion
+  double matrix[9];
+};
+
+Turn turn_of(const double* t) {
+  const double x = t[0], y = t[1], z = t[2], scale = 1.0 / std::sqrt(1.0 + x * x + y * y + z * z);
+  const double qw = scale, qx = x * scale, qy = y * scale, qz = z * scale;
+  return {qw, qx, qy, qz,
+          {1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy),
+           2.0 * (qx * qy + qw * qz), 1.0 - 2.0 * (qx * qx + qz * qz), 2.0 * (qy * qz - qw * qx),
+           2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), 1.0 - 2.0 * (qx * qx + qy * qy)}};
+}
+
+void move_row(const MovedRows& moved, const std::vector<Turn>& turns, std::size_t i, float* means, float* quats) {
+  const std::size_t k = static_cast<std::size_t>(moved.place[i]);
+  const Turn& t = turns[k];
+  const float *from = moved.rows.arrays.means + 3 * i, *q = moved.rows.arrays.quats + 4 * i;
+  const double *centre = moved.centre + 3 * k, *shift = moved.shift + 3 * k;
+  const double x = from[0] - centre[0], y = from[1] - centre[1], z = from[2] - centre[2];
+  for (int axis = 0; axis < 3; axis++) {
+    const double* m = t.matrix + 3 * axis;
+    means[3 * i + axis] = static_cast<float>(m[0] * x + m[1] * y + m[2] * z + centre[axis] + shift[axis]);
+  }
+  const double w = q[0], a = q[1], b = q[2], c = q[3];
+  quats[4 * i] = static_cast<float>(t.w * w - t.x * a - t.y * b - t.z * c);
+  quats[4 * i + 1] = static_cast<float>(t.w * a + t.x * w + t.y * c - t.z * b);
+  quats[4 * i + 2] = static_cast<float>(t.w * b - t.x * c + t.y * w + t.z * a);
+  quats[4 * i + 3] = static_cast<float>(t.w * c + t.x * b - t.y * a + t.z * w);
+}
+
+// Adds force and torque of one row to those of its group.
+void add_row(const MovedRows& moved, std::size_t i, const Workspace& work, double* slope) {
+  const std::size_t k = static_cast<std::size_t>(moved.place[i]);
+  const float *mean = work.means.data() + 3 * i, *q = work.quats.data() + 4 * i;
+  const float *force = work.gradient[0].data() + 3 * i, *g = work.gradient[1].data() + 4 * i;
+  double arm[3];
+  for (int axis = 0; axis < 3; axis++) arm[axis] = mean[axis] - (moved.centre[3 * k + axis] + moved.shift[3 * k + axis]);
+  const double fx = force[0], fy = force[1], fz = force[2], w = q[0], x = q[1], y = q[2], z = q[3];
+  const double a = g[0], b = g[1], c = g[2], d = g[3];
+  // A small turn v in front of a quaternion q adds (0, v) q to it.
+  const double torque[] = {2 * (arm[1] * fz - arm[2] * fy) + (-a * x + b * w - c * z + d * y),
+                           2 * (arm[2] * fx - arm[0] * fz) + (-a * y + b * z + c * w - d * x),
+                           2 * (arm[0] * fy - arm[1] * fx) + (-a * z - b * y + c * x + d * w)};
+  double* out = slope + 6 * k;
+  for (int axis = 0; axis < 3; axis++) {
+    out[axis] += force[axis];
+    out[3 + axis] += torque[axis];
+  }
+}
+
+}  // namespace
+
+ViewPull pull_moved(Rasterizer& rasterizer, const MovedRows& moved, const ViewComparison& view, double* slope) {
+  Workspace& work = workspace();
+  const std::size_t rows = moved.rows.count, degree = static_cast<std::size_t>(moved.rows.sh_degree);
+  const std::size_t widths[] = {3, 4, 3, 1, 3, 3 * ((degree + 1) * (degree + 1) - 1)};
+  float *means = work.means.require(3 * rows), *quats = work.quats.require(4 * rows), *gradients[6];
+  for (int a = 0; a < 6; a++) gradients[a] = work.gradient[a].require(rows * widths[a]);
+  std::vector<Turn> turns;
+  for (std::size_t k = 0; k < moved.groups; k++) turns.push_back(turn_of(moved.turn + 3 * k));
+  parallel_for(rows, ROW_GRAIN, [&](std::size_t begin, std::size_t end) {
+    for (std::size_t i = begin; i < end; i++) move_row(moved, turns, i, means, quats);
+  });
+  Scene scene = moved.rows;
+  scene.arrays.means = means;
+  scene.arrays.quats = quats;
+  const GradientArrays out{gradients[0], gradients[1], gradients[2], gradients[3],
+                           gradients[4], gradients[5], work.means2d.require(2 * rows)};
+  const ViewPull pulled = pull_view(rasterizer, scene, view, out);
+  rasterizer.forget();  // its arrays belong to the next call
+  if (pulled.faults) return pulled;
+  std::fill_n(slope, 6 * moved.groups, 0.0);
+  for (std::size_t i = 0; i < rows; i++) add_row(moved, i, work, slope);
+  return pulled;
+}
+
+}  // namespace gsstream_cpu

@@ -1,0 +1,23 @@
+// Rows that move in rigid groups, rendered from where they are now, and the gradient by the groups' transforms: what
+// every iteration of a fit of motions does. The arithmetic is that of gsstream.core.changes.motion.transformed and of
+// gsstream.motion.pull_back, float64 in the same order, so that the results are the same bits.
+#pragma once
+#include <cstddef>
+#include <cstdint>
+
+#include "fit/view_pull.hpp"
+
+namespace gsstream_cpu {
+
+struct MovedRows {
+  Scene rows;            // the active rows before they move
+  const int64_t* place;  // [A] group of each, below `groups`
+  std::size_t groups;
+  const double *centre, *shift, *turn;  // [K, 3]; turn: axis * tan(angle / 2)
+};
+
+// slope [K, 6]: by the groups' shift and by a small turn in front of theirs, as a turn counts there. Nothing is written
+// where there is a fault.
+ViewPull pull_moved(Rasterizer& rasterizer, const MovedRows& moved, const ViewComparison& view, double* slope);
+
+}  // namespace gsstream_cpu

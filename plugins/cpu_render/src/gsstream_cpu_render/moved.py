@@ -1,0 +1,34 @@
+"""The gradient of a view's loss by the transforms of groups of rows, in one native call."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsstream.api import Comparison, Gaussians, Moves
+from gsstream_cpu_render import _native
+from gsstream_cpu_render.arrays import SplatArrays
+from gsstream_cpu_render.native import native_scene
+
+
+def moved_slope(
+    rasterizer: Any, compared: Any, rows: Gaussians[NDArray[Any]], moves: Moves, comparison: Comparison
+) -> tuple[float, NDArray[Any]] | None:
+    """Return loss and gradient as ``gsstream.api.RenderSession.pull_moved``; None where there is a fault.
+
+    Arguments:
+        rasterizer: native, frozen to the rows.
+        compared: ``comparison`` as the kernels take it.
+        rows: [A] before they move. moves: of these rows.
+        comparison: what the render is compared with.
+    """
+    slope = np.empty((len(moves.centre), 6))
+    place = np.ascontiguousarray(moves.place, np.int64)
+    transforms = [np.ascontiguousarray(part, np.float64) for part in (moves.centre, moves.shift, moves.turn)]
+    splats = SplatArrays(*(np.ascontiguousarray(value, np.float32) for _, value in rows.items()))
+    faults, l1, dssim = _native.pull_moved(rasterizer, native_scene(splats), compared, place, *transforms, slope)
+    weight, scale = comparison.dssim, 1.0 / comparison.target.image.size
+    loss = float((1.0 - weight) * (l1 * scale) + weight * (dssim * scale))
+    return (loss, slope) if faults == 0 and np.isfinite(loss) else None

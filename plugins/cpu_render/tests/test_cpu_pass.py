@@ -1,0 +1,197 @@
+"""Iterations of a residual in one native call: what the loop of single calls finds, whatever takes part in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gsstream_cpu_render import _native
+from gsstream_cpu_render.residual import CpuResidualTable
+from gsstream_cpu_render.threads import num_threads, set_num_threads
+
+from gsstream.core.errors import ComponentError
+from gsstream.engine.assembly.assemble import Assembly, assemble
+from gsstream.engine.frame0.points import gather_points
+from gsstream.engine.run.encoder import Encoder
+from gsstream.engine.step import frame_step
+from gsstream.engine.step.optimise import optimise
+from gsstream.engine.step.problem import Problem, Solution
+from gsstream.gate.always_open import AlwaysOpen
+from gsstream.plugins.catalog import load_catalog
+from gsstream.recipe.load import resolve_recipe
+from gsstream.regularizer.base import GatePrice
+from gsstream.source.open import open_source
+
+SOURCE = "synthetic:frames=3&views=3&width=64&height=48&supersample=1"
+TINY = (
+    "first_frame.max_iterations=20", "first_frame.points=recording", "first_frame.max_points=400",
+    "first_frame.fill_points=0", "stream.epochs=2",
+)  # fmt: skip
+#: What takes part in the iterations of each, beside images, residuals, gates, their price and Adam.
+CASES = {
+    "edge: rates, rows that leave": ("s2gs-edge", ()),
+    "levels that wait": ("s2gs-paper", ("gate.noise=none", "stream.epochs=4")),
+    "position residuals that cost": ("s2gs-edge", ("regularizer.lambda2=3", "regularizer.lambda1=0.1")),
+    "a sum instead of a mean": ("s2gs-edge", ("regularizer.reduction=sum", "regularizer.lambda1=1e-4")),
+    "gates that are always open": ("dense", ()),
+    "rates that fall": ("dense", ("stream.lr_final_factor=0.1",)),
+    "tiles that are drawn": ("s2gs-edge", ("stream.quiet_tiles=0.3",)),
+    "colour maps of cameras": ("s2gs-edge", ("first_frame.exposure=true",)),
+    "residuals without decoders": ("s2gs-edge", ("update=additive",)),
+}
+
+
+def captured(method: str, settings: tuple[str, ...]) -> tuple[Assembly, Problem]:
+    """The parts and the problem of the last frame of a small run."""
+    catalog, found = load_catalog(), []
+    overrides = [("the test", text) for text in (*TINY, *settings)]
+    parts = assemble(resolve_recipe(method, catalog.recipe_path, (), overrides), catalog)
+    source = open_source(SOURCE)
+
+    def noted(parts: Assembly, problem: Problem, generator: torch.Generator) -> Solution:
+        found.append(problem)
+        return optimise(parts, problem, generator)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(frame_step, "optimise", noted)
+        encoder = Encoder(
+            parts, source.info, lambda frame: gather_points(source.points, frame, parts.recipe.first_frame, encoder.rng)
+        )
+        for index in range(3):
+            encoder.encode(source.frame(index))
+    problem = found[-1]
+    # The run has committed the session of this frame since.
+    session = parts.renderer.open(encoder.state.player.scene.gaussians.map(torch.from_numpy), None,
+                                  source.frame(2).cameras, parts.recipe.background)  # fmt: skip
+    session.narrow(problem.rows)
+    return parts, replace(problem, session=session)
+
+
+def solved(parts: Assembly, problem: Problem) -> Solution:
+    problem.session.narrow(problem.rows)
+    return optimise(parts, problem, torch.Generator().manual_seed(7))
+
+
+def one_by_one(parts: Assembly, problem: Problem) -> Solution:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(CpuResidualTable, "run", lambda table, work: [])
+        return solved(parts, problem)
+
+
+@pytest.fixture(autouse=True)
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many iterations each native call made; also in front of what is patched later."""
+    assert hasattr(_native.ResidualTable, "run"), "the kernels are older than the plugin: install it again"
+    made: list[int] = []
+    run = CpuResidualTable.run
+
+    def counted(table: CpuResidualTable, work: Any) -> list[float]:
+        losses = run(table, work)
+        made.append(len(losses))
+        return losses
+
+    monkeypatch.setattr(CpuResidualTable, "run", counted)
+    return made
+
+
+def assert_alike(one: Solution, other: Solution) -> None:
+    assert torch.equal(one.rows, other.rows)
+    assert one.iterations == other.iterations
+    assert one.loss == pytest.approx(other.loss, rel=1e-5)
+    np.testing.assert_allclose(one.logits.numpy(), other.logits.numpy(), rtol=0, atol=1e-3)
+    for name, value in other.latents.items():
+        largest = max(1e-6, float(value.abs().max()))
+        np.testing.assert_allclose(one.latents[name].numpy(), value.numpy(), rtol=0, atol=2e-3 * largest, err_msg=name)
+    for name, value in other.decoders.items():
+        np.testing.assert_allclose(one.decoders[name].numpy(), value.numpy(), rtol=0, atol=1e-4, err_msg=name)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_one_call_finds_what_single_calls_find(case: str, calls: list[int]) -> None:
+    parts, problem = captured(*CASES[case])
+    calls.clear()
+    found = solved(parts, problem)
+    assert sum(calls) == found.iterations > 0, "every iteration was made by the native call"
+    assert any(float(value.abs().max()) > 0 for value in found.latents.values())
+    expected = one_by_one(parts, problem)
+    assert_alike(found, expected)
+
+
+def test_any_number_of_threads_gives_the_same_bits() -> None:
+    parts, problem = captured(*CASES["edge: rates, rows that leave"])
+    before, found = num_threads(), []
+    for number in (1, 2, 3):
+        set_num_threads(number)
+        solution = solved(parts, problem)
+        found.append(b"".join(value.numpy().tobytes() for value in (solution.logits, *solution.latents.values())))
+    set_num_threads(before)
+    assert found[0] == found[1] == found[2]
+
+
+def test_gates_that_wait_are_not_moved_by_images() -> None:
+    """Progressive training lets finer levels wait: in the first pass nothing reaches their residuals."""
+    parts, problem = captured("s2gs-paper", ("gate.noise=none", "regularizer.lambda1=0", "regularizer.lambda2=0"))
+    levels = torch.from_numpy(problem.layout.unit_of[problem.rows.numpy()].astype(np.int64))
+    assert len(levels.unique()) > 2, "a scene of several levels"
+    recipe = parts.recipe.model_copy(update={"stream": parts.recipe.stream.model_copy(update={"epochs": 1})})
+    found = solved(replace(parts, recipe=recipe), problem)
+    expected = one_by_one(replace(parts, recipe=recipe), problem)
+    assert_alike(found, expected)
+
+
+def faulty(change: Callable[[Problem], None], calls: list[int]) -> None:
+    parts, problem = captured(*CASES["edge: rates, rows that leave"])
+    problem = replace(problem, base=problem.base.map(torch.clone))
+    change(problem)
+    calls.clear()
+    with pytest.raises(ComponentError) as native:
+        solved(parts, problem)
+    with pytest.raises(ComponentError) as loop:
+        one_by_one(parts, problem)
+    assert str(native.value) == str(loop.value)
+    assert "iteration" in str(native.value)
+    assert calls == [0], "nothing of the iteration was made"
+
+
+@pytest.mark.parametrize("name", ["means", "sh0", "opacities"])
+def test_a_value_that_is_not_finite_is_named_as_by_single_calls(name: str, calls: list[int]) -> None:
+    def spoil(problem: Problem) -> None:
+        getattr(problem.base, name)[3] = torch.nan
+
+    faulty(spoil, calls)
+
+
+def test_a_loss_that_is_not_finite_is_named_as_by_single_calls(calls: list[int]) -> None:
+    def spoil(problem: Problem) -> None:
+        problem.base.sh0[:] = 3e38
+
+    faulty(spoil, calls)
+
+
+def test_caches_that_do_not_fit_are_used_one_by_one(calls: list[int]) -> None:
+    parts, problem = captured("s2gs-edge", ("renderer.name=cpu", "renderer.cache_mb=0.05"))
+    calls.clear()
+    found = solved(parts, problem)
+    assert sum(calls) == 0
+    assert_alike(found, one_by_one(parts, problem))
+
+
+def test_a_time_budget_looks_at_its_clock_after_every_iteration(calls: list[int]) -> None:
+    captured("s2gs-edge", ("budget.time=30", "stream.epochs=1"))
+    assert calls
+    assert set(calls) == {1}
+
+
+def test_the_law_of_gates_that_are_always_open_is_one_everywhere() -> None:
+    law = AlwaysOpen().law()
+    gates, slopes = law.gates(torch.tensor([-9.0, 0.0, 9.0]))
+    probability, slope = law.probability(torch.tensor([-9.0, 0.0, 9.0]))
+    assert torch.equal(gates, torch.ones(3))
+    assert torch.equal(probability, torch.ones(3))
+    assert not slopes.any()
+    assert not slope.any()
+    assert GatePrice(0, 0).gate == 0

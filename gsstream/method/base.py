@@ -1,4 +1,4 @@
-"""StreamingMethod: the one interface to a method, three calls. What it sends is played by every player.
+"""StreamingMethod: the one interface to a method. What it sends is played by every player.
 
 A method is given a frame and what the engine can do (``Tools``), and returns a packet and the state it goes on from.
 The engine keeps the rest: recordings, recipes, the stream on disk, metrics, resume. ``engine.method.parts.PartsMethod``
@@ -97,14 +97,30 @@ class StreamingMethod(Part, Generic[State]):
         recipe says ``stream.on_error: repeat``.
 
         Arguments:
-            state: what this method returned for the frame before.
+            state: what this method returned for the frame before, its ``follow_up`` included.
             frame: training images of this frame.
             tools: what the engine can do.
         """
 
+    def follow_up(self, state: State, step: Step[State], frame: Frame, tools: Tools) -> Step[State]:
+        """Do the work of a later frame that its packet need not wait for, and return the step with the state after it.
+
+        The engine calls it once after every ``step``, when the packet has been handed out: whoever follows the stream
+        live does not wait for this work. The next frame begins after it. Packet, status and ``state.player`` stay as
+        they are; the engine compares. What it changes in the state ``resume`` makes, too. By default there is no such
+        work. A frame whose ``effort`` is 0 must not fail here either.
+
+        Arguments:
+            state: before the frame, as ``step`` was given it.
+            step: what ``step`` returned for the frame; its metrics have the numbers of the engine, too.
+            frame: training images of the frame.
+            tools: what the engine can do.
+        """
+        return step
+
     @abstractmethod
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> State:
-        """Return the state after the last packet of a stream, as ``step`` returned it there.
+        """Return the state after the last packet of a stream, as ``follow_up`` returned it there.
 
         Arguments:
             player: what every player has after that packet.

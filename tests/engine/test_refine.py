@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
@@ -12,12 +13,15 @@ import pytest
 import torch
 
 from gsstream.core.changes import Births, Delta, Layout, Rows, Scene
+from gsstream.core.errors import ComponentError
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
-from gsstream.encode import Encoder, encoder_for, open_recording
+from gsstream.encode import Encoder, Listeners, encoder_for, open_recording
 from gsstream.engine.fit.densify import DensifyStatistics
+from gsstream.engine.frame0 import refine
 from gsstream.engine.frame0.refine import carried
 from gsstream.engine.keys import keyframes
+from gsstream.engine.method.held import LeftOutWarning
 from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.state.refinement import Refinement
 from gsstream.method.base import Step
@@ -80,6 +84,86 @@ def test_a_size_that_no_key_packet_keeps_puts_it_off_and_says_so() -> None:
     assert iterations(made) == [20, 20, 20, 0, 0]
     said = [step.metrics.get("key_postponed", "") for step in made[1:]]
     assert [text.startswith("refined: ") for text in said] == [False, False, True, True, True]
+
+
+def told(monkeypatch: pytest.MonkeyPatch, efforts: tuple[float, ...]) -> list[str]:
+    """What happens in which order: packets that are handed out, and iterations of the refinement."""
+    out: list[str] = []
+    step = refine.FirstFrameRun.step
+
+    def watched(run: Any, iteration: int) -> float:
+        text = f"refined in {run.frame.index}"
+        if run.frame.index > 0 and text not in out:
+            out.append(text)
+        return step(run, iteration)
+
+    monkeypatch.setattr(refine.FirstFrameRun, "step", watched)
+    with open_recording(WORLD) as source:
+        listeners = Listeners(packet=lambda packet: out.append(f"{packet.kind.name.lower()} {packet.frame}"))
+        made = encoder_for("s2gs-edge", source, SETTINGS, listeners)
+    for frame, effort in zip(frames(), efforts, strict=True):
+        made.encode(replace(frame, effort=effort))
+    return out
+
+
+def test_iterations_follow_the_packet_but_those_that_complete_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last are needed for the key packet, which is that of their own frame."""
+    assert told(monkeypatch, (1,) * 6) == [
+        "key 0", "empty 1", "refined in 1", "empty 2", "refined in 2", "refined in 3", "key 3", "empty 4", "empty 5"
+    ]  # fmt: skip
+
+
+def test_a_skipped_frame_is_not_taken_for_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert told(monkeypatch, (1, 1, 1, 0, 0, 1)) == [
+        "key 0", "empty 1", "refined in 1", "empty 2", "refined in 2", "empty 3", "empty 4", "refined in 5", "key 5"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_no_period_of_key_packets_ends_the_refinement(every: int) -> None:
+    made = steps(**{"codec.key_every": every})
+    due = {0, *range(3, 6, every)}
+    assert [frame for frame, step in enumerate(made) if step.status == "key"] == sorted(due)
+    assert made[3].metrics["key_reason"] == "refined"
+
+
+class Broken:
+    """Stands for the loss of a refinement: frames of this world are still, and call it for nothing else."""
+
+    def prepare(self, *_: Any) -> None:
+        raise RuntimeError("out of order")
+
+    evaluate = prepare
+
+
+def test_a_refinement_that_fails_leaves_the_encoder_as_it_was() -> None:
+    made = encoder()
+    sound = made.parts
+    made.encode(frames()[0])
+    before = made.state
+    made.parts = replace(sound, loss=Broken())
+    with pytest.raises(ComponentError, match=r"failed at frame 1, .*out of order"):
+        made.encode(frames()[1])
+    assert made.state is before
+    made.parts = sound
+    sent = [made.encode(frame).packet.data for frame in frames()[1:]]
+    assert sent == [step.packet.data for step in whole()[1:]]
+
+
+def test_a_refinement_that_fails_is_left_out_and_its_iterations_are_made_later() -> None:
+    """The packet of the frame is out and sound: a warning says what is missing, and the key packet is put off."""
+    made = encoder(**{"stream.on_error": "repeat"})
+    sound, lines = made.parts, []
+    for frame in frames():
+        made.parts = replace(sound, loss=Broken()) if frame.index == 2 else sound
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            lines.append(made.encode(frame).metrics)
+        said = [str(one.message) for one in caught if one.category is LeftOutWarning]
+        assert len(said) == (frame.index == 2), said
+    assert [line["status"] for line in lines] == ["key", "empty", "empty", "empty", "key", "empty"]
+    assert [line.get("refine_iterations", 0) for line in lines] == [0, 20, 0, 20, 20, 0]
+    assert ["error" in line for line in lines] == [False, False, True, False, False, False]
 
 
 def test_without_it_nothing_is_refined() -> None:

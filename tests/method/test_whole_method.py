@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ from gsstream.core.changes import Delta, Displacement, Groups
 from gsstream.core.errors import ComponentError, RecipeError
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.fit.exposure import Exposure
-from gsstream.engine.method.held import RepeatedFrameWarning, difference_between
+from gsstream.engine.method.held import LeftOutWarning, RepeatedFrameWarning, difference_between
+from gsstream.engine.run.encoder import Encoder, Listeners
 from gsstream.method.base import StreamingMethod
 from gsstream.method.hold import Hold, HoldState
 from gsstream.method.packets import send_delta
@@ -25,6 +26,7 @@ from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe
 from gsstream.source.open import open_source
+from gsstream.testing.stepper.checks import check_method_resume
 from gsstream.testing.stepper.example import ExampleStepper
 from gsstream.testing.stepping import SOURCE, MethodUnderTest
 
@@ -206,6 +208,151 @@ def test_what_is_sent_in_place_of_a_failed_frame_must_be_empty() -> None:
     start = subject.begin(open_source(SOURCE).frame(0))
     with pytest.raises(ComponentError, match="out of ideas"):
         subject.step(start.state, open_source(SOURCE).frame(1))
+
+
+class Ponders(Hold):  # type: ignore[misc]  # wrong on purpose
+    """Holds, and then does in ``ponder`` what its packets need not wait for."""
+
+    def follow_up(self, state, step, frame, tools):
+        return self.ponder(state, step, frame)
+
+
+def pondering(ponder) -> MethodUnderTest:
+    return MethodUnderTest("dense", type("Wrong", (Ponders,), {"ponder": lambda _, *given: ponder(*given)})())
+
+
+@dataclass(frozen=True)
+class Thought:
+    """What the player has, and the frame that was thought about last."""
+
+    player: Any
+    about: int
+
+
+def test_the_packet_is_out_before_the_work_that_follows_it() -> None:
+    told: list[tuple[str, int]] = []
+
+    def ponder(state, step, frame):
+        told.append(("follow up", frame.index))
+        assert state.player.frame == frame.index - 1
+        assert step.metrics["num_gaussians"] == len(step.state.player.gaussians), "with the engine's own numbers"
+        return replace(step, state=Thought(step.state.player, frame.index), metrics={"thoughts": 1})
+
+    subject = pondering(ponder)
+    source = open_source(SOURCE)
+    listeners = Listeners(packet=lambda packet: told.append(("packet", packet.frame)))
+    encoder = Encoder(subject.parts, source.info, lambda _: source.points("recording"), listeners=listeners)
+    steps = [encoder.encode(source.frame(index)) for index in range(3)]
+    assert told == [("packet", 0), ("packet", 1), ("follow up", 1), ("packet", 2), ("follow up", 2)]
+    assert [getattr(step.state, "about", None) for step in steps] == [None, 1, 2]
+    for step in steps[1:]:
+        assert step.metrics["thoughts"] == 1
+        assert step.metrics["num_gaussians"] == len(step.state.player.gaussians)
+        assert set(step.metrics["seconds"]) == {"step", "follow_up", "other"}
+        assert step.metrics["seconds"]["follow_up"] > 0
+
+
+def test_a_method_without_such_work_has_no_seconds_of_it() -> None:
+    assert set(MethodUnderTest("dense", Hold()).steps[1].metrics["seconds"]) == {"step", "other"}
+
+
+def swap_packet(_state, step, _frame):
+    return replace(step, packet=replace(step.packet, data=step.packet.data[:-1]))
+
+
+def swap_status(_state, step, _frame):
+    return replace(step, status="delta")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (swap_packet, "packet or status"),
+        (swap_status, "packet or status"),
+        (lambda _state, step, _frame: drift(step), "means is off by up to 0.25"),
+    ],
+    ids=["packet", "status", "player"],
+)
+def test_what_has_been_handed_out_is_not_changed_afterwards(wrong, message: str) -> None:
+    subject = pondering(wrong)
+    start = subject.begin(open_source(SOURCE).frame(0))
+    with pytest.raises(ComponentError, match="its follow_up changed what has been handed out: ") as caught:
+        subject.step(start.state, open_source(SOURCE).frame(1))
+    assert message in str(caught.value)
+    assert (caught.value.slot, caught.value.part, caught.value.frame) == ("stepper", "Wrong", 1)
+
+
+def test_what_fails_after_a_packet_leaves_the_encoder_as_it_was_and_gives_the_packet_again() -> None:
+    sent, broken = [], [True]
+
+    def ponder(state, step, frame):
+        if broken:
+            broken.clear()
+            raise RuntimeError("out of ideas")
+        return step
+
+    subject, source = pondering(ponder), open_source(SOURCE)
+    listeners = Listeners(packet=sent.append)
+    encoder = Encoder(subject.parts, source.info, lambda _: source.points("recording"), listeners=listeners)
+    before = encoder.encode(source.frame(0)).state
+    with pytest.raises(ComponentError, match=r"stepper 'Wrong' .* failed at frame 1: RuntimeError: out of ideas"):
+        encoder.encode(source.frame(1))
+    assert encoder.state is before
+    encoder.encode(source.frame(1))
+    assert [packet.frame for packet in sent] == [0, 1, 1]
+    assert sent[1].data == sent[2].data
+
+
+def test_what_fails_after_a_packet_is_left_out_when_the_recipe_says_so() -> None:
+    asked: list[float] = []
+
+    def ponder(state, step, frame):
+        asked.append(frame.effort)
+        if frame.effort > 0:
+            raise RuntimeError("out of ideas")
+        return replace(step, state=Thought(step.state.player, -1))
+
+    subject, source = repeating(pondering(ponder)), open_source(SOURCE)
+    start = subject.begin(source.frame(0))
+    with pytest.warns(LeftOutWarning, match=r"frame 1: its packet is sound, but .* left out: stepper 'Wrong'"):
+        step = subject.step(start.state, source.frame(1))
+    assert asked == [1, 0]
+    assert step.state.about == -1
+    assert "out of ideas" in step.metrics["error"]
+    assert step.metrics["seconds"]["failed"] > 0
+
+
+def test_work_that_cannot_be_left_out_either_ends_the_run() -> None:
+    def ponder(state, step, frame):
+        raise RuntimeError("out of ideas")
+
+    subject = repeating(pondering(ponder))
+    start = subject.begin(open_source(SOURCE).frame(0))
+    with pytest.raises(ComponentError, match="out of ideas"):
+        subject.step(start.state, open_source(SOURCE).frame(1))
+
+
+class Tires(Follow):  # type: ignore[misc]  # wrong on purpose
+    """Follows the light for one frame; thinks about it after its packet, and rests from then on."""
+
+    def step(self, state, frame, tools):
+        return super().step(state, replace(frame, effort=0.0) if isinstance(state, Thought) else frame, tools)
+
+    def follow_up(self, state, step, frame, tools):
+        return replace(step, state=Thought(step.state.player, frame.index))
+
+
+class Remembers(Tires):
+    """The same, and knows it when it is resumed."""
+
+    def resume(self, player, shown, tools):
+        return Thought(player, player.frame)
+
+
+def test_the_contract_kit_finds_what_a_resumed_run_forgets_of_that_work() -> None:
+    check_method_resume(MethodUnderTest("dense", Remembers()))
+    with pytest.raises(AssertionError, match="resumed run: packet of frame 2 differs"):
+        check_method_resume(MethodUnderTest("dense", Tires()))
 
 
 def test_a_run_repeats_failed_frames_of_a_whole_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

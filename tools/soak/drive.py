@@ -17,7 +17,7 @@ import numpy as np
 
 from gsstream.core.errors import ComponentError, InputError, PluginUnavailable, ShapeError
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.engine.method.held import RepeatedFrameWarning
+from gsstream.engine.method.held import LeftOutWarning, RepeatedFrameWarning
 from gsstream.engine.run.recording import open_recording
 from gsstream.engine.run.session import METRICS, STREAM, run
 from gsstream.method.base import Step
@@ -91,9 +91,10 @@ def _encode_and_check(case: Case, parts: Assembly, catalog: Catalog, out: Path, 
     source = open_recording(case.source, parts.recipe, catalog)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", RepeatedFrameWarning)
+            for failed in (RepeatedFrameWarning, LeftOutWarning):
+                warnings.simplefilter("error", failed)
             run(parts, source, out, quiet=True, witness=witness)
-    except RepeatedFrameWarning as error:
+    except (RepeatedFrameWarning, LeftOutWarning) as error:
         raise ComponentError(
             str(error), slot="any", part="any", distribution="any", frame=len(digests), iteration=None
         ) from error

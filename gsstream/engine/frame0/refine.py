@@ -3,7 +3,8 @@
 The fit is that of frame 0, from the first key packet on: densification, pruning and falling rates over all of its
 iterations, some in every frame, each on the pictures of that frame. What the stream moves is moved here, too: a
 Gaussian that came of another one goes where that one goes. Nothing of it is sent before the last iteration: then a key
-packet brings the scene (``engine.keys.keyframes``).
+packet brings the scene (``engine.keys.keyframes``). So a frame's iterations follow its packet, which does not wait for
+them; those of the last frame precede it, because that packet brings what they make.
 """
 
 from __future__ import annotations
@@ -55,6 +56,20 @@ def refined(parts: Assembly, state: StreamState, step: Step, frame: Frame, rng: 
     return replace(step, state=replace(after, refinement=found), metrics=metrics)
 
 
+def follows_packet(stream: Stream, state: StreamState, frame: Frame) -> bool:
+    """Say whether what a frame gives to the refinement can be made after its packet: its last iterations cannot.
+
+    Arguments:
+        stream: section ``stream`` of the recipe.
+        state: before the frame.
+        frame: one that is skipped makes no iteration.
+    """
+    if not is_refining(stream, state):
+        return False
+    made = 0 if state.refinement is None else state.refinement.iterations
+    return made + (stream.refine_iterations if frame.effort > 0 else 0) < _iterations(stream)
+
+
 def is_refining(stream: Stream, state: StreamState) -> bool:
     """Say whether the first frame of a stream is still to be refined: only that one has a key packet like this."""
     return stream.refine_frames > 0 and SHOWN not in state.player.meta.extra
@@ -62,7 +77,12 @@ def is_refining(stream: Stream, state: StreamState) -> bool:
 
 def is_refined(stream: Stream, refinement: Refinement) -> bool:
     """Say whether all iterations are made."""
-    return refinement.iterations >= stream.refine_frames * stream.refine_iterations
+    return refinement.iterations >= _iterations(stream)
+
+
+def _iterations(stream: Stream) -> int:
+    """All iterations of the refinement."""
+    return stream.refine_frames * stream.refine_iterations
 
 
 def begun(player: PlayerState) -> Refinement:
@@ -94,8 +114,8 @@ def advanced(
     start, stream = carried(refinement, before, after), parts.recipe.stream
     if frame.effort == 0 or is_refined(stream, start):
         return start
-    total = stream.refine_frames * stream.refine_iterations
-    run = FirstFrameRun(start.gaussians, start.levels, frame, parts, rng.stream("refine", frame.index), total)
+    generator = rng.stream("refine", frame.index)
+    run = FirstFrameRun(start.gaussians, start.levels, frame, parts, generator, _iterations(stream))
     run.judge.exposure, run.statistics = exposure, start.statistics
     for name, held in start.moments.items():
         run.table.load_moments(name, held)

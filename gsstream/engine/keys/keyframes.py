@@ -58,7 +58,10 @@ def refresh(parts: Assembly, step: Step, frame: Frame, tools: RunTools) -> Step:
 
 
 def _due(parts: Assembly, step: Step) -> str | None:
-    """Why the frame is to become a key packet; None: it is not."""
+    """Why the frame is to become a key packet; None: it is not.
+
+    It is not asked of frames whose iterations of a refinement follow their packets (``engine.method.parts``).
+    """
     every, state = parts.recipe.codec.key_every, step.state
     if step.status == "key":
         return None

@@ -26,6 +26,10 @@ class RepeatedFrameWarning(UserWarning):
     """A part failed, and its frame was sent as "nothing changed"."""
 
 
+class LeftOutWarning(UserWarning):
+    """A part failed in work that follows a frame's packet, which is sound and out; the work was left out."""
+
+
 def begin_held(tools: RunTools, frame: Frame) -> Step[Any]:
     """Make frame 0. Raises InputError with fewer cameras than the method needs, ComponentError when it fails."""
     parts = tools.parts
@@ -46,25 +50,87 @@ def step_held(tools: RunTools, state: MethodState, frame: Frame) -> Step[Any]:
     Raises ComponentError when the method fails, unless the recipe says ``stream.on_error: repeat``: then the method is
     asked for the same frame as one that is worth nothing, which it has to answer by an empty packet.
     """
+    # What does not answer by an empty packet breaks its contract: what it sends instead cannot be trusted either.
+    found, error = _or_worth_nothing(
+        tools, frame, lambda now: _step(tools, state, now), lambda step: step.status == "empty"
+    )
+    if error is not None:
+        warnings.warn(f"frame {frame.index} repeats the one before it: {error}", RepeatedFrameWarning, stacklevel=2)
+    return found
+
+
+def follow_up_held(tools: RunTools, state: MethodState, step: Step[Any], frame: Frame) -> Step[Any]:
+    """Do the work of a later frame that follows its packet; its seconds are added to those of the frame.
+
+    Arguments:
+        tools: what the run lends to its method.
+        state: before the frame.
+        step: of the frame; its packet has been handed out.
+        frame: training images of the frame.
+
+    Raises ComponentError when the method fails, unless the recipe says ``stream.on_error: repeat``: then the method is
+    asked for the same work of a frame that is worth nothing.
+    """
+    found, error = _or_worth_nothing(tools, frame, lambda now: _follow_up(tools, state, step, now), lambda _: True)
+    if error is not None:
+        warnings.warn(
+            f"frame {frame.index}: its packet is sound, but the work that follows it failed and is left out: {error}",
+            LeftOutWarning, stacklevel=2
+        )  # fmt: skip
+    return found
+
+
+def _or_worth_nothing(
+    tools: RunTools, frame: Frame, make: Callable[[Frame], Step[Any]], sound: Callable[[Step[Any]], bool]
+) -> tuple[Step[Any], Exception | None]:
+    """What ``make`` makes of a frame; where that fails and the recipe says so, of one without worth, and the failure.
+
+    The failure is raised again when the second answer is not ``sound``.
+    """
     started = time.perf_counter()
     try:
-        return _step(tools, state, frame)
+        return make(frame), None
     except (ComponentError, ShapeError) as error:
         if tools.parts.recipe.stream.on_error == "raise":
             raise
         lost = time.perf_counter() - started
-        step = _step(tools, state, replace(frame, effort=0.0))
-        if step.status != "empty":
-            raise  # it does not keep its contract: what it sends instead cannot be trusted either
-        warnings.warn(f"frame {frame.index} repeats the one before it: {error}", RepeatedFrameWarning, stacklevel=2)
+        step = make(replace(frame, effort=0.0))
+        if not sound(step):
+            raise
         seconds = {**step.metrics["seconds"], "failed": lost}
-        return replace(step, metrics={**step.metrics, "seconds": seconds, "error": str(error)})
+        return replace(step, metrics={**step.metrics, "seconds": seconds, "error": str(error)}), error
 
 
 def _step(tools: RunTools, state: MethodState, frame: Frame) -> Step[Any]:
     parts = tools.parts
     parts.where.enter(frame.index)
     return _held(parts, state.player, frame, lambda: parts.stepper.step(state, frame, tools))
+
+
+def _follow_up(tools: RunTools, state: MethodState, step: Step[Any], frame: Frame) -> Step[Any]:
+    """Let the method do what follows a packet, and see that it leaves alone what players have."""
+    parts = tools.parts
+    parts.where.enter(frame.index)
+    started = time.perf_counter()
+    found: Step[Any] = parts.stepper.follow_up(state, step, frame, tools)
+    seconds = time.perf_counter() - started
+    parts.where.enter(frame.index)
+    if found is step:
+        return step
+    difference = ""
+    if found.packet.data != step.packet.data or found.status != step.status:
+        difference = "packet or status"
+    elif found.state.player is not step.state.player:
+        difference = difference_between(step.state.player, found.state.player)
+    if difference:
+        raise fault(
+            f"its follow_up changed what has been handed out: {difference}. Return dataclasses.replace(step, ...) with "
+            "another state of the same player", "stepper", parts.part("stepper"), parts.where
+        )  # fmt: skip
+    metrics = {**step.metrics, **found.metrics}
+    if metrics["seconds"] == step.metrics["seconds"]:
+        metrics["seconds"] = {**metrics["seconds"], "follow_up": seconds}
+    return replace(found, metrics=metrics)
 
 
 def _held(parts: Assembly, before: PlayerState | None, frame: Frame, make: Callable[[], Step[Any]]) -> Step[Any]:

@@ -9,7 +9,7 @@ from gsstream.core.frame import Frame
 from gsstream.engine.budget.controller import planned
 from gsstream.engine.budget.spent import spent
 from gsstream.engine.frame0.begin import begin
-from gsstream.engine.frame0.refine import refined
+from gsstream.engine.frame0.refine import follows_packet, refined
 from gsstream.engine.frame0.taken import begin_from
 from gsstream.engine.keys.keyframes import refresh
 from gsstream.engine.keys.resume import memory_after, refinement_after, state_after
@@ -47,7 +47,15 @@ class PartsMethod(StreamingMethod[StreamState]):
             epochs = step.metrics["iterations"] / len(frame.cameras)
             entry = spent(allowance, pace, fitted, own.recipe.stream, epochs)
             step = replace(step, metrics={**step.metrics, "budget": entry})
+        if follows_packet(own.recipe.stream, state, frame):
+            return step  # no key packet is due before the last iteration of the refinement
         return refresh(own, refined(own, state, step, frame, tools.rng), frame, tools)
+
+    def follow_up(self, state: StreamState, step: Step, frame: Frame, tools: Any) -> Step:
+        parts = tools.parts
+        if not follows_packet(parts.recipe.stream, state, frame):
+            return step
+        return refined(parts, state, step, frame, tools.rng)
 
     def resume(self, player: PlayerState, shown: Frame, tools: Any) -> StreamState:
         state = replace(state_after(tools.parts, tools.since_key(), tools.rng), previous=shown)

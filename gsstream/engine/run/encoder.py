@@ -24,7 +24,7 @@ from gsstream.engine.frame0.optimise import Progress
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.frame0.taken import cloud_of
 from gsstream.engine.keys.resume import check_stream, ended, since_key
-from gsstream.engine.method.held import begin_held, step_held
+from gsstream.engine.method.held import begin_held, follow_up_held, step_held
 from gsstream.engine.run.threads import one_torch_thread
 from gsstream.engine.step.tools import RunTools
 from gsstream.method.base import Step
@@ -42,7 +42,8 @@ class Listeners:
     """Functions that an encoder calls while it works.
 
     Arguments:
-        packet: every packet, as soon as it is made; what it does counts as part of the frame.
+        packet: every packet, as soon as it is made and before the work that follows it (``follow_up`` of a method);
+            what it does counts as part of the frame.
         chosen: the assembly after the scene has decided every ``auto``, before frame 0.
         progress: iterations of frame 0.
         say: one line for a person.
@@ -59,6 +60,7 @@ class Encoder:
 
     :meth:`encode` takes the frames in order and returns a :class:`gsstream.method.base.Step` for each: its ``packet``
     is what a player reads, its ``metrics`` say what the frame cost. A frame that fails leaves the encoder as it was.
+    A packet that others wait for is best taken from ``listeners``: with some methods work follows it in the same call.
 
     Arguments:
         parts: the live parts of a recipe (``engine.assembly.assemble``).
@@ -92,7 +94,8 @@ class Encoder:
 
         Raises:
             ShapeError: images that do not fit the cameras, or values outside [0, 1].
-            ComponentError: a part fails and the recipe says ``stream.on_error: raise``.
+            ComponentError: a part fails and the recipe says ``stream.on_error: raise``. Where it fails in the work that
+                follows a packet, that packet has been handed out; the same frame gives it again.
         """
         frame.validate()
         frame = self.at_near(frame)
@@ -101,6 +104,9 @@ class Encoder:
         with one_torch_thread():
             step = self._begin(frame) if self.state is None else self._step(frame)
         self._listeners.packet(step.packet)
+        if self.state is not None:  # only now: whoever waits for the packet does not wait for this
+            with one_torch_thread():
+                step = follow_up_held(self._tools(), self.state, step, frame)
         total, cpu = time.perf_counter() - started, time.process_time() - worked
         seconds = step.metrics["seconds"]
         metrics: dict[str, Any] = {

@@ -48,6 +48,9 @@ class Pulled:
     def narrow(self, rows: torch.Tensor) -> None:
         self.rows = rows
 
+    def pull_moved(self, *given: object) -> None:
+        """Leave it to ``pull``."""
+
     def pull(self, view: int, rows: Gaussians[torch.Tensor], near_change: bool = False) -> float:
         loss = (rows.means - self.aims[self.rows]).square().sum()
         loss.backward()

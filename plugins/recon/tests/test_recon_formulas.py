@@ -45,6 +45,9 @@ class Pulled:
     def narrow(self, rows: torch.Tensor) -> None:
         self.rows = rows
 
+    def pull_moved(self, *given: object) -> None:
+        """Leave it to ``pull``."""
+
     def pull(self, view: int, rows: Gaussians[torch.Tensor], near_change: bool = False) -> float:
         self.seen.append(rows.means.detach().numpy().copy())
         loss = (rows.means - self.aims[self.rows]).square().sum()

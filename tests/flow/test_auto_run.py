@@ -136,8 +136,8 @@ def invert_test_images(folder: Path) -> None:
     cameras = json.loads((folder / "cameras.json").read_text())["cameras"]
     for camera in cameras:
         if camera["split"] == "test":
-            for path in (folder / camera["id"]).glob("*.png"):
-                ImageOps.invert(Image.open(path).convert("RGB")).save(path)
+            for path in (folder / camera["id"]).glob("*.jpg"):
+                ImageOps.invert(Image.open(path).convert("RGB")).save(path, quality=95)
 
 
 def test_test_cameras_have_no_say(tmp_path: Path) -> None:

@@ -10,9 +10,11 @@
 namespace gsstream_cpu {
 namespace {
 
+constexpr std::size_t FILL_GRAIN = 8;  // rows of blocks
+
 // Memory of one calling thread, kept between calls.
 struct Workspace {
-  Buffer<float> image, transmittance, recorded, gradient;
+  Buffer<float> image, recorded, gradient;
   std::vector<uint8_t> touched, around, read, counted;  // by tiles of 16 x 16 pixels
 };
 
@@ -60,22 +62,27 @@ void for_marked(const Grid& grid, const std::vector<uint8_t>& marked, Fn&& fn) {
 // What lies around the blocks that were rendered, as far as windows of the loss reach: it is as in the cache.
 void fill_around(const Grid& grid, const TileSelection& rendered, const std::vector<uint8_t>& read, const float* cached,
                  float* image) {
-  parallel_for(static_cast<std::size_t>(rendered.tiles_y), 2, [&](std::size_t begin, std::size_t end) {
-    for (std::size_t tile_y = begin; tile_y < end; tile_y++)
-      for (int tile_x = 0; tile_x < rendered.tiles_x; tile_x++) {
-        const uint32_t done = rendered.blocks[tile_y * rendered.tiles_x + tile_x];
-        for (int b = 0; b < BLOCKS; b++) {
-          const int x = tile_x * TILE_WIDTH + b % BLOCKS_X * BLOCK_SIDE,
-                    y = static_cast<int>(tile_y) * TILE_HEIGHT + b / BLOCKS_X * BLOCK_SIDE;
-          if (done >> b & 1u || x >= grid.width || y >= grid.height) continue;
-          if (!read[static_cast<std::size_t>(y / kTile) * grid.columns + x / kTile]) continue;
-          const std::size_t floats = 3 * static_cast<std::size_t>(std::min(BLOCK_SIDE, grid.width - x));
-          for (int v = y; v < std::min(grid.height, y + BLOCK_SIDE); v++) {
-            const std::size_t at = 3 * (static_cast<std::size_t>(v) * grid.width + x);
-            std::memcpy(image + at, cached + at, floats * sizeof(float));
-          }
+  const int columns = (grid.width + BLOCK_SIDE - 1) / BLOCK_SIDE, rows = (grid.height + BLOCK_SIDE - 1) / BLOCK_SIDE;
+  parallel_for(static_cast<std::size_t>(rows), FILL_GRAIN, [&](std::size_t begin, std::size_t end) {
+    for (int row = static_cast<int>(begin); row < static_cast<int>(end); row++) {
+      const uint32_t* tiles = &rendered.blocks[static_cast<std::size_t>(row / BLOCKS_Y) * rendered.tiles_x];
+      const uint8_t* marks = &read[static_cast<std::size_t>(row * BLOCK_SIDE / kTile) * grid.columns];
+      const auto missing = [&](int column) {
+        const int block = row % BLOCKS_Y * BLOCKS_X + column % BLOCKS_X;
+        return marks[column * BLOCK_SIDE / kTile] && !(tiles[column / BLOCKS_X] >> block & 1u);
+      };
+      for (int first = 0; first < columns; first++) {
+        int last = first;
+        while (last < columns && missing(last)) last++;
+        if (last == first) continue;
+        const int left = first * BLOCK_SIDE, right = std::min(grid.width, last * BLOCK_SIDE);
+        for (int y = row * BLOCK_SIDE; y < std::min(grid.height, (row + 1) * BLOCK_SIDE); y++) {
+          const std::size_t at = 3 * (static_cast<std::size_t>(y) * grid.width + left);
+          std::memcpy(image + at, cached + at, 3 * static_cast<std::size_t>(right - left) * sizeof(float));
         }
+        first = last;
       }
+    }
   });
 }
 
@@ -125,10 +132,9 @@ ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparis
   const std::size_t pixels = static_cast<std::size_t>(grid.width) * grid.height;
   const std::size_t tiles = static_cast<std::size_t>(grid.columns) * grid.rows;
   float* image = work.image.require(3 * pixels);
-  const Target target{{view.background[0], view.background[1], view.background[2]},
-                      image, work.transmittance.require(pixels)};
+  const Target target{{view.background[0], view.background[1], view.background[2]}, image, nullptr};
   ViewPull result{};
-  result.faults = rasterizer.forward_active(rows, target, true, counted(view.weights, tiles, work.counted));
+  result.faults = rasterizer.forward_layered(rows, target, counted(view.weights, tiles, work.counted));
   if (result.faults) return result;
   work.touched.resize(tiles);
   rasterizer.touched().write_mask(grid.width, grid.height, work.touched.data());
@@ -163,7 +169,7 @@ ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparis
       pull_colours(view.matrix, job.gradient + 3 * first, count);
     });
   if (view.weights) weigh(grid, view.weights, work.touched, job.gradient);
-  rasterizer.backward_active(job.gradient, nullptr, out);
+  rasterizer.backward_layered(job.gradient, out);
   return result;
 }
 

@@ -14,6 +14,23 @@ namespace {
 constexpr int PARTS = BLOCK_PIXELS / LANES;  // vectors per block
 constexpr int PREFETCH = 8;                  // entries ahead
 
+// Light from behind all entries of a list, at pixels of this transmittance. Those that take no more light see the
+// background alone, as if every entry were in the list.
+struct Behind {
+  Floats red, green, blue;
+  GSS_INLINE Behind(const CompositeJob& job, uint32_t tile, int b, int q, Floats transmittance)
+      : red(broadcast(job.background[0])),
+        green(broadcast(job.background[1])),
+        blue(broadcast(job.background[2])) {
+    if (!job.layers) return;
+    const LayerPixels& layers = *job.layers[tile];
+    const Mask live = greater(transmittance, broadcast(TRANSMITTANCE_MIN));
+    red = select(live, load(layers.back[0][b] + q), red);
+    green = select(live, load(layers.back[1][b] + q), green);
+    blue = select(live, load(layers.back[2][b] + q), blue);
+  }
+};
+
 // ---- forward
 
 struct ForwardTile {
@@ -35,6 +52,26 @@ GSS_INLINE void start_tile(ForwardTile& tile, uint32_t blocks) {
       tile.live[b][q / LANES] = greater(broadcast(1.0f), Floats{});
     }
   }
+}
+
+// Starts from what lies in front. Returns the blocks in which some pixel still takes light.
+GSS_INLINE uint32_t start_behind(ForwardTile& tile, uint32_t blocks, const LayerPixels& layers) {
+  uint32_t alive = 0;
+  for (; blocks; blocks &= blocks - 1) {
+    const int b = __builtin_ctz(blocks);
+    for (int q = 0; q < BLOCK_PIXELS; q += LANES) {
+      const Floats transmittance = load(layers.transmittance[b] + q);
+      const Mask live = greater(transmittance, broadcast(TRANSMITTANCE_MIN));
+      store(tile.transmittance[b] + q, transmittance);
+      store(tile.red[b] + q, load(layers.front[0][b] + q));
+      store(tile.green[b] + q, load(layers.front[1][b] + q));
+      store(tile.blue[b] + q, load(layers.front[2][b] + q));
+      store(tile.last[b] + q, select(live, broadcast(INT32_MAX), Ints{}));
+      tile.live[b][q / LANES] = live;
+      if (any(live)) alive |= 1u << b;
+    }
+  }
+  return alive;
 }
 
 // Retires the pixels whose transmittance fell to the minimum; true if none of the block is left.
@@ -76,21 +113,27 @@ GSS_INLINE uint32_t blend_entry(ForwardTile& tile, const Kernel& k, uint32_t blo
   return contributed;
 }
 
-GSS_INLINE void blend_tile(const CompositeJob& job, ForwardTile& tile, uint32_t index, float x, float y) {
-  const uint32_t first = job.lists.begin[index], count = job.lists.end[index] - first;
-  const TileEntry* entries = job.lists.entries + first;
-  const uint32_t* blocks = job.lists.blocks + first;
-  uint32_t* contributed = job.contributed + first;
-  uint32_t alive = job.tile_blocks[index], k = 0;
-  for (; k < count && alive; k++) {
-    if (k + PREFETCH < count) __builtin_prefetch(&job.records[entries[k + PREFETCH].record]);
-    const uint32_t wanted = blocks[k] & alive;
-    contributed[k] = 0;
+// Depth-sorted entries with the blocks that each touches.
+struct Entries {
+  const TileEntry* entries;
+  const uint32_t* blocks;
+  uint32_t* contributed;
+  uint32_t count;
+};
+
+// Not inlined: the same instructions, so the same bits, wherever a Gaussian is blended.
+__attribute__((noinline)) void blend(ForwardTile& tile, const Record* records, const Entries& list, uint32_t alive,
+                                     float x, float y) {
+  uint32_t k = 0;
+  for (; k < list.count && alive; k++) {
+    if (k + PREFETCH < list.count) __builtin_prefetch(&records[list.entries[k + PREFETCH].record]);
+    const uint32_t wanted = list.blocks[k] & alive;
+    list.contributed[k] = 0;
     if (!wanted) continue;
-    const Kernel kernel(job.records[entries[k].record], x, y);
-    contributed[k] = blend_entry(tile, kernel, wanted, static_cast<int32_t>(k) + 1, alive);
+    const Kernel kernel(records[list.entries[k].record], x, y);
+    list.contributed[k] = blend_entry(tile, kernel, wanted, static_cast<int32_t>(k) + 1, alive);
   }
-  for (; k < count; k++) contributed[k] = 0;
+  for (; k < list.count; k++) list.contributed[k] = 0;
 }
 
 GSS_INLINE void finish_tile(const CompositeJob& job, ForwardTile& tile, uint32_t index, int tile_x, int tile_y) {
@@ -101,27 +144,84 @@ GSS_INLINE void finish_tile(const CompositeJob& job, ForwardTile& tile, uint32_t
     const int b = __builtin_ctz(blocks);
     for (int q = 0; q < BLOCK_PIXELS; q += LANES) {
       const Floats t = load(tile.transmittance[b] + q);
+      const Behind behind(job, index, b, q, t);
       store(kept_transmittance + b * BLOCK_PIXELS + q, t);
       store(kept_last + b * BLOCK_PIXELS + q, load(tile.last[b] + q));
-      store(tile.red[b] + q, load(tile.red[b] + q) + t * job.background[0]);
-      store(tile.green[b] + q, load(tile.green[b] + q) + t * job.background[1]);
-      store(tile.blue[b] + q, load(tile.blue[b] + q) + t * job.background[2]);
+      store(tile.red[b] + q, load(tile.red[b] + q) + t * behind.red);
+      store(tile.green[b] + q, load(tile.green[b] + q) + t * behind.green);
+      store(tile.blue[b] + q, load(tile.blue[b] + q) + t * behind.blue);
     }
     const BlockPlace place = place_of(b, tile_x, tile_y, job.width, job.height);
     write_rgb(place, tile.red[b], tile.green[b], tile.blue[b], job.image);
-    write_scalar(place, tile.transmittance[b], job.transmittance);
+    if (job.transmittance) write_scalar(place, tile.transmittance[b], job.transmittance);
   }
 }
 
 void forward(const CompositeJob& job, std::size_t first_tile, std::size_t end_tile) {
   ForwardTile tile;
   for (std::size_t slot = first_tile; slot < end_tile; slot++) {
-    const uint32_t index = job.tiles[slot];
+    const uint32_t index = job.tiles[slot], first = job.lists.begin[index];
     const int x = static_cast<int>(index) % job.tiles_x * TILE_WIDTH,
               y = static_cast<int>(index) / job.tiles_x * TILE_HEIGHT;
-    start_tile(tile, job.tile_blocks[index]);
-    blend_tile(job, tile, index, static_cast<float>(x), static_cast<float>(y));
+    const Entries list{job.lists.entries + first, job.lists.blocks + first, job.contributed + first,
+                       job.lists.end[index] - first};
+    uint32_t alive = job.tile_blocks[index];
+    if (job.layers)
+      alive = start_behind(tile, alive, *job.layers[index]);
+    else
+      start_tile(tile, alive);
+    blend(tile, job.records, list, alive, static_cast<float>(x), static_cast<float>(y));
     finish_tile(job, tile, index, x, y);
+  }
+}
+
+// ---- layers
+
+GSS_INLINE void blend_layer(const LayerJob& job, ForwardTile& tile, uint32_t alive) {
+  const Entries list{job.entries, job.blocks, job.contributed, static_cast<uint32_t>(job.count)};
+  blend(tile, job.records, list, alive, static_cast<float>(job.x), static_cast<float>(job.y));
+}
+
+void extend_front(const LayerJob& job) {
+  ForwardTile tile;
+  LayerPixels& layers = *job.pixels;
+  blend_layer(job, tile, start_behind(tile, job.wanted, layers));
+  for (uint32_t blocks = job.wanted; blocks; blocks &= blocks - 1) {
+    const int b = __builtin_ctz(blocks);
+    for (int q = 0; q < BLOCK_PIXELS; q += LANES) {
+      store(layers.transmittance[b] + q, load(tile.transmittance[b] + q));
+      store(layers.front[0][b] + q, load(tile.red[b] + q));
+      store(layers.front[1][b] + q, load(tile.green[b] + q));
+      store(layers.front[2][b] + q, load(tile.blue[b] + q));
+    }
+  }
+}
+
+// A block that takes no light behind its front layer needs nothing behind it.
+GSS_INLINE uint32_t open_blocks(const LayerPixels& layers, uint32_t wanted) {
+  uint32_t open = 0;
+  for (uint32_t blocks = wanted; blocks; blocks &= blocks - 1) {
+    const int b = __builtin_ctz(blocks);
+    for (int q = 0; q < BLOCK_PIXELS; q += LANES)
+      if (any(greater(load(layers.transmittance[b] + q), broadcast(TRANSMITTANCE_MIN)))) open |= 1u << b;
+  }
+  return open;
+}
+
+void extend_back(const LayerJob& job) {
+  ForwardTile tile;
+  LayerPixels& layers = *job.pixels;
+  const uint32_t open = open_blocks(layers, job.wanted);
+  start_tile(tile, open);
+  blend_layer(job, tile, open);
+  for (uint32_t blocks = open; blocks; blocks &= blocks - 1) {
+    const int b = __builtin_ctz(blocks);
+    for (int q = 0; q < BLOCK_PIXELS; q += LANES) {
+      const Floats t = load(tile.transmittance[b] + q);
+      store(layers.back[0][b] + q, load(tile.red[b] + q) + t * load(layers.back[0][b] + q));
+      store(layers.back[1][b] + q, load(tile.green[b] + q) + t * load(layers.back[1][b] + q));
+      store(layers.back[2][b] + q, load(tile.blue[b] + q) + t * load(layers.back[2][b] + q));
+    }
   }
 }
 
@@ -138,7 +238,6 @@ struct BackwardTile {
 GSS_INLINE bool start_backward_tile(const CompositeBackwardJob& job, BackwardTile& tile, uint32_t index, int tile_x,
                                     int tile_y) {
   const CompositeJob& fwd = job.forward;
-  const float* background = fwd.background;
   const std::size_t pixels = static_cast<std::size_t>(index) * BLOCKS * BLOCK_PIXELS;
   const float* kept_transmittance = fwd.pixel_transmittance + pixels;
   const int32_t* kept_last = fwd.pixel_last + pixels;
@@ -153,8 +252,9 @@ GSS_INLINE bool start_backward_tile(const CompositeBackwardJob& job, BackwardTil
       const Floats t = load(kept_transmittance + b * BLOCK_PIXELS + q), from_alpha = load(alpha_gradient + q);
       magnitude |=
           (Ints)load(tile.red[b] + q) | (Ints)load(tile.green[b] + q) | (Ints)load(tile.blue[b] + q) | (Ints)from_alpha;
-      const Floats seen = background[0] * load(tile.red[b] + q) + background[1] * load(tile.green[b] + q) +
-                          background[2] * load(tile.blue[b] + q);
+      const Behind behind(fwd, index, b, q, t);
+      const Floats seen = behind.red * load(tile.red[b] + q) + behind.green * load(tile.green[b] + q) +
+                          behind.blue * load(tile.blue[b] + q);
       store(tile.transmittance[b] + q, t);
       store(tile.behind[b] + q, t * (seen - from_alpha));  // alpha = 1 - transmittance
       store(tile.last[b] + q, load(kept_last + b * BLOCK_PIXELS + q));
@@ -267,7 +367,7 @@ void backward(const CompositeBackwardJob& job, std::size_t first_tile, std::size
 }  // namespace
 
 const CompositeKernels& composite_kernels() {
-  static const CompositeKernels table{forward, backward};
+  static const CompositeKernels table{forward, backward, extend_front, extend_back};
   return table;
 }
 

@@ -16,6 +16,8 @@ struct ProjectBackwardKernels {
 struct CompositeKernels {
   void (*forward)(const CompositeJob&, std::size_t first_tile, std::size_t end_tile);
   void (*backward)(const CompositeBackwardJob&, std::size_t first_tile, std::size_t end_tile);
+  void (*extend_front)(const LayerJob&);
+  void (*extend_back)(const LayerJob&);
 };
 
 GSS_KERNEL_TABLE(ProjectKernels, project_kernels)

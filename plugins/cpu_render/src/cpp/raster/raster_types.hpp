@@ -101,6 +101,24 @@ struct TileListsView {
   const uint32_t* blocks;
 };
 
+// What the pixels of a raster tile see in front of and behind the entries of its list, in block order: light and
+// transmittance of what lies in front, light of what lies behind, the background included.
+struct LayerPixels {
+  alignas(64) float transmittance[BLOCKS][BLOCK_PIXELS], front[3][BLOCKS][BLOCK_PIXELS], back[3][BLOCKS][BLOCK_PIXELS];
+};
+
+// Blends entries in front of all that a layer holds (back) or behind it (front).
+struct LayerJob {
+  const Record* records;
+  int x, y;  // pixel at which the tile begins
+  const TileEntry* entries;
+  const uint32_t* blocks;
+  std::size_t count;
+  uint32_t* contributed;  // [count], scratch
+  uint32_t wanted;        // blocks that are changed
+  LayerPixels* pixels;
+};
+
 struct CompositeJob {
   const Record* records;
   TileListsView lists;
@@ -109,6 +127,7 @@ struct CompositeJob {
   int tiles_x, width, height;
   float background[3];
   float *image, *transmittance;  // caller's [H,W,3] and [H,W]; only active blocks are written
+  const LayerPixels* const* layers;  // by tile of the image; null: nothing in front, and the background behind
   uint32_t* contributed;         // per entry: the blocks where it added light; backward visits only these
   float* pixel_transmittance;    // per tile of the image, block order: final transmittance
   int32_t* pixel_last;           // per tile of the image, block order: entries from this index on were not counted

@@ -29,7 +29,7 @@ void Rasterizer::expect(const std::string& operation) const {
   const auto named = [&](const Rule& rule) { return operation == rule.operation; };
   const Rule* rule = std::find_if(std::begin(RULES), std::end(RULES), named);
   if (rule == std::end(RULES)) throw std::invalid_argument("expect: no operation is called '" + operation + "'.");
-  const bool frozen = state_ == State::frozen || state_ == State::active_passed;
+  const bool frozen = state_ == State::frozen || state_ == State::active_passed || state_ == State::layered_passed;
   const char* missing = nullptr;
   if (rule->needs == State::cached && state_ == State::empty)
     missing = "a forward pass of the whole scene before, got none. Call forward first.";
@@ -39,12 +39,14 @@ void Rasterizer::expect(const std::string& operation) const {
     missing = "freeze(tile_mask, active_ids) before, got none since the last forward or update.";
   if (rule->needs == State::active_passed && state_ != State::active_passed)
     missing = "a forward_active pass before, got none (or another pass since).";
+  if (rule->needs == State::layered_passed && state_ != State::layered_passed)
+    missing = "a forward_layered pass before, got none (or another pass since).";
   if (missing) throw std::invalid_argument(operation + ": expected " + missing);
 }
 
 void Rasterizer::drop_pass() {
   if (state_ == State::passed) state_ = State::cached;
-  if (state_ == State::active_passed) state_ = State::frozen;
+  if (state_ == State::active_passed || state_ == State::layered_passed) state_ = State::frozen;
 }
 
 TileSelection Rasterizer::cached_tiles(const uint8_t* mask, const char* operation) const {
@@ -111,8 +113,8 @@ void Rasterizer::join_chunks(std::size_t chunks) {
 }
 
 // Stage 3.
-CompositeJob Rasterizer::composite(const TileListsView& lists, const TileSelection& selection, const Target& target,
-                                   uint32_t* contributed, PixelTrace& trace) {
+CompositeJob Rasterizer::composite_job(const TileListsView& lists, const TileSelection& selection,
+                                       const Target& target, uint32_t* contributed, PixelTrace& trace) const {
   const std::size_t pixels = selection.blocks.size() * BLOCKS * BLOCK_PIXELS;
   CompositeJob job{};
   job.records = records_.data();
@@ -128,6 +130,12 @@ CompositeJob Rasterizer::composite(const TileListsView& lists, const TileSelecti
   job.contributed = contributed;
   job.pixel_transmittance = trace.transmittance.require(pixels);
   job.pixel_last = trace.last.require(pixels);
+  return job;
+}
+
+CompositeJob Rasterizer::composite(const TileListsView& lists, const TileSelection& selection, const Target& target,
+                                   uint32_t* contributed, PixelTrace& trace) {
+  const CompositeJob job = composite_job(lists, selection, target, contributed, trace);
   parallel_for(selection.active.size(), TILE_GRAIN,
                [&](std::size_t begin, std::size_t end) { composite_kernels_.forward(job, begin, end); });
   return job;
@@ -144,6 +152,7 @@ uint32_t Rasterizer::forward(const Scene& scene, const Camera& camera, const uin
   sort_by_depth(visible_.by_depth, sort_scratch_, visible_.count);
   build_tile_lists(visible_, selection_.blocks.size(), 0, merged_lists_);
   entry_count_ = merged_lists_.size;
+  drop_layers();
   cached_lists_.adopt(merged_lists_);
   job_ = composite(cached_lists_.view(), selection_, target, cached_lists_.contributed.data(), cached_trace_);
   job_tiles_ = selection_.active.size();
@@ -160,13 +169,21 @@ uint32_t Rasterizer::forward(const Scene& scene, const Camera& camera, const uin
 void Rasterizer::freeze(const uint8_t* mask, const uint32_t* active, std::size_t count) {
   const Claim claim(busy_);
   TileSelection wanted = cached_tiles(mask, "freeze");
-  set_active(active, count, "freeze: active_ids");
+  if (set_active(active, count, "freeze: active_ids") && active_in_cache_.any()) {
+    active_in_cache_.keep(cached_lists_.view(), is_active_);
+    layers_.freeze();
+  } else {
+    drop_layers();
+    active_in_cache_.find(cached_lists_.view(), cached_lists_.tiles(), is_active_);
+  }
+  active_in_cache_.touched(cached_lists_.view(), dropped_blocks_);
   selection_ = std::move(wanted);
-  filter_tile_lists(cached_lists_.view(), selection_.blocks, is_active_, frozen_lists_, dropped_blocks_);
+  frozen_listed_ = false;
   state_ = State::frozen;
 }
 
-void Rasterizer::set_active(const uint32_t* active, std::size_t count, const char* name) {
+// Returns whether all of these rows were active before.
+bool Rasterizer::set_active(const uint32_t* active, std::size_t count, const char* name) {
   for (std::size_t i = 0; i < count; i++)
     if (active[i] >= scene_count_ || (i > 0 && active[i] <= active[i - 1]))
       throw std::invalid_argument(std::string(name) + " must be strictly ascending rows below " +
@@ -174,11 +191,13 @@ void Rasterizer::set_active(const uint32_t* active, std::size_t count, const cha
                                   std::to_string(i) + ". Sort them and drop duplicates.");
   state_ = State::cached;
   is_active_.resize(scene_count_, 0);
+  const bool fewer = std::all_of(active, active + count, [&](uint32_t row) { return is_active_[row]; });
   for (uint32_t row : active_rows_)
     if (row < is_active_.size()) is_active_[row] = 0;
   active_rows_.assign(active, active + count);
   for (uint32_t row : active_rows_) is_active_[row] = 1;
   records_.require_keeping(scene_count_ + count, scene_count_);
+  return fewer;
 }
 
 // Projects the active rows and leaves their lists over `selection` in active_lists_.
@@ -191,9 +210,8 @@ uint32_t Rasterizer::list_active(const Scene& rows, const TileSelection& selecti
   return 0;
 }
 
-uint32_t Rasterizer::forward_active(const Scene& rows, const Target& target, bool touched_only, const uint8_t* mask) {
-  const Claim claim(busy_);
-  expect("forward_active");
+// Lists the active rows and selects what they touch.
+uint32_t Rasterizer::begin_active(const Scene& rows, bool touched_only, const uint8_t* mask) {
   drop_pass();
   passes_++;
   TileSelection fewer;
@@ -208,13 +226,22 @@ uint32_t Rasterizer::forward_active(const Scene& rows, const Target& target, boo
   } else {
     touched_ = within;
   }
-  const TileSelection& wanted = touched_;
-  merge_tile_lists(frozen_lists_, active_lists_, wanted.blocks, records_.data(), static_cast<uint32_t>(scene_count_),
-                   active_rows_, merged_lists_);
-  entry_count_ = merged_lists_.size;
-  job_ = composite(merged_lists_.view(), wanted, target, contributed_.require(entry_count_), trace_);
-  job_tiles_ = wanted.active.size();
   scene_ = rows;
+  job_tiles_ = touched_.active.size();
+  return 0;
+}
+
+uint32_t Rasterizer::forward_active(const Scene& rows, const Target& target, bool touched_only) {
+  const Claim claim(busy_);
+  expect("forward_active");
+  const uint32_t faults = begin_active(rows, touched_only, nullptr);
+  if (faults) return faults;
+  if (!frozen_listed_) filter_tile_lists(cached_lists_.view(), selection_.blocks, is_active_, frozen_lists_);
+  frozen_listed_ = true;
+  merge_tile_lists(frozen_lists_, active_lists_, touched_.blocks,
+                   {records_.data(), static_cast<uint32_t>(scene_count_), active_rows_.data()}, merged_lists_);
+  entry_count_ = merged_lists_.size;
+  job_ = composite(merged_lists_.view(), touched_, target, contributed_.require(entry_count_), trace_);
   state_ = State::active_passed;
   return 0;
 }
@@ -265,6 +292,12 @@ void Rasterizer::backward_active(const float* image_gradient, const float* alpha
   const Claim claim(busy_);
   expect("backward_active");
   differentiate(image_gradient, alpha_gradient, out, false);
+}
+
+void Rasterizer::backward_layered(const float* image_gradient, const GradientArrays& out) {
+  const Claim claim(busy_);
+  expect("backward_layered");
+  differentiate(image_gradient, nullptr, out, false);
 }
 
 }  // namespace gsstream_cpu

@@ -2,6 +2,7 @@
 //
 //   full path         forward -> backward
 //   incremental mode  forward (fills the cache) -> freeze -> { forward_active -> backward_active }* -> update -> freeze
+//   ... for a fit     { forward_layered -> backward_layered }* in the place of { forward_active -> backward_active }*
 //   ...               at any time after forward: backward_cached, forward_cached
 //
 // The incremental mode gives the same bits as the full path over the same tiles, without any cost that grows with the
@@ -16,6 +17,8 @@
 #include <vector>
 
 #include "runtime/buffer.hpp"
+#include "raster/active_entries.hpp"
+#include "raster/layers.hpp"
 #include "raster/raster_kernels.hpp"
 #include "raster/raster_types.hpp"
 #include "raster/screen_pass.hpp"
@@ -49,9 +52,10 @@ struct PixelTrace {
 class Rasterizer {
  public:
   // What there is to work with. `passed` (a forward whose backward may follow) offers what `cached` does, `frozen` too,
-  // and `active_passed` (a forward_active whose backward may follow) what `frozen` does.
-  enum class State { empty, cached, passed, frozen, active_passed };
-  // What each operation needs and leaves behind. When it fails, forward leaves `empty` and forward_active `frozen`; on
+  // `active_passed` and `layered_passed` (a forward_active or forward_layered whose backward may follow) what `frozen`
+  // does.
+  enum class State { empty, cached, passed, frozen, active_passed, layered_passed };
+  // What each operation needs and leaves behind. When it fails, forward leaves `empty`, forward_active and forward_layered `frozen`; on
   // `empty`, forget and shed_scratch do nothing.
   struct Rule {
     const char* operation;
@@ -64,6 +68,8 @@ class Rasterizer {
       {"freeze", State::cached, "frozen"},
       {"forward_active", State::frozen, "active_passed"},
       {"backward_active", State::active_passed, "the same"},
+      {"forward_layered", State::frozen, "layered_passed"},
+      {"backward_layered", State::layered_passed, "the same"},
       {"update", State::cached, "cached"},
       {"backward_cached", State::cached, "the same"},
       {"drawn_in_cache", State::cached, "the same"},
@@ -81,8 +87,13 @@ class Rasterizer {
   // The arrays of `scene` are read again by the matching backward.
   uint32_t forward(const Scene& scene, const Camera& camera, const uint8_t* mask, const Target& target);
   // With `touched_only`, only blocks that the active rows touch now or touched in the cache are rendered: all others
-  // would come out as they are in the cache. `mask`, as forward's: tiles outside it are not rendered either.
-  uint32_t forward_active(const Scene& rows, const Target& target, bool touched_only, const uint8_t* mask = nullptr);
+  // would come out as they are in the cache.
+  uint32_t forward_active(const Scene& rows, const Target& target, bool touched_only);
+  // forward_active with touched_only for the sake of gradients: frozen Gaussians that lie in front of all active ones or
+  // behind them are blended once and not in every pass (layers.hpp). `mask`, as forward's: tiles outside it are not
+  // rendered either. target.transmittance may be null; if not, it gets
+  // what is left in front of the layers behind.
+  uint32_t forward_layered(const Scene& rows, const Target& target, const uint8_t* mask = nullptr);
   // Renders from the cache alone (no projection, no gradients).
   void forward_cached(const uint8_t* mask, const Target& target);
 
@@ -103,6 +114,9 @@ class Rasterizer {
   // Outputs have one row per active row.
   void backward_active(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out);
 
+  // As backward_active, after forward_layered.
+  void backward_layered(const float* image_gradient, const GradientArrays& out);
+
   // active: strictly ascending rows of the cached scene.
   void freeze(const uint8_t* mask, const uint32_t* active, std::size_t count);
   // Puts new values of some rows (strictly ascending) into the cache and renders anew, into `target`, the tiles that
@@ -112,7 +126,7 @@ class Rasterizer {
   // Lets go of the memory that only a full pass needs. No backward may follow.
   void shed_scratch();
 
-  // Tiles rendered by the last forward_active.
+  // Tiles rendered by the last forward_active or forward_layered.
   const TileSelection& touched() const { return touched_; }
   const VisibleSet& visible() const { return visible_; }
   std::size_t pair_count() const { return visible_.pair_count; }
@@ -136,8 +150,15 @@ class Rasterizer {
 
   uint32_t project(const Scene& scene, const TileSelection& selection, Record* records);
   void join_chunks(std::size_t chunks);
-  void set_active(const uint32_t* active, std::size_t count, const char* name);
+  bool set_active(const uint32_t* active, std::size_t count, const char* name);
   uint32_t list_active(const Scene& rows, const TileSelection& selection);
+  uint32_t begin_active(const Scene& rows, bool touched_only, const uint8_t* mask);
+  void drop_layers();
+  void settle_layers(const float* background);
+  TileListsView place_layered_lists();
+  void merge_layered_tile(std::size_t tile);
+  CompositeJob composite_job(const TileListsView& lists, const TileSelection& selection, const Target& target,
+                             uint32_t* contributed, PixelTrace& trace) const;
   CompositeJob composite(const TileListsView& lists, const TileSelection& selection, const Target& target,
                          uint32_t* contributed, PixelTrace& trace);
   void replace_tiles(const std::vector<uint32_t>& changed_tiles);
@@ -159,7 +180,7 @@ class Rasterizer {
   std::size_t job_tiles_ = 0, entry_count_ = 0;
   TileSelection selection_;
   TileSelection touched_;  // of the last active pass
-  std::vector<uint32_t> dropped_blocks_;
+  std::vector<uint32_t> dropped_blocks_;  // that the active rows touch in the cache
 
   std::unique_ptr<ProjectChunk[]> chunks_;
   std::size_t chunk_capacity_ = 0;
@@ -182,6 +203,12 @@ class Rasterizer {
   TileLists frozen_lists_, active_lists_, merged_lists_;  // merged_lists_ also receives the lists of a full pass
   std::vector<uint32_t> active_rows_;
   std::vector<uint8_t> is_active_;
+  ActiveEntries active_in_cache_;
+  bool frozen_listed_ = false;  // frozen_lists_ are those of the last freeze
+
+  Layers layers_;
+  float layer_background_[3] = {};
+  std::vector<const LayerPixels*> layer_pixels_;
 };
 
 }  // namespace gsstream_cpu

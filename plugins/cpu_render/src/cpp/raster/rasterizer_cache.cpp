@@ -13,11 +13,14 @@ uint32_t Rasterizer::update(const uint32_t* changed, const Scene& rows, const Ta
   const Claim claim(busy_);
   expect("update");
   set_active(changed, rows.count, "update: changed");
+  drop_layers();
   passes_++;
   const uint32_t faults = list_active(rows, cached_selection_);
   if (faults) return faults;
-  std::vector<uint32_t> touched(cached_lists_.tiles());
-  find_active_blocks(cached_lists_.view(), is_active_, touched);
+  ActiveEntries before;
+  std::vector<uint32_t> touched;
+  before.find(cached_lists_.view(), cached_lists_.tiles(), is_active_);
+  before.touched(cached_lists_.view(), touched);
   add_touched_blocks(active_lists_, touched);
   replace_tiles(touched);
   for (uint32_t row : active_rows_) cached_visible_.erase(row);
@@ -120,6 +123,7 @@ void Rasterizer::shed_scratch() {
   visible_.count = visible_.pair_count = 0;
   sort_scratch_.release();
   moments_.release();
+  drop_layers();
   for (TileLists* lists : {&frozen_lists_, &active_lists_, &merged_lists_}) {
     lists->tiles = lists->size = 0;
     lists->offset.release();
@@ -135,7 +139,7 @@ std::size_t Rasterizer::cache_bytes() const {
 std::size_t Rasterizer::memory_bytes() const {
   std::size_t bytes = cache_bytes() + visible_.bytes() + sort_scratch_.bytes() + contributed_.bytes() + trace_.bytes() +
                       moments_.bytes() + screen_.bytes() + active_rows_.capacity() * sizeof(uint32_t) +
-                      is_active_.capacity();
+                      is_active_.capacity() + active_in_cache_.bytes() + layers_.bytes() + layer_pixels_.capacity() * sizeof layer_pixels_[0];
   for (const TileLists* lists : {&frozen_lists_, &active_lists_, &merged_lists_}) bytes += lists->bytes();
   for (std::size_t c = 0; c < chunk_capacity_; c++)
     bytes += sizeof(ProjectChunk) + chunks_[c].pairs.capacity * sizeof(Pair);

@@ -75,38 +75,25 @@ void build_tile_lists(const VisibleSet& visible, std::size_t tiles, uint32_t rec
 }
 
 void filter_tile_lists(const TileListsView& from, const std::vector<uint32_t>& tile_blocks,
-                       const std::vector<uint8_t>& is_active, TileLists& out, std::vector<uint32_t>& dropped) {
+                       const std::vector<uint8_t>& is_active, TileLists& out) {
   const std::size_t tiles = tile_blocks.size();
   std::size_t most = 0;
   for (std::size_t tile = 0; tile < tiles; tile++)
     if (tile_blocks[tile]) most += from.end[tile] - from.begin[tile];
   out.resize(tiles, most);
-  dropped.assign(tiles, 0);
   uint32_t next = 0;
   for (std::size_t tile = 0; tile < tiles; tile++) {
     out.offset[tile] = next;
     if (!tile_blocks[tile]) continue;
     for (uint32_t e = from.begin[tile]; e < from.end[tile]; e++) {
       const uint32_t blocks = from.blocks[e] & tile_blocks[tile];
-      if (is_active[from.entries[e].record]) {
-        dropped[tile] |= blocks;
-      } else if (blocks) {
-        out.entries[next] = {from.entries[e].record, FROZEN};
-        out.blocks[next++] = blocks;
-      }
+      if (!blocks || is_active[from.entries[e].record]) continue;
+      out.entries[next] = {from.entries[e].record, FROZEN};
+      out.blocks[next++] = blocks;
     }
   }
   out.offset[tiles] = next;
   out.size = next;
-}
-
-void find_active_blocks(const TileListsView& lists, const std::vector<uint8_t>& is_active,
-                        std::vector<uint32_t>& touched) {
-  for (std::size_t tile = 0; tile < touched.size(); tile++) {
-    touched[tile] = 0;
-    for (uint32_t e = lists.begin[tile]; e < lists.end[tile]; e++)
-      if (is_active[lists.entries[e].record]) touched[tile] |= lists.blocks[e];
-  }
 }
 
 void add_touched_blocks(const TileLists& lists, std::vector<uint32_t>& touched) {
@@ -114,9 +101,31 @@ void add_touched_blocks(const TileLists& lists, std::vector<uint32_t>& touched) 
     for (uint32_t e = lists.offset[tile]; e < lists.offset[tile + 1]; e++) touched[tile] |= lists.blocks[e];
 }
 
+void merge_tile(const ListSlice& frozen, const ListSlice& active, const DepthOrder& order, TileLists& out,
+                std::size_t place) {
+  TileEntry* entries = out.entries.data() + place;
+  uint32_t* blocks = out.blocks.data() + place;
+  const auto take = [&](const ListSlice& from, std::size_t i) {
+    *entries++ = from.entries[i];
+    *blocks++ = from.blocks[i];
+  };
+  std::size_t f = 0;
+  for (std::size_t a = 0; a < active.size; a++) {
+    const uint32_t record = active.entries[a].record, row = order.active_rows[record - order.base];
+    const float depth = order.records[record].depth;
+    for (; f < frozen.size; f++) {
+      const uint32_t other = frozen.entries[f].record;
+      const float far = order.records[other].depth;
+      if (depth != far ? depth < far : row < other) break;
+      take(frozen, f);
+    }
+    take(active, a);
+  }
+  for (; f < frozen.size; f++) take(frozen, f);
+}
+
 void merge_tile_lists(const TileLists& frozen, const TileLists& active, const std::vector<uint32_t>& tile_blocks,
-                      const Record* records, uint32_t record_base, const std::vector<uint32_t>& active_rows,
-                      TileLists& out) {
+                      const DepthOrder& order, TileLists& out) {
   out.resize(frozen.tiles, frozen.size + active.size);
   uint32_t total = 0;
   for (std::size_t tile = 0; tile < frozen.tiles; tile++) {
@@ -126,23 +135,9 @@ void merge_tile_lists(const TileLists& frozen, const TileLists& active, const st
   }
   out.offset[frozen.tiles] = total;
   out.size = total;
-  const auto active_first = [&](const TileEntry& a, const TileEntry& f) {
-    const float near = records[a.record].depth, far = records[f.record].depth;
-    return near != far ? near < far : active_rows[a.record - record_base] < f.record;
-  };
   parallel_for(frozen.tiles, MERGE_GRAIN, [&](std::size_t begin, std::size_t end) {
-    for (std::size_t tile = begin; tile < end; tile++) {
-      if (!tile_blocks[tile]) continue;
-      uint32_t a = active.offset[tile], f = frozen.offset[tile], place = out.offset[tile];
-      const uint32_t a_end = active.offset[tile + 1], f_end = frozen.offset[tile + 1];
-      while (a < a_end || f < f_end) {
-        const bool take_active = f == f_end || (a < a_end && active_first(active.entries[a], frozen.entries[f]));
-        const TileLists& source = take_active ? active : frozen;
-        const uint32_t from = take_active ? a++ : f++;
-        out.entries[place] = source.entries[from];
-        out.blocks[place++] = source.blocks[from];
-      }
-    }
+    for (std::size_t tile = begin; tile < end; tile++)
+      if (tile_blocks[tile]) merge_tile(frozen.slice(tile), active.slice(tile), order, out, out.offset[tile]);
   });
 }
 

@@ -1,0 +1,251 @@
+"""Layers of what stands still: a pull over them says what the scene says, whatever was pulled before."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from cpu_scenes import BACKGROUND, random_splats
+from gsstream_cpu_render import _native
+from gsstream_cpu_render.loss_part import CpuLoss
+from gsstream_cpu_render.renderer import CpuRenderer
+from gsstream_cpu_render.session import CpuSession
+from gsstream_cpu_render.threads import num_threads, set_num_threads
+from test_cpu_fit import some_tiles, step_by_step
+from test_cpu_renderer import replaced, rig
+
+from gsstream.api import Comparison, Gaussians, Pulled
+
+Scene = Gaussians[torch.Tensor]
+COUNT = 700  # lists of some 150 entries a tile: several cells of the layers behind
+#: Largest error of a gradient, as a share of the largest of its attribute: pixels whose transmittance fell below 1e-4
+#: take no light from Gaussians one by one, but the layer behind is not cut off there.
+BOUND = 2e-3
+
+
+@pytest.fixture(params=_native.supported_isas())
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    before = _native.active_isa()
+    _native.select_isa(request.param)
+    yield request.param
+    _native.select_isa(before)
+
+
+@pytest.fixture(params=[1, 2])
+def threads(request: pytest.FixtureRequest) -> Iterator[int]:
+    before = num_threads()
+    set_num_threads(request.param)
+    yield request.param
+    set_num_threads(before)
+
+
+def crowd(seed: int, opaque: bool = False) -> Scene:
+    return Gaussians(*(torch.from_numpy(a) for a in random_splats(COUNT, seed, 4, opaque)))
+
+
+def wall(whole: Scene) -> Scene:
+    """The scene behind an opaque sheet that hides about half of the picture in view 0."""
+    sheet = {name: value[:1].clone() for name, value in whole.items()}
+    sheet["means"][:] = torch.tensor([0.9, 0.0, -1.3])
+    sheet["quats"][:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    sheet["scales"][:] = torch.log(torch.tensor([0.5, 3.0, 0.01]))
+    sheet["opacities"][:] = 12.0
+    merged = {name: torch.cat([sheet[name], sheet[name], value[2:]]) for name, value in whole.items()}
+    return Gaussians(**merged)
+
+
+def some_rows(count: int, g: torch.Generator, among: torch.Tensor | None = None) -> torch.Tensor:
+    among = torch.arange(COUNT) if among is None else among
+    return among[torch.randperm(len(among), generator=g)[:count]].sort().values
+
+
+def moved(rows: Scene, amount: float, depth: float, g: torch.Generator) -> Scene:
+    """Every value changed a little, and the places along the view by up to ``depth`` scene units."""
+    changed = rows.map(lambda value: value + amount * torch.randn(value.shape, generator=g))
+    along = torch.zeros(len(rows), 3)
+    along[:, 2] = depth * (2 * torch.rand(len(rows), generator=g) - 1)
+    return Gaussians(**{name: value + along if name == "means" else value for name, value in changed.items()})
+
+
+def opened(whole: Scene, rows: torch.Tensor, **config: float) -> CpuSession:
+    session = CpuRenderer(CpuRenderer.Config(**config)).open(whole, rows, rig(), BACKGROUND)
+    assert isinstance(session, CpuSession)
+    return session
+
+
+def comparison(dssim: float = 0.3, coloured: bool = False, tiles: torch.Tensor | None = None) -> Comparison:
+    """With an image that is brighter than any render: no pixel is near the kink of the absolute difference."""
+    cameras, g = rig(), torch.Generator().manual_seed(4)
+    target = CpuLoss().prepare(9 + torch.rand(cameras.height, cameras.width, 3, generator=g))
+    maps = (torch.eye(3) + 0.1 * torch.rand(3, 3, generator=g), 0.1 * torch.rand(3, generator=g)) if coloured else ()
+    return replace(Comparison(CpuLoss(), target, dssim, *maps), tiles=tiles)
+
+
+def pulled(session: CpuSession, view: int, rows: Scene, wanted: Comparison) -> Pulled:
+    found = session.pull(view, rows, wanted)
+    assert found is not None
+    return found
+
+
+def bits(found: Pulled) -> tuple[float, dict[str, bytes]]:
+    return found.loss, {name: value.numpy().tobytes() for name, value in found.gradients.items()}
+
+
+def assert_near(got: Scene, want: Scene, bound: float = BOUND) -> None:
+    for (name, value), (_, truth) in zip(got.items(), want.items(), strict=True):
+        np.testing.assert_allclose(value, truth, rtol=0, atol=bound * float(truth.abs().max()), err_msg=name)
+
+
+def between(session: CpuSession, view: int) -> int:
+    """Entries that the last pass of a view blended."""
+    return int(session._view(view).rasterizer._native.entry_count)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_pull_does_not_depend_on_the_pulls_before_it(seed: int, isa: str, threads: int) -> None:
+    g = torch.Generator().manual_seed(seed)
+    whole = wall(crowd(seed)) if seed == 3 else crowd(seed, opaque=seed % 2 == 1)
+    active = some_rows(60, g)
+    session = opened(whole, active)
+    for step in range(14):
+        if step in (3, 5, 11):  # fewer rows, then fewer still
+            active = some_rows(2 * len(active) // 3, g, active)
+            session.narrow(active)
+        if step == 7:  # other rows, of the same scene
+            active = some_rows(60, g)
+            session.narrow(active)
+        if step == 9:  # another scene, in which some of them have moved
+            changed = active[::3]
+            whole = replaced(whole, changed, moved(whole.rows(changed), 0.05, 0.3, g))
+            session = session.commit(whole, changed)
+            session.narrow(active)
+        rows = moved(whole.rows(active), 0.02, [0.0, 0.01, 0.1, 1.0][step % 4], g)
+        wanted = comparison(coloured=step % 3 == 1, tiles=some_tiles(step) if step % 5 == 2 else None)
+        for view in (0, 1) if step % 2 else (0,):
+            found = bits(pulled(session, view, rows, wanted))
+            assert found == bits(pulled(opened(whole, active), view, rows, wanted)), f"step {step}, view {view}"
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("dssim", [0.0, 0.5])
+def test_a_pull_is_near_the_gradient_of_the_whole_scene(seed: int, dssim: float, isa: str) -> None:
+    g = torch.Generator().manual_seed(seed)
+    whole = wall(crowd(seed)) if seed == 3 else crowd(seed, opaque=seed % 2 == 1)
+    active = some_rows(60, g)
+    session = opened(whole, active)
+    for step in range(5):
+        rows = moved(whole.rows(active), 0.02, 0.1 * step, g)
+        found, (loss, gradients) = pulled(session, 0, rows, comparison(dssim)), step_by_step(
+            opened(whole, active), rows, comparison(dssim), 0
+        )
+        assert found.loss == pytest.approx(loss, rel=1e-4)
+        assert_near(found.gradients, gradients)
+        if step == 2:
+            active = active[::2]
+            session.narrow(active)
+
+
+def test_with_nothing_behind_the_active_rows_a_pull_has_the_bits_of_the_whole_scene(isa: str, threads: int) -> None:
+    whole, g = crowd(6), torch.Generator().manual_seed(6)
+    active = some_rows(40, g)
+    whole.means[:, 2].clamp_(max=0.2)
+    whole.means[active, 2] += 4  # behind the others, as seen by either camera
+    session = opened(whole, active)
+    for step in range(4):
+        rows = moved(whole.rows(active), 0.02, 0.2 * step, g)
+        found = pulled(session, 1, rows, comparison())
+        loss, gradients = step_by_step(opened(whole, active), rows, comparison())
+        assert found.loss == loss
+        assert bits(found)[1] == bits(found._replace(gradients=gradients))[1]
+        assert all(bool(value.any()) for _, value in gradients.items())
+
+
+def test_the_layers_hold_most_of_a_crowd_and_the_more_the_fewer_rows_change() -> None:
+    whole, g = crowd(1), torch.Generator().manual_seed(1)
+    active = some_rows(6, g)
+    session = opened(whole, active)
+    session.render(0, whole.rows(active))
+    every = between(session, 0)
+    pulled(session, 0, whole.rows(active), comparison())
+    few = between(session, 0)
+    session.narrow(active[:1])
+    pulled(session, 0, whole.rows(active[:1]), comparison())
+    assert between(session, 0) < few < 0.7 * every
+
+
+def test_rows_that_leave_the_view_and_come_back(isa: str) -> None:
+    whole, g = crowd(2), torch.Generator().manual_seed(2)
+    active = some_rows(30, g)
+    session, here = opened(whole, active), whole.rows(active)
+    away = here.map(torch.clone)
+    away.means[:] += 100
+    before = bits(pulled(session, 0, here, comparison()))
+    gone = pulled(session, 0, away, comparison())
+    assert not any(bool(value.any()) for _, value in gone.gradients.items())
+    assert bits(pulled(session, 0, here, comparison())) == before
+
+
+def test_gaussians_at_one_depth() -> None:
+    """Ties go by row, also between rows that change and rows in the layers."""
+    whole, g = crowd(8), torch.Generator().manual_seed(8)
+    whole.means[:] = whole.means[(torch.arange(COUNT) // 50) * 50]
+    active = some_rows(40, g)
+    session = opened(whole, active)
+    for step in range(3):
+        rows = whole.rows(active) if step != 1 else moved(whole.rows(active), 0.0, 0.5, g)
+        found = pulled(session, 0, rows, comparison())
+        assert bits(found) == bits(pulled(opened(whole, active), 0, rows, comparison()))
+        assert_near(found.gradients, step_by_step(opened(whole, active), rows, comparison(), 0)[1])
+
+
+def test_a_render_between_pulls_is_that_of_the_scene_and_changes_nothing(isa: str) -> None:
+    whole, g = crowd(4), torch.Generator().manual_seed(4)
+    active = some_rows(40, g)
+    session, rows = opened(whole, active), moved(whole.rows(active), 0.05, 0.2, g)
+    before = bits(pulled(session, 0, rows, comparison()))
+    assert torch.equal(session.render(0, rows).image, opened(whole, active).render(0, rows).image)
+    assert bits(pulled(session, 0, rows, comparison())) == before
+
+
+def test_a_value_that_is_not_finite_leaves_the_layers_usable() -> None:
+    whole, g = crowd(5), torch.Generator().manual_seed(5)
+    active = some_rows(40, g)
+    session, rows = opened(whole, active), moved(whole.rows(active), 0.05, 0.2, g)
+    before = bits(pulled(session, 0, rows, comparison()))
+    bad = rows.map(torch.clone)
+    bad.means[3, 1] = torch.nan
+    with pytest.raises(ValueError, match="expected finite values"):
+        session.pull(0, bad, comparison())
+    assert bits(pulled(session, 0, rows, comparison())) == before
+
+
+def test_a_pull_beyond_the_memory_limit_has_the_same_bits() -> None:
+    whole, g = crowd(7), torch.Generator().manual_seed(7)
+    active = some_rows(40, g)
+    roomy, tight = opened(whole, active), opened(whole, active, cache_mb=0.0)
+    for step in range(3):
+        rows = moved(whole.rows(active), 0.02, 0.1 * step, g)
+        assert bits(pulled(roomy, 0, rows, comparison())) == bits(pulled(tight, 0, rows, comparison()))
+
+
+def test_layers_count_as_memory_until_the_scene_changes() -> None:
+    whole, g = crowd(9), torch.Generator().manual_seed(9)
+    active = some_rows(40, g)
+    session = opened(whole, active)
+    native = session._view(0).rasterizer._native
+    pulled(session, 0, whole.rows(active), comparison())
+    layered = native.memory_bytes()
+    native.shed_scratch()
+    shed = native.memory_bytes()
+    session.narrow(active)
+    session.render(0, whole.rows(active))
+    rendered = native.memory_bytes()
+    pixels = 6 * 32 * 16 * 7 * 4  # tiles of the picture, their pixels, transmittance and two colours
+    assert layered - shed > pixels
+    pulled(session, 0, whole.rows(active), comparison())
+    assert native.memory_bytes() - rendered > pixels
+    session.commit(whole, active)
+    assert native.memory_bytes() < rendered + pixels

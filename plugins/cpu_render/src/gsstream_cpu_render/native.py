@@ -125,9 +125,11 @@ class NativeRasterizer:
     ) -> float:  # fmt: skip
         """Render the active rows, judge the picture and write the gradient by the rows: one iteration of a fit.
 
-        The bits are those of `forward_active` with ``touched_only``, `photometric_loss` with ``around`` and
-        `backward_active`, one after the other; whole images are neither made nor copied. Tiles that are left out stay
-        as they are in the cache.
+        It stands for `forward_active` with ``touched_only``, `photometric_loss` with ``around`` and `backward_active`,
+        one after the other; whole images are neither made nor copied, and frozen Gaussians in front of all active ones
+        or behind them are blended once for all calls after a `forward`, not in each. By that colours differ from those
+        of `forward_active` by 1e-4 of a Gaussian's colour and rounding; where nothing lies behind the active rows,
+        not at all. The bits do not depend on earlier calls. Tiles that are left out stay as they are in the cache.
 
         Arguments:
             rows: raw parameters of the A active Gaussians, in the order of active_ids.

@@ -1,7 +1,7 @@
 // One view rendered, compared with what its camera recorded, and differentiated, in one call: what every iteration of
-// every fit does. The same kernels as forward_layered, photometric_run and backward_layered one after the other, without
-// copies of whole images in between. Results are a function of the cached scene, the active rows and the comparison, bit
-// by bit; against forward_active and backward_active they differ by what layers.hpp says.
+// every fit does. The same kernels as forward_layered, photometric_run and backward_layered one after the other,
+// without copies of whole images in between. Results are a function of the cached scene, the active rows and the
+// comparison, bit by bit; against forward_active and backward_active they differ by what layers.hpp says.
 #pragma once
 #include <cstdint>
 

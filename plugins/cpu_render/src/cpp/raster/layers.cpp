@@ -1,14 +1,14 @@
 #include "raster/layers.hpp"
 
 #include <algorithm>
-#include <limits>
+#include <cstring>
+
+#include "raster/layer_limits.hpp"
 
 namespace gsstream_cpu {
 namespace {
 
-constexpr float NEAREST = -std::numeric_limits<float>::infinity(), FARTHEST = std::numeric_limits<float>::infinity();
 constexpr uint32_t LEAST_SPARE = 8;  // entries
-constexpr uint32_t CELL = 32;        // entries
 
 // Entries with the blocks in which they are wanted.
 struct List {
@@ -31,17 +31,6 @@ struct List {
   }
 };
 
-// Blocks that an active entry is the first or the last to touch.
-struct End {
-  uint32_t blocks;
-  float depth;
-};
-struct Ends {
-  End first[BLOCKS], last[BLOCKS];
-  int firsts = 0, lasts = 0;
-  uint32_t reached = 0;
-};
-
 // Blocks for which the front, the list between the layers or the back begins or ends at one place of the cached list.
 struct Turn {
   uint32_t front, between, back;
@@ -49,7 +38,7 @@ struct Turn {
 
 // Memory of one thread, kept between calls.
 struct Workspace {
-  List front, back;
+  List front, between, back;
   std::vector<Turn> turns;
   Buffer<uint32_t> contributed;
 };
@@ -57,80 +46,6 @@ struct Workspace {
 Workspace& workspace() {
   thread_local Workspace own;
   return own;
-}
-
-template <class Visit>
-void for_blocks(uint32_t blocks, Visit&& visit) {
-  for (; blocks; blocks &= blocks - 1) visit(__builtin_ctz(blocks));
-}
-
-// The cached list of one tile.
-struct CachedTile {
-  const Record* records;
-  const TileEntry* entries;
-  const uint32_t* blocks;
-  uint32_t count;
-  const std::vector<uint32_t>& active;
-
-  CachedTile(const LayerSource& source, std::size_t tile)
-      : records(source.records),
-        entries(source.cached.entries + source.cached.begin[tile]),
-        blocks(source.cached.blocks + source.cached.begin[tile]),
-        count(source.cached.end[tile] - source.cached.begin[tile]),
-        active((*source.in_cache)[tile]) {}
-  float depth(uint32_t entry) const { return records[entries[entry].record].depth; }
-  // Number of entries nearer than this depth.
-  uint32_t nearer(float depth) const {
-    const auto before = [&](const TileEntry& e, float d) { return records[e.record].depth < d; };
-    return static_cast<uint32_t>(std::lower_bound(entries, entries + count, depth, before) - entries);
-  }
-  // Number of entries that are not farther.
-  uint32_t not_farther(float depth) const {
-    const auto before = [&](float d, const TileEntry& e) { return d < records[e.record].depth; };
-    return static_cast<uint32_t>(std::upper_bound(entries, entries + count, depth, before) - entries);
-  }
-};
-
-Ends find_ends(const LayerSource& source, std::size_t tile, uint32_t touched) {
-  const ListSlice active = source.active->slice(tile);
-  const auto end = [&](std::size_t e, uint32_t blocks) {
-    return End{blocks, source.records[active.entries[e].record].depth};
-  };
-  Ends ends;
-  for (std::size_t e = 0; e < active.size; e++) {
-    const uint32_t fresh = active.blocks[e] & touched & ~ends.reached;
-    if (fresh) ends.first[ends.firsts++] = end(e, fresh);
-    ends.reached |= fresh;
-  }
-  uint32_t missing = ends.reached;
-  for (std::size_t e = active.size; missing; e--) {
-    const uint32_t fresh = active.blocks[e - 1] & missing;
-    if (fresh) ends.last[ends.lasts++] = end(e - 1, fresh);
-    missing &= ~fresh;
-  }
-  return ends;
-}
-
-// Blocks of which one or the other layer does not hold.
-uint32_t find_crossed_fronts(const TileLayers& tile, const Ends& ends) {
-  uint32_t crossed = 0;
-  for (int i = 0; i < ends.firsts; i++)
-    for_blocks(ends.first[i].blocks & tile.settled, [&](int b) {
-      if (!(ends.first[i].depth > tile.front_depth[b])) crossed |= 1u << b;
-    });
-  return crossed;
-}
-uint32_t find_other_backs(const TileLayers& tile, const Ends& ends, uint32_t touched) {
-  uint32_t others = 0;
-  for_blocks(touched & tile.settled & ~ends.reached, [&](int b) {
-    if (tile.cell_depth[b] != NEAREST) others |= 1u << b;
-  });
-  for (int i = 0; i < ends.lasts; i++)
-    for_blocks(ends.last[i].blocks & tile.settled, [&](int b) {
-      const float depth = ends.last[i].depth;
-      if (!(depth >= tile.cell_depth[b] && depth < tile.back_depth[b])) others |= 1u << b;
-    });
-  return others;
 }
 
 void start_front(TileLayers& tile, int b) {
@@ -144,46 +59,6 @@ void start_back(TileLayers& tile, int b, uint32_t count, const float* background
   tile.back_begin[b] = count;
   for (int channel = 0; channel < 3; channel++)
     std::fill_n(tile.pixels.back[channel][b], BLOCK_PIXELS, background[channel]);
-}
-
-struct Limits {
-  uint32_t front[BLOCKS], back[BLOCKS];
-};
-
-// The last place at which the front layer of a block may end, and the one at which its back layer has to begin.
-Limits find_limits(const CachedTile& cached, const Ends& ends, uint32_t blocks, TileLayers& tile) {
-  Limits limits;
-  const auto cell_behind = [&](uint32_t place) { return std::min(cached.count, (place + CELL - 1) / CELL * CELL); };
-  for_blocks(blocks, [&](int b) {
-    limits.front[b] = cached.count;
-    limits.back[b] = 0;
-    tile.cell_depth[b] = NEAREST;
-  });
-  for (uint32_t e : cached.active)
-    for_blocks(cached.blocks[e] & blocks, [&](int b) {
-      limits.front[b] = std::min(limits.front[b], e);
-      limits.back[b] = cell_behind(e + 1);
-    });
-  for (int i = 0; i < ends.firsts; i++) {
-    if (!(ends.first[i].blocks & blocks)) continue;
-    const uint32_t nearer = cached.nearer(ends.first[i].depth);
-    for_blocks(ends.first[i].blocks & blocks, [&](int b) {
-      limits.front[b] = std::min(limits.front[b], nearer - std::min(nearer, tile.spare[b]));
-    });
-  }
-  for (int i = 0; i < ends.lasts; i++) {
-    if (!(ends.last[i].blocks & blocks)) continue;
-    const uint32_t behind = cell_behind(cached.not_farther(ends.last[i].depth));
-    for_blocks(ends.last[i].blocks & blocks, [&](int b) {
-      if (behind <= limits.back[b]) return;
-      limits.back[b] = behind;
-      tile.cell_depth[b] = cached.depth((behind - 1) / CELL * CELL);
-    });
-  }
-  for_blocks(blocks, [&](int b) {
-    tile.back_depth[b] = limits.back[b] < cached.count ? cached.depth(limits.back[b]) : FARTHEST;
-  });
-  return limits;
 }
 
 // Moves the ends of the layers of these blocks to the limits; notes in `turns` what each part of the list now becomes.
@@ -205,12 +80,8 @@ void move_ends(const Limits& limits, uint32_t blocks, TileLayers& tile, Turn* tu
 }
 
 // Divides the frozen entries of the cached list between what joins the layers and what lies between them.
-void deal_out(const CachedTile& cached, const Turn* turns, TileLayers& tile, Workspace& work) {
-  work.front.start(cached.count);
-  work.back.start(cached.count);
-  TileEntry* entries = tile.entries.require(cached.count);
-  uint32_t* blocks = tile.blocks.require(cached.count);
-  std::size_t size = 0;
+void deal_out(const CachedTile& cached, const Turn* turns, Workspace& work) {
+  for (List* list : {&work.front, &work.between, &work.back}) list->start(cached.count);
   Turn now{};
   auto active = cached.active.begin();
   for (uint32_t e = 0; e < cached.count; e++) {
@@ -221,12 +92,16 @@ void deal_out(const CachedTile& cached, const Turn* turns, TileLayers& tile, Wor
     active += !frozen;
     const uint32_t record = cached.entries[e].record, in = frozen ? cached.blocks[e] : 0;
     work.front.add(record, in & now.front, e);
+    work.between.add(record, in & now.between, e);
     work.back.add(record, in & now.back, e);
-    entries[size] = {record, FROZEN};
-    blocks[size] = in & now.between;
-    size += blocks[size] != 0;
   }
-  tile.size = size;
+}
+
+void keep_between(const List& between, TileLayers& tile) {
+  tile.size = between.size;
+  if (!tile.size) return;
+  std::memcpy(tile.entries.require(tile.size), between.entries.data(), tile.size * sizeof(TileEntry));
+  std::memcpy(tile.blocks.require(tile.size), between.blocks.data(), tile.size * sizeof(uint32_t));
 }
 
 // Remembers behind which depths the active Gaussians have to stay.
@@ -261,9 +136,16 @@ void extend(const LayerSource& source, std::size_t index, TileLayers& tile, Work
 }  // namespace
 
 void Layers::clear(std::size_t tiles) {
-  tiles_.clear();
   tiles_.resize(tiles);
+  for (const auto& tile : tiles_)
+    if (tile) tile->settled = tile->current = 0;
+  valid_ = true;
+}
+
+void Layers::release() {
+  tiles_.clear();
   tiles_.shrink_to_fit();
+  valid_ = false;
 }
 
 void Layers::freeze() {
@@ -280,6 +162,7 @@ void Layers::settle(const LayerSource& source, std::size_t index, uint32_t touch
   if (!blocks) return;
   const CachedTile cached(source, index);
   for_blocks(crossed, [&](int b) { tile.spare[b] = std::max(2 * tile.spare[b], LEAST_SPARE); });
+  for_blocks(blocks & ~tile.settled, [&](int b) { tile.spare[b] = 0; });
   const uint32_t fresh = blocks & ~tile.settled;
   tile.settled |= blocks;
   const Limits limits = find_limits(cached, ends, blocks, tile);
@@ -292,7 +175,8 @@ void Layers::settle(const LayerSource& source, std::size_t index, uint32_t touch
   Workspace& work = workspace();
   work.turns.assign(cached.count + 1, Turn{});
   move_ends(limits, blocks, tile, work.turns.data());
-  deal_out(cached, work.turns.data(), tile, work);
+  deal_out(cached, work.turns.data(), work);
+  keep_between(work.between, tile);
   guard_fronts(cached, work.front, blocks, tile);
   extend(source, index, tile, work);
   tile.current |= blocks;

@@ -153,6 +153,7 @@ uint32_t Rasterizer::forward(const Scene& scene, const Camera& camera, const uin
   build_tile_lists(visible_, selection_.blocks.size(), 0, merged_lists_);
   entry_count_ = merged_lists_.size;
   drop_layers();
+  layers_.release();
   cached_lists_.adopt(merged_lists_);
   job_ = composite(cached_lists_.view(), selection_, target, cached_lists_.contributed.data(), cached_trace_);
   job_tiles_ = selection_.active.size();

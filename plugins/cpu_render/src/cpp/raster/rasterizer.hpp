@@ -55,8 +55,8 @@ class Rasterizer {
   // `active_passed` and `layered_passed` (a forward_active or forward_layered whose backward may follow) what `frozen`
   // does.
   enum class State { empty, cached, passed, frozen, active_passed, layered_passed };
-  // What each operation needs and leaves behind. When it fails, forward leaves `empty`, forward_active and forward_layered `frozen`; on
-  // `empty`, forget and shed_scratch do nothing.
+  // What each operation needs and leaves behind. When it fails, forward leaves `empty`, forward_active and
+  // forward_layered leave `frozen`; on `empty`, forget and shed_scratch do nothing.
   struct Rule {
     const char* operation;
     State needs;
@@ -89,8 +89,8 @@ class Rasterizer {
   // With `touched_only`, only blocks that the active rows touch now or touched in the cache are rendered: all others
   // would come out as they are in the cache.
   uint32_t forward_active(const Scene& rows, const Target& target, bool touched_only);
-  // forward_active with touched_only for the sake of gradients: frozen Gaussians that lie in front of all active ones or
-  // behind them are blended once and not in every pass (layers.hpp). `mask`, as forward's: tiles outside it are not
+  // forward_active with touched_only for the sake of gradients: frozen Gaussians that lie in front of all active ones
+  // or behind them are blended once and not in every pass (layers.hpp). `mask`, as forward's: tiles outside it are not
   // rendered either. target.transmittance may be null; if not, it gets
   // what is left in front of the layers behind.
   uint32_t forward_layered(const Scene& rows, const Target& target, const uint8_t* mask = nullptr);

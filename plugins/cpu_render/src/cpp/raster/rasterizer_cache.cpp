@@ -124,6 +124,7 @@ void Rasterizer::shed_scratch() {
   sort_scratch_.release();
   moments_.release();
   drop_layers();
+  layers_.release();
   for (TileLists* lists : {&frozen_lists_, &active_lists_, &merged_lists_}) {
     lists->tiles = lists->size = 0;
     lists->offset.release();
@@ -139,7 +140,8 @@ std::size_t Rasterizer::cache_bytes() const {
 std::size_t Rasterizer::memory_bytes() const {
   std::size_t bytes = cache_bytes() + visible_.bytes() + sort_scratch_.bytes() + contributed_.bytes() + trace_.bytes() +
                       moments_.bytes() + screen_.bytes() + active_rows_.capacity() * sizeof(uint32_t) +
-                      is_active_.capacity() + active_in_cache_.bytes() + layers_.bytes() + layer_pixels_.capacity() * sizeof layer_pixels_[0];
+                      is_active_.capacity() + active_in_cache_.bytes() + layers_.bytes() +
+                      layer_pixels_.capacity() * sizeof layer_pixels_[0];
   for (const TileLists* lists : {&frozen_lists_, &active_lists_, &merged_lists_}) bytes += lists->bytes();
   for (std::size_t c = 0; c < chunk_capacity_; c++)
     bytes += sizeof(ProjectChunk) + chunks_[c].pairs.capacity * sizeof(Pair);

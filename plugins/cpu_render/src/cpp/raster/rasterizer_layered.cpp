@@ -25,13 +25,13 @@ uint32_t Rasterizer::forward_layered(const Scene& rows, const Target& target, co
 }
 
 void Rasterizer::drop_layers() {
-  layers_.clear();
+  layers_.drop();
   active_in_cache_.clear();
 }
 
 void Rasterizer::settle_layers(const float* background) {
   const std::size_t tiles = touched_.blocks.size();
-  if (!layers_.any() || !std::equal(background, background + 3, layer_background_)) {
+  if (!layers_.valid() || !std::equal(background, background + 3, layer_background_)) {
     layers_.clear(tiles);
     std::copy_n(background, 3, layer_background_);
   }

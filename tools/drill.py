@@ -143,6 +143,7 @@ def reported(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
     shown = [line for line in later if line["live"]["policy"] not in ("dropped", "missing")]
     latency = sorted(line["live"]["latency_seconds"] for line in shown)
     half = [line["live"]["latency_seconds"] for line in shown if line["frame"] >= len(lines) / 2]
+    refining = [line["live"]["latency_seconds"] for line in shown if line.get("refine_iterations", 0) > 0]
     deltas = [sum(line["bytes"].values()) for line in later if line["status"] != "key"]
     numbers = {
         "latency_first_s": lines[0]["live"]["latency_seconds"],
@@ -150,6 +151,7 @@ def reported(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "latency_p90_s": latency[math.ceil(0.9 * len(latency)) - 1] if latency else math.nan,
         "latency_worst_s": latency[-1] if latency else math.nan,
         "latency_median_of_second_half_s": median(half) if half else math.nan,
+        "latency_median_while_refining_s": median(refining) if refining else math.nan,
         "kb_per_frame": sum(deltas) / 1000 / len(deltas) if deltas else math.nan,
         "seconds_per_shown_frame": mean(sum(line["seconds"].values()) for line in shown),
         "cpu_seconds_per_shown_frame": mean(line["cpu_seconds"] for line in shown),

@@ -32,6 +32,14 @@ def test_dropped_frames_do_not_count_for_latency() -> None:
     assert reported(lines[:1])["latency_median_s"] is None
 
 
+def test_frames_that_refine_are_told_apart() -> None:
+    lines = [line(0, 50.0), *(line(t, t / 2, refine_iterations=20 if 2 <= t <= 4 else 0) for t in range(1, 7))]
+    lines[3] = line(3, 9.0, "dropped", refine_iterations=0)
+    lines += [line(7, 99.0)]
+    assert reported(lines)["latency_median_while_refining_s"] == 1.5
+    assert reported(lines[:2])["latency_median_while_refining_s"] is None
+
+
 def test_a_capture_keeps_to_its_rate_and_shows_whole_files(tmp_path: Path) -> None:
     finished = demo_copy(tmp_path / "scene", frames=3)
     capture = Capture(finished, tmp_path / "live", 20.0, 6)

@@ -246,3 +246,16 @@ def test_layers_count_as_memory() -> None:
     rendered = native.memory_bytes()
     pulled(session, 0, whole.rows(active), comparison())
     assert native.memory_bytes() - rendered > pixels
+
+
+def test_no_backward_of_a_render_may_follow_a_pull() -> None:
+    """What a pull left is not what `backward_active` differentiates."""
+    whole, g = crowd(3), torch.Generator().manual_seed(3)
+    active = some_rows(20, g)
+    session = opened(whole, active)
+    output = session.render(0, whole.rows(active).map(lambda value: value.clone().requires_grad_()))
+    rasterizer = session._view(0).rasterizer
+    rasterizer.backward_active(np.ones_like(output.image.detach().numpy()))
+    pulled(session, 0, whole.rows(active), comparison())
+    with pytest.raises(ValueError, match="backward_active: expected a forward_active pass before"):
+        rasterizer.backward_active(np.ones_like(output.image.detach().numpy()))

@@ -28,10 +28,16 @@ def slope_of(
         return slope
     leaves = transformed(base, moves).map(lambda value: torch.from_numpy(value).requires_grad_())
     work.pull(view, leaves, near_change)
-    return _pulled_back(leaves, moves)
+    return pulled_back(leaves, moves)
 
 
-def _pulled_back(leaves: Gaussians[torch.Tensor], moves: Moves) -> FloatArray:
+def pulled_back(leaves: Gaussians[torch.Tensor], moves: Moves) -> FloatArray:
+    """Return the gradient [K, 6] by shift and turn of the groups, from that of the rows that they have moved.
+
+    Arguments:
+        leaves: the A rows after they moved, with their gradients.
+        moves: of these rows, which it counts from 0 to A - 1.
+    """
     number = len(moves.centre)
     if leaves.means.grad is None:
         return np.zeros((number, 6))

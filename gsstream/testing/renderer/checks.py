@@ -12,6 +12,7 @@ from gsstream.render.reference import ALPHA_CUT, project
 from gsstream.testing.cases import BLACK, RENDERER, SIZE, Scene, fingerprint, world
 from gsstream.testing.compare import EXACT, at_most, equal, finite
 from gsstream.testing.registry import check
+from gsstream.testing.renderer import short_cuts as short_cuts  # its checks register themselves
 
 WORLDS = ("empty", "one", "two identical", "line", "cloud", "far", "thin", "unseen")
 GREY = (0.2, 0.5, 0.9)

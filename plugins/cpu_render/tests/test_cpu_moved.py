@@ -17,7 +17,7 @@ from test_cpu_renderer import rig, scene
 from gsstream.api import Comparison, Gaussians, Moves, RenderSession
 from gsstream.core.changes.motion import transformed
 from gsstream.loss.photometric import ReferenceLoss
-from gsstream.motion.pull_back import _pulled_back
+from gsstream.motion.pull_back import pulled_back
 
 ROWS = torch.tensor([1, 2, 5, 8, 11, 13, 17])
 
@@ -56,7 +56,7 @@ def by_single_calls(
     assert pulled is not None
     for (_, leaf), (_, gradient) in zip(leaves.items(), pulled.gradients.items(), strict=True):
         leaf.grad = gradient
-    return pulled.loss, _pulled_back(leaves, given)
+    return pulled.loss, pulled_back(leaves, given)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-6, 0.3, 4.0])

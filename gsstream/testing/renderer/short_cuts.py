@@ -1,0 +1,99 @@
+"""What a session promises of its short cuts: the numbers of the calls that they stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+
+from gsstream.core.changes.motion import Moves, transformed
+from gsstream.loss.base import Loss
+from gsstream.motion.pull_back import pulled_back
+from gsstream.plugins.catalog import load_catalog
+from gsstream.render.base import Comparison, Renderer, RenderSession
+from gsstream.testing.cases import SIZE, Scene, world
+from gsstream.testing.compare import equal
+from gsstream.testing.registry import Skip, check
+
+#: Of the largest value of a gradient. A renderer may blend what stands still once for all passes of a frame, and then
+#: a pixel whose light is nearly used up may end a Gaussian later (docs/results/live.md).
+NEAR = 5e-3
+WHY = "the same calls, up to rounding and the end of a pixel's light"
+
+
+def _losses() -> Iterator[tuple[str, Loss]]:
+    catalog = load_catalog()
+    for name in catalog.names("loss"):
+        yield name, catalog.resolve("loss", name)()
+
+
+def _opened(part: Renderer) -> tuple[RenderSession, Scene]:
+    """A narrowed session, and other values of its rows."""
+    case = world("cloud")
+    active = torch.arange(0, len(case.gaussians), 9)
+    session = part.open(case.gaussians, None, case.cameras, (0.2, 0.5, 0.9))
+    session.narrow(active)
+    g = torch.Generator().manual_seed(3)
+    return session, case.gaussians.rows(active).map(lambda v: v + 0.02 * torch.randn(v.shape, generator=g))
+
+
+def _comparison(loss: Loss) -> Comparison:
+    """SSIM alone, because a pixel that L1 sees from its other side has a gradient of the other sign."""
+    image = torch.rand(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(4))
+    return Comparison(loss, loss.prepare(image), 1.0)
+
+
+def _step_by_step(session: RenderSession, view: int, rows: Scene, wanted: Comparison) -> tuple[float, Scene]:
+    leaves = rows.map(lambda value: value.clone().requires_grad_())
+    output = session.render(view, leaves)
+    assert isinstance(wanted.loss, Loss)
+    value, gradient = wanted.loss.evaluate(output.image.detach(), wanted.target, wanted.dssim, output.tiles)
+    output.image.backward(gradient)  # type: ignore[no-untyped-call]
+    return value, leaves
+
+
+def _moves(count: int) -> Moves:
+    rng = np.random.default_rng(5)
+    transforms = (0.02 * rng.standard_normal((3, 3)) for _ in range(3))
+    return Moves(np.arange(count), np.arange(count) % 3, *transforms)
+
+
+@check("renderer")
+def check_renderer_short_cuts(part: Renderer) -> None:
+    """``pull`` and ``pull_moved``, for every loss that they know, give what render, loss and backward pass give."""
+    known = 0
+    for name, loss in _losses():
+        for view in (0, 1):
+            session, rows = _opened(part)
+            pulled = session.pull(view, rows, _comparison(loss))
+            if pulled is None:
+                continue
+            known += 1
+            value, leaves = _step_by_step(_opened(part)[0], view, rows, _comparison(loss))
+            equal(f"loss {name!r}, camera {view}: loss", torch.tensor(pulled.loss), torch.tensor(value), 1e-4, WHY)
+            for (what, got), (_, leaf) in zip(pulled.gradients.items(), leaves.items(), strict=True):
+                if got.numel():
+                    assert leaf.grad is not None
+                    scale = float(leaf.grad.abs().max()) or 1.0
+                    place = f"loss {name!r}, camera {view}: gradient of {what}"
+                    equal(place, got / scale, leaf.grad / scale, NEAR, WHY)
+            _check_moved(part, view, loss, name)
+    if not known:
+        raise Skip("its sessions offer no short cut")
+
+
+def _check_moved(part: Renderer, view: int, loss: Loss, name: str) -> None:
+    session, rows = _opened(part)
+    before = rows.map(torch.Tensor.numpy)
+    moves = _moves(len(rows))
+    found = session.pull_moved(view, before, moves, _comparison(loss))
+    if found is None:
+        return
+    there = transformed(before, moves).map(torch.from_numpy)
+    value, leaves = _step_by_step(_opened(part)[0], view, there, _comparison(loss))
+    slope = torch.from_numpy(pulled_back(leaves, moves))
+    scale = float(slope.abs().max()) or 1.0
+    equal(f"loss {name!r}, camera {view}: loss after motions", torch.tensor(found[0]), torch.tensor(value), 1e-4, WHY)
+    got = torch.from_numpy(found[1]) / scale
+    equal(f"loss {name!r}, camera {view}: slope of motions", got, slope / scale, NEAR, WHY)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -23,14 +22,6 @@ from gsstream.testing.optimiser.checks import _residual_case
 
 BACKGROUND = (0.2, 0.5, 0.9)
 ROWS = torch.tensor([2, 5, 11, 17])
-
-
-@pytest.fixture(params=[1, 2, 3])
-def threads(request: pytest.FixtureRequest) -> Iterator[int]:
-    before = num_threads()
-    set_num_threads(request.param)
-    yield request.param
-    set_num_threads(before)
 
 
 def opened() -> tuple[RenderSession, Gaussians[torch.Tensor]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 import torch
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.renderer import CpuRenderer
-from gsstream_cpu_render.threads import num_threads, set_num_threads
 from test_cpu_fit import BACKGROUND, comparison, some_tiles
 from test_cpu_renderer import rig, scene
 
@@ -20,14 +18,6 @@ from gsstream.loss.photometric import ReferenceLoss
 from gsstream.motion.pull_back import pulled_back
 
 ROWS = torch.tensor([1, 2, 5, 8, 11, 13, 17])
-
-
-@pytest.fixture(params=[1, 2, 3])
-def threads(request: pytest.FixtureRequest) -> Iterator[int]:
-    before = num_threads()
-    set_num_threads(request.param)
-    yield request.param
-    set_num_threads(before)
 
 
 @pytest.fixture(autouse=True)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch
@@ -11,21 +9,12 @@ from cpu_scenes import BACKGROUND, HEIGHT, WIDTH
 from gsstream_cpu_render.arrays import SplatArrays
 from gsstream_cpu_render.pool import lease, release_idle_memory
 from gsstream_cpu_render.renderer import CpuRenderer
-from gsstream_cpu_render.threads import num_threads, set_num_threads
 from test_cpu_renderer import N, grads, leaves, pull, replaced, rig, scene, upstream
 
 from gsstream.api import Gaussians, InputError, Renderer, RenderSession, ScatterSession, ScreenGradient
 from gsstream.render.reference import ReferenceRenderer
 
 Scene = Gaussians[torch.Tensor]
-
-
-@pytest.fixture(params=[1, 2, 3])
-def threads(request: pytest.FixtureRequest) -> Iterator[int]:
-    before = num_threads()
-    set_num_threads(request.param)
-    yield request.param
-    set_num_threads(before)
 
 
 def some_rows(count: int, seed: int) -> torch.Tensor:

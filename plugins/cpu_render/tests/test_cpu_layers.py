@@ -76,6 +76,13 @@ def opened(whole: Scene, rows: torch.Tensor, **config: float) -> CpuSession:
     return session
 
 
+def begun(seed: int, g: torch.Generator) -> tuple[Scene, torch.Tensor, CpuSession]:
+    """A scene of the kind that the seed says, some rows of it, and a session in which they change."""
+    whole = wall(crowd(seed)) if seed == 3 else crowd(seed, opaque=seed % 2 == 1)
+    active = some_rows(60, g)
+    return whole, active, opened(whole, active)
+
+
 def comparison(dssim: float = 0.3, coloured: bool = False, tiles: torch.Tensor | None = None) -> Comparison:
     """With an image that is brighter than any render: no pixel is near the kink of the absolute difference."""
     cameras, g = rig(), torch.Generator().manual_seed(4)
@@ -107,9 +114,7 @@ def between(session: CpuSession, view: int) -> int:
 @pytest.mark.parametrize("seed", range(4))
 def test_a_pull_does_not_depend_on_the_pulls_before_it(seed: int, isa: str, threads: int) -> None:
     g = torch.Generator().manual_seed(seed)
-    whole = wall(crowd(seed)) if seed == 3 else crowd(seed, opaque=seed % 2 == 1)
-    active = some_rows(60, g)
-    session = opened(whole, active)
+    whole, active, session = begun(seed, g)
     for step in range(14):
         if step in (3, 5, 11):  # fewer rows, then fewer still
             active = some_rows(2 * len(active) // 3, g, active)
@@ -133,9 +138,7 @@ def test_a_pull_does_not_depend_on_the_pulls_before_it(seed: int, isa: str, thre
 @pytest.mark.parametrize("dssim", [0.0, 0.5])
 def test_a_pull_is_near_the_gradient_of_the_whole_scene(seed: int, dssim: float, isa: str) -> None:
     g = torch.Generator().manual_seed(seed)
-    whole = wall(crowd(seed)) if seed == 3 else crowd(seed, opaque=seed % 2 == 1)
-    active = some_rows(60, g)
-    session = opened(whole, active)
+    whole, active, session = begun(seed, g)
     for step in range(5):
         rows = moved(whole.rows(active), 0.02, 0.1 * step, g)
         found, (loss, gradients) = pulled(session, 0, rows, comparison(dssim)), step_by_step(

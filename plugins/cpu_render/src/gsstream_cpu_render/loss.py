@@ -115,8 +115,12 @@ def photometric_loss(
     if not np.isfinite(l1 + dssim):
         refuse(first_non_finite("image", image) or first_non_finite("target", goal)
                or "image: expected values in [0, 1], got some so large that the loss overflows")  # fmt: skip
-    l1, dssim = l1 * scale, dssim * scale
-    return PhotometricLoss((1.0 - dssim_weight) * l1 + dssim_weight * dssim, l1, dssim, result)
+    return PhotometricLoss(weighted(l1, dssim, dssim_weight, scale), l1 * scale, dssim * scale, result)
+
+
+def weighted(l1: float, dssim: float, dssim_weight: float, scale: float) -> float:
+    """The loss of sums of |I - G| and of 1 - SSIM, both times ``scale``."""
+    return float((1.0 - dssim_weight) * (l1 * scale) + dssim_weight * (dssim * scale))
 
 
 def _image(name: str, value: Any) -> Float32:

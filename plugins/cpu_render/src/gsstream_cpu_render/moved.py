@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from gsstream.api import Comparison, Gaussians, Moves
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import SplatArrays
+from gsstream_cpu_render.loss import weighted
 from gsstream_cpu_render.native import native_scene
 
 
@@ -29,6 +30,5 @@ def moved_slope(
     transforms = [np.ascontiguousarray(part, np.float64) for part in (moves.centre, moves.shift, moves.turn)]
     splats = SplatArrays(*(np.ascontiguousarray(value, np.float32) for _, value in rows.items()))
     faults, l1, dssim = _native.pull_moved(rasterizer, native_scene(splats), compared, place, *transforms, slope)
-    weight, scale = comparison.dssim, 1.0 / comparison.target.image.size
-    loss = float((1.0 - weight) * (l1 * scale) + weight * (dssim * scale))
+    loss = weighted(l1, dssim, comparison.dssim, 1.0 / comparison.target.image.size)
     return (loss, slope) if faults == 0 and np.isfinite(loss) else None

@@ -19,7 +19,7 @@ from gsstream_cpu_render.arrays import (
     require_splats,
 )
 from gsstream_cpu_render.checks import Float32, refuse, refuse_value
-from gsstream_cpu_render.loss import PhotometricTarget
+from gsstream_cpu_render.loss import PhotometricTarget, weighted
 from gsstream_cpu_render.view import NEAR, Background, checked_view
 
 
@@ -155,7 +155,7 @@ class NativeRasterizer:
         self._coefficients = rows.shN.shape[1] + 1
         if not np.isfinite(l1 + dssim):
             refuse("image: expected colours of ordinary size, got some so large that the loss is not finite")
-        return float((1.0 - dssim_weight) * (l1 * scale) + dssim_weight * (dssim * scale))
+        return weighted(l1, dssim, dssim_weight, scale)
 
     # ---- checks
 

@@ -103,13 +103,11 @@ class CpuSession(RenderSession):
         return replace(output, tiles=torch.from_numpy(active.tiles))
 
     def pull(self, view: int, rows: Gaussians[torch.Tensor], comparison: Comparison) -> Pulled | None:
-        # In a wide session nothing stands still that could be left out; rows in another order are rare.
-        # Kernels that were built before this call existed do without it, until the plugin is installed again.
-        known = type(comparison.loss) is CpuLoss and hasattr(_native, "Comparison")
-        if self._ids is None or self._order is not None or not known:
+        ids = self._short_cut_rows([comparison])
+        if ids is None:
             return None
         cached = self._view(view)  # its owner while the native call runs
-        cached.freeze(self._ids, None)
+        cached.freeze(ids, None)
         return cached.pull(rows, comparison)
 
     def pull_moved(
@@ -127,15 +125,24 @@ class CpuSession(RenderSession):
         Arguments:
             views: indices of cameras of the rig. comparisons: one for each.
         """
-        known = all(type(comparison.loss) is CpuLoss for comparison in comparisons)
-        if self._ids is None or self._order is not None or not known:
+        ids = self._short_cut_rows(comparisons)
+        if ids is None:
             return None
         ready = []
         for view, comparison in zip(views, comparisons, strict=True):
             cached = self._view(view)
-            cached.freeze(self._ids, None)
+            cached.freeze(ids, None)
             ready.append((cached.rasterizer.handle, cached.comparison(comparison)))
         return ready if all(view in self._views for view in views) else None
+
+    def _short_cut_rows(self, comparisons: Sequence[Comparison]) -> Ids | None:
+        """The active rows, where the kernels can render, compare and differentiate in one call.
+
+        In a wide session nothing stands still that could be left out; rows in another order are rare. Kernels that were
+        built before such calls existed do without them, until the plugin is installed again.
+        """
+        known = all(type(comparison.loss) is CpuLoss for comparison in comparisons) and hasattr(_native, "Comparison")
+        return self._ids if known and self._order is None else None
 
     def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
         if len(gaussians) != len(self._gaussians):

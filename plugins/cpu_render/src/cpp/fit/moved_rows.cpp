@@ -14,7 +14,7 @@ constexpr std::size_t ROW_GRAIN = 1024;
 
 // Memory of one calling thread, kept between calls.
 struct Workspace {
-  Buffer<float> means, quats, gradient[6], means2d;
+  Buffer<float> means, quats, gradient[ATTRIBUTES], means2d;
 };
 
 Workspace& workspace() {
@@ -77,10 +77,10 @@ void add_row(const MovedRows& moved, std::size_t i, const Workspace& work, doubl
 
 ViewPull pull_moved(Rasterizer& rasterizer, const MovedRows& moved, const ViewComparison& view, double* slope) {
   Workspace& work = workspace();
-  const std::size_t rows = moved.rows.count, degree = static_cast<std::size_t>(moved.rows.sh_degree);
-  const std::size_t widths[] = {3, 4, 3, 1, 3, 3 * ((degree + 1) * (degree + 1) - 1)};
-  float *means = work.means.require(3 * rows), *quats = work.quats.require(4 * rows), *gradients[6];
-  for (int a = 0; a < 6; a++) gradients[a] = work.gradient[a].require(rows * widths[a]);
+  const std::size_t rows = moved.rows.count;
+  const auto widths = row_widths(moved.rows.sh_degree);
+  float *means = work.means.require(3 * rows), *quats = work.quats.require(4 * rows), *gradients[ATTRIBUTES];
+  for (std::size_t a = 0; a < ATTRIBUTES; a++) gradients[a] = work.gradient[a].require(rows * widths[a]);
   std::vector<Turn> turns;
   for (std::size_t k = 0; k < moved.groups; k++) turns.push_back(turn_of(moved.turn + 3 * k));
   parallel_for(rows, ROW_GRAIN, [&](std::size_t begin, std::size_t end) {

@@ -159,10 +159,8 @@ std::vector<double> run(PyResidualTable& table, const std::vector<View>& views, 
   pass.rows = base.scene.count;
   const GaussianArrays& rows = base.scene.arrays;
   const float* const arrays[] = {rows.means, rows.quats, rows.scales, rows.opacities, rows.sh0, rows.shN};
-  const std::size_t degree = static_cast<std::size_t>(base.scene.sh_degree);
-  const std::size_t widths[] = {3, 4, 3, 1, 3, 3 * ((degree + 1) * (degree + 1) - 1)};
+  const auto widths = row_widths(base.scene.sh_degree);
   std::copy_n(arrays, ATTRIBUTES, pass.base);
-  std::copy_n(widths, ATTRIBUTES, pass.widths);
   pass.sh_degree = base.scene.sh_degree;
   const std::vector<ResidualBlock>& blocks = pass.table->blocks();
   require(attributes.size() == blocks.size(), "one attribute for each block");

@@ -46,14 +46,15 @@ class Run {
  private:
   // Where rows are rendered from: those of the table that it decodes, and the others as they are.
   GaussianArrays point_at_rows() {
+    const auto widths = row_widths(pass_.sh_degree);
     const float* rows[ATTRIBUTES];
     float* gradients[ATTRIBUTES];
     for (std::size_t a = 0; a < ATTRIBUTES; a++) {
       rows[a] = pass_.base[a];
-      gradients[a] = s_.gradient[a].require(pass_.rows * pass_.widths[a]);
+      gradients[a] = s_.gradient[a].require(pass_.rows * widths[a]);
     }
     for (std::size_t a : pass_.attribute) {
-      float* decoded = s_.out[a].require(pass_.rows * pass_.widths[a]);
+      float* decoded = s_.out[a].require(pass_.rows * widths[a]);
       rows[a] = decoded;
       bases_.push_back(pass_.base[a]);
       decoded_.push_back(decoded);

@@ -11,9 +11,6 @@
 
 namespace gsstream_cpu {
 
-// Means, quats, scales, opacities, sh0, shN: the order of attributes wherever they are numbered.
-constexpr std::size_t ATTRIBUTES = 6;
-
 // Gates are sigmoid(logit / temperature + shift), rounded to steps of 1 / levels; open with probability sigmoid(logit - margin).
 struct GateRule {
   float temperature, shift, levels, margin, bound;
@@ -32,7 +29,6 @@ struct ResidualPass {
   ResidualTable* table;
   std::size_t rows, nodes;
   const float* base[ATTRIBUTES];           // [A, ...] each
-  std::size_t widths[ATTRIBUTES];          // floats of a row
   std::vector<std::size_t> attribute;      // of each block of the table
   int sh_degree;
   const float *units, *steps;              // [A], [L]

@@ -9,6 +9,7 @@
 // number of frozen Gaussians. Results do not depend on the number of threads. Not re-entrant: concurrent use of one
 // object throws std::runtime_error.
 #pragma once
+#include <array>
 #include <atomic>
 #include <cstddef>
 #include <cstdint>
@@ -36,6 +37,15 @@ struct Scene {
   std::size_t count = 0;
   int sh_degree = 0;
 };
+
+// Means, quats, scales, opacities, sh0, shN: the order of attributes wherever they are numbered.
+constexpr std::size_t ATTRIBUTES = 6;
+
+// Floats of a row of each attribute.
+inline std::array<std::size_t, ATTRIBUTES> row_widths(int sh_degree) {
+  const std::size_t bases = static_cast<std::size_t>((sh_degree + 1) * (sh_degree + 1));
+  return {3, 4, 3, 1, 3, 3 * (bases - 1)};
+}
 
 struct Target {
   float background[3];

@@ -18,6 +18,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.shapes import FloatArray, check_shape
 from gsstream.init.aggregate import aggregate, best_plane
 from gsstream.init.geometry import depth_range, neighbour_views, pixel_centres
+from gsstream.init.window import window_mean
 
 _GREY = np.array([0.299, 0.587, 0.114], np.float32)
 
@@ -167,30 +168,16 @@ def _ncc_cost(
     settings: SweepSettings,
 ) -> torch.Tensor:
     floor = settings.noise**2
-    square, product = warped * warped, warped * reference
-    cost = torch.zeros_like(warped)
+    moments = torch.cat([warped, warped * warped, warped * reference])
+    agreement = torch.zeros_like(warped)
     for half, (mean, variance) in zip(settings.windows, statistics, strict=True):
-        warped_mean = _box(warped, half)
-        warped_variance = (_box(square, half) - warped_mean * warped_mean).clamp_min(0)
-        covariance = _box(product, half) - warped_mean * mean
-        cost += 0.5 * (1 - covariance * torch.rsqrt((variance + floor) * (warped_variance + floor)))
-    return cost[:, 0] / len(settings.windows)
+        warped_mean, square, product = window_mean(moments, half).chunk(3)
+        warped_variance = (square - warped_mean * warped_mean).clamp_min_(0)
+        covariance = product - warped_mean * mean
+        agreement += covariance.mul_(torch.rsqrt(warped_variance.add_(floor).mul_(variance + floor)))
+    return 0.5 * (1 - agreement[:, 0] / len(settings.windows))
 
 
 def _mean_and_variance(image: torch.Tensor, half: int) -> tuple[torch.Tensor, torch.Tensor]:
-    mean = _box(image, half)
-    return mean, (_box(image * image, half) - mean * mean).clamp_min(0)
-
-
-def _box(image: torch.Tensor, half: int) -> torch.Tensor:
-    """Mean over a square of 2 half + 1 pixels; borders are replicated. [N, 1, H, W]."""
-    height, width = image.shape[-2:]
-    side = 2 * half + 1
-    padded = F.pad(image, (half, half, half, half), mode="replicate")
-    rows = padded[..., :width].clone()
-    for k in range(1, side):
-        rows += padded[..., k : k + width]
-    total = rows[..., :height, :].clone()
-    for k in range(1, side):
-        total += rows[..., k : k + height, :]
-    return total / (side * side)
+    mean = window_mean(image, half)
+    return mean, (window_mean(image * image, half) - mean * mean).clamp_min(0)

@@ -48,7 +48,7 @@ class FirstFrame(Section):
     """Seeding and root optimisation of frame 0."""
 
     epochs: int = Field(default=250, ge=0, description="passes over the training cameras (paper: 250)")
-    max_iterations: int = Field(default=4000, ge=0, description="upper bound on epochs * cameras (released code: 4000)")
+    max_iterations: int = Field(default=2000, ge=0, description="upper bound on epochs * cameras (released code: 4000)")
     sh_degree: Degree = Field(
         default=2, description="degree of the spherical harmonics (paper's code: 2); auto: the scene decides"
     )
@@ -70,6 +70,11 @@ class FirstFrame(Section):
         default=0.0, ge=0, le=0.1,
         description="standard deviation of noise on every centre, drawn anew in every iteration, fraction of the rig's "
         "extent (HiCoM): Gaussians that few cameras see fit them less closely",
+    )  # fmt: skip
+    lr_factor: float = Field(
+        default=2.0, gt=0, le=100,
+        description="factor on 3DGS's learning rates of everything but the centres, which are meant for 30,000 "
+        "iterations: in fewer, Gaussians that grow into place faster leave less for others to be born for; 1: as there",
     )  # fmt: skip
     densify_from: int = Field(default=300, ge=0, description="first iteration of densification and pruning")
     densify_every: int = Field(default=100, ge=1, description="iterations between two densifications")

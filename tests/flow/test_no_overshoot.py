@@ -23,9 +23,10 @@ from gsstream.trade.measure.records import mean
 
 EVENT = 5
 WORLD = f"synthetic:views=4&width=64&height=48&supersample=1&frames=20&noise=0.01&event={EVENT}&scene="
+#: The rates of frame 0 are those that the bounds below were set with: with others, too, some seeds lose the mover.
 SETTINGS = (
     "first_frame.max_iterations=240", "first_frame.max_gaussians=3000", "first_frame.sh_degree=0",
-    "first_frame.points=recording", "stream.epochs=6",
+    "first_frame.points=recording", "first_frame.lr_factor=1", "stream.epochs=6",
 )  # fmt: skip
 #: Loss that is not an overshoot, dB: runs of other seeds differ by half of it.
 MARGIN = 1.0

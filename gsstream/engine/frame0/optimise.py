@@ -70,9 +70,9 @@ def first_rates(settings: FirstFrame, extent: float) -> dict[str, float]:
         settings: section ``first_frame`` of the recipe.
         extent: of the cameras, scene units.
     """
-    s = settings
-    rates = {"means": s.lr_means * extent, "quats": schedule.LR_QUATS, "scales": schedule.LR_SCALES}
-    return {**rates, "opacities": schedule.LR_OPACITIES, "sh0": schedule.LR_SH0, "shN": schedule.LR_SHN}
+    rates = {"quats": schedule.LR_QUATS, "scales": schedule.LR_SCALES, "opacities": schedule.LR_OPACITIES,
+             "sh0": schedule.LR_SH0, "shN": schedule.LR_SHN}  # fmt: skip
+    return {"means": settings.lr_means * extent, **{name: settings.lr_factor * lr for name, lr in rates.items()}}
 
 
 def optimise_first_frame(

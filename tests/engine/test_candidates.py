@@ -15,7 +15,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.engine.step.active.candidates import candidates, changed_rows, released
 from gsstream.engine.step.active.change import Change
-from gsstream.render.base import TILE, ScatterSession
+from gsstream.render.base import TILE, RenderSession, ScatterSession
 from gsstream.render.reference import ReferenceRenderer
 from gsstream.testing.cases import BLACK, scene
 
@@ -33,6 +33,8 @@ def rig(views: int) -> Cameras:
 
 class SaidToBeSeen:
     """A session that sees what it is told to; it remembers which views it was asked about."""
+
+    visible_anywhere = RenderSession.visible_anywhere
 
     def __init__(self, seen: torch.Tensor) -> None:
         self.seen, self.asked = seen, list[int]()

@@ -142,6 +142,10 @@ def check_renderer_visible(part: Renderer) -> None:
         fresh = part.open(case.gaussians, None, case.cameras, GREY)
         got, want = (each.visible(0, masks[-1]) for each in (session, fresh))
         equal(f"world {name!r}: visible in the narrowed session", got, want)
+        for tiles in ([last] * len(case.cameras), [last, first], [last & False] * len(case.cameras)):
+            asked = torch.stack([*tiles, *[first & False] * (len(case.cameras) - len(tiles))])[: len(case.cameras)]
+            each_alone = torch.stack([fresh.visible(view, asked[view]) for view in range(len(asked))]).any(0)
+            equal(f"world {name!r}: visible anywhere", session.visible_anywhere(asked), each_alone)
 
 
 def _reached(scene: Scene, cameras: Cameras, view: int, mask: torch.Tensor) -> torch.Tensor:

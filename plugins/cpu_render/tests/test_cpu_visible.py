@@ -192,3 +192,62 @@ def test_the_rasteriser_refuses_tiles_that_it_did_not_draw() -> None:
     assert rasterizer.drawn_in_cache(part).any()
     with pytest.raises(InputError, match="did not cover"):
         rasterizer.drawn_in_cache(everything)
+
+
+@pytest.mark.parametrize("megabytes", [None, 0.0, 0.05])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_all_cameras_at_once_are_one_after_the_other(threads: int, megabytes: float | None) -> None:
+    """Also beyond the budget of the caches, where a view's cache is filled for every call."""
+    whole, before = scene(), num_threads()
+    set_num_threads(threads)
+    try:
+        session = opened(whole, ODD, megabytes)
+        for first, second in zip(masks(ODD), reversed(masks(ODD, 1)), strict=True):
+            asked = torch.stack([first, second])
+            expected = session.visible(0, first) | session.visible(1, second)
+            assert torch.equal(session.visible_anywhere(asked), expected)
+            assert torch.equal(opened(whole, ODD, megabytes).visible_anywhere(asked), expected)
+    finally:
+        set_num_threads(before)
+
+
+def test_tiles_of_another_shape_are_refused_for_all_cameras() -> None:
+    with pytest.raises(ShapeError, match="tile"):
+        opened(scene()).visible_anywhere(torch.ones(2, 1, 1, dtype=torch.bool))
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_commits_of_all_cameras_at_once_are_one_after_the_other(threads: int) -> None:
+    """The views of a rig are brought to the next scene by several threads; each has the bits of a new session."""
+    whole, ids, before = scene(), torch.arange(3, N, 7), num_threads()
+    later = changed(whole, ids, 5)
+    set_num_threads(threads)
+    try:
+        session = opened(whole, ODD)
+        for view in range(2):
+            session.visible(view, masks(ODD)[0])
+        kept, fresh = session.commit(later, ids), opened(later, ODD)
+        weights = torch.rand(ODD[1], ODD[0], 3, generator=torch.Generator().manual_seed(4))
+        for view in range(2):
+            got, want = (each.screen_gradient(view, weights) for each in (kept, fresh))
+            assert torch.equal(got.gradient, want.gradient)
+            assert torch.equal(got.visible, want.visible)
+            for each in (kept, fresh):
+                each.narrow(ids)
+            images = [each.render(view, later.rows(ids)).image for each in (kept, fresh)]
+            assert torch.equal(*images)
+    finally:
+        set_num_threads(before)
+
+
+def test_a_value_that_is_not_finite_is_refused_by_a_commit_of_all_cameras() -> None:
+    whole, ids = scene(), torch.tensor([2, 5])
+    session = opened(whole)
+    for view in range(2):
+        session.visible(view, masks(EVEN)[0])
+    later = replace(whole, means=whole.means.clone())
+    later.means[5] = float("nan")
+    with pytest.raises(ValueError, match="means"):
+        session.commit(later, ids)
+    everywhere = torch.stack([masks(EVEN)[0]] * 2)
+    assert torch.equal(session.visible_anywhere(everywhere), opened(whole).visible_anywhere(everywhere))

@@ -48,10 +48,9 @@ def changed_rows(
     """
     if change is None:
         return torch.ones(len(means), dtype=torch.bool)
-    seen = torch.zeros(len(means), dtype=torch.bool)
-    for view in range(len(cameras)):
-        if bool(change.tiles[view].any()):
-            seen |= session.visible(view, change.tiles[view])
+    if not bool(change.tiles.any()):
+        return torch.zeros(len(means), dtype=torch.bool)
+    seen = session.visible_anywhere(change.tiles)
     rows = seen.nonzero()[:, 0]
     seen[rows] = change.votes(means[rows], cameras) >= least_votes
     return seen

@@ -26,14 +26,12 @@ from gsstream.api import (
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import SplatArrays
 from gsstream_cpu_render.autograd import differentiable, splats_of
+from gsstream_cpu_render.cached_view import CachedView, Ids, update_views
 from gsstream_cpu_render.checks import Float32, as_array
-from gsstream_cpu_render.loss import PhotometricTarget
 from gsstream_cpu_render.loss_part import CpuLoss
 from gsstream_cpu_render.moved import moved_slope
 from gsstream_cpu_render.pool import Lease, Passes, lease
 from gsstream_cpu_render.view import Background
-
-Ids = NDArray[np.uint32]
 
 
 @final
@@ -58,7 +56,7 @@ class CpuSession(RenderSession):
         budget: int | None = None,
     ) -> None:
         self._gaussians, self._cameras, self._background, self._budget = gaussians, cameras, background, budget
-        self._views: dict[int, _CachedView] = {}
+        self._views: dict[int, CachedView] = {}
         self._refused: set[int] = set()  # views that do not fit into the budget
         self._order: torch.Tensor | None = None
         self._ids: Ids | None = None
@@ -83,6 +81,20 @@ class CpuSession(RenderSession):
             return torch.zeros(len(self._gaussians), dtype=torch.bool)
         cached = self._view(view)  # its owner while the native call runs
         return torch.from_numpy(cached.rasterizer.drawn_in_cache(as_array("tiles", tiles)))
+
+    def visible_anywhere(self, tiles: torch.Tensor) -> torch.Tensor:
+        views = tiles.flatten(1).any(1).nonzero()[:, 0].tolist()
+        for view in views:
+            check_tiles(tiles[view], (self._cameras.height, self._cameras.width))
+            if not self._refused:
+                self._view(view)
+        if not hasattr(_native, "drawn_in_views") or any(view not in self._views for view in views):
+            return super().visible_anywhere(tiles)  # caches beyond the budget are filled one at a time
+        drawn = np.zeros(len(self._gaussians), np.uint8)
+        if views:
+            masks = as_array("tiles", tiles.contiguous()).view(np.uint8)
+            _native.drawn_in_views([(self._views[view].rasterizer.handle, masks[view]) for view in views], drawn)
+        return torch.from_numpy(drawn.view(np.bool_))
 
     def render(
         self,
@@ -156,8 +168,7 @@ class CpuSession(RenderSession):
         views, self._views = self._views, {}
         if len(ids):
             rows = gaussians.rows(changed if order is None else changed[order])
-            for view in views.values():
-                view.update(ids, splats_of(rows))
+            update_views(list(views.values()), ids, splats_of(rows), np.asarray(self._background, np.float32))
         for view in views.values():
             view.thaw()
         after._views = views
@@ -169,14 +180,14 @@ class CpuSession(RenderSession):
     def _lease(self, view: int, own: bool = False) -> Lease:
         return lease(self._cameras, view, self._background, own)
 
-    def _view(self, view: int) -> _CachedView:
+    def _view(self, view: int) -> CachedView:
         """A view with its cache filled, kept for the next call unless the caches together are beyond the budget."""
         cached = self._views.get(view)
         if cached is None:
             kept = view not in self._refused
             # Memory of its own where memory counts: what the pool lends is as large as its former owners needed.
             held = self._lease(view, own=kept and self._budget is not None)
-            cached = _CachedView(held, splats_of(self._gaussians))
+            cached = CachedView(held, splats_of(self._gaussians))
             if kept:
                 self._views[view] = cached
         # What passes work in grows with them, so a view that fitted when it came may have to go later.
@@ -206,62 +217,10 @@ class FullPass(Passes):
         return self._held.rasterizer.backward(v_image, v_alpha)
 
 
-class _CachedView:
-    """A camera's cache and its render of the scene as it was when the session opened or last was committed."""
-
-    def __init__(self, held: Lease, splats: SplatArrays) -> None:
-        self.held, self.rasterizer = held, held.rasterizer
-        self.image, self.transmittance = self.rasterizer.forward(splats)
-        self.rasterizer.forget()
-        self.rasterizer.shed_scratch()
-        self._frozen: tuple[Ids, Any] | None = None
-        self.scenes = 0  # how many changes of the scene it has seen
-
-    def thaw(self) -> None:
-        """Other rows may change from now on."""
-        self._frozen = None
-
-    def freeze(self, ids: Ids, mask: Any) -> None:
-        """Let these rows change, in these tiles; does nothing if that is already so."""
-        if self._frozen is not None and self._frozen[0] is ids and _same(self._frozen[1], mask):
-            return
-        self.rasterizer.freeze(mask, ids)
-        self._frozen = ids, None if mask is None else mask.copy()
-
-    def update(self, ids: Ids, rows: SplatArrays) -> None:
-        """Bring cache and render to the scene in which these rows have these values."""
-        self.scenes += 1
-        self.rasterizer.update(ids, rows, self.image, self.transmittance)
-
-    def pull(self, rows: Gaussians[torch.Tensor], comparison: Comparison) -> Pulled:
-        """Render the active rows, compare, differentiate."""
-        gradients = rows.map(lambda value: torch.empty(value.shape))
-        loss = self.rasterizer.pull_active(splats_of(rows), *self._compared(comparison), splats_of(gradients))
-        return Pulled(loss, gradients)
-
-    def comparison(self, comparison: Comparison) -> Any:
-        """What renders of this view are compared with, as the kernels take it."""
-        return self.rasterizer.comparison(*self._compared(comparison))
-
-    def _compared(self, comparison: Comparison) -> tuple[Any, PhotometricTarget, float, list[Any], Any]:
-        target: PhotometricTarget = comparison.target
-        colours = [None if value is None else value.contiguous().numpy() for value in
-                   (comparison.matrix, comparison.offset)]  # fmt: skip
-        weights = None if comparison.tiles is None else as_array("tiles", comparison.tiles)
-        return self.image, target, comparison.dssim, colours, weights
-
-    def bytes(self) -> int:
-        return self.rasterizer.memory_bytes() + self.image.nbytes + self.transmittance.nbytes
-
-
-def _same(a: Any, b: Any) -> bool:
-    return a is b or (a is not None and b is not None and np.array_equal(a, b))
-
-
 class _ActivePass(Passes):
     """Forward and backward of the active rows over a view's cache, which it shares with other passes."""
 
-    def __init__(self, view: _CachedView, ids: Ids, mask: Any) -> None:
+    def __init__(self, view: CachedView, ids: Ids, mask: Any) -> None:
         self._view, self._ids, self._mask = view, ids, mask
         self._pass, self._scene = -1, view.scenes
         self.tiles: NDArray[np.bool_] = np.zeros((0, 0), np.bool_)  # known after a forward

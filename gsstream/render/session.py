@@ -1,0 +1,161 @@
+"""RenderSession: one scene of which some rows change, seen by one rig."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import torch
+
+from gsstream.core.changes.motion import Moves
+from gsstream.core.context import ScreenGradient
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.shapes import FloatArray
+from gsstream.render.output import Comparison, Pulled, RenderCache, RenderOutput
+
+
+class RenderSession(ABC):
+    """Renders a scene of which only some rows change, from a fixed rig.
+
+    A session begins wide: every row may change. ``narrow`` says which rows change from then on; all others stay as they
+    are in the session's scene. ``commit`` ends a frame: it gives the session of the next scene, wide again, which
+    renders and differentiates exactly as one opened anew would, and in which a renderer may keep whatever did not
+    change. ``screen_gradient`` and ``visible`` belong to the session's scene and may be asked for at any time.
+    """
+
+    @abstractmethod
+    def render(
+        self,
+        view: int,
+        rows: Gaussians[torch.Tensor],
+        *,
+        probe: torch.Tensor | None = None,
+        tile_mask: torch.Tensor | None = None,
+    ) -> RenderOutput:
+        """Render camera ``view``, differentiably.
+
+        Arguments:
+            view: index of a camera of the rig.
+            rows: the A active rows, raw parameters; all N of a session that was not narrowed.
+            probe: [A, 2] zeros that require grad; its gradient is the gradient of the 2-D means in pixels.
+            tile_mask: [ceil(H / 16), ceil(W / 16)] bool; None renders everything. Inside, image and alpha are those
+                of the scene with these rows, and gradients are sums over these pixels alone. Outside, a narrowed
+                session shows its scene as it was before these rows changed, or, where it keeps no cache, the scene with
+                these rows; so a mask must cover what the rows touch and touched, and an SSIM window that looks beyond
+                it sees the right picture. Outside, the gradient of the image is taken as zero.
+        """
+
+    @abstractmethod
+    def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
+        """Pull an upstream image gradient [H, W, 3] back to the 2-D means (pixels) of the session's scene.
+
+        What this projects and sorts, ``render`` need not do again. Where the gradient is zero in most of the image, a
+        renderer may spend work only on the rest.
+        """
+
+    @abstractmethod
+    def visible(self, view: int, tiles: torch.Tensor) -> torch.Tensor:
+        """Say which Gaussians of the session's scene are drawn in the marked tiles of camera ``view``.
+
+        A Gaussian is drawn at a pixel when it lies behind the near plane, its alpha at the pixel's centre is at least
+        1/255, and the transmittance before it exceeds 1e-4: exactly then it adds light to the pixel. Its colour does
+        not matter; a black Gaussian on black is drawn. Two answers may differ in rows whose alpha or transmittance lies
+        at its bound within rounding. A renderer that draws whole blocks of pixels may count those that lie in a marked
+        tile beyond the image's edge. Nothing is differentiated; the work of a renderer that keeps a cache follows the
+        marked tiles once the view's cache is filled.
+
+        Arguments:
+            view: index of a camera of the rig.
+            tiles: [ceil(H / 16), ceil(W / 16)] bool, the tiles that are asked about.
+
+        Returns:
+            [N] bool, one per Gaussian of the session's scene, active or not.
+
+        Raises:
+            ShapeError: ``tiles`` of another shape or dtype.
+        """
+
+    def visible_anywhere(self, tiles: torch.Tensor) -> torch.Tensor:
+        """Say which Gaussians are drawn in the marked tiles of any camera: ``visible``, camera by camera.
+
+        A renderer may ask its cameras at the same time.
+
+        Arguments:
+            tiles: [V, ceil(H / 16), ceil(W / 16)] bool, the tiles of each camera of the rig.
+
+        Returns:
+            [N] bool; no Gaussian where no tile is marked.
+
+        Raises:
+            ShapeError: tiles of another shape or dtype.
+        """
+        # A camera without a marked tile has no say, and need not be projected into.
+        first, *others = tiles.flatten(1).any(1).nonzero()[:, 0].tolist() or [0]
+        drawn = self.visible(first, tiles[first])
+        for view in others:
+            drawn = drawn | self.visible(view, tiles[view])
+        return drawn
+
+    @abstractmethod
+    def narrow(self, active: torch.Tensor) -> None:
+        """Freeze all rows but ``active`` [A], ascending. Replaces an earlier choice."""
+
+    def pull(self, view: int, rows: Gaussians[torch.Tensor], comparison: Comparison) -> Pulled | None:
+        """Render camera ``view``, compare it and differentiate, in one call; None where there is no such short cut.
+
+        It stands for ``render``, the loss's ``evaluate`` on the tiles that the rows can change, and the backward pass,
+        whose results it gives up to rounding; whoever gets None makes these calls.
+
+        Arguments:
+            view: index of a camera of the rig.
+            rows: the A active rows, raw parameters; no graph is looked at.
+            comparison: what the render is compared with.
+
+        Raises:
+            ShapeError: rows that cannot be rendered, or a loss that is not finite.
+        """
+        return None
+
+    def pull_moved(
+        self, view: int, rows: Gaussians[FloatArray], moves: Moves, comparison: Comparison
+    ) -> tuple[float, FloatArray] | None:
+        """Render rows after their groups moved, compare, and pull the loss back to the groups, in one call.
+
+        None where there is no such short cut, or it finds a fault: whoever asks then makes the calls that it stands for
+        (``gsstream.blocks.slope_of``), which raise the error. Results are theirs up to rounding.
+
+        Arguments:
+            view: index of a camera of the rig.
+            rows: the A active rows before they move, raw parameters.
+            moves: of these rows, which it counts from 0 to A - 1.
+            comparison: what the render is compared with.
+
+        Returns:
+            The loss, and its gradient [K, 6] by the groups' shift and turn.
+        """
+        return None
+
+    def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
+        """Return the session of the next scene, equal bit for bit to one opened anew with ``gaussians``.
+
+        No row of it is frozen.
+
+        This session gives its caches away; it stays correct, but has to fill them again. Backward through what it
+        rendered is no longer possible. Call it when nothing can fail any more, with decoded values: a frame that failed
+        after rendering changed nothing here, its session can be kept or dropped.
+
+        Arguments:
+            gaussians: the whole next scene, as many rows as now; not copied, so never change it in place.
+            changed: [A] int64 rows in which it may differ from the session's scene, whether they were active or not;
+                in no other row may it differ. May be empty.
+
+        Raises:
+            InputError: another number of rows, values that are not finite.
+            NotImplementedError: the renderer was built before sessions could go on; install its plugin again.
+        """
+        raise NotImplementedError(
+            f"{type(self).__name__} has no method 'commit' to go on to the next frame; install its plugin again"
+        )
+
+    def cache_bytes(self) -> RenderCache:
+        """Return what is kept for the cameras; empty for a renderer that caches nothing."""
+        return RenderCache()

@@ -1,0 +1,89 @@
+// What all cameras of a rig do with their caches, at the same time: each view is one thread's, so that nobody waits
+// within a view. The same bits as one after the other.
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <cstdint>
+#include <stdexcept>
+#include <string>
+#include <tuple>
+#include <vector>
+
+#include "fit/comparison_arrays.hpp"
+#include "raster/rasterizer.hpp"
+#include "raster/scene_arrays.hpp"
+#include "runtime/bindings.hpp"
+#include "runtime/parallel.hpp"
+
+namespace nb = nanobind;
+
+namespace gsstream_cpu {
+namespace {
+
+using Updated = std::tuple<nb::object, FloatArray, FloatArray>;  // rasteriser, image, transmittance
+using Asked = std::tuple<nb::object, ByteArray>;                 // rasteriser, tiles
+
+// Fault bits of all views. Views without a fault are changed, also where another one has a fault.
+uint32_t update_views(const std::vector<Updated>& views, IndexArray changed, const SceneArrays& rows,
+                      ConstFloatArray background) {
+  require(changed.ndim() == 1 && changed.shape(0) == rows.scene.count, "expected one row per changed id");
+  require_shape(background, {3}, "background");
+  std::vector<Rasterizer*> rasterizers;
+  std::vector<Target> targets;
+  for (const auto& [object, image, transmittance] : views) {
+    Rasterizer& rasterizer = native_rasterizer(object);
+    const std::size_t w = static_cast<std::size_t>(rasterizer.width()), h = static_cast<std::size_t>(rasterizer.height());
+    require_shape(image, {h, w, 3}, "image");
+    require_shape(transmittance, {h, w}, "transmittance");
+    const float* b = background.data();
+    targets.push_back({{b[0], b[1], b[2]}, image.data(), transmittance.data()});
+    rasterizers.push_back(&rasterizer);
+  }
+  std::vector<uint32_t> faults(views.size());
+  const uint32_t* ids = changed.data();
+  const nb::gil_scoped_release released;
+  parallel_for(views.size(), 1, [&](std::size_t begin, std::size_t end) {
+    for (std::size_t view = begin; view < end; view++)
+      faults[view] = rasterizers[view]->update(ids, rows.scene, targets[view]);
+  });
+  uint32_t all = 0;
+  for (uint32_t fault : faults) all |= fault;
+  return all;
+}
+
+// out[row] = 1 where a row is drawn in a marked tile of some view.
+void drawn_in_views(const std::vector<Asked>& views, ByteOutArray out) {
+  std::vector<Rasterizer*> rasterizers;
+  std::vector<const uint8_t*> masks;
+  for (const auto& [object, tiles] : views) {
+    Rasterizer& rasterizer = native_rasterizer(object);
+    const auto cells = [](int pixels) { return static_cast<std::size_t>((pixels + MASK_TILE - 1) / MASK_TILE); };
+    require_shape(tiles, {cells(rasterizer.height()), cells(rasterizer.width())}, "tiles");
+    require_shape(out, {rasterizer.scene_count()}, "out");
+    rasterizers.push_back(&rasterizer);
+    masks.push_back(tiles.data());
+  }
+  const std::size_t rows = out.size();
+  std::vector<uint8_t> drawn(views.size() * rows);
+  uint8_t* result = out.data();
+  const nb::gil_scoped_release released;
+  parallel_for(views.size(), 1, [&](std::size_t begin, std::size_t end) {
+    for (std::size_t view = begin; view < end; view++)
+      rasterizers[view]->drawn_in_cache(masks[view], drawn.data() + view * rows);
+  });
+  for (std::size_t row = 0; row < rows; row++) result[row] = 0;
+  for (std::size_t view = 0; view < views.size(); view++)
+    for (std::size_t row = 0; row < rows; row++) result[row] |= drawn[view * rows + row];
+}
+
+}  // namespace
+
+void bind_views(nb::module_& module) {
+  const auto strict = [](const char* name) { return nb::arg(name).noconvert(); };
+  module.def("update_views", &update_views, nb::arg("views"), strict("changed"), nb::arg("scene"), strict("background"),
+             "Rasterizer.update of several views; returns the FAULT_* bits of all.");
+  module.def("drawn_in_views", &drawn_in_views, nb::arg("views"), strict("out"),
+             "The rows that Rasterizer.drawn_in_cache names in any of several views.");
+}
+
+}  // namespace gsstream_cpu

@@ -1,0 +1,87 @@
+"""One camera's cache and render of a scene, and what all cameras do with theirs at the same time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsstream.api import Comparison, Gaussians, Pulled
+from gsstream_cpu_render import _native
+from gsstream_cpu_render.arrays import SplatArrays, raise_on_faults, require_splats
+from gsstream_cpu_render.autograd import splats_of
+from gsstream_cpu_render.checks import Float32, as_array
+from gsstream_cpu_render.loss import PhotometricTarget
+from gsstream_cpu_render.native import native_scene
+from gsstream_cpu_render.pool import Lease
+
+Ids = NDArray[np.uint32]
+
+
+class CachedView:
+    """A camera's cache and its render of the scene as it was when the session opened or last was committed."""
+
+    def __init__(self, held: Lease, splats: SplatArrays) -> None:
+        self.held, self.rasterizer = held, held.rasterizer
+        self.image, self.transmittance = self.rasterizer.forward(splats)
+        self.rasterizer.forget()
+        self.rasterizer.shed_scratch()
+        self._frozen: tuple[Ids, Any] | None = None
+        self.scenes = 0  # how many changes of the scene it has seen
+
+    def thaw(self) -> None:
+        """Other rows may change from now on."""
+        self._frozen = None
+
+    def freeze(self, ids: Ids, mask: Any) -> None:
+        """Let these rows change, in these tiles; does nothing if that is already so."""
+        if self._frozen is not None and self._frozen[0] is ids and _same(self._frozen[1], mask):
+            return
+        self.rasterizer.freeze(mask, ids)
+        self._frozen = ids, None if mask is None else mask.copy()
+
+    def update(self, ids: Ids, rows: SplatArrays) -> None:
+        """Bring cache and render to the scene in which these rows have these values."""
+        self.scenes += 1
+        self.rasterizer.update(ids, rows, self.image, self.transmittance)
+
+    def pull(self, rows: Gaussians[torch.Tensor], comparison: Comparison) -> Pulled:
+        """Render the active rows, compare, differentiate."""
+        gradients = rows.map(lambda value: torch.empty(value.shape))
+        loss = self.rasterizer.pull_active(splats_of(rows), *self._compared(comparison), splats_of(gradients))
+        return Pulled(loss, gradients)
+
+    def comparison(self, comparison: Comparison) -> Any:
+        """What renders of this view are compared with, as the kernels take it."""
+        return self.rasterizer.comparison(*self._compared(comparison))
+
+    def _compared(self, comparison: Comparison) -> tuple[Any, PhotometricTarget, float, list[Any], Any]:
+        target: PhotometricTarget = comparison.target
+        colours = [None if value is None else value.contiguous().numpy() for value in
+                   (comparison.matrix, comparison.offset)]  # fmt: skip
+        weights = None if comparison.tiles is None else as_array("tiles", comparison.tiles)
+        return self.image, target, comparison.dssim, colours, weights
+
+    def bytes(self) -> int:
+        return self.rasterizer.memory_bytes() + self.image.nbytes + self.transmittance.nbytes
+
+
+def update_views(views: Sequence[CachedView], ids: Ids, rows: SplatArrays, background: Float32) -> None:
+    """Bring caches and renders to the scene in which these rows have these values, all views at the same time."""
+    if not views or not hasattr(_native, "update_views"):
+        for view in views:
+            view.update(ids, rows)
+        return
+    rows = require_splats(rows, len(ids))
+    for view in views:
+        view.scenes += 1
+        view.rasterizer.forget()  # what it kept for a backward pass is not there any more afterwards
+    targets = [(view.rasterizer.handle, view.image, view.transmittance) for view in views]
+    raise_on_faults(_native.update_views(targets, ids, native_scene(rows), background), rows)
+
+
+def _same(a: Any, b: Any) -> bool:
+    return a is b or (a is not None and b is not None and np.array_equal(a, b))

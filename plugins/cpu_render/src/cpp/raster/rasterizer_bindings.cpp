@@ -15,28 +15,12 @@
 #include "runtime/bindings.hpp"
 #include "raster/rasterizer.hpp"
 #include "raster/scene_arrays.hpp"
+#include "raster/view_arrays.hpp"
 
 namespace nb = nanobind;
 
 namespace gsstream_cpu {
 namespace {
-
-const uint8_t* mask_data(const std::optional<ByteArray>& mask, int width, int height) {
-  if (!mask) return nullptr;
-  const auto cells = [](int pixels) { return static_cast<std::size_t>((pixels + MASK_TILE - 1) / MASK_TILE); };
-  require_shape(*mask, {cells(height), cells(width)}, "tile_mask");
-  return mask->data();
-}
-
-Target make_target(const ConstFloatArray& background, const FloatArray& image, const FloatArray& transmittance,
-                   int width, int height) {
-  const std::size_t w = static_cast<std::size_t>(width), h = static_cast<std::size_t>(height);
-  require_shape(background, {3}, "background");
-  require_shape(image, {h, w, 3}, "image");
-  require_shape(transmittance, {h, w}, "transmittance");
-  const float* b = background.data();
-  return {{b[0], b[1], b[2]}, image.data(), transmittance.data()};
-}
 
 class PyRasterizer {
  public:

@@ -12,6 +12,7 @@
 #include "fit/comparison_arrays.hpp"
 #include "raster/rasterizer.hpp"
 #include "raster/scene_arrays.hpp"
+#include "raster/view_arrays.hpp"
 #include "runtime/bindings.hpp"
 #include "runtime/parallel.hpp"
 
@@ -27,16 +28,11 @@ using Asked = std::tuple<nb::object, ByteArray>;                 // rasteriser, 
 uint32_t update_views(const std::vector<Updated>& views, IndexArray changed, const SceneArrays& rows,
                       ConstFloatArray background) {
   require(changed.ndim() == 1 && changed.shape(0) == rows.scene.count, "expected one row per changed id");
-  require_shape(background, {3}, "background");
   std::vector<Rasterizer*> rasterizers;
   std::vector<Target> targets;
   for (const auto& [object, image, transmittance] : views) {
     Rasterizer& rasterizer = native_rasterizer(object);
-    const std::size_t w = static_cast<std::size_t>(rasterizer.width()), h = static_cast<std::size_t>(rasterizer.height());
-    require_shape(image, {h, w, 3}, "image");
-    require_shape(transmittance, {h, w}, "transmittance");
-    const float* b = background.data();
-    targets.push_back({{b[0], b[1], b[2]}, image.data(), transmittance.data()});
+    targets.push_back(make_target(background, image, transmittance, rasterizer.width(), rasterizer.height()));
     rasterizers.push_back(&rasterizer);
   }
   std::vector<uint32_t> faults(views.size());
@@ -57,11 +53,9 @@ void drawn_in_views(const std::vector<Asked>& views, ByteOutArray out) {
   std::vector<const uint8_t*> masks;
   for (const auto& [object, tiles] : views) {
     Rasterizer& rasterizer = native_rasterizer(object);
-    const auto cells = [](int pixels) { return static_cast<std::size_t>((pixels + MASK_TILE - 1) / MASK_TILE); };
-    require_shape(tiles, {cells(rasterizer.height()), cells(rasterizer.width())}, "tiles");
     require_shape(out, {rasterizer.scene_count()}, "out");
     rasterizers.push_back(&rasterizer);
-    masks.push_back(tiles.data());
+    masks.push_back(mask_data(tiles, rasterizer.width(), rasterizer.height()));
   }
   const std::size_t rows = out.size();
   std::vector<uint8_t> drawn(views.size() * rows);

@@ -87,10 +87,10 @@ class FirstFrame(Section):
         description="at most one Gaussian per this many training pixels: more than the images can pin down describe "
         "the training cameras, not the scene; 0: max_gaussians alone bounds them",
     )  # fmt: skip
-    prune_share: float = Field(
-        default=0.0, ge=0, lt=1,
-        description="share of the images' blending weight that may go when growth ends, with the Gaussians that every "
-        "view shows least of; 0: none goes",
+    prune_error: float = Field(
+        default=10.0, ge=0,
+        description="a Gaussian goes, when growth has ended, whose absence changes all training images by less than "
+        "this many mean squared errors of one channel of a pixel; 0: none goes",
     )  # fmt: skip
     exposure: bool = Field(
         default=False, description="fit an affine colour map per training camera while optimising frame 0"
@@ -223,8 +223,8 @@ class Codec(Section):
     )  # fmt: skip
     key_rate: float = Field(
         default=0.0, ge=0,
-        description="squared error that a bit of frame 0's view-dependent colour must save, in mean squared errors "
-        "of one channel of a training image's pixel; 0: every coefficient is rounded to the nearest",
+        description="squared error that a bit of frame 0 must save, in mean squared errors of one channel of a "
+        "training image's pixel; 0: every value is rounded to the nearest",
     )  # fmt: skip
     fsync: bool = Field(default=False, description="force every packet to disk before the next frame starts")
 

@@ -22,7 +22,7 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import blaming
 from gsstream.engine.assembly.pending import refuse_pending
 from gsstream.engine.fit.exposure import Exposure
-from gsstream.engine.frame0.cheaper import cheaper_colors
+from gsstream.engine.frame0.cheaper import cheaper_rows
 from gsstream.engine.frame0.how_many import most_gaussians
 from gsstream.engine.frame0.optimise import Progress, initial_gaussians, optimise_first_frame, sort_by_node
 from gsstream.engine.state.stream_state import Step, StreamState
@@ -53,7 +53,7 @@ def begin(
     found = optimise_first_frame(start, anchors.levels, frame, parts, rng, progress)
     clock.append(time.perf_counter())
     # Positions are float32 in the packet too, so the hierarchy of the decoded scene is the one built here.
-    cheaper = cheaper_colors(parts, found.gaussians, frame, found.exposure, rng)
+    cheaper = cheaper_rows(parts, found.gaussians, frame, found.exposure, rng)
     decoded = quantise_key(cheaper.map(lambda t: t.numpy())).map(torch.from_numpy)
     hierarchy, levels, decoded = arrange(parts, decoded, found.levels, anchors)
     layout = make_layout(hierarchy, levels, anchors)

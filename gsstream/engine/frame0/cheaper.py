@@ -1,15 +1,13 @@
-"""View-dependent colour of frame 0 is rounded by what a bit buys: a coefficient stays only where the images feel it.
+"""Frame 0 is rounded by what a bit buys (``codec.key_rate``): a value is as exact as the training images feel it.
 
-Most of these coefficients explain noise, or hardly anything: most Gaussians are small, hidden or seen from one side.
-Each takes the code that makes squared error plus weight times bits least, among the nearest
-one, its neighbours towards zero and zero itself (rate-distortion optimised quantisation, as video encoders do it).
-The packet's format is the same, and a player does not know of it. Colours of degree 0 are left alone: where no training
-camera sees a Gaussian they would become grey, and other cameras do see it.
+Most Gaussians are small, half hidden or seen from one side, so most of their rotations, sizes and colours may be off by
+several steps and no image shows it; most coefficients of view-dependent colour explain noise and go altogether. How far
+a code may move is bounded, because other cameras may feel what the training cameras do not.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -19,21 +17,23 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.fit.backward import pull_back
 from gsstream.engine.fit.exposure import Exposure
+from gsstream.engine.frame0.axes import nearest_axes
+from gsstream.engine.frame0.probes import probes
+from gsstream.engine.frame0.rounding import codes_nearby, codes_towards_zero
 from gsstream.packet.grids import KEY_BITS, color_codes, color_slopes, from_codes
 
-BITS = KEY_BITS["shN"]
-#: How often the bits of a code are estimated from what was chosen. The third time changes next to nothing.
-ROUNDS = 3
-#: Count of a code that nobody has chosen yet, so that its bits are many, but a number.
-UNUSED = 0.05
+#: How far a code may move, in steps of its grid: a colour by 0.04, an axis by 7 degrees, a scale by a factor of 2.7, an
+#: opacity by a logit. View-dependent colour may go to zero from anywhere.
+REACH: Mapping[str, int] = {"quats": 8, "scales": 16, "opacities": 8, "sh0": 8}
+#: Probes of a camera.
+PROBES = 2
 
 
-def cheaper_colors(
+def cheaper_rows(
     parts: Assembly, gaussians: Gaussians[torch.Tensor], frame: Frame, exposure: Exposure | None, rng: Rng
 ) -> Gaussians[torch.Tensor]:
-    """Return the Gaussians with view-dependent colours that a key packet holds in fewer bytes (``codec.key_rate``).
+    """Return Gaussians that look nearly the same and that a key packet holds in fewer bytes.
 
     Arguments:
         parts: the live parts of the recipe.
@@ -42,66 +42,63 @@ def cheaper_colors(
         exposure: colour maps of the cameras, or None.
         rng: random streams by name and frame.
     """
+    rows = nearest_axes(gaussians)
     rate = parts.recipe.codec.key_rate
-    if rate == 0 or gaussians.shN.numel() == 0:
-        return gaussians
-    felt, error = _felt(parts, gaussians, frame, exposure, rng.stream("key rate", frame.index))
-    codes = chosen_codes(color_codes(gaussians.shN.numpy(), BITS), felt, rate * error)
-    return replace(gaussians, shN=torch.from_numpy(from_codes("shN", codes, BITS)).reshape(gaussians.shN.shape))
+    if rate == 0:
+        return rows
+    felt, error = felt_codes(parts, rows, frame, exposure, rng.stream("key rate", frame.index))
+    return Gaussians(
+        means=rows.means,
+        **{name: _rounded(name, values, felt[name], rate * error) for name, values in rows.items() if name in KEY_BITS},
+    )
 
 
-def chosen_codes(exact: FloatArray, felt: FloatArray, weight: float) -> IntArray:
-    """Return the codes [N, width] int32 with the least ``felt (code - exact)^2 + weight bits``, column by column.
-
-    The bits of a code are those of a coder that knows how often each one occurs in its column.
-
-    Arguments:
-        exact: [N, width] codes before rounding.
-        felt: [N, width] squared error of all images, for a code that is off by one.
-        weight: squared error that a bit must save, at least 0.
-    """
-    nearest = np.rint(exact).astype(np.int32)
-    if weight == 0 or nearest.size == 0:
-        return nearest
-    return np.stack([_column(*columns, weight) for columns in zip(exact.T, nearest.T, felt.T, strict=True)], 1)
-
-
-def _column(exact: FloatArray, nearest: IntArray, felt: FloatArray, weight: float) -> IntArray:
-    towards = np.sign(nearest)
-    candidates = np.stack([nearest, nearest - towards, nearest - 2 * towards, np.zeros_like(nearest)])
-    # A code of 1 has no neighbour two towards zero on its side of it.
-    candidates[2] = np.where(np.abs(nearest) > 1, candidates[2], 0)
-    error = felt * (candidates - exact) ** 2
-    low = int(min(candidates.min(), 0))
-    chosen = nearest
-    for _ in range(ROUNDS):
-        counts = np.bincount(chosen - low, minlength=int(candidates.max()) - low + 1) + UNUSED
-        bits = -np.log2(counts / counts.sum())
-        best = np.argmin(error + weight * bits[candidates - low], 0)
-        chosen = candidates[best, np.arange(len(best))]
-    return chosen
-
-
-def _felt(
+def felt_codes(
     parts: Assembly, gaussians: Gaussians[torch.Tensor], frame: Frame, exposure: Exposure | None,
     generator: torch.Generator,
-) -> tuple[FloatArray, float]:  # fmt: skip
-    """How much the training images feel each code [N, width], and their mean squared error.
+) -> tuple[dict[str, FloatArray], float]:  # fmt: skip
+    """Return how much the training images feel each code, and their mean squared error.
 
-    Images are pulled back with random signs: the mean square of that slope is the sum of the squared slopes of all
-    pixels, so one pass over the cameras gives the diagonal of the Gauss-Newton matrix (Hutchinson's estimate).
+    Arguments:
+        parts: the live parts of the recipe.
+        gaussians: N rows, raw values.
+        frame: training images of frame 0.
+        exposure: colour maps of the cameras, or None.
+        generator: of random signs.
+
+    Returns attribute -> [N, width] float64: squared change of all images together when a code is one higher.
     """
-    felt: FloatArray = np.zeros((len(gaussians), gaussians.shN[0].numel()))
+    felt: dict[str, FloatArray] = {name: np.zeros(_flat(getattr(gaussians, name)).shape) for name in KEY_BITS}
     error = 0.0
-    views = len(frame.cameras)
-    session = parts.renderer.open(gaussians, None, frame.cameras, parts.recipe.background)
-    for view in range(views):
-        leaves = gaussians.map(lambda value: value.detach().clone().requires_grad_())
-        image = session.render(view, leaves).image
-        seen = image.detach() if exposure is None else exposure.apply(view, image.detach())
-        error += float((seen - torch.from_numpy(frame.images[view])).square().mean()) / views
-        signs = torch.randint(0, 2, image.shape, generator=generator).to(image.dtype) * 2 - 1
-        pull_back([image], [signs if exposure is None else exposure.pull(view, signs)])
-        if leaves.shN.grad is not None:
-            felt += color_slopes(leaves.shN.grad.numpy(), BITS) ** 2
-    return felt, error
+    drawn = probes(parts.renderer, gaussians, frame, exposure, parts.recipe.background, generator, each=PROBES)
+    for probe in drawn:
+        error += probe.error
+        for name, bits in KEY_BITS.items():
+            slopes = _flat(getattr(probe.slopes, name))
+            colors = name in ("sh0", "shN")
+            felt[name] += (color_slopes(slopes, bits) if colors else slopes * 2.0**-bits) ** 2
+    return {name: squares / PROBES for name, squares in felt.items()}, error / (PROBES * len(frame.cameras))
+
+
+def _rounded(name: str, values: torch.Tensor, felt: FloatArray, weight: float) -> torch.Tensor:
+    bits = KEY_BITS[name]
+    if name == "shN":
+        codes = codes_towards_zero(color_codes(values.numpy(), bits), felt, weight)
+    elif name == "sh0":
+        codes = codes_nearby(color_codes(values.numpy(), bits), felt, weight, REACH[name])
+    elif name == "quats":
+        codes = _unit_codes(codes_nearby(_flat(values)[:, 1:] * 2.0**bits, felt[:, 1:], weight, REACH[name]), bits)
+    else:
+        codes = codes_nearby(_flat(values) * 2.0**bits, felt, weight, REACH[name])
+    return torch.from_numpy(from_codes(name, codes, bits)).reshape(values.shape)
+
+
+def _unit_codes(others: IntArray, bits: int) -> IntArray:
+    """[N, 4] int32 codes of unit quaternions whose first component, the largest, follows from the three others."""
+    first = np.rint(np.sqrt(4.0**bits - (others.astype(np.float64) ** 2).sum(1)))
+    return np.column_stack([first.astype(np.int32), others])
+
+
+def _flat(values: torch.Tensor) -> FloatArray:
+    """[N, width] float64."""
+    return values.detach().numpy().astype(np.float64).reshape(len(values), -1)

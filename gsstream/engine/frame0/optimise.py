@@ -26,7 +26,8 @@ from gsstream.engine.fit.exposure import Exposure, ExposureFit
 from gsstream.engine.fit.judge import Judge
 from gsstream.engine.fit.nearest import neighbour_distance
 from gsstream.engine.fit.row_table import RowTable
-from gsstream.engine.frame0.how_many import most_gaussians, shown, worth_keeping
+from gsstream.engine.frame0.how_many import most_gaussians
+from gsstream.engine.frame0.removal import not_missed
 from gsstream.recipe.model import FirstFrame
 from gsstream.render.activations import logit, rgb_to_sh0
 from gsstream.structure.base import Anchors
@@ -163,7 +164,7 @@ class FirstFrameRun:
             self.statistics = self.statistics.add(probe.grad * size)
             if iteration >= s.densify_from and iteration % s.densify_every == 0:
                 self._densify()
-        if s.prune_share > 0 and iteration == int(last):
+        if s.prune_error > 0 and iteration in [int(share * self.iterations) for share in schedule.PRUNE_AT]:
             self._prune()
         self.smooth = value if math.isnan(self.smooth) else 0.98 * self.smooth + 0.02 * value
         return self.smooth
@@ -205,9 +206,13 @@ class FirstFrameRun:
         self.statistics = DensifyStatistics.zeros(len(self.levels))
 
     def _prune(self) -> None:
-        """Drop what the images hardly show; growth has just ended, and what remains has time to close the gaps."""
-        pixels = shown(self.renderer, self.gaussians().map(torch.Tensor.detach), self.frame.cameras)
-        rows = worth_keeping(pixels, self.settings.prune_share)
+        """Drop what the images would not miss; what remains has time to close the gaps."""
+        gaussians = self.gaussians().map(torch.Tensor.detach)
+        exposure = self.exposure.exposure if self.exposure else self.judge.exposure
+        rows = not_missed(
+            self.renderer, gaussians, self.frame, exposure, self.recipe.background, self.generator,
+            self.settings.prune_error,
+        )  # fmt: skip
         self.table.keep(rows)
         self.levels, self.came_from = self.levels[rows], self.came_from[rows]
         self.statistics = DensifyStatistics.zeros(len(rows))

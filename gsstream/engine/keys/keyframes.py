@@ -16,7 +16,7 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import arrange, decoded_anchors, key_state, make_layout
-from gsstream.engine.frame0.cheaper import cheaper_colors
+from gsstream.engine.frame0.cheaper import cheaper_rows
 from gsstream.engine.frame0.refine import SHOWN, is_refined
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.tools import RunTools
@@ -86,7 +86,7 @@ def refined_key(parts: Assembly, state: StreamState, frame: Frame, meta: StreamM
     """
     found = state.refinement
     assert found is not None
-    cheaper = cheaper_colors(parts, found.gaussians, frame, state.exposure, rng)
+    cheaper = cheaper_rows(parts, found.gaussians, frame, state.exposure, rng)
     gaussians = quantise_key(cheaper.map(lambda t: t.numpy())).map(torch.from_numpy)
     return _keyed(parts, state, gaussians, found.levels, frame, frame.index, meta, rng)
 

@@ -1,0 +1,59 @@
+"""The names of a Gaussian's axes: of 24 quaternions that draw the same, frame 0 keeps the one nearest to no rotation.
+
+An ellipsoid does not say which of its axes is the first, nor which way it points, so a quaternion may be followed by
+any rotation that takes axes to axes, when the scales change places with them. The quaternions that remain lie within
+63 degrees of no rotation and are told apart by two bits less.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import torch
+
+from gsstream.core.gaussians import Gaussians
+from gsstream.render.activations import rotation_matrices
+
+_HALF = 0.5**0.5
+
+
+def nearest_axes(gaussians: Gaussians[torch.Tensor]) -> Gaussians[torch.Tensor]:
+    """Return Gaussians that draw the same, with unit quaternions whose first component is largest, at least 0.85.
+
+    Arguments:
+        gaussians: N rows, raw values; no quaternion has norm zero.
+    """
+    quats = gaussians.quats.double()
+    quats = quats / quats.norm(dim=1, keepdim=True)
+    # [N, 24]: first component of the product of each quaternion with each of the rotations.
+    first = quats @ (_TURNS * torch.tensor([1.0, -1.0, -1.0, -1.0])).T
+    turn = first.abs().argmax(1)
+    turned = _products(quats, _TURNS[turn])
+    turned = turned * turned[:, :1].sign()
+    scales = gaussians.scales.gather(1, _PLACES[turn])
+    return replace(gaussians, quats=turned.to(gaussians.quats.dtype), scales=scales)
+
+
+def _turns() -> torch.Tensor:
+    """[24, 4] unit quaternions of the rotations that take axes to axes, one of each pair of opposite signs."""
+    units = torch.eye(4).tolist()
+    halves = [[0.5, *(0.5 * s for s in signs)] for signs in itertools.product((1, -1), repeat=3)]
+    edges = []
+    for one, other in itertools.combinations(range(4), 2):
+        for sign in (1, -1):
+            edge = [0.0] * 4
+            edge[one], edge[other] = _HALF, sign * _HALF
+            edges.append(edge)
+    return torch.tensor([*units, *halves, *edges], dtype=torch.float64)
+
+
+def _products(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Hamilton product of quaternions [n, 4], wxyz."""
+    w, v, x, u = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
+    return torch.cat([w * x - (v * u).sum(1, keepdim=True), w * u + x * v + torch.linalg.cross(v, u)], 1)
+
+
+_TURNS = _turns()
+#: [24, 3]: the axis whose scale comes to each place.
+_PLACES = rotation_matrices(_TURNS).abs().argmax(1)

@@ -1,0 +1,106 @@
+"""Which Gaussians of frame 0 the images would not miss: the estimate against removing them, extremes, whole runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from test_encoder import TINY, WORLD, frames
+
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.rng import Rng
+from gsstream.encode import encoder_for, open_recording
+from gsstream.engine.fit.exposure import Exposure
+from gsstream.engine.frame0.removal import removal_errors, worth_keeping
+from gsstream.packet import decode_packet
+from gsstream.render.base import Renderer
+from gsstream.render.reference import ReferenceRenderer
+
+BLACK = (0.0, 0.0, 0.0)
+GROWING = {
+    "first_frame.max_iterations": 60, "first_frame.densify_from": 10, "first_frame.densify_every": 5,
+    "first_frame.densify_gradient": 1e-6,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Renderer:
+    return ReferenceRenderer()
+
+
+def fitted(**settings: Any) -> Gaussians[np.ndarray]:
+    """Frame 0 of the small world."""
+    with open_recording(WORLD) as source:
+        packet = encoder_for("s2gs-edge", source, {**TINY, **settings}).encode(frames()[0]).packet
+    return decode_packet(None, packet.data).gaussians
+
+
+def images(renderer: Renderer, scene: Gaussians[torch.Tensor], exposure: Exposure | None = None) -> torch.Tensor:
+    cameras = frames()[0].cameras
+    drawn = [renderer.render(scene, cameras, view, BLACK).image for view in range(len(cameras))]
+    return torch.stack([image if exposure is None else exposure.apply(v, image) for v, image in enumerate(drawn)])
+
+
+@pytest.mark.parametrize("exposed", [False, True])
+def test_the_estimate_is_what_leaving_one_out_changes(renderer: Renderer, exposed: bool) -> None:
+    """Another way to the same number: draw the scene without it. Opaque ones are among them."""
+    scene = fitted(**{"first_frame.prune_error": 0}).map(torch.from_numpy)
+    opacities = scene.opacities.clone()
+    opacities[::3] = 30.0
+    scene = replace(scene, opacities=opacities)
+    torch.manual_seed(0)
+    exposure = Exposure(torch.eye(3) + 0.2 * torch.randn(3, 3, 3), 0.1 * torch.randn(3, 3)) if exposed else None
+    drawn = [
+        removal_errors(renderer, scene, frames()[0], exposure, BLACK, Rng(seed).stream("a", 0)) for seed in range(12)
+    ]
+    found = torch.stack([errors for errors, _ in drawn]).mean(0)
+    whole = images(renderer, scene, exposure)
+    for row in (*range(0, len(scene), max(1, len(scene) // 12)), int(found.argmax()), int(found.argmin())):
+        rest = torch.tensor([other for other in range(len(scene)) if other != row])
+        exact = float((images(renderer, scene.rows(rest), exposure) - whole).double().square().sum())
+        assert float(found[row]) == pytest.approx(exact, rel=0.6, abs=1e-4)
+    truth = torch.from_numpy(np.stack(list(frames()[0].images)))
+    assert drawn[0][1] == pytest.approx(float((whole - truth).square().mean()), rel=1e-3)
+
+
+def test_the_reference_and_the_cpu_renderer_agree(renderer: Renderer) -> None:
+    scene = fitted().map(torch.from_numpy)
+    with open_recording(WORLD) as source:
+        native = encoder_for("s2gs-edge", source, TINY).parts.renderer
+    one, other = (
+        removal_errors(part, scene, frames()[0], None, BLACK, Rng(3).stream("a", 0))[0] for part in (renderer, native)
+    )
+    assert torch.allclose(one, other, rtol=0.05, atol=1e-4)
+
+
+def test_what_nobody_sees_goes_and_what_is_seen_alone_stays(renderer: Renderer) -> None:
+    scene = fitted().map(torch.from_numpy)
+    far = scene.rows(torch.zeros(1, dtype=torch.int64))
+    far = replace(far, means=far.means + 1000.0)
+    both = Gaussians(**{name: torch.cat([getattr(scene, name), getattr(far, name)]) for name, _ in scene.items()})
+    errors, error = removal_errors(renderer, both, frames()[0], None, BLACK, Rng(0).stream("a", 0))
+    assert float(errors[-1]) == 0.0
+    kept = worth_keeping(errors, 0.1 * error)
+    assert len(scene) not in kept.tolist()
+    assert len(kept) > 0
+
+
+def test_where_nothing_is_felt_all_remain_and_order_is_kept() -> None:
+    assert worth_keeping(torch.tensor([0.0, 2.0, 0.0, 3.0]), 0.0).tolist() == [1, 3]
+    assert worth_keeping(torch.tensor([3.0, 1.0, 2.0]), 1.5).tolist() == [0, 2]
+    assert worth_keeping(torch.zeros(3), 0.0).tolist() == [0, 1, 2]
+    assert worth_keeping(torch.ones(2), 5.0).tolist() == [0, 1]
+    assert worth_keeping(torch.zeros(0), 1.0).tolist() == []
+
+
+def test_a_run_has_fewer_gaussians_that_show_nearly_the_same(renderer: Renderer) -> None:
+    every, fewer = (fitted(**GROWING, **{"first_frame.prune_error": least}) for least in (0.0, 10.0))
+    assert 0 < len(fewer) < 0.9 * len(every)
+    truth = torch.from_numpy(np.stack(list(frames()[0].images)))
+    errors = [
+        float((images(renderer, scene.map(torch.from_numpy)) - truth).square().mean()) for scene in (every, fewer)
+    ]
+    assert errors[1] < 1.3 * errors[0]

@@ -222,7 +222,7 @@ class Codec(Section):
         "not read under a budget of size, which trims as far as it must",
     )  # fmt: skip
     key_rate: float = Field(
-        default=0.0, ge=0,
+        default=0.1, ge=0,
         description="squared error that a bit of frame 0 must save, in mean squared errors of one channel of a "
         "training image's pixel; 0: every value is rounded to the nearest",
     )  # fmt: skip

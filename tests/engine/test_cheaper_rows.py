@@ -15,7 +15,7 @@ from test_encoder import TINY, WORLD, frames
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.encode import encoder_for, open_recording
-from gsstream.engine.frame0.cheaper import REACH, felt_codes
+from gsstream.engine.frame0.cheaper import REACH, cheaper_rows, felt_codes
 from gsstream.engine.frame0.rounding import codes_nearby, codes_towards_zero
 from gsstream.packet import EncodedPacket, decode_packet
 from gsstream.packet.grids import KEY_BITS, color_codes, color_slopes, from_codes, to_codes
@@ -115,20 +115,23 @@ def test_a_run_has_a_smaller_key_packet_that_shows_nearly_the_same() -> None:
             shown = encoder.parts.renderer.render(scene, frames()[0].cameras, view, (0.0, 0.0, 0.0)).image
             error += float((shown - torch.from_numpy(frames()[0].images[view])).square().mean())
         errors.append(error)
-    assert errors[1] < 1.1 * errors[0]
+    assert errors[1] < 1.3 * errors[0]
 
 
 def test_what_moves_stays_within_reach() -> None:
     """At any rate: other cameras may feel what the training cameras do not."""
-    first, second = (scene_of(key_packet(rate)[0]) for rate in (0.0, 1e6))
-    assert len(first) == len(second)
-    scenes = (first, second)
-    codes = [{name: to_codes(name, getattr(s, name), KEY_BITS[name]) for name in REACH} for s in scenes]
+    packet, _ = key_packet(0.0)
+    scene, codes = scene_of(packet).map(torch.from_numpy), []
+    for rate in (0.0, 1e6):
+        parts, rng = key_packet(rate)[1].parts, Rng(0)
+        found = cheaper_rows(parts, scene, frames()[0], None, rng)
+        assert torch.equal(found.means, scene.means)
+        codes.append({name: to_codes(name, getattr(found, name).numpy(), bits) for name, bits in KEY_BITS.items()})
     for name, reach in REACH.items():
         # The first component of a quaternion follows from the three others.
         one, other = (found[name][:, 1:] if name == "quats" else found[name] for found in codes)
         assert 0 < int(np.abs(one - other).max()) <= reach, name
-    assert not second.shN.any()
+    assert not codes[1]["shN"].any()
 
 
 @pytest.mark.parametrize("name", sorted(KEY_BITS))

@@ -157,3 +157,10 @@ def test_what_is_felt_is_what_a_code_changes(name: str) -> None:
         images.append([encoder.parts.renderer.render(other, frame.cameras, v, (0.0, 0.0, 0.0)).image for v in range(3)])
     exact = sum(float((a - b).square().sum()) for a, b in zip(*images, strict=True))
     assert felt[row, column] == pytest.approx(exact, rel=0.5)
+
+
+def test_a_scene_without_gaussians_stays_one() -> None:
+    """A refinement of a few iterations may prune everything: it was refused with an error of numpy's."""
+    packet, encoder = key_packet(0.1)
+    scene = scene_of(packet).map(torch.from_numpy).rows(torch.zeros(0, dtype=torch.int64))
+    assert len(cheaper_rows(encoder.parts, scene, frames()[0], None, Rng(0))) == 0

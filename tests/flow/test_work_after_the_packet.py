@@ -24,7 +24,7 @@ REFINED: dict[str, Any] = {
     "stream__refine_frames": 3, "stream__refine_iterations": 6, "first_frame__densify_from": 5,
     "first_frame__densify_every": 4,
 }  # fmt: skip
-QUICK = {"first_frame__max_iterations": 8, "stream__epochs": 1, "scale": 0.5}
+QUICK = {"first_frame__max_iterations": 8, "first_frame__prune_error": 0, "stream__epochs": 1, "scale": 0.5}
 
 #: ``gsstream`` that is killed, as from outside, at an iteration of a frame's refinement.
 DYING = """

@@ -44,7 +44,7 @@ def cheaper_rows(
     """
     rows = nearest_axes(gaussians)
     rate = parts.recipe.codec.key_rate
-    if rate == 0:
+    if rate == 0 or len(rows) == 0:
         return rows
     felt, error = felt_codes(parts, rows, frame, exposure, rng.stream("key rate", frame.index))
     return Gaussians(

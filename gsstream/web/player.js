@@ -60,7 +60,7 @@ export class Player extends EventTarget {
 
   _start(segments, frame) {
     this.snapshots.clear();
-    this.buffer = this.source.follow?.(this) ?? new PacketBuffer(segments, () => this._news());
+    this.buffer = this.source.follow?.(this) ?? new PacketBuffer(segments, () => this._news(), (walker) => this._early(walker));
     this.buffer.fps = this.source.fps ?? 30;
     this._target = this.buffer.live ? null : (frame ?? this.buffer.first ?? 0);
     this.buffer.want(this._target);
@@ -286,6 +286,11 @@ export class Player extends EventTarget {
     this._opened = null;
     this.dispatchEvent(new CustomEvent("problem", { detail: error.message }));
     this._say("state");
+  }
+
+  /** A part of a packet is there, perhaps enough for a first picture. */
+  _early(walker) {
+    if (!this.state) import("./early.js").then(({ look }) => look(this, walker), () => {});
   }
 
   _news() {

@@ -7,9 +7,11 @@ import { createHash } from "node:crypto";
 import { readFileSync, writeFileSync } from "node:fs";
 
 import { KIND } from "../../gsstream/web/container.js";
-import { decodePacket, sceneBytes } from "../../gsstream/web/decode.js";
+import { decodePacket } from "../../gsstream/web/decode.js";
+import "../../gsstream/web/layers.js";
 import { PacketError } from "../../gsstream/web/errors.js";
 import { PacketWalker } from "../../gsstream/web/walker.js";
+import { sceneBytes } from "./scene-bytes.mjs";
 
 /** Push a stream in pieces, as a download would. */
 function play(bytes, piece) {

@@ -119,5 +119,5 @@ export async function* packetsOf(segment, signal, onPart) {
   (walker ?? make()).finish();
 }
 
-/** Whether the first section is 11, layers. */
+// Section 11 is layers.
 const isLayered = (data) => data?.[16] === 11;

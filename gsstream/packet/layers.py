@@ -101,7 +101,7 @@ def decode_layers(data: bytes, sections: Mapping[str, Section], number: int, off
     """
     rest = sections["rest"]
     with located(sections["layers"].offset):
-        in_first, size, checksum = _head(sections["layers"].data)
+        in_first, size, checksum = read_head(sections["layers"].data)
         if size != sections["layout"].offset - SECTION_HEADER.size - offset - _START or in_first > number:
             raise PacketError(f"layers: {in_first} of {number} Gaussians in {size} bytes cannot be")
         if zlib.crc32(data[_START : _START + size]) != checksum:
@@ -138,7 +138,7 @@ def _first_layer(data: bytes) -> FirstLayer | None:
     number, length = SECTION_HEADER.unpack_from(data, PACKET_HEADER.size)
     if header.kind != PacketKind.KEY or number != SECTION_IDS["layers"] or length != _LAYERS.size:
         return None
-    in_first, size, checksum = _head(data[_START - _LAYERS.size : _START])
+    in_first, size, checksum = read_head(data[_START - _LAYERS.size : _START])
     body = data[_START : _START + size]
     if len(body) < size or in_first > most_gaussians(len(body)) or zlib.crc32(body) != checksum:
         return None
@@ -149,8 +149,8 @@ def _first_layer(data: bytes) -> FirstLayer | None:
     return FirstLayer(decode_rows(sections, in_first), meta, header.frame)
 
 
-def _head(data: bytes) -> tuple[int, int, int]:
-    """Gaussians of the first layer, bytes of the sections it takes, and their CRC-32."""
+def read_head(data: bytes) -> tuple[int, int, int]:
+    """Return what section ``layers`` says: Gaussians of the first layer, bytes of its sections, their CRC-32."""
     if len(data) != _LAYERS.size:
         raise PacketError(f"layers: expected {_LAYERS.size} bytes, got {len(data)}")
     in_first, size, checksum = _LAYERS.unpack(data)

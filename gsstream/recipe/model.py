@@ -227,7 +227,7 @@ class Codec(Section):
         "training image's pixel; 0: every value is rounded to the nearest",
     )  # fmt: skip
     first_layer: float = Field(
-        default=0.55, gt=0, le=1,
+        default=0.5, gt=0, le=1,
         description="share of frame 0's Gaussians that stand first in its packet, those that the training images would "
         "miss most: players draw them while the rest is on its way; 1: all stand together",
     )  # fmt: skip

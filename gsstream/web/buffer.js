@@ -11,7 +11,10 @@ const MOST_BYTES = 128 * 2 ** 20;
 /** Seconds of deltas that are rather replayed than jumped over by a join. */
 const REPLAYED = 1;
 
-/** Packets by frame, loaded piece by piece around the frame that is played. `onNews` is called for every packet, `onPart` as packetsOf says. */
+/**
+ * Packets by frame, loaded piece by piece around the frame that is played. `onNews` is called for every packet; for
+ * `onPart` see packetsOf.
+ */
 export class PacketBuffer {
   constructor(segments, onNews, onPart) {
     this.parts = segments.map((segment) => ({ segment, state: "absent", packets: [], bytes: 0, error: null }));

@@ -5,7 +5,7 @@ import { START, firstLayer, headOf } from "./layers.js";
 
 const looked = new WeakSet();
 
-/** Show the first layer of the packet whose first bytes `walker` has, once it is there and while `player` has no more. */
+/** Show the first layer of the packet whose first bytes `walker` has, once, while `player` has nothing else to show. */
 export function look(player, walker) {
   const head = walker.ahead(START);
   if (!head || player.state || looked.has(walker)) return;

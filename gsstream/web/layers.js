@@ -48,7 +48,9 @@ function merge({ data, offset }, found, now, count, number) {
   }
   const named = Object.fromEntries(ATTRIBUTES.map((name, i) => [name, { data: parts[i], offset }]));
   const later = decodeAttributes(named, number - count);
-  if (named.shN.data[1] !== found.shN.data[1]) throw new PacketError("rest: expected shN as wide as in the first layer");
+  if (named.shN.data[1] !== found.shN.data[1]) {
+    throw new PacketError("rest: shN is not as wide as in the first layer");
+  }
   return Object.fromEntries(ATTRIBUTES.map((name) => [name, interleaved(first, [later[name], now[name]])]));
 }
 

@@ -60,7 +60,9 @@ export class Player extends EventTarget {
 
   _start(segments, frame) {
     this.snapshots.clear();
-    this.buffer = this.source.follow?.(this) ?? new PacketBuffer(segments, () => this._news(), (walker) => this._early(walker));
+    // A part of a packet may be enough for a first picture.
+    const early = (walker) => this.state || import("./early.js").then(({ look }) => look(this, walker), () => {});
+    this.buffer = this.source.follow?.(this) ?? new PacketBuffer(segments, () => this._news(), early);
     this.buffer.fps = this.source.fps ?? 30;
     this._target = this.buffer.live ? null : (frame ?? this.buffer.first ?? 0);
     this.buffer.want(this._target);
@@ -150,11 +152,7 @@ export class Player extends EventTarget {
   close() {
     this._abort?.abort(new DOMException("the player is closed", "AbortError"));
     this.buffer?.dispose();
-    this.buffer = null;
-    this.state = null;
-    this.view = null;
-    this.problem = null;
-    this._target = null;
+    this.buffer = this.state = this.view = this.problem = this._target = null;
   }
 
   dispose() {
@@ -286,11 +284,6 @@ export class Player extends EventTarget {
     this._opened = null;
     this.dispatchEvent(new CustomEvent("problem", { detail: error.message }));
     this._say("state");
-  }
-
-  /** A part of a packet is there, perhaps enough for a first picture. */
-  _early(walker) {
-    if (!this.state) import("./early.js").then(({ look }) => look(this, walker), () => {});
   }
 
   _news() {

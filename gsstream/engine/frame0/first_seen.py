@@ -1,4 +1,4 @@
-"""Which Gaussians of frame 0 stand first in its packet (``codec.first_layer``): those that the images would miss most."""
+"""Which Gaussians stand first in a key packet (``codec.first_layer``): those that the images would miss most."""
 
 from __future__ import annotations
 

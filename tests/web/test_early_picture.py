@@ -26,7 +26,6 @@ from gsstream.packet.base import file_header
 from gsstream.player.playback import Playback
 from gsstream.serve.package import package
 
-
 FIRST = """
     const { firstLayer } = await load('layers.js');
     const { ATTRIBUTES } = await load('limits.js');

@@ -20,17 +20,19 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "web"))
 
 P = "document.querySelector('gsstream-player')?.player"
+#: A pixel that is read back is drawn.
+FINISH = f"(({{ gl }}) => gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)))({P}.renderer)"
 #: Milliseconds since the page was asked for, once the graphics have finished the page's own first picture.
 DRAWN = f"""(async () => {{
   while (!{P}.statistics.drawn) await new Promise((resolve) => setTimeout(resolve, 5));
-  {P}.renderer.readPixels();
+  {FINISH};
   return performance.now();
 }})()"""
 SEEK = f"""(async () => {{
   const started = performance.now(), before = {P}.buffer.received, drawn = {P}.statistics.drawn;
   {P}.seek(FRAME);
   while ({P}.frame !== FRAME || {P}.statistics.drawn === drawn) await new Promise((resolve) => setTimeout(resolve, 5));
-  {P}.renderer.readPixels();
+  {FINISH};
   return [performance.now() - started, {P}.buffer.received - before];
 }})()"""
 STEPS = f"""(async () => {{

@@ -24,6 +24,7 @@ from gsstream.core.errors import ShapeError
 
 FloatArray = np.ndarray[Any, np.dtype[np.floating[Any]]]
 IntArray = np.ndarray[Any, np.dtype[np.integer[Any]]]
+BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 
 
 def check_shape(name: str, array: Any, expected: Sequence[int | str]) -> dict[str, int]:

@@ -17,6 +17,8 @@ from gsstream.packet.key import KeyState as KeyState
 from gsstream.packet.key import decode_key as decode_key
 from gsstream.packet.key import encode_key as encode_key
 from gsstream.packet.key import quantise_key as quantise_key
+from gsstream.packet.layers import FirstLayer as FirstLayer
+from gsstream.packet.layers import first_layer as first_layer
 from gsstream.packet.meta import StreamMeta as StreamMeta
 from gsstream.packet.meta import hash_recipe as hash_recipe
 from gsstream.packet.reader import Entry as Entry

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import ATTRIBUTES
 
-FORMAT_MAJOR, FORMAT_MINOR = 2, 2
+FORMAT_MAJOR, FORMAT_MINOR = 2, 3
 FORMAT_VERSION = f"{FORMAT_MAJOR}.{FORMAT_MINOR}"
 #: First byte not ASCII, a CR LF and a lone LF: text-mode transfers and terminals are noticed, as in PNG.
 MAGIC = b"\x89GSS\r\n\x1a\n"
@@ -36,6 +36,14 @@ WIDTHS: Mapping[str, tuple[int, ...]] = {
 }  # fmt: skip
 
 
+def most_gaussians(size: int) -> int:
+    """Return how many Gaussians (and nodes) a key packet of ``size`` bytes may announce.
+
+    This bounds what a small lie costs.
+    """
+    return min(MAX_GAUSSIANS, FREE_GAUSSIANS + MAX_GAUSSIANS_PER_BYTE * size)
+
+
 class PacketKind(IntEnum):
     """The type byte of a packet."""
 
@@ -47,7 +55,7 @@ class PacketKind(IntEnum):
 
 SECTION_NAMES: Mapping[int, str] = {
     1: "meta", 2: "layout", 3: "gates", 4: "decoders", 5: "index", 6: "deaths", 7: "births",
-    8: "motion", 9: "pattern", 10: "field",
+    8: "motion", 9: "pattern", 10: "field", 11: "layers", 12: "rest",
     **{16 + i: name for i, name in enumerate(ATTRIBUTES)}
 }  # fmt: skip
 SECTION_IDS: Mapping[str, int] = {name: number for number, name in SECTION_NAMES.items()}
@@ -174,10 +182,21 @@ def parse_packet(data: bytes, offset: int = 0) -> tuple[PacketHeader, dict[str, 
     start = zlib.crc32(struct.pack("<BBII", header.kind, header.sections, header.frame, header.body))
     if zlib.crc32(body, start) != header.checksum:
         raise PacketError(f"packet of frame {header.frame} is damaged: its checksum does not match", offset)
+    return header, split_sections(body, header.sections, offset + PACKET_HEADER.size)
+
+
+def split_sections(body: bytes, number: int, offset: int) -> dict[str, Section]:
+    """Return name -> section of bytes that must hold that many sections and nothing else. Raises PacketError.
+
+    Arguments:
+        body: the sections, one after the other.
+        number: how many they are.
+        offset: place of the first one in the file, for errors.
+    """
     found: dict[str, Section] = {}
     at = 0
-    for _ in range(header.sections):
-        where = offset + PACKET_HEADER.size + at
+    for _ in range(number):
+        where = offset + at
         if at + SECTION_HEADER.size > len(body):
             raise PacketError("section header runs past the end of its packet", where)
         number, length = SECTION_HEADER.unpack_from(body, at)
@@ -188,11 +207,11 @@ def parse_packet(data: bytes, offset: int = 0) -> tuple[PacketHeader, dict[str, 
         at += SECTION_HEADER.size
         if length > len(body) - at:
             raise PacketError(f"section {name}: {length} bytes announced, {len(body) - at} left in the packet", where)
-        found[name] = Section(body[at : at + length], offset + PACKET_HEADER.size + at)
+        found[name] = Section(body[at : at + length], offset + at)
         at += length
     if at != len(body):
-        raise PacketError(f"{len(body) - at} bytes after the last section", offset + PACKET_HEADER.size + at)
-    return header, found
+        raise PacketError(f"{len(body) - at} bytes after the last section", offset + at)
+    return found
 
 
 def expect(data: bytes, offset: int, kind: PacketKind) -> tuple[PacketHeader, dict[str, Section]]:

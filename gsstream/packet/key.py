@@ -10,11 +10,9 @@ import numpy as np
 from gsstream.core.changes import Layout
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
-from gsstream.core.shapes import FloatArray
+from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.packet.base import (
-    FREE_GAUSSIANS,
     MAX_GAUSSIANS,
-    MAX_GAUSSIANS_PER_BYTE,
     MAX_META,
     MAX_UNITS,
     EncodedPacket,
@@ -22,9 +20,11 @@ from gsstream.packet.base import (
     build_packet,
     expect,
     located,
+    most_gaussians,
 )  # fmt: skip
 from gsstream.packet.bits import pack_blobs, unpack_blobs
 from gsstream.packet.bulk import compress, decompress
+from gsstream.packet.layers import ORDER, decode_layers, in_layers
 from gsstream.packet.meta import StreamMeta, meta_from_json, meta_to_json
 from gsstream.packet.rows import decode_rows, decoded_rows, encode_rows, row_codes
 from gsstream.packet.symbols import decode_symbols, encode_symbols
@@ -51,13 +51,23 @@ def quantise_key(gaussians: Gaussians[FloatArray]) -> Gaussians[FloatArray]:
     return decoded_rows(gaussians, row_codes(gaussians))
 
 
-def encode_key(state: KeyState, *, frame: int = 0) -> EncodedPacket:
-    """Encode a key packet; ``decode_key`` gives ``quantise_key(state.gaussians)``. Raises ShapeError on a bad state."""
+def encode_key(state: KeyState, *, frame: int = 0, first: BoolArray | None = None) -> EncodedPacket:
+    """Encode a key packet; ``decode_key`` gives ``quantise_key(state.gaussians)``. Raises ShapeError on a bad state.
+
+    Arguments:
+        state: scene, layout, meta.
+        frame: its index.
+        first: [N] bool: Gaussians that stand before all others, so that a player can draw them before it has the whole
+            packet; None: the packet has no layers.
+    """
     gaussians, layout = state.gaussians, state.layout
     gaussians.validate()
     _check_layout(gaussians, layout)
-    sections = [("meta", compress(meta_to_json(state.meta))), ("layout", _encode_layout(layout))]
-    sections += encode_rows(gaussians).items()
+    about, stored = compress(meta_to_json(state.meta)), _encode_layout(layout)
+    if first is None:
+        sections = [("meta", about), ("layout", stored), *encode_rows(gaussians).items()]
+    else:
+        sections = in_layers(about, stored, gaussians, first)
     packet = build_packet(PacketKind.KEY, frame, sections)
     if len(gaussians) > most_gaussians(len(packet.data)):
         raise ShapeError(
@@ -67,26 +77,24 @@ def encode_key(state: KeyState, *, frame: int = 0) -> EncodedPacket:
     return packet
 
 
-def most_gaussians(size: int) -> int:
-    """Return how many Gaussians (and nodes) a key packet of ``size`` bytes may announce.
-
-    This bounds what a small lie costs.
-    """
-    return min(MAX_GAUSSIANS, FREE_GAUSSIANS + MAX_GAUSSIANS_PER_BYTE * size)
-
-
 def decode_key(data: bytes, *, offset: int = 0) -> KeyState:
     """Decode a complete key packet. ``offset`` is its place in the file. Raises PacketError."""
     _, sections = expect(data, offset, PacketKind.KEY)
     wanted = {"meta", "layout", *ATTRIBUTES}
-    if set(sections) != wanted:
-        raise PacketError(f"key packet: expected sections {sorted(wanted)}, got {sorted(sections)}", offset)
+    if tuple(sections) != ORDER and set(sections) != wanted:
+        raise PacketError(
+            f"key packet: expected sections {sorted(wanted)} in any order, or {list(ORDER)} in this one, got "
+            f"{list(sections)}", offset,
+        )  # fmt: skip
     with located(sections["meta"].offset):
         meta = meta_from_json(decompress(sections["meta"].data, MAX_META))
     with located(sections["layout"].offset):
         layout = _decode_layout(sections["layout"].data, most_gaussians(len(data)))
     number = len(layout.unit_of)
-    gaussians = decode_rows({name: sections[name] for name in ATTRIBUTES}, number)
+    if "layers" in sections:
+        gaussians = decode_layers(data, sections, number, offset)
+    else:
+        gaussians = decode_rows({name: sections[name] for name in ATTRIBUTES}, number)
     return KeyState(gaussians, layout, meta)
 
 

@@ -55,17 +55,18 @@ def quantise_positions(means: FloatArray, scale_codes: IntArray, bits: int) -> F
     return np.asarray(np.rint(np.asarray(means, np.float64) / steps) * steps + 0.0, np.float32)
 
 
-def encode_positions(means: FloatArray, scale_codes: IntArray, bits: int) -> bytes:
+def encode_positions(means: FloatArray, scale_codes: IntArray, bits: int, floor: int | None = None) -> bytes:
     """Encode what :func:`quantise_positions` returned; the reader knows N and the scales.
 
     Arguments:
         means: [N, 3] on their grids.
         scale_codes: [N, 3] codes of the log scales.
         bits: their fractional bits.
+        floor: log2 of the finest step, where these rows are part of a scene; None: that of these rows.
     """
     if len(means) == 0:
         return b""
-    floor = floor_exponent(scale_codes, bits)
+    floor = floor_exponent(scale_codes, bits) if floor is None else floor
     exponents = step_exponents(scale_codes, bits, floor, FINENESS)
     wide = np.asarray(means, np.float64)
     best = min(_cell_candidates(wide, floor), key=lambda cell: _cost(wide, exponents, cell))

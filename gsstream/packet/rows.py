@@ -31,8 +31,20 @@ def decoded_rows(gaussians: Gaussians[FloatArray], codes: Mapping[str, IntArray]
 def encode_rows(gaussians: Gaussians[FloatArray]) -> dict[str, bytes]:
     """Quantise rows and return attribute -> payload, positions first; the reader must know N."""
     codes = row_codes(gaussians)
-    means = decoded_rows(gaussians, codes).means
-    out = {"means": encode_positions(means, codes["scales"], KEY_BITS["scales"])}
+    return encode_codes(decoded_rows(gaussians, codes).means, codes)
+
+
+def encode_codes(
+    means: FloatArray, codes: Mapping[str, IntArray], floor: int | None = None
+) -> dict[str, bytes]:
+    """Return attribute -> payload of rows that are quantised already, positions first.
+
+    Arguments:
+        means: [N, 3] on their grids.
+        codes: attribute -> [N, width] as :func:`row_codes` gives them.
+        floor: log2 of the finest step of positions, where these rows are part of a scene; None: that of these rows.
+    """
+    out = {"means": encode_positions(means, codes["scales"], KEY_BITS["scales"], floor)}
     for name, table in codes.items():
         head = _FIXED.pack(KEY_BITS[name], table.shape[1])
         out[name] = head + encode_symbols(fold_quats(table, KEY_BITS[name]) if name == "quats" else table)

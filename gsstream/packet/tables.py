@@ -15,6 +15,7 @@ from gsstream.packet.base import MAX_GAUSSIANS, PacketKind, Section
 from gsstream.packet.bits import unpack_blobs
 from gsstream.packet.changes.rows import HEAD_PARTS, decode_births
 from gsstream.packet.gates import decode_gates, run_tokens
+from gsstream.packet.layers import read_head
 from gsstream.packet.pattern import decode_pattern
 from gsstream.packet.symbols import decode_symbols
 
@@ -63,7 +64,15 @@ def _key_tables(data: Mapping[str, bytes], layout: Layout) -> Iterator[Table]:
     parts = unpack_blobs(data["layout"][_LAYOUT_HEAD + 4 * len(layout.units) :], 2)
     for part, rows in zip(parts, (nodes, number), strict=True):
         yield _table("layout", part, rows, 1)
-    yield from _row_tables(data, number)
+    if "layers" not in data:
+        yield from _row_tables(data, number)
+        return
+    in_first, _, _ = read_head(data["layers"])
+    yield from _row_tables(data, in_first)
+    marks, *parts = unpack_blobs(data["rest"], 1 + len(ATTRIBUTES))
+    yield _table("rest", marks, number, 1)
+    later = dict(zip(ATTRIBUTES, parts, strict=True))
+    yield from (table._replace(name="rest") for table in _row_tables(later, number - in_first))
 
 
 def _row_tables(data: Mapping[str, bytes], number: int) -> Iterator[Table]:

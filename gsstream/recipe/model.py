@@ -226,6 +226,11 @@ class Codec(Section):
         description="squared error that a bit of frame 0 must save, in mean squared errors of one channel of a "
         "training image's pixel; 0: every value is rounded to the nearest",
     )  # fmt: skip
+    first_layer: float = Field(
+        default=0.5, gt=0, le=1,
+        description="share of frame 0's Gaussians that stand first in its packet, those that the training images would "
+        "miss most: players draw them while the rest is on its way; 1: all stand together",
+    )  # fmt: skip
     fsync: bool = Field(default=False, description="force every packet to disk before the next frame starts")
 
 

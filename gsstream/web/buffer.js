@@ -11,16 +11,19 @@ const MOST_BYTES = 128 * 2 ** 20;
 /** Seconds of deltas that are rather replayed than jumped over by a join. */
 const REPLAYED = 1;
 
-/** Packets by frame, loaded piece by piece around the frame that is played. `onNews` is called for every packet. */
+/**
+ * Packets by frame, loaded piece by piece around the frame that is played. `onNews` is called for every packet; for
+ * `onPart` see packetsOf.
+ */
 export class PacketBuffer {
-  constructor(segments, onNews) {
+  constructor(segments, onNews, onPart) {
     this.parts = segments.map((segment) => ({ segment, state: "absent", packets: [], bytes: 0, error: null }));
     let home = null;
     for (const part of this.parts) {
       if (!part.segment.join) home = part;
       Object.assign(part, { home, key: null, join: part.segment.join ? { state: "absent", data: null } : null });
     }
-    this.onNews = onNews;
+    Object.assign(this, { onNews, onPart });
     this.received = 0;
     this.fps = 30;
     this.frame = null;
@@ -208,7 +211,7 @@ export class PacketBuffer {
 
   /** Packets of a piece; those of others, when the server sends the whole file, are kept as well. */
   async _loadPackets(part, signal) {
-    for await (const packet of packetsOf(part.segment, signal)) {
+    for await (const packet of packetsOf(part.segment, signal, this.onPart)) {
       const { kind, frame } = packet.header;
       const owner = this._part(frame) ?? part;
       const expected = owner.packets.length ? lastOf(owner) + 1 : (owner.segment.first ?? frame);

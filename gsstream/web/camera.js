@@ -123,16 +123,8 @@ export function looked(view, pivot, yaw, pitch) {
 }
 
 /** View and pivot moved along the view's own axes, in scene units. */
-export function moved(view, pivot, [right, down, forward]) {
-  const step = add(
-    add(
-      view.right.map((v) => v * right),
-      view.down,
-      down,
-    ),
-    view.forward,
-    forward,
-  );
+export function moved(view, pivot, by) {
+  const step = [view.right, view.down, view.forward].reduce((sum, axis, i) => add(sum, axis, by[i]), [0, 0, 0]);
   return { view: { ...view, eye: add(view.eye, step) }, pivot: { ...pivot, point: add(pivot.point, step) } };
 }
 

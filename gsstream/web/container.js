@@ -1,33 +1,19 @@
 // The container: file header, packet headers, sections and their checksums (sections 1, 2 and 7 of the packet format).
 
 import { PacketError } from "./errors.js";
-import { FORMAT_MAJOR, FORMAT_MINOR, MAX_BODY, MAX_SECTIONS } from "./limits.js";
+import { ATTRIBUTES, FORMAT_MAJOR, FORMAT_MINOR, MAX_BODY, MAX_SECTIONS } from "./limits.js";
 
 export const FILE_HEADER = 16;
 export const PACKET_HEADER = 16;
-const SECTION_HEADER = 5;
+export const SECTION_HEADER = 5;
 const MAGIC = [0x89, 0x47, 0x53, 0x53, 0x0d, 0x0a, 0x1a, 0x0a];
 
 export const KIND = { key: 1, delta: 2, empty: 3, index: 4 };
 export const KIND_NAMES = { 1: "key", 2: "delta", 3: "empty", 4: "index" };
-export const SECTION_NAMES = {
-  1: "meta",
-  2: "layout",
-  3: "gates",
-  4: "decoders",
-  5: "index",
-  6: "deaths",
-  7: "births",
-  8: "motion",
-  9: "pattern",
-  10: "field",
-  16: "means",
-  17: "quats",
-  18: "scales",
-  19: "opacities",
-  20: "sh0",
-  21: "shN",
-};
+const SECTION_NAMES = [
+  ...",meta,layout,gates,decoders,index,deaths,births,motion,pattern,field,layers,rest,,,".split(","),
+  ...ATTRIBUTES,
+];
 
 const CRC_TABLE = new Uint32Array(256).map((_, byte) => {
   let value = byte;
@@ -42,7 +28,7 @@ export function crc32(data, start = 0) {
   return ~crc >>> 0;
 }
 
-function viewOf(data) {
+export function viewOf(data) {
   return new DataView(data.buffer, data.byteOffset, data.byteLength);
 }
 
@@ -84,10 +70,7 @@ export function parseHeader(data, offset) {
     body: view.getUint32(8, true),
     checksum: view.getUint32(12, true),
   };
-  const packed = new Uint8Array(14);
-  packed.set(data.subarray(0, 2));
-  packed.set(data.subarray(4, 16), 2);
-  if (view.getUint16(2, true) !== (crc32(packed) & 0xffff)) {
+  if (view.getUint16(2, true) !== (crc32(data.subarray(4, 16), crc32(data.subarray(0, 2))) & 0xffff)) {
     throw new PacketError("packet header damaged: its check does not match", offset);
   }
   if (!KIND_NAMES[header.kind]) throw new PacketError(`unknown packet type ${header.kind}; expected 1 to 4`, offset);
@@ -98,7 +81,7 @@ export function parseHeader(data, offset) {
 }
 
 /**
- * Check a complete packet and split it: `{ header, sections }`, sections in file order as `{ name, data, offset }`.
+ * Check a complete packet and split it: `{ header, sections }`, see splitSections.
  *
  * Throws PacketError with the byte of the file.
  */
@@ -108,29 +91,25 @@ export function parsePacket(data, offset) {
   if (body.length !== header.body) {
     throw new PacketError(`packet body: expected ${header.body} bytes, got ${body.length}`, offset);
   }
-  const packed = new Uint8Array(10);
-  packed.set(data.subarray(0, 2));
-  packed.set(data.subarray(4, 12), 2);
-  if (crc32(body, crc32(packed)) !== header.checksum) {
+  if (crc32(body, crc32(data.subarray(4, 12), crc32(data.subarray(0, 2)))) !== header.checksum) {
     throw new PacketError(`packet of frame ${header.frame} is damaged: its checksum does not match`, offset);
   }
-  return { header, sections: splitSections(header, body, offset + PACKET_HEADER) };
+  return { header, sections: splitSections(header.sections, body, offset + PACKET_HEADER) };
 }
 
-function splitSections(header, body, start) {
+/** The `number` sections of `body` in file order, name -> `{ data, offset }`; `start`: its place in the file. */
+export function splitSections(number, body, start) {
   const view = viewOf(body);
-  const sections = [];
+  const sections = {};
   let at = 0;
-  for (let i = 0; i < header.sections; i += 1) {
+  for (let i = 0; i < number; i += 1) {
     if (at + SECTION_HEADER > body.length) {
       throw new PacketError("section header runs past the end of its packet", start + at);
     }
     const name = SECTION_NAMES[body[at]];
     const length = view.getUint32(at + 1, true);
     if (!name) throw new PacketError(`section ${body[at]} is unknown: a newer player is needed`, start + at);
-    if (sections.some((section) => section.name === name)) {
-      throw new PacketError(`section ${name} is repeated`, start + at);
-    }
+    if (sections[name]) throw new PacketError(`section ${name} is repeated`, start + at);
     at += SECTION_HEADER;
     if (length > body.length - at) {
       throw new PacketError(
@@ -138,7 +117,7 @@ function splitSections(header, body, start) {
         start + at,
       );
     }
-    sections.push({ name, data: body.subarray(at, at + length), offset: start + at });
+    sections[name] = { data: body.subarray(at, at + length), offset: start + at };
     at += length;
   }
   if (at !== body.length) throw new PacketError(`${body.length - at} bytes after the last section`, start + at);
@@ -148,10 +127,10 @@ function splitSections(header, body, start) {
 /** [{ frame, offset }] of every key packet, from a complete index packet at `offset`. Throws PacketError. */
 export function parseIndex(data, offset) {
   const { sections } = parsePacket(data, offset);
-  if (sections.length !== 1 || sections[0].name !== "index") {
+  if (`${Object.keys(sections)}` !== "index") {
     throw new PacketError("index packet: expected the section index alone", offset);
   }
-  const section = sections[0];
+  const section = sections.index;
   const size = section.data.length - 12;
   if (size < 0 || size % 12) throw new PacketError(`index of ${section.data.length} bytes cannot be`, section.offset);
   const view = viewOf(section.data);

@@ -3,11 +3,10 @@
 import { decodeMotions, united, SECTIONS as MOTION } from "./changes/motion.js";
 import { applyResidual, decodeResidual, SECTIONS as RESIDUAL } from "./changes/residual.js";
 import { applyRows, decodeRows, SECTIONS as ROWS } from "./changes/rows.js";
-import { KIND, KIND_NAMES, parsePacket } from "./container.js";
+import { KIND, parsePacket } from "./container.js";
 import { PacketError, located } from "./errors.js";
 import { displacement, gatherDisplacement, gatherGroups, pick } from "./history.js";
 import { decodeKey } from "./key.js";
-import { ATTRIBUTES } from "./limits.js";
 
 /**
  * The state after one complete packet at byte `offset` of its file.
@@ -28,7 +27,7 @@ export function decodePacket(state, data, offset = 0) {
     throw new PacketError(`frame ${header.frame} needs the state of the frame before it, got ${had}`, offset);
   }
   if (header.kind === KIND.empty) {
-    if (sections.length) throw new PacketError("empty packet with sections", offset);
+    if (header.sections) throw new PacketError("empty packet with sections", offset);
     state.moved = null;
     state.change = { kind: "empty" };
   } else {
@@ -39,11 +38,15 @@ export function decodePacket(state, data, offset = 0) {
 }
 
 function keyState(header, sections, size, offset) {
-  const { scene, layout, meta } = decodeKey(sections, size, offset);
-  const number = layout.unitOf.length;
+  const decoded = decodeKey(sections, size, offset);
+  return firstState(header.frame, decoded.layout.unitOf.length, decoded);
+}
+
+/** The state of a key packet, or of its first layer, which has no `layout`. */
+export function firstState(frame, number, { scene, layout, meta }) {
   const widths = { means: 3, quats: 4, scales: 3, opacities: 1, sh0: 3, shN: number ? scene.shN.length / number : 0 };
   return {
-    frame: header.frame,
+    frame,
     number,
     scene,
     widths,
@@ -54,26 +57,24 @@ function keyState(header, sections, size, offset) {
     moved: null,
     turned: false,
     spare: null,
-    change: { kind: KIND_NAMES[KIND.key] },
+    change: { kind: "key" },
   };
 }
 
 /** Sections of a delta packet in their order. */
 const ORDER = [...MOTION, ...RESIDUAL, ...ROWS];
 
-function decodeDelta(sections, state, offset) {
-  const field = sections.find(({ name }) => name === "field");
+function decodeDelta(found, state, offset) {
+  const { field, motion } = found;
   if (field) throw new PacketError("a network moves this frame: only gsstream play can show it", field.offset);
-  const places = sections.map(({ name }) => ORDER.indexOf(name));
-  if (!places.length || places.some((place, i) => place < 0 || (i > 0 && place < places[i - 1]))) {
-    const names = sections.map(({ name }) => name).join(", ");
-    throw new PacketError(`delta packet: sections ${names || "none"} do not stand in this order`, offset);
+  const names = Object.keys(found);
+  const places = names.map((name) => ORDER.indexOf(name));
+  if (!places.length || places.some((place, i) => place < 0 || place < places[i - 1])) {
+    throw new PacketError(`delta packet: sections ${names.join(", ") || "none"} do not stand in this order`, offset);
   }
-  const found = Object.fromEntries(sections.map((section) => [section.name, section]));
-  const { motion } = found;
   const motions = motion ? located(motion.offset, () => decodeMotions(motion, state)) : null;
-  const stray = sections.find(({ name }) => RESIDUAL.includes(name));
-  if (stray && !found.gates) throw new PacketError(`delta packet: section ${stray.name} without gates`, stray.offset);
+  const stray = names.find((name) => RESIDUAL.includes(name));
+  if (stray && !found.gates) throw new PacketError(`delta packet: section ${stray} without gates`, found[stray].offset);
   const residual = found.gates ? decodeResidual(found, state, offset) : null;
   const rows = found.deaths || found.births ? decodeRows(found, state, offset) : null;
   return { motions, residual, rows };
@@ -112,18 +113,6 @@ function applyDelta(state, { motions, residual, rows }) {
     state.number = change.source.length;
   }
   return change;
-}
-
-/** The bytes of all attributes in their order: equal for equal states. */
-export function sceneBytes(state) {
-  const arrays = ATTRIBUTES.map((name) => state.scene[name]);
-  const out = new Uint8Array(arrays.reduce((sum, array) => sum + array.byteLength, 0));
-  let at = 0;
-  for (const array of arrays) {
-    out.set(new Uint8Array(array.buffer, array.byteOffset, array.byteLength), at);
-    at += array.byteLength;
-  }
-  return out;
 }
 
 /** A copy of a state that later packets do not touch. */

@@ -2,24 +2,34 @@
 // layout says how many Gaussians each node holds, and the length unit of each one's position residual.
 
 import { decodeAttributes } from "./attributes.js";
+import { viewOf } from "./container.js";
 import { unpackParts } from "./bits.js";
 import { PacketError, located } from "./errors.js";
 import { ATTRIBUTES, FREE_GAUSSIANS, MAX_GAUSSIANS, MAX_GAUSSIANS_PER_BYTE, MAX_META, MAX_UNITS } from "./limits.js";
 import { decodeSymbols, range } from "./symbols.js";
 import { decompress } from "./vendor/fzstd.js";
 
+/** `layers` decodes packets with layers, once who meets one has loaded layers.js. */
+export const later = { layers: null };
+
 /** Decode the sections of a key packet of `size` bytes at `offset`: `{ scene, layout, meta }`. */
-export function decodeKey(sections, size, offset) {
+export function decodeKey(found, size, offset) {
   const wanted = ["meta", "layout", ...ATTRIBUTES];
-  const found = Object.fromEntries(sections.map((section) => [section.name, section]));
-  if (sections.length !== wanted.length || wanted.some((name) => !found[name])) {
-    throw new PacketError(`key packet: expected sections ${wanted}, got ${sections.map((s) => s.name)}`, offset);
+  const names = Object.keys(found);
+  const layered = `${names}` === `layers,meta,${ATTRIBUTES},layout,rest`;
+  if (!layered && (names.length !== wanted.length || wanted.some((name) => !found[name]))) {
+    throw new PacketError(`key packet: expected sections ${wanted}, got ${names}`, offset);
   }
-  const most = Math.min(MAX_GAUSSIANS, FREE_GAUSSIANS + MAX_GAUSSIANS_PER_BYTE * size);
   const meta = located(found.meta.offset, () => decodeMeta(found.meta.data));
-  const layout = located(found.layout.offset, () => decodeLayout(found.layout.data, most));
-  const scene = decodeAttributes(found, layout.unitOf.length);
+  const layout = located(found.layout.offset, () => decodeLayout(found.layout.data, mostGaussians(size)));
+  const decode = layered ? later.layers : decodeAttributes;
+  const scene = decode(found, layout.unitOf.length);
   return { scene, layout, meta };
+}
+
+/** How many Gaussians and nodes a key packet of so many bytes may announce. */
+export function mostGaussians(size) {
+  return Math.min(MAX_GAUSSIANS, FREE_GAUSSIANS + MAX_GAUSSIANS_PER_BYTE * size);
 }
 
 /**
@@ -29,7 +39,7 @@ export function decodeKey(sections, size, offset) {
  */
 function decodeLayout(data, most) {
   if (data.length < 9) throw new PacketError("layout cut short");
-  const view = new DataView(data.buffer, data.byteOffset, data.byteLength);
+  const view = viewOf(data);
   const number = view.getUint32(0, true);
   const nodes = view.getUint32(4, true);
   const kinds = data[8];
@@ -71,7 +81,7 @@ export function decodeUnits(data, number, kinds) {
 }
 
 /** Decode the meta section. What a player does not use (the recipe and its hash) is handed on unchecked. */
-function decodeMeta(data) {
+export function decodeMeta(data) {
   let value;
   try {
     value = JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(inflate(data, MAX_META)));

@@ -1,7 +1,7 @@
 // Limits of section 8 of the packet format: what a reader checks before it allocates.
 
 export const FORMAT_MAJOR = 2;
-export const FORMAT_MINOR = 2;
+export const FORMAT_MINOR = 3;
 export const MAX_GAUSSIANS = 4_000_000;
 export const FREE_GAUSSIANS = 1 << 16;
 export const MAX_GAUSSIANS_PER_BYTE = 64;

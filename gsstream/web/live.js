@@ -1,6 +1,7 @@
 // A stream as it is written: packets from a socket, decoded when they come, the newest one shown.
 
 import { FILE_HEADER, KIND, PACKET_HEADER, checkFileHeader, parseHeader } from "./container.js";
+import "./layers.js";
 import { PacketError } from "./errors.js";
 import { Latency } from "./latency.js";
 import { LiveSocket } from "./live-socket.js";

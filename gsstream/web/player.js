@@ -60,7 +60,9 @@ export class Player extends EventTarget {
 
   _start(segments, frame) {
     this.snapshots.clear();
-    this.buffer = this.source.follow?.(this) ?? new PacketBuffer(segments, () => this._news());
+    // A part of a packet may be enough for a first picture.
+    const early = (walker) => this.state || import("./early.js").then(({ look }) => look(this, walker), () => {});
+    this.buffer = this.source.follow?.(this) ?? new PacketBuffer(segments, () => this._news(), early);
     this.buffer.fps = this.source.fps ?? 30;
     this._target = this.buffer.live ? null : (frame ?? this.buffer.first ?? 0);
     this.buffer.want(this._target);
@@ -150,11 +152,7 @@ export class Player extends EventTarget {
   close() {
     this._abort?.abort(new DOMException("the player is closed", "AbortError"));
     this.buffer?.dispose();
-    this.buffer = null;
-    this.state = null;
-    this.view = null;
-    this.problem = null;
-    this._target = null;
+    this.buffer = this.state = this.view = this.problem = this._target = null;
   }
 
   dispose() {

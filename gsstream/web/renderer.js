@@ -76,18 +76,6 @@ export class Renderer {
     return true;
   }
 
-  /** The picture last drawn as RGBA bytes, top row first. */
-  readPixels() {
-    const { gl } = this;
-    const { width, height } = this.canvas;
-    const data = new Uint8Array(width * height * 4);
-    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, data);
-    const out = new Uint8Array(data.length);
-    for (let y = 0; y < height; y += 1)
-      out.set(data.subarray(4 * width * (height - 1 - y), 4 * width * (height - y)), 4 * width * y);
-    return out;
-  }
-
   dispose() {
     this.sorter.dispose();
     this.gl.getExtension("WEBGL_lose_context")?.loseContext();

@@ -97,8 +97,11 @@ function piecesOf(segment, entry, base) {
   }));
 }
 
-/** Packets `{ data, offset, header }` of a segment as they arrive. Throws PacketError or SourceError. */
-export async function* packetsOf(segment, signal) {
+/**
+ * Packets `{ data, offset, header }` of a segment as they arrive. `onPart` gets the walker while it holds a part of
+ * a packet with layers. Throws PacketError or SourceError.
+ */
+export async function* packetsOf(segment, signal, onPart) {
   const all = segment.all && { ...segment.all, sent: false };
   const chunks = segment.opened?.(signal) ?? bytesOf(segment.url, { ...segment, all, signal });
   // Whether the server sends the piece or the whole file is known with the first bytes.
@@ -107,7 +110,14 @@ export async function* packetsOf(segment, signal) {
   for await (const chunk of chunks) {
     walker ??= make();
     walker.push(chunk);
-    for (let packet = walker.next(); packet; packet = walker.next()) yield packet;
+    for (let packet = walker.next(); packet; packet = walker.next()) {
+      if (isLayered(packet.data)) await import("./layers.js");
+      yield packet;
+    }
+    if (isLayered(walker.ahead(17))) onPart?.(walker);
   }
   (walker ?? make()).finish();
 }
+
+// Section 11 is layers.
+const isLayered = (data) => data?.[16] === 11;

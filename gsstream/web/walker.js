@@ -27,16 +27,22 @@ export class PacketWalker {
     this.size += chunk.length;
   }
 
+  /** The next `size` bytes, which stay; null until they are there. */
+  ahead(size) {
+    return this.size < size ? null : this._peek(size);
+  }
+
   /** The next complete packet `{ data, offset, header }`, or null until more bytes come. Throws PacketError. */
   next() {
     if (this.whole && this.version === null) {
-      if (this.size < FILE_HEADER) return null;
-      this.version = checkFileHeader(this._peek(FILE_HEADER));
+      const head = this.ahead(FILE_HEADER);
+      if (!head) return null;
+      this.version = checkFileHeader(head);
       this._take(FILE_HEADER);
     }
-    if (this.size < PACKET_HEADER) return null;
-    const header = parseHeader(this._peek(PACKET_HEADER), this.offset);
-    if (this.size < PACKET_HEADER + header.body) return null;
+    const head = this.ahead(PACKET_HEADER);
+    const header = head && parseHeader(head, this.offset);
+    if (!head || this.size < PACKET_HEADER + header.body) return null;
     this._checkOrder(header);
     const { offset } = this;
     const data = this._take(PACKET_HEADER + header.body);

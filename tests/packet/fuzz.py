@@ -28,6 +28,8 @@ from fuzz_cases import Base, bases, mutate
 
 from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import Gaussians
+from gsstream.packet import first_layer
+from gsstream.packet.base import FILE_HEADER
 from gsstream.player.playback import Playback
 
 
@@ -52,6 +54,9 @@ def play(path: Path, data: bytes, base: Base) -> str:
             playback.reader.check()
     except PacketError as caught:
         error = caught
+    early = first_layer(data[FILE_HEADER.size :])
+    if early is not None:
+        early.gaussians.validate()
     if seen < sound:
         raise Failure(f"{seen} frames played, {sound} are undamaged: {error}")
     if error is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ from packet_scenes import decode_all, make_field_packets, make_moving_packets, m
 
 from gsstream.core.gaussians import Gaussians
 from gsstream.packet import EncodedPacket, PacketKind
-from gsstream.packet.base import PACKET_HEADER, build_packet, file_header, parse_packet
+from gsstream.packet.base import PACKET_HEADER, SECTION_HEADER, SECTION_IDS, build_packet, file_header, parse_packet
 from gsstream.packet.bulk import compress, decompress
 from gsstream.packet.reader import index_body
 
@@ -30,13 +30,14 @@ class Base:
 
 
 def bases() -> list[Base]:
-    """Streams with every kind of packet and change, also without view-dependent colour and of one Gaussian."""
+    """Streams with every kind of packet and change, also without view-dependent colour, of one Gaussian, in layers."""
     settings = [
         {"seed": 21, "frames": 5, "key_at": 3, "number": 8, "nodes": 4, "sh_rest": 0},
         {"seed": 22, "frames": 4, "key_at": 9, "number": 40, "nodes": 12, "sh_rest": 3},
         {"seed": 23, "frames": 3, "key_at": 9, "number": 1, "nodes": 1, "sh_rest": 15},
         {"seed": 24, "frames": 4, "key_at": 9, "number": 300, "nodes": 90, "sh_rest": 0},
         {"seed": 25, "frames": 5, "key_at": 9, "number": 30, "nodes": 9, "sh_rest": 3, "edits": (1, 3)},
+        {"seed": 29, "frames": 3, "key_at": 9, "number": 40, "nodes": 9, "sh_rest": 3, "layers": True},
     ]
     moving = [
         {"seed": 26, "number": 30, "nodes": 9, "sh_rest": 0},
@@ -113,9 +114,18 @@ def _sections(rng: np.random.Generator, base: Base) -> bytes:
     for name in ("motion", "field"):
         if name in sections and rng.random() < 0.5:
             target = name
-    changed = [(n, _payload(rng, n, s.data) if n == target else s.data) for n, s in sections.items()]
-    packets[at] = build_packet(header.kind, header.frame, changed)
+    changed = {n: _payload(rng, n, s.data) if n == target else s.data for n, s in sections.items()}
+    if "layers" in changed and target != "layers":
+        changed["layers"] = _repaired_layers(changed)
+    packets[at] = build_packet(header.kind, header.frame, list(changed.items()))
     return _join(packets)
+
+
+def _repaired_layers(payloads: Mapping[str, bytes]) -> bytes:
+    """What section layers must say of the sections behind it, so that their damage reaches their decoders."""
+    shown = [(name, payloads[name]) for name in payloads if name not in ("layers", "layout", "rest")]
+    body = b"".join(SECTION_HEADER.pack(SECTION_IDS[name], len(data)) + data for name, data in shown)
+    return payloads["layers"][:4] + struct.pack("<II", len(body), zlib.crc32(body))
 
 
 def _payload(rng: np.random.Generator, name: str, data: bytes) -> bytes:

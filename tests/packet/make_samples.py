@@ -2,7 +2,7 @@
 
 ``stream.gss`` has every kind of packet, births and deaths; ``moving.gss`` has motions: from rest, predicted, corrected,
 of groups formed anew, two in a frame, and births after one; ``field.gss`` has fields; ``world.gss`` lies in other
-coordinates than its recording.
+coordinates than its recording; the key packets of ``layers.gss`` have layers.
 
 Usage: python tests/packet/make_samples.py
 """
@@ -39,6 +39,7 @@ def main() -> None:
         "moving": make_moving_packets(seed=12, number=30, nodes=9),
         "field": make_field_packets(seed=14, number=30, nodes=9),
         "world": [make_placed_key(seed=13, number=20, nodes=6)],
+        "layers": make_packets(seed=15, number=30, nodes=9, layers=True),
     }
     folder = SAMPLES / FORMAT_VERSION
     folder.mkdir(parents=True)

@@ -219,15 +219,19 @@ def follow(state: PlayerState, delta: Delta) -> PlayerState:
 
 
 def make_packets(
-    seed: int = 0, frames: int = 7, key_at: int = 4, edits: tuple[int, ...] = (), **sizes: int
+    seed: int = 0, frames: int = 7, key_at: int = 4, edits: tuple[int, ...] = (), layers: bool = False, **sizes: int
 ) -> list[EncodedPacket]:
-    """Key, deltas with a decoder that changes once, an empty packet at frame 2, a second key; births at ``edits``."""
+    """Key, deltas with a decoder that changes once, an empty packet at frame 2, a second key; births at ``edits``.
+
+    With ``layers`` the key packets have them.
+    """
     rng = np.random.default_rng(seed)
     state: PlayerState | None = None
     packets = []
     for frame in range(frames):
         if frame in (0, key_at):
-            packet = encode_key(make_key(rng, **sizes), frame=frame)
+            key = make_key(rng, **sizes)
+            packet = encode_key(key, frame=frame, first=rng.random(len(key.gaussians)) < 0.6 if layers else None)
         elif frame == 2:
             packet = encode_empty(frame=frame)
         elif frame in edits:

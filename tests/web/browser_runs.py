@@ -26,7 +26,11 @@ needs_browser = pytest.mark.skipif(NODE is None or CHROMIUM is None, reason="nod
 
 
 class Handler(SimpleHTTPRequestHandler):
-    """A static server. ``faults``: ranges (false: always 200), cut_after (bytes), status, gone_after (files)."""
+    """A static server.
+
+    ``faults``: ranges (false: always 200), cut_after (bytes), status, gone_after (files), held_after (bytes; the others
+    come once the page has asked for /mended, which ends all faults).
+    """
 
     extensions_map = SimpleHTTPRequestHandler.extensions_map | {".js": "text/javascript"}
 
@@ -70,6 +74,9 @@ class Handler(SimpleHTTPRequestHandler):
             self.send_header("Content-Range", f"bytes {start}-{end}/{len(data)}")
         self.send_header("Content-Length", str(len(part)))
         self.end_headers()
+        if "held_after" in faults:
+            self._send_in_two(part, faults)
+            return
         cut = faults.get("cut_after")
         with contextlib.suppress(OSError):
             self.wfile.write(part if cut is None else part[:cut])
@@ -79,6 +86,17 @@ class Handler(SimpleHTTPRequestHandler):
                 time.sleep(0.3)
                 self.connection.shutdown(socket.SHUT_WR)
                 self.close_connection = True
+
+
+    def _send_in_two(self, part: bytes, faults: dict[str, Any]) -> None:
+        held = faults["held_after"]
+        with contextlib.suppress(OSError):
+            self.wfile.write(part[:held])
+            self.wfile.flush()
+            end = time.monotonic() + 60
+            while "held_after" in faults and time.monotonic() < end:
+                time.sleep(0.02)
+            self.wfile.write(part[held:])
 
 
 @contextlib.contextmanager

@@ -6,8 +6,10 @@
 import { createHash } from "node:crypto";
 import { readFileSync } from "node:fs";
 
-import { decodePacket, sceneBytes } from "../../gsstream/web/decode.js";
+import { decodePacket } from "../../gsstream/web/decode.js";
+import "../../gsstream/web/layers.js";
 import { decodeJoin } from "../../gsstream/web/joins.js";
+import { sceneBytes } from "./scene-bytes.mjs";
 
 const [, , from, number] = process.argv;
 const data = new Uint8Array(readFileSync(from));

@@ -39,7 +39,8 @@ FINISH = f"""(() => {{
   const draw = player.draw.bind(player);
   player.draw = (options) => {{
     draw(options);
-    player.renderer.readPixels();
+    const {{ gl }} = player.renderer;
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
     player.finished.push([player.frame, Date.now() + player.buffer.socket.ahead]);
   }};
 }})()"""

@@ -28,3 +28,20 @@ def play_in_node(streams: Sequence[bytes], folder: Path, *, timeout: float = 300
     found: dict[str, Any] = json.loads(results.read_text())
     assert len(found["streams"]) == len(streams)
     return found
+
+
+def node(code: str, given: object, folder: Path) -> Any:
+    """What a piece of JavaScript makes of ``given`` (JSON): it sees ``given`` and the folder of modules ``web``."""
+    file = folder / "given.json"
+    file.write_text(json.dumps(given))
+    script = (
+        "import { readFileSync } from 'node:fs';\n"
+        f"const given = JSON.parse(readFileSync({json.dumps(str(file))}));\n"
+        f"const load = (name) => import({json.dumps(str(HERE.parents[1] / 'gsstream' / 'web'))} + '/' + name);\n"
+        f"console.log(JSON.stringify(await (async () => {{ {code} }})()));\n"
+    )
+    done = subprocess.run(
+        [str(NODE), "--input-type=module", "-"], input=script, capture_output=True, text=True, timeout=600, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)

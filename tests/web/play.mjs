@@ -1,15 +1,19 @@
 // Play streams with the browser's decoder and say what came of them. Usage: node play.mjs STREAMS RESULTS
 //
 // STREAMS holds streams one after the other, each preceded by its length (u32). RESULTS gets a JSON list with an entry
-// for each: the SHA-256 of the state after every packet, the error that ended it, and how long it took.
+// for each: the SHA-256 of the state after every packet, that of the first packet's first layer, the error that ended it, and how long it took.
 
 import { createHash } from "node:crypto";
 import { readFileSync, writeFileSync } from "node:fs";
 
 import { KIND } from "../../gsstream/web/container.js";
-import { decodePacket, sceneBytes } from "../../gsstream/web/decode.js";
+import { decodePacket } from "../../gsstream/web/decode.js";
+import { firstLayer } from "../../gsstream/web/layers.js";
 import { PacketError } from "../../gsstream/web/errors.js";
 import { PacketWalker } from "../../gsstream/web/walker.js";
+import { sceneBytes } from "./scene-bytes.mjs";
+
+const digest = (state) => createHash("sha256").update(sceneBytes(state)).digest("hex");
 
 /** Push a stream in pieces, as a download would. */
 function play(bytes, piece) {
@@ -24,14 +28,16 @@ function play(bytes, piece) {
       for (let packet = walker.next(); packet; packet = walker.next()) {
         if (packet.header.kind === KIND.index) continue;
         state = decodePacket(state, packet.data, packet.offset);
-        digests.push(createHash("sha256").update(sceneBytes(state)).digest("hex"));
+        digests.push(digest(state));
       }
     }
     walker.finish();
   } catch (caught) {
     error = { message: caught.message, offset: caught.offset ?? null, expected: caught instanceof PacketError };
   }
-  return { digests, error, milliseconds: performance.now() - started };
+  const first = firstLayer(bytes.subarray(16));
+  const early = first && digest(first);
+  return { digests, early, error, milliseconds: performance.now() - started };
 }
 
 /** Peak resident memory of this process alone: maxRSS counts the process that started it as well, from before exec. */

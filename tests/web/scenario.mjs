@@ -60,9 +60,14 @@ const actions = {
     player.seek(${frame});
     while (player.frame !== ${frame}) await new Promise(requestAnimationFrame);
     player.draw({ exact: true });
-    const bytes = player.renderer.readPixels();
+    const { gl } = player.renderer;
     let text = "";
-    for (const byte of bytes) text += String.fromCharCode(byte);
+    // Rows of a picture in the graphics go from the bottom to the top.
+    for (let y = ${height} - 1; y >= 0; y -= 1) {
+      const bytes = new Uint8Array(4 * ${width});
+      gl.readPixels(0, y, ${width}, 1, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+      for (const byte of bytes) text += String.fromCharCode(byte);
+    }
     return btoa(text);
   })()`),
 };

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import subprocess
 from pathlib import Path
 
 import constriction
@@ -13,7 +12,7 @@ import pytest
 import zstandard
 from decoder_fuzz import FAULTY_FRAME, NETWORK, fuzz
 from moving_scenes import moving_packets
-from node_runs import NODE, needs_node, play_in_node
+from node_runs import needs_node, node, play_in_node
 
 from gsstream.cli.main import run_command
 from gsstream.core.errors import PacketError
@@ -31,23 +30,6 @@ SAMPLES = HERE.parent / "packet" / "samples"
 def digests(path: Path) -> list[str]:
     with Playback(path) as playback:
         return [hashlib.sha256(b"".join(a.tobytes() for _, a in s.items())).hexdigest() for _, s in playback]
-
-
-def node(code: str, given: object, folder: Path) -> object:
-    """What a piece of JavaScript makes of ``given`` (JSON): it sees ``given`` and the folder of modules ``web``."""
-    file = folder / "given.json"
-    file.write_text(json.dumps(given))
-    script = (
-        "import { readFileSync } from 'node:fs';\n"
-        f"const given = JSON.parse(readFileSync({json.dumps(str(file))}));\n"
-        f"const load = (name) => import({json.dumps(str(HERE.parents[1] / 'gsstream' / 'web'))} + '/' + name);\n"
-        f"console.log(JSON.stringify(await (async () => {{ {code} }})()));\n"
-    )
-    done = subprocess.run(
-        [str(NODE), "--input-type=module", "-"], input=script, capture_output=True, text=True, timeout=600, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
 
 
 def test_stored_streams_decode_to_the_bits_they_always_decoded_to(tmp_path):

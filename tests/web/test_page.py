@@ -277,13 +277,14 @@ def test_the_page_is_small():
         str(p.relative_to(folder)): len(gzip.compress(p.read_bytes()))
         for p in folder.rglob("*") if p.is_file() and "vendor" not in p.parts
     }  # fmt: skip
-    # What only a live stream takes, a seek by a join, a stream without a package and the statistics is loaded only
-    # there; the adapter for three.js and what is for scripts alone never.
-    later = [sizes.pop(f"{name}.js") for name in ("live", "live-socket", "latency", "joins", "file", "statistics")]
+    # What only a live stream takes, a seek by a join, a stream without a package, a packet with layers and the
+    # statistics is loaded only there; the adapter for three.js and what is for scripts alone never.
+    names = ("live", "live-socket", "latency", "joins", "file", "statistics", "layers", "early")
+    later = [sizes.pop(f"{name}.js") for name in names]
     del sizes["gsstream-spark.js"], sizes["world.js"]
     assert len(sizes) > 20
     assert sum(sizes.values()) <= 60_000
-    assert sum(later) <= 9_300
+    assert sum(later) <= 11_900
 
 
 def test_a_segment_is_a_stream_of_its_own(site):

@@ -17,12 +17,13 @@ from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
-from gsstream.core.shapes import FloatArray
+from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import blaming
 from gsstream.engine.assembly.pending import refuse_pending
 from gsstream.engine.fit.exposure import Exposure
 from gsstream.engine.frame0.cheaper import cheaper_rows
+from gsstream.engine.frame0.first_seen import first_rows
 from gsstream.engine.frame0.how_many import most_gaussians
 from gsstream.engine.frame0.optimise import Progress, initial_gaussians, optimise_first_frame, sort_by_node
 from gsstream.engine.state.stream_state import Step, StreamState
@@ -57,7 +58,10 @@ def begin(
     decoded = quantise_key(cheaper.map(lambda t: t.numpy())).map(torch.from_numpy)
     hierarchy, levels, decoded = arrange(parts, decoded, found.levels, anchors)
     layout = make_layout(hierarchy, levels, anchors)
-    state, packet = key_state(parts, decoded, layout, hierarchy, frame, meta, found.exposure, anchors.origin, rng)
+    first = first_rows(parts, decoded, frame, found.exposure, rng)
+    state, packet = key_state(
+        parts, decoded, layout, hierarchy, frame, meta, found.exposure, anchors.origin, rng, first
+    )
     clock.append(time.perf_counter())
     metrics: dict[str, Any] = {
         "bytes": dict(packet.sizes),
@@ -166,6 +170,7 @@ def key_state(
     exposure: Exposure | None,
     origin: torch.Tensor,
     rng: Rng,
+    first: BoolArray | None = None,
 ) -> tuple[StreamState, EncodedPacket]:
     """Encode a key packet and continue from its decoded bytes.
 
@@ -178,10 +183,11 @@ def key_state(
         exposure: colour maps of the cameras, or None.
         origin: [3] origin of the structure's grid.
         rng: random streams by name and frame.
+        first: [N] bool: the Gaussians of the packet's first layer; None: it has no layers.
     """
     extra: Mapping[str, Any] = {**meta.extra, **exposure_to_meta(exposure), "origin": origin.tolist()}
     arrays: Gaussians[FloatArray] = gaussians.map(lambda t: np.ascontiguousarray(t.numpy()))
-    packet = encode_key(KeyState(arrays, layout, replace(meta, extra=extra)), frame=frame.index)
+    packet = encode_key(KeyState(arrays, layout, replace(meta, extra=extra)), frame=frame.index, first=first)
     player = decode_packet(None, packet.data)
     decoders = parts.update.init_decoders(gaussians, rng.stream("decoders", frame.index))
     state = StreamState(

@@ -17,6 +17,7 @@ from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.pending import refuse_pending
 from gsstream.engine.frame0.begin import arrange, decoded_anchors, exposure_from_meta, key_state, make_layout
+from gsstream.engine.frame0.first_seen import first_rows
 from gsstream.engine.state.stream_state import Step
 from gsstream.packet import PlayerState, StreamMeta, quantise_key
 from gsstream.structure.base import Anchors
@@ -53,7 +54,10 @@ def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMe
     hierarchy, levels, gaussians = arrange(parts, gaussians, anchors.levels, anchors)
     layout = make_layout(hierarchy, levels, anchors)
     exposure = exposure_from_meta(first.meta)
-    state, packet = key_state(parts, gaussians, layout, hierarchy, frame, meta, exposure, anchors.origin, rng)
+    first_seen = first_rows(parts, gaussians, frame, exposure, rng)
+    state, packet = key_state(
+        parts, gaussians, layout, hierarchy, frame, meta, exposure, anchors.origin, rng, first_seen
+    )
     metrics = {
         "bytes": dict(packet.sizes),
         "num_gaussians": len(gaussians),

@@ -17,6 +17,7 @@ from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import arrange, decoded_anchors, key_state, make_layout
 from gsstream.engine.frame0.cheaper import cheaper_rows
+from gsstream.engine.frame0.first_seen import first_rows
 from gsstream.engine.frame0.refine import SHOWN, is_refined
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.tools import RunTools
@@ -88,7 +89,7 @@ def refined_key(parts: Assembly, state: StreamState, frame: Frame, meta: StreamM
     assert found is not None
     cheaper = cheaper_rows(parts, found.gaussians, frame, state.exposure, rng)
     gaussians = quantise_key(cheaper.map(lambda t: t.numpy())).map(torch.from_numpy)
-    return _keyed(parts, state, gaussians, found.levels, frame, frame.index, meta, rng)
+    return _keyed(parts, state, gaussians, found.levels, frame, frame.index, meta, rng, layered=True)
 
 
 def decoded_again(parts: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
@@ -108,16 +109,20 @@ def decoded_again(parts: Assembly, state: StreamState, frame: Frame, meta: Strea
 
 def _keyed(
     parts: Assembly, state: StreamState, gaussians: Gaussians[torch.Tensor], levels: torch.Tensor, frame: Frame,
-    shown: int, meta: StreamMeta, rng: Rng,
+    shown: int, meta: StreamMeta, rng: Rng, *, layered: bool = False,
 ) -> Step:  # fmt: skip
-    """A key packet of Gaussians on its grids, of these levels, which show the pictures of the frame ``shown``."""
+    """A key packet of Gaussians on its grids, of these levels, which show the pictures of the frame ``shown``.
+
+    A periodic one has no layers: whoever plays on needs none, and to find them would cost the frame time.
+    """
     anchors = decoded_anchors(state.player)
     hierarchy, levels, gaussians = arrange(parts, gaussians, levels, anchors)
     layout = make_layout(hierarchy, levels, anchors)
     # A resumed run must compare the next frame with the picture this scene shows, which may be an older one.
     meta = replace(meta, extra={**meta.extra, SHOWN: shown})
+    first = first_rows(parts, gaussians, frame, state.exposure, rng) if layered else None
     after, packet = key_state(
-        parts, gaussians, layout, hierarchy, frame, meta, state.exposure, anchors.origin, rng
+        parts, gaussians, layout, hierarchy, frame, meta, state.exposure, anchors.origin, rng, first
     )
     metrics = {"bytes": dict(packet.sizes), "num_gaussians": len(gaussians), "num_gates": len(layout.node_counts)}
     return Step(after, packet, "key", metrics)

@@ -1,0 +1,47 @@
+"""Which Gaussians stand first in a key packet (``codec.first_layer``): those that the images would miss most."""
+
+from __future__ import annotations
+
+import torch
+
+from gsstream.core.frame import Frame
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.rng import Rng
+from gsstream.core.shapes import BoolArray
+from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.fit.exposure import Exposure
+from gsstream.engine.frame0.removal import removal_errors
+
+
+def first_rows(
+    parts: Assembly, gaussians: Gaussians[torch.Tensor], frame: Frame, exposure: Exposure | None, rng: Rng
+) -> BoolArray | None:
+    """Return the choice [N] bool of the Gaussians that come first, or None where the packet is to have no layers.
+
+    Arguments:
+        parts: the live parts of the recipe.
+        gaussians: N rows as players will have them, in the order of the packet.
+        frame: training images of the packet's frame.
+        exposure: colour maps of the cameras, or None.
+        rng: random streams by name and frame.
+    """
+    share = parts.recipe.codec.first_layer
+    if share == 1 or len(gaussians) == 0:
+        return None
+    generator = rng.stream("first layer", frame.index)
+    errors, _ = removal_errors(parts.renderer, gaussians, frame, exposure, parts.recipe.background, generator)
+    return most_missed(errors, share)
+
+
+def most_missed(errors: torch.Tensor, share: float) -> BoolArray:
+    """Return the choice [N] bool of the rows with the largest errors; of equal ones those that stand first.
+
+    Arguments:
+        errors: [N] at least 0.
+        share: of the rows that are chosen, 0 to 1; at least one is, where there is any.
+    """
+    order = torch.argsort(errors, descending=True, stable=True)
+    chosen = torch.zeros(len(errors), dtype=torch.bool)
+    chosen[order[: max(1, round(share * len(errors)))]] = True
+    choice: BoolArray = chosen.numpy()
+    return choice

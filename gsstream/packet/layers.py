@@ -1,0 +1,170 @@
+"""Key packets in two layers: first the Gaussians that a picture would miss most, whole, then the rest of them.
+
+Section ``layers`` stands first. It says how many Gaussians the attribute sections hold, how many bytes the sections
+behind it take that a picture needs, and what their checksum is: a player that has so many bytes can draw a picture that
+it knows to be sound, while the rest is on its way. The rows of the scene are those it would have without layers.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from gsstream.core.errors import PacketError, ShapeError
+from gsstream.core.gaussians import ATTRIBUTES, Gaussians
+from gsstream.core.shapes import BoolArray, FloatArray
+from gsstream.packet.base import (
+    MAX_META,
+    PACKET_HEADER,
+    SECTION_HEADER,
+    SECTION_IDS,
+    PacketKind,
+    Section,
+    located,
+    most_gaussians,
+    parse_header,
+    split_sections,
+)  # fmt: skip
+from gsstream.packet.bits import pack_blobs, unpack_blobs
+from gsstream.packet.bulk import decompress
+from gsstream.packet.grids import KEY_BITS
+from gsstream.packet.meta import StreamMeta, meta_from_json
+from gsstream.packet.positions import floor_exponent
+from gsstream.packet.rows import decode_rows, decoded_rows, encode_codes, row_codes
+from gsstream.packet.symbols import decode_symbols, encode_symbols
+
+_LAYERS = struct.Struct("<III")
+#: Where the bytes begin that section ``layers``, the first of its packet, tells of.
+_START = PACKET_HEADER.size + SECTION_HEADER.size + _LAYERS.size
+
+#: Sections that the checksum of the first layer covers, and all sections of a packet with layers, in their order.
+_SHOWN = ("meta", *ATTRIBUTES)
+ORDER = ("layers", *_SHOWN, "layout", "rest")
+
+
+class FirstLayer(NamedTuple):
+    """What can be drawn of a key packet of which the rest has not come yet.
+
+    Arguments:
+        gaussians: [K] rows, in the order they have in the scene.
+        meta: of the stream.
+        frame: index of the frame.
+    """
+
+    gaussians: Gaussians[FloatArray]
+    meta: StreamMeta
+    frame: int
+
+
+def in_layers(
+    meta: bytes, layout: bytes, gaussians: Gaussians[FloatArray], first: BoolArray
+) -> list[tuple[str, bytes]]:
+    """Return all sections of a key packet in two layers, in their order.
+
+    Arguments:
+        meta, layout: payloads of these sections.
+        gaussians: N rows, raw values.
+        first: [N] bool: the rows of the first layer.
+
+    Raises ShapeError when ``first`` does not fit.
+    """
+    if first.shape != (len(gaussians),) or first.dtype != np.bool_:
+        raise ShapeError(f"first: expected [{len(gaussians)}] bool, got {list(first.shape)} {first.dtype}")
+    codes = row_codes(gaussians)
+    means = decoded_rows(gaussians, codes).means
+    # Both layers lie on the grids of the whole scene, so that the layers do not show in what is decoded.
+    floor = floor_exponent(codes["scales"], KEY_BITS["scales"]) if len(means) else None
+    now, later = (
+        encode_codes(means[rows], {name: table[rows] for name, table in codes.items()}, floor)
+        for rows in (first, ~first)
+    )
+    payloads = {"meta": meta, "layout": layout, **now}
+    body = b"".join(SECTION_HEADER.pack(SECTION_IDS[name], len(payloads[name])) + payloads[name] for name in _SHOWN)
+    payloads["layers"] = _LAYERS.pack(int(first.sum()), len(body), zlib.crc32(body))
+    mask = encode_symbols(first[:, None].astype(np.int32))
+    payloads["rest"] = pack_blobs([mask, *(later[name] for name in ATTRIBUTES)])
+    return [(name, payloads[name]) for name in ORDER]
+
+
+def decode_layers(data: bytes, sections: Mapping[str, Section], number: int, offset: int) -> Gaussians[FloatArray]:
+    """Return the rows of a sound key packet with layers, both together. Raises PacketError.
+
+    Arguments:
+        data: the packet.
+        sections: of the packet, those of ``ORDER``.
+        number: N, the rows of the scene.
+        offset: place of the packet in the file, for errors.
+    """
+    rest = sections["rest"]
+    with located(sections["layers"].offset):
+        in_first, size, checksum = read_head(sections["layers"].data)
+        if size != sections["layout"].offset - SECTION_HEADER.size - offset - _START or in_first > number:
+            raise PacketError(f"layers: {in_first} of {number} Gaussians in {size} bytes cannot be")
+        if zlib.crc32(data[_START : _START + size]) != checksum:
+            raise PacketError("layers: the checksum of the first layer does not match")
+    now = decode_rows(sections, in_first)
+    with located(rest.offset):
+        mask, *parts = unpack_blobs(rest.data, 1 + len(ATTRIBUTES))
+        first = _mask(decode_symbols(mask, number, 1)[:, 0], in_first)
+        later = decode_rows({name: Section(part, rest.offset) for name, part in zip(ATTRIBUTES, parts, strict=True)},
+                            number - in_first)
+        if now.shN.shape[1] != later.shN.shape[1]:
+            raise PacketError(f"rest: shN of {later.shN.shape[1]} coefficients, the first layer has {now.shN.shape[1]}")
+    return Gaussians(**{name: _merged(first, getattr(now, name), getattr(later, name)) for name in ATTRIBUTES})
+
+
+def first_layer(data: bytes) -> FirstLayer | None:
+    """Return what can be drawn of the beginning of a key packet, or None: not enough is there, or it has no layers.
+
+    What is damaged gives None as well; whoever reads the whole packet says what is wrong with it.
+
+    Arguments:
+        data: bytes from the header of a packet on, as many as are there.
+    """
+    try:
+        return _first_layer(data)
+    except PacketError:
+        return None
+
+
+def _first_layer(data: bytes) -> FirstLayer | None:
+    if len(data) < _START:
+        return None
+    header = parse_header(data, 0)
+    number, length = SECTION_HEADER.unpack_from(data, PACKET_HEADER.size)
+    if header.kind != PacketKind.KEY or number != SECTION_IDS["layers"] or length != _LAYERS.size:
+        return None
+    in_first, size, checksum = read_head(data[_START - _LAYERS.size : _START])
+    body = data[_START : _START + size]
+    if len(body) < size or in_first > most_gaussians(len(body)) or zlib.crc32(body) != checksum:
+        return None
+    sections = split_sections(body, len(_SHOWN), _START)
+    if tuple(sections) != _SHOWN:
+        return None
+    meta = meta_from_json(decompress(sections["meta"].data, MAX_META))
+    return FirstLayer(decode_rows(sections, in_first), meta, header.frame)
+
+
+def read_head(data: bytes) -> tuple[int, int, int]:
+    """Return what section ``layers`` says: Gaussians of the first layer, bytes of its sections, their CRC-32."""
+    if len(data) != _LAYERS.size:
+        raise PacketError(f"layers: expected {_LAYERS.size} bytes, got {len(data)}")
+    in_first, size, checksum = _LAYERS.unpack(data)
+    return in_first, size, checksum
+
+
+def _mask(marks: np.ndarray, in_first: int) -> BoolArray:
+    first: BoolArray = marks == 1
+    if not (first | (marks == 0)).all() or int(first.sum()) != in_first:
+        raise PacketError(f"rest: {int(first.sum())} Gaussians are marked, the first layer has {in_first}")
+    return first
+
+
+def _merged(first: BoolArray, now: FloatArray, later: FloatArray) -> FloatArray:
+    out = np.empty((len(first), *now.shape[1:]), np.float32)
+    out[first], out[~first] = now, later
+    return out

@@ -93,7 +93,7 @@ def test_slopes_of_codes_are_those_of_finite_differences() -> None:
 @cache
 def key_packet(rate: float) -> tuple[EncodedPacket, Any]:
     with open_recording(WORLD) as source:
-        made = encoder_for("s2gs-edge", source, {**TINY, "codec.key_rate": rate})
+        made = encoder_for("s2gs-edge", source, {**TINY, "codec.key_rate": rate, "codec.first_layer": 1})
     step = made.encode(frames()[0])
     return step.packet, made
 

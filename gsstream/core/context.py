@@ -25,6 +25,21 @@ class ScreenGradient(NamedTuple):
     visible: torch.Tensor
 
 
+class MovedPull(NamedTuple):
+    """What a view says of groups of rows that moved.
+
+    Arguments:
+        loss: of the view.
+        slope: [K, 6] its gradient by shift [per scene unit] and turn [per tan(angle / 2)] of the groups.
+        curvature: [K, 6, 6] how fast that gradient grows where a group moves on, a symmetric block for each; None where
+            nobody asked for it. See ``gsstream.motion.curvature``.
+    """
+
+    loss: float
+    slope: FloatArray
+    curvature: FloatArray | None = None
+
+
 class FrameContext(Protocol):
     """What an estimator may look at. Nothing here can be changed, and no call leaves a gradient behind."""
 
@@ -109,9 +124,9 @@ class FrameWork(FrameContext, Protocol):
         """
 
     def pull_moved(
-        self, view: int, rows: Gaussians[FloatArray], moves: Moves, near_change: bool = False
-    ) -> FloatArray | None:
-        """Return the gradient [K, 6] of a loss by shift and turn of groups, if the renderer has a call for it.
+        self, view: int, rows: Gaussians[FloatArray], moves: Moves, near_change: bool = False, curved: bool = False
+    ) -> MovedPull | None:
+        """Return loss and gradient by shift and turn of groups, if the renderer has a call for it.
 
         None where it has none; ``gsstream.blocks.slope_of`` asks this first and gives the gradient in any case.
 
@@ -119,6 +134,19 @@ class FrameWork(FrameContext, Protocol):
             view: index of a training camera.
             rows: the A rows of :meth:`narrow` before they move.
             moves: of these rows, which it counts from 0 to A - 1.
+            near_change: as for :meth:`pull`.
+            curved: return the curvature, too.
+        """
+
+    def structure(self, view: int, rows: Gaussians[torch.Tensor], near_change: bool = False) -> FloatArray:
+        """Return [A, 3]: how firmly the picture holds each row where it is.
+
+        Sums over the pixels of a view: the share that a row has of a pixel's light, times the structure tensor (xx, xy,
+        yy, per pixel^2) of the render there, each value weighed by 1 / (its distance from what the camera recorded).
+
+        Arguments:
+            view: index of a training camera.
+            rows: the A rows of :meth:`narrow`.
             near_change: as for :meth:`pull`.
         """
 

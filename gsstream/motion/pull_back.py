@@ -9,6 +9,7 @@ from gsstream.core.changes.motion import Moves, transformed
 from gsstream.core.context import FrameWork
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
+from gsstream.motion.curvature import curvature_of
 
 
 def slope_of(
@@ -23,12 +24,36 @@ def slope_of(
         moves: of the rows of ``base``: its ``rows`` count from 0 to A - 1.
         near_change: as for ``work.pull``.
     """
-    slope = work.pull_moved(view, base, moves, near_change)
-    if slope is not None:
-        return slope
+    pulled = work.pull_moved(view, base, moves, near_change)
+    if pulled is not None:
+        return pulled.slope
+    return pulled_back(_moved_leaves(work, view, base, moves, near_change), moves)
+
+
+def curved_slope_of(
+    work: FrameWork, view: int, base: Gaussians[FloatArray], moves: Moves, near_change: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Return the gradient [K, 6] as :func:`slope_of`, and the curvature [K, 6, 6] of the groups, at these moves.
+
+    Arguments:
+        work, view, base, moves, near_change: as for :func:`slope_of`.
+    """
+    pulled = work.pull_moved(view, base, moves, near_change, curved=True)
+    if pulled is not None and pulled.curvature is not None:
+        return pulled.slope, pulled.curvature
+    leaves = _moved_leaves(work, view, base, moves, near_change)
+    structure = work.structure(view, leaves.map(torch.Tensor.detach), near_change)
+    means = leaves.means.detach().numpy()
+    return pulled_back(leaves, moves), curvature_of(means, moves, work.cameras, view, structure)
+
+
+def _moved_leaves(
+    work: FrameWork, view: int, base: Gaussians[FloatArray], moves: Moves, near_change: bool
+) -> Gaussians[torch.Tensor]:
+    """The rows after they moved, with the gradient of a view's loss."""
     leaves = transformed(base, moves).map(lambda value: torch.from_numpy(value).requires_grad_())
     work.pull(view, leaves, near_change)
-    return pulled_back(leaves, moves)
+    return leaves
 
 
 def pulled_back(leaves: Gaussians[torch.Tensor], moves: Moves) -> FloatArray:

@@ -14,8 +14,8 @@ from gsstream.core.part import PartConfig
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.motion.base import MotionPart
-from gsstream.motion.fitting import felt_most, fitted_moves
 from gsstream.motion.groups import changed_groups, known_groups
+from gsstream.motion.newton import Damping, newton_moves
 
 
 class Units(NamedTuple):
@@ -35,9 +35,9 @@ class Units(NamedTuple):
 class Rigid(MotionPart):
     """Fits one rigid transform per group, starting from the last frame's, and codes what corrects the prediction.
 
-    A few passes over the training cameras move the groups' six numbers each, with Adam's moments, one length of step
-    for all six, and a falling rate; only the Gaussians of groups that lie in what changed are rendered anew. A group
-    that ends within ``least`` pixels of where it stood is left alone.
+    A few passes over the training cameras move the groups' six numbers each, by damped Gauss-Newton steps after every
+    view; only the Gaussians of groups that lie in what changed are rendered anew. A group that ends within ``least``
+    pixels of where it stood is left alone.
     """
 
     class Config(PartConfig):
@@ -50,8 +50,13 @@ class Rigid(MotionPart):
         epochs: int = Field(
             default=2, ge=1, le=100, description="passes over the training cameras; a hurried frame makes its share"
         )
-        lr: float = Field(default=0.25, gt=0, le=10, description="first step, pixels per iteration")
-        lr_final: float = Field(default=0.025, gt=0, le=10, description="last step, pixels per iteration")
+        damping: float = Field(
+            default=0.1, ge=0, le=100, description="share of a group's mean curvature that is added to it"
+        )
+        hold: float = Field(
+            default=40.0, gt=0, le=1e6, description="curvature that holds every group back besides, per pixel^2"
+        )
+        longest: float = Field(default=0.5, gt=0, le=10, description="longest step of an iteration, pixels")
         step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
         everywhere: bool = Field(
             default=True,
@@ -87,6 +92,6 @@ class Rigid(MotionPart):
         """[K, 6] shift and turn of the groups that explain the images best."""
         config = self.config
         total = max(1, round(config.epochs * len(work.cameras) * work.effort))
-        rates = [config.lr * (config.lr_final / config.lr) ** (step / total) for step in range(total)]
+        damping = Damping(config.damping, config.hold, config.longest)
         order, near = rng.numpy("motion", work.index), not config.everywhere
-        return fitted_moves(scene, work, start, units.row, rates, order, felt_most, near_change=near)
+        return newton_moves(scene, work, start, units.row, total, order, damping, near)

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 import torch
 
 from gsstream.core.changes.motion import Moves
-from gsstream.core.context import ScreenGradient
+from gsstream.core.context import MovedPull, ScreenGradient
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
 from gsstream.render.output import Comparison, Pulled, RenderCache, RenderOutput
@@ -116,21 +116,20 @@ class RenderSession(ABC):
         return None
 
     def pull_moved(
-        self, view: int, rows: Gaussians[FloatArray], moves: Moves, comparison: Comparison
-    ) -> tuple[float, FloatArray] | None:
+        self, view: int, rows: Gaussians[FloatArray], moves: Moves, comparison: Comparison, curved: bool = False
+    ) -> MovedPull | None:
         """Render rows after their groups moved, compare, and pull the loss back to the groups, in one call.
 
         None where there is no such short cut, or it finds a fault: whoever asks then makes the calls that it stands for
-        (``gsstream.blocks.slope_of``), which raise the error. Results are theirs up to rounding.
+        (``gsstream.blocks.slope_of``, ``gsstream.motion.pull_back.curved_slope_of``), which raise the error. Results
+        are theirs up to rounding.
 
         Arguments:
             view: index of a camera of the rig.
             rows: the A active rows before they move, raw parameters.
             moves: of these rows, which it counts from 0 to A - 1.
             comparison: what the render is compared with.
-
-        Returns:
-            The loss, and its gradient [K, 6] by the groups' shift and turn.
+            curved: return the curvature, too.
         """
         return None
 

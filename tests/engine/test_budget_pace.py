@@ -25,11 +25,13 @@ class Clock:
         return self.now
 
 
-def paced(seconds: float, **known: float) -> tuple[Pace, Clock]:
+def paced(seconds: float, effort: float = 1.0, before: float = 0.0, **known: float) -> tuple[Pace, Clock]:
     clock = Clock()
+    began = clock.now
+    clock.now += before
     values = {"after": 1.0, "each": 0.55, **known}
     found = FramePlan(20, 6.0, 3e-4, most_epochs=30, seconds=seconds, **values)  # type: ignore[arg-type]
-    return Pace(Allowance(found, clock.now, clock), 20, 3e-4, 5), clock
+    return Pace(Allowance(found, began, clock), max(1, round(effort * 20)), 3e-4, 5, effort), clock
 
 
 def test_the_clock_ends_a_frame_before_its_coding_has_no_time_left() -> None:
@@ -43,6 +45,26 @@ def test_the_clock_ends_a_frame_before_its_coding_has_no_time_left() -> None:
             break
     assert done == 13, "4 seconds are there beside coding, and 13 views of 0.3 s fit into them"
     assert pace.stopped_by_clock
+
+
+@pytest.mark.parametrize(("effort", "views"), [(1.0, 33), (0.5, 16), (0.2, 6), (0.01, 1)])
+def test_a_hurried_frame_takes_its_share_of_the_time_that_passes_have(effort: float, views: int) -> None:
+    """Its run is behind: time that the deadline leaves is for the frames that wait."""
+    pace, clock = paced(13.0, effort, before=2.0)
+    pace.begin(10)
+    done, over = 0, False
+    while not over and done < 100:
+        clock.now += 0.3
+        done += 1
+        over = pace.is_over()
+    assert done == views, "of 13 seconds 2 were before the passes and 1 is kept for what follows them"
+
+
+def test_a_hurried_frame_that_has_no_time_left_is_not_given_more() -> None:
+    pace, clock = paced(2.0, 0.2, before=5.0)
+    pace.begin(10)
+    clock.now += 0.3
+    assert pace.is_over()
 
 
 def test_passes_follow_what_they_took() -> None:

@@ -12,7 +12,7 @@ from gsstream.cli.main import run_command
 from gsstream.packet import StreamReader
 from gsstream.player.playback import Playback
 
-SIZE = 700
+SIZE = 500
 TIGHT = ("--budget", f"size={SIZE}B")
 
 
@@ -47,7 +47,7 @@ def test_sizes_hold_in_the_file_and_are_reported(held: Path) -> None:
     assert f"budget size {SIZE / 1000:.2f} KB: 3 of 3 frames inside" in summary
     assert "\ngiven up: " in summary
     assert "time: 1.0" not in (held / "out" / "recipe.yaml").read_text()
-    assert "size: 700" in (held / "out" / "recipe.yaml").read_text()
+    assert f"size: {SIZE}" in (held / "out" / "recipe.yaml").read_text()
 
 
 def test_the_encoder_goes_on_from_what_it_trimmed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,7 +121,7 @@ def test_key_packets_wait_for_a_budget_that_has_room(tmp_path: Path) -> None:
     lines = metrics(tmp_path / "small")
     assert [line["status"] for line in lines[1:]].count("key") == 0
     assert ["key_postponed" in line for line in lines] == [False, False, True, True, True, True]
-    assert "bytes where 700 are allowed" in lines[2]["key_postponed"]
+    assert f"bytes where {SIZE} are allowed" in lines[2]["key_postponed"]
     assert (
         "a key packet was due and postponed in 4 frames (frames 2 to 5): period: about"
         in (tmp_path / "small" / "summary.txt").read_text()
@@ -159,9 +159,9 @@ def test_a_whole_method_has_no_budget_of_frames(tmp_path: Path, capsys: pytest.C
 
 def test_a_budget_is_data(tmp_path: Path) -> None:
     recipe = tmp_path / "mine.yaml"
-    recipe.write_text("base: s2gs-edge\nbudget: {size: 0.7KB}\n")
+    recipe.write_text(f"base: s2gs-edge\nbudget: {{size: {SIZE / 1000}KB}}\n")
     encode(tmp_path / "file", "--recipe", str(recipe), "--frames", "2", method="s2gs-edge")
     encode(tmp_path / "option", *TIGHT, "--frames", "2", method="s2gs-edge")
     ours, theirs = ((tmp_path / name / "stream.gss").read_bytes() for name in ("file", "option"))
     assert ours == theirs
-    assert metrics(tmp_path / "file")[1]["budget"]["limits"] == {"size": 700}
+    assert metrics(tmp_path / "file")[1]["budget"]["limits"] == {"size": SIZE}

@@ -47,7 +47,7 @@ class Pace:
 
     Arguments:
         epochs, rate_weight: of the plan or the recipe. views: iterations of a pass.
-        effort: share of the passes that the frame is worth.
+        effort: share of the passes that the frame is worth, and of the time that they have.
 
     Without an allowance it is the recipe's number of passes and weight.
     """
@@ -59,7 +59,7 @@ class Pace:
         self._timed = allowance if plan is not None and plan.seconds is not None else None
         # With a time budget the number of passes in the plan is a prediction, and the clock may allow more.
         self._most = max(epochs, round(effort * plan.most_epochs)) if plan is not None and self._timed else epochs
-        self.epochs, self.rate_weight = epochs, rate_weight
+        self.epochs, self.rate_weight, self._effort = epochs, rate_weight, effort
         self.estimate = 0.0
         self._weights: list[float] = []
         self.stopped_by_clock = False
@@ -94,7 +94,9 @@ class Pace:
         assert self._timed.plan.seconds is not None
         seconds, after = self._timed.plan.seconds, self._timed.plan.after
         kept = min(self._each, UNKNOWN_RESERVE * seconds) if after is None else after
-        return self._timed.started + seconds - kept - now
+        # A run that is behind hurries to catch up: what the passes of a hurried frame leave of its time is not theirs.
+        given_up = (1 - self._effort) * (seconds - kept - self.before)
+        return self._timed.started + seconds - kept - now - max(0.0, given_up)
 
     def close(self) -> None:
         """Note that the optimisation has ended."""

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.gaussians import Gaussians
+from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.guard import plain
 from gsstream.engine.fit.backward import pull_back
 from gsstream.engine.fit.exposure import Exposure
 from gsstream.loss.base import Loss
 from gsstream.render.base import TILE, Comparison, Pulled, Renderer, RenderSession
+from gsstream.render.structure import weighed_structure
 
 
 class Judge:
@@ -56,6 +59,23 @@ class Judge:
             touched = counted if touched is None else counted & touched
         loss, _ = self.backward(view, output.image, touched, tiles)
         return Pulled(loss, leaves.map(_gradient))
+
+    def structure(
+        self, session: RenderSession, view: int, rows: Gaussians[torch.Tensor], tiles: torch.Tensor | None = None
+    ) -> FloatArray:
+        """Return [A, 3]: sums over pixels of the share that a row has of a pixel's light, times structure there.
+
+        Arguments:
+            session, view, rows, tiles: as for :meth:`pull`.
+        """
+        rows = rows.map(torch.Tensor.detach)
+        colour = rows.sh0.clone().requires_grad_()
+        output = session.render(view, replace(rows, sh0=colour), tile_mask=None if tiles is None else tiles > 0)
+        recorded = self.recorded(view, output.image.detach())
+        # The gradient of a pixel by a colour is the share that its Gaussian has of the pixel's light.
+        pull_back([output.image], [weighed_structure(recorded, torch.from_numpy(self._images[view]))])
+        shares = _gradient(colour)[:, 0].numpy() / SH0
+        return np.asarray(shares)
 
     def comparison(self, view: int, tiles: torch.Tensor | None = None) -> Comparison:
         """Return what renders of a view are compared with.

@@ -6,7 +6,7 @@ import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.changes.motion import Moves
-from gsstream.core.context import ScreenGradient
+from gsstream.core.context import MovedPull, ScreenGradient
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
@@ -142,15 +142,19 @@ class FrameView:
         self._session = self.session_for(rows)
 
     def pull_moved(
-        self, view: int, rows: Gaussians[FloatArray], moves: Moves, near_change: bool = False
-    ) -> FloatArray | None:
+        self, view: int, rows: Gaussians[FloatArray], moves: Moves, near_change: bool = False, curved: bool = False
+    ) -> MovedPull | None:
         if not self.judge.in_one_go:
             return None
-        pulled = self.session.pull_moved(view, rows, moves, self.judge.comparison(view, self._tiles(view, near_change)))
-        if pulled is None:
-            return None
+        comparison = self.judge.comparison(view, self._tiles(view, near_change))
+        pulled = self.session.pull_moved(view, rows, moves, comparison, curved)
+        if pulled is not None:
+            self._parts.where.count()
+        return pulled
+
+    def structure(self, view: int, rows: Gaussians[torch.Tensor], near_change: bool = False) -> FloatArray:
         self._parts.where.count()
-        return pulled[1]
+        return self.judge.structure(self.session, view, rows, self._tiles(view, near_change))
 
     def _tiles(self, view: int, near_change: bool) -> torch.Tensor | None:
         """Factors on the gradients of tiles; None: all count."""

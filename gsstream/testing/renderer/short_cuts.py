@@ -8,7 +8,9 @@ import numpy as np
 import torch
 
 from gsstream.core.changes.motion import Moves, transformed
+from gsstream.engine.fit.judge import Judge
 from gsstream.loss.base import Loss
+from gsstream.motion.curvature import curvature_of
 from gsstream.motion.pull_back import pulled_back
 from gsstream.plugins.catalog import load_catalog
 from gsstream.render.base import Comparison, Renderer, RenderSession
@@ -20,6 +22,8 @@ from gsstream.testing.registry import check
 #: a pixel whose light is nearly used up may end a Gaussian later (docs/results/live.md).
 NEAR = 5e-3
 WHY = "the same calls, up to rounding and the end of a pixel's light"
+#: What renders are compared with.
+IMAGE = torch.rand(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(4))
 
 
 def _losses() -> Iterator[tuple[str, Loss]]:
@@ -40,8 +44,7 @@ def _opened(part: Renderer) -> tuple[RenderSession, Scene]:
 
 def _comparison(loss: Loss) -> Comparison:
     """SSIM alone, because a pixel that L1 sees from its other side has a gradient of the other sign."""
-    image = torch.rand(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(4))
-    return Comparison(loss, loss.prepare(image), 1.0)
+    return Comparison(loss, loss.prepare(IMAGE), 1.0)
 
 
 def _step_by_step(session: RenderSession, view: int, rows: Scene, wanted: Comparison) -> tuple[float, Scene]:
@@ -83,13 +86,20 @@ def _check_moved(part: Renderer, view: int, loss: Loss, name: str) -> None:
     session, rows = _opened(part)
     before = rows.map(torch.Tensor.numpy)
     moves = _moves(len(rows))
-    found = session.pull_moved(view, before, moves, _comparison(loss))
+    found = session.pull_moved(view, before, moves, _comparison(loss), curved=True)
     if found is None:
         return
     there = transformed(before, moves).map(torch.from_numpy)
     value, leaves = _step_by_step(_opened(part)[0], view, there, _comparison(loss))
     slope = torch.from_numpy(pulled_back(leaves, moves))
     scale = float(slope.abs().max()) or 1.0
-    equal(f"loss {name!r}, camera {view}: loss after motions", torch.tensor(found[0]), torch.tensor(value), 1e-4, WHY)
-    got = torch.from_numpy(found[1]) / scale
+    equal(f"loss {name!r}, camera {view}: loss after motions", torch.tensor(found.loss), torch.tensor(value), 1e-4, WHY)
+    got = torch.from_numpy(found.slope) / scale
     equal(f"loss {name!r}, camera {view}: slope of motions", got, slope / scale, NEAR, WHY)
+    assert found.curvature is not None, f"loss {name!r}, camera {view}: pull_moved was asked for curvature, got none"
+    judge = Judge(loss, 1.0, IMAGE[None].expand(view + 1, -1, -1, -1).numpy(), None)
+    structure = judge.structure(_opened(part)[0], view, there)
+    curvature = torch.from_numpy(curvature_of(there.means.numpy(), moves, world("cloud").cameras, view, structure))
+    scale = float(curvature.abs().max()) or 1.0
+    got = torch.from_numpy(found.curvature) / scale
+    equal(f"loss {name!r}, camera {view}: curvature of motions", got, curvature / scale, NEAR, WHY)

@@ -14,7 +14,10 @@ from test_cpu_renderer import rig, scene
 
 from gsstream.api import Comparison, Gaussians, Moves, RenderSession
 from gsstream.core.changes.motion import transformed
+from gsstream.engine.fit.exposure import Exposure
+from gsstream.engine.fit.judge import Judge
 from gsstream.loss.photometric import ReferenceLoss
+from gsstream.motion.curvature import curvature_of
 from gsstream.motion.pull_back import pulled_back
 
 ROWS = torch.tensor([1, 2, 5, 8, 11, 13, 17])
@@ -61,6 +64,32 @@ def test_one_call_has_the_bits_of_single_calls(size: float, coloured: bool, thre
     assert found[1].tobytes() == slope.tobytes()
     assert size > 1 or np.abs(slope[:2]).max() > 0
     assert not slope[2].any(), "a group without rows feels nothing"
+
+
+@pytest.mark.parametrize("coloured", [False, True])
+@pytest.mark.parametrize("some", [False, True])
+def test_curvature_is_that_of_the_structure_of_the_picture(coloured: bool, some: bool, threads: int) -> None:
+    """Of the picture as its camera records it, in the tiles that count; the slope has the same bits as without."""
+    wanted, given = comparison(coloured), moves()
+    tiles = some_tiles() if some else None
+    wanted = replace(wanted, tiles=tiles)
+    session, rows = opened()
+    found = session.pull_moved(1, rows, given, wanted, curved=True)
+    assert found is not None
+    assert found.curvature is not None
+    assert found.slope.tobytes() == by_single_calls(*opened(), given, wanted)[1].tobytes()
+    exposure = None
+    if coloured:
+        assert wanted.matrix is not None
+        assert wanted.offset is not None
+        exposure = Exposure(wanted.matrix.expand(2, 3, 3), wanted.offset.expand(2, 3))
+    judge = Judge(ReferenceLoss(), 0.2, np.stack([wanted.target.image] * 2), exposure)
+    there = transformed(rows, given).map(torch.from_numpy)
+    structure = judge.structure(opened()[0], 1, there, tiles)
+    expected = curvature_of(there.means.numpy(), given, rig(), 1, structure)
+    np.testing.assert_allclose(found.curvature, expected, atol=1e-4 * np.abs(expected).max())
+    assert np.abs(expected[:2]).max() > 0
+    assert not found.curvature[2].any(), "a group without rows is held by nothing"
 
 
 def test_tiles_that_are_left_out_say_nothing() -> None:

@@ -15,6 +15,7 @@ from gsstream.api import (
     Comparison,
     Gaussians,
     InputError,
+    MovedPull,
     Moves,
     Pulled,
     RenderCache,
@@ -123,10 +124,10 @@ class CpuSession(RenderSession):
         return cached.pull(rows, comparison)
 
     def pull_moved(
-        self, view: int, rows: Gaussians[NDArray[Any]], moves: Moves, comparison: Comparison
-    ) -> tuple[float, NDArray[Any]] | None:
+        self, view: int, rows: Gaussians[NDArray[Any]], moves: Moves, comparison: Comparison, curved: bool = False
+    ) -> MovedPull | None:
         ready = self.in_one_go([view], [comparison]) if hasattr(_native, "pull_moved") else None
-        return None if ready is None else moved_slope(*ready[0], rows, moves, comparison)
+        return None if ready is None else moved_slope(*ready[0], rows, moves, comparison, curved)
 
     def in_one_go(self, views: Sequence[int], comparisons: Sequence[Comparison]) -> list[tuple[Any, Any]] | None:
         """The native rasterisers of these views, frozen to the active rows, and what they are compared with.

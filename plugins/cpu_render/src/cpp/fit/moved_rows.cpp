@@ -14,7 +14,7 @@ constexpr std::size_t ROW_GRAIN = 1024;
 
 // Memory of one calling thread, kept between calls.
 struct Workspace {
-  Buffer<float> means, quats, gradient[ATTRIBUTES], means2d;
+  Buffer<float> means, quats, gradient[ATTRIBUTES], means2d, structure;
 };
 
 Workspace& workspace() {
@@ -73,9 +73,44 @@ void add_row(const MovedRows& moved, std::size_t i, const Workspace& work, doubl
   }
 }
 
+// out [2][6]: derivative of the row's place on the screen by shift and turn of its group. Float64 as in Python, from the
+// camera that the kernels have in float32.
+void row_on_screen(const MovedRows& moved, std::size_t i, const float* mean, const Camera& camera, double out[2][6]) {
+  const std::size_t k = static_cast<std::size_t>(moved.place[i]);
+  const float* r = camera.rotation;
+  double seen[3], arm[3];
+  for (int axis = 0; axis < 3; axis++) {
+    const float* m = r + 3 * axis;
+    seen[axis] = double{m[0]} * mean[0] + double{m[1]} * mean[1] + double{m[2]} * mean[2] + camera.translation[axis];
+    arm[axis] = mean[axis] - (moved.centre[3 * k + axis] + moved.shift[3 * k + axis]);
+  }
+  const double depth = std::max(seen[2], double{camera.near}), focal[] = {camera.fx, camera.fy};
+  for (int d = 0; d < 2; d++) {
+    double* p = out[d];
+    for (int axis = 0; axis < 3; axis++) p[axis] = focal[d] / depth * (r[3 * d + axis] - seen[d] / depth * r[6 + axis]);
+    p[3] = 2 * (arm[1] * p[2] - arm[2] * p[1]);
+    p[4] = 2 * (arm[2] * p[0] - arm[0] * p[2]);
+    p[5] = 2 * (arm[0] * p[1] - arm[1] * p[0]);
+  }
+}
+
+// Adds the curvature of one row to that of its group.
+void add_curvature(const MovedRows& moved, std::size_t i, const Workspace& work, const Camera& camera, double* curvature) {
+  const float* s = work.structure.data() + 3 * i;
+  if (s[0] == 0.0f && s[2] == 0.0f) return;  // not seen
+  double p[2][6];
+  row_on_screen(moved, i, work.means.data() + 3 * i, camera, p);
+  double* out = curvature + 36 * moved.place[i];
+  for (int a = 0; a < 6; a++) {
+    const double x = s[0] * p[0][a] + s[1] * p[1][a], y = s[1] * p[0][a] + s[2] * p[1][a];
+    for (int b = 0; b < 6; b++) out[6 * a + b] += x * p[0][b] + y * p[1][b];
+  }
+}
+
 }  // namespace
 
-ViewPull pull_moved(Rasterizer& rasterizer, const MovedRows& moved, const ViewComparison& view, double* slope) {
+ViewPull pull_moved(Rasterizer& rasterizer, const MovedRows& moved, const ViewComparison& view, double* slope,
+                    double* curvature) {
   Workspace& work = workspace();
   const std::size_t rows = moved.rows.count;
   const auto widths = row_widths(moved.rows.sh_degree);
@@ -91,11 +126,16 @@ ViewPull pull_moved(Rasterizer& rasterizer, const MovedRows& moved, const ViewCo
   scene.arrays.quats = quats;
   const GradientArrays out{gradients[0], gradients[1], gradients[2], gradients[3],
                            gradients[4], gradients[5], work.means2d.require(2 * rows)};
-  const ViewPull pulled = pull_view(rasterizer, scene, view, out);
+  float* structure = curvature ? work.structure.require(3 * rows) : nullptr;
+  const ViewPull pulled = pull_view(rasterizer, scene, view, out, structure);
   rasterizer.forget();  // its arrays belong to the next call
   if (pulled.faults) return pulled;
   std::fill_n(slope, 6 * moved.groups, 0.0);
   for (std::size_t i = 0; i < rows; i++) add_row(moved, i, work, slope);
+  if (curvature) {
+    std::fill_n(curvature, 36 * moved.groups, 0.0);
+    for (std::size_t i = 0; i < rows; i++) add_curvature(moved, i, work, rasterizer.camera(), curvature);
+  }
   return pulled;
 }
 

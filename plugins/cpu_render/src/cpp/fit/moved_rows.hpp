@@ -1,6 +1,7 @@
 // Rows that move in rigid groups, rendered from where they are now, and the gradient by the groups' transforms: what
 // every iteration of a fit of motions does. The arithmetic is that of gsstream.core.changes.motion.transformed and of
-// gsstream.motion.pull_back, float64 in the same order, so that the results are the same bits.
+// gsstream.motion.pull_back, float64 in the same order, so that the results are the same bits, and that of
+// gsstream.motion.curvature.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -16,8 +17,9 @@ struct MovedRows {
   const double *centre, *shift, *turn;  // [K, 3]; turn: axis * tan(angle / 2)
 };
 
-// slope [K, 6]: by the groups' shift and by a small turn in front of theirs, as a turn counts there. Nothing is written
-// where there is a fault.
-ViewPull pull_moved(Rasterizer& rasterizer, const MovedRows& moved, const ViewComparison& view, double* slope);
+// slope [K, 6]: by the groups' shift and by a small turn in front of theirs, as a turn counts there. curvature [K, 6, 6]: of
+// the sum over all values of the picture; null: not wanted. Nothing is written where there is a fault.
+ViewPull pull_moved(Rasterizer& rasterizer, const MovedRows& moved, const ViewComparison& view, double* slope,
+                    double* curvature = nullptr);
 
 }  // namespace gsstream_cpu

@@ -4,6 +4,7 @@
 #include <cstring>
 #include <vector>
 
+#include "fit/structure.hpp"
 #include "runtime/buffer.hpp"
 #include "runtime/parallel.hpp"
 
@@ -11,10 +12,11 @@ namespace gsstream_cpu {
 namespace {
 
 constexpr std::size_t FILL_GRAIN = 8;  // rows of blocks
+constexpr float SH0 = 0.28209479177387814f;  // colour per unit of sh0
 
 // Memory of one calling thread, kept between calls.
 struct Workspace {
-  Buffer<float> image, recorded, gradient;
+  Buffer<float> image, recorded, gradient, structure;
   std::vector<uint8_t> touched, around, read, counted;  // by tiles of 16 x 16 pixels
 };
 
@@ -123,9 +125,23 @@ void weigh(const Grid& grid, const float* weights, const std::vector<uint8_t>& m
     }
 }
 
+// The gradient of a pixel by a row's colour is the share that the row has of its light: so the pass that gives gradients
+// sums up structure, too. `out` is written over.
+void pull_structure(Rasterizer& rasterizer, const Grid& grid, const ViewComparison& view, const float* recorded,
+                    const GradientArrays& out, std::size_t rows, float* structure) {
+  Workspace& work = workspace();
+  float* picture = work.structure.require(3 * static_cast<std::size_t>(grid.width) * grid.height);
+  for_marked(grid, work.touched, [&](std::size_t first, std::size_t count) {
+    structure_of_line(recorded, view.target, grid.width, grid.height, first, count, picture);
+  });
+  rasterizer.backward_layered(picture, out);
+  for (std::size_t i = 0; i < 3 * rows; i++) structure[i] = out.sh0[i] / SH0;
+}
+
 }  // namespace
 
-ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparison& view, const GradientArrays& out) {
+ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparison& view, const GradientArrays& out,
+                   float* structure) {
   Workspace& work = workspace();
   const Grid grid{rasterizer.width(), rasterizer.height(), (rasterizer.width() + kTile - 1) / kTile,
                   (rasterizer.height() + kTile - 1) / kTile};
@@ -169,6 +185,7 @@ ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparis
       pull_colours(view.matrix, job.gradient + 3 * first, count);
     });
   if (view.weights) weigh(grid, view.weights, work.touched, job.gradient);
+  if (structure) pull_structure(rasterizer, grid, view, recorded, out, rows.count, structure);
   rasterizer.backward_layered(job.gradient, out);
   return result;
 }

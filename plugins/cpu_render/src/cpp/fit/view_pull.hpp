@@ -25,7 +25,9 @@ struct ViewPull {
   PhotometricSums sums;  // over the touched tiles that count and those beside them
 };
 
-// `rows` are the active rows of `rasterizer`, which must be frozen. `out` has one row per active row.
-ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparison& view, const GradientArrays& out);
+// `rows` are the active rows of `rasterizer`, which must be frozen. `out` has one row per active row. `structure` [A, 3]:
+// sums over pixels of each row's share of the light, times the structure of the picture there; null: not wanted.
+ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparison& view, const GradientArrays& out,
+                   float* structure = nullptr);
 
 }  // namespace gsstream_cpu

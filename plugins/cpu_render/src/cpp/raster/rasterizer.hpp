@@ -143,6 +143,7 @@ class Rasterizer {
   std::size_t entry_count() const { return entry_count_; }
   std::size_t scene_count() const { return scene_count_; }
   std::size_t active_count() const { return active_rows_.size(); }
+  const Camera& camera() const { return camera_; }  // of the cache
   int width() const { return camera_.width; }
   int height() const { return camera_.height; }
   Isa isa() const { return isa_; }

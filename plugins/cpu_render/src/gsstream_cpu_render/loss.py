@@ -37,7 +37,7 @@ class PhotometricTarget:
         _native.photometric_target(image, mean, variance)
         # A window mean is not finite if any value in the window is not, so one sum over the statistics tells.
         with np.errstate(invalid="ignore", over="ignore"):
-            suspicious = not np.isfinite(variance.sum(dtype=np.float64))
+            suspicious = not np.isfinite(variance.sum())
         if suspicious:
             refuse(first_non_finite("target", image) or "target: expected values in [0, 1], got some that overflow")
         for name, array in (("image", image), ("mean", mean), ("variance", variance)):

@@ -20,6 +20,7 @@ from gsstream.api import (
     RenderCache,
     RenderOutput,
     RenderSession,
+    RowGradient,
     ScreenGradient,
     check_tiles,
 )
@@ -74,6 +75,15 @@ class CpuSession(RenderSession):
         cached = self._view(view)  # its owner while the native call runs
         gradient, visible = cached.rasterizer.backward_cached(splats, upstream)
         return ScreenGradient(torch.from_numpy(gradient), torch.from_numpy(visible))
+
+    def screen_gradient_rows(self, view: int, image_gradient: torch.Tensor) -> RowGradient:
+        if not hasattr(_native.Rasterizer, "pull_cached"):
+            return super().screen_gradient_rows(view, image_gradient)
+        upstream = as_array("image_gradient", image_gradient.contiguous())
+        splats = splats_of(self._gaussians)
+        cached = self._view(view)  # its owner while the native call runs
+        rows, gradient = cached.rasterizer.pull_cached(splats, upstream)
+        return RowGradient(torch.from_numpy(rows), torch.from_numpy(gradient))
 
     def visible(self, view: int, tiles: torch.Tensor) -> torch.Tensor:
         check_tiles(tiles, (self._cameras.height, self._cameras.width))

@@ -69,7 +69,7 @@ struct PairList {
 enum Fault : uint32_t { FAULT_NOT_FINITE = 1, FAULT_QUATERNION = 2 };
 
 // Result of projecting PROJECT_CHUNK consecutive rows.
-constexpr std::size_t PROJECT_CHUNK = 512;
+constexpr std::size_t PROJECT_CHUNK = 256;
 struct ProjectChunk {
   uint32_t visible = 0;
   uint32_t faults = 0;  // Fault bits

@@ -30,7 +30,7 @@
 namespace gsstream_cpu {
 
 constexpr std::size_t TILE_GRAIN = 2;        // tiles that a thread composites or differentiates at a time
-constexpr std::size_t BACKWARD_GRAIN = 512;  // visible Gaussians; a multiple of every vector width
+constexpr std::size_t BACKWARD_GRAIN = 256;  // visible Gaussians; a multiple of every vector width
 
 struct Scene {
   GaussianArrays arrays{};
@@ -110,6 +110,11 @@ class Rasterizer {
   // Gradient of the 2-D means [N,2] of the cached scene, from what its forward left: nothing is rendered. Costs follow
   // the pixels at which the image gradient is not zero. `scene`: the values that the cache was made of.
   void backward_cached(const Scene& scene, const float* image_gradient, float* means2d_gradient);
+  // The same of the rows that the image's gradient reaches alone; returns their number. pulled_rows writes which they
+  // are, ascending, and their gradients [K,2]; it may follow once.
+  std::size_t pull_cached(const Scene& scene, const float* image_gradient);
+  void pulled_rows(int64_t* rows, float* means2d_gradient) const;
+  std::size_t pulled_count() const { return screen_.count; }
   // out [N]: 1 for the rows of the cached scene that touch a cached tile.
   void visible_in_cache(uint8_t* out) const;
   // out [N]: 1 for the rows of the cached scene that added light to a pixel of a wanted tile. Costs follow these tiles,
@@ -171,6 +176,7 @@ class Rasterizer {
                              uint32_t* contributed, PixelTrace& trace) const;
   CompositeJob composite(const TileListsView& lists, const TileSelection& selection, const Target& target,
                          uint32_t* contributed, PixelTrace& trace);
+  void differentiate_cached(const Scene& scene, const float* image_gradient, float* means2d_gradient, bool compact);
   void replace_tiles(const std::vector<uint32_t>& changed_tiles);
   void differentiate(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out,
                      bool compact);
@@ -198,7 +204,7 @@ class Rasterizer {
   Buffer<DepthItem> sort_scratch_;
   Buffer<uint32_t> contributed_;
   PixelTrace trace_;
-  Buffer<float> moments_;
+  Buffer<float> moments_, screen_gradient_;
   ScreenPass screen_;
 
   // The cache: records of all Gaussians (then of the active rows), depth-sorted lists of the whole scene, what its

@@ -65,6 +65,24 @@ void Rasterizer::replace_tiles(const std::vector<uint32_t>& changed_tiles) {
 void Rasterizer::backward_cached(const Scene& scene, const float* image_gradient, float* means2d_gradient) {
   const Claim claim(busy_);
   expect("backward_cached");
+  differentiate_cached(scene, image_gradient, means2d_gradient, false);
+}
+
+std::size_t Rasterizer::pull_cached(const Scene& scene, const float* image_gradient) {
+  const Claim claim(busy_);
+  expect("backward_cached");
+  differentiate_cached(scene, image_gradient, nullptr, true);
+  return screen_.count;
+}
+
+void Rasterizer::pulled_rows(int64_t* rows, float* means2d_gradient) const {
+  std::copy_n(screen_.rows.data(), screen_.count, rows);
+  std::copy_n(screen_gradient_.data(), 2 * screen_.count, means2d_gradient);
+}
+
+// Where `compact`, the gradients of the reached rows are left in screen_gradient_.
+void Rasterizer::differentiate_cached(const Scene& scene, const float* image_gradient, float* means2d_gradient,
+                                      bool compact) {
   if (scene.count != scene_count_)
     throw std::invalid_argument("backward_cached: expected the scene of the cached forward pass with " +
                                 std::to_string(scene_count_) + " rows, got " + std::to_string(scene.count) + ".");
@@ -89,11 +107,14 @@ void Rasterizer::backward_cached(const Scene& scene, const float* image_gradient
                                     moments_.require(screen_.pair_count * MOMENT_STRIDE)};
   parallel_for(wanted.active.size(), TILE_GRAIN,
                [&](std::size_t begin, std::size_t end) { composite_kernels_.backward(raster, begin, end); });
-  std::fill_n(means2d_gradient, 2 * scene_count_, 0.0f);
+  if (compact)
+    means2d_gradient = screen_gradient_.require(2 * screen_.count);
+  else
+    std::fill_n(means2d_gradient, 2 * scene_count_, 0.0f);
   GradientArrays out{};
   out.means2d = means2d_gradient;
   const ProjectBackwardJob rows{scene.arrays,           camera_,         screen_.count, screen_.rows.data(),
-                                screen_.offset.data(),  moments_.data(), out,           false};
+                                screen_.offset.data(),  moments_.data(), out,           compact};
   parallel_for(screen_.count, BACKWARD_GRAIN, [&](std::size_t begin, std::size_t end) {
     project_backward_kernels_.backward[scene.sh_degree](rows, begin, end);
   });
@@ -123,6 +144,7 @@ void Rasterizer::shed_scratch() {
   visible_.count = visible_.pair_count = 0;
   sort_scratch_.release();
   moments_.release();
+  screen_gradient_.release();
   drop_layers();
   layers_.release();
   for (TileLists* lists : {&frozen_lists_, &active_lists_, &merged_lists_}) {
@@ -139,7 +161,7 @@ std::size_t Rasterizer::cache_bytes() const {
 
 std::size_t Rasterizer::memory_bytes() const {
   std::size_t bytes = cache_bytes() + visible_.bytes() + sort_scratch_.bytes() + contributed_.bytes() + trace_.bytes() +
-                      moments_.bytes() + screen_.bytes() + active_rows_.capacity() * sizeof(uint32_t) +
+                      moments_.bytes() + screen_gradient_.bytes() + screen_.bytes() + active_rows_.capacity() * sizeof(uint32_t) +
                       is_active_.capacity() + active_in_cache_.bytes() + layers_.bytes() +
                       layer_pixels_.capacity() * sizeof layer_pixels_[0];
   for (const TileLists* lists : {&frozen_lists_, &active_lists_, &merged_lists_}) bytes += lists->bytes();

@@ -166,6 +166,7 @@ class Rasterizer {
   uint32_t project(const Scene& scene, const TileSelection& selection, Record* records);
   void join_chunks(std::size_t chunks);
   bool set_active(const uint32_t* active, std::size_t count, const char* name);
+  std::vector<uint8_t> tiles_of_active() const;
   uint32_t list_active(const Scene& rows, const TileSelection& selection);
   uint32_t begin_active(const Scene& rows, bool touched_only, const uint8_t* mask);
   void drop_layers();
@@ -177,7 +178,8 @@ class Rasterizer {
   CompositeJob composite(const TileListsView& lists, const TileSelection& selection, const Target& target,
                          uint32_t* contributed, PixelTrace& trace);
   void differentiate_cached(const Scene& scene, const float* image_gradient, float* means2d_gradient, bool compact);
-  void replace_tiles(const std::vector<uint32_t>& changed_tiles);
+  void replace_tiles(const std::vector<uint32_t>& changed_blocks);
+  void renumber_last(std::size_t tile, uint32_t changed, const std::vector<uint32_t>& place);
   void differentiate(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out,
                      bool compact);
   void clear_gradients(const GradientArrays& out) const;

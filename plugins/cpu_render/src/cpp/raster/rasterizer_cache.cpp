@@ -19,33 +19,37 @@ uint32_t Rasterizer::update(const uint32_t* changed, const Scene& rows, const Ta
   if (faults) return faults;
   ActiveEntries before;
   std::vector<uint32_t> touched;
-  before.find(cached_lists_.view(), cached_lists_.tiles(), is_active_);
+  before.find(cached_lists_.view(), tiles_of_active(), is_active_);
   before.touched(cached_lists_.view(), touched);
   add_touched_blocks(active_lists_, touched);
   replace_tiles(touched);
   for (uint32_t row : active_rows_) cached_visible_.erase(row);
   for (std::size_t i = 0; i < visible_.count; i++) cached_visible_.insert(active_rows_[visible_.rows[i]]);
-  // All blocks of a touched tile, so that what its forward leaves is whole again.
-  for (std::size_t tile = 0; tile < touched.size(); tile++) touched[tile] = touched[tile] ? ~0u : 0;
   touched_.restrict(cached_selection_, touched);
-  composite(cached_lists_.view(), touched_, target, cached_lists_.contributed.data(), cached_trace_);
+  CompositeJob job =
+      composite_job(cached_lists_.view(), touched_, target, cached_lists_.contributed.data(), cached_trace_);
+  job.keeps = true;  // the other blocks of a touched tile see the same Gaussians as before
+  parallel_for(touched_.active.size(), TILE_GRAIN,
+               [&](std::size_t begin, std::size_t end) { composite_kernels_.forward(job, begin, end); });
   return 0;
 }
 
 // Merges active_lists_ into the cached lists of the changed tiles, by (depth, row), then their records into the cache.
-void Rasterizer::replace_tiles(const std::vector<uint32_t>& changed_tiles) {
+// What the last forward left of blocks that do not change is carried over.
+void Rasterizer::replace_tiles(const std::vector<uint32_t>& changed_blocks) {
   const uint32_t base = static_cast<uint32_t>(scene_count_);
   std::vector<TileEntry> entries;
-  std::vector<uint32_t> blocks;
+  std::vector<uint32_t> blocks, contributed, place;  // place: of the entries before, where they are now
   const auto row_of = [&](uint32_t record) { return record < base ? record : active_rows_[record - base]; };
   const auto in_front = [&](uint32_t a, uint32_t b) {
     const float near = records_[a].depth, far = records_[b].depth;
     return near != far ? near < far : row_of(a) < row_of(b);
   };
-  for (std::size_t tile = 0; tile < changed_tiles.size(); tile++) {
-    if (!changed_tiles[tile]) continue;
+  for (std::size_t tile = 0; tile < changed_blocks.size(); tile++) {
+    if (!changed_blocks[tile]) continue;
+    for (std::vector<uint32_t>* values : {&blocks, &contributed}) values->clear();
     entries.clear();
-    blocks.clear();
+    place.assign(cached_lists_.end[tile] - cached_lists_.begin[tile], 0);
     uint32_t a = active_lists_.offset[tile], c = cached_lists_.begin[tile];
     const uint32_t a_end = active_lists_.offset[tile + 1], c_end = cached_lists_.end[tile];
     for (;;) {
@@ -54,12 +58,25 @@ void Rasterizer::replace_tiles(const std::vector<uint32_t>& changed_tiles) {
       const bool take_active =
           c == c_end || (a < a_end && in_front(active_lists_.entries[a].record, cached_lists_.entries[c].record));
       const uint32_t record = take_active ? active_lists_.entries[a].record : cached_lists_.entries[c].record;
+      if (!take_active) place[c - cached_lists_.begin[tile]] = static_cast<uint32_t>(entries.size());
       entries.push_back({row_of(record), FROZEN});
+      contributed.push_back(take_active ? 0 : cached_lists_.contributed[c] & ~changed_blocks[tile]);
       blocks.push_back(take_active ? active_lists_.blocks[a++] : cached_lists_.blocks[c++]);
     }
-    cached_lists_.replace(tile, entries, blocks);
+    renumber_last(tile, changed_blocks[tile], place);
+    cached_lists_.replace(tile, entries, blocks, contributed);
   }
   for (std::size_t slot = 0; slot < active_rows_.size(); slot++) records_[active_rows_[slot]] = records_[base + slot];
+}
+
+// The entries at which pixels of the other blocks of a tile took their last light, counted in its new list.
+void Rasterizer::renumber_last(std::size_t tile, uint32_t changed, const std::vector<uint32_t>& place) {
+  int32_t* last = cached_trace_.last.data() + tile * BLOCKS * BLOCK_PIXELS;
+  for (uint32_t kept = cached_selection_.blocks[tile] & ~changed; kept; kept &= kept - 1) {
+    int32_t* pixels = last + __builtin_ctz(kept) * BLOCK_PIXELS;
+    for (int i = 0; i < BLOCK_PIXELS; i++)
+      if (pixels[i] != INT32_MAX) pixels[i] = static_cast<int32_t>(place[static_cast<std::size_t>(pixels[i] - 1)]) + 1;
+  }
 }
 
 void Rasterizer::backward_cached(const Scene& scene, const float* image_gradient, float* means2d_gradient) {

@@ -27,7 +27,7 @@ from gsstream.api import (
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import SplatArrays
 from gsstream_cpu_render.autograd import differentiable, splats_of
-from gsstream_cpu_render.cached_view import CachedView, Ids, update_views
+from gsstream_cpu_render.cached_view import CachedView, Ids, freeze_views, update_views
 from gsstream_cpu_render.checks import Float32, as_array
 from gsstream_cpu_render.loss_part import CpuLoss
 from gsstream_cpu_render.moved import moved_slope
@@ -150,11 +150,9 @@ class CpuSession(RenderSession):
         ids = self._short_cut_rows(comparisons)
         if ids is None:
             return None
-        ready = []
-        for view, comparison in zip(views, comparisons, strict=True):
-            cached = self._view(view)
-            cached.freeze(ids, None)
-            ready.append((cached.rasterizer.handle, cached.comparison(comparison)))
+        cached = [self._view(view) for view in views]
+        freeze_views(cached, ids)
+        ready = [(view.rasterizer.handle, view.comparison(what)) for view, what in zip(cached, comparisons, strict=True)]
         return ready if all(view in self._views for view in views) else None
 
     def _short_cut_rows(self, comparisons: Sequence[Comparison]) -> Ids | None:

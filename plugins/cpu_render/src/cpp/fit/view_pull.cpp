@@ -164,6 +164,7 @@ ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparis
   job.target = view.target;
   job.target_mean = view.mean;
   job.target_variance = view.variance;
+  job.known = view.known;
   job.active = work.around.data();
   job.wanted = work.touched.data();
   job.gradient = work.gradient.require(3 * pixels);

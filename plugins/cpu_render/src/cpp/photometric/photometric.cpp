@@ -156,7 +156,7 @@ PhotometricSums photometric_run(PhotometricJob job) {
   return sums;
 }
 
-void photometric_target(const float* target, int height, int width, float* mean, float* variance) {
+void photometric_target(const float* target, int height, int width, float* mean, float* variance, uint8_t* known) {
   PhotometricJob job{};
   job.height = height;
   job.width = width;
@@ -165,6 +165,7 @@ void photometric_target(const float* target, int height, int width, float* mean,
   job.target = target;
   job.target_mean = mean;
   job.target_variance = variance;
+  job.known = known;
   workspace().fit(job, false);
   const PhotometricKernels& kernels = photometric_kernels();
   parallel_for(static_cast<std::size_t>(job.tile_rows), 1, [&](std::size_t begin, std::size_t end) {

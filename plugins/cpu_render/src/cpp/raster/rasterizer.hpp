@@ -120,6 +120,8 @@ class Rasterizer {
   // out [N]: 1 for the rows of the cached scene that added light to a pixel of a wanted tile. Costs follow these tiles,
   // but for clearing `out`. Border blocks reach beyond the image and are counted whole.
   void drawn_in_cache(const uint8_t* mask, uint8_t* out);
+  // The same without clearing `out`, to which other rasterisers may add at the same time.
+  void add_drawn(const uint8_t* mask, uint8_t* out);
 
   // Ends the life of the arrays given to the last forward; no backward may follow.
   void forget() { drop_pass(); }

@@ -222,10 +222,10 @@ void bind_rasterizer(nb::module_& module) {
            strict("means"), strict("quats"), strict("scales"), strict("opacities"), strict("sh0"), strict("shN"));
   nb::class_<ComparisonArrays>(module, "Comparison", "What a render of one view is compared with; not copied.")
       .def(nb::init<ConstFloatArray, ConstFloatArray, ConstFloatArray, ConstFloatArray, ConstFloatArray,
-                    std::optional<ConstFloatArray>, std::optional<ConstFloatArray>, double, double,
+                    ByteOutArray, std::optional<ConstFloatArray>, std::optional<ConstFloatArray>, double, double,
                     std::optional<ConstFloatArray>>(),
            strict("background"), strict("cached_image"), strict("target"), strict("mean"), strict("variance"),
-           strict("matrix").none(), strict("offset").none(), nb::arg("l1_scale"), nb::arg("ssim_scale"),
+           strict("known"), strict("matrix").none(), strict("offset").none(), nb::arg("l1_scale"), nb::arg("ssim_scale"),
            strict("tile_weights").none());
   nb::class_<PyRasterizer>(module, "Rasterizer",
                            "Rasteriser of one camera; see gsstream_cpu_render.rasterizer for the checked interface.")

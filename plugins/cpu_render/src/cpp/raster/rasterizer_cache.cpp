@@ -1,5 +1,6 @@
 // The rasteriser's cache after its forward: changing rows, differentiating it, and what memory it takes.
 #include <algorithm>
+#include <atomic>
 #include <stdexcept>
 #include <string>
 
@@ -142,12 +143,18 @@ void Rasterizer::visible_in_cache(uint8_t* out) const {
 }
 
 void Rasterizer::drawn_in_cache(const uint8_t* mask, uint8_t* out) {
+  expect("drawn_in_cache");
+  std::fill_n(out, scene_count_, uint8_t{0});
+  add_drawn(mask, out);
+}
+
+void Rasterizer::add_drawn(const uint8_t* mask, uint8_t* out) {
   const Claim claim(busy_);
   const TileSelection wanted = cached_tiles(mask, "drawn_in_cache");
-  std::fill_n(out, scene_count_, uint8_t{0});
   for (uint32_t tile : wanted.active)
     for (uint32_t e = cached_lists_.begin[tile]; e < cached_lists_.end[tile]; e++)
-      if (cached_lists_.contributed[e] & wanted.blocks[tile]) out[cached_lists_.entries[e].record] = 1;
+      if (cached_lists_.contributed[e] & wanted.blocks[tile])
+        std::atomic_ref(out[cached_lists_.entries[e].record]).store(1, std::memory_order_relaxed);
 }
 
 void Rasterizer::shed_scratch() {

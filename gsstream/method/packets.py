@@ -11,8 +11,8 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
 from gsstream.packet import (
     EncodedPacket,
-    KnownMotions,
     KeyState,
+    KnownMotions,
     PlayerState,
     StreamMeta,
     decode_packet,

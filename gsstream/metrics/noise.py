@@ -26,9 +26,12 @@ def median(values: FloatArray) -> np.floating[Any]:
     half = len(flat) // 2
     parted = np.partition(flat, half)
     if np.isnan(parted[half:].max()):  # a partition puts NaN last
-        return values.dtype.type(np.nan)
-    upper = parted[half]
-    return upper if len(flat) % 2 else (parted[:half].max() + upper) / values.dtype.type(2)
+        nothing: np.floating[Any] = values.dtype.type(np.nan)
+        return nothing
+    middle: np.floating[Any] = parted[half]
+    if len(flat) % 2 == 0:
+        middle = (parted[:half].max() + middle) / values.dtype.type(2)
+    return middle
 
 
 def median_deviation(values: FloatArray) -> np.floating[Any]:

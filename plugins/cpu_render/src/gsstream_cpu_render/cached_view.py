@@ -83,6 +83,8 @@ def freeze_views(views: Sequence[CachedView], ids: Ids) -> None:
             view.freeze(ids, None)
         return
     others = [view for view in views if not view.is_frozen(ids, None)]
+    if not others:
+        return
     try:
         _native.freeze_views([view.rasterizer.handle for view in others], ids)
     except ValueError as error:

@@ -152,7 +152,8 @@ class CpuSession(RenderSession):
             return None
         cached = [self._view(view) for view in views]
         freeze_views(cached, ids)
-        ready = [(view.rasterizer.handle, view.comparison(what)) for view, what in zip(cached, comparisons, strict=True)]
+        pairs = zip(cached, comparisons, strict=True)
+        ready = [(view.rasterizer.handle, view.comparison(comparison)) for view, comparison in pairs]
         return ready if all(view in self._views for view in views) else None
 
     def _short_cut_rows(self, comparisons: Sequence[Comparison]) -> Ids | None:

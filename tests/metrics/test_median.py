@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsstream.metrics.noise import median, median_deviation
+from gsstream.core.median import median
+from gsstream.metrics.noise import median_deviation
 
 KINDS = pytest.mark.parametrize("kind", [np.float32, np.float64])
 

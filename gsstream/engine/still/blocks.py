@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from gsstream.core.median import median
 from gsstream.core.shapes import FloatArray
-from gsstream.metrics.noise import MAD_TO_SIGMA, median, median_deviation
+from gsstream.metrics.noise import MAD_TO_SIGMA, median_deviation
 
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 #: Differences are averaged over BLOCK x BLOCK pixels first: noise of neighbouring pixels is mostly independent and

@@ -33,6 +33,7 @@ from gsstream.core.changes.motion import Moves as Moves
 from gsstream.core.context import FrameContext as FrameContext
 from gsstream.core.context import FrameWork as FrameWork
 from gsstream.core.context import MovedPull as MovedPull
+from gsstream.core.context import RowGradient as RowGradient
 from gsstream.core.context import ScreenGradient as ScreenGradient
 from gsstream.core.errors import ComponentError as ComponentError
 from gsstream.core.errors import GsstreamError as GsstreamError

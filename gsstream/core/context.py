@@ -40,6 +40,13 @@ class MovedPull(NamedTuple):
     curvature: FloatArray | None = None
 
 
+class RowGradient(NamedTuple):
+    """The same of the rows that it reaches: ``rows`` [K] int64, ascending; ``gradient`` [K, 2]. All others have 0."""
+
+    rows: torch.Tensor
+    gradient: torch.Tensor
+
+
 class FrameContext(Protocol):
     """What an estimator may look at. Nothing here can be changed, and no call leaves a gradient behind."""
 
@@ -69,6 +76,9 @@ class FrameContext(Protocol):
 
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
         """Pull an upstream gradient [H, W, 3] back to the 2-D means of ``gaussians`` in one backward pass."""
+
+    def screen_gradient_rows(self, view: int, image_gradient: torch.Tensor) -> RowGradient:
+        """Return what :meth:`screen_gradient` does of the rows that it reaches, without arrays of all N rows."""
 
     def noise_sigma(self, view: int) -> float:
         """Return the robust standard deviation of a camera's noise between two frames, in [0, 1] image units."""

@@ -66,7 +66,10 @@ def tree_roots(parent: torch.Tensor) -> torch.Tensor:
     """
     root = parent
     for _ in range(len(parent).bit_length()):
-        root = root[root]
+        further = root[root]
+        if bool((further == root).all()):  # whatever is jumped from here, it stays
+            break
+        root = further
     # Checked at the end, because a circle whose length is a power of two looks like a root in between.
     if bool((parent[root] == root).all()):
         return root

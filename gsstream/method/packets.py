@@ -12,6 +12,7 @@ from gsstream.core.shapes import FloatArray
 from gsstream.packet import (
     EncodedPacket,
     KeyState,
+    KnownMotions,
     PlayerState,
     StreamMeta,
     decode_packet,
@@ -41,17 +42,20 @@ def send_key(gaussians: Gaussians[FloatArray], layout: Layout, meta: StreamMeta,
     return Sent(packet, decode_packet(None, packet.data))
 
 
-def delta_packet(player: PlayerState, delta: Delta, *, frame: int) -> EncodedPacket:
+def delta_packet(
+    player: PlayerState, delta: Delta, *, frame: int, known: KnownMotions | None = None
+) -> EncodedPacket:
     """Return the packet of a delta, an empty one when nothing changes. Raises ShapeError as :func:`send_delta` does.
 
     Arguments:
         player: what players have before it.
         delta: what the frame changes.
         frame: its index.
+        known: motions that were encoded before, as for ``encode_delta``.
     """
     if delta.is_empty:
         return encode_empty(frame=frame)
-    return encode_delta(delta, player.layout, player.decoders, frame=frame)
+    return encode_delta(delta, player.layout, player.decoders, frame=frame, known=known)
 
 
 def send_delta(player: PlayerState, delta: Delta) -> Sent:

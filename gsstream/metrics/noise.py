@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from gsstream.core.median import median
 from gsstream.core.shapes import FloatArray
 from gsstream.metrics.psnr import check_pair
 
@@ -16,8 +17,8 @@ MAD_TO_SIGMA = 1.4826
 
 def median_deviation(values: FloatArray) -> np.floating[Any]:
     """Return the median absolute deviation from the median, in the precision of ``values``."""
-    deviation: np.floating[Any] = np.median(np.abs(values - np.median(values)))
-    return deviation
+    difference = values - median(values)
+    return median(np.abs(difference, out=difference))
 
 
 def noise_sigma(first: FloatArray, second: FloatArray) -> float:

@@ -7,6 +7,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.changes import Groups, Scene, groups_for
 from gsstream.core.context import FrameWork
+from gsstream.core.median import median
 from gsstream.core.shapes import FloatArray, IntArray
 
 
@@ -17,11 +18,14 @@ def pixel_size(means: FloatArray, cameras: Cameras) -> float:
         means: [N, 3] centres, N > 0.
     """
     columns = np.ascontiguousarray(means.T, np.float64)
-    widths = np.empty((len(cameras), len(means)))
+    widths, x, y, z = np.empty((len(cameras), len(means))), *np.empty_like(columns)
     for width, at, K in zip(widths, cameras.centers, cameras.Ks, strict=True):
-        x, y, z = columns - at[:, None]
-        width[:] = np.sqrt(x * x + y * y + z * z) / K[0, 0]
-    return float(np.median(widths))
+        for axis, (column, offset) in enumerate(zip((x, y, z), at, strict=True)):
+            np.subtract(columns[axis], offset, out=column)
+            np.multiply(column, column, out=column)
+        np.add(np.add(x, y, out=x), z, out=x)
+        np.divide(np.sqrt(x, out=x), K[0, 0], out=width)
+    return float(median(widths))
 
 
 def known_groups(scene: Scene, cameras: Cameras, pixels: float, shades: int) -> Groups:

@@ -8,6 +8,7 @@ from gsstream.packet.base import FORMAT_VERSION as FORMAT_VERSION
 from gsstream.packet.base import EncodedPacket as EncodedPacket
 from gsstream.packet.base import PacketKind as PacketKind
 from gsstream.packet.changes.residual import quantise_decoders as quantise_decoders
+from gsstream.packet.delta import KnownMotions as KnownMotions
 from gsstream.packet.delta import decode_delta as decode_delta
 from gsstream.packet.delta import decode_empty as decode_empty
 from gsstream.packet.delta import encode_delta as encode_delta

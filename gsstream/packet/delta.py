@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping
 
-from gsstream.core.changes import Delta, Layout, Scene
+from gsstream.core.changes import Delta, Layout, Motion, Scene
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.shapes import FloatArray
@@ -28,9 +29,14 @@ def encode_empty(*, frame: int) -> EncodedPacket:
     return build_packet(PacketKind.EMPTY, frame, [])
 
 
+#: Motions and the section that :func:`encode_motions` made of them.
+KnownMotions = tuple[tuple[Motion, ...], list[tuple[str, bytes]]]
+
+
 def encode_delta(
-    delta: Delta, layout: Layout, previous_decoders: Mapping[str, FloatArray], *, frame: int
-) -> EncodedPacket:
+    delta: Delta, layout: Layout, previous_decoders: Mapping[str, FloatArray], *, frame: int,
+    known: KnownMotions | None = None,
+) -> EncodedPacket:  # fmt: skip
     """Encode one frame's changes.
 
     Arguments:
@@ -38,10 +44,11 @@ def encode_delta(
         delta: decoders of its residual must come from :func:`quantise_decoders`.
         layout: that of the frame before.
         previous_decoders: the decoders last sent since the last key packet (:func:`next_decoders`).
+        known: motions that were encoded before; those of the delta are encoded anew unless they are these objects.
 
     Raises ShapeError when a change does not fit the layout, or when there is none: that is an empty packet.
     """
-    sections = encode_motions(delta.motions)
+    sections = _motion_sections(delta.motions, known)
     if delta.field is not None:
         sections += encode_field(delta.field)
     if delta.residual is not None:
@@ -51,6 +58,12 @@ def encode_delta(
     if not sections:
         raise ShapeError("delta: expected at least one change, got none; encode_empty makes the packet of such a frame")
     return build_packet(PacketKind.DELTA, frame, sections)
+
+
+def _motion_sections(motions: tuple[Motion, ...], known: KnownMotions | None) -> list[tuple[str, bytes]]:
+    if known is not None and len(motions) == len(known[0]) and all(map(operator.is_, motions, known[0])):
+        return list(known[1])
+    return encode_motions(motions)
 
 
 def decode_delta(

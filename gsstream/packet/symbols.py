@@ -53,8 +53,10 @@ def encode_symbols(symbols: IntArray) -> bytes:
         return b""
     columns = [np.ascontiguousarray(symbols[:, i], np.int64) for i in range(symbols.shape[1])]
     own = [_fit(column) for column in columns]
-    pooled = _fit(np.concatenate(columns))
-    shared = sum(map(_cost, own, columns)) > sum(_cost(pooled, c, header=False) for c in columns) + _header_cost(pooled)
+    pooled = _fit(np.concatenate(columns)) if len(columns) > 1 else own[0]
+    shared = len(columns) > 1 and sum(map(_cost, own, columns)) > (
+        sum(_cost(pooled, c, header=False) for c in columns) + _header_cost(pooled)
+    )
     models = [pooled] if shared else own
     head = BitWriter()
     head.bits(int(shared), 1)
@@ -108,7 +110,7 @@ def decode_symbols(data: bytes, rows: int, channels: int) -> IntArray:
 
 
 def _fit(column: IntArray) -> Model:
-    values, counts = np.unique(column, return_counts=True)
+    values, counts = _histogram(column)
     first, last = _trim(values, counts)
     low, high = int(values[first]), int(values[last])
     table = np.zeros(high - low + 1, np.int64)
@@ -117,6 +119,16 @@ def _fit(column: IntArray) -> Model:
     if outside:
         table = np.append(table, outside)
     return Model(low, _round_counts(table), outside > 0)
+
+
+def _histogram(column: IntArray) -> tuple[IntArray, IntArray]:
+    """Values that occur, ascending, and how often each does: ``np.unique``, without sorting where values are near."""
+    low, high = int(column.min()), int(column.max())
+    if high - low > len(column) + MAX_BINS:
+        return np.unique(column, return_counts=True)
+    counts = np.bincount(column - low)
+    values = np.flatnonzero(counts)
+    return values + low, counts[values]
 
 
 def _trim(values: IntArray, counts: IntArray) -> tuple[int, int]:
@@ -196,6 +208,8 @@ def _read_counts(head: BitReader, number: int) -> IntArray:
 def _index(column: IntArray, model: Model) -> tuple[IntArray, BitWriter]:
     """Bin of every value, and the escaped values as bits."""
     index = column - model.low
+    if not model.escapes:  # then the model has a bin for each of them
+        return index, BitWriter()
     outside = (index < 0) | (index >= model.bins)
     tail = BitWriter()
     for value in index[outside].tolist():

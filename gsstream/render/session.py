@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 import torch
 
 from gsstream.core.changes.motion import Moves
-from gsstream.core.context import MovedPull, ScreenGradient
+from gsstream.core.context import MovedPull, RowGradient, ScreenGradient
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
 from gsstream.render.output import Comparison, Pulled, RenderCache, RenderOutput
@@ -51,6 +51,16 @@ class RenderSession(ABC):
         What this projects and sorts, ``render`` need not do again. Where the gradient is zero in most of the image, a
         renderer may spend work only on the rest.
         """
+
+    def screen_gradient_rows(self, view: int, image_gradient: torch.Tensor) -> RowGradient:
+        """Return what :meth:`screen_gradient` does of the rows that it reaches; all others have a gradient of zero.
+
+        For a renderer whose work follows the pixels at which the image's gradient is not zero; it may also name rows
+        that these pixels do not reach.
+        """
+        pulled = self.screen_gradient(view, image_gradient)
+        rows = pulled.visible.nonzero()[:, 0]
+        return RowGradient(rows, pulled.gradient[rows])
 
     @abstractmethod
     def visible(self, view: int, tiles: torch.Tensor) -> torch.Tensor:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.context import ScreenGradient
+from gsstream.core.context import RowGradient, ScreenGradient
 from gsstream.core.frame import PointCloud
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
@@ -72,6 +72,11 @@ class World:
             # Many checks ask for the same gradient of the same world; the renderer is a pure function.
             _GRADIENTS[key] = RENDERER.screen_gradient(self.gaussians, rig, 0, upstream)
         return _copy(_GRADIENTS[key])  # type: ignore[no-any-return]
+
+    def screen_gradient_rows(self, view: int, image_gradient: torch.Tensor) -> RowGradient:
+        gradient, visible = self.screen_gradient(view, image_gradient)
+        rows = visible.nonzero()[:, 0]
+        return RowGradient(rows, gradient[rows])
 
     def noise_sigma(self, view: int) -> float:
         return self.sigma

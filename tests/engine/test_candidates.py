@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.engine.step.active.candidates import candidates, changed_rows, released
+from gsstream.engine.step.active.candidates import VoteBook, candidates, changed_rows, released
 from gsstream.engine.step.active.change import Change
 from gsstream.render.base import TILE, RenderSession, ScatterSession
 from gsstream.render.reference import ReferenceRenderer
@@ -120,6 +120,24 @@ def test_what_is_seen_in_a_changed_tile_is_what_changes_its_pixels() -> None:
         # A row that lies behind opaque ones is seen by the session and changes nothing: never the other way round.
         assert bool(found[row]) or not changes, row
     assert 0 < int(found.sum()) < 25, "a rig that sees all or nothing proves nothing"
+
+
+@given(seed=st.integers(0, 999), moved=st.integers(0, 40), grown=st.booleans())
+def test_votes_that_are_known_are_those_counted_anew(seed: int, moved: int, grown: bool) -> None:
+    """Asked about some rows, then about others of the scene after a motion, or of one with another number of rows."""
+    rng = np.random.default_rng(seed)
+    means = torch.from_numpy(rng.uniform([-4, -3, -1], [4, 3, 6], (40, 3)).astype(np.float32))
+    change = Change(torch.from_numpy(rng.random((3, 3, 4)) < 0.3), HEIGHT, WIDTH)
+    book = VoteBook(change, rig(3))
+    after = means.clone()
+    after[rng.permutation(40)[:moved]] += 1.0
+    if grown:
+        after = torch.cat([after, after[:5] + 0.5])
+    for some in (means, after, after):
+        rows = torch.from_numpy(np.sort(rng.permutation(len(some))[: rng.integers(0, len(some) + 1)]))
+        found = book.of(some, rows)
+        assert found.dtype == torch.float32
+        assert found.tolist() == change.votes(some[rows], rig(3)).tolist()
 
 
 @given(nodes=st.integers(1, 6), rows=st.integers(0, 20), seed=st.integers(0, 999), threshold=st.sampled_from([0, 0.25]))

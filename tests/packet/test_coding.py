@@ -12,7 +12,7 @@ from gsstream.core.errors import PacketError, ShapeError
 from gsstream.packet.bits import BitReader, BitWriter, pack_blobs, unpack_blobs
 from gsstream.packet.bulk import compress, decompress
 from gsstream.packet.gates import decode_gates, encode_gates
-from gsstream.packet.symbols import decode_symbols, encode_symbols
+from gsstream.packet.symbols import _histogram, decode_symbols, encode_symbols
 
 INT32 = st.integers(-(2**31), 2**31 - 1)
 
@@ -21,6 +21,12 @@ def entropy_bytes(column: np.ndarray) -> float:
     """Order-0 entropy, bytes."""
     _, counts = np.unique(column, return_counts=True)
     return float(-(counts * np.log2(counts / counts.sum())).sum() / 8)
+
+
+@given(hnp.arrays(np.int64, st.integers(1, 60), elements=st.integers(-9, 9) | INT32))
+def test_histogram_is_numpys(column):
+    for got, wanted in zip(_histogram(column), np.unique(column, return_counts=True), strict=True):
+        np.testing.assert_array_equal(got, wanted)
 
 
 @given(st.lists(st.tuples(st.sampled_from("bgs"), st.integers(0, 2**33)), max_size=60))

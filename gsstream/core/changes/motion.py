@@ -7,6 +7,7 @@ where the prediction holds, and six small integers where it does not.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -21,6 +22,8 @@ from gsstream.core.shapes import FloatArray, IntArray
 #: Cells are counted from -HALF_GRID to HALF_GRID - 1 along each axis; what lies beyond belongs to the outermost one.
 HALF_GRID = 1 << 15
 MAX_SHADES = 16
+#: Cells per row up to which groups are numbered by a table of all cells around the rows.
+MOST_CELLS = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,14 +113,41 @@ def groups_for(scene: Scene, cell: float, shades: int, regroup: bool = False) ->
     known = scene.groups
     if known is not None and not regroup and known.cell == cell and known.shades == shades:
         return known
-    index = np.floor(scene.gaussians.means.astype(np.float64) / float(cell))
-    x, y, z = np.clip(index, -HALF_GRID, HALF_GRID - 1).astype(np.int64).T + HALF_GRID
+    columns = np.ascontiguousarray(scene.gaussians.means.T, np.float64)
+    columns /= float(cell)
+    index = np.clip(np.floor(columns, out=columns), -HALF_GRID, HALF_GRID - 1, out=columns)
+    x, y, z = index.astype(np.int64) + HALF_GRID
     red, green, blue = scene.gaussians.sh0[:, 0].astype(np.float64).T
     bright = 0.5 + SH0 * (0.25 * red + 0.5 * green + 0.25 * blue)
     shade = np.clip(np.floor(bright * shades), 0, shades - 1).astype(np.int64)
-    keys = ((x * (2 * HALF_GRID) + y) * (2 * HALF_GRID) + z) * MAX_SHADES + shade
-    names, group_of = np.unique(keys, return_inverse=True)
-    return Groups(cell, shades, group_of.astype(np.int32), len(names))
+    group_of, count = _numbered((x, y, z, shade), (2 * HALF_GRID, 2 * HALF_GRID, 2 * HALF_GRID, MAX_SHADES))
+    return Groups(cell, shades, group_of, count)
+
+
+def _numbered(digits: Sequence[IntArray], bases: Sequence[int]) -> tuple[IntArray, int]:
+    """Number of every row among the numbers that occur, in ascending order [N] int32, and how many occur.
+
+    Arguments:
+        digits: [N] int64 each, the foremost first. bases: of each digit; their product is below 2^63.
+    """
+    if len(digits[0]) == 0:
+        return np.zeros(0, np.int32), 0
+    low = [int(digit.min()) for digit in digits]
+    spans = [int(digit.max()) - least + 1 for digit, least in zip(digits, low, strict=True)]
+    small = math.prod(spans) <= MOST_CELLS * len(digits[0])
+    key = np.zeros(len(digits[0]), np.int64)
+    for digit, least, span, base in zip(digits, low, spans, bases, strict=True):
+        key = key * (span if small else base) + (digit - least if small else digit)
+    if not small:
+        names, number = np.unique(key, return_inverse=True)
+        return number.astype(np.int32), len(names)
+    # Where all cells of the box around the rows fit into a table, nothing need be sorted.
+    occurs = np.zeros(math.prod(spans), np.bool_)
+    occurs[key] = True
+    names = np.flatnonzero(occurs)
+    rank = np.empty(len(occurs), np.int32)
+    rank[names] = np.arange(len(names), dtype=np.int32)
+    return rank[key], len(names)
 
 
 def moves_of(scene: Scene, groups: Groups, moving: IntArray, predicted: bool) -> Moves:

@@ -148,10 +148,16 @@ class _Table:
 
     def _choose(self, price: float) -> tuple[IntArray, BoolArray, float]:
         """(symbols [K], open [G] of the gates, bits) at a price of loss per bit."""
-        choice = (self.losses + price * self.lengths).argmin(0), np.arange(len(self.gate))
-        length = self._by_gate(self.lengths[choice]) + self.fixed
-        opened = self.closed > self._by_gate(self.losses[choice]) + price * length
-        return self.values[choice], opened, float(length[opened].sum())
+        costs = self.losses + price * self.lengths
+        nearer = costs[1] < costs[0]
+        zero = costs[2] < np.where(nearer, costs[1], costs[0])  # of equal costs the first, as argmin would have it
+
+        def chosen(of: Any) -> Any:
+            return np.where(zero, of[2], np.where(nearer, of[1], of[0]))
+
+        length = self._by_gate(chosen(self.lengths)) + self.fixed
+        opened = self.closed > self._by_gate(chosen(self.losses)) + price * length
+        return chosen(self.values), opened, float(length[opened].sum())
 
     def _by_gate(self, values: FloatArray) -> FloatArray:
         """[G] sums over the symbols behind each open gate."""

@@ -6,7 +6,7 @@ import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.changes.motion import Moves
-from gsstream.core.context import MovedPull, ScreenGradient
+from gsstream.core.context import MovedPull, RowGradient, ScreenGradient
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
@@ -17,7 +17,7 @@ from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.fit.backward import pull_back
 from gsstream.engine.fit.exposure import Exposure
 from gsstream.engine.fit.judge import Judge, shown
-from gsstream.engine.step.active.candidates import changed_rows
+from gsstream.engine.step.active.candidates import VoteBook, changed_rows
 from gsstream.engine.step.active.change import MOST_PIXEL_SIGMA, Change
 from gsstream.metrics.noise import noise_sigma
 from gsstream.optimiser.base import RowOptimiser
@@ -36,12 +36,13 @@ class FrameView:
         session: a render session of this scene that is kept from before, or None.
         targets: [V, H, W, 3] what renders are compared with; None: the images of the frame.
         judge: of the same targets and colour maps, which has made of them what it needs; None: a new one.
+        votes: counted so far in the frame; None: none.
     """
 
     def __init__(
         self, parts: Assembly, gaussians: Gaussians[torch.Tensor], hierarchy: Hierarchy, frame: Frame, previous: Frame,
         exposure: Exposure | None, change: Change | None = None, session: RenderSession | None = None,
-        targets: FloatArray | None = None, judge: Judge | None = None,
+        targets: FloatArray | None = None, judge: Judge | None = None, votes: VoteBook | None = None,
     ) -> None:  # fmt: skip
         self._parts, self._gaussians, self._hierarchy = parts, gaussians, hierarchy
         self._frame, self._previous, self._change = frame, previous, change
@@ -51,6 +52,7 @@ class FrameView:
         in_one_go = parts.checks is not Checks.STEP
         self.judge = judge or Judge(parts.loss, parts.recipe.loss.dssim, self._targets, exposure, in_one_go)
         self._session = session
+        self._votes = votes or (None if change is None else VoteBook(change, frame.cameras))
 
     @property
     def session(self) -> RenderSession:
@@ -99,15 +101,27 @@ class FrameView:
         return shown(self._parts.renderer, gaussians, self.cameras, view, self._background, self.judge.exposure)
 
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
+        if self._stands_still(view):
+            number = len(self._gaussians)
+            return ScreenGradient(torch.zeros(number, 2), torch.zeros(number, dtype=torch.bool))
+        return self.session.screen_gradient(view, self._upstream(view, image_gradient))
+
+    def screen_gradient_rows(self, view: int, image_gradient: torch.Tensor) -> RowGradient:
+        if self._stands_still(view):
+            return RowGradient(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 2))
+        return self.session.screen_gradient_rows(view, self._upstream(view, image_gradient))
+
+    def _stands_still(self, view: int) -> bool:
+        return self._change is not None and not bool(self._change.tiles[view].any())
+
+    def _upstream(self, view: int, image_gradient: torch.Tensor) -> torch.Tensor:
+        """A gradient by what a camera records, in the tiles that changed, as one by the scene's colours."""
         upstream = image_gradient.float()
         if self._change is not None:
-            if not bool(self._change.tiles[view].any()):
-                number = len(self._gaussians)
-                return ScreenGradient(torch.zeros(number, 2), torch.zeros(number, dtype=torch.bool))
             upstream = upstream * self._change.pixels(view)
         if self.judge.exposure:
             upstream = self.judge.exposure.pull(view, upstream)
-        return self.session.screen_gradient(view, upstream.contiguous())
+        return upstream.contiguous()
 
     def noise_sigma(self, view: int) -> float:
         # Where everything moves, the estimate measures the motion instead of the noise, so it is bounded; see
@@ -120,7 +134,9 @@ class FrameView:
         return self._parts.optimiser
 
     def changed_rows(self, least_votes: float) -> torch.Tensor:
-        return changed_rows(self._change, self._gaussians.means, self.cameras, self.session, least_votes)
+        return changed_rows(
+            self._change, self._gaussians.means, self.cameras, self.session, least_votes, self._votes
+        )
 
     def changed_pixels(self, view: int) -> torch.Tensor:
         if self._change is None:
@@ -176,5 +192,5 @@ class FrameView:
     def on(self, gaussians: Gaussians[torch.Tensor], session: RenderSession | None = None) -> FrameView:
         return FrameView(
             self._parts, gaussians, self._hierarchy, self._frame, self._previous, self.judge.exposure, self._change,
-            session, self._targets, self.judge,
+            session, self._targets, self.judge, self._votes,
         )  # fmt: skip

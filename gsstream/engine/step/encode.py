@@ -11,6 +11,7 @@ from gsstream.engine.step.harden import rows_of
 from gsstream.engine.step.problem import Problem, Solution
 from gsstream.method.packets import delta_packet
 from gsstream.packet import EncodedPacket, PlayerState
+from gsstream.packet.changes.motion import encode_motions
 
 
 def encode_frame(delta: Delta, before: PlayerState, problem: Problem, solution: Solution, trim: float) -> Fitted:
@@ -22,7 +23,9 @@ def encode_frame(delta: Delta, before: PlayerState, problem: Problem, solution: 
         delta: what the frame is to change. before: what players have before it.
         trim: share of the bytes to be given up where no size is asked for, 0 to 1.
     """
-    encoded = partial(delta_packet, before, frame=problem.frame)
+    # Packets of the same motions are made several times, and motions are never trimmed.
+    motions = delta.motions
+    encoded = partial(delta_packet, before, frame=problem.frame, known=(motions, encode_motions(motions)))
     packet = encoded(delta)
     whole = Fitted(delta, packet, len(packet.data))
     budget = None if problem.allowance is None else problem.allowance.plan.max_bytes

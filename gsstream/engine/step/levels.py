@@ -20,9 +20,11 @@ def level_schedule(stream: Stream, unit_of: IntArray) -> tuple[tuple[float, int]
         stream: of the recipe.
         unit_of: [N] level of every Gaussian of the scene.
     """
+    if not stream.progressive:
+        return ()
     levels = np.unique(unit_of).tolist()
     waiting = levels[len(levels) // 2 :]
-    if not stream.progressive or len(waiting) < 2:
+    if len(waiting) < 2:
         return ()
     weights = [stream.progressive_omega**i for i in range(len(waiting))]
     ends = np.cumsum(weights) / sum(weights)

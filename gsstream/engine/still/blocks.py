@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from gsstream.core.median import median
 from gsstream.core.shapes import FloatArray
 from gsstream.metrics.noise import MAD_TO_SIGMA, median_deviation
 
@@ -35,14 +36,28 @@ def changed_blocks(difference: FloatArray, threshold: float) -> BoolArray:
         threshold: multiple of the robust spread of the block means.
     """
     means = block_means(difference)
-    sigma = min(max(min(MAD_TO_SIGMA * float(median_deviation(means)), _rough(means)), LEAST_SIGMA), MOST_SIGMA)
-    return np.asarray((np.abs(means) > threshold * sigma).any(-1))
+    marked = np.abs(means) > threshold * block_sigma(means)
+    return np.asarray(marked[..., 0] | marked[..., 1] | marked[..., 2])
+
+
+def block_sigma(means: FloatArray) -> float:
+    """Return the noise of block means of a difference, image units, within its bounds.
+
+    Arguments:
+        means: [rows, columns, 3] of :func:`block_means`.
+    """
+    spread = MAD_TO_SIGMA * float(median_deviation(means))
+    if spread <= LEAST_SIGMA:  # then it does not matter what second differences admit
+        return LEAST_SIGMA
+    return min(max(_at_most_rough(spread, means), LEAST_SIGMA), MOST_SIGMA)
 
 
 def block_means(picture: FloatArray) -> FloatArray:
     """Return [ceil(H / 4), ceil(W / 4), 3] means of [H, W, 3]; blocks at the border average the pixels they have."""
-    sizes = [np.minimum(BLOCK, n - np.arange(0, n, BLOCK)) for n in picture.shape[:2]]
     sums = _sums(_sums(picture).swapaxes(0, 1)).swapaxes(0, 1)
+    if not any(n % BLOCK for n in picture.shape[:2]):
+        return np.asarray(np.multiply(sums, 1 / BLOCK**2, dtype=np.float64))
+    sizes = [np.minimum(BLOCK, n - np.arange(0, n, BLOCK)) for n in picture.shape[:2]]
     return np.asarray(sums / np.outer(*sizes)[..., None])
 
 
@@ -55,11 +70,29 @@ def _sums(rows: FloatArray) -> FloatArray:
     return sums if whole == len(rows) else np.concatenate([sums, rows[whole] + rows[whole + 1 :].sum(0, keepdims=True)])
 
 
-def _rough(means: FloatArray) -> float:
-    """Most noise of a block that its second differences along rows and columns admit; inf in a picture too small."""
-    second = [means[:-2] - 2 * means[1:-1] + means[2:], means[:, :-2] - 2 * means[:, 1:-1] + means[:, 2:]]
-    values = np.abs(np.concatenate([part.ravel() for part in second]))
-    if not values.size:
-        return np.inf
+def _at_most_rough(spread: float, means: FloatArray) -> float:
+    """The lesser of ``spread`` and of the noise that second differences of blocks along rows and columns admit."""
+    rows, columns, channels = means.shape
+    along, across = max(rows - 2, 0) * columns * channels, rows * max(columns - 2, 0) * channels
+    if along + across == 0:  # a picture too small
+        return spread
+    values = np.empty(along + across, means.dtype)
+    if along:
+        _second_differences(means[:-2], means[1:-1], means[2:], values[:along].reshape(rows - 2, columns, channels))
+    if across:
+        out = values[along:].reshape(rows, columns - 2, channels)
+        _second_differences(means[:, :-2], means[:, 1:-1], means[:, 2:], out)
     # The variance of a - 2 b + c is six times that of each.
-    return float(MOST_OF_ROUGHNESS * MAD_TO_SIGMA * np.median(values) / np.sqrt(6))
+    admitted = MOST_OF_ROUGHNESS * MAD_TO_SIGMA / np.sqrt(6)
+    # Usually it admits more than the spread, and to see that takes counting alone; the margin is for rounding.
+    if np.count_nonzero(values < spread / admitted * (1 + 1e-9)) < len(values) // 2:
+        return spread
+    return min(spread, float(MOST_OF_ROUGHNESS * MAD_TO_SIGMA * median(values) / np.sqrt(6)))
+
+
+def _second_differences(first: FloatArray, second: FloatArray, third: FloatArray, out: FloatArray) -> None:
+    """Write |first - 2 second + third| to ``out``."""
+    np.multiply(second, 2, out=out)
+    np.subtract(first, out, out=out)
+    np.add(out, third, out=out)
+    np.abs(out, out=out)

@@ -113,6 +113,11 @@ def check_renderer_screen_gradient(part: Renderer) -> None:
     at_most("gradient of what is not in view", got.gradient[hidden].abs(), 0.0, 0.0, EXACT)
     moved = (got.gradient != 0).any(1)
     assert not bool((moved & ~got.visible).any()), "a Gaussian has a gradient and is not called visible"
+    session = part.open(case.gaussians, None, case.cameras, GREY)
+    few, whole = session.screen_gradient_rows(0, weights), session.screen_gradient(0, weights).gradient
+    assert bool((few.rows[1:] > few.rows[:-1]).all()), "screen_gradient_rows: rows that are not in ascending order"
+    spread = torch.zeros_like(whole).index_copy(0, few.rows, few.gradient)
+    equal("screen_gradient_rows, against screen_gradient", spread, whole, 0.0, EXACT)
 
 
 @check("renderer")

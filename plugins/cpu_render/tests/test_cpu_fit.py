@@ -84,6 +84,30 @@ def test_a_render_after_a_pull_is_that_of_the_scene() -> None:
     assert torch.equal(session.render(1, rows).image, fresh.render(1, rows).image)
 
 
+def test_a_target_knows_its_statistics_where_they_were_needed() -> None:
+    """Strip by strip, in any order, they are those that are made in one go."""
+    cameras, g = rig(), torch.Generator().manual_seed(4)
+    image = torch.rand(cameras.height, cameras.width, 3, generator=g)
+    wanted, again = CpuLoss().prepare(image), CpuLoss().prepare(image)
+    assert not wanted.partial[2].any()
+    session, rows = opened()
+    first = session.pull(1, rows, Comparison(CpuLoss(), wanted, 0.2))
+    assert wanted.partial[2].any()
+    for got, expected in zip(wanted.statistics, again.statistics, strict=True):
+        np.testing.assert_array_equal(got, expected)
+    second = opened()[0].pull(1, rows, Comparison(CpuLoss(), again, 0.2))
+    assert first.loss == second.loss
+    for (_, one), (_, other) in zip(first.gradients.items(), second.gradients.items(), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_rows_beyond_the_scene_are_refused_for_all_views_at_once() -> None:
+    session, _ = opened()
+    session.narrow(torch.tensor([2, 10_000]))
+    with pytest.raises(InputError, match="10000"):
+        session.in_one_go([0, 1], [comparison(), comparison()])
+
+
 def some_tiles(seed: int = 6) -> torch.Tensor:
     """Factors of tiles, about half of them 0, the others unlike one another."""
     cameras, g = rig(), torch.Generator().manual_seed(seed)

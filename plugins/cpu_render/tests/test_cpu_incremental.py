@@ -170,3 +170,34 @@ def test_bad_active_ids(ids: np.ndarray, message: str) -> None:
     subject.forward(random_splats(20, 0, 1))
     with pytest.raises(InputError, match=message):
         subject.freeze(None, ids)
+
+
+@pytest.mark.parametrize("isa", _native.supported_isas())
+@pytest.mark.parametrize("opaque", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_updates_of_few_blocks_leave_what_a_forward_of_the_scene_leaves(isa: str, opaque: bool, seed: int) -> None:
+    """One small row after another: most blocks of a touched tile keep what was rendered of them, in another list.
+
+    With opaque Gaussians pixels end early, so the place at which they did has to follow the list.
+    """
+    before = _native.active_isa()
+    _native.select_isa(isa)
+    try:
+        splats = random_splats(300, seed, 4, opaque=opaque)
+        if opaque:
+            splats.opacities[::3] = 9.0
+        subject = rasterizer()
+        picture = subject.forward(splats)
+        for step in range(6):
+            ids = some_ids(300, 1 + step % 2, 10 * seed + step)
+            rows = moved(rows_of(splats, ids), 7 * seed + step)
+            rows.scales[:] = -3.5  # a pixel or two wide
+            subject.update(ids, rows, *picture)
+            splats = with_rows(splats, ids, rows)
+            fresh = rasterizer()
+            assert equal_bits(picture, fresh.forward(splats))
+            v_image = upstream(step)[0]
+            assert equal_bits(subject.backward_cached(splats, v_image), fresh.backward_cached(splats, v_image))
+            assert np.array_equal(subject.drawn_in_cache(None), fresh.drawn_in_cache(None))
+    finally:
+        _native.select_isa(before)

@@ -109,6 +109,19 @@ def test_backward_of_the_cache_is_the_means2d_part() -> None:
     assert np.array_equal(subject.backward_cached(splats, v_image)[0], subject.backward(v_image).means2d)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.05, 1.0])
+def test_rows_that_a_gradient_reaches_are_those_of_the_whole(share: float) -> None:
+    subject, splats = rasterizer(), random_splats(300, 6, 4)
+    subject.forward(splats)
+    v_image = upstream(6)[0] * (np.random.default_rng(6).random((HEIGHT, WIDTH, 1)) < share).astype(np.float32)
+    rows, gradient = subject.pull_cached(splats, v_image)
+    whole = subject.backward_cached(splats, v_image)[0]
+    assert np.all(np.diff(rows) > 0)
+    assert np.array_equal(gradient, whole[rows])
+    assert not np.delete(whole, rows, 0).any()
+    assert (len(rows) > 0) == (share > 0)
+
+
 def test_nan_upstream_reaches_the_gradient() -> None:
     # A tile whose upstream gradient is zero is skipped; NaN must not count as zero.
     subject = rasterizer()

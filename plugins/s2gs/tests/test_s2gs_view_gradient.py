@@ -39,6 +39,20 @@ def auc(score: torch.Tensor, truth: torch.Tensor) -> float:
     return float(((a > b).double() + 0.5 * (a == b).double()).mean())
 
 
+@pytest.mark.parametrize("units", ["ndc", "pixel"])
+def test_rows_that_a_change_reaches_are_all_there_is_to_look_at(units: str) -> None:
+    """The few rows that are asked for where that suffices: as the magnitudes of all rows have it, to the bit."""
+    part, (seen, _) = estimator(units=units), moving()
+    rows, few, _, _ = part._reached(seen)
+    every, _, _ = part._magnitudes(seen)
+    rest = torch.ones(len(every), dtype=torch.bool)
+    rest[rows] = False
+    assert len(rows)
+    assert float(few.max()) > 0
+    assert torch.equal(few, every[rows])
+    assert not bool(every[rest].any())
+
+
 class TestFormulas:
     values = (4.0, 1.0, 2.0, 10.0, 3.0)
 

@@ -10,6 +10,7 @@ what moves lies in changed tiles in most of them (the idea of a visual hull).
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 from gsstream.core.cameras import Cameras
@@ -34,9 +35,36 @@ def candidates(
     return ((open_probability > threshold)[hierarchy.node_of] & changed).nonzero()[:, 0]
 
 
+class VoteBook:
+    """The votes of a frame that were counted so far: a centre that has not moved since keeps its own.
+
+    Arguments:
+        change: of the frame. cameras: its training cameras.
+    """
+
+    def __init__(self, change: Change, cameras: Cameras) -> None:
+        self._change, self._cameras = change, cameras
+        self._means, self._votes = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+
+    def of(self, means: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+        """Return the votes [A] of these rows [A] int64 of a scene with centres [N, 3], see :meth:`Change.votes`."""
+        centres, asked = means.numpy(), rows.numpy()
+        if len(centres) != len(self._means):
+            self._means = np.full_like(centres, np.nan)  # equal to no centre
+            self._votes = np.zeros(len(centres), np.float32)
+        now, before = centres[asked], self._means[asked]
+        known = (now[:, 0] == before[:, 0]) & (now[:, 1] == before[:, 1]) & (now[:, 2] == before[:, 2])
+        fresh = asked[~known]
+        if len(fresh):
+            self._means[fresh] = centres[fresh]
+            self._votes[fresh] = self._change.votes(torch.from_numpy(centres[fresh]), self._cameras).numpy()
+        return torch.from_numpy(self._votes[asked])
+
+
 def changed_rows(
-    change: Change | None, means: torch.Tensor, cameras: Cameras, session: RenderSession, least_votes: float
-) -> torch.Tensor:
+    change: Change | None, means: torch.Tensor, cameras: Cameras, session: RenderSession, least_votes: float,
+    book: VoteBook | None = None,
+) -> torch.Tensor:  # fmt: skip
     """Return [N] bool: Gaussians seen in a changed tile, with at least this share of votes; all without a ``change``.
 
     Arguments:
@@ -45,6 +73,7 @@ def changed_rows(
         means: [N, 3] centres of the session's scene.
         session: asked which Gaussians are visible in which tiles.
         least_votes: 0 to 1.
+        book: votes of this change that are known from other scenes of the frame; None: of none.
     """
     if change is None:
         return torch.ones(len(means), dtype=torch.bool)
@@ -52,7 +81,7 @@ def changed_rows(
         return torch.zeros(len(means), dtype=torch.bool)
     seen = session.visible_anywhere(change.tiles)
     rows = seen.nonzero()[:, 0]
-    seen[rows] = change.votes(means[rows], cameras) >= least_votes
+    seen[rows] = (book or VoteBook(change, cameras)).of(means, rows) >= least_votes
     return seen
 
 

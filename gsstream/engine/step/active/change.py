@@ -49,21 +49,31 @@ class Change:
         Arguments:
             means: [N, 3] centres. A centre that projects into no view gets 0.
         """
-        near, centres = self.near.float().numpy(), means.numpy()
-        hits, seen = np.zeros(len(means), np.float32), np.zeros(len(means), np.float32)
-        # In numpy, and column by column: half of the time of torch, for most of it are calls on few numbers.
+        near = self.near.flatten(1).numpy()
+        # What lies in no picture looks up a tile that never changes.
+        lookup = np.concatenate([near, np.zeros((len(near), 1), np.bool_)], 1)
+        hits, seen = np.zeros(len(means), np.int32), np.zeros(len(means), np.int32)
+        centres = np.ascontiguousarray(means.numpy().T)
         for view in range(len(cameras)):
-            pose, K = cameras.viewmats[view].astype(np.float32), cameras.Ks[view].astype(np.float32)
-            x, y, z = np.ascontiguousarray((centres @ pose[:3, :3].T + pose[:3, 3]).T)
-            inside = z > cameras.near
-            depth = np.where(inside, z, np.float32(1))
-            u, v = K[0, 0] * x / depth + K[0, 2], K[1, 1] * y / depth + K[1, 2]
-            inside &= (u >= 0) & (v >= 0) & (u < self.width) & (v < self.height)
-            rows = inside.nonzero()[0]
-            row, column = ((of[rows] / np.float32(TILE)).astype(np.int64) for of in (v, u))
-            seen[rows] += 1
-            hits[rows] += near[view][row, column]
-        return torch.from_numpy(hits / np.maximum(seen, 1))
+            inside, tile = self._tile_of(centres, cameras, view)
+            seen += inside
+            hits += lookup[view].take(np.where(inside, tile, len(lookup[view]) - 1))
+        return torch.from_numpy(np.divide(hits, np.maximum(seen, 1), dtype=np.float32))
+
+    def _tile_of(self, centres: FloatArray, cameras: Cameras, view: int) -> tuple[BoolArray, IntArray]:
+        """[N] bool, which of the centres [3, N] project into a picture; [N] index of the tile, of any value elsewhere.
+
+        Column by column: a row's answer has the same bits whatever other rows are asked about.
+        """
+        pose, K = cameras.viewmats[view].astype(np.float32), cameras.Ks[view].astype(np.float32)
+        x, y, z = (row[0] * centres[0] + row[1] * centres[1] + row[2] * centres[2] + row[3] for row in pose[:3])
+        inside: BoolArray = z > cameras.near
+        inverse = np.float32(1) / np.where(inside, z, np.float32(1))
+        u, v = K[0, 0] * x * inverse + K[0, 2], K[1, 1] * y * inverse + K[1, 2]
+        inside &= (u >= 0) & (v >= 0) & (u < self.width) & (v < self.height)
+        # Numbers beyond the picture may not fit into an integer.
+        u, v = (np.where(inside, of, np.float32(0)) * np.float32(1 / TILE) for of in (u, v))
+        return inside, v.astype(np.int32) * np.int32(-(-self.width // TILE)) + u.astype(np.int32)
 
 
 def detect_change(previous: Frame, frame: Frame, threshold: float) -> Change | None:

@@ -13,7 +13,7 @@ from gsstream.api import Comparison, Gaussians, Pulled
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import SplatArrays, raise_on_faults, require_splats
 from gsstream_cpu_render.autograd import splats_of
-from gsstream_cpu_render.checks import Float32, as_array
+from gsstream_cpu_render.checks import Float32, as_array, refuse_value
 from gsstream_cpu_render.loss import PhotometricTarget
 from gsstream_cpu_render.native import native_scene
 from gsstream_cpu_render.pool import Lease
@@ -38,9 +38,16 @@ class CachedView:
 
     def freeze(self, ids: Ids, mask: Any) -> None:
         """Let these rows change, in these tiles; does nothing if that is already so."""
-        if self._frozen is not None and self._frozen[0] is ids and _same(self._frozen[1], mask):
-            return
-        self.rasterizer.freeze(mask, ids)
+        if not self.is_frozen(ids, mask):
+            self.rasterizer.freeze(mask, ids)
+            self.is_now_frozen(ids, mask)
+
+    def is_frozen(self, ids: Ids, mask: Any) -> bool:
+        """Whether these rows may change, in these tiles, and no others."""
+        return self._frozen is not None and self._frozen[0] is ids and _same(self._frozen[1], mask)
+
+    def is_now_frozen(self, ids: Ids, mask: Any) -> None:
+        """Remember what the rasteriser was frozen to."""
         self._frozen = ids, None if mask is None else mask.copy()
 
     def update(self, ids: Ids, rows: SplatArrays) -> None:
@@ -67,6 +74,23 @@ class CachedView:
 
     def bytes(self) -> int:
         return self.rasterizer.memory_bytes() + self.image.nbytes + self.transmittance.nbytes
+
+
+def freeze_views(views: Sequence[CachedView], ids: Ids) -> None:
+    """Let these rows change in all tiles, in all views at the same time."""
+    if not hasattr(_native, "freeze_views"):
+        for view in views:
+            view.freeze(ids, None)
+        return
+    others = [view for view in views if not view.is_frozen(ids, None)]
+    if not others:
+        return
+    try:
+        _native.freeze_views([view.rasterizer.handle for view in others], ids)
+    except ValueError as error:
+        refuse_value(str(error))
+    for view in others:
+        view.is_now_frozen(ids, None)
 
 
 def update_views(views: Sequence[CachedView], ids: Ids, rows: SplatArrays, background: Float32) -> None:

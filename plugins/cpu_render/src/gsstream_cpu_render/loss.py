@@ -17,32 +17,42 @@ from gsstream_cpu_render.checks import Float32, first_non_finite, native_array, 
 
 TILE = 16
 """Side of a tile, pixels."""
+MOST = 1e15
+"""Largest value of a target: sums of squares over a window stay finite."""
 
 
 @dataclass(frozen=True)
 class PhotometricTarget:
     """A target image with its window statistics, computed once and used in every iteration of a frame.
 
-    ``image`` [H, W, 3] float32 (a private copy), ``mean`` and ``variance`` [H, W, 3]: blurred image and windowed
-    variance. Raises ShapeError for a wrong shape or dtype and for a value that is not finite.
+    ``image`` [H, W, 3] float32 (a private copy). Statistics are made strip by strip where they are first needed, for
+    the rows that change are seen in few tiles. Raises ShapeError for a wrong shape or dtype and for a value that is not
+    finite.
     """
 
     image: Float32
-    mean: Float32 = field(init=False, repr=False)
-    variance: Float32 = field(init=False, repr=False)
+    #: Blurred image and windowed variance [H, W, 3], and in which strips of tiles they are known (1) already.
+    partial: tuple[Float32, Float32, NDArray[np.uint8]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         image = _image("target", self.image).copy()
-        mean, variance = np.empty_like(image), np.empty_like(image)
-        _native.photometric_target(image, mean, variance)
-        # A window mean is not finite if any value in the window is not, so one sum over the statistics tells.
-        with np.errstate(invalid="ignore", over="ignore"):
-            suspicious = not np.isfinite(variance.sum(dtype=np.float64))
-        if suspicious:
+        # NaN is passed on by both; the statistics square what they are given.
+        largest = max(abs(float(image.min())), abs(float(image.max())))
+        if not largest < MOST:
             refuse(first_non_finite("target", image) or "target: expected values in [0, 1], got some that overflow")
-        for name, array in (("image", image), ("mean", mean), ("variance", variance)):
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
+        image.flags.writeable = False
+        rows, columns = tile_shape(*image.shape[:2])
+        known = np.zeros((rows, -(-columns // _native.STRIP_TILES)), np.uint8)
+        object.__setattr__(self, "image", image)
+        object.__setattr__(self, "partial", (np.empty_like(image), np.empty_like(image), known))
+
+    @property
+    def statistics(self) -> tuple[Float32, Float32]:
+        """Blurred image and windowed variance [H, W, 3], whole."""
+        mean, variance, known = self.partial
+        if not known.all():
+            _native.photometric_target(self.image, mean, variance, known)
+        return mean, variance
 
 
 @dataclass(frozen=True)
@@ -108,7 +118,7 @@ def photometric_loss(
     else:
         result = native_array("out", out, np.float32, image.shape, writable=True)
     scale = 1.0 / image.size
-    statistics = (None, None) if known is None else (known.mean, known.variance)
+    statistics = (None, None) if known is None else known.statistics
     l1, dssim = _native.photometric_evaluate(
         image, goal, *statistics, active, wanted, result, (1.0 - dssim_weight) * scale, -dssim_weight * scale
     )

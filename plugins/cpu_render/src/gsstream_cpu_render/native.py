@@ -111,7 +111,7 @@ class NativeRasterizer:
             InputError: arrays of another shape.
         """
         images = [require_float32("cached_image", cached_image, (self.height, self.width, 3)), target.image,
-                  target.mean, target.variance]  # fmt: skip
+                  *target.partial]  # fmt: skip
         scale = 1.0 / target.image.size
         scales = (1.0 - dssim_weight) * scale, -dssim_weight * scale
         try:

@@ -225,6 +225,24 @@ class NumpyRasterizer(NativeRasterizer):
         self._call("visible_in_cache", visible)
         return v_means2d, visible.view(np.bool_)
 
+    def pull_cached(self, splats: SplatArrays, v_image: Float32) -> tuple[NDArray[np.int64], Float32]:
+        """What `backward_cached` gives of the rows that ``v_image`` reaches: [K] ascending and [K, 2], the same bits.
+
+        All other rows have a gradient of zero. Work and memory do not grow with the number of rows of the scene, but
+        for one bit of each.
+
+        Arguments:
+            splats, v_image: as for `backward_cached`.
+
+        Raises:
+            InputError: as `backward_cached`.
+        """
+        splats = require_splats(splats)
+        count = self._call("pull_cached", native_scene(splats), self._upstream(v_image, None)[0])
+        rows, gradient = np.empty(count, np.int64), np.empty((count, 2), np.float32)
+        self._call("pulled_rows", rows, gradient)
+        return rows, gradient
+
     def drawn_in_cache(self, tile_mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
         """Say which rows of the cached scene added light to a pixel of the marked tiles: [N] bool.
 

@@ -21,13 +21,14 @@ from gsstream.api import (
     RenderCache,
     RenderOutput,
     RenderSession,
+    RowGradient,
     ScreenGradient,
     check_tiles,
 )
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import SplatArrays
 from gsstream_cpu_render.autograd import differentiable, splats_of
-from gsstream_cpu_render.cached_view import CachedView, Ids, update_views
+from gsstream_cpu_render.cached_view import CachedView, Ids, freeze_views, update_views
 from gsstream_cpu_render.checks import Float32, as_array
 from gsstream_cpu_render.loss_part import CpuLoss
 from gsstream_cpu_render.moved import moved_slope
@@ -75,6 +76,15 @@ class CpuSession(RenderSession):
         cached = self._view(view)  # its owner while the native call runs
         gradient, visible = cached.rasterizer.backward_cached(splats, upstream)
         return ScreenGradient(torch.from_numpy(gradient), torch.from_numpy(visible))
+
+    def screen_gradient_rows(self, view: int, image_gradient: torch.Tensor) -> RowGradient:
+        if not hasattr(_native.Rasterizer, "pull_cached"):
+            return super().screen_gradient_rows(view, image_gradient)
+        upstream = as_array("image_gradient", image_gradient.contiguous())
+        splats = splats_of(self._gaussians)
+        cached = self._view(view)  # its owner while the native call runs
+        rows, gradient = cached.rasterizer.pull_cached(splats, upstream)
+        return RowGradient(torch.from_numpy(rows), torch.from_numpy(gradient))
 
     def visible(self, view: int, tiles: torch.Tensor) -> torch.Tensor:
         check_tiles(tiles, (self._cameras.height, self._cameras.width))
@@ -141,11 +151,10 @@ class CpuSession(RenderSession):
         ids = self._short_cut_rows(comparisons)
         if ids is None:
             return None
-        ready = []
-        for view, comparison in zip(views, comparisons, strict=True):
-            cached = self._view(view)
-            cached.freeze(ids, None)
-            ready.append((cached.rasterizer.handle, cached.comparison(comparison)))
+        cached = [self._view(view) for view in views]
+        freeze_views(cached, ids)
+        pairs = zip(cached, comparisons, strict=True)
+        ready = [(view.rasterizer.handle, view.comparison(comparison)) for view, comparison in pairs]
         return ready if all(view in self._views for view in views) else None
 
     def _short_cut_rows(self, comparisons: Sequence[Comparison]) -> Ids | None:

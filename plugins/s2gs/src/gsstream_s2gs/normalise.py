@@ -7,8 +7,7 @@ import torch
 
 def median(values: torch.Tensor) -> torch.Tensor:
     """The median; the mean of the two middle values when n is even (torch.median would take the lower)."""
-    ordered = values.sort().values
-    low, high = ordered[(len(values) - 1) // 2], ordered[len(values) // 2]
+    low, high = (values.kthvalue(place + 1).values for place in ((len(values) - 1) // 2, len(values) // 2))
     return low + (high - low) / 2
 
 

@@ -109,8 +109,11 @@ class ViewSpaceGradient(ConfidenceEstimator):
     def estimate(self, context: FrameContext) -> torch.Tensor:
         """Logits [N] float32 in [-limit, limit]. Raises ShapeError when a gradient is not finite."""
         config = self.config
-        magnitude, expected, seen = self._magnitudes(context)
-        logits = torch.full_like(magnitude, config.floor)
+        # Where it does not matter which Gaussians are seen, those that a change reaches are all there is to look at.
+        few = config.aggregate == "mean-vector" and config.statistics == "touched" and config.normalisation != "noise"
+        rows, magnitude, expected, seen = self._reached(context) if few else (None, *self._magnitudes(context))
+        number = len(context.gaussians.means)
+        logits = magnitude.new_full((number,), config.floor)
         if not bool((magnitude > 0).any()):
             return logits.float()
         if config.statistics == "touched":
@@ -126,8 +129,22 @@ class ViewSpaceGradient(ConfidenceEstimator):
             chosen = noise_units(values, expected[seen], config.noise_threshold, config.floor)
         # Whatever a change touches is never less likely to change than what it does not touch.
         least = config.floor if config.statistics == "touched" else -config.limit
-        logits[seen] = chosen.clamp(least, config.limit)
+        logits[seen if rows is None else rows[seen]] = chosen.clamp(least, config.limit)
         return logits.float()
+
+    def _reached(self, context: FrameContext) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Rows [K] that a change reaches, ascending, and of them what :meth:`_magnitudes` says of all, to the bit."""
+        means = context.gaussians.means
+        total = torch.zeros(len(means), 2, dtype=torch.float64, device=means.device)
+        reached = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+        views = len(context.cameras)
+        for view in range(views):
+            pulled = context.screen_gradient_rows(view, self._upstream(context, view))
+            total[pulled.rows] += self._scaled(context, view, pulled.gradient)
+            reached[pulled.rows] = True
+        rows = reached.nonzero()[:, 0]
+        magnitude = total[rows].norm(dim=1) / max(views, 1)
+        return rows, magnitude, torch.zeros_like(magnitude), torch.ones_like(rows, dtype=torch.bool)
 
     def _magnitudes(self, context: FrameContext) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """|m| [N] float64, the same expected from noise alone (zeros unless asked for), and who is seen [N] bool."""
@@ -152,11 +169,15 @@ class ViewSpaceGradient(ConfidenceEstimator):
     def _gradient(self, context: FrameContext, view: int, upstream: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """One backward pass: [N, 2] in the chosen units, float64 (float32 squares vanish below 1e-23); [N] bool."""
         gradient, visible = context.screen_gradient(view, upstream)
+        return self._scaled(context, view, gradient) * visible[:, None], visible
+
+    def _scaled(self, context: FrameContext, view: int, gradient: torch.Tensor) -> torch.Tensor:
+        """Gradients [K, 2] per pixel in the chosen units, float64."""
         check_finite(f"screen gradient of view {view} at frame {context.index}", gradient)
-        result = gradient.double() * visible[:, None]
+        result = gradient.double()
         if self.config.units == "ndc":
             result = result * result.new_tensor([context.cameras.width / 2, context.cameras.height / 2])
-        return result, visible
+        return result
 
     def _upstream(self, context: FrameContext, view: int) -> torch.Tensor:
         """[H, W, 3] derivative of E_t - E_{t-1} with respect to the render of frame t-1."""

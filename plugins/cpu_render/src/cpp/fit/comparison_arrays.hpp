@@ -10,10 +10,12 @@ namespace gsstream_cpu {
 class ComparisonArrays {
  public:
   ComparisonArrays(ConstFloatArray background, ConstFloatArray cached_image, ConstFloatArray target,
-                   ConstFloatArray mean, ConstFloatArray variance, std::optional<ConstFloatArray> matrix,
+                   ConstFloatArray mean, ConstFloatArray variance, ByteOutArray known,
+                   std::optional<ConstFloatArray> matrix,
                    std::optional<ConstFloatArray> offset, double l1_scale, double ssim_scale,
                    std::optional<ConstFloatArray> weights)
       : images_{cached_image, target, mean, variance},
+        known_(known),
         background_(background),
         matrix_(matrix),
         offset_(offset),
@@ -31,15 +33,17 @@ class ComparisonArrays {
     const std::size_t w = static_cast<std::size_t>(width), h = static_cast<std::size_t>(height);
     const auto cells = [](std::size_t pixels) { return (pixels + MASK_TILE - 1) / MASK_TILE; };
     for (const ConstFloatArray& image : images_) require_shape(image, {h, w, 3}, "image");
+    require_shape(known_, {cells(h), static_cast<std::size_t>(strips_of(static_cast<int>(cells(w))))}, "known");
     if (weights_) require_shape(*weights_, {cells(h), cells(w)}, "tile_weights");
     const float* b = background_.data();
-    return {images_[0].data(), images_[1].data(), images_[2].data(), images_[3].data(),
+    return {images_[0].data(), images_[1].data(), images_[2].data(), images_[3].data(), known_.data(),
             matrix_ ? matrix_->data() : nullptr, offset_ ? offset_->data() : nullptr, {b[0], b[1], b[2]},
             l1_scale_, ssim_scale_, weights_ ? weights_->data() : nullptr};
   }
 
  private:
   ConstFloatArray images_[4];
+  ByteOutArray known_;
   ConstFloatArray background_;
   std::optional<ConstFloatArray> matrix_, offset_, weights_;
   float l1_scale_, ssim_scale_;

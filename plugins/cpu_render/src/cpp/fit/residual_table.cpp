@@ -79,9 +79,14 @@ void ResidualTable::pull(ResidualPullJob job, float* matrix_gradient) {
     spread[l] = std::max(LEAST_SPREAD, static_cast<float>(total / rows));
   }
   job.spread = spread;
+  float *scale = scale_.require(lp), *tail = tail_.require(lp), *cost = cost_.require(lp);
+  job.scale = scale;
+  job.tail = tail;
+  job.cost = cost;
   job.transposed = transposed_.data();
   job.matrix_partial = partial_.require(chunks * latents_ * dp);
   const ResidualKernels& kernels = residual_kernels();
+  kernels.price(job, scale, tail, cost);
   for_chunks(job_.rows, [&](std::size_t begin, std::size_t end) { kernels.pull(job, begin, end); });
   std::fill_n(matrix_gradient, latents_ * features_, 0.0f);
   for (const ResidualBlock& block : blocks_) {

@@ -39,13 +39,15 @@ struct ResidualPullJob {
   ResidualJob forward;
   const float* const* gradient;  // by block: [A, width]
   const float* transposed;       // [D, padded L]
-  const float* spread;           // [padded L] symbols
+  const float *spread, *scale, *tail, *cost;  // [padded L] symbols; and what the price of a latent is made of
   float weight;                  // loss per bit
   float *latent_gradient, *gate_gradient;
   float* matrix_partial;         // [chunks, L, padded D]
 };
 
 struct ResidualKernels {
+  // Fills scale, tail and cost of a job from its spreads and steps.
+  void (*price)(const ResidualPullJob&, float* scale, float* tail, float* cost);
   void (*decode)(const ResidualJob&, std::size_t begin, std::size_t end);
   void (*pull)(const ResidualPullJob&, std::size_t begin, std::size_t end);
 };
@@ -68,7 +70,7 @@ class ResidualTable {
   std::vector<ResidualBlock> blocks_;
   std::size_t latents_, features_;
   ResidualJob job_{};  // of the last decode
-  Buffer<float> kept_, quantised_, decoded_, magnitudes_, partial_, spread_, matrix_, transposed_, steps_;
+  Buffer<float> kept_, quantised_, decoded_, magnitudes_, partial_, spread_, scale_, tail_, cost_, matrix_, transposed_, steps_;
 };
 
 }  // namespace gsstream_cpu

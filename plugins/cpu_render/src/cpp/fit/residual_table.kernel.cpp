@@ -64,16 +64,27 @@ void decode(const ResidualJob& job, std::size_t begin, std::size_t end) {
   }
 }
 
+// What the price of a latent is made of and is the same in every row.
+void price(const ResidualPullJob& job, float* scales, float* tails, float* costs) {
+  for (std::size_t l = 0; l < job.forward.padded_latents; l += LANES) {
+    const Floats step = load(job.forward.steps + l), spread = load(job.spread + l), half = broadcast(0.5f);
+    const Floats scale = LOG2_OF_E / spread;
+    store(scales + l, scale);
+    store(tails + l, exp2(-half * scale));
+    store(costs + l, spread * step * LN_TWO);
+  }
+}
+
 // Derivative by the latent of `weight` times the bits of its symbol; see gsstream.residual.rate.laplace_gradient.
 GSS_INLINE Floats rate_slope(const ResidualPullJob& job, std::size_t l, Floats latent) {
-  const Floats step = load(job.forward.steps + l), spread = load(job.spread + l), half = broadcast(0.5f);
-  const Floats u = latent / step, magnitude = max(u, -u), scale = LOG2_OF_E / spread;
-  const Floats tail = exp2(-half * scale), grown = exp2(min(magnitude, half) * scale), shrunk = 1.0f / grown;
+  const Floats half = broadcast(0.5f), scale = load(job.scale + l), tail = load(job.tail + l);
+  const Floats u = latent / load(job.forward.steps + l), magnitude = max(u, -u);
+  const Floats grown = exp2(min(magnitude, half) * scale), shrunk = 1.0f / grown;
   const Floats inside = (grown - shrunk) * tail / (2.0f - (grown + shrunk) * tail);
   const Floats slope = select(greater(half, magnitude), inside, broadcast(1.0f));
   // At u = 0 the slope inside is 0, whatever the sign.
   const Floats sign = select(greater(u, Floats{}), broadcast(1.0f), broadcast(-1.0f));
-  return job.weight * slope * sign / (spread * step * LN_TWO);
+  return job.weight * slope * sign / load(job.cost + l);
 }
 
 // Gathers the upstream gradient of one row; returns that of its gate, and leaves the gated one in `upstream`.
@@ -138,7 +149,7 @@ void pull(const ResidualPullJob& job, std::size_t begin, std::size_t end) {
 }  // namespace
 
 const ResidualKernels& residual_kernels() {
-  static const ResidualKernels table{decode, pull};
+  static const ResidualKernels table{price, decode, pull};
   return table;
 }
 

@@ -88,19 +88,25 @@ void fill_around(const Grid& grid, const TileSelection& rendered, const std::vec
   });
 }
 
+// Three channels of a pixel, and nothing in the fourth place.
+typedef float Colour __attribute__((vector_size(16)));
+
+void store_colour(float* out, Colour colour) { std::memcpy(out, &colour, 3 * sizeof(float)); }
+
 // out = matrix in + offset, pixel by pixel.
 void apply_colours(const float* matrix, const float* offset, const float* in, float* out, std::size_t pixels) {
+  const Colour red{matrix[0], matrix[3], matrix[6], 0}, green{matrix[1], matrix[4], matrix[7], 0},
+      blue{matrix[2], matrix[5], matrix[8], 0}, added{offset[0], offset[1], offset[2], 0};
   for (std::size_t i = 0; i < 3 * pixels; i += 3)
-    for (int j = 0; j < 3; j++)
-      out[i + j] = offset[j] + (matrix[3 * j] * in[i] + matrix[3 * j + 1] * in[i + 1] + matrix[3 * j + 2] * in[i + 2]);
+    store_colour(out + i, added + (red * in[i] + green * in[i + 1] + blue * in[i + 2]));
 }
 
 // gradient = gradient matrix, pixel by pixel.
 void pull_colours(const float* matrix, float* gradient, std::size_t pixels) {
-  for (std::size_t i = 0; i < 3 * pixels; i += 3) {
-    const float r = gradient[i], g = gradient[i + 1], b = gradient[i + 2];
-    for (int k = 0; k < 3; k++) gradient[i + k] = r * matrix[k] + g * matrix[3 + k] + b * matrix[6 + k];
-  }
+  const Colour red{matrix[0], matrix[1], matrix[2], 0}, green{matrix[3], matrix[4], matrix[5], 0},
+      blue{matrix[6], matrix[7], matrix[8], 0};
+  for (std::size_t i = 0; i < 3 * pixels; i += 3)
+    store_colour(gradient + i, red * gradient[i] + green * gradient[i + 1] + blue * gradient[i + 2]);
 }
 
 // Tiles that are not left out; null where all count.
@@ -174,6 +180,7 @@ ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparis
   job.target = view.target;
   job.target_mean = view.mean;
   job.target_variance = view.variance;
+  job.known = view.known;
   job.active = work.around.data();
   job.wanted = work.touched.data();
   job.gradient = work.gradient.require(3 * pixels);

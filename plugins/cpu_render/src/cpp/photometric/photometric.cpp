@@ -94,10 +94,30 @@ Workspace& workspace() {
   return own;
 }
 
-// Rows of tiles per chunk: two chunks a thread, so that a mask that is busy at one end of the image still balances.
-std::size_t chunk_rows(int tile_rows) {
-  const auto rows = static_cast<std::size_t>(tile_rows), parts = 2 * static_cast<std::size_t>(num_threads());
+// Rows of tiles per chunk: two chunks a thread, so that a mask that is busy at one end of the rows still balances.
+std::size_t chunk_rows(std::size_t rows) {
+  const std::size_t parts = 2 * static_cast<std::size_t>(num_threads());
   return std::max<std::size_t>(1, (rows + parts - 1) / parts);
+}
+
+// Rows of tiles in which something is to be done: from the first to the last that has an active or a wanted tile, or
+// lies beside one that has.
+struct BusyRows {
+  std::size_t first, end;
+};
+BusyRows busy_rows(const PhotometricJob& job) {
+  const auto busy = [&](int row) {
+    const std::size_t begin = static_cast<std::size_t>(row) * static_cast<std::size_t>(job.tile_columns);
+    for (int column = 0; column < job.tile_columns; column++)
+      if (job.active[begin + static_cast<std::size_t>(column)] || job.wanted[begin + static_cast<std::size_t>(column)])
+        return true;
+    return false;
+  };
+  int first = 0, last = job.tile_rows - 1;
+  while (first <= last && !busy(first)) first++;
+  while (last >= first && !busy(last)) last--;
+  if (first > last) return {0, 0};
+  return {static_cast<std::size_t>(std::max(0, first - 1)), static_cast<std::size_t>(std::min(job.tile_rows, last + 2))};
 }
 
 }  // namespace
@@ -106,23 +126,25 @@ PhotometricSums photometric_run(PhotometricJob job) {
   Workspace& work = workspace();
   work.fit(job, job.gradient != nullptr);
   const PhotometricKernels& kernels = photometric_kernels();
-  const auto rows = static_cast<std::size_t>(job.tile_rows);
+  const BusyRows busy = busy_rows(job);
+  const std::size_t rows = busy.end - busy.first;
   uint8_t* done = work.done.data();
   // Inside a chunk the gradient follows one row behind the maps, which are then still in the cache. The first and last
   // row of a chunk need maps of another chunk and wait for the second round.
-  parallel_for(rows, chunk_rows(job.tile_rows), [&](std::size_t begin, std::size_t end) {
+  parallel_for(rows, chunk_rows(rows), [&](std::size_t first, std::size_t last) {
     float* scratch = strip_scratch();
+    const std::size_t begin = busy.first + first, end = busy.first + last;
     for (std::size_t row = begin; row < end; ++row) {
       kernels.forward_row(job, static_cast<int>(row), scratch);
-      const bool ready = row >= 1 && (row >= begin + 2 || (row == 1 && begin == 0));
+      const bool ready = row >= 1 && (row >= begin + 2 || (row == begin + 1 && begin == busy.first));
       if (job.gradient == nullptr || !ready) continue;
       kernels.backward_row(job, static_cast<int>(row) - 1, scratch);
       done[row - 1] = 1;
     }
   });
   if (job.gradient != nullptr) {
-    parallel_for(rows, 1, [&](std::size_t begin, std::size_t end) {
-      for (std::size_t row = begin; row < end; ++row)
+    parallel_for(rows, 1, [&](std::size_t first, std::size_t last) {
+      for (std::size_t row = busy.first + first; row < busy.first + last; ++row)
         if (!done[row]) kernels.backward_row(job, static_cast<int>(row), strip_scratch());
     });
   }
@@ -134,7 +156,7 @@ PhotometricSums photometric_run(PhotometricJob job) {
   return sums;
 }
 
-void photometric_target(const float* target, int height, int width, float* mean, float* variance) {
+void photometric_target(const float* target, int height, int width, float* mean, float* variance, uint8_t* known) {
   PhotometricJob job{};
   job.height = height;
   job.width = width;
@@ -143,6 +165,7 @@ void photometric_target(const float* target, int height, int width, float* mean,
   job.target = target;
   job.target_mean = mean;
   job.target_variance = variance;
+  job.known = known;
   workspace().fit(job, false);
   const PhotometricKernels& kernels = photometric_kernels();
   parallel_for(static_cast<std::size_t>(job.tile_rows), 1, [&](std::size_t begin, std::size_t end) {

@@ -29,6 +29,8 @@ struct PhotometricJob {
   const float* target;
   const float* target_mean;      // [H, W, 3] blurred target, or null: computed on the way
   const float* target_variance;  // [H, W, 3] blurred target^2 - mean^2, or null like target_mean
+  uint8_t* known;                // [tile_rows, strips of kStripTiles] where mean and variance are known; the others are
+                                 // filled in where they are needed (const is cast away). Null: everywhere
   const uint8_t* active;         // [tile_rows, tile_columns] tiles in the sum
   const uint8_t* wanted;         // tiles whose gradient is written; contains active
   const float* window;           // 6 weights, from the rim to the centre
@@ -42,7 +44,8 @@ struct PhotometricJob {
 };
 
 struct PhotometricKernels {
-  // Blurred target and its variance into job.target_mean / target_variance (const is cast away), all tiles of a row.
+  // Blurred target and its variance into job.target_mean / target_variance (const is cast away), where they are not
+  // known yet, of all tiles of a row.
   void (*target_row)(const PhotometricJob&, int tile_row, float* scratch);
   // Sums and derivative maps of the active tiles of a row; zeroes the maps of inactive neighbours of wanted tiles.
   void (*forward_row)(const PhotometricJob&, int tile_row, float* scratch);
@@ -57,7 +60,9 @@ struct PhotometricSums {
 
 // Runs the kernels over all tile rows. `job` comes without window, weights, maps and partial: they are filled in here.
 PhotometricSums photometric_run(PhotometricJob job);
-// Writes mean and variance [H, W, 3] of the target.
-void photometric_target(const float* target, int height, int width, float* mean, float* variance);
+// Strips of tiles whose statistics are made together, in a row of tiles.
+constexpr int strips_of(int tile_columns) { return (tile_columns + kStripTiles - 1) / kStripTiles; }
+// Writes mean and variance [H, W, 3] of the target, but where they are `known` already; null: everywhere.
+void photometric_target(const float* target, int height, int width, float* mean, float* variance, uint8_t* known);
 
 }  // namespace gsstream_cpu

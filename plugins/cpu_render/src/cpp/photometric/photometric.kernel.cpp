@@ -170,10 +170,12 @@ int run_length(const PhotometricJob& job, const uint8_t* mask, int tile_row, int
   return end - first;
 }
 
-void target_row(const PhotometricJob& job, int tile_row, float* scratch) {
-  const Window window = load_window(job.window);
-  Scratch t(scratch);
-  for (int tile = 0; tile < job.tile_columns; tile += kStripTiles) {
+// Makes the statistics of those strips from tile `first` to `end` of a row where they are not known.
+void fill_statistics(const PhotometricJob& job, int tile_row, int first, int end, const Window& window, Scratch& t) {
+  uint8_t* known = job.known ? job.known + tile_row * strips_of(job.tile_columns) : nullptr;
+  for (int strip = first / kStripTiles; strip * kStripTiles < end; ++strip) {
+    if (known && known[strip]) continue;
+    const int tile = strip * kStripTiles;
     const int tiles = job.tile_columns - tile < kStripTiles ? job.tile_columns - tile : kStripTiles;
     const Strip s = make_strip(job, tile_row, tile, tiles);
     load_target(job, s, t);
@@ -184,7 +186,14 @@ void target_row(const PhotometricJob& job, int tile_row, float* scratch) {
       std::memcpy(const_cast<float*>(job.target_mean) + pixel, t.mean + at, sizeof(float) * s.floats);
       std::memcpy(const_cast<float*>(job.target_variance) + pixel, t.variance + at, sizeof(float) * s.floats);
     }
+    if (known) known[strip] = 1;
   }
+}
+
+void target_row(const PhotometricJob& job, int tile_row, float* scratch) {
+  const Window window = load_window(job.window);
+  Scratch t(scratch);
+  fill_statistics(job, tile_row, 0, job.tile_columns, window, t);
 }
 
 void forward_row(const PhotometricJob& job, int tile_row, float* scratch) {
@@ -197,6 +206,7 @@ void forward_row(const PhotometricJob& job, int tile_row, float* scratch) {
       continue;
     }
     tiles = run_length(job, job.active, tile_row, tile);
+    if (job.known) fill_statistics(job, tile_row, tile, tile + tiles, window, t);
     const Strip s = make_strip(job, tile_row, tile, tiles);
     load_target(job, s, t);
     load_strip(job, s, job.image, t.image);

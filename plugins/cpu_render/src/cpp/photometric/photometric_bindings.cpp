@@ -66,17 +66,22 @@ std::pair<double, double> evaluate(ConstFloatArray image, ConstFloatArray target
   return {sums.l1, sums.dssim};
 }
 
-void prepare(ConstFloatArray target, FloatArray mean, FloatArray variance) {
+void prepare(ConstFloatArray target, FloatArray mean, FloatArray variance, ByteOutArray known) {
   require(target.ndim() == 3, "target must be [H, W, 3]");
   const std::size_t height = target.shape(0), width = target.shape(1);
   require_size(height, width);
   require_image(target, height, width, "target must be [H, W, 3]");
   require_image(mean, height, width, "mean must have the target's shape");
   require_image(variance, height, width, "variance must have the target's shape");
+  const std::size_t rows = (height + kTile - 1) / kTile, columns = (width + kTile - 1) / kTile;
+  require(known.ndim() == 2 && known.shape(0) == rows &&
+              known.shape(1) == static_cast<std::size_t>(strips_of(static_cast<int>(columns))),
+          "known must have a place for every strip of tiles");
+  uint8_t* strips = known.data();
   const float* in = target.data();
   float *mean_out = mean.data(), *variance_out = variance.data();
   const nb::gil_scoped_release released;
-  photometric_target(in, static_cast<int>(height), static_cast<int>(width), mean_out, variance_out);
+  photometric_target(in, static_cast<int>(height), static_cast<int>(width), mean_out, variance_out, strips);
 }
 
 }  // namespace
@@ -88,7 +93,9 @@ void bind_photometric(nb::module_& module) {
              nb::arg("l1_scale"), nb::arg("ssim_scale"),
              "Sums over active tiles of |I - G| and of 1 - SSIM; writes the scaled gradient of wanted tiles.");
   module.def("photometric_target", &prepare, nb::arg("target").noconvert(), nb::arg("mean").noconvert(),
-             nb::arg("variance").noconvert(), "Writes the blurred target and its windowed variance.");
+             nb::arg("variance").noconvert(), nb::arg("known").noconvert(),
+             "Writes the blurred target and its windowed variance, in the strips of tiles where they are not known.");
+  module.attr("STRIP_TILES") = kStripTiles;
 }
 
 }  // namespace gsstream_cpu

@@ -8,13 +8,15 @@ namespace gsstream_cpu {
 
 constexpr std::size_t SEARCH_GRAIN = 16;  // tiles
 
-void ActiveEntries::find(const TileListsView& lists, std::size_t tiles, const std::vector<uint8_t>& is_active) {
-  tiles_.resize(tiles);
-  parallel_for(tiles, SEARCH_GRAIN, [&](std::size_t begin, std::size_t end) {
+void ActiveEntries::find(const TileListsView& lists, const std::vector<uint8_t>& marked,
+                         const std::vector<uint8_t>& is_active) {
+  tiles_.resize(marked.size());
+  parallel_for(marked.size(), SEARCH_GRAIN, [&](std::size_t begin, std::size_t end) {
     for (std::size_t tile = begin; tile < end; tile++) {
+      tiles_[tile].clear();
+      if (!marked[tile]) continue;
       const TileEntry* entries = lists.entries + lists.begin[tile];
       const uint32_t count = lists.end[tile] - lists.begin[tile];
-      tiles_[tile].clear();
       for (uint32_t e = 0; e < count; e++)
         if (is_active[entries[e].record]) tiles_[tile].push_back(e);
     }

@@ -11,8 +11,8 @@ namespace gsstream_cpu {
 // For every tile, in ascending order, the entries whose Gaussian is active, counted from the tile's first entry.
 class ActiveEntries {
  public:
-  // is_active: by record of the lists.
-  void find(const TileListsView& lists, std::size_t tiles, const std::vector<uint8_t>& is_active);
+  // is_active: by record of the lists. marked [tiles]: where to look; in no other tile is an active Gaussian.
+  void find(const TileListsView& lists, const std::vector<uint8_t>& marked, const std::vector<uint8_t>& is_active);
   void clear();
   // False after clear().
   bool any() const { return !tiles_.empty(); }

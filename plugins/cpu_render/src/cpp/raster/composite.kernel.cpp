@@ -119,6 +119,7 @@ struct Entries {
   const uint32_t* blocks;
   uint32_t* contributed;
   uint32_t count;
+  uint32_t kept;  // blocks of which `contributed` stays as it is
 };
 
 // Not inlined: the same instructions, so the same bits, wherever a Gaussian is blended.
@@ -128,12 +129,12 @@ __attribute__((noinline)) void blend(ForwardTile& tile, const Record* records, c
   for (; k < list.count && alive; k++) {
     if (k + PREFETCH < list.count) __builtin_prefetch(&records[list.entries[k + PREFETCH].record]);
     const uint32_t wanted = list.blocks[k] & alive;
-    list.contributed[k] = 0;
+    list.contributed[k] &= list.kept;
     if (!wanted) continue;
     const Kernel kernel(records[list.entries[k].record], x, y);
-    list.contributed[k] = blend_entry(tile, kernel, wanted, static_cast<int32_t>(k) + 1, alive);
+    list.contributed[k] |= blend_entry(tile, kernel, wanted, static_cast<int32_t>(k) + 1, alive);
   }
-  for (; k < list.count; k++) list.contributed[k] = 0;
+  for (; k < list.count; k++) list.contributed[k] &= list.kept;
 }
 
 GSS_INLINE void finish_tile(const CompositeJob& job, ForwardTile& tile, uint32_t index, int tile_x, int tile_y) {
@@ -164,7 +165,7 @@ void forward(const CompositeJob& job, std::size_t first_tile, std::size_t end_ti
     const int x = static_cast<int>(index) % job.tiles_x * TILE_WIDTH,
               y = static_cast<int>(index) / job.tiles_x * TILE_HEIGHT;
     const Entries list{job.lists.entries + first, job.lists.blocks + first, job.contributed + first,
-                       job.lists.end[index] - first};
+                       job.lists.end[index] - first, job.keeps ? ~job.tile_blocks[index] : 0};
     uint32_t alive = job.tile_blocks[index];
     if (job.layers)
       alive = start_behind(tile, alive, *job.layers[index]);
@@ -178,7 +179,7 @@ void forward(const CompositeJob& job, std::size_t first_tile, std::size_t end_ti
 // ---- layers
 
 GSS_INLINE void blend_layer(const LayerJob& job, ForwardTile& tile, uint32_t alive) {
-  const Entries list{job.entries, job.blocks, job.contributed, static_cast<uint32_t>(job.count)};
+  const Entries list{job.entries, job.blocks, job.contributed, static_cast<uint32_t>(job.count), 0};
   blend(tile, job.records, list, alive, static_cast<float>(job.x), static_cast<float>(job.y));
 }
 

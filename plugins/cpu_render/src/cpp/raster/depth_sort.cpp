@@ -9,7 +9,7 @@
 namespace gsstream_cpu {
 namespace {
 
-constexpr std::size_t RADIX_FROM = 2048;      // below, std::sort is faster
+constexpr std::size_t RADIX_FROM = 512;       // below, std::sort is faster
 constexpr std::size_t PARALLEL_FROM = 16384;  // items per additional thread
 constexpr int DIGIT_BITS = 11;
 constexpr uint32_t DIGITS = 1u << DIGIT_BITS;

@@ -63,16 +63,19 @@ Limits find_limits(const CachedTile& cached, const Ends& ends, uint32_t blocks, 
     for_blocks(cached.blocks[place] & missing, [&](int b) { limits.back[b] = cell_behind(place + 1); });
     missing &= ~cached.blocks[place];
   }
+  uint32_t nearer = 0;  // the first ends come nearest first, the last ones farthest first
   for (int i = 0; i < ends.firsts; i++) {
     if (!(ends.first[i].blocks & blocks)) continue;
-    const uint32_t nearer = cached.nearer(ends.first[i].depth);
+    nearer = cached.nearer(ends.first[i].depth, nearer);
     for_blocks(ends.first[i].blocks & blocks, [&](int b) {
       limits.front[b] = std::min(limits.front[b], nearer - std::min(nearer, tile.spare[b]));
     });
   }
+  uint32_t farthest = cached.count;
   for (int i = 0; i < ends.lasts; i++) {
     if (!(ends.last[i].blocks & blocks)) continue;
-    const uint32_t behind = cell_behind(cached.not_farther(ends.last[i].depth));
+    farthest = cached.not_farther(ends.last[i].depth, farthest);
+    const uint32_t behind = cell_behind(farthest);
     for_blocks(ends.last[i].blocks & blocks, [&](int b) {
       if (behind <= limits.back[b]) return;
       limits.back[b] = behind;

@@ -33,15 +33,27 @@ struct CachedTile {
         count(source.cached.end[tile] - source.cached.begin[tile]),
         active((*source.in_cache)[tile]) {}
   float depth(uint32_t entry) const { return records[entries[entry].record].depth; }
-  // Number of entries nearer than this depth.
-  uint32_t nearer(float depth) const {
-    const auto before = [&](const TileEntry& e, float d) { return records[e.record].depth < d; };
-    return static_cast<uint32_t>(std::lower_bound(entries, entries + count, depth, before) - entries);
+  // Number of entries nearer than this depth; `least`: a number that there are at any rate, near which it is looked for.
+  uint32_t nearer(float depth, uint32_t least) const {
+    const auto is_before = [&](const TileEntry& e, float d) { return records[e.record].depth < d; };
+    uint32_t low = least, step = 1;
+    while (low + step <= count && is_before(entries[low + step - 1], depth)) {
+      low += step;
+      step *= 2;
+    }
+    const TileEntry* end = entries + std::min(count, low + step - 1);
+    return static_cast<uint32_t>(std::lower_bound(entries + low, end, depth, is_before) - entries);
   }
-  // Number of entries that are not farther.
-  uint32_t not_farther(float depth) const {
-    const auto before = [&](float d, const TileEntry& e) { return d < records[e.record].depth; };
-    return static_cast<uint32_t>(std::upper_bound(entries, entries + count, depth, before) - entries);
+  // Number of entries that are not farther; `most`: a number that it does not exceed, near which it is looked for.
+  uint32_t not_farther(float depth, uint32_t most) const {
+    const auto is_behind = [&](float d, const TileEntry& e) { return d < records[e.record].depth; };
+    uint32_t high = most, step = 1;
+    while (high >= step && is_behind(depth, entries[high - step])) {
+      high -= step;
+      step *= 2;
+    }
+    const TileEntry* begin = entries + (high >= step ? high - step + 1 : 0);
+    return static_cast<uint32_t>(std::upper_bound(begin, entries + high, depth, is_behind) - entries);
   }
 };
 

@@ -82,9 +82,13 @@ void move_ends(const Limits& limits, uint32_t blocks, TileLayers& tile, Turn* tu
 // Divides the frozen entries of the cached list between what joins the layers and what lies between them.
 void deal_out(const CachedTile& cached, const Turn* turns, Workspace& work) {
   for (List* list : {&work.front, &work.between, &work.back}) list->start(cached.count);
+  const auto turns_at = [&](uint32_t e) { return turns[e].front | turns[e].between | turns[e].back; };
+  uint32_t begin = 0, end = cached.count;  // nothing is dealt before the first turn, nor behind the last
+  while (begin < end && !turns_at(begin)) begin++;
+  while (end > begin && !turns_at(end)) end--;
   Turn now{};
-  auto active = cached.active.begin();
-  for (uint32_t e = 0; e < cached.count; e++) {
+  auto active = std::lower_bound(cached.active.begin(), cached.active.end(), begin);
+  for (uint32_t e = begin; e < end; e++) {
     now.front ^= turns[e].front;
     now.between ^= turns[e].between;
     now.back ^= turns[e].back;

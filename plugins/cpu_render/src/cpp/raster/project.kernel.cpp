@@ -115,6 +115,10 @@ GSS_INLINE uint32_t emit_group(const ProjectJob& job, const Footprints& f, const
     r.c = f.c[lane];
     r.log2_opacity = f.log2_opacity[lane];
     r.depth = f.depth[lane];
+    r.tile_x0 = static_cast<uint16_t>(f.tile_x0[lane]);
+    r.tile_y0 = static_cast<uint16_t>(f.tile_y0[lane]);
+    r.tile_x1 = static_cast<uint16_t>(f.tile_x1[lane]);
+    r.tile_y1 = static_cast<uint16_t>(f.tile_y1[lane]);
     const uint32_t pairs = emit_pairs(job, f, lane, r, chunk.pairs);
     if (!pairs) continue;
     visible |= 1u << lane;

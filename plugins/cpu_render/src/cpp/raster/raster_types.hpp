@@ -47,7 +47,8 @@ struct alignas(64) Record {
   float x, y, a, b, c, log2_opacity;
   float color[3];
   float depth;
-  float padding[6];
+  uint16_t tile_x0, tile_y0, tile_x1, tile_y1;  // raster tiles that it may touch lie in this box, ends included
+  float padding[4];
 };
 
 // "This Gaussian touches these blocks of that tile."
@@ -69,7 +70,7 @@ struct PairList {
 enum Fault : uint32_t { FAULT_NOT_FINITE = 1, FAULT_QUATERNION = 2 };
 
 // Result of projecting PROJECT_CHUNK consecutive rows.
-constexpr std::size_t PROJECT_CHUNK = 512;
+constexpr std::size_t PROJECT_CHUNK = 256;
 struct ProjectChunk {
   uint32_t visible = 0;
   uint32_t faults = 0;  // Fault bits
@@ -129,6 +130,7 @@ struct CompositeJob {
   float *image, *transmittance;  // caller's [H,W,3] and [H,W]; only active blocks are written
   const LayerPixels* const* layers;  // by tile of the image; null: nothing in front, and the background behind
   uint32_t* contributed;         // per entry: the blocks where it added light; backward visits only these
+  bool keeps;                    // what `contributed` says of blocks that are not rendered stays; else it is cleared
   float* pixel_transmittance;    // per tile of the image, block order: final transmittance
   int32_t* pixel_last;           // per tile of the image, block order: entries from this index on were not counted
 };

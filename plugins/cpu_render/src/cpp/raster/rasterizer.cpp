@@ -175,7 +175,7 @@ void Rasterizer::freeze(const uint8_t* mask, const uint32_t* active, std::size_t
     layers_.freeze();
   } else {
     drop_layers();
-    active_in_cache_.find(cached_lists_.view(), cached_lists_.tiles(), is_active_);
+    active_in_cache_.find(cached_lists_.view(), tiles_of_active(), is_active_);
   }
   active_in_cache_.touched(cached_lists_.view(), dropped_blocks_);
   selection_ = std::move(wanted);
@@ -199,6 +199,18 @@ bool Rasterizer::set_active(const uint32_t* active, std::size_t count, const cha
   for (uint32_t row : active_rows_) is_active_[row] = 1;
   records_.require_keeping(scene_count_ + count, scene_count_);
   return fewer;
+}
+
+// Which tiles' cached lists may hold an active row: 1 or 0.
+std::vector<uint8_t> Rasterizer::tiles_of_active() const {
+  std::vector<uint8_t> marked(cached_lists_.tiles(), 0);
+  for (uint32_t row : active_rows_) {
+    if (!cached_visible_.contains(row)) continue;
+    const Record& r = records_[row];
+    for (int y = r.tile_y0; y <= r.tile_y1; y++)
+      for (int x = r.tile_x0; x <= r.tile_x1; x++) marked[static_cast<std::size_t>(y * cached_selection_.tiles_x + x)] = 1;
+  }
+  return marked;
 }
 
 // Projects the active rows and leaves their lists over `selection` in active_lists_.

@@ -30,7 +30,7 @@
 namespace gsstream_cpu {
 
 constexpr std::size_t TILE_GRAIN = 2;        // tiles that a thread composites or differentiates at a time
-constexpr std::size_t BACKWARD_GRAIN = 512;  // visible Gaussians; a multiple of every vector width
+constexpr std::size_t BACKWARD_GRAIN = 256;  // visible Gaussians; a multiple of every vector width
 
 struct Scene {
   GaussianArrays arrays{};
@@ -110,11 +110,18 @@ class Rasterizer {
   // Gradient of the 2-D means [N,2] of the cached scene, from what its forward left: nothing is rendered. Costs follow
   // the pixels at which the image gradient is not zero. `scene`: the values that the cache was made of.
   void backward_cached(const Scene& scene, const float* image_gradient, float* means2d_gradient);
+  // The same of the rows that the image's gradient reaches alone; returns their number. pulled_rows writes which they
+  // are, ascending, and their gradients [K,2]; it may follow once.
+  std::size_t pull_cached(const Scene& scene, const float* image_gradient);
+  void pulled_rows(int64_t* rows, float* means2d_gradient) const;
+  std::size_t pulled_count() const { return screen_.count; }
   // out [N]: 1 for the rows of the cached scene that touch a cached tile.
   void visible_in_cache(uint8_t* out) const;
   // out [N]: 1 for the rows of the cached scene that added light to a pixel of a wanted tile. Costs follow these tiles,
   // but for clearing `out`. Border blocks reach beyond the image and are counted whole.
   void drawn_in_cache(const uint8_t* mask, uint8_t* out);
+  // The same without clearing `out`, to which other rasterisers may add at the same time.
+  void add_drawn(const uint8_t* mask, uint8_t* out);
 
   // Ends the life of the arrays given to the last forward; no backward may follow.
   void forget() { drop_pass(); }
@@ -162,6 +169,7 @@ class Rasterizer {
   uint32_t project(const Scene& scene, const TileSelection& selection, Record* records);
   void join_chunks(std::size_t chunks);
   bool set_active(const uint32_t* active, std::size_t count, const char* name);
+  std::vector<uint8_t> tiles_of_active() const;
   uint32_t list_active(const Scene& rows, const TileSelection& selection);
   uint32_t begin_active(const Scene& rows, bool touched_only, const uint8_t* mask);
   void drop_layers();
@@ -172,7 +180,9 @@ class Rasterizer {
                              uint32_t* contributed, PixelTrace& trace) const;
   CompositeJob composite(const TileListsView& lists, const TileSelection& selection, const Target& target,
                          uint32_t* contributed, PixelTrace& trace);
-  void replace_tiles(const std::vector<uint32_t>& changed_tiles);
+  void differentiate_cached(const Scene& scene, const float* image_gradient, float* means2d_gradient, bool compact);
+  void replace_tiles(const std::vector<uint32_t>& changed_blocks);
+  void renumber_last(std::size_t tile, uint32_t changed, const std::vector<uint32_t>& place);
   void differentiate(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out,
                      bool compact);
   void clear_gradients(const GradientArrays& out) const;
@@ -199,7 +209,7 @@ class Rasterizer {
   Buffer<DepthItem> sort_scratch_;
   Buffer<uint32_t> contributed_;
   PixelTrace trace_;
-  Buffer<float> moments_;
+  Buffer<float> moments_, screen_gradient_;
   ScreenPass screen_;
 
   // The cache: records of all Gaussians (then of the active rows), depth-sorted lists of the whole scene, what its

@@ -56,6 +56,18 @@ class PyRasterizer {
     rasterizer_.backward_cached(scene.scene, v_image.data(), v_means2d.data());
   }
 
+  std::size_t pull_cached(const SceneArrays& scene, ConstFloatArray v_image) {
+    upstream(v_image, std::nullopt);
+    const nb::gil_scoped_release release;
+    return rasterizer_.pull_cached(scene.scene, v_image.data());
+  }
+
+  void pulled_rows(RowOutArray rows, FloatArray v_means2d) const {
+    require_shape(rows, {rasterizer_.pulled_count()}, "rows");
+    require_shape(v_means2d, {rasterizer_.pulled_count(), 2}, "v_means2d");
+    rasterizer_.pulled_rows(rows.data(), v_means2d.data());
+  }
+
   void visible_in_cache(ByteOutArray out) const {
     require_shape(out, {rasterizer_.scene_count()}, "out");
     rasterizer_.visible_in_cache(out.data());
@@ -210,10 +222,10 @@ void bind_rasterizer(nb::module_& module) {
            strict("means"), strict("quats"), strict("scales"), strict("opacities"), strict("sh0"), strict("shN"));
   nb::class_<ComparisonArrays>(module, "Comparison", "What a render of one view is compared with; not copied.")
       .def(nb::init<ConstFloatArray, ConstFloatArray, ConstFloatArray, ConstFloatArray, ConstFloatArray,
-                    std::optional<ConstFloatArray>, std::optional<ConstFloatArray>, double, double,
+                    ByteOutArray, std::optional<ConstFloatArray>, std::optional<ConstFloatArray>, double, double,
                     std::optional<ConstFloatArray>>(),
            strict("background"), strict("cached_image"), strict("target"), strict("mean"), strict("variance"),
-           strict("matrix").none(), strict("offset").none(), nb::arg("l1_scale"), nb::arg("ssim_scale"),
+           strict("known"), strict("matrix").none(), strict("offset").none(), nb::arg("l1_scale"), nb::arg("ssim_scale"),
            strict("tile_weights").none());
   nb::class_<PyRasterizer>(module, "Rasterizer",
                            "Rasteriser of one camera; see gsstream_cpu_render.rasterizer for the checked interface.")
@@ -235,6 +247,8 @@ void bind_rasterizer(nb::module_& module) {
            strict("v_quats"), strict("v_scales"), strict("v_opacities"), strict("v_sh0"), strict("v_shN"))
       .def("update", &PyRasterizer::update, strict("changed"), nb::arg("scene"), strict("background"), GSS_TARGET)
       .def("backward_cached", &PyRasterizer::backward_cached, nb::arg("scene"), strict("v_image"), strict("v_means2d"))
+      .def("pull_cached", &PyRasterizer::pull_cached, nb::arg("scene"), strict("v_image"))
+      .def("pulled_rows", &PyRasterizer::pulled_rows, strict("rows"), strict("v_means2d"))
       .def("visible_in_cache", &PyRasterizer::visible_in_cache, strict("out"))
       .def("drawn_in_cache", &PyRasterizer::drawn_in_cache, strict("tile_mask").none(), strict("out"))
       .def("shed_scratch", &PyRasterizer::shed_scratch)

@@ -1,5 +1,6 @@
 // The rasteriser's cache after its forward: changing rows, differentiating it, and what memory it takes.
 #include <algorithm>
+#include <atomic>
 #include <stdexcept>
 #include <string>
 
@@ -19,33 +20,37 @@ uint32_t Rasterizer::update(const uint32_t* changed, const Scene& rows, const Ta
   if (faults) return faults;
   ActiveEntries before;
   std::vector<uint32_t> touched;
-  before.find(cached_lists_.view(), cached_lists_.tiles(), is_active_);
+  before.find(cached_lists_.view(), tiles_of_active(), is_active_);
   before.touched(cached_lists_.view(), touched);
   add_touched_blocks(active_lists_, touched);
   replace_tiles(touched);
   for (uint32_t row : active_rows_) cached_visible_.erase(row);
   for (std::size_t i = 0; i < visible_.count; i++) cached_visible_.insert(active_rows_[visible_.rows[i]]);
-  // All blocks of a touched tile, so that what its forward leaves is whole again.
-  for (std::size_t tile = 0; tile < touched.size(); tile++) touched[tile] = touched[tile] ? ~0u : 0;
   touched_.restrict(cached_selection_, touched);
-  composite(cached_lists_.view(), touched_, target, cached_lists_.contributed.data(), cached_trace_);
+  CompositeJob job =
+      composite_job(cached_lists_.view(), touched_, target, cached_lists_.contributed.data(), cached_trace_);
+  job.keeps = true;  // the other blocks of a touched tile see the same Gaussians as before
+  parallel_for(touched_.active.size(), TILE_GRAIN,
+               [&](std::size_t begin, std::size_t end) { composite_kernels_.forward(job, begin, end); });
   return 0;
 }
 
 // Merges active_lists_ into the cached lists of the changed tiles, by (depth, row), then their records into the cache.
-void Rasterizer::replace_tiles(const std::vector<uint32_t>& changed_tiles) {
+// What the last forward left of blocks that do not change is carried over.
+void Rasterizer::replace_tiles(const std::vector<uint32_t>& changed_blocks) {
   const uint32_t base = static_cast<uint32_t>(scene_count_);
   std::vector<TileEntry> entries;
-  std::vector<uint32_t> blocks;
+  std::vector<uint32_t> blocks, contributed, place;  // place: of the entries before, where they are now
   const auto row_of = [&](uint32_t record) { return record < base ? record : active_rows_[record - base]; };
   const auto in_front = [&](uint32_t a, uint32_t b) {
     const float near = records_[a].depth, far = records_[b].depth;
     return near != far ? near < far : row_of(a) < row_of(b);
   };
-  for (std::size_t tile = 0; tile < changed_tiles.size(); tile++) {
-    if (!changed_tiles[tile]) continue;
+  for (std::size_t tile = 0; tile < changed_blocks.size(); tile++) {
+    if (!changed_blocks[tile]) continue;
+    for (std::vector<uint32_t>* values : {&blocks, &contributed}) values->clear();
     entries.clear();
-    blocks.clear();
+    place.assign(cached_lists_.end[tile] - cached_lists_.begin[tile], 0);
     uint32_t a = active_lists_.offset[tile], c = cached_lists_.begin[tile];
     const uint32_t a_end = active_lists_.offset[tile + 1], c_end = cached_lists_.end[tile];
     for (;;) {
@@ -54,17 +59,48 @@ void Rasterizer::replace_tiles(const std::vector<uint32_t>& changed_tiles) {
       const bool take_active =
           c == c_end || (a < a_end && in_front(active_lists_.entries[a].record, cached_lists_.entries[c].record));
       const uint32_t record = take_active ? active_lists_.entries[a].record : cached_lists_.entries[c].record;
+      if (!take_active) place[c - cached_lists_.begin[tile]] = static_cast<uint32_t>(entries.size());
       entries.push_back({row_of(record), FROZEN});
+      contributed.push_back(take_active ? 0 : cached_lists_.contributed[c] & ~changed_blocks[tile]);
       blocks.push_back(take_active ? active_lists_.blocks[a++] : cached_lists_.blocks[c++]);
     }
-    cached_lists_.replace(tile, entries, blocks);
+    renumber_last(tile, changed_blocks[tile], place);
+    cached_lists_.replace(tile, entries, blocks, contributed);
   }
   for (std::size_t slot = 0; slot < active_rows_.size(); slot++) records_[active_rows_[slot]] = records_[base + slot];
+}
+
+// The entries at which pixels of the other blocks of a tile took their last light, counted in its new list.
+void Rasterizer::renumber_last(std::size_t tile, uint32_t changed, const std::vector<uint32_t>& place) {
+  int32_t* last = cached_trace_.last.data() + tile * BLOCKS * BLOCK_PIXELS;
+  for (uint32_t kept = cached_selection_.blocks[tile] & ~changed; kept; kept &= kept - 1) {
+    int32_t* pixels = last + __builtin_ctz(kept) * BLOCK_PIXELS;
+    for (int i = 0; i < BLOCK_PIXELS; i++)
+      if (pixels[i] != INT32_MAX) pixels[i] = static_cast<int32_t>(place[static_cast<std::size_t>(pixels[i] - 1)]) + 1;
+  }
 }
 
 void Rasterizer::backward_cached(const Scene& scene, const float* image_gradient, float* means2d_gradient) {
   const Claim claim(busy_);
   expect("backward_cached");
+  differentiate_cached(scene, image_gradient, means2d_gradient, false);
+}
+
+std::size_t Rasterizer::pull_cached(const Scene& scene, const float* image_gradient) {
+  const Claim claim(busy_);
+  expect("backward_cached");
+  differentiate_cached(scene, image_gradient, nullptr, true);
+  return screen_.count;
+}
+
+void Rasterizer::pulled_rows(int64_t* rows, float* means2d_gradient) const {
+  std::copy_n(screen_.rows.data(), screen_.count, rows);
+  std::copy_n(screen_gradient_.data(), 2 * screen_.count, means2d_gradient);
+}
+
+// Where `compact`, the gradients of the reached rows are left in screen_gradient_.
+void Rasterizer::differentiate_cached(const Scene& scene, const float* image_gradient, float* means2d_gradient,
+                                      bool compact) {
   if (scene.count != scene_count_)
     throw std::invalid_argument("backward_cached: expected the scene of the cached forward pass with " +
                                 std::to_string(scene_count_) + " rows, got " + std::to_string(scene.count) + ".");
@@ -89,11 +125,14 @@ void Rasterizer::backward_cached(const Scene& scene, const float* image_gradient
                                     moments_.require(screen_.pair_count * MOMENT_STRIDE)};
   parallel_for(wanted.active.size(), TILE_GRAIN,
                [&](std::size_t begin, std::size_t end) { composite_kernels_.backward(raster, begin, end); });
-  std::fill_n(means2d_gradient, 2 * scene_count_, 0.0f);
+  if (compact)
+    means2d_gradient = screen_gradient_.require(2 * screen_.count);
+  else
+    std::fill_n(means2d_gradient, 2 * scene_count_, 0.0f);
   GradientArrays out{};
   out.means2d = means2d_gradient;
   const ProjectBackwardJob rows{scene.arrays,           camera_,         screen_.count, screen_.rows.data(),
-                                screen_.offset.data(),  moments_.data(), out,           false};
+                                screen_.offset.data(),  moments_.data(), out,           compact};
   parallel_for(screen_.count, BACKWARD_GRAIN, [&](std::size_t begin, std::size_t end) {
     project_backward_kernels_.backward[scene.sh_degree](rows, begin, end);
   });
@@ -104,12 +143,18 @@ void Rasterizer::visible_in_cache(uint8_t* out) const {
 }
 
 void Rasterizer::drawn_in_cache(const uint8_t* mask, uint8_t* out) {
+  expect("drawn_in_cache");
+  std::fill_n(out, scene_count_, uint8_t{0});
+  add_drawn(mask, out);
+}
+
+void Rasterizer::add_drawn(const uint8_t* mask, uint8_t* out) {
   const Claim claim(busy_);
   const TileSelection wanted = cached_tiles(mask, "drawn_in_cache");
-  std::fill_n(out, scene_count_, uint8_t{0});
   for (uint32_t tile : wanted.active)
     for (uint32_t e = cached_lists_.begin[tile]; e < cached_lists_.end[tile]; e++)
-      if (cached_lists_.contributed[e] & wanted.blocks[tile]) out[cached_lists_.entries[e].record] = 1;
+      if (cached_lists_.contributed[e] & wanted.blocks[tile])
+        std::atomic_ref(out[cached_lists_.entries[e].record]).store(1, std::memory_order_relaxed);
 }
 
 void Rasterizer::shed_scratch() {
@@ -123,6 +168,7 @@ void Rasterizer::shed_scratch() {
   visible_.count = visible_.pair_count = 0;
   sort_scratch_.release();
   moments_.release();
+  screen_gradient_.release();
   drop_layers();
   layers_.release();
   for (TileLists* lists : {&frozen_lists_, &active_lists_, &merged_lists_}) {
@@ -139,7 +185,7 @@ std::size_t Rasterizer::cache_bytes() const {
 
 std::size_t Rasterizer::memory_bytes() const {
   std::size_t bytes = cache_bytes() + visible_.bytes() + sort_scratch_.bytes() + contributed_.bytes() + trace_.bytes() +
-                      moments_.bytes() + screen_.bytes() + active_rows_.capacity() * sizeof(uint32_t) +
+                      moments_.bytes() + screen_gradient_.bytes() + screen_.bytes() + active_rows_.capacity() * sizeof(uint32_t) +
                       is_active_.capacity() + active_in_cache_.bytes() + layers_.bytes() +
                       layer_pixels_.capacity() * sizeof layer_pixels_[0];
   for (const TileLists* lists : {&frozen_lists_, &active_lists_, &merged_lists_}) bytes += lists->bytes();

@@ -17,7 +17,8 @@ void TileStore::adopt(TileLists& lists) {
 }
 
 void TileStore::replace(std::size_t tile, const std::vector<TileEntry>& fresh,
-                        const std::vector<uint32_t>& fresh_blocks) {
+                        const std::vector<uint32_t>& fresh_blocks,
+                        const std::vector<uint32_t>& fresh_contributed) {
   const std::size_t count = fresh.size();
   if (count > room[tile]) {
     end[tile] = begin[tile];  // what it held is not moved
@@ -36,6 +37,7 @@ void TileStore::replace(std::size_t tile, const std::vector<TileEntry>& fresh,
   if (!count) return;
   std::memcpy(&entries[begin[tile]], fresh.data(), count * sizeof(TileEntry));
   std::memcpy(&blocks[begin[tile]], fresh_blocks.data(), count * sizeof(uint32_t));
+  std::memcpy(&contributed[begin[tile]], fresh_contributed.data(), count * sizeof(uint32_t));
 }
 
 void TileStore::compact() {

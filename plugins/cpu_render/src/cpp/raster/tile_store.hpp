@@ -24,8 +24,9 @@ struct TileStore {
   }
   // Takes over the memory of `lists`, which is left with unspecified contents.
   void adopt(TileLists& lists);
-  // Makes the list of a tile these entries. Its `contributed` is then undefined.
-  void replace(std::size_t tile, const std::vector<TileEntry>& fresh, const std::vector<uint32_t>& fresh_blocks);
+  // Makes the list of a tile these entries.
+  void replace(std::size_t tile, const std::vector<TileEntry>& fresh, const std::vector<uint32_t>& fresh_blocks,
+               const std::vector<uint32_t>& fresh_contributed);
 
  private:
   void compact();

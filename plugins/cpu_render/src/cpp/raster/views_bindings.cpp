@@ -3,6 +3,7 @@
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <cstdint>
 #include <stdexcept>
 #include <string>
@@ -57,17 +58,26 @@ void drawn_in_views(const std::vector<Asked>& views, ByteOutArray out) {
     rasterizers.push_back(&rasterizer);
     masks.push_back(mask_data(tiles, rasterizer.width(), rasterizer.height()));
   }
-  const std::size_t rows = out.size();
-  std::vector<uint8_t> drawn(views.size() * rows);
   uint8_t* result = out.data();
+  const std::size_t rows = out.size();
+  const nb::gil_scoped_release released;
+  std::fill_n(result, rows, uint8_t{0});
+  parallel_for(views.size(), 1, [&](std::size_t begin, std::size_t end) {
+    for (std::size_t view = begin; view < end; view++) rasterizers[view]->add_drawn(masks[view], result);
+  });
+}
+
+// Rasterizer::freeze of several views, all tiles, the same rows.
+void freeze_views(const std::vector<nb::object>& views, IndexArray active) {
+  require(active.ndim() == 1, "active_ids must be [A]");
+  std::vector<Rasterizer*> rasterizers;
+  for (const nb::object& object : views) rasterizers.push_back(&native_rasterizer(object));
+  const uint32_t* ids = active.data();
+  const std::size_t count = active.shape(0);
   const nb::gil_scoped_release released;
   parallel_for(views.size(), 1, [&](std::size_t begin, std::size_t end) {
-    for (std::size_t view = begin; view < end; view++)
-      rasterizers[view]->drawn_in_cache(masks[view], drawn.data() + view * rows);
+    for (std::size_t view = begin; view < end; view++) rasterizers[view]->freeze(nullptr, ids, count);
   });
-  for (std::size_t row = 0; row < rows; row++) result[row] = 0;
-  for (std::size_t view = 0; view < views.size(); view++)
-    for (std::size_t row = 0; row < rows; row++) result[row] |= drawn[view * rows + row];
 }
 
 }  // namespace
@@ -76,6 +86,8 @@ void bind_views(nb::module_& module) {
   const auto strict = [](const char* name) { return nb::arg(name).noconvert(); };
   module.def("update_views", &update_views, nb::arg("views"), strict("changed"), nb::arg("scene"), strict("background"),
              "Rasterizer.update of several views; returns the FAULT_* bits of all.");
+  module.def("freeze_views", &freeze_views, nb::arg("views"), strict("active"),
+             "Rasterizer.freeze of several views, in all tiles, to the same rows.");
   module.def("drawn_in_views", &drawn_in_views, nb::arg("views"), strict("out"),
              "The rows that Rasterizer.drawn_in_cache names in any of several views.");
 }

@@ -14,6 +14,7 @@ using ConstFloatArray = nanobind::ndarray<const float, nanobind::c_contig, nanob
 using ByteArray = nanobind::ndarray<const uint8_t, nanobind::c_contig, nanobind::device::cpu>;
 using ByteOutArray = nanobind::ndarray<uint8_t, nanobind::c_contig, nanobind::device::cpu>;
 using IndexArray = nanobind::ndarray<const uint32_t, nanobind::c_contig, nanobind::device::cpu>;
+using RowOutArray = nanobind::ndarray<int64_t, nanobind::c_contig, nanobind::device::cpu>;
 using IndexOutArray = nanobind::ndarray<uint32_t, nanobind::c_contig, nanobind::device::cpu>;
 
 void bind_rasterizer(nanobind::module_& module);

@@ -19,8 +19,8 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.encode import Encoder, Listeners, encoder_for, open_recording
 from gsstream.engine.fit.densify import DensifyStatistics
 from gsstream.engine.frame0 import refine
-from gsstream.engine.frame0.refine import carried
 from gsstream.engine.frame0.axes import nearest_axes
+from gsstream.engine.frame0.refine import carried
 from gsstream.engine.keys import keyframes
 from gsstream.engine.method.held import LeftOutWarning
 from gsstream.engine.run.measure import HeldOut

@@ -14,6 +14,7 @@ from packet_scenes import make_key, replaced, same_bits
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.packet import decode_key, encode_key, first_layer, quantise_key
 from gsstream.packet.base import PACKET_HEADER, build_packet, parse_packet
+from gsstream.packet.tables import coded_tables
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -161,3 +162,16 @@ def test_the_checksum_is_that_of_the_sections_that_a_picture_needs():
     assert packet.data[33 + size] == 2
     assert zlib.crc32(packet.data[33 : 33 + size]) == checksum
     assert PACKET_HEADER.size == 16
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_the_tables_of_both_layers_are_counted(share):
+    """The measured coder: tables of a section take no more than the section, and as many symbols as without layers."""
+    state, _, packet = make_layers(number=200, share=share)
+    header, sections = parse_packet(packet.data)
+    tables = coded_tables(sections, header.kind, state.layout)
+    sizes = {name: sum(table.size for table in tables if table.name == name) for name in packet.sizes}
+    for name in set(packet.sizes) - {"header", "layers", "meta"}:
+        # Heads and lengths of parts are in no table.
+        assert packet.sizes[name] - 40 <= sizes[name] <= packet.sizes[name], name
+    assert all(table.entropy_bits <= 8 * table.size for table in tables)

@@ -14,7 +14,7 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.encode import encoder_for, open_recording
 from gsstream.engine.fit.exposure import Exposure
-from gsstream.engine.frame0.removal import removal_errors, worth_keeping
+from gsstream.engine.frame0.removal import not_missed, removal_errors, worth_keeping
 from gsstream.packet import decode_packet
 from gsstream.render.base import Renderer
 from gsstream.render.reference import ReferenceRenderer
@@ -104,3 +104,26 @@ def test_a_run_has_fewer_gaussians_that_show_nearly_the_same(renderer: Renderer)
         float((images(renderer, scene.map(torch.from_numpy)) - truth).square().mean()) for scene in (every, fewer)
     ]
     assert errors[1] < 1.3 * errors[0]
+
+
+def test_of_equal_gaussians_none_is_missed_and_yet_not_all_go(renderer: Renderer) -> None:
+    """Ten of each, which together are as opaque: each alone may go, all together may not."""
+    scene = fitted(**{"first_frame.prune_error": 0}).map(torch.from_numpy)
+    left = (1 - scene.opacities.double().sigmoid().clamp(max=0.99)) ** 0.1
+    thin = replace(scene, opacities=((1 - left) / left).log().float())
+    many = thin.rows(torch.arange(len(scene)).repeat_interleave(10))
+    truth = torch.from_numpy(np.stack(list(frames()[0].images)))
+
+    def error(rows: torch.Tensor) -> float:
+        return float((images(renderer, many.rows(rows)) - truth).square().mean())
+
+    def drawn() -> torch.Generator:
+        return Rng(0).stream("a", 0)
+
+    whole = error(torch.arange(len(many)))
+    errors, _ = removal_errors(renderer, many, frames()[0], None, BLACK, drawn())
+    least = float(errors.max()) / whole / 2
+    assert error(worth_keeping(errors, least * whole)) > 1.5 * whole, "otherwise this says nothing"
+    kept = not_missed(renderer, many, frames()[0], None, BLACK, drawn(), least)
+    assert error(kept) <= 1.25 * whole * (1 + 1e-4)
+    assert torch.equal(kept, kept.sort().values)

@@ -29,7 +29,7 @@ def nearest_axes(gaussians: Gaussians[torch.Tensor]) -> Gaussians[torch.Tensor]:
     # [N, 24]: first component of the product of each quaternion with each of the rotations.
     first = quats @ (_TURNS * torch.tensor([1.0, -1.0, -1.0, -1.0])).T
     turn = first.abs().argmax(1)
-    turned = _products(quats, _TURNS[turn])
+    turned = quat_products(quats, _TURNS[turn])
     turned = turned * turned[:, :1].sign()
     scales = gaussians.scales.gather(1, _PLACES[turn])
     return replace(gaussians, quats=turned.to(gaussians.quats.dtype), scales=scales)
@@ -48,8 +48,12 @@ def _turns() -> torch.Tensor:
     return torch.tensor([*units, *halves, *edges], dtype=torch.float64)
 
 
-def _products(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Hamilton product of quaternions [n, 4], wxyz."""
+def quat_products(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Return the Hamilton products [n, 4] of quaternions, wxyz.
+
+    Arguments:
+        a: [n, 4] the turns that come second. b: [n, 4] those that come first.
+    """
     w, v, x, u = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
     return torch.cat([w * x - (v * u).sum(1, keepdim=True), w * u + x * v + torch.linalg.cross(v, u)], 1)
 

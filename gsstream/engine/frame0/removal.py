@@ -20,7 +20,7 @@ from gsstream.engine.frame0.probes import probes
 from gsstream.render.base import Renderer
 
 #: Probes of a camera. A Gaussian that one camera sees is underestimated tenfold by a quarter of single probes, and by
-#: four together in one case of two hundred.
+#: four together in one case of sixty.
 PROBES = 4
 #: Opacity logits above this one count as this one, 0.999: where an opacity is 1 in float32 the images have no slope.
 MOST_LOGIT = 7.0

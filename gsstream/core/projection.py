@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.shapes import FloatArray
-
-BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
+from gsstream.core.shapes import BoolArray, FloatArray
 
 
 def project(points: FloatArray, cameras: Cameras, index: int) -> tuple[FloatArray, FloatArray]:

@@ -11,8 +11,8 @@ import torch.nn.functional as F
 from gsstream.core.cameras import Cameras
 from gsstream.core.context import FrameWork
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.projection import BoolArray, inside, project
-from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.core.projection import inside, project
+from gsstream.core.shapes import BoolArray, FloatArray, IntArray
 from gsstream.growth.fitting import joined
 
 #: Least noise of a pixel: recordings of 8 bits may repeat a still pixel exactly.

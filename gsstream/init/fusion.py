@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.projection import BoolArray, inside, project, unproject
-from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.core.projection import inside, project, unproject
+from gsstream.core.shapes import BoolArray, FloatArray, IntArray
 from gsstream.init.geometry import pixel_centres
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.projection import BoolArray, inside, project
-from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.core.projection import inside, project
+from gsstream.core.shapes import BoolArray, FloatArray, IntArray
 
 
 def visible_views(points: FloatArray, cameras: Cameras) -> BoolArray:

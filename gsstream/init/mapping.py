@@ -12,8 +12,7 @@ import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
-from gsstream.core.projection import BoolArray
-from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.core.shapes import BoolArray, FloatArray, IntArray
 from gsstream.init.sfm import run_pycolmap, write_images, write_rig
 
 #: Number of focal lengths among the parameters of a lens model; the principal point follows, then the distortion.

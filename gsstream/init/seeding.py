@@ -12,8 +12,8 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
 from gsstream.core.frame import PointCloud
-from gsstream.core.projection import BoolArray, inside, project, unproject
-from gsstream.core.shapes import FloatArray, check_finite, check_shape
+from gsstream.core.projection import inside, project, unproject
+from gsstream.core.shapes import BoolArray, FloatArray, check_finite, check_shape
 from gsstream.init.fusion import agreement, color_gains, interpolate_depths, world_points
 from gsstream.init.geometry import depth_range, visible_views
 from gsstream.init.sweep import SweepSettings, sweep_depths

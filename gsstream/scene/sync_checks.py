@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.projection import BoolArray, inside, project
-from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.core.projection import inside, project
+from gsstream.core.shapes import BoolArray, FloatArray, IntArray
 from gsstream.init.geometry import depth_range, focus_point
 from gsstream.metrics.noise import noise_sigma
 from gsstream.scene.findings import Finding, error

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from gsstream.core.shapes import FloatArray
+from gsstream.core.shapes import BoolArray, FloatArray
 
-BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 _FAR = np.float32(1e9)
 _EPSILON = np.float32(1e-4)
 _rng = np.random.default_rng(7)  # a private generator: fixed wave directions [3, 16], wave numbers from 0.4 to 5

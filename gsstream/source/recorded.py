@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -12,14 +11,12 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError, SourceError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.names import check_camera_ids
-from gsstream.core.shapes import FloatArray
+from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.source.base import PointKind, SourceInfo, Split, check_index
 from gsstream.source.clips import PREPARE, Clip
 from gsstream.source.distortion import Lens, Undistorter, pinhole_intrinsics
 from gsstream.source.multiview import scaled_size
 from gsstream.source.sync import align
-
-BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 
 
 @dataclass(frozen=True, slots=True)

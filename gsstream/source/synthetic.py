@@ -13,10 +13,10 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError, suggest
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.rng import Rng
-from gsstream.core.shapes import FloatArray
+from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.source.base import PointKind, SourceInfo, Split, check_index
 from gsstream.source.multiview import scaled_size
-from gsstream.source.primitives import BoolArray, Hits, Placed, cast, lit
+from gsstream.source.primitives import Hits, Placed, cast, lit
 from gsstream.source.toyroom import LIGHT, arc_cameras
 from gsstream.source.toyscenes import SceneName, ToyScene
 

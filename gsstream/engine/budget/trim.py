@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 
 from gsstream.core.changes import Delta, Layout, Residual
-from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.core.shapes import BoolArray, FloatArray, IntArray
 from gsstream.packet import EncodedPacket
 
-BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 #: Most packets that are encoded in search of one that fits, and the share of the limit that counts as close enough.
 TRIES, GOOD_ENOUGH = 8, 0.95
 #: Steps of the search for a price per bit; bits that an open gate takes besides its rows.

@@ -16,6 +16,11 @@ def pull_back(roots: Sequence[torch.Tensor], gradients: Sequence[torch.Tensor]) 
     _Known.apply(tuple(gradients), *roots).backward()  # type: ignore[no-untyped-call]
 
 
+def gradient_of(leaf: torch.Tensor) -> torch.Tensor:
+    """Return the gradient of a leaf; zeros where nothing reached it."""
+    return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+
+
 class _Known(torch.autograd.Function):
     """A number whose derivative by each root is the gradient given for it."""
 

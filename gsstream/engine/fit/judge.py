@@ -12,7 +12,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.guard import plain
-from gsstream.engine.fit.backward import pull_back
+from gsstream.engine.fit.backward import gradient_of, pull_back
 from gsstream.engine.fit.exposure import Exposure
 from gsstream.loss.base import Loss
 from gsstream.render.base import TILE, Comparison, Pulled, Renderer, RenderSession
@@ -58,7 +58,7 @@ class Judge:
         if counted is not None:
             touched = counted if touched is None else counted & touched
         loss, _ = self.backward(view, output.image, touched, tiles)
-        return Pulled(loss, leaves.map(_gradient))
+        return Pulled(loss, leaves.map(gradient_of))
 
     def structure(
         self, session: RenderSession, view: int, rows: Gaussians[torch.Tensor], tiles: torch.Tensor | None = None
@@ -74,7 +74,7 @@ class Judge:
         recorded = self.recorded(view, output.image.detach())
         # The gradient of a pixel by a colour is the share that its Gaussian has of the pixel's light.
         pull_back([output.image], [weighed_structure(recorded, torch.from_numpy(self._images[view]))])
-        shares = _gradient(colour)[:, 0].numpy() / SH0
+        shares = gradient_of(colour)[:, 0].numpy() / SH0
         return np.asarray(shares)
 
     def comparison(self, view: int, tiles: torch.Tensor | None = None) -> Comparison:
@@ -138,8 +138,3 @@ def shown(
     with torch.no_grad():
         image = renderer.render(gaussians, cameras, view, background).image
     return exposure.apply(view, image) if exposure else image
-
-
-def _gradient(value: torch.Tensor) -> torch.Tensor:
-    """Gradient of a leaf; zeros where nothing reached it."""
-    return torch.zeros_like(value) if value.grad is None else value.grad

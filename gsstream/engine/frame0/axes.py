@@ -27,7 +27,7 @@ def nearest_axes(gaussians: Gaussians[torch.Tensor]) -> Gaussians[torch.Tensor]:
     quats = gaussians.quats.double()
     quats = quats / quats.norm(dim=1, keepdim=True)
     # [N, 24]: first component of the product of each quaternion with each of the rotations.
-    first = quats @ (_TURNS * torch.tensor([1.0, -1.0, -1.0, -1.0])).T
+    first = quats @ conjugates(_TURNS).T
     turn = first.abs().argmax(1)
     turned = quat_products(quats, _TURNS[turn])
     turned = turned * turned[:, :1].sign()
@@ -56,6 +56,11 @@ def quat_products(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """
     w, v, x, u = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
     return torch.cat([w * x - (v * u).sum(1, keepdim=True), w * u + x * v + torch.linalg.cross(v, u)], 1)
+
+
+def conjugates(quats: torch.Tensor) -> torch.Tensor:
+    """Return the conjugates [n, 4] of quaternions [n, 4], wxyz: of unit ones the turns back."""
+    return quats * torch.tensor([1.0, -1.0, -1.0, -1.0])
 
 
 _TURNS = _turns()

@@ -19,7 +19,7 @@ from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.exposure import Exposure
 from gsstream.engine.frame0.axes import nearest_axes
-from gsstream.engine.frame0.probes import probes
+from gsstream.engine.frame0.probes import TrainingViews, probes
 from gsstream.engine.frame0.rounding import codes_nearby, codes_towards_zero
 from gsstream.packet.grids import KEY_BITS, color_codes, color_slopes, from_codes
 
@@ -70,8 +70,8 @@ def felt_codes(
     """
     felt: dict[str, FloatArray] = {name: np.zeros(_flat(getattr(gaussians, name)).shape) for name in KEY_BITS}
     error = 0.0
-    drawn = probes(parts.renderer, gaussians, frame, exposure, parts.recipe.background, generator, each=PROBES)
-    for probe in drawn:
+    views = TrainingViews(parts.renderer, frame, exposure, parts.recipe.background)
+    for probe in probes(views, gaussians, generator, each=PROBES):
         error += probe.error
         for name, bits in KEY_BITS.items():
             slopes = _flat(getattr(probe.slopes, name))

@@ -10,6 +10,7 @@ from gsstream.core.rng import Rng
 from gsstream.core.shapes import BoolArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.exposure import Exposure
+from gsstream.engine.frame0.probes import TrainingViews
 from gsstream.engine.frame0.removal import removal_errors
 
 
@@ -29,7 +30,8 @@ def first_rows(
     if share == 1 or len(gaussians) == 0:
         return None
     generator = rng.stream("first layer", frame.index)
-    errors, _ = removal_errors(parts.renderer, gaussians, frame, exposure, parts.recipe.background, generator)
+    views = TrainingViews(parts.renderer, frame, exposure, parts.recipe.background)
+    errors, _ = removal_errors(views, gaussians, generator)
     return most_missed(errors, share)
 
 

@@ -27,6 +27,7 @@ from gsstream.engine.fit.judge import Judge
 from gsstream.engine.fit.nearest import neighbour_distance
 from gsstream.engine.fit.row_table import RowTable
 from gsstream.engine.frame0.how_many import most_gaussians
+from gsstream.engine.frame0.probes import TrainingViews
 from gsstream.engine.frame0.removal import not_missed
 from gsstream.recipe.model import FirstFrame
 from gsstream.render.activations import logit, rgb_to_sh0
@@ -209,10 +210,8 @@ class FirstFrameRun:
         """Drop what the images would not miss; what remains has time to close the gaps."""
         gaussians = self.gaussians().map(torch.Tensor.detach)
         exposure = self.exposure.exposure if self.exposure else self.judge.exposure
-        rows = not_missed(
-            self.renderer, gaussians, self.frame, exposure, self.recipe.background, self.generator,
-            self.settings.prune_error,
-        )  # fmt: skip
+        views = TrainingViews(self.renderer, self.frame, exposure, self.recipe.background)
+        rows = not_missed(views, gaussians, self.generator, self.settings.prune_error)
         self.table.keep(rows)
         self.levels, self.came_from = self.levels[rows], self.came_from[rows]
         self.statistics = DensifyStatistics.zeros(len(rows))

@@ -7,15 +7,37 @@ diagonal of the Gauss-Newton matrix (Hutchinson's estimate) without one pass for
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
-from gsstream.engine.fit.backward import pull_back
+from gsstream.engine.fit.backward import gradient_of, pull_back
 from gsstream.engine.fit.exposure import Exposure
 from gsstream.render.base import Renderer
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingViews:
+    """What the training cameras recorded of a frame, and how they would record a scene.
+
+    Arguments:
+        renderer: of the run.
+        frame: training images.
+        exposure: colour maps of the cameras, or None.
+        background: colour behind the scene.
+    """
+
+    renderer: Renderer
+    frame: Frame
+    exposure: Exposure | None
+    background: tuple[float, float, float]
+
+    def error(self, view: int, image: torch.Tensor) -> float:
+        """Return the mean squared error of what a camera would record [H, W, 3]."""
+        return float((image - torch.from_numpy(self.frame.images[view])).square().mean())
 
 
 class Probe(NamedTuple):
@@ -30,31 +52,23 @@ class Probe(NamedTuple):
 
 
 def probes(
-    renderer: Renderer, gaussians: Gaussians[torch.Tensor], frame: Frame, exposure: Exposure | None,
-    background: tuple[float, float, float], generator: torch.Generator, *, each: int,
-) -> Iterator[Probe]:  # fmt: skip
+    views: TrainingViews, gaussians: Gaussians[torch.Tensor], generator: torch.Generator, *, each: int
+) -> Iterator[Probe]:
     """Yield ``each`` probes of every camera.
 
     Arguments:
-        renderer: of the run.
+        views: of the training cameras.
         gaussians: N rows, raw values, without gradients.
-        frame: training images.
-        exposure: colour maps of the cameras, or None.
-        background: colour behind the scene.
         generator: of the signs.
         each: probes of a camera, at least 1; the relative deviation of a sum of their squares falls with its root.
     """
-    session = renderer.open(gaussians, None, frame.cameras, background)
-    for view in range(len(frame.cameras)):
+    cameras, exposure = views.frame.cameras, views.exposure
+    session = views.renderer.open(gaussians, None, cameras, views.background)
+    for view in range(len(cameras)):
         for _ in range(each):
             leaves = gaussians.map(lambda value: value.detach().clone().requires_grad_())
             image = session.render(view, leaves).image
-            seen = image.detach() if exposure is None else exposure.apply(view, image.detach())
-            error = float((seen - torch.from_numpy(frame.images[view])).square().mean())
             signs = torch.randint(0, 2, image.shape, generator=generator).to(image.dtype) * 2 - 1
             pull_back([image], [signs if exposure is None else exposure.pull(view, signs)])
-            yield Probe(leaves.map(_slope), error)
-
-
-def _slope(leaf: torch.Tensor) -> torch.Tensor:
-    return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+            seen = image.detach() if exposure is None else exposure.apply(view, image.detach())
+            yield Probe(leaves.map(gradient_of), views.error(view, seen))

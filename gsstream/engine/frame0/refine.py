@@ -23,7 +23,7 @@ from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.densify import DensifyStatistics
 from gsstream.engine.fit.exposure import Exposure
-from gsstream.engine.frame0.axes import quat_products
+from gsstream.engine.frame0.axes import conjugates, quat_products
 from gsstream.engine.frame0.optimise import FirstFrameRun
 from gsstream.engine.state.refinement import Refinement
 from gsstream.engine.state.stream_state import Step, StreamState
@@ -153,7 +153,7 @@ def carried(refinement: Refinement, before: PlayerState, after: PlayerState) -> 
     means, quats = g.means.clone(), g.quats.clone()
     offset = (turn @ (g.means[rows] - was[0][old])[..., None])[..., 0]
     means[rows] = new[0][there] + offset
-    quats[rows] = quat_products(quat_products(new[1][there], _conjugate(was[1][old])), g.quats[rows])
+    quats[rows] = quat_products(quat_products(new[1][there], conjugates(was[1][old])), g.quats[rows])
     return replace(refinement, gaussians=replace(g, means=means, quats=quats), ancestors=now)
 
 
@@ -173,7 +173,3 @@ def _rows_now(before: PlayerState, after: PlayerState) -> torch.Tensor:
     old = torch.from_numpy(source) < count
     out[torch.from_numpy(source)[old]] = old.nonzero()[:, 0]
     return out
-
-
-def _conjugate(q: torch.Tensor) -> torch.Tensor:
-    return q * torch.tensor([1.0, -1.0, -1.0, -1.0])

@@ -13,11 +13,9 @@ from dataclasses import replace
 
 import torch
 
-from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
-from gsstream.engine.fit.exposure import Exposure
-from gsstream.engine.frame0.probes import probes
-from gsstream.render.base import Renderer
+from gsstream.engine.fit.judge import shown
+from gsstream.engine.frame0.probes import TrainingViews, probes
 
 #: Probes of a camera. A Gaussian that one camera sees is underestimated tenfold by a quarter of single probes, and by
 #: four together in one case of sixty.
@@ -31,17 +29,13 @@ TRIES = 8
 
 
 def removal_errors(
-    renderer: Renderer, gaussians: Gaussians[torch.Tensor], frame: Frame, exposure: Exposure | None,
-    background: tuple[float, float, float], generator: torch.Generator,
-) -> tuple[torch.Tensor, float]:  # fmt: skip
+    views: TrainingViews, gaussians: Gaussians[torch.Tensor], generator: torch.Generator
+) -> tuple[torch.Tensor, float]:
     """Return what the absence of each Gaussian alone changes, and how far the images are off with all of them.
 
     Arguments:
-        renderer: of the run.
+        views: of the training cameras.
         gaussians: N rows, raw values, without gradients.
-        frame: training images.
-        exposure: colour maps of the cameras, or None.
-        background: colour behind the scene.
         generator: of random signs, by which the first number is estimated.
 
     Returns [N] float64, the squared change of all channels of all pixels together, and the mean squared error of a
@@ -50,12 +44,12 @@ def removal_errors(
     rows = replace(gaussians, opacities=gaussians.opacities.clamp(max=MOST_LOGIT))
     squares = torch.zeros(len(rows), dtype=torch.float64)
     error = 0.0
-    for probe in probes(renderer, rows, frame, exposure, background, generator, each=PROBES):
+    for probe in probes(views, rows, generator, each=PROBES):
         squares += probe.slopes.opacities.double().square()
         error += probe.error
     # By the opacity o instead of its logit, times o, which is how far it falls: o / (o (1 - o)).
     left = 1 - rows.opacities.double().sigmoid()
-    return squares / PROBES / left**2, error / (PROBES * len(frame.cameras))
+    return squares / PROBES / left**2, error / (PROBES * len(views.frame.cameras))
 
 
 def worth_keeping(errors: torch.Tensor, least: float) -> torch.Tensor:
@@ -72,42 +66,33 @@ def worth_keeping(errors: torch.Tensor, least: float) -> torch.Tensor:
 
 
 def not_missed(
-    renderer: Renderer, gaussians: Gaussians[torch.Tensor], frame: Frame, exposure: Exposure | None,
-    background: tuple[float, float, float], generator: torch.Generator, least: float,
-) -> torch.Tensor:  # fmt: skip
+    views: TrainingViews, gaussians: Gaussians[torch.Tensor], generator: torch.Generator, least: float
+) -> torch.Tensor:
     """Return the rows [K] int64, in order, that remain when those go that the training images would not miss.
 
     What one may do without, all together may not: of ten equal Gaussians none is missed. So where the images are off by
     ``GROWTH`` times as much without all of them, only those go that are missed less.
 
     Arguments:
-        renderer: of the run.
+        views: of the training cameras.
         gaussians: N rows, raw values, without gradients.
-        frame: training images.
-        exposure: colour maps of the cameras, or None.
-        background: colour behind the scene.
         generator: of random signs.
         least: what a Gaussian's absence must add to stay, in mean squared errors of a channel of a pixel.
     """
-    errors, error = removal_errors(renderer, gaussians, frame, exposure, background, generator)
+    errors, error = removal_errors(views, gaussians, generator)
     for _ in range(TRIES):
         rows = worth_keeping(errors, least * error)
         if len(rows) == len(errors):
             return rows
-        if _mean_error(renderer, gaussians.rows(rows), frame, exposure, background) <= GROWTH * error:
+        if _mean_error(views, gaussians.rows(rows)) <= GROWTH * error:
             return rows
         least /= 4
     return torch.arange(len(errors))
 
 
-def _mean_error(
-    renderer: Renderer, gaussians: Gaussians[torch.Tensor], frame: Frame, exposure: Exposure | None,
-    background: tuple[float, float, float],
-) -> float:  # fmt: skip
-    error = 0.0
-    for view in range(len(frame.cameras)):
-        with torch.no_grad():
-            image = renderer.render(gaussians, frame.cameras, view, background).image
-        seen = image if exposure is None else exposure.apply(view, image)
-        error += float((seen - torch.from_numpy(frame.images[view])).square().mean())
-    return error / len(frame.cameras)
+def _mean_error(views: TrainingViews, gaussians: Gaussians[torch.Tensor]) -> float:
+    cameras, error = views.frame.cameras, 0.0
+    for view in range(len(cameras)):
+        seen = shown(views.renderer, gaussians, cameras, view, views.background, views.exposure)
+        error += views.error(view, seen)
+    return error / len(cameras)

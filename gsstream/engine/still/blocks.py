@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from gsstream.core.median import median
-from gsstream.core.shapes import FloatArray
+from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.metrics.noise import MAD_TO_SIGMA, median_deviation
 
-BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 #: Differences are averaged over BLOCK x BLOCK pixels first: noise of neighbouring pixels is mostly independent and
 #: averages out (rendered noise is heavy-tailed, so a threshold on single pixels finds it everywhere), motion does not.
 BLOCK = 4

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsstream.core.shapes import FloatArray, IntArray
-from gsstream.engine.still.blocks import BLOCK, BoolArray, changed_blocks
+from gsstream.core.shapes import BoolArray, FloatArray, IntArray
+from gsstream.engine.still.blocks import BLOCK, changed_blocks
 from gsstream.metrics.noise import noise_sigma
 
 #: Most pictures that a mean weighs: later ones replace older ones, so that a slow change of the light is followed.

@@ -9,9 +9,9 @@ import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame
-from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.core.shapes import BoolArray, FloatArray, IntArray
 from gsstream.core.storage import unpacked
-from gsstream.engine.still.blocks import BLOCK, BoolArray, changed_blocks
+from gsstream.engine.still.blocks import BLOCK, changed_blocks
 from gsstream.render.base import TILE
 
 #: Blocks of a 16 x 16 tile (of 16) that must exceed the threshold.

@@ -97,6 +97,7 @@ from gsstream.render.base import Renderer as Renderer
 from gsstream.render.base import RenderOutput as RenderOutput
 from gsstream.render.base import RenderSession as RenderSession
 from gsstream.render.base import ScatterSession as ScatterSession
+from gsstream.render.base import WholePull as WholePull
 from gsstream.render.base import check_tiles as check_tiles
 from gsstream.render.base import drawn_rows as drawn_rows
 from gsstream.residual.base import AttributeCode as AttributeCode

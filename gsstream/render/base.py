@@ -22,6 +22,7 @@ from gsstream.render.output import Comparison as Comparison
 from gsstream.render.output import Pulled as Pulled
 from gsstream.render.output import RenderCache as RenderCache
 from gsstream.render.output import RenderOutput as RenderOutput
+from gsstream.render.output import WholePull as WholePull
 from gsstream.render.session import RenderSession as RenderSession
 
 

@@ -80,3 +80,19 @@ class Pulled(NamedTuple):
 
     loss: float
     gradients: Gaussians[torch.Tensor]
+
+
+class WholePull(NamedTuple):
+    """Loss of a view, and its gradient by all that frame 0 fits; whoever gets it may change it.
+
+    Arguments:
+        loss: of the view.
+        gradients: by the N rows of the scene.
+        means2d: [N, 2] by the 2-D means, pixels; None where nobody asked for it.
+        colours: [12] by the camera's colour map, its matrix [3, 3] row by row and its offset [3]; None without a map.
+    """
+
+    loss: float
+    gradients: Gaussians[torch.Tensor]
+    means2d: torch.Tensor | None
+    colours: torch.Tensor | None

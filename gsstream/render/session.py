@@ -10,7 +10,7 @@ from gsstream.core.changes.motion import Moves
 from gsstream.core.context import MovedPull, RowGradient, ScreenGradient
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
-from gsstream.render.output import Comparison, Pulled, RenderCache, RenderOutput
+from gsstream.render.output import Comparison, Pulled, RenderCache, RenderOutput, WholePull
 
 
 class RenderSession(ABC):
@@ -118,6 +118,23 @@ class RenderSession(ABC):
         Arguments:
             view: index of a camera of the rig.
             rows: the A active rows, raw parameters; no graph is looked at.
+            comparison: what the render is compared with.
+
+        Raises:
+            ShapeError: rows that cannot be rendered, or a loss that is not finite.
+        """
+        return None
+
+    def pull_whole(self, view: int, rows: Gaussians[torch.Tensor], comparison: Comparison) -> WholePull | None:
+        """Render a scene of which every row moves, compare it and differentiate, in one call: an iteration of frame 0.
+
+        None where there is no such short cut, as in a narrowed session; whoever gets None makes the calls that it
+        stands for: ``render`` with a probe, the loss's ``evaluate`` and the backward pass, whose results it gives up
+        to rounding.
+
+        Arguments:
+            view: index of a camera of the rig.
+            rows: all N rows, raw parameters; no graph is looked at.
             comparison: what the render is compared with.
 
         Raises:

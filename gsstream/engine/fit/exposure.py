@@ -55,18 +55,16 @@ class ExposureFit:
         zeros = torch.zeros(num_cameras, 12)
         return ExposureFit(Exposure.identity(num_cameras), zeros, zeros, (0,) * num_cameras)
 
-    def step(self, view: int, image: torch.Tensor, gradient: torch.Tensor, lr: float, pull: float) -> ExposureFit:
+    def step(self, view: int, slope: torch.Tensor, lr: float, pull: float) -> ExposureFit:
         """Make one Adam step of camera ``view``.
 
         Arguments:
             view: index of a training camera.
-            image, gradient: [H, W, 3] uncorrected render, and the loss gradient with respect to the corrected one.
+            slope: [12] gradient of the loss by the camera's colour map (:func:`colour_slope`).
             lr: learning rate of the matrix entries; offsets use 0.4 of it.
             pull: weight of the quadratic pull towards identity.
         """
         matrix, offset = self.exposure.matrix[view], self.exposure.offset[view]
-        pixels, upstream = image.reshape(-1, 3), gradient.reshape(-1, 3)
-        slope = torch.cat([(upstream.T @ pixels).flatten(), upstream.sum(0)])
         slope = slope + pull * torch.cat([(matrix - torch.eye(3)).flatten(), offset])
         count = self.steps[view] + 1
         first = 0.9 * self.first[view] + 0.1 * slope
@@ -84,6 +82,17 @@ class ExposureFit:
         matrix, offset = self.exposure.matrix, self.exposure.offset
         centered = Exposure(matrix - matrix.mean(0) + torch.eye(3), offset - offset.mean(0))
         return replace(self, exposure=centered)
+
+
+def colour_slope(image: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
+    """Return [12]: the gradient of the loss by a colour map, its matrix row by row and its offset.
+
+    Arguments:
+        image: [H, W, 3] scene colours.
+        gradient: [H, W, 3] of the loss by the recorded colours.
+    """
+    pixels, upstream = image.reshape(-1, 3), gradient.reshape(-1, 3)
+    return torch.cat([(upstream.T @ pixels).flatten(), upstream.sum(0)])
 
 
 def _put(values: torch.Tensor, row: int, value: torch.Tensor) -> torch.Tensor:

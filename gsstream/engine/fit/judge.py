@@ -13,9 +13,9 @@ from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.guard import plain
 from gsstream.engine.fit.backward import gradient_of, pull_back
-from gsstream.engine.fit.exposure import Exposure
+from gsstream.engine.fit.exposure import Exposure, colour_slope
 from gsstream.loss.base import Loss
-from gsstream.render.base import TILE, Comparison, Pulled, Renderer, RenderSession
+from gsstream.render.base import TILE, Comparison, Pulled, Renderer, RenderSession, WholePull
 from gsstream.render.structure import weighed_structure
 
 
@@ -59,6 +59,28 @@ class Judge:
             touched = counted if touched is None else counted & touched
         loss, _ = self.backward(view, output.image, touched, tiles)
         return Pulled(loss, leaves.map(gradient_of))
+
+    def pull_whole(
+        self, session: RenderSession, view: int, rows: Gaussians[torch.Tensor], probed: bool = True
+    ) -> WholePull:
+        """Render a view of a scene of which every row moves, judge it, and pull the loss back to all that frame 0 fits.
+
+        Arguments:
+            session: renders the scene; not narrowed.
+            view: index of a training camera.
+            rows: all N rows; a graph of theirs is left alone.
+            probed: whether the gradient by the 2-D means is needed, too.
+        """
+        if self.in_one_go:
+            pulled = session.pull_whole(view, rows, self.comparison(view))
+            if pulled is not None:
+                return pulled
+        leaves = rows.map(lambda value: value.detach().requires_grad_())
+        probe = torch.zeros(len(rows), 2, requires_grad=True) if probed else None
+        image = session.render(view, leaves, probe=probe).image
+        loss, gradient = self.backward(view, image)
+        colours = colour_slope(image.detach(), gradient) if self.exposure else None
+        return WholePull(loss, leaves.map(gradient_of), None if probe is None else gradient_of(probe), colours)
 
     def structure(
         self, session: RenderSession, view: int, rows: Gaussians[torch.Tensor], tiles: torch.Tensor | None = None

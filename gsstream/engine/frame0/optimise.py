@@ -19,7 +19,7 @@ from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.topology import TopologyEdit
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.assembly.checks import VARIABLE, Look
+from gsstream.engine.assembly.checks import VARIABLE, Checks, Look
 from gsstream.engine.fit import schedule
 from gsstream.engine.fit.densify import DensifyStatistics, grow_and_prune
 from gsstream.engine.fit.exposure import Exposure, ExposureFit
@@ -31,6 +31,7 @@ from gsstream.engine.frame0.probes import TrainingViews
 from gsstream.engine.frame0.removal import not_missed
 from gsstream.recipe.model import FirstFrame
 from gsstream.render.activations import logit, rgb_to_sh0
+from gsstream.render.base import WholePull
 from gsstream.structure.base import Anchors
 
 CENTER_EVERY = 50
@@ -136,7 +137,8 @@ class FirstFrameRun:
         self.extent = frame.cameras.extent
         self.iterations, self.generator = iterations, generator
         self.table = RowTable(dict(start.items()), first_rates(self.settings, self.extent), parts.optimiser)
-        self.judge = Judge(parts.loss, parts.recipe.loss.dssim, frame.images, None)
+        in_one_go = parts.checks is not Checks.STEP
+        self.judge = Judge(parts.loss, parts.recipe.loss.dssim, frame.images, None, in_one_go)
         #: Colour maps that are fitted along; None: those of the judge stay.
         self.exposure: ExposureFit | None = None
         self.statistics = DensifyStatistics.zeros(len(start))
@@ -153,51 +155,48 @@ class FirstFrameRun:
         view, self.parts.where.iteration = self._next_view(), iteration
         last = schedule.DENSIFY_UNTIL * self.iterations
         densify = s.densify_from <= iteration + s.densify_every and iteration <= last
-        rows = self._disturbed(self.gaussians())
-        probe = torch.zeros(len(rows), 2, requires_grad=True) if densify else None
-        session = self.renderer.open(rows, None, self.frame.cameras, self.recipe.background)
-        value = self._backward(view, session.render(view, rows, probe=probe).image)
+        rows = self._disturbed(self.gaussians().map(torch.Tensor.detach))
+        pulled = self._pull(view, rows, densify)
         fraction = iteration / self.iterations
         self.table.set_lr("means", self.extent * _log_linear(s.lr_means, s.lr_means_final, fraction))
-        self.table.step()
-        if probe is not None and probe.grad is not None:
+        self.table.step(self._penalised(pulled.gradients))
+        if densify and pulled.means2d is not None:
             size = torch.tensor([self.frame.cameras.width / 2, self.frame.cameras.height / 2])
-            self.statistics = self.statistics.add(probe.grad * size)
+            self.statistics = self.statistics.add(pulled.means2d * size)
             if iteration >= s.densify_from and iteration % s.densify_every == 0:
                 self._densify()
         if s.prune_error > 0 and iteration in [int(share * self.iterations) for share in schedule.PRUNE_AT]:
             self._prune()
-        self.smooth = value if math.isnan(self.smooth) else 0.98 * self.smooth + 0.02 * value
+        self.smooth = pulled.loss if math.isnan(self.smooth) else 0.98 * self.smooth + 0.02 * pulled.loss
         return self.smooth
 
     def _disturbed(self, rows: Gaussians[torch.Tensor]) -> Gaussians[torch.Tensor]:
-        """The scene with noise on its centres, through which gradients pass; as it is where none is wanted."""
+        """The scene with noise on its centres, which a gradient does not see; as it is without noise."""
         if self.settings.noise == 0:
             return rows
         noise = torch.randn(rows.means.shape, generator=self.generator) * (self.settings.noise * self.extent)
         return replace(rows, means=rows.means + noise)
 
-    def _backward(self, view: int, image: torch.Tensor) -> float:
-        """Loss, its gradient into the leaves, and the exposure step."""
+    def _pull(self, view: int, rows: Gaussians[torch.Tensor], probed: bool) -> WholePull:
+        """Loss of a view and its gradients, and the exposure step."""
         if self.exposure:
             self.judge.exposure = self.exposure.exposure
-        value, gradient = self.judge.backward(view, image)
-        self._penalise()
-        if self.exposure:
-            self.exposure = self.exposure.step(view, image.detach(), gradient, lr=0.005, pull=1e-3)
+        session = self.renderer.open(rows, None, self.frame.cameras, self.recipe.background)
+        pulled = self.judge.pull_whole(session, view, rows, probed)
+        if self.exposure and pulled.colours is not None:
+            self.exposure = self.exposure.step(view, pulled.colours, lr=0.005, pull=1e-3)
             if sum(self.exposure.steps) % CENTER_EVERY == 0:
                 self.exposure = self.exposure.centered()
-        return value
+        return pulled
 
-    def _penalise(self) -> None:
-        """Gradients of the mean opacity and the mean scale, added by hand: they need no graph."""
+    def _penalised(self, gradients: Gaussians[torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Gradients with those of the mean opacity and the mean scale, which need no graph."""
         count = max(1, len(self.levels))
-        opacities, scales = self.table["opacities"], self.table["scales"]
-        if opacities.grad is not None:
-            p = opacities.detach().sigmoid()
-            opacities.grad.add_(p * (1 - p), alpha=schedule.OPACITY_PENALTY / count)
-        if scales.grad is not None:
-            scales.grad.add_(scales.detach().exp(), alpha=schedule.SCALE_PENALTY / (3 * count * self.extent))
+        p = self.table["opacities"].detach().sigmoid()
+        gradients.opacities.add_(p * (1 - p), alpha=schedule.OPACITY_PENALTY / count)
+        sizes = self.table["scales"].detach().exp()
+        gradients.scales.add_(sizes, alpha=schedule.SCALE_PENALTY / (3 * count * self.extent))
+        return dict(gradients.items())
 
     def _densify(self) -> None:
         gaussians = self.gaussians().map(torch.Tensor.detach)

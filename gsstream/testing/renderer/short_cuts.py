@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from gsstream.core.changes.motion import Moves, transformed
+from gsstream.engine.fit.exposure import Exposure
 from gsstream.engine.fit.judge import Judge
 from gsstream.loss.base import Loss
 from gsstream.motion.curvature import curvature_of
@@ -103,3 +104,35 @@ def _check_moved(part: Renderer, view: int, loss: Loss, name: str) -> None:
     scale = float(curvature.abs().max()) or 1.0
     got = torch.from_numpy(found.curvature) / scale
     equal(f"loss {name!r}, camera {view}: curvature of motions", got, curvature / scale, NEAR, WHY)
+
+
+@check("renderer")
+def check_renderer_whole(part: Renderer) -> None:
+    """Where sessions have ``pull_whole``, it gives what render, loss and backward pass give of a whole scene."""
+    for name, loss in _losses():
+        _check_whole(part, loss, name)
+
+
+def _check_whole(part: Renderer, loss: Loss, name: str) -> None:
+    case = world("cloud")
+    rows, view = case.gaussians, 1
+    g = torch.Generator().manual_seed(6)
+    exposure = Exposure(torch.eye(3) + 0.1 * torch.randn(2, 3, 3, generator=g), 0.1 * torch.randn(2, 3, generator=g))
+    images = IMAGE[None].expand(view + 1, -1, -1, -1).numpy()
+    judge = Judge(loss, 1.0, images, exposure)
+    session = part.open(rows, None, case.cameras, (0.2, 0.5, 0.9))
+    found = session.pull_whole(view, rows, judge.comparison(view))
+    if found is None:
+        return
+    expected = judge.pull_whole(session, view, rows)
+    equal(f"loss {name!r}, whole scene: loss", torch.tensor(found.loss), torch.tensor(expected.loss), 1e-4, WHY)
+    got_all, want_all = (
+        {**dict(pull.gradients.items()), "2-D means": pull.means2d, "colour map": pull.colours}
+        for pull in (found, expected)
+    )
+    for what, want in want_all.items():
+        got = got_all[what]
+        assert got is not None, f"loss {name!r}, whole scene: expected a gradient of {what}, got None"
+        if want is not None and want.numel():
+            scale = float(want.abs().max()) or 1.0
+            equal(f"loss {name!r}, whole scene: gradient of {what}", got / scale, want / scale, 1e-5, WHY)

@@ -9,9 +9,12 @@ import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.context import ScreenGradient
-from gsstream.render.base import Comparison, Pulled, RenderOutput, RenderSession, ScatterSession
+from gsstream.engine.fit.exposure import Exposure
+from gsstream.engine.fit.judge import Judge
+from gsstream.render.base import Comparison, Pulled, RenderOutput, RenderSession, ScatterSession, WholePull
 from gsstream.render.reference import ReferenceRenderer
 from gsstream.testing.renderer.example import ExampleRenderer
+from gsstream.testing.renderer.short_cuts import IMAGE
 from saboteurs.register import spoils
 
 # The reference is final; only a saboteur may inherit from it, and only behind the type checker's back.
@@ -130,4 +133,26 @@ class Hasty(Reference):
 
     def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
         session: RenderSession = _HurriesOpacities(self, gaussians, active, cameras, background)
+        return session
+
+
+class _SlidesMeans(Session):
+    def pull_whole(self, view: int, rows: Any, comparison: Comparison) -> WholePull:
+        loss: Any = comparison.loss
+        assert comparison.matrix is not None
+        assert comparison.offset is not None
+        exposure = Exposure(comparison.matrix.expand(2, 3, 3), comparison.offset.expand(2, 3))
+        images = IMAGE.expand(view + 1, -1, -1, -1).numpy()
+        plain: Any = Reference().open(rows, None, self._cameras, self._background)
+        found = Judge(loss, comparison.dssim, images, exposure).pull_whole(plain, view, rows)
+        assert found.means2d is not None
+        return found._replace(means2d=2 * found.means2d)
+
+
+@spoils("check_renderer_whole")
+class Sliding(Reference):
+    """Has a short cut for whole scenes, in which 2-D means count twice."""
+
+    def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
+        session: RenderSession = _SlidesMeans(self, gaussians, active, cameras, background)
         return session

@@ -96,13 +96,13 @@ class NativeRasterizer:
         return self._native
 
     def comparison(
-        self, cached_image: Float32, target: PhotometricTarget, dssim_weight: float,
+        self, cached_image: Float32 | None, target: PhotometricTarget, dssim_weight: float,
         colours: Sequence[Float32 | None], weights: Float32 | None,
     ) -> Any:  # fmt: skip
-        """What renders of the active rows are compared with, as the one handle that the kernels take.
+        """What renders are compared with, as the one handle that the kernels take.
 
         Arguments:
-            cached_image: [H, W, 3] the cached render.
+            cached_image: [H, W, 3] the cached render; None where every Gaussian moves.
             target: what the picture is compared with. dssim_weight: w in [0, 1].
             colours: [3, 3] and [3], the map from colours of the scene to those of the target; or twice None.
             weights: [ceil(H / 16), ceil(W / 16)] factors on the gradients of tiles, 0: left out; None: all count once.
@@ -110,12 +110,14 @@ class NativeRasterizer:
         Raises:
             InputError: arrays of another shape.
         """
-        images = [require_float32("cached_image", cached_image, (self.height, self.width, 3)), target.image,
-                  *target.partial]  # fmt: skip
+        if cached_image is not None:
+            require_float32("cached_image", cached_image, (self.height, self.width, 3))
         scale = 1.0 / target.image.size
         scales = (1.0 - dssim_weight) * scale, -dssim_weight * scale
         try:
-            return _native.Comparison(self._view.background, *images, *colours, *scales, weights)
+            return _native.Comparison(
+                self._view.background, cached_image, target.image, *target.partial, *colours, *scales, weights
+            )
         except ValueError as error:
             refuse_value(str(error))
 
@@ -145,17 +147,42 @@ class NativeRasterizer:
         self._expect("forward_active")
         rows = require_splats(rows, self._native.active_count)
         comparison = self.comparison(cached_image, target, dssim_weight, colours, weights)
-        scale = 1.0 / target.image.size
         try:
             result = self._native.pull_active(native_scene(rows), comparison, *out)
         except ValueError as error:
             refuse_value(str(error))
-        faults, l1, dssim = result
-        raise_on_faults(faults, rows)
         self._coefficients = rows.shN.shape[1] + 1
-        if not np.isfinite(l1 + dssim):
-            refuse("image: expected colours of ordinary size, got some so large that the loss is not finite")
-        return weighted(l1, dssim, dssim_weight, scale)
+        return _loss_of(result, rows, target, dssim_weight)
+
+    def pull_whole(
+        self, splats: SplatArrays, target: PhotometricTarget, dssim_weight: float,
+        colours: Sequence[Float32 | None], out: Sequence[Float32], map_slope: Float32 | None,
+    ) -> float:  # fmt: skip
+        """Render all Gaussians, judge the picture and write the gradient by all of them: an iteration of frame 0.
+
+        It stands for `forward`, `photometric_loss` and `backward`, one after the other; whole images are neither made
+        nor copied. No backward may follow. The bits do not depend on earlier calls or on the number of threads.
+
+        Arguments:
+            splats: raw parameters of N Gaussians.
+            target, dssim_weight, colours: as for ``comparison``.
+            out: arrays like those of ``splats``, and [N, 2] for the 2-D means in pixels; the gradient is written here.
+            map_slope: [12] for the gradient by the matrix and the offset of ``colours``; None: not wanted.
+
+        Returns:
+            The loss.
+
+        Raises:
+            InputError: as forward; a loss that is not finite.
+        """
+        splats = require_splats(splats)
+        comparison = self.comparison(None, target, dssim_weight, colours, None)
+        camera = self._view[:-1]  # the background is the comparison's
+        try:
+            result = _native.pull_whole(self._native, native_scene(splats), *camera, comparison, *out, map_slope)
+        except ValueError as error:
+            refuse_value(str(error))
+        return _loss_of(result, splats, target, dssim_weight)
 
     # ---- checks
 
@@ -196,3 +223,14 @@ class NativeRasterizer:
         for name, value, shape in zip(out._fields, out, gradient_shapes(rows, self._coefficients), strict=True):
             require_float32(f"out.{name}", value, shape, writable=True)
         return out
+
+
+def _loss_of(
+    result: tuple[int, float, float], splats: SplatArrays, target: PhotometricTarget, dssim_weight: float
+) -> float:
+    """The loss of fault bits and sums as a kernel gives them; raises InputError for faults."""
+    faults, l1, dssim = result
+    raise_on_faults(faults, splats)
+    if not np.isfinite(l1 + dssim):
+        refuse("image: expected colours of ordinary size, got some so large that the loss is not finite")
+    return weighted(l1, dssim, dssim_weight, 1.0 / target.image.size)

@@ -23,6 +23,7 @@ from gsstream.api import (
     RenderSession,
     RowGradient,
     ScreenGradient,
+    WholePull,
     check_tiles,
 )
 from gsstream_cpu_render import _native
@@ -34,6 +35,7 @@ from gsstream_cpu_render.loss_part import CpuLoss
 from gsstream_cpu_render.moved import moved_slope
 from gsstream_cpu_render.pool import Lease, Passes, lease
 from gsstream_cpu_render.view import Background
+from gsstream_cpu_render.whole import whole_pull
 
 
 @final
@@ -132,6 +134,14 @@ class CpuSession(RenderSession):
         cached = self._view(view)  # its owner while the native call runs
         cached.freeze(ids, None)
         return cached.pull(rows, comparison)
+
+    def pull_whole(
+        self, view: int, rows: Gaussians[torch.Tensor], comparison: Comparison
+    ) -> WholePull | None:
+        wide = self._ids is None and comparison.tiles is None and type(comparison.loss) is CpuLoss
+        if not wide or not hasattr(_native, "pull_whole"):
+            return None
+        return whole_pull(self._lease(view), rows, comparison)
 
     def pull_moved(
         self, view: int, rows: Gaussians[NDArray[Any]], moves: Moves, comparison: Comparison, curved: bool = False

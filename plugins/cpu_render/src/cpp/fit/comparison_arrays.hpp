@@ -9,12 +9,13 @@ namespace gsstream_cpu {
 
 class ComparisonArrays {
  public:
-  ComparisonArrays(ConstFloatArray background, ConstFloatArray cached_image, ConstFloatArray target,
+  ComparisonArrays(ConstFloatArray background, std::optional<ConstFloatArray> cached_image, ConstFloatArray target,
                    ConstFloatArray mean, ConstFloatArray variance, ByteOutArray known,
                    std::optional<ConstFloatArray> matrix,
                    std::optional<ConstFloatArray> offset, double l1_scale, double ssim_scale,
                    std::optional<ConstFloatArray> weights)
-      : images_{cached_image, target, mean, variance},
+      : cached_(cached_image),
+        images_{target, mean, variance},
         known_(known),
         background_(background),
         matrix_(matrix),
@@ -28,21 +29,29 @@ class ComparisonArrays {
     if (offset_) require_shape(*offset_, {3}, "offset");
   }
 
-  // For a rasteriser of images of this size. Valid as long as this object.
+  // For a rasteriser of images of this size, of which some Gaussians stand still. Valid as long as this object.
   ViewComparison view(int width, int height) const {
+    require(cached_.has_value(), "a comparison of active rows needs the cached image");
+    return whole_view(width, height);
+  }
+
+  // The same where every Gaussian moves.
+  ViewComparison whole_view(int width, int height) const {
     const std::size_t w = static_cast<std::size_t>(width), h = static_cast<std::size_t>(height);
     const auto cells = [](std::size_t pixels) { return (pixels + MASK_TILE - 1) / MASK_TILE; };
     for (const ConstFloatArray& image : images_) require_shape(image, {h, w, 3}, "image");
+    if (cached_) require_shape(*cached_, {h, w, 3}, "image");
     require_shape(known_, {cells(h), static_cast<std::size_t>(strips_of(static_cast<int>(cells(w))))}, "known");
     if (weights_) require_shape(*weights_, {cells(h), cells(w)}, "tile_weights");
     const float* b = background_.data();
-    return {images_[0].data(), images_[1].data(), images_[2].data(), images_[3].data(), known_.data(),
+    return {cached_ ? cached_->data() : nullptr, images_[0].data(), images_[1].data(), images_[2].data(), known_.data(),
             matrix_ ? matrix_->data() : nullptr, offset_ ? offset_->data() : nullptr, {b[0], b[1], b[2]},
             l1_scale_, ssim_scale_, weights_ ? weights_->data() : nullptr};
   }
 
  private:
-  ConstFloatArray images_[4];
+  std::optional<ConstFloatArray> cached_;
+  ConstFloatArray images_[3];
   ByteOutArray known_;
   ConstFloatArray background_;
   std::optional<ConstFloatArray> matrix_, offset_, weights_;

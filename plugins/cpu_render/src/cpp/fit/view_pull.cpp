@@ -4,6 +4,7 @@
 #include <cstring>
 #include <vector>
 
+#include "fit/colour_map.hpp"
 #include "fit/structure.hpp"
 #include "runtime/buffer.hpp"
 #include "runtime/parallel.hpp"
@@ -88,27 +89,6 @@ void fill_around(const Grid& grid, const TileSelection& rendered, const std::vec
   });
 }
 
-// Three channels of a pixel, and nothing in the fourth place.
-typedef float Colour __attribute__((vector_size(16)));
-
-void store_colour(float* out, Colour colour) { std::memcpy(out, &colour, 3 * sizeof(float)); }
-
-// out = matrix in + offset, pixel by pixel.
-void apply_colours(const float* matrix, const float* offset, const float* in, float* out, std::size_t pixels) {
-  const Colour red{matrix[0], matrix[3], matrix[6], 0}, green{matrix[1], matrix[4], matrix[7], 0},
-      blue{matrix[2], matrix[5], matrix[8], 0}, added{offset[0], offset[1], offset[2], 0};
-  for (std::size_t i = 0; i < 3 * pixels; i += 3)
-    store_colour(out + i, added + (red * in[i] + green * in[i + 1] + blue * in[i + 2]));
-}
-
-// gradient = gradient matrix, pixel by pixel.
-void pull_colours(const float* matrix, float* gradient, std::size_t pixels) {
-  const Colour red{matrix[0], matrix[1], matrix[2], 0}, green{matrix[3], matrix[4], matrix[5], 0},
-      blue{matrix[6], matrix[7], matrix[8], 0};
-  for (std::size_t i = 0; i < 3 * pixels; i += 3)
-    store_colour(gradient + i, red * gradient[i] + green * gradient[i + 1] + blue * gradient[i + 2]);
-}
-
 // Tiles that are not left out; null where all count.
 const uint8_t* counted(const float* weights, std::size_t tiles, std::vector<uint8_t>& mask) {
   if (!weights) return nullptr;
@@ -146,6 +126,22 @@ void pull_structure(Rasterizer& rasterizer, const Grid& grid, const ViewComparis
 
 }  // namespace
 
+PhotometricJob photometric_job(int width, int height, const ViewComparison& view, const float* recorded) {
+  PhotometricJob job{};
+  job.height = height;
+  job.width = width;
+  job.tile_rows = (height + kTile - 1) / kTile;
+  job.tile_columns = (width + kTile - 1) / kTile;
+  job.image = recorded;
+  job.target = view.target;
+  job.target_mean = view.mean;
+  job.target_variance = view.variance;
+  job.known = view.known;
+  job.l1_scale = view.l1_scale;
+  job.ssim_scale = view.ssim_scale;
+  return job;
+}
+
 ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparison& view, const GradientArrays& out,
                    float* structure) {
   Workspace& work = workspace();
@@ -171,21 +167,10 @@ ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparis
     });
     recorded = mapped;
   }
-  PhotometricJob job{};
-  job.height = grid.height;
-  job.width = grid.width;
-  job.tile_rows = grid.rows;
-  job.tile_columns = grid.columns;
-  job.image = recorded;
-  job.target = view.target;
-  job.target_mean = view.mean;
-  job.target_variance = view.variance;
-  job.known = view.known;
+  PhotometricJob job = photometric_job(grid.width, grid.height, view, recorded);
   job.active = work.around.data();
   job.wanted = work.touched.data();
   job.gradient = work.gradient.require(3 * pixels);
-  job.l1_scale = view.l1_scale;
-  job.ssim_scale = view.ssim_scale;
   result.sums = photometric_run(job);
   if (view.matrix)
     for_marked(grid, work.touched, [&](std::size_t first, std::size_t count) {

@@ -11,7 +11,7 @@
 namespace gsstream_cpu {
 
 struct ViewComparison {
-  const float* cached_image;               // [H, W, 3] render of the cached scene
+  const float* cached_image;               // [H, W, 3] render of the cached scene; null where nothing stands still
   const float *target, *mean, *variance;   // [H, W, 3] each; the last two as photometric_target makes them,
   uint8_t* known;                          // in these strips of tiles; the others are filled in on the way
   const float *matrix, *offset;            // colour map [3, 3], [3] of the camera; or both null
@@ -25,6 +25,9 @@ struct ViewPull {
   uint32_t faults;       // Fault bits; if any is set, nothing else is written
   PhotometricSums sums;  // over the touched tiles that count and those beside them
 };
+
+// What the photometric kernels need to compare these recorded colours [H, W, 3]; tiles and gradient are to be added.
+PhotometricJob photometric_job(int width, int height, const ViewComparison& view, const float* recorded);
 
 // `rows` are the active rows of `rasterizer`, which must be frozen. `out` has one row per active row. `structure` [A, 3]:
 // sums over pixels of each row's share of the light, times the structure of the picture there; null: not wanted.

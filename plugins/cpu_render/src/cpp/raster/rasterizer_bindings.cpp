@@ -13,6 +13,7 @@
 #include "fit/comparison_arrays.hpp"
 #include "fit/view_pull.hpp"
 #include "runtime/bindings.hpp"
+#include "raster/gradient_arrays.hpp"
 #include "raster/rasterizer.hpp"
 #include "raster/scene_arrays.hpp"
 #include "raster/view_arrays.hpp"
@@ -126,7 +127,8 @@ class PyRasterizer {
     const ViewComparison view = comparison.view(rasterizer_.width(), rasterizer_.height());
     current_ = rows;
     means2d_.require(2 * rows.scene.count);
-    GradientArrays out = gradients_of(rows.scene.count, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN);
+    GradientArrays out = gradient_arrays(rows.scene.count, rows.scene.sh_degree, v_means, v_quats, v_scales, v_opacities,
+                                         v_sh0, v_shN);
     out.means2d = means2d_.data();
     const nb::gil_scoped_release release;
     const ViewPull pulled = pull_view(rasterizer_, rows.scene, view, out);
@@ -169,22 +171,10 @@ class PyRasterizer {
   GradientArrays gradients(std::size_t n, const FloatArray& means, const FloatArray& quats, const FloatArray& scales,
                            const FloatArray& opacities, const FloatArray& sh0, const FloatArray& shN,
                            const FloatArray& means2d) const {
-    GradientArrays out = gradients_of(n, means, quats, scales, opacities, sh0, shN);
+    GradientArrays out = gradient_arrays(n, current_.scene.sh_degree, means, quats, scales, opacities, sh0, shN);
     require_shape(means2d, {n, 2}, "v_means2d");
     out.means2d = means2d.data();
     return out;
-  }
-
-  GradientArrays gradients_of(std::size_t n, const FloatArray& means, const FloatArray& quats, const FloatArray& scales,
-                              const FloatArray& opacities, const FloatArray& sh0, const FloatArray& shN) const {
-    const std::size_t degree = static_cast<std::size_t>(current_.scene.sh_degree), bases = (degree + 1) * (degree + 1);
-    require_shape(means, {n, 3}, "v_means");
-    require_shape(quats, {n, 4}, "v_quats");
-    require_shape(scales, {n, 3}, "v_scales");
-    require_shape(opacities, {n}, "v_opacities");
-    require_shape(sh0, {n, 1, 3}, "v_sh0");
-    require_shape(shN, {n, bases - 1, 3}, "v_shN");
-    return {means.data(), quats.data(), scales.data(), opacities.data(), sh0.data(), shN.data(), nullptr};
   }
 
   const float* upstream(const ConstFloatArray& v_image, const std::optional<ConstFloatArray>& v_alpha) const {
@@ -221,10 +211,10 @@ void bind_rasterizer(nb::module_& module) {
                     ConstFloatArray>(),
            strict("means"), strict("quats"), strict("scales"), strict("opacities"), strict("sh0"), strict("shN"));
   nb::class_<ComparisonArrays>(module, "Comparison", "What a render of one view is compared with; not copied.")
-      .def(nb::init<ConstFloatArray, ConstFloatArray, ConstFloatArray, ConstFloatArray, ConstFloatArray,
+      .def(nb::init<ConstFloatArray, std::optional<ConstFloatArray>, ConstFloatArray, ConstFloatArray, ConstFloatArray,
                     ByteOutArray, std::optional<ConstFloatArray>, std::optional<ConstFloatArray>, double, double,
                     std::optional<ConstFloatArray>>(),
-           strict("background"), strict("cached_image"), strict("target"), strict("mean"), strict("variance"),
+           strict("background"), strict("cached_image").none(), strict("target"), strict("mean"), strict("variance"),
            strict("known"), strict("matrix").none(), strict("offset").none(), nb::arg("l1_scale"), nb::arg("ssim_scale"),
            strict("tile_weights").none());
   nb::class_<PyRasterizer>(module, "Rasterizer",

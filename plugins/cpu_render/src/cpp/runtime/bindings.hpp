@@ -22,6 +22,7 @@ void bind_photometric(nanobind::module_& module);
 void bind_adam(nanobind::module_& module);
 void bind_residual(nanobind::module_& module);
 void bind_moved(nanobind::module_& module);
+void bind_whole(nanobind::module_& module);
 void bind_views(nanobind::module_& module);
 void bind_threads(nanobind::module_& module);
 

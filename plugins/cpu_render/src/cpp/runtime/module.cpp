@@ -30,6 +30,7 @@ NB_MODULE(_native, module) {
   gsstream_cpu::bind_adam(module);
   gsstream_cpu::bind_residual(module);
   gsstream_cpu::bind_moved(module);
+  gsstream_cpu::bind_whole(module);
   gsstream_cpu::bind_views(module);
   gsstream_cpu::bind_threads(module);
 }

@@ -51,6 +51,12 @@ class Probe(NamedTuple):
     error: float
 
 
+def _taken(leaf: torch.Tensor) -> torch.Tensor:
+    """The gradient of a leaf, which has none afterwards."""
+    gradient, leaf.grad = gradient_of(leaf), None
+    return gradient
+
+
 def probes(
     views: TrainingViews, gaussians: Gaussians[torch.Tensor], generator: torch.Generator, *, each: int
 ) -> Iterator[Probe]:
@@ -65,10 +71,11 @@ def probes(
     cameras, exposure = views.frame.cameras, views.exposure
     session = views.renderer.open(gaussians, None, cameras, views.background)
     for view in range(len(cameras)):
-        for _ in range(each):
-            leaves = gaussians.map(lambda value: value.detach().clone().requires_grad_())
-            image = session.render(view, leaves).image
+        leaves = gaussians.map(lambda value: value.detach().clone().requires_grad_())
+        image = session.render(view, leaves).image
+        seen = image.detach() if exposure is None else exposure.apply(view, image.detach())
+        error = views.error(view, seen)
+        for number in range(each):
             signs = torch.randint(0, 2, image.shape, generator=generator).to(image.dtype) * 2 - 1
-            pull_back([image], [signs if exposure is None else exposure.pull(view, signs)])
-            seen = image.detach() if exposure is None else exposure.apply(view, image.detach())
-            yield Probe(leaves.map(gradient_of), views.error(view, seen))
+            pull_back([image], [signs if exposure is None else exposure.pull(view, signs)], again=number < each - 1)
+            yield Probe(leaves.map(_taken), error)

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 
-def pull_back(roots: Sequence[torch.Tensor], gradients: Sequence[torch.Tensor], again: bool = False) -> None:
+def pull_back(roots: Sequence[torch.Tensor], gradients: Sequence[torch.Tensor], *, again: bool = False) -> None:
     """Add to every leaf what ``gradients``, one like each root, make of it: ``torch.autograd.backward``, bit for bit.
 
     That function imports a library of symbols when it is handed gradients: 0.6 s and 36 MB of every process.

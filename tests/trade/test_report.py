@@ -114,6 +114,15 @@ def test_groups_have_means_spreads_and_noise(tmp_path):
     assert list(data.failed) == ["a bad seed 0"]
 
 
+def test_axes_that_end_alike_have_labels_of_their_own(tmp_path):
+    cells = [
+        ("a", "v", {"stream.epochs": 4, "gate.lr": 1}, 0, 30.0, 20.0, 1.0),
+        ("a", "v", {"motion.params.epochs": 4}, 0, 31.0, 20.0, 1.0),
+    ]
+    data = read_sweep_data(make_table(tmp_path / "t", cells))
+    assert [group.label for group in data.groups] == ["v stream.epochs=4 lr=1", "v motion.params.epochs=4"]
+
+
 def test_what_a_knob_buys(tmp_path):
     data = read_sweep_data(make_table(tmp_path / "t", CELLS))
     found = {e.knob: e for e in effects(data.of("a"), ["psnr", "psnr_moving", "kb", "seconds"])}

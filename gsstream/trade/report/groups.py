@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import math
 import statistics
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,17 +29,25 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """All finished seeds of a point."""
+    """All finished seeds of a point.
+
+    Arguments:
+        scene, variant, axes: of the point.
+        runs: one for each seed.
+        words: key of an axis -> the word for it in labels; for others the last word of the key.
+    """
 
     scene: str
     variant: str
     axes: Mapping[str, Any]
     runs: tuple[Run, ...]
+    words: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
-        """``edge`` or ``edge epochs=3``: the last word of each key."""
-        return " ".join([self.variant, *(f"{key.rpartition('.')[2]}={_short(v)}" for key, v in self.axes.items())])
+        """``edge`` or ``edge epochs=3``."""
+        named = (f"{self.words.get(key, _last_word(key))}={_short(value)}" for key, value in self.axes.items())
+        return " ".join([self.variant, *named])
 
     def mean(self, key: str) -> float:
         """Return the mean over seeds; nan when a seed did not measure it."""
@@ -85,13 +93,14 @@ def read_sweep_data(folder: Path) -> SweepData:
     table = read_table(folder)
     if table.plan is None:
         raise InputError(f"{folder}: the table holds no plan; expected the folder of 'gsstream sweep'")
+    words = _words({key for point in table.plan["points"] for key in point["axes"]})
     found: dict[str, list[tuple[Mapping[str, Any], Run]]] = {}
     failed, missing = {}, []
     for point in table.plan["points"]:
         row = table.cells.get(point["cell"])
         key = json.dumps([point["scene"], point["variant"], point["axes"]])
         if row is None or row["status"] != "done":
-            label = f"{Group(point['scene'], point['variant'], point['axes'], ()).label} seed {point['seed']}"
+            label = f"{Group(point['scene'], point['variant'], point['axes'], (), words).label} seed {point['seed']}"
             if row is None:
                 missing.append(f"{point['scene']} {label}")
             else:
@@ -104,7 +113,7 @@ def read_sweep_data(folder: Path) -> SweepData:
     if not found:
         raise InputError(f"{folder}: no cell has finished yet ({len(failed)} failed); nothing to report")
     groups = tuple(
-        Group(items[0][0]["scene"], items[0][0]["variant"], items[0][0]["axes"], tuple(run for _, run in items))
+        Group(items[0][0]["scene"], items[0][0]["variant"], items[0][0]["axes"], tuple(run for _, run in items), words)
         for items in found.values()
     )
     return SweepData(table.plan["config"], groups, failed, tuple(missing), table)
@@ -156,6 +165,17 @@ def is_tie(first: Group, second: Group, key: str, noise: float) -> bool | None:
         return None
     error = noise * math.sqrt(1 / len(first.runs) + 1 / len(second.runs))
     return abs(first.mean(key) - second.mean(key)) <= 2 * error
+
+
+def _words(keys: Iterable[str]) -> dict[str, str]:
+    """Words for axes in labels: the last word of a key; the whole key where two axes end alike."""
+    known = sorted(keys)
+    last = [_last_word(key) for key in known]
+    return {key: word if last.count(word) == 1 else key for key, word in zip(known, last, strict=True)}
+
+
+def _last_word(key: str) -> str:
+    return key.rpartition(".")[2]
 
 
 def _short(value: Any) -> str:

@@ -171,7 +171,7 @@ class FirstFrameRun:
         return self.smooth
 
     def _disturbed(self, rows: Gaussians[torch.Tensor]) -> Gaussians[torch.Tensor]:
-        """The scene with noise on its centres, which a gradient does not see; as it is without noise."""
+        """The scene with noise on its centres, through which gradients pass unchanged; as it is without noise."""
         if self.settings.noise == 0:
             return rows
         noise = torch.randn(rows.means.shape, generator=self.generator) * (self.settings.noise * self.extent)

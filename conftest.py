@@ -26,7 +26,7 @@ ROOT = Path(__file__).parent
 #: Files that take longest, longest first. They are begun first: a long file that is begun last keeps one core busy
 #: while the others wait. A name that is missing here costs only time.
 LONG = (
-    "flow/test_closed_loop", "flow/test_repeat_and_resume", "flow/test_segments", "flow/test_key_refresh",
+    "flow/test_closed_loop", "flow/test_repeat_and_resume", "flow/test_key_refresh",
     "trade/test_sweep_ray", "contract/test_new_plugin", "contract/test_tutorial", "plugins/test_six_rings",
     "flow/test_paper_configs", "web/test_page", "engine/test_trials", "flow/test_budget", "contract/test_saboteurs",
     "contract/test_shipped_plugins", "flow/test_no_overshoot", "web/test_live_page", "flow/test_odd_runs",

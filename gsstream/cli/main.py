@@ -29,7 +29,6 @@ from gsstream.cli import (
     run,
     scaffold,
     scene,
-    segments,
     serve,
     streams,
     sweep,
@@ -90,7 +89,6 @@ app.command(name="manifest")(deliver.manifest)
 app.command(name="view")(deliver.view)
 app.command(name="package")(package.package)
 app.command(name="serve")(serve.serve)
-app.command(name="run-segments")(segments.run_segments)
 app.command(name="sweep")(sweep.sweep)
 app.command(name="tune")(tune.tune)
 app.command(name="report")(report.report)

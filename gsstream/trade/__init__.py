@@ -1,6 +1,5 @@
 """What a run costs and what it gives, measured and shown: one room for each question.
 
 ``measure`` reads what runs wrote, ``show`` draws it, ``jobs`` runs work on this machine or a cluster, ``sweep`` runs
-many recipes on many scenes, ``report`` sets a sweep out, ``segments`` encodes a long recording in pieces, and ``bench``
-times renderers and frame steps.
+many recipes on many scenes, ``report`` sets a sweep out, and ``bench`` times renderers and frame steps.
 """

@@ -35,7 +35,6 @@ CHEAP = [
 ]
 
 RUN = ["run", "--source", "demo", "--out", "OUT"]
-SEGMENTS = ["run-segments", *RUN[1:], "--segments", "2"]
 
 OPTIONS = {
     "gsstream": ["--debug", "--version"],
@@ -56,11 +55,6 @@ OPTIONS = {
     "gsstream view": ["STREAM", "--port", "--host"],
     "gsstream package": ["STREAM", "--out", "--rendition", "--join-every"],
     "gsstream serve": ["STREAM", "--live", "--host", "--port", "--token", "--viewers", "--origin"],
-    "gsstream run-segments": [
-        "--source", "--out", "--segments", "--method", "--recipe", "--set", "--frames", "--scale", "--start",
-        "--key-epochs", "--first-frame", "--workers", "--threads", "--ray", "--resume", "--overwrite", "--no-video",
-        "--no-pictures", "--quiet",
-    ],
     "gsstream sweep": [
         "CONFIG", "--out", "--scenes", "--data", "--workers", "--threads", "--ray", "--split", "--dry-run", "--quiet",
     ],
@@ -155,8 +149,6 @@ def run(capsys: pytest.CaptureFixture[str], *args: str) -> tuple[int, str, str]:
         ([*RUN, "--method", "dens"], "no method named 'dens'; did you mean 'dense'?"),
         ([*RUN, "--set", "lss.dssim=1"], "--set lss.dssim=1: unknown key 'lss'; did you mean 'loss'?"),
         ([*RUN, "--frames", "0"], "--frames frames=0: frames: input should be greater than or equal to 1, got 0"),
-        ([*SEGMENTS, "--frames", "0"], "--frames frames=0: frames: input should be greater than or equal to 1, got 0"),
-        ([*SEGMENTS, "--scale", "0"], "--scale scale=0.0: scale: input should be greater than 0, got 0.0"),
         ([*RUN, "--recipe", "absent.yaml"], "cannot read the recipe absent.yaml: "),
         ([*RUN, "--budget", "siz=20KB"], "--budget siz=20KB: unknown key 'siz'; did you mean 'size'?"),
         (

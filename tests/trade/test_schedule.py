@@ -1,4 +1,4 @@
-"""The one loop of sweeps and segments: nothing starts too early, too often or not at all, whoever dies or fails."""
+"""The one loop of sweeps: nothing starts too early, too often or not at all, whoever dies or fails."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 #: Libraries with thread pools of their own read these when they are imported.
 _THREAD_VARIABLES = ("GSSTREAM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-#: What a worker does: a job (data with an ``id``) in, its outcome out. Sweeps and segments have jobs of their own.
+#: What a worker does: a job (data with an ``id``) in, its outcome out.
 Work = Callable[[Any], Any]
 
 

@@ -150,16 +150,6 @@ class Stream(Section):
         default=0.0, ge=0, le=1,
         description="weight in the loss of the residual's estimated bits per pixel of one view; 0: none",
     )  # fmt: skip
-    remember: bool = Field(
-        default=False,
-        description="each training camera remembers the mean of its still pixels since the last key packet, and frames "
-        "are compared with that instead of the last noisy picture; 7 bytes per pixel and camera",
-    )  # fmt: skip
-    heal: float = Field(
-        default=0.0, ge=0, le=1,
-        description="largest share of the tiles of all views that each frame opens where the scene differs from what "
-        "the cameras remember (remember: true) by more than its noise, the worst first; 0: none",
-    )  # fmt: skip
     refine_frames: int = Field(
         default=0, ge=0,
         description="later frames in each of which a first frame that was made in few iterations goes on being "
@@ -175,15 +165,6 @@ class Stream(Section):
     )
     progressive: bool = Field(default=False, description="activate octree levels from floor(H/2) on (paper)")
     progressive_omega: float = Field(default=1.5, ge=1, description="iterations per level: N_{i+1} = omega N_i")
-
-    @model_validator(mode="after")
-    def _heals_what_it_remembers(self) -> Stream:
-        if self.heal > 0 and not self.remember:
-            raise ValueError(
-                f"expected remember: true with heal: {self.heal:g}, got false; what is to be mended is found in the "
-                "memory of still pixels"
-            )
-        return self
 
     @model_validator(mode="after")
     def _refines_in_frames_and_iterations(self) -> Stream:

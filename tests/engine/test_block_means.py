@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsstream.engine.still.blocks import (
+from gsstream.engine.step.active.blocks import (
     BLOCK,
     LEAST_SIGMA,
     MOST_OF_ROUGHNESS,

@@ -37,7 +37,7 @@ GROWING: Mapping[str, Any] = {
 }  # fmt: skip
 #: Gaussians are born and pruned in the first two of the three frames, so that all that goes on has to go on exactly.
 REFINING: Mapping[str, Any] = {
-    "stream.refine_frames": 3, "stream.refine_iterations": 6, "stream.remember": True,
+    "stream.refine_frames": 3, "stream.refine_iterations": 6,
     "first_frame.densify_from": 5, "first_frame.densify_every": 4,
 }  # fmt: skip
 #: Pictures this small hardly say where a group has gone: what holds it back must be weak.

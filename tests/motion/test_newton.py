@@ -163,7 +163,7 @@ def test_a_body_that_moved_is_found_where_it_went(seed: int) -> None:
     frame = replace(work._frame, images=blank, cameras=cameras)
 
     def seen(images: np.ndarray) -> FrameView:
-        return FrameView(work._parts, cloud.gaussians, work.hierarchy, frame, frame, None, None, None, images)
+        return FrameView(work._parts, cloud.gaussians, work.hierarchy, replace(frame, images=images), frame, None)
 
     images = np.stack([seen(blank).shown(after, view).numpy() for view in range(len(cameras))])
     arm = float(np.linalg.norm(gaussians.means[rows] - centre, axis=1).mean())

@@ -50,8 +50,7 @@ def refined(parts: Assembly, state: StreamState, step: Step, frame: Frame, rng: 
     started = time.perf_counter()
     after = step.state
     before = state.refinement or begun(state.player)
-    seen = frame if after.memory is None else replace(frame, images=after.memory.targets(frame.images))
-    found = advanced(parts, before, state.player, after.player, seen, state.exposure, rng)
+    found = advanced(parts, before, state.player, after.player, frame, state.exposure, rng)
     metrics = {**step.metrics, "refine_iterations": found.iterations - before.iterations}
     metrics["seconds"] = {**metrics["seconds"], "refine": time.perf_counter() - started}
     return replace(step, state=replace(after, refinement=found), metrics=metrics)
@@ -108,7 +107,7 @@ def advanced(
         parts: the live parts of the recipe.
         refinement: after the frame before.
         before: what players had then. after: what they have now.
-        frame: training images, or what takes their place as targets.
+        frame: its training images.
         exposure: colour maps of the cameras, or None.
         rng: random streams by name and frame.
     """

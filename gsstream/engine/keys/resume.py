@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +10,6 @@ import numpy as np
 import torch
 
 from gsstream.core.errors import OutputError, PacketError
-from gsstream.core.frame import Frame
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
@@ -20,12 +18,9 @@ from gsstream.engine.frame0.refine import SHOWN, advanced, begun, is_refining
 from gsstream.engine.state.follow import follow
 from gsstream.engine.state.refinement import Refinement
 from gsstream.engine.state.stream_state import StreamState
-from gsstream.engine.step.heal import remembered
 from gsstream.engine.step.tools import RunTools
-from gsstream.engine.still.memory import StillMemory
 from gsstream.packet import PacketKind, PlayerState, StreamMeta, StreamReader, decode_packet
 from gsstream.packet.base import FILE_HEADER
-from gsstream.recipe.model import Stream
 from gsstream.source.base import SourceInfo
 
 #: Keys that may differ when a run is resumed, by section; besides them, ``frames``.
@@ -121,24 +116,6 @@ def state_after(parts: Assembly, states: Iterable[PlayerState], rng: Rng) -> Str
     return state
 
 
-def memory_after(stream: Stream, state: StreamState, images: Callable[[int], Frame]) -> StillMemory | None:
-    """Return what the cameras remember of still pixels: made again from the pictures since the last key packet.
-
-    Arguments:
-        stream: section ``stream`` of the recipe.
-        state: at the end of the stream.
-        images: frame index -> its training images.
-    """
-    memory: StillMemory | None = None
-    if not stream.remember or state.player.frame == state.key_frame:
-        return memory
-    previous = images(int(state.player.meta.extra.get(SHOWN, state.key_frame)))
-    for index in range(state.key_frame + 1, state.player.frame + 1):
-        frame = images(index)
-        memory = remembered(stream, memory, previous, frame)
-    return memory
-
-
 def refinement_after(parts: Assembly, state: StreamState, tools: RunTools) -> Refinement | None:
     """Return the first frame as far as it was refined: made again from the packets and pictures since its key packet.
 
@@ -152,17 +129,13 @@ def refinement_after(parts: Assembly, state: StreamState, tools: RunTools) -> Re
         return None
     assert tools.images is not None
     found: Refinement | None = None
-    memory: StillMemory | None = None
-    first = before = state.player
+    before = state.player
     for player in tools.since_key():
         if found is None:
-            found, first = begun(player), player
+            found = begun(player)
         else:
             frame = tools.images(player.frame)
-            if stream.remember:
-                memory = remembered(stream, memory, frame if memory else tools.images(first.frame), frame)
-            seen = frame if memory is None else replace(frame, images=memory.targets(frame.images))
-            found = advanced(parts, found, before, player, seen, state.exposure, tools.rng)
+            found = advanced(parts, found, before, player, frame, state.exposure, tools.rng)
         before = player
     return found
 

@@ -12,7 +12,7 @@ from gsstream.engine.frame0.begin import begin
 from gsstream.engine.frame0.refine import follows_packet, refined
 from gsstream.engine.frame0.taken import begin_from
 from gsstream.engine.keys.keyframes import refresh
-from gsstream.engine.keys.resume import memory_after, refinement_after, state_after
+from gsstream.engine.keys.resume import refinement_after, state_after
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.frame_step import frame_step
 from gsstream.engine.step.metrics import cache_metrics
@@ -59,5 +59,4 @@ class PartsMethod(StreamingMethod[StreamState]):
 
     def resume(self, player: PlayerState, shown: Frame, tools: Any) -> StreamState:
         state = replace(state_after(tools.parts, tools.since_key(), tools.rng), previous=shown)
-        state = replace(state, memory=memory_after(tools.parts.recipe.stream, state, tools.images))
         return replace(state, refinement=refinement_after(tools.parts, state, tools))

@@ -12,7 +12,6 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.engine.fit.exposure import Exposure
 from gsstream.engine.state.refinement import Refinement
-from gsstream.engine.still.memory import StillMemory
 from gsstream.method.base import Step as MethodStep
 from gsstream.packet import PlayerState
 from gsstream.render.base import RenderSession
@@ -30,8 +29,6 @@ class StreamState:
         decoders: linear decoders to continue from; equal to the player's once they were sent.
         exposure: colour maps of the training cameras, or None.
         key_frame: frame of the last key packet.
-        memory: what the cameras remember of still pixels since the last key packet; None before the frame after it, or
-            when the recipe asks for none.
         refinement: the first frame as it goes on being optimised beside the stream; None before the frame after it,
             from the key packet on that brings it, and when the recipe asks for none.
         session: what the renderer keeps of this scene from one frame to the next. Nothing but time depends on it: a
@@ -44,7 +41,6 @@ class StreamState:
     decoders: Mapping[str, torch.Tensor] = field(default_factory=dict)
     exposure: Exposure | None = None
     key_frame: int = 0
-    memory: StillMemory | None = None
     refinement: Refinement | None = None
     session: RenderSession | None = field(default=None, compare=False, repr=False)
 

@@ -34,23 +34,21 @@ class FrameView:
         previous: training images that this scene shows.
         change: what changed since; None: everything counts as changed.
         session: a render session of this scene that is kept from before, or None.
-        targets: [V, H, W, 3] what renders are compared with; None: the images of the frame.
-        judge: of the same targets and colour maps, which has made of them what it needs; None: a new one.
+        judge: of the same images and colour maps, which has made of them what it needs; None: a new one.
         votes: counted so far in the frame; None: none.
     """
 
     def __init__(
         self, parts: Assembly, gaussians: Gaussians[torch.Tensor], hierarchy: Hierarchy, frame: Frame, previous: Frame,
         exposure: Exposure | None, change: Change | None = None, session: RenderSession | None = None,
-        targets: FloatArray | None = None, judge: Judge | None = None, votes: VoteBook | None = None,
+        judge: Judge | None = None, votes: VoteBook | None = None,
     ) -> None:  # fmt: skip
         self._parts, self._gaussians, self._hierarchy = parts, gaussians, hierarchy
         self._frame, self._previous, self._change = frame, previous, change
         self._background = parts.recipe.background
-        self._targets = frame.images if targets is None else targets
         # What the level "step" looks at, images and their gradients, is not seen where a session does all in one call.
         in_one_go = parts.checks is not Checks.STEP
-        self.judge = judge or Judge(parts.loss, parts.recipe.loss.dssim, self._targets, exposure, in_one_go)
+        self.judge = judge or Judge(parts.loss, parts.recipe.loss.dssim, frame.images, exposure, in_one_go)
         self._session = session
         self._votes = votes or (None if change is None else VoteBook(change, frame.cameras))
 
@@ -192,5 +190,5 @@ class FrameView:
     def on(self, gaussians: Gaussians[torch.Tensor], session: RenderSession | None = None) -> FrameView:
         return FrameView(
             self._parts, gaussians, self._hierarchy, self._frame, self._previous, self.judge.exposure, self._change,
-            session, self._targets, self.judge, self._votes,
+            session, self.judge, self._votes,
         )  # fmt: skip

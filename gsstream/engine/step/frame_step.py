@@ -8,8 +8,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-import torch
-
 from gsstream.core.changes import Delta
 from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
@@ -20,19 +18,17 @@ from gsstream.engine.budget.trim import Fitted
 from gsstream.engine.state.follow import follow
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.active.candidates import candidates
-from gsstream.engine.step.active.change import Change, detect_change
+from gsstream.engine.step.active.change import detect_change
 from gsstream.engine.step.clock import PhaseClock
 from gsstream.engine.step.encode import encode_frame
 from gsstream.engine.step.growth import grown
 from gsstream.engine.step.harden import harden
-from gsstream.engine.step.heal import mended_rows, raised, remembered
 from gsstream.engine.step.keep import kept_session
 from gsstream.engine.step.metrics import step_metrics
 from gsstream.engine.step.motion import moved
 from gsstream.engine.step.optimise import optimise
 from gsstream.engine.step.problem import Problem
 from gsstream.packet import decode_packet, encode_empty
-from gsstream.recipe.model import Stream
 
 
 class Outcome(NamedTuple):
@@ -63,28 +59,21 @@ def frame_step(
         return still(state, frame, clock)
     with clock.phase("change"):
         change = detect_change(state.previous, frame, stream.change_threshold)
-        memory = remembered(stream, state.memory, state.previous, frame)
-        state = replace(state, memory=memory)
-        targets = frame.images if memory is None else memory.targets(frame.images)
     if change is not None and change.share == 0:
         return still(state, frame, clock)
     with clock.phase("motion"):
-        motions, scene, view = moved(parts, state, frame, change, rng, targets, allowance)
+        motions, scene, view = moved(parts, state, frame, change, rng, allowance)
     with clock.phase("confidence"):
         confidence = parts.propagation.propagate(parts.confidence.estimate(view), state.hierarchy)
         logits = parts.gate.init(confidence)
         open_probability = parts.gate.open_probability(logits)
         able = view.changed_rows(stream.change_votes)
-        if memory is not None and stream.heal:
-            mending = mended_rows(view, memory, stream.heal)
-            able, logits = able | mending, raised(logits, mending, state.hierarchy)
-            open_probability = parts.gate.open_probability(logits)
         rows = candidates(able, open_probability, state.hierarchy, stream.active_threshold)
     with clock.phase("optimise"):
         problem = Problem(
             frame.index, frame.effort, scene.layout, state.hierarchy, rows, view.gaussians.rows(rows), logits,
             state.decoders, view.session_for(rows), view.judge, len(frame.cameras),
-            frame.cameras.width * frame.cameras.height, allowance, _near(change, stream),
+            frame.cameras.width * frame.cameras.height, allowance, None if change is None else change.near,
         )  # fmt: skip
         solution = optimise(parts, problem, rng.stream("frame", frame.index))
         residual = harden(parts, problem, solution)
@@ -103,11 +92,6 @@ def frame_step(
     metrics = step_metrics(fitted.delta, after, fitted.packet, solution, len(rows))
     metrics |= {"changed_tiles": 1.0 if change is None else change.share, "seconds": clock.seconds}
     return Outcome(Step(after, fitted.packet, "empty" if unchanged else "delta", metrics), solution.pace, fitted)
-
-
-def _near(change: Change | None, stream: Stream) -> torch.Tensor | None:
-    """Tiles that every iteration looks at; None: all. What is mended stands still: a frame that mends looks at all."""
-    return None if change is None or stream.heal else change.near
 
 
 def still(state: StreamState, frame: Frame, clock: PhaseClock) -> Outcome:

@@ -10,7 +10,6 @@ from gsstream.core.changes import Motion, Scene
 from gsstream.core.changes.motion import apply_motions
 from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
-from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import blaming
 from gsstream.engine.budget.pace import Allowance
@@ -32,7 +31,7 @@ class Moved(NamedTuple):
 
 
 def moved(
-    parts: Assembly, state: StreamState, frame: Frame, change: Change | None, rng: Rng, targets: FloatArray,
+    parts: Assembly, state: StreamState, frame: Frame, change: Change | None, rng: Rng,
     allowance: Allowance | None = None,
 ) -> Moved:  # fmt: skip
     """Ask the motion part, and apply what it proposes as every player will.
@@ -43,7 +42,6 @@ def moved(
         frame: training images of this frame.
         change: what changed in them; None: everything counts as changed.
         rng: random streams by name and frame.
-        targets: [V, H, W, 3] what renders are compared with: the images, or what the cameras remember of them.
         allowance: what the frame may spend. Motions that would take more than their share of its bytes are left out:
             nothing trims them, and a frame that is too large for its residual too would be given up as a whole.
 
@@ -52,7 +50,6 @@ def moved(
     scene = state.player.scene
     view = FrameView(
         parts, state.gaussians, state.hierarchy, frame, state.previous, state.exposure, change, state.session,
-        targets,
     )  # fmt: skip
     motions = tuple(motion for motion in parts.motion.propose(scene, view, rng) if not motion.is_empty)
     if not motions:

@@ -11,7 +11,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame
 from gsstream.core.shapes import BoolArray, FloatArray, IntArray
 from gsstream.core.storage import unpacked
-from gsstream.engine.still.blocks import BLOCK, changed_blocks
+from gsstream.engine.step.active.blocks import BLOCK, changed_blocks
 from gsstream.render.base import TILE
 
 #: Blocks of a 16 x 16 tile (of 16) that must exceed the threshold.
@@ -95,13 +95,6 @@ def _changed(before: FloatArray, after: FloatArray, threshold: float) -> BoolArr
     moved = changed_blocks(after - before, threshold)
     count, blocks = marked_per_tile(moved, TILE // BLOCK)
     return np.asarray(count >= np.minimum(LEAST_BLOCKS, blocks))
-
-
-def tile_sums(blocks: FloatArray) -> FloatArray:
-    """Return [ceil(H / 16), ceil(W / 16)]: the sums over tiles of values [ceil(H / 4), ceil(W / 4)] of blocks."""
-    side = TILE // BLOCK
-    rows, columns = np.arange(0, blocks.shape[0], side), np.arange(0, blocks.shape[1], side)
-    return np.asarray(np.add.reduceat(np.add.reduceat(blocks, rows, 0), columns, 1))
 
 
 def marked_per_tile(marked: BoolArray, side: int = TILE) -> tuple[IntArray, IntArray]:

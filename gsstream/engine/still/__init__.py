@@ -1,1 +1,0 @@
-"""What stands still in the pictures of a camera, and is remembered."""

@@ -35,7 +35,7 @@ LONG = (
     "flow/test_checks", "packet/test_fuzz", "flow/test_run_ends", "flow/test_watch", "flow/test_worlds",
     "scene/test_validate", "trade/test_tune", "queen/tests/test_queen_stream", "tools/test_soak",
     "flow/test_still_frames", "packet/test_corrupt", "init/test_init_sfm", "source/test_layout_runs",
-    "trade/test_sweep_real", "s2gs/tests/test_s2gs_anchor_insertion", "tools/test_cost_scripts",
+    "trade/test_sweep_real", "tools/test_cost_scripts",
     "flow/test_light_process", "player/test_player_memory", "trade/test_offline", "trade/test_compare",
 )  # fmt: skip
 #: What ``make check`` runs: rooms whose tests are cheap, and the one test of whole runs that must never fail.

@@ -106,18 +106,6 @@ class FrameWork(FrameContext, Protocol):
                 changed tile. Where change is not detected, all Gaussians count.
         """
 
-    def changed_pixels(self, view: int) -> torch.Tensor:
-        """Return [H, W] bool: pixels in the tiles of a view that changed; all where change is not detected."""
-
-    def scene_image(self, view: int) -> torch.Tensor:
-        """Return [H, W, 3]: what a camera recorded in frame t, in the colours of the scene.
-
-        The camera's colour map is taken back, so that pictures of cameras of different colour response can be compared.
-        """
-
-    def drawn_rows(self) -> torch.Tensor:
-        """Return [N] bool: Gaussians that are drawn in some view."""
-
     def narrow(self, rows: torch.Tensor) -> None:
         """Freeze all rows but [A] int64, ascending: from now on only these move."""
 

@@ -18,7 +18,7 @@ SHIPPED: Mapping[str, tuple[str, ...]] = {
     "s2gs": (
         "method/s2gs", "method/s2gs-edge", "method/s2gs-fast", "method/s2gs-paper", "confidence/error-aware",
         "confidence/noise-normalised", "confidence/uniform-random", "confidence/view-gradient", "gate/gumbel-sigmoid",
-        "growth/anchor-insertion", "propagation/hierarchical-max", "propagation/selective-leaf",
+        "propagation/hierarchical-max", "propagation/selective-leaf",
         "regularizer/expected-sparsity", "structure/octree", "update/latent",
     ),
     "player": ("renderer/cpu", "loss/cpu", "optimiser/cpu"),

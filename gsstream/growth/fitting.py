@@ -11,7 +11,7 @@ import torch
 from gsstream.core.context import FrameWork
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.rng import Rng
-from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.core.shapes import FloatArray
 
 Array = TypeVar("Array", torch.Tensor, FloatArray)
 #: Learning rates: those of 3DGS at the start of training; positions in standard deviations of each Gaussian.
@@ -63,11 +63,3 @@ def fitted_births(
                 way = way / ((second[name] / (1 - BETAS[1] ** step)).sqrt() + EPSILON)
                 values[name] = values[name] - RATES[name] * (way * size if name == "means" else way)
     return Gaussians(**{name: values[name].detach() for name in ATTRIBUTES})
-
-
-def finite(born: Gaussians[torch.Tensor]) -> IntArray:
-    """Return the rows of which every value is finite."""
-    good = torch.ones(len(born), dtype=torch.bool)
-    for value in (value for _, value in born.items()):
-        good &= torch.isfinite(value).flatten(1).all(1) if value.ndim > 1 else torch.isfinite(value)
-    return good.nonzero()[:, 0].numpy()

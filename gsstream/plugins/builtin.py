@@ -22,7 +22,6 @@ def gsstream_components() -> list[ComponentSpec]:
         _part("motion", "coasting", "motion.coasting:Coasting", "what moved goes on moving"),
         _part("motion", "rigid", "motion.rigid:Rigid", "one fitted rigid motion per group"),
         _part("growth", "none", "growth.none:NoGrowth", "nothing is born and nothing leaves"),
-        _part("growth", "error", "growth.error:ErrorGrowth", "born where views stay wrong, gone where none shows them"),
         _part("stepper", "parts", "engine.method.parts:PartsMethod", "the slots of the recipe, one after the other"),
         _part("stepper", "hold", "method.hold:Hold", "frame 0 and nothing after it"),
         _part("renderer", "reference", "render.reference:ReferenceRenderer", "pure torch, slow, defines the truth"),

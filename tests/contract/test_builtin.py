@@ -12,7 +12,6 @@ from gsstream.core.kinds import CONTRACTS, PART_KINDS
 from gsstream.engine.method.parts import PartsMethod
 from gsstream.gate.always_open import AlwaysOpen
 from gsstream.gate.base import GateSampler
-from gsstream.growth.error import ErrorGrowth
 from gsstream.growth.none import NoGrowth
 from gsstream.loss.photometric import ReferenceLoss
 from gsstream.method.hold import Hold
@@ -41,7 +40,7 @@ from gsstream.testing.update.example import ExampleUpdate
 BUILTIN = [
     Flat(), Uniform(), Uniform(Uniform.Config(logit=-50)), GroupMax(), AlwaysOpen(), NoRegularizer(), Additive(),
     ReferenceRenderer(), ReferenceLoss(), ReferenceAdam(), Hold(), PartsMethod(),
-    Still(), Coasting(), Rigid(), NoGrowth(), ErrorGrowth(),
+    Still(), Coasting(), Rigid(), NoGrowth(),
 ]  # fmt: skip
 EXAMPLES = [ExampleStructure(), ExampleConfidence(), ExamplePropagation(), ExampleGate(), ExampleRegularizer()]
 EXAMPLES += [ExampleStepper(), ExampleUpdate(), ExampleLoss()]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from growing_plugin import growth_installed
 
 from gsstream.cli.main import run_command
 from gsstream.core.errors import ComponentError, InputError, RecipeError, ShapeError
@@ -30,11 +31,7 @@ TINY: Mapping[str, Any] = {
     # Images this small and this far off would not miss most of what the cases need.
     "first_frame.prune_error": 0,
 }  # fmt: skip
-#: Anchor insertion finds nothing in so small a world unless it is easily pleased.
-GROWING: Mapping[str, Any] = {
-    "growth": "anchor-insertion", "growth.per_frame": 24, "growth.error": 0.02, "growth.votes": 0.5,
-    "growth.least_views": 2, "growth.agreement": 0.5, "growth.least_opacity": 0.0, "growth.epochs": 1,
-}  # fmt: skip
+GROWING: Mapping[str, Any] = {"growth": "copies", "growth.per_frame": 24}
 #: Gaussians are born and pruned in the first two of the three frames, so that all that goes on has to go on exactly.
 REFINING: Mapping[str, Any] = {
     "stream.refine_frames": 3, "stream.refine_iterations": 6,
@@ -52,6 +49,12 @@ CASES: Mapping[str, Mapping[str, Any]] = {
     "refined": {**REFINING, **MOVING},
     "growing refined with keys": {**GROWING, **REFINING, "motion": "coasting", "codec.key_every": 2},
 }
+
+
+@pytest.fixture(autouse=True, scope="module")
+def growth(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with growth_installed(tmp_path_factory.mktemp("growth")):
+        yield
 
 
 @cache

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from flow_runs import WORLD, Witness, arguments, demo_copy, encode, metrics, without_test_cameras
+from growing_plugin import growth_installed
 from residual_oracle import train_rows
 
 from gsstream.cli.main import run_command
@@ -231,11 +232,8 @@ def test_a_run_repeats_from_its_saved_recipe(tmp_path: Path) -> None:
 MOTION = {
     "coasting": {"motion": "coasting"},
     "rigid": {"motion": "rigid", "motion__epochs": 1},
-    "growing": {
-        "growth": "anchor-insertion", "growth__error": 0.05, "growth__least_views": 2, "growth__per_frame": 40,
-        "motion": "still",
-    },
-}  # fmt: skip
+    "growing": {"growth": "copies", "growth__per_frame": 40, "motion": "still"},
+}
 MOTION["growing and coasting"] = {**MOTION["growing"], **MOTION["coasting"]}
 MOTION["growing and rigid"] = {**MOTION["growing"], **MOTION["rigid"]}
 
@@ -244,7 +242,8 @@ MOTION["growing and rigid"] = {**MOTION["growing"], **MOTION["rigid"]}
 def test_motions_and_births_leave_both_ends_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str) -> None:
     """What later motions are predicted from, displacements and groups, is the same on both ends too."""
     witness = Witness(monkeypatch)
-    encode(tmp_path, "--frames", "4", method="s2gs-edge", **MOTION[case])
+    with growth_installed(tmp_path):
+        encode(tmp_path, "--frames", "4", method="s2gs-edge", **MOTION[case])
     lines = metrics(tmp_path)[1:]
     assert any(line["moving_groups"] > 0 for line in lines) == (MOTION[case]["motion"] != "still")
     assert any(line["births"] > 0 for line in lines) == ("growth" in MOTION[case]) or case == "growing and rigid"

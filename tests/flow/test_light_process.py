@@ -16,10 +16,12 @@ from gsstream.engine.fit.backward import pull_back
 UNWANTED = ("torch._dynamo", "torch._inductor", "sympy", "torch.fx.experimental.symbolic_shapes")
 
 
-def test_a_run_loads_no_compiler_and_no_symbols(tmp_path: Path) -> None:
+@pytest.mark.parametrize("method", ["s2gs-edge", "hicom"])
+def test_a_run_loads_no_compiler_and_no_symbols(tmp_path: Path, method: str) -> None:
+    """Neither where motions and residuals are fitted, nor where Gaussians are born and fitted."""
     source = demo_copy(tmp_path / "demo", frames=2)
-    arguments = ["run", "--method", "s2gs-edge", "--source", str(source), "--out", str(tmp_path / "out"), "--no-video"]
-    settings = ["first_frame.epochs=1", "stream.epochs=1", "growth=anchor-insertion", "growth.per_frame=50"]
+    arguments = ["run", "--method", method, "--source", str(source), "--out", str(tmp_path / "out"), "--no-video"]
+    settings = ["first_frame.epochs=1", "stream.epochs=1"]
     arguments += ["--quiet", *(word for setting in settings for word in ("--set", setting))]
     program = f"""
 import sys

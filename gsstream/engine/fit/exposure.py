@@ -27,15 +27,6 @@ class Exposure:
         """Return [H, W, 3]: scene colours as camera ``view`` records them."""
         return torch.addmm(self.offset[view], image.reshape(-1, 3), self.matrix[view].T).reshape(image.shape)
 
-    def undo(self, view: int, image: torch.Tensor) -> torch.Tensor:
-        """Return [H, W, 3]: what camera ``view`` recorded, in scene colours.
-
-        Raises LinAlgError where a map has no inverse.
-        """
-        inverse: torch.Tensor = torch.linalg.inv(self.matrix[view])
-        scene: torch.Tensor = ((image.reshape(-1, 3) - self.offset[view]) @ inverse.T).reshape(image.shape)
-        return scene
-
     def pull(self, view: int, gradient: torch.Tensor) -> torch.Tensor:
         """Return the gradient with respect to scene colours, given that with respect to recorded colours [H, W, 3]."""
         return (gradient.reshape(-1, 3) @ self.matrix[view]).reshape(gradient.shape)

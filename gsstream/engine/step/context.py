@@ -21,7 +21,7 @@ from gsstream.engine.step.active.candidates import VoteBook, changed_rows
 from gsstream.engine.step.active.change import MOST_PIXEL_SIGMA, Change
 from gsstream.metrics.noise import noise_sigma
 from gsstream.optimiser.base import RowOptimiser
-from gsstream.render.base import TILE, RenderSession
+from gsstream.render.base import RenderSession
 
 
 class FrameView:
@@ -135,22 +135,6 @@ class FrameView:
         return changed_rows(
             self._change, self._gaussians.means, self.cameras, self.session, least_votes, self._votes
         )
-
-    def changed_pixels(self, view: int) -> torch.Tensor:
-        if self._change is None:
-            return torch.ones(self.cameras.height, self.cameras.width, dtype=torch.bool)
-        return self._change.pixels(view)[..., 0] > 0
-
-    def scene_image(self, view: int) -> torch.Tensor:
-        image, exposure = self.image(view), self.judge.exposure
-        return exposure.undo(view, image) if exposure else image
-
-    def drawn_rows(self) -> torch.Tensor:
-        tiles = torch.ones(-(-self.cameras.height // TILE), -(-self.cameras.width // TILE), dtype=torch.bool)
-        drawn = torch.zeros(len(self._gaussians), dtype=torch.bool)
-        for view in range(len(self.cameras)):
-            drawn |= self.session.visible(view, tiles)
-        return drawn
 
     def narrow(self, rows: torch.Tensor) -> None:
         self._session = self.session_for(rows)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from gsstream_s2gs.anchor_insertion import AnchorInsertion
 from gsstream_s2gs.error_aware import ErrorAware
 from gsstream_s2gs.expected_sparsity import ExpectedSparsity
 from gsstream_s2gs.gumbel_sigmoid import GumbelSigmoid
@@ -30,7 +29,6 @@ PARTS = [
     NoiseNormalised(), NoiseNormalised(NoiseNormalised.Config(probes=4)),
     ErrorAware(), ErrorAware(ErrorAware.Config(budget=0.0)),
     SelectiveLeaf(), SelectiveLeaf(SelectiveLeaf.Config(suspect=-1.0, spread=1.0)),
-    AnchorInsertion(), AnchorInsertion(AnchorInsertion.Config(error=0.02, votes=0.5, least_views=2, agreement=0.5)),
 ]  # fmt: skip
 
 

@@ -23,12 +23,12 @@ from residual_oracle import train_rows
 from ruamel.yaml import YAML
 from s2gs_scene import gaussians
 
-from gsstream.api import ConfidenceEstimator, GateSampler, Growth, Part, Propagation, Regularizer, Structure, UpdateRule
+from gsstream.api import ConfidenceEstimator, GateSampler, Part, Propagation, Regularizer, Structure, UpdateRule
 from gsstream.recipe.model import Recipe
 from gsstream.residual.base import init_latents
 
 KINDS = {
-    "structure": Structure, "confidence": ConfidenceEstimator, "propagation": Propagation, "growth": Growth,
+    "structure": Structure, "confidence": ConfidenceEstimator, "propagation": Propagation,
     "gate": GateSampler, "regularizer": Regularizer, "update": UpdateRule,
 }  # fmt: skip
 
@@ -117,8 +117,8 @@ class TestRecipes:
     def test_every_slot_is_one_of_our_parts_with_valid_settings(self, name: str) -> None:
         recipe = self.resolved(name)
         specs = {(s.kind, s.name): s for s in plugin.COMPONENTS}
-        assert recipe.growth.name == "none", "the paper's scene keeps its anchors: growth is an extension"
-        for kind in KINDS.keys() - {"growth"}:
+        assert recipe.growth.name == "none", "the paper's scene keeps its anchors"
+        for kind in KINDS:
             reference = getattr(recipe, kind)
             part_class(specs[kind, reference.name]).Config.model_validate(reference.params)
 

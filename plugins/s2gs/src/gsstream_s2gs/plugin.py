@@ -48,12 +48,6 @@ COMPONENTS = [
         summary="maximum over each tree, shared by all its nodes",
     ),
     ComponentSpec(
-        kind="growth",
-        name="anchor-insertion",
-        target="gsstream_s2gs.anchor_insertion:AnchorInsertion",
-        summary="births where a frame is still wrong in several cameras",
-    ),
-    ComponentSpec(
         kind="gate",
         name="gumbel-sigmoid",
         target="gsstream_s2gs.gumbel_sigmoid:GumbelSigmoid",

@@ -1,0 +1,67 @@
+"""A growth part for tests of whole runs, and how to have it installed: Gaussians are born, fitted, and leave."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import final
+
+import numpy as np
+import pytest
+import torch
+from pydantic import Field
+
+from gsstream.api import FrameWork, Growth, PartConfig, Rng, Rows, Scene, in_nodes, own_nodes
+from gsstream.blocks import fitted_births
+from gsstream.spec import ComponentSpec, hookimpl
+
+
+@final
+class CopyGrowth(Growth):
+    """Copies Gaussians of what changed, in nodes that exist or in new ones, and removes the faintest."""
+
+    source = "gsstream"
+
+    class Config(PartConfig):
+        per_frame: int = Field(default=24, ge=1, le=1000, description="Gaussians born in a frame, half as many leave")
+
+    def propose(self, after: Scene, work: FrameWork, rng: Rng) -> Rows | None:
+        changed = np.flatnonzero(work.changed_rows(0.5).numpy())
+        number = min(self.config.per_frame, len(changed))
+        if not number:
+            return None
+        generator = rng.numpy("copies", work.index)
+        rows = np.sort(generator.choice(changed, number, replace=False))
+        copies = after.gaussians.rows(rows)
+        beside = generator.normal(0, 0.5, (number, 3)) * np.exp(copies.scales).mean(1, keepdims=True)
+        copies = replace(copies, means=(copies.means + beside).astype(np.float32))
+        scene, views = after.gaussians.map(torch.from_numpy), range(len(work.cameras))
+        fitted = fitted_births(scene, copies.map(torch.from_numpy), work, views, 1, rng).map(torch.Tensor.numpy)
+        layout = after.layout
+        units = layout.unit_of[rows]
+        births = (
+            in_nodes(fitted, layout.node_of[rows], units)
+            if work.index % 2
+            else own_nodes(fitted, units, len(layout.node_counts))
+        )
+        faintest = np.argsort(after.gaussians.opacities, kind="stable")[: number // 2]
+        return Rows(births, np.sort(faintest))
+
+
+@hookimpl
+def gsstream_components() -> list[ComponentSpec]:
+    return [ComponentSpec(kind="growth", name="copies", target="growing_plugin:CopyGrowth", summary="for tests")]
+
+
+@contextmanager
+def growth_installed(folder: Path) -> Iterator[None]:
+    """In this process the part is installed as any plugin is: as the entry point of a distribution."""
+    info = folder / "growing_plugin-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: growing-plugin\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[gsstream]\ngrowing = growing_plugin\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(folder))
+        yield

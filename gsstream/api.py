@@ -6,9 +6,6 @@ Importing this module imports torch (the parts are torch code); ``gsstream.spec`
 from gsstream import API_VERSION as API_VERSION
 from gsstream.confidence.base import ConfidenceEstimator as ConfidenceEstimator
 from gsstream.confidence.base import ConfidenceTraits as ConfidenceTraits
-from gsstream.core.auto import AutoRule as AutoRule
-from gsstream.core.auto import Choice as Choice
-from gsstream.core.auto import SceneFacts as SceneFacts
 from gsstream.core.cameras import Cameras as Cameras
 from gsstream.core.changes import Births as Births
 from gsstream.core.changes import Delta as Delta

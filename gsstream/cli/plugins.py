@@ -105,8 +105,6 @@ def _describe(catalog: Catalog, kind: str, name: str, entry: Entry) -> str:
     config = getattr(target, "Config", None)
     rows = list(setting_rows(config)) if config is not None else []
     lines += ["", table(("SETTING", "TYPE", "DEFAULT", "MEANING"), rows)] if rows else ["no settings"]
-    autos = getattr(target, "auto_rules", {})
-    lines += [f"the scene decides on 'auto': {', '.join(autos)}"] if autos else []
     users = list(_users(catalog, kind, name))
     return "\n".join([*lines, "", table(("METHOD", "SETTING", "VALUE", "SET BY"), users)] if users else lines)
 

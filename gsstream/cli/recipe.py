@@ -88,9 +88,9 @@ def _part_schemas(catalog: Catalog) -> dict[str, dict[str, PartSchema]]:
         for name in catalog.names(slot):
             try:
                 part = catalog.resolve(slot, name)
-                config, autos = part.Config, tuple(part.auto_rules)
+                config = part.Config
             except PluginUnavailable as error:
                 typer.echo(f"warning: {error}", err=True)
-                config, autos = None, ()
-            found[slot][name] = PartSchema(catalog.entry(slot, name).spec.summary, config, autos)
+                config = None
+            found[slot][name] = PartSchema(catalog.entry(slot, name).spec.summary, config)
     return found

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
-from gsstream.core.auto import AutoRule
-
 
 class PartConfig(BaseModel):
     """Base of every part's nested ``Config``: frozen, unknown keys refused, defaults validated."""
@@ -48,17 +46,12 @@ class Part(ABC):  # noqa: B024 - each kind adds what is abstract
 
     ``denied``: checks of the contract kit that the part cannot pass -> why not, in 20 characters or more. They are made
     all the same and must fail: a denial that is no longer true is itself a failure.
-
-    ``auto_rules``: settings that a recipe may leave to the scene by saying ``auto``, and the rule that chooses each, in
-    the order in which they choose. A nested setting is written with dots. A part is never built with ``auto`` in its
-    settings: until the scene is known it has its defaults there.
     """
 
     Config: ClassVar[type[PartConfig]] = PartConfig
     source: ClassVar[str] = ""
     traits: ClassVar[Traits] = Traits()
     denied: ClassVar[Mapping[str, str]] = MappingProxyType({})
-    auto_rules: ClassVar[Mapping[str, AutoRule]] = MappingProxyType({})
     if TYPE_CHECKING:
 
         @property

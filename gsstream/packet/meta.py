@@ -148,7 +148,7 @@ def _check(meta: StreamMeta) -> None:
 
 
 def _check_encoder_s_own(meta: StreamMeta) -> None:
-    """What encoders leave for those that go on from this scene: a grid's origin, colour maps, choices."""
+    """What encoders leave for those that go on from this scene: a grid's origin and colour maps."""
     extra = meta.extra
     if "origin" in extra:
         _array("extra.origin", extra["origin"], (3,))
@@ -159,9 +159,6 @@ def _check_encoder_s_own(meta: StreamMeta) -> None:
     shown = extra.get("shown", 0)
     if isinstance(shown, bool) or not isinstance(shown, int) or shown < 0:
         raise ValueError(f"extra.shown: expected the number of a frame, got {shown!r:.60}")
-    for key, choice in _object(extra.get("auto", {})).items():
-        if not {"value", "why"} <= _object(choice).keys():
-            raise ValueError(f"extra.auto.{key}: expected a value and why, got {choice!r:.60}")
 
 
 def _array(name: str, value: Any, shape: tuple[int, ...]) -> None:

@@ -5,11 +5,10 @@ Defaults here are those of the dense baseline; methods ship their own recipe fil
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from gsstream.core.auto import AUTO
 from gsstream.recipe.budget import Budget
 from gsstream.source.options import DataOptions
 
@@ -34,24 +33,12 @@ class ComponentRef(Section):
     params: dict[str, Any] = Field(default_factory=dict, description="the part's own settings")
 
 
-def _degree(value: object) -> object:
-    """One message for both kinds of value."""
-    if value != AUTO and (isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 3):
-        raise ValueError("expected an integer from 0 to 3, or 'auto'")
-    return value
-
-
-Degree = Annotated[Annotated[int, Field(ge=0, le=3)] | Literal["auto"], BeforeValidator(_degree)]
-
-
 class FirstFrame(Section):
     """Seeding and root optimisation of frame 0."""
 
     epochs: int = Field(default=250, ge=0, description="passes over the training cameras (paper: 250)")
     max_iterations: int = Field(default=2000, ge=0, description="upper bound on epochs * cameras (released code: 4000)")
-    sh_degree: Degree = Field(
-        default=2, description="degree of the spherical harmonics (paper's code: 2); auto: the scene decides"
-    )
+    sh_degree: int = Field(default=2, ge=0, le=3, description="degree of the spherical harmonics (paper's code: 2)")
     points: Literal["auto", "recording", "sparse", "sfm", "sweep"] = Field(
         default="auto",
         description="auto: the recording's points, else sweep; sparse: the recording's thinned set; "
@@ -95,26 +82,6 @@ class FirstFrame(Section):
     exposure: bool = Field(
         default=False, description="fit an affine colour map per training camera while optimising frame 0"
     )
-    trials: int = Field(
-        default=16, ge=0, le=1000,
-        description="where the recipe says auto: most short fits of frame 0, judged on training cameras that are left "
-        "out of them, by which values are compared; 0: rules alone",
-    )  # fmt: skip
-    trial_epochs: int = Field(default=30, ge=1, description="passes over the cameras of such a short fit")
-    trial_cameras: float = Field(
-        default=0.25, gt=0, lt=1, description="share of the training cameras that a short fit leaves out, as its judges"
-    )
-    trial_folds: int = Field(
-        default=2, ge=1, le=8,
-        description="short fits behind each trial, every one without other cameras; as many as there are cameras for",
-    )  # fmt: skip
-
-    @property
-    def degree(self) -> int:
-        """``sh_degree`` once it is a number; a run chooses before it looks."""
-        assert not isinstance(self.sh_degree, str), "first_frame.sh_degree is still 'auto'"
-        return self.sh_degree
-
 
 class Stream(Section):
     """Every later frame."""

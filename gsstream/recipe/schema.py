@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from gsstream.core.auto import AUTO
 from gsstream.core.part import PartConfig
 from gsstream.recipe.load import ResolvedRecipe
 from gsstream.recipe.model import ComponentRef, Recipe
@@ -21,14 +20,10 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 @dataclass(frozen=True, slots=True)
 class PartSchema:
-    """A part as a schema sees it: what it is, its settings, and which of them the scene may decide.
-
-    The settings are None where the plugin could not be imported.
-    """
+    """A part as a schema sees it: what it is, and its settings; None where the plugin could not be imported."""
 
     summary: str
     config: type[PartConfig] | None
-    autos: tuple[str, ...] = ()
 
 
 def slots() -> list[str]:
@@ -75,8 +70,6 @@ def _slot(
         if part.config is None:
             continue
         own = part.config.model_json_schema()
-        for key in part.autos:
-            _offer_auto(own, key)
         keys |= set(own.get("properties", {}))
         settings = _moved(own, f"{slot}.{name}", definitions)
         case: Schema = {"if": {"properties": {"name": {"const": name}}}, "then": {"properties": {"params": settings}}}
@@ -97,19 +90,6 @@ def _slot(
         "allOf": cases,
     }  # fmt: skip
     return {"description": choice["description"], "anyOf": [choice, section]}
-
-
-def _offer_auto(own: Schema, key: str) -> None:
-    """Let the setting under a dotted key say ``auto``, too."""
-    *above, name = key.split(".")
-    section = own
-    for step in above:
-        section = own["$defs"][section["properties"][step]["$ref"].rpartition("/")[2]]
-    field = section["properties"][name]
-    if {"const": AUTO} in field.get("anyOf", ()):
-        return  # sections that share a definition
-    kept = {word: field.pop(word) for word in ("default", "description", "title") if word in field}
-    section["properties"][name] = {"anyOf": [field, {"const": AUTO}], **kept}
 
 
 def _moved(own: Schema, place: str, definitions: Schema) -> Schema:

@@ -45,7 +45,7 @@ def test_passes_the_contract_untouched(kind: str, results: dict[str, tuple[int, 
     assert code == 0, out + err
     assert f"{kind} my-{kind} (from gsstream-my-{kind} 0.1.0)" in out
     skipped = [line.split()[1] for line in out.splitlines() if "(skipped)" in line]
-    assert skipped == ([] if kind == "source" else ["auto_rules"]), "only settings that a scene could choose"
+    assert skipped == []
     assert "✓ cheap_spec" in out
 
 

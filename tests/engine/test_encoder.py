@@ -249,19 +249,16 @@ def test_listeners_are_told_in_order() -> None:
     told: list[tuple[str, Any]] = []
     listeners = Listeners(
         packet=lambda packet: told.append(("packet", packet.frame)),
-        chosen=lambda parts: told.append(("chosen", len(parts.pending))),
         progress=lambda *_: told.append(("progress", None)),
         say=lambda line: told.append(("say", line)),
     )
     with open_recording(WORLD) as source:
-        settings = {**TINY, "structure.root_exponent": "auto", "first_frame.trials": 0}
-        made = encoder_for("s2gs-edge", source, settings, listeners)
+        made = encoder_for("s2gs-edge", source, TINY, listeners)
     assert told == [], "nothing is done before the first frame"
     steps = [made.encode(frame) for frame in frames()[:3]]
     names = [name for name, _ in told if name != "say"]
     changes = [name for place, name in enumerate(names) if place == 0 or names[place - 1] != name]
-    assert changes == ["chosen", "progress", "packet"]
-    assert ("chosen", 0) in told, "nothing is open any more"
+    assert changes == ["progress", "packet"]
     assert [frame for name, frame in told if name == "packet"] == [0, 1, 2]
     assert [step.packet.frame for step in steps] == [0, 1, 2]
 

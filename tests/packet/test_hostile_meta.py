@@ -57,7 +57,6 @@ LIES = {
     "exposure is a list": put(extra={"exposure": [1]}),
     "shown before the start": put(extra={"shown": -1}),
     "shown as text": put(extra={"shown": "1"}),
-    "a choice without its reason": put(extra={"auto": {"first_frame.sh_degree": {"value": 2}}}),
 }
 
 

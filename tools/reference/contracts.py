@@ -94,10 +94,6 @@ def hooks() -> str:
                 about = (inspect.getdoc(function) or "").splitlines()
                 lines.append(f"- {how}`{signature(name, function)}` ({must}){': ' + about[0] if about else ''}")
         lines.append("")
-    rules = inspect.getdoc(importlib.import_module("gsstream.core.auto").SceneFacts) or ""
-    usage = "`auto_rules = {SETTING: rule}`, `rule(facts, settings) -> Choice(value, why, ladder=())`"
-    lines += ["## Rules of `auto`", "", usage]
-    lines += ["([how](../howto/auto.md)). What a rule is told:", "", "```", rules, "```", ""]
     lines += ["## Traits", "", "What a part claims, `traits = GateTraits(...)`; each claim calls for checks.", ""]
     for part_kind in PART_KINDS.values():
         record = Traits if part_kind.contract is None else type(part_kind.contract_class().traits)
@@ -135,7 +131,4 @@ def parts() -> str:
             lines += ["| setting | type | default | meaning |", "|---|---|---|---|"] if rows else ["No settings.", ""]
             lines += [f"| `{k}` | {cell(t)} | `{d}` | {cell(m)} |" for k, t, d, m in rows]
             lines += [""] if rows else []
-            if autos := getattr(catalog.resolve(kind, name), "auto_rules", {}):
-                keys = ", ".join(f"`{key}`" for key in autos)
-                lines += [f"[`auto`](../howto/auto.md), and the scene decides: {keys}.", ""]
     return "\n".join(lines)

@@ -17,7 +17,6 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from gsstream.core.auto import AUTO
 from gsstream.core.errors import PluginUnavailable
 from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.core.rng import Rng
@@ -105,12 +104,7 @@ SOMETIMES: Mapping[str, Draw] = MappingProxyType({
 #: Drawn with the others where the method is made of parts.
 OF_PARTS: Mapping[str, Draw] = MappingProxyType({
     "codec.trim": _of(0.0, 0.3, 0.9, 0.999), "budget.size": _of(16, 200, 1500, 20_000), "budget.time": _logs(1e-3, 2),
-    "budget.clock": _of("processor", "wall"), "first_frame.sh_degree": _of("auto"),
-})  # fmt: skip
-#: What keeps a choice of ``auto`` short.
-TRIALS: Mapping[str, Draw] = MappingProxyType({
-    "first_frame.trials": _of(0, 2, 4), "first_frame.trial_epochs": _of(1, 2),
-    "first_frame.trial_cameras": _logs(0.01, 0.9), "first_frame.trial_folds": _of(1, 2, 3),
+    "budget.clock": _of("processor", "wall"),
 })  # fmt: skip
 
 
@@ -147,7 +141,6 @@ def draw_case(seed: int, index: int, catalog: Catalog) -> Case:
     else:
         settings |= {key: draw(rng) for key, draw in OF_PARTS.items() if rng.random() < share}
         settings |= _parts(catalog, rng, share)
-        settings |= {key: draw(rng) for key, draw in TRIALS.items()} if AUTO in settings.values() else {}
     return Case(seed, index, source, method, tuple(settings.items()))
 
 
@@ -187,8 +180,6 @@ def usable(catalog: Catalog, slot: str) -> list[str]:
 def _settings_of(catalog: Catalog, slot: str, name: str, rng: Generator, share: float) -> Iterator[tuple[str, Any]]:
     part = catalog.resolve(slot, name)
     yield from _fields(part.Config(), f"{slot}.params", rng, share)
-    if rng.random() < share:
-        yield from ((f"{slot}.params.{key}", AUTO) for key in part.auto_rules)
 
 
 def _fields(config: BaseModel, path: str, rng: Generator, share: float) -> Iterator[tuple[str, Any]]:

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gsstream.confidence.base import ConfidenceEstimator
-from gsstream.core.auto import AUTO, Choice
 from gsstream.core.errors import PluginUnavailable, UnknownName
 from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.core.needs import install_renderer
@@ -59,9 +58,6 @@ class Assembly:
         origins: path -> origin of every value that is not a default (for ``recipe.save.save_resolved``).
         distributions: installed distributions that the parts come from.
         checks: how closely the run looks at what parts return; nothing that is sent depends on it.
-        pending: paths of values that are still ``auto``; the parts have their defaults there
-            (``engine.auto.rules.settle``).
-        chosen: key -> what the scene decided.
         title: the method and what was changed of its recipe, for tables and pictures.
         where: the frame and iteration that errors name.
 
@@ -84,8 +80,6 @@ class Assembly:
     origins: Mapping[KeyPath, Origin] = field(default_factory=dict)
     distributions: tuple[str, ...] = ()
     checks: Checks = Checks.FRAME
-    pending: tuple[KeyPath, ...] = ()
-    chosen: Mapping[str, Choice] = field(default_factory=dict)
     title: str = ""
     where: Where = field(default_factory=Where, compare=False, repr=False)
 
@@ -123,9 +117,6 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
     problems: list[str] = []
     parts: dict[str, Any] = {}
     refs: dict[str, ComponentRef] = {}
-    pending: list[KeyPath] = []
-    if resolved.recipe.first_frame.sh_degree == AUTO:
-        pending.append(("first_frame", "sh_degree"))
     for slot in SLOTS:
         ref: ComponentRef = getattr(resolved.recipe, slot)
         if slot == "renderer" and ref.name == "auto":
@@ -136,10 +127,10 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
             built = _build(slot, ref, resolved, catalog, problems)
         if built is not None:
             parts[slot] = built
-            refs[slot] = _written_out(slot, ref, built, pending)
+            refs[slot] = ComponentRef(name=ref.name, params=built.config.model_dump(mode="json"))
     loss = _loss(resolved, catalog, problems)
     if "stepper" in parts:
-        paths = list(unheeded(resolved.recipe.model_copy(update=refs), parts["stepper"], parts, pending))
+        paths = list(unheeded(resolved.recipe.model_copy(update=refs), parts["stepper"], parts))
         problems += _unread(paths, resolved)
     join_problems(problems)
     parts["loss"] = loss
@@ -147,7 +138,7 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
     owners = sorted({catalog.entry(slot, ref.name).distribution for slot, ref in refs.items()})
     recipe = resolved.recipe.model_copy(update=refs)
     return Assembly(
-        recipe=recipe, origins=resolved.origins, distributions=tuple(owners), pending=tuple(pending), checks=level,
+        recipe=recipe, origins=resolved.origins, distributions=tuple(owners), checks=level,
         title=title(resolved.recipe, catalog), **parts,
     )  # fmt: skip
 
@@ -167,23 +158,8 @@ def _unread(paths: list[KeyPath], resolved: ResolvedRecipe) -> list[str]:
     return [f"{resolved.near(path).where}: {'.'.join(path)}: {hint}" for path in paths]
 
 
-def _written_out(slot: str, ref: ComponentRef, part: Part, pending: list[KeyPath]) -> ComponentRef:
-    """The part with all its settings; what is left to the scene says ``auto`` and is added to ``pending``."""
-    left = [key for key in part.auto_rules if value_at(ref.params, key) == AUTO]
-    pending += [(slot, "params", *key.split(".")) for key in left]
-    params = with_values(part.config.model_dump(mode="json"), dict.fromkeys(left, AUTO))
-    return ComponentRef(name=ref.name, params=params)
-
-
-def value_at(params: Any, key: str) -> Any:
-    """Return the value under a dotted key; None where there is none."""
-    for name in key.split("."):
-        params = params.get(name) if isinstance(params, Mapping) else None
-    return params
-
-
 def with_values(params: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return ``params`` with the values under dotted keys; the value None takes a key away."""
+    """Return ``params`` with the values under dotted keys."""
     out: dict[str, Any] = copy.deepcopy(dict(params))
     for key, value in values.items():
         *above, name = key.split(".")
@@ -191,8 +167,6 @@ def with_values(params: Mapping[str, Any], values: Mapping[str, Any]) -> dict[st
         for step in above:
             section = section.setdefault(step, {})
         section[name] = value
-        if value is None:
-            del section[name]
     return out
 
 
@@ -204,11 +178,7 @@ def _build(
     except UnknownName as error:
         problems.append(f"{resolved.near((slot, 'name')).where}: {slot}.name: {error}")
         return None
-    left = [key for key in cls.auto_rules if value_at(ref.params, key) == AUTO]
-    fixed, found = with_values(ref.params, dict.fromkeys(left)), list[str]()
-    config = validate(cls.Config, fixed, resolved.near, (slot, "params"), found)
-    offered = f"; 'auto' is offered for {', '.join(cls.auto_rules)}" if cls.auto_rules else "; it offers no 'auto'"
-    problems += [text + offered if text.endswith("got 'auto'") else text for text in found]
+    config = validate(cls.Config, ref.params, resolved.near, (slot, "params"), problems)
     return None if config is None else _construct(slot, ref.name, cls, config, catalog)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from gsstream.core.kinds import METHOD_SLOTS
@@ -17,7 +17,7 @@ SESSION_KEYS = ("codec.fsync", "codec.key_rate", "codec.first_layer", "budget.me
 
 
 def unheeded(
-    recipe: Recipe, method: StreamingMethod[Any], parts: Mapping[str, Any], pending: Iterable[KeyPath]
+    recipe: Recipe, method: StreamingMethod[Any], parts: Mapping[str, Any]
 ) -> Iterator[KeyPath]:
     """Yield the paths of keys that differ from their default though the method does not read them.
 
@@ -25,7 +25,6 @@ def unheeded(
         method: the live method.
         recipe: with every part's parameters written out.
         parts: slot -> live part.
-        pending: paths of keys that the scene is to decide.
     """
     default = Recipe()
     for slot in METHOD_SLOTS:
@@ -41,4 +40,3 @@ def unheeded(
             path = f"{section}.{key}"
             if getattr(now, key) != getattr(usual, key) and path not in SESSION_KEYS and not method.reads(path):
                 yield section, key
-    yield from (path for path in pending if path[0] in METHOD_SLOTS and not method.reads(path[0]))

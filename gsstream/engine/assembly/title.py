@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from gsstream.core.auto import AUTO
 from gsstream.core.errors import GsstreamError
 from gsstream.plugins.catalog import Catalog
 from gsstream.recipe.load import resolve_recipe
@@ -84,7 +83,7 @@ def _differences(value: Any, usual: Any, path: str) -> Iterator[str]:
     if isinstance(value, Mapping) and isinstance(usual, Mapping):
         for key, inner in value.items():
             yield from _differences(inner, usual.get(key), f"{path}.{key}")
-    elif usual != AUTO and path not in NOR_THESE and value != usual and _as_list(value) != _as_list(usual):
+    elif path not in NOR_THESE and value != usual and _as_list(value) != _as_list(usual):
         yield f"{path}={_short(value)}"
 
 

@@ -20,7 +20,6 @@ from gsstream.core.rng import Rng
 from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import blaming
-from gsstream.engine.assembly.pending import refuse_pending
 from gsstream.engine.fit.exposure import Exposure
 from gsstream.engine.frame0.cheaper import cheaper_rows
 from gsstream.engine.frame0.first_seen import first_rows
@@ -45,7 +44,6 @@ def begin(
         frame: training images of frame 0.
         meta: what the key packet says about the run; the exposure fit is added to it.
     """
-    refuse_pending(parts)
     check_cameras(frame.cameras, 1, "a frame")
     clock = [time.perf_counter()]
     anchors = seeded(parts, points, frame)

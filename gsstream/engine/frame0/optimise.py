@@ -62,7 +62,7 @@ def initial_gaussians(anchors: Anchors, settings: FirstFrame) -> Gaussians[torch
         scales=spacing.log()[:, None].repeat(1, 3),
         opacities=torch.full((count,), logit(schedule.OPACITY)),
         sh0=rgb_to_sh0(anchors.colors.float()),
-        shN=torch.zeros(count, (settings.degree + 1) ** 2 - 1, 3),
+        shN=torch.zeros(count, (settings.sh_degree + 1) ** 2 - 1, 3),
     )
 
 

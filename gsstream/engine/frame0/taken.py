@@ -15,7 +15,6 @@ from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.assembly.pending import refuse_pending
 from gsstream.engine.frame0.begin import arrange, decoded_anchors, exposure_from_meta, key_state, make_layout
 from gsstream.engine.frame0.first_seen import first_rows
 from gsstream.engine.state.stream_state import Step
@@ -38,13 +37,12 @@ def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMe
     Raises InputError when the recipe asks for another degree of spherical harmonics than the stream has, when a camera
     that judges here took part in it, or when its colour maps are of other cameras.
     """
-    refuse_pending(parts)
     started = time.perf_counter()
     _check_views(first.meta, frame.cameras, () if parts.recipe.data.leak == "training" else meta.test.ids)
-    if first.gaussians.sh_degree != parts.recipe.first_frame.degree:
+    if first.gaussians.sh_degree != parts.recipe.first_frame.sh_degree:
         raise InputError(
             f"the first frame has spherical harmonics of degree {first.gaussians.sh_degree}, the recipe asks for "
-            f"{parts.recipe.first_frame.degree}; set first_frame.sh_degree={first.gaussians.sh_degree}"
+            f"{parts.recipe.first_frame.sh_degree}; set first_frame.sh_degree={first.gaussians.sh_degree}"
         )
     # A delta may have put Gaussians between the positions that a key packet can say. They are grouped as players will
     # have them, or a resumed run would find other groups.

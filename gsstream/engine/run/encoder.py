@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -15,8 +14,6 @@ from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.rng import Rng
 from gsstream.core.world import snapped
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.auto.rules import recall, record, stream_extra
-from gsstream.engine.auto.trials import choose
 from gsstream.engine.budget.controller import Controller
 from gsstream.engine.budget.pace import CLOCKS
 from gsstream.engine.frame0.carried import in_world
@@ -44,13 +41,11 @@ class Listeners:
     Arguments:
         packet: every packet, as soon as it is made and before the work that follows it (``follow_up`` of a method);
             what it does counts as part of the frame.
-        chosen: the assembly after the scene has decided every ``auto``, before frame 0.
         progress: iterations of frame 0.
         say: one line for a person.
     """
 
     packet: Callable[[EncodedPacket], object] = lambda _: None
-    chosen: Callable[[Assembly], None] = lambda _: None
     progress: Progress = lambda *_: None
     say: Callable[[str], None] = lambda _: None
 
@@ -114,8 +109,6 @@ class Encoder:
             "seconds": {**seconds, "other": max(0.0, total - sum(seconds.values()))},
             "cpu_seconds": cpu, "peak_memory_mb": peak_memory_mb(),
         }  # fmt: skip
-        if frame.index == 0:
-            metrics |= record(self.parts)
         step = replace(step, metrics=self.controller.settle(metrics, clock() - began))
         self.state = step.state
         return step
@@ -133,13 +126,12 @@ class Encoder:
 
         Raises OutputError when the recipe or the recording is not the one the stream was written with.
         """
-        if (extra := stream_extra(stream)) is not None:
-            # The title, too, is what the stream says: equal recipes may be called otherwise by another version.
-            self.parts = replace(recall(self.parts, extra), title=str(extra.get("title", self.parts.title)))
         # Checked before the replay, which with the parts of another recipe would fail with a less helpful message.
         if not check_stream(self.parts, stream, self.info) or (last is not None and last < 0):
             return None
         end = ended(stream, last)
+        # The title is what the stream says: equal recipes may be called otherwise by another version.
+        self.parts = replace(self.parts, title=end.player.meta.title)
         tools = self._tools(
             replay=lambda: since_key(stream, end), images=lambda index: self.at_near(image(index))
         )
@@ -154,12 +146,6 @@ class Encoder:
         return replace(frame, cameras=replace(cameras, near=self.near))
 
     def _begin(self, frame: Frame) -> Step[Any]:
-        if self.parts.pending:
-            seeds = functools.cache(lambda: self._points(frame))
-            meta, say = self._meta(frame), self._listeners.say
-            self.parts = choose(self.parts, seeds, frame, meta, self._first, say)
-            self._listeners.chosen(self.parts)
-            return begin_held(self._tools(points=lambda _: seeds()), frame)
         return begin_held(self._tools(), frame)
 
     def _step(self, frame: Frame) -> Step[Any]:
@@ -197,7 +183,7 @@ class Encoder:
             fps=info.fps,
             background=recipe.background,
             plugins={name: version(name) for name in sorted(distributions)},
-            extra={"source_uri": info.uri, "licence": info.licence, "title": self.parts.title, **record(self.parts)},
+            extra={"source_uri": info.uri, "licence": info.licence, "title": self.parts.title},
             world=info.world,
         )
 

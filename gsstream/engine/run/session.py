@@ -15,7 +15,6 @@ from typing import Any
 
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.auto.rules import lines
 from gsstream.engine.budget.memory import within_memory
 from gsstream.engine.frame0.points import gather_points, with_test_views
 from gsstream.engine.keys.resume import ended, since_key
@@ -96,10 +95,7 @@ class _Run:
         self.held_out = HeldOut(parts.renderer, parts.recipe.background) if measure else None
         self.left_behind = LeftBehind() if diagnose else None
         self.progress = RunProgress(self.total, quiet)
-        listeners = Listeners(
-            packet=self._write, chosen=self._chosen, progress=self.progress.first_frame,
-            say=self.progress.say,
-        )  # fmt: skip
+        listeners = Listeners(packet=self._write, progress=self.progress.first_frame, say=self.progress.say)
         self.encoder = Encoder(parts, source.info, self._seeds, first_frame=first_frame, listeners=listeners)
         self.writer: StreamWriter
         #: When the last packet was complete in the file, seconds since 1970.
@@ -167,11 +163,6 @@ class _Run:
         recipe = self.encoder.parts.recipe
         seen = with_test_views(self.source, frame) if recipe.data.leak == "points" else frame
         return gather_points(self.source.points, seen, recipe.first_frame, self.encoder.rng)
-
-    def _chosen(self, parts: Assembly) -> None:
-        save_resolved(self.out / RECIPE, parts.resolved)
-        for line in lines(parts):
-            self.progress.say(line)
 
     def _resume(self) -> int | None:
         """Go on after what the folder holds; the last frame of that, or None to begin anew."""

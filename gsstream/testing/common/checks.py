@@ -23,7 +23,6 @@ from gsstream.core.kinds import CONTRACTS
 from gsstream.core.part import Part
 from gsstream.gate.base import GateSampler
 from gsstream.testing.cases import World, fingerprint, world
-from gsstream.testing.common import auto as auto
 from gsstream.testing.compare import ROUNDING, all_equal, finite
 from gsstream.testing.drive import behaviour_of, draw, outputs
 from gsstream.testing.recording import SourceUnderTest

@@ -22,7 +22,6 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.engine.assembly.pending import refuse_pending
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.metrics import peak_memory_mb, psnr
@@ -109,8 +108,6 @@ def bench_frame(plan: FramePlan, catalog: Catalog, progress: Progress) -> dict[s
     """Measure everything in the plan; plain JSON values."""
     machine = machine_facts()
     parts = {name: assemble(recipe, catalog) for name, recipe in variants(plan.recipe).items()}
-    for assembly in parts.values():
-        refuse_pending(assembly)
     results: list[dict[str, Any]] = []
     # One torch thread, as in a run: see engine.run.threads.
     with torch_threads(1):
@@ -199,7 +196,7 @@ def _encoder(parts: Assembly, rig: Cameras, first: PlayerState | None = None) ->
 
 
 def _scene(plan: FramePlan, static: int) -> Gaussians[FloatArray]:
-    degree = plan.recipe.first_frame.degree
+    degree = plan.recipe.first_frame.sh_degree
     still = make_gaussians(synthetic_points(static, plan.seed), static, plan.seed, degree=degree)
     moving = make_gaussians(object_points(plan.moving, plan.seed), plan.moving, plan.seed + 1, degree=degree)
     parts = dict(still.items())

@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 
-from gsstream.core.auto import Choice, SceneFacts
 from gsstream.testing.confidence.example import ExampleConfidence
 from gsstream.testing.gate.example import ExampleGate
 from gsstream.testing.propagation.example import ExamplePropagation
@@ -51,17 +50,6 @@ class Evasive(Gate):
     """Denies a check that there is not."""
 
     denied = MappingProxyType({"check_gate_kindness": "no gate has ever been kind, and this one is none"})
-
-
-def _refused(facts: SceneFacts, _settings: Any) -> Choice:
-    return Choice(1.0 / facts.cameras - 1.0, "fewer cameras, harder gates")
-
-
-@spoils("check_auto_rules")
-class Overreacher(Gate):
-    """Its rule of auto chooses a temperature that its settings refuse."""
-
-    auto_rules = MappingProxyType({"temperature": _refused})
 
 
 @spoils("check_pure")

@@ -8,7 +8,6 @@ from typing import Any, final
 from pydantic import Field, model_validator
 
 from gsstream.api import AttributeCode, PartConfig, UpdateRule
-from gsstream_s2gs.auto import LATENT_RULES
 
 
 class OffsetCode(PartConfig):
@@ -90,7 +89,6 @@ class LatentResidual(UpdateRule):
                 for name, value in data.items()
             }
 
-    auto_rules = LATENT_RULES
 
     def codes(self) -> Mapping[str, AttributeCode]:
         """Attribute -> code; an attribute with ``lr`` 0 never changes."""

@@ -23,7 +23,6 @@ from gsstream.api import (
     check_shape,
 )
 from gsstream_s2gs import morton
-from gsstream_s2gs.auto import OCTREE_RULES
 
 #: Cells on either side of the root cube that are told apart when Gaussians are grouped; farther ones share the last.
 FAR_CELLS = 1 << (morton.AXIS_BITS - 1)
@@ -104,7 +103,6 @@ class StreamingOctree(Structure):
 
     traits = StructureTraits(idempotent=True, local=True)
     grouping_settings = frozenset({"gate_level", "grouping"})
-    auto_rules = OCTREE_RULES
 
     def seed(self, points: PointCloud, cameras: Cameras) -> Anchors:
         """Anchors of [P] points seen by the training cameras, sorted by level, then along a Morton curve.

@@ -1,1 +1,0 @@
-"""Values that the scene decides before frame 0."""

@@ -1,4 +1,4 @@
-"""``gsstream export``, ``manifest`` and ``view``: streams for other programs, for web servers and for the browser."""
+"""``gsstream export`` and ``manifest``: streams for other programs and for web servers."""
 
 from __future__ import annotations
 
@@ -59,19 +59,3 @@ def manifest(
         out.write_text(text, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"cannot write {out}: {error.strerror or error}") from error
-
-
-def view(
-    stream: Stream,
-    port: Annotated[int, typer.Option("--port", min=1, max=65535, help="Port of the page.")] = 8080,
-    host: Annotated[
-        str, typer.Option("--host", help="Address to serve at; 0.0.0.0 lets other machines look.")
-    ] = "127.0.0.1",
-) -> None:
-    """Show a stream in the browser, with a time slider (extra: viewer)."""
-    file = stream_file(stream)
-    from gsstream.player.view import Viewer
-
-    with Viewer(file, host=host, port=port) as viewer:
-        typer.echo(f"{file}: {viewer.url} (Ctrl-C ends)")
-        viewer.wait()

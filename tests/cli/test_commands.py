@@ -25,7 +25,6 @@ CHEAP = [
     ["bench", "frame", "--help"],
     ["export", "--help"],
     ["manifest", "--help"],
-    ["view", "--help"],
     ["package", "--help"],
     ["sweep", "--help"],
     ["tune", "--help"],
@@ -52,7 +51,6 @@ OPTIONS = {
     "gsstream info": ["STREAM", "--json"],
     "gsstream export": ["STREAM", "--out", "--format", "--frames", "--max-memory", "--origin"],
     "gsstream manifest": ["STREAM", "--out"],
-    "gsstream view": ["STREAM", "--port", "--host"],
     "gsstream package": ["STREAM", "--out", "--rendition", "--join-every"],
     "gsstream serve": ["STREAM", "--live", "--host", "--port", "--token", "--viewers", "--origin"],
     "gsstream sweep": [

@@ -2,6 +2,7 @@
 #   make demo            encode the recording that ships with gsstream; says where the pictures are and how to open it
 #   make test            lint, types, import rules and all tests
 #   make check           the same with the quick tests alone: for every change, in a minute or two on two cores
+#   make docs            the reference pages that are made from the code, in docs/reference/
 #   make dist            every distribution, as source archive and wheel, in dist/
 #   make PYTHON=python3.12 test    choose the interpreter .venv is made with
 #   make clean           remove .venv and what was built
@@ -26,7 +27,7 @@ checksum = $(firstword $(shell cat $(1) | cksum))
 INSTALLED := $(VENV)/.installed-$(call checksum,$(LISTS))
 BUILT := $(VENV)/.built-$(call checksum,$(NATIVE))
 
-.PHONY: demo test check dist setup clean
+.PHONY: demo test check docs dist setup clean
 .DEFAULT_GOAL := demo
 
 demo: setup
@@ -47,6 +48,9 @@ test check: setup
 	done; \
 	echo "== pytest"; $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS) || status=1; \
 	exit $$status
+
+docs: setup
+	$(BIN)/python -m tools.reference
 
 dist: setup
 	$(BIN)/python -m tools.dist --out dist

@@ -49,6 +49,8 @@ def build(out: Path, chosen: Sequence[Path], *, isolated: bool = True) -> dict[s
     out.mkdir(parents=True, exist_ok=True)
     if any(out.iterdir()):
         raise FileExistsError(f"{out} is not empty: expected a new folder, so that no archive of before stays in it")
+    if ROOT in chosen:  # the archives of gsstream hold the pages that are made from its code
+        subprocess.run([sys.executable, "-m", "tools.reference"], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
     environment = {**os.environ, "SOURCE_DATE_EPOCH": source_date(), "PIP_CONSTRAINT": str(PINS)}
     for project in chosen:
         print(f"== {project.relative_to(ROOT)}", flush=True)

@@ -105,7 +105,7 @@ def options_of(command, path: str) -> dict[str, list[str]]:
 
 
 def test_options_are_frozen() -> None:
-    """A new option is a promise: add it here and to docs/reference/cli.md on purpose, or make it a recipe key."""
+    """A new option is a promise: add it here on purpose, or make it a recipe key."""
     found = options_of(get_command(app), "gsstream")
     assert {path: sorted(names) for path, names in found.items()} == {p: sorted(names) for p, names in OPTIONS.items()}
 

@@ -1,14 +1,14 @@
-"""Writes the pages of docs/reference from the code: ``python -m tools.reference``, in the root of the repository."""
+"""Write the pages of docs/reference that are made from the code: ``make docs``, or ``python -m tools.reference``."""
 
 from __future__ import annotations
 
-from tools.reference.pages import FOLDER, PAGES
+from tools.reference.pages import FOLDER, write
 
 
 def main() -> None:
-    """Write every page."""
-    for page, make in PAGES.items():
-        (FOLDER / page).write_text(make(), encoding="utf-8")
+    """Write every page into docs/reference."""
+    for path in write(FOLDER):
+        print(path)
 
 
 if __name__ == "__main__":

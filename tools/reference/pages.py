@@ -1,6 +1,12 @@
-"""Every page by its file name; ``tests/test_architecture.py`` fails while one on disk differs from what is made."""
+"""Every page of docs/reference that is made from the code, by its file name.
+
+``BUILT`` pages are not in the repository (``docs/reference/.gitignore``): ``make docs`` and ``make dist`` write them.
+``TRACKED`` pages are, because messages of the program name them; a test compares them with what is made.
+"""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 from tools.reference.api import api
 from tools.reference.commands import cli, recipe
@@ -10,7 +16,13 @@ from tools.reference.text import ROOT
 
 FOLDER = ROOT / "docs" / "reference"
 
-PAGES = {
-    "api.md": api, "checks.md": checks, "cli.md": cli, "recipe.md": recipe, "hooks.md": hooks, "parts.md": parts,
-    "scene-checks.md": scene_checks,
-}  # fmt: skip
+BUILT = {"api.md": api, "checks.md": checks, "cli.md": cli, "recipe.md": recipe, "hooks.md": hooks, "parts.md": parts}
+TRACKED = {"scene-checks.md": scene_checks}
+PAGES = BUILT | TRACKED
+
+
+def write(folder: Path) -> list[Path]:
+    """Write every page into an existing folder, and return their paths."""
+    for name, make in PAGES.items():
+        (folder / name).write_text(make(), encoding="utf-8")
+    return [folder / name for name in PAGES]

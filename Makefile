@@ -15,7 +15,7 @@ endif
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO_METHOD ?= s2gs-edge
-# Half of the usual iterations of frame 0, for somebody who waits: half a decibel less (docs/results/index.md).
+# Half of the usual iterations of frame 0, for somebody who waits: half a decibel less (docs/results/index.md, the demo).
 DEMO_SETTINGS ?= --set first_frame.max_iterations=1000
 DEMO_OUT ?= runs/demo
 WORKERS ?= $(shell echo $$(( $$(nproc) < 4 ? $$(nproc) + 1 : 4 )))

@@ -1,6 +1,6 @@
 """Runs held against a budget: ``python -m tools.held --budget size=10KB RUN...``, made under it or not.
 
-Makes the tables of docs/results/budget.md from the ``metrics.jsonl`` of run folders, and from the fixed recipes of a
+Makes the tables of docs/results/trade.md from the ``metrics.jsonl`` of run folders, and from the fixed recipes of a
 sweep (``--sweep DIR SCENE``).
 """
 

@@ -1,6 +1,6 @@
 """Hold the browser's decoder against Python's on damaged and lying streams, piece by piece, and keep the result.
 
-Usage: python -m tools.web_fuzz --count 20000 --out docs/results/web-fuzz.json
+Usage: python -m tools.web_fuzz --count 20000 --out FILE
 
 The cases are those of tests/web/decoder_fuzz.py and follow from (seed, number) alone. Pieces that the file holds are
 not run again, so the job can be ended at any time. The exit code is 1 when a case failed.

@@ -4,7 +4,7 @@ Usage: python -m tools.worlds [--source demo] [--method s2gs-fast] [--set KEY=VA
 [--seeds 0 1 2] [--as-filed]
 
 Prints a table: as it is with several seeds, then moved, scaled and turned with the first one. ``--as-filed`` leaves the
-recording in the coordinates it comes in, as gsstream did before decision 0034.
+recording in the coordinates it comes in, which is what docs/adr/0010 keeps a run from.
 """
 
 from __future__ import annotations

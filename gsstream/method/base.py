@@ -73,7 +73,7 @@ class StreamingMethod(Part, Generic[State]):
         if "decoder" in vars(cls):
             raise TypeError(
                 f"{cls.__name__}.decoder: every player decodes packets in the same way, so no method has a decoder of "
-                "its own; take it out (docs/adr/0015-whole-methods.md)"
+                "its own; take it out"
             )
 
     def reads(self, key: str) -> bool:

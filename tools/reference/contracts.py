@@ -52,7 +52,7 @@ ELSEWHERE = {
     "a gate's noise at the ends of the generator's range": "a generator cannot be made to return them; 65,536 draws "
     "must be finite (`check_gate_noise_is_data`)",
     "no drift over many frames": "minutes, not seconds: `tests/flow/test_closed_loop.py`, and 300 frames in "
-    "docs/results/stream.md; the kit compares three frames bit by bit",
+    "docs/results/trade.md; the kit compares three frames bit by bit",
     "resume in another process, after a kill": "`tests/flow/test_repeat_and_resume.py`; the kit resumes from the "
     "stream alone, so a process has nothing to add",
     "files cut, torn or lying about themselves": "`tests/packet`; the kit damages packets",

@@ -12,7 +12,7 @@ from gsstream.core.errors import InputError
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.source.base import SourceInfo
 
-#: Interpreter, torch, the renderer and the engine with everything a run imports (measured, docs/results/budget.md).
+#: Interpreter, torch, the renderer and the engine with everything a run imports (measured, docs/results/trade.md).
 PROCESS = 280_000_000
 #: Copies of a training image, float32 RGB: two frames, two decoded ahead, the loss's target and its blurred moments,
 #: and what change is looked for in (measured on two recordings).

@@ -172,7 +172,7 @@ class Pace:
 def next_weight(weight: float, expected: float, wanted: float) -> float:
     """Return the weight of the rate after a pass that would send more or fewer bytes than are wanted.
 
-    Bytes fall with about the square root of the weight (docs/results/stream.md), so the first power leads half of the
+    Bytes fall with about the square root of the weight (docs/results/trade.md), so the first power leads half of the
     way to the goal; a factor of three a pass is the most that residuals can follow. What was taken back comes slowly
     again, so the way down is half as fast.
 

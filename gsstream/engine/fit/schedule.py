@@ -13,7 +13,7 @@ LR_QUATS, LR_SCALES, LR_OPACITIES, LR_SH0, LR_SHN = 0.001, 0.005, 0.05, 0.0025, 
 #: Share of the iterations after which nothing is densified or pruned any more.
 DENSIFY_UNTIL = 0.6
 #: Shares of the iterations after which what the images would not miss goes: when growth has ended, and once more while
-#: there is time to close the gaps. Earlier, what is pruned grows again (docs/results/frame0.md).
+#: there is time to close the gaps. Earlier, what is pruned grows again (docs/results/trade.md).
 PRUNE_AT = (0.6, 0.8)
 #: Gaussians below this opacity, or wider than this fraction of the rig's extent, are removed.
 PRUNE_OPACITY, MAX_SCALE = 0.01, 0.3

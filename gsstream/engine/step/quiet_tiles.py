@@ -3,7 +3,7 @@
 Candidates reach far beyond what changed: on a recording of people they cover nearly every tile of every view. A tile
 that did not change, and lies beside none that did, holds them to where they were, and a few of these quiet tiles say
 that as well as all: those that are drawn count for those that are not, so that the gradient is right on average
-(docs/results/live.md).
+(docs/results/cost.md).
 """
 
 from __future__ import annotations

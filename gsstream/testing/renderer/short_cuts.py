@@ -20,7 +20,7 @@ from gsstream.testing.compare import equal
 from gsstream.testing.registry import check
 
 #: Of the largest value of a gradient. A renderer may blend what stands still once for all passes of a frame, and then
-#: a pixel whose light is nearly used up may end a Gaussian later (docs/results/live.md).
+#: a pixel whose light is nearly used up may end a Gaussian later (docs/results/cost.md).
 NEAR = 5e-3
 WHY = "the same calls, up to rounding and the end of a pixel's light"
 #: What renders are compared with.

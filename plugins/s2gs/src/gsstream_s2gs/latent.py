@@ -47,7 +47,7 @@ class LatentResidual(UpdateRule):
     one symbol into 3e-5 of colour, invisible in 8 bits. Here:
 
     * ``lr`` 0.1 to 1 symbol per iteration, so that a residual can move by several symbols within one pass over a rig.
-      Measured on a real rig (docs/results/index.md): at 0.025 to 0.05 the same gates lose 1.3 dB on moving pixels.
+      Measured on a real rig: at 0.025 to 0.05 the same gates lose 1.3 dB on moving pixels.
     * ``decoder_std``: one symbol is about half the smallest visible change: 0.01 in sh0 (0.7 of 255 grey levels), 0.005
       in a unit quaternion (half a degree), 0.01 in log size (1 %), 0.1 in the opacity logit (2.5 % at half opacity).
     * Higher colour moves more slowly: it costs most bits and explains least between two frames.

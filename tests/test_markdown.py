@@ -1,0 +1,272 @@
+"""What a page names exists: links, paths, recipe keys, commands with their options, methods.
+
+A placeholder is written in capitals (`tests/FOLDER`, `--out DIR`, `--set SLOT.KEY=VALUE`) or as `...`.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import BaseModel
+from typer.main import get_command
+
+from gsstream.cli.main import app
+from gsstream.core.kinds import CONTRACTS
+from gsstream.plugins.catalog import load_catalog
+from gsstream.recipe.model import Recipe
+from tools.reference.pages import BUILT, FOLDER
+
+ROOT = Path(__file__).parents[1]
+MADE = {FOLDER / name for name in BUILT}
+PAGES = sorted(
+    {*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("configs/**/*.md"), *ROOT.glob("plugins/*/README.md")}
+    - MADE
+)
+#: Folders whose files pages may name by their path in the repository.
+PLACES = "gsstream|plugins|tests|tools|docs|configs"
+#: Options of other programs that pages name: pip, pytest, make and the like.
+FOREIGN = {
+    "--find-links", "--index-url", "--extra-index-url", "--no-build-isolation", "--no-deps", "--directory", "--bind",
+    "--no-binary",
+}  # fmt: skip
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+INDENTED = re.compile(r"(?<=\n\n)(?: {4}.*\n)+")
+INLINE = re.compile(r"`([^`\n]+)`")
+PLACEHOLDER = re.compile(r"(?=.*[A-Z])[A-Z0-9_]+|\.\.\.|…")
+
+
+@functools.cache
+def prose(page: Path) -> str:
+    """A page without its fenced and indented blocks."""
+    return INDENTED.sub("\n", FENCE.sub("\n", page.read_text(encoding="utf-8")))
+
+
+@functools.cache
+def shell_lines(page: Path) -> list[str]:
+    """Lines of the blocks of a page that hold no other language, continued lines joined, comments taken off."""
+    text = page.read_text(encoding="utf-8")
+    blocks = [body for language, body in FENCE.findall(text) if language in ("", "bash", "sh", "console")]
+    blocks += INDENTED.findall(FENCE.sub("\n", text))
+    joined = "\n".join(blocks).replace("\\\n", "")
+    return [line.strip().removeprefix("$ ") for line in joined.splitlines()]
+
+
+def commands(lines: list[str]) -> Iterator[list[str]]:
+    """The words after ``gsstream`` of every call of it."""
+    for line in lines:
+        try:
+            words = shlex.split(line, comments=True)
+        except ValueError:  # a line of another language, or a placeholder with an apostrophe
+            continue
+        call: list[str] = []
+        for word in [*words, ";"]:
+            ends = word.endswith(";") or word in ("&&", "|", "&", "||", ">")
+            call += [word.rstrip(";")] if word.rstrip(";") and word not in ("&&", "|", "&", "||", ">") else []
+            if ends and call:
+                while "=" in call[0] and len(call) > 1:  # variables of the environment
+                    call.pop(0)
+                if call[0] == "gsstream" or call[0].endswith("bin/gsstream"):
+                    yield call[1:]
+                call = []
+
+
+@functools.cache
+def command_line() -> Any:
+    return get_command(app)
+
+
+def problem(words: list[str], complete: bool) -> str | None:
+    """What the command line would refuse of a call; values are not looked at.
+
+    An incomplete call, in a sentence or with ``...`` in it, may leave out what is required.
+    """
+    command, path, rest = command_line(), "gsstream", list(words)
+    complete = complete and "..." not in rest
+    rest = [word for word in rest if word != "..."]
+    if rest and rest[0] in ("--debug",):
+        rest.pop(0)
+    while getattr(command, "commands", None) and rest and not rest[0].startswith("-"):
+        if PLACEHOLDER.fullmatch(rest[0]):
+            return None
+        if rest[0] not in command.commands:
+            return f"{path} has no command {rest[0]!r}"
+        path, command = f"{path} {rest[0]}", command.commands[rest.pop(0)]
+    switches = [p for p in command.params if p.param_type_name == "option"]
+    options = {text: switch for switch in switches for text in (*switch.opts, *switch.secondary_opts)}
+    given, arguments = set(), 0
+    while rest:
+        word, equals, _ = rest.pop(0).partition("=")
+        if word in ("-h", "--help"):
+            return None
+        if not re.match(r"--?[a-z]", word):
+            arguments += 1
+        elif word not in options:
+            return f"{path} has no option {word}"
+        else:
+            given.add(options[word].name)
+            if not options[word].is_flag and not equals:
+                if not rest and complete:
+                    return f"{path} {word} lacks its value"
+                rest = rest[1:]
+    positional = [p for p in command.params if p.param_type_name == "argument"]
+    if arguments > len(positional) and all(p.nargs == 1 for p in positional):
+        return f"{path} takes {len(positional)} arguments, not {arguments}"
+    if complete:
+        lacking = [p.opts[0] for p in switches if p.required and p.name not in given]
+        lacking += [p.name for p in positional[arguments:] if p.required]
+        if lacking:
+            return f"{path} lacks {', '.join(lacking)}"
+    return None
+
+
+@functools.cache
+def catalog() -> Any:
+    return load_catalog()
+
+
+def fields(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    for name, field in model.model_fields.items():
+        yield f"{prefix}{name}"
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from fields(field.annotation, f"{prefix}{name}.")
+
+
+@functools.cache
+def recipe_keys() -> set[str]:
+    """Every key that some recipe may have: those of the recipe, and those of every part in its slot."""
+    keys = set(fields(Recipe))
+    for kind, name in catalog().entries:
+        if kind in CONTRACTS and kind in Recipe.model_fields:
+            own = set(fields(catalog().resolve(kind, name).Config))
+            keys |= {f"{kind}.{key}" for key in own} | {f"{kind}.params.{key}" for key in own}
+    return keys
+
+
+SECTION = re.compile(r"([a-z_]+)((?:\.[a-z_0-9]+)+)(?=$|[=:\s,])")
+ENDINGS = {"gss", "json", "jsonl", "yaml", "py", "md", "txt", "png", "js", "mjs", "cpp", "hpp", "html"}
+
+
+def keys_named(text: str) -> Iterator[str]:
+    """Keys of recipes in a piece of code: `stream.epochs`, `--set gate.temperature=0.3`."""
+    for section, rest in SECTION.findall(text):
+        key = section + rest
+        if section in Recipe.model_fields and rest.rpartition(".")[2] not in ENDINGS:
+            yield key
+
+
+def methods_named(words: list[str]) -> Iterator[str]:
+    yield from (word for before, word in itertools.pairwise(words) if before == "--method")
+    if words[:1] == ["compare"] and len(words) > 1:
+        yield from filter(None, words[1].split(","))
+    if words[:2] == ["methods", "show"]:
+        yield from words[2:3]
+
+
+def check(found: Iterator[str] | list[str]) -> None:
+    if wrong := list(found):
+        pytest.fail("\n".join(wrong), pytrace=False)
+
+
+def where(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+def test_the_pages_are_found() -> None:
+    assert len(PAGES) > 40
+    assert sum(len(list(commands(shell_lines(page)))) for page in PAGES) > 30
+
+
+def heading_anchor(heading: str) -> str:
+    text = re.sub(r"[^\w\- ]", "", heading.replace("`", "").strip().lower())
+    return text.replace(" ", "-")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=where)
+def test_links_lead_somewhere(page: Path) -> None:
+    def wrong() -> Iterator[str]:
+        for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+            name, _, anchor = target.partition("#")
+            place = (page.parent / name).resolve() if name else page
+            if ":" in name or place in MADE:
+                continue
+            if not place.exists():
+                yield target
+            elif anchor and place.suffix == ".md":
+                headings = re.findall(r"^#+ (.*)$", place.read_text(encoding="utf-8"), re.MULTILINE)
+                if anchor not in map(heading_anchor, headings):
+                    yield f"{target}: no such heading"
+
+    check(wrong())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=where)
+def test_paths_exist(page: Path) -> None:
+    def wrong() -> Iterator[str]:
+        text = page.read_text(encoding="utf-8")
+        for code in INLINE.findall(text):
+            for path in re.findall(rf"(?:^|(?<=[\s\"'(=]))(?:{PLACES})/[\w./*{{}},-]*", code):
+                pattern = re.sub(r"\{[^}]*\}|(?<![a-z])[A-Z][A-Z_]+(?![a-z.])", "*", path.rstrip(".,"))
+                found = any(ROOT.glob(pattern)) or any(page.parent.glob(pattern))
+                if not found and ROOT / pattern not in MADE:
+                    yield path
+        for module in re.findall(r"python -m ((?:tools|tests|gsstream)(?:\.\w+)*)", text):
+            place = ROOT / module.replace(".", "/")
+            if not (place.is_dir() or place.with_suffix(".py").is_file() or PLACEHOLDER.fullmatch(place.name)):
+                yield module
+
+    check(wrong())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=where)
+def test_commands_parse(page: Path) -> None:
+    def wrong() -> Iterator[str]:
+        for words in commands(shell_lines(page)):
+            if said := problem(words, complete=True):
+                yield f"{' '.join(words)}: {said}"
+        for code in INLINE.findall(prose(page)):
+            for words in commands([code]):
+                if said := problem(words, complete=False):
+                    yield f"`{code}`: {said}"
+
+    check(wrong())
+
+
+@functools.cache
+def options_in_the_code() -> str:
+    """Text of everything that defines options: the command line, the tools and scripts, and the settings of pytest."""
+    places = [*ROOT.glob("gsstream/cli/**/*.py"), *ROOT.glob("tools/**/*.*"), *ROOT.glob("tests/**/*.py")]
+    places += [*ROOT.glob("plugins/*/src/**/*.py"), ROOT / "conftest.py"]
+    return "\n".join(path.read_text(encoding="utf-8") for path in places if path.suffix in (".py", ".mjs"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=where)
+def test_options_in_sentences_exist(page: Path) -> None:
+    named = {word for code in INLINE.findall(prose(page)) for word in re.findall(r"(?<![\w-])--[a-z][\w-]+", code)}
+    check(sorted(word for word in named - FOREIGN if f'"{word}"' not in options_in_the_code()))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=where)
+def test_recipe_keys_exist(page: Path) -> None:
+    pieces = [*INLINE.findall(prose(page)), *shell_lines(page)]
+    unknown = {key for piece in pieces for key in keys_named(piece)} - recipe_keys()
+    code = "".join(body for language, body in FENCE.findall(page.read_text(encoding="utf-8")) if language == "python")
+    own = set(re.findall(r"^ +(\w+): ", code, re.MULTILINE))  # settings of a part that the page shows how to write
+    check(sorted(key for key in unknown if key.rpartition(".")[2] not in own))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=where)
+def test_methods_exist(page: Path) -> None:
+    known = {name for kind, name in catalog().entries if kind == "method"}
+    calls = [*commands([*shell_lines(page), *INLINE.findall(prose(page))])]
+    named = {name for words in calls for name in methods_named(words)}
+    named |= set(re.findall(r"encoder_for\(\"([^\"]+)\"", page.read_text(encoding="utf-8")))
+    code = "".join(body for language, body in FENCE.findall(page.read_text(encoding="utf-8")) if language)
+    known |= set(re.findall(r"\"([\w-]+)\"", code))  # a method that the page shows how to write
+    check(sorted(n for n in named - known if not (PLACEHOLDER.fullmatch(n) or n.endswith(".yaml"))))

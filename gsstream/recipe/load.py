@@ -6,8 +6,6 @@ Naming another part in a slot drops the parameters that lower layers gave to the
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gsstream.core.errors import RecipeError
+from gsstream.packet.meta import hash_recipe
 from gsstream.recipe.check import join_problems, keep_known, validate
 from gsstream.recipe.document import (
     DEFAULT,
@@ -159,8 +158,7 @@ def recipe_hash(recipe: Recipe) -> str:
 
     Equal hashes mean equal runs of the same recording. ``StreamMeta.recipe_hash`` is the same number.
     """
-    canonical = json.dumps(recipe.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+    return hash_recipe(recipe.model_dump(mode="json"))
 
 
 def _method_chain(name: str, find_method: FindMethod, within: tuple[str, ...]) -> list[Layer]:

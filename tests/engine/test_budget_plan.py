@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import assume, given
@@ -22,6 +23,7 @@ from gsstream.engine.budget.plan import (
     plan,
 )
 from gsstream.engine.budget.report import budget_lines
+from gsstream.packet.symbols import encode_symbols
 from gsstream.recipe.budget import Budget, budget_overrides
 from gsstream.recipe.model import Stream
 
@@ -168,6 +170,15 @@ def test_estimated_bytes() -> None:
     fair = torch.randint(0, 4, (8000, 3)).float()
     assert estimated_bytes(fair) == pytest.approx(3 * 8000 * 2 / 8, rel=0.02)
     assert estimated_bytes(torch.zeros(1000, 3)) < 40
+
+
+@pytest.mark.parametrize("spread", [0.5, 3.0, 40.0])
+@pytest.mark.parametrize("rows", [5, 50, 5000])
+def test_estimated_bytes_are_hardly_less_and_little_more_than_those_of_the_coder(rows: int, spread: float) -> None:
+    """Few rows of many values cost mostly the model: which values there are, and how many of each."""
+    symbols = np.rint(np.random.default_rng(0).laplace(scale=spread, size=(rows, 6))).astype(np.int32)
+    coded = len(encode_symbols(symbols))
+    assert 0.99 * coded <= estimated_bytes(torch.from_numpy(symbols)) <= 1.05 * coded + 100
 
 
 def line(frame: int, size: int, **more: object) -> dict[str, object]:

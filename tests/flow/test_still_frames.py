@@ -42,7 +42,7 @@ def test_a_pause_costs_a_few_bytes_and_no_optimisation(tmp_path: Path, monkeypat
     still = [PacketKind.EMPTY] * 2
     assert kinds(tmp_path / "o") == [PacketKind.KEY, PacketKind.DELTA, *still, PacketKind.DELTA]
     lines = metrics(tmp_path / "o")
-    assert [line["iterations"] for line in lines[2:4]] == [0, 0]
+    assert [(line["iterations"], line["loss"]) for line in lines[2:4]] == [(0, 0.0), (0, 0.0)]
     assert all(sum(line["bytes"].values()) <= 32 for line in lines[2:4])
     before, paused_state = witness.states[1], witness.states[3]
     for (name, a), (_, b) in zip(before.player.gaussians.items(), paused_state.player.gaussians.items(), strict=True):
@@ -74,3 +74,11 @@ def test_a_fade_too_slow_to_see_from_frame_to_frame_is_seen_in_the_end(tmp_path:
     lines = metrics(tmp_path / "o")
     assert lines[1]["changed_tiles"] == 0
     assert any(line["iterations"] > 0 for line in lines[1:])
+
+
+def test_a_frame_without_candidates_costs_nothing_and_loses_nothing(tmp_path: Path) -> None:
+    """The pictures change, but no gate can open: nothing is optimised, and the loss of nothing is 0."""
+    encode(tmp_path / "o", stream__active_threshold=1)
+    for line in metrics(tmp_path / "o")[1:]:
+        assert (line["candidate_gaussians"], line["iterations"], line["loss"]) == (0, 0, 0.0)
+        assert line["changed_tiles"] > 0

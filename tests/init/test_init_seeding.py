@@ -185,13 +185,15 @@ def test_best_plane_finds_the_vertex_of_a_parabola() -> None:
 def test_fill_respects_views_distance_and_coverage(scene: SyntheticSource) -> None:
     images, cameras = scene.frame(0).images, scene.info.train
 
-    def fill(points: PointCloud | None, seed: int = 0) -> PointCloud:
-        rng = np.random.default_rng(seed)
-        return fill_volume(points, images, cameras, 500, min_views=4, min_distance=0.8, rng=rng)
+    def fill(points: PointCloud | None, count: int = 500) -> PointCloud:
+        rng = np.random.default_rng(0)
+        return fill_volume(points, images, cameras, count, min_views=4, min_distance=0.8, rng=rng)
 
     free = fill(None)
     assert len(free) == 500
     assert free.xyz.tobytes() == fill(None).xyz.tobytes()
+    [one] = zip(*(table.tolist() for table in (fill(None, count=1).xyz, fill(None, count=1).rgb)), strict=True)
+    assert one == (free.xyz[0].tolist(), free.rgb[0].tolist())
     assert (visible_views(free.xyz, cameras).sum(1) >= 4).all()
     gaps = np.linalg.norm(free.xyz[:, None] - cameras.centers[None], axis=2)
     assert gaps.min() >= 0.8 - 1e-5

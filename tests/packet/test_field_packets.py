@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from packet_scenes import begin, decode_all, follow, make_delta, make_field, make_field_packets, make_key, make_motion
+from packet_scenes import begin, decode_all, follow, make_delta, make_field, make_field_packets, make_motion
 
 from gsstream.core.changes import Delta, FieldShape, Rows, Scene, apply_delta, apply_field, apply_motion, field_rows
 from gsstream.core.changes.hashgrid import evaluated
@@ -203,4 +203,3 @@ def test_the_stream_of_the_samples_says_every_form_of_field():
     kinds = [[type(change).__name__ for change in state.delta.changes] for state in states[1:]]
     assert kinds[2][:2] == ["Motion", "Field"]
     assert {state.delta.field.marks is None for state in states[1:] if state.delta.field} == {True, False}
-    assert len(make_key(np.random.default_rng(0)).gaussians) == 40

@@ -21,11 +21,13 @@ from gsstream.packet import (
     encode_delta,
     encode_empty,
     encode_key,
+    positions,
     quantise_decoders,
     quantise_key,
 )
 from gsstream.packet.base import SECTION_NAMES, parse_packet
 from gsstream.packet.grids import KEY_BITS
+from gsstream.packet.rows import encode_codes, row_codes
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -98,6 +100,22 @@ def test_positions_round_trip_at_any_scale_and_distance(seed, size, reach, numbe
     decoded = decode_key(packet.data).gaussians
     assert same_bits(decoded, quantise_key(state.gaussians))
     assert same_bits(quantise_key(decoded), decoded)
+
+
+@pytest.mark.parametrize(("number", "reach"), [(3000, 1.0), (3000, 100.0), (30, 1.0)])
+def test_positions_take_the_cell_of_the_smallest_packet(number, reach, monkeypatch):
+    """Every cell decodes, so nothing but the size says whether the estimate of the cheapest is right."""
+    scene = make_scene(np.random.default_rng(6), number)
+    scene = dataclasses.replace(scene, means=np.sort(scene.means * np.float32(reach), 0))
+    codes, means = row_codes(scene), quantise_key(scene).means
+    chosen, candidates = encode_codes(means, codes)["means"], positions._cell_candidates
+    sizes = {}
+    for cell in candidates(means, int.from_bytes(chosen[:1], signed=True)):
+        monkeypatch.setattr(positions, "_cell_candidates", lambda *_, cell=cell: [cell])
+        sizes[cell] = len(encode_codes(means, codes)["means"])
+    assert len(sizes) > 5
+    assert len(chosen) <= 1.02 * min(sizes.values())
+    assert max(sizes.values()) > 1.1 * min(sizes.values())
 
 
 def test_coordinates_too_large_for_their_gaussians_are_refused():

@@ -41,7 +41,8 @@ LONG = (
 #: What ``make check`` runs: rooms whose tests are cheap, and the one test of whole runs that must never fail.
 QUICK = ("core", "spec", "recipe", "residual", "render", "metrics", "cli", "packet", "player", "method", "plugins")
 QUICK_FILES = (
-    "flow/test_closed_loop", "test_architecture", "test_docstrings", "test_readme", "contract/test_parts",
+    "flow/test_closed_loop", "test_architecture", "test_docstrings", "test_markdown", "test_readme",
+    "contract/test_parts",
 )  # fmt: skip
 #: Too slow for that in these rooms.
 NOT_QUICK = (

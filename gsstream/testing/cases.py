@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -213,6 +214,19 @@ def _moving(name: str, views: int = 3) -> World:
     return make_world(name, scene(_cloud()), rig(views), shift=0.08)
 
 
+def _sized(name: str, factor: float) -> World:
+    """A cloud, its points and its cameras in another unit of length: its images are the same."""
+    base = make_world(name, scene(_cloud(30)), rig(), shift=0.08)
+    blobs, cameras, anchors, viewmats = base.gaussians, base.cameras, base.anchors, base.cameras.viewmats.copy()
+    viewmats[:, :3, 3] *= factor
+    lengths = {key: factor * getattr(anchors, key) for key in ("positions", "cell_sizes", "origin")}
+    return replace(
+        base, gaussians=replace(blobs, means=factor * blobs.means, scales=blobs.scales + math.log(factor)),
+        cameras=replace(cameras, viewmats=viewmats, near=factor * cameras.near),
+        points=replace(base.points, xyz=np.float32(factor) * base.points.xyz), anchors=replace(anchors, **lengths),
+    )  # fmt: skip
+
+
 def _huge(name: str) -> World:
     world = make_world(name, scene(_cloud(24)), rig())
     return replace(world, logits=1e4 * torch.sign(world.logits))
@@ -221,10 +235,13 @@ def _huge(name: str) -> World:
 WORLDS: dict[str, Callable[[], World]] = {
     "empty": lambda: make_world("empty", scene(torch.zeros(0, 3)), rig()),
     "one": lambda: make_world("one", scene(torch.tensor([[0.1, 0.0, 0.0]])), rig()),
+    "coincident": lambda: make_world("coincident", scene(torch.full((40, 3), 0.25)), rig()),
     "two identical": lambda: make_world("two identical", scene(torch.full((2, 3), 0.1)), rig()),
     "line": lambda: make_world("line", scene(_line()), rig(), shift=0.05),
     "cloud": lambda: _moving("cloud"),
     "far": lambda: make_world("far", scene(_cloud(30) + 1e6), rig()),
+    "tiny": lambda: _sized("tiny", 1e-6),
+    "vast": lambda: _sized("vast", 1e6),
     "thin": lambda: make_world("thin", _thin(), rig(), shift=0.05),
     "static": lambda: make_world("static", scene(_cloud()), rig()),
     "moving": lambda: _moving("moving"),
@@ -232,6 +249,12 @@ WORLDS: dict[str, Callable[[], World]] = {
     "one camera": lambda: _moving("one camera", 1),
     "huge logits": lambda: _huge("huge logits"),
 }
+
+#: Worlds at the ends of what there can be; every part of a kind with ``behaviour`` is tried on each.
+EXTREMES = (
+    "empty", "one", "two identical", "coincident", "line", "far", "tiny", "vast", "thin", "unseen", "one camera",
+    "huge logits",
+)  # fmt: skip
 
 
 @functools.cache

@@ -22,7 +22,7 @@ from gsstream.core.errors import InputError
 from gsstream.core.kinds import CONTRACTS
 from gsstream.core.part import Part
 from gsstream.gate.base import GateSampler
-from gsstream.testing.cases import World, fingerprint, world
+from gsstream.testing.cases import EXTREMES, World, fingerprint, world
 from gsstream.testing.compare import ROUNDING, all_equal, finite
 from gsstream.testing.drive import behaviour_of, draw, outputs
 from gsstream.testing.recording import SourceUnderTest
@@ -180,9 +180,9 @@ def check_dtype_and_device(part: Part) -> None:
 
 
 @check("common", kinds=BEHAVED)
-def check_empty_and_one(part: Part) -> None:
-    """No Gaussians, one, and two identical ones work; nothing is NaN."""
-    for name in ("empty", "one", "two identical"):
+def check_extremes(part: Part) -> None:
+    """Worlds of no, one, identical, collinear, far, tiny, vast, thin and unseen Gaussians work; nothing is NaN."""
+    for name in EXTREMES:
         try:
             found = outputs(part, world(name))
         except Exception as error:

@@ -18,7 +18,7 @@ ENOUGH_AUC = 0.9
 @check("confidence")
 def check_confidence_range(part: ConfidenceEstimator) -> None:
     """[N] finite float32 logits, on every world."""
-    for name in ("one", "line", "cloud", "far", "thin", "unseen", "one camera"):
+    for name in ("one", "line", "cloud", "far", "tiny", "vast", "thin", "unseen", "one camera"):
         case = world(name)
         got = part.estimate(case)
         n = len(case.gaussians)

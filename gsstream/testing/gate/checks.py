@@ -113,17 +113,20 @@ def check_gate_gradient_flow(part: GateSampler) -> None:
 
 @check("gate")
 def check_gate_extremes(part: GateSampler) -> None:
-    """Logits of +-1e4 give gates in [0, 1], finite probabilities and finite gradients."""
-    for start in (part.init(torch.tensor([-1e4, 1e4])), torch.tensor([-1e4, 1e4])):
-        logits = start.detach().clone().requires_grad_(True)
-        gates = part.sample(logits, None)
-        probability = part.open_probability(logits)
-        finite("open probability at +-1e4", probability)
-        assert float(gates[1].detach()) == 1.0, f"logit 1e4: expected a gate of exactly 1.0, got {gates[1].item()!r}"
-        total = (gates + probability).sum()
-        if total.requires_grad:
-            (gradient,) = torch.autograd.grad(total, logits)
-            finite("gradient at +-1e4", gradient)
+    """Logits of +-1e4 and the ends of float32 give gates in [0, 1], finite probabilities and finite gradients."""
+    for far in (1e4, 3e38):
+        ends = torch.tensor([-far, far])
+        for start in (part.init(ends), ends):
+            logits = start.detach().clone().requires_grad_(True)
+            finite(f"open probability at +-{far:g}", part.open_probability(logits))
+            opened = float(part.sample(logits, None)[1].detach())
+            assert opened == 1.0, f"logit {far:g}: expected a gate of exactly 1.0, got {opened!r}"
+            for how, gates in _samples(part, logits):
+                finite(f"gates {how} at +-{far:g}", gates)
+                total = (gates + part.open_probability(logits)).sum()
+                if total.requires_grad:
+                    (gradient,) = torch.autograd.grad(total, logits)
+                    finite(f"gradient {how} at +-{far:g}", gradient)
 
 
 @check("gate", trait="temperature")

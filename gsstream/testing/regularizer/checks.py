@@ -14,6 +14,9 @@ from gsstream.testing.cases import World, forest, world
 from gsstream.testing.compare import ROUNDING, at_most, equal, finite
 from gsstream.testing.registry import Skip, check
 
+#: Of a scene, so that a sum that is added up one by one in float32 would lose digits: a million rows.
+COPIES = 5000
+
 
 def _terms(
     part: Regularizer, case: World, opened: torch.Tensor | None = None, residual: torch.Tensor | None = None
@@ -113,7 +116,7 @@ def check_regularizer_gradient(part: Regularizer) -> None:
 
 @check("regularizer")
 def check_regularizer_reduction(part: Regularizer) -> None:
-    """A scene beside its own copy costs the same (reduction "mean") or twice as much ("sum")."""
+    """A scene beside its own copy costs the same (reduction "mean") or twice as much ("sum"), and so do many copies."""
     case = world("cloud")
     once, m = _total(_terms(part, case)), case.hierarchy.num_nodes
     half = forest(len(case.logits))
@@ -121,6 +124,10 @@ def check_regularizer_reduction(part: Regularizer) -> None:
     terms = part.penalty(_opened(case).repeat(2), case.residual.repeat(2, 1), both, 2 * len(case.logits))
     factor = {"mean": 1.0, "sum": 2.0}[part.claims().reduction]
     equal(f"reduction {part.claims().reduction!r}", _total(terms), factor * once, 1e-5, ROUNDING)
+    many = Hierarchy(case.hierarchy.node_of.repeat(COPIES), case.hierarchy.parent, case.hierarchy.level)
+    terms = part.penalty(_opened(case), case.residual.repeat(COPIES, 1), many, COPIES * len(case.logits))
+    factor = {"mean": 1.0, "sum": float(COPIES)}[part.claims().reduction]
+    equal(f"{COPIES} times as many rows, one by one", _total(terms) / factor, once, 1e-5, "no digit is lost in a sum")
 
 
 @check("regularizer")

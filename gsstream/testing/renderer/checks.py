@@ -14,7 +14,7 @@ from gsstream.testing.compare import EXACT, at_most, equal, finite
 from gsstream.testing.registry import check
 from gsstream.testing.renderer import short_cuts as short_cuts  # its checks register themselves
 
-WORLDS = ("empty", "one", "two identical", "line", "cloud", "far", "thin", "unseen")
+WORLDS = ("empty", "one", "two identical", "line", "cloud", "far", "tiny", "vast", "thin", "unseen")
 GREY = (0.2, 0.5, 0.9)
 #: One alpha at the cut of 1/255 may fall on either side in another arithmetic; so may the last Gaussian of a pixel.
 CUT = 1e-2

@@ -15,7 +15,7 @@ from gsstream.testing.cases import World, world
 from gsstream.testing.compare import finite
 from gsstream.testing.registry import check
 
-WORLDS = ("one", "two identical", "line", "cloud", "far", "thin", "unseen")
+WORLDS = ("one", "two identical", "line", "cloud", "far", "tiny", "vast", "thin", "unseen")
 
 
 def canonical(labels: torch.Tensor) -> list[int]:
@@ -114,10 +114,8 @@ def check_structure_idempotent(part: Structure) -> None:
 @check("structure")
 def check_structure_degenerate(part: Structure) -> None:
     """Coincident, collapsed and far clouds: a valid forest, at most N nodes per level, M = 0 for N = 0."""
-    coincident = world("cloud")
-    coincident.gaussians.means[:] = 0.25
-    cases = [("coincident", coincident)] + [(name, world(name)) for name in ("empty", "far", "thin", "two identical")]
-    for name, case in cases:
+    for name in ("coincident", "empty", "far", "tiny", "vast", "thin", "two identical"):
+        case = world(name)
         forest = _built(part, case)
         forest.validate()
         deepest = int(forest.level.max()) + 1 if forest.num_nodes else 1
@@ -140,21 +138,22 @@ def check_structure_no_gradient(part: Structure) -> None:
 @check("structure")
 def check_structure_seed(part: Structure) -> None:
     """Anchors are finite, levels index cell sizes, cells are positive and never grow; no points raise InputError."""
-    case = world("cloud")
-    anchors = part.seed(case.points, case.cameras)
-    n = len(anchors.positions)
-    shapes = tuple(anchors.positions.shape), tuple(anchors.colors.shape)
-    assert shapes == ((n, 3), (n, 3)), f"positions and colors: expected shapes [{n}, 3], got {shapes}"
-    assert n > 0, "no anchors were placed"
-    finite("positions", anchors.positions)
-    levels = len(anchors.cell_sizes)
-    low, high = int(anchors.levels.min()), int(anchors.levels.max())
-    assert low >= 0 and high < levels, f"levels: expected [0, {levels}), got {low} to {high}"
-    assert float(anchors.cell_sizes.min()) > 0, f"cell_sizes: expected positive, got {anchors.cell_sizes.tolist()}"
-    assert bool((anchors.cell_sizes.diff() <= 0).all()), f"cell_sizes grow: {anchors.cell_sizes.tolist()}"
+    for name in (*WORLDS, "coincident"):
+        case = world(name)
+        anchors = part.seed(case.points, case.cameras)
+        n, levels, sizes = len(anchors.positions), len(anchors.cell_sizes), anchors.cell_sizes
+        shapes = tuple(anchors.positions.shape), tuple(anchors.colors.shape)
+        assert shapes == ((n, 3), (n, 3)), f"world {name!r}: expected positions and colors of [{n}, 3], got {shapes}"
+        most = len(case.points) * levels
+        assert 0 < n <= most, f"world {name!r}: expected 1 to {most} anchors, points times levels; got {n}"
+        finite(f"world {name!r}: positions", anchors.positions)
+        low, high = int(anchors.levels.min()), int(anchors.levels.max())
+        assert low >= 0 and high < levels, f"world {name!r}: levels: expected [0, {levels}), got {low} to {high}"
+        assert float(sizes.min()) > 0, f"world {name!r}: cell_sizes: expected positive, got {sizes.tolist()}"
+        assert bool((sizes.diff() <= 0).all()), f"world {name!r}: cell_sizes grow: {sizes.tolist()}"
     nothing = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), "nothing")
     try:
-        part.seed(nothing, case.cameras)
+        part.seed(nothing, world("cloud").cameras)
     except InputError:
         return
     raise AssertionError("no points were accepted; expected InputError saying what to do")

@@ -1,4 +1,4 @@
-"""View-space gradient difference: formulas by hand, invariances, extremes, and motion found in rendered images."""
+"""View-space gradient difference: formulas by hand, statistics, and motion found in rendered images."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ import math
 import numpy as np
 import pytest
 import torch
-from gsstream_s2gs.normalise import median, robust
+from gsstream_s2gs.normalise import median
 from gsstream_s2gs.view_gradient import ViewSpaceGradient
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 from s2gs_scene import SIZE, context, gaussians, images, moving, rig, told
-
-from gsstream.api import ShapeError
 
 NORMALISATIONS = ("robust", "ratio", "minmax")
 FLOOR = -math.log(1000.0)
@@ -94,11 +92,6 @@ class TestFormulas:
         assert of("sum-of-norms") == 10.0
         assert of("mean-of-norms") == 5.0
 
-    def test_relative_epsilon_does_not_know_units(self) -> None:
-        a = estimator(epsilon_mode="relative").estimate(told(magnitudes(list(self.values))))
-        b = estimator(epsilon_mode="relative").estimate(told(1e-9 * magnitudes(list(self.values))))
-        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
-
     @given(st.lists(st.floats(0, 1e6), min_size=1, max_size=40))
     @settings(max_examples=100, deadline=None)
     def test_median_is_numpys(self, values: list[float]) -> None:
@@ -120,7 +113,7 @@ class TestFormulas:
             torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-8)
 
 
-class TestInvariances:
+class TestStatistics:
     @pytest.mark.parametrize(
         ("normalisation", "loss"), [("noise", "mse"), *itertools.product(NORMALISATIONS, ("mse", "l2norm"))]
     )
@@ -131,23 +124,6 @@ class TestInvariances:
         assert bool((z <= FLOOR + 1e-6).all())
         assert z.dtype == torch.float32
         assert z.shape == (60,)
-
-    @pytest.mark.parametrize("normalisation", NORMALISATIONS)
-    def test_order_of_gaussians_and_of_cameras(self, normalisation: str) -> None:
-        context, _ = moving()
-        part = estimator(normalisation=normalisation, epsilon_mode="relative")
-        z = part.estimate(context)
-        order = torch.randperm(60, generator=torch.Generator().manual_seed(1))
-        permuted = dataclasses.replace(context, gaussians=context.gaussians.rows(order))
-        torch.testing.assert_close(part.estimate(permuted), z[order], rtol=1e-3, atol=1e-3)
-        views = [2, 0, 1]
-        turned = dataclasses.replace(
-            context,
-            cameras=context.cameras.select(views),
-            before=[context.before[v] for v in views],
-            now=[context.now[v] for v in views],
-        )
-        torch.testing.assert_close(part.estimate(turned), z, rtol=1e-4, atol=1e-4)
 
     def test_unseen_have_the_floor_and_do_not_enter_the_statistics(self) -> None:
         gradient = magnitudes([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0])
@@ -175,45 +151,6 @@ class TestInvariances:
         z = estimator().estimate(told(magnitudes([5.0, 1.0]), torch.tensor([[False, True]])))
         assert float(z[0]) == pytest.approx(FLOOR)
 
-    def test_nothing_is_left_behind(self) -> None:
-        context, _ = moving()
-        scene = context.gaussians.map(lambda a: a.requires_grad_())
-        before = {name: value.detach().clone() for name, value in scene.items()}
-        z = estimator().estimate(dataclasses.replace(context, gaussians=scene))
-        assert not z.requires_grad
-        for name, value in scene.items():
-            assert value.grad is None
-            assert torch.equal(value, before[name])
-
-
-class TestExtremes:
-    cases = (
-        [],
-        [0.0],
-        [1.0],
-        [0.0] * 9,
-        [1.0] * 9,
-        [0.0] * 9 + [1.0],
-        [1.0] * 9 + [1e30],
-        [1e-30] * 5 + [2e-30] * 4,
-        [1e30, 2e30, 3e30],
-        [1e-38, 1e38],
-        [3e38] * 4 + [0.0],
-    )
-
-    @pytest.mark.parametrize("values", cases, ids=str)
-    @pytest.mark.parametrize("normalisation", NORMALISATIONS)
-    @pytest.mark.parametrize(("epsilon", "mode"), [(2e-4, "absolute"), (0.0, "absolute"), (1e-3, "relative")])
-    def test_finite_and_monotone(self, values: list[float], normalisation: str, epsilon: float, mode: str) -> None:
-        z = estimator(normalisation=normalisation, epsilon=epsilon, epsilon_mode=mode).estimate(
-            told(magnitudes(values))
-        )
-        assert z.shape == (len(values),)
-        assert torch.isfinite(z).all()
-        assert float(z.abs().max() if len(z) else 0) <= 50
-        for (a, za), (b, zb) in itertools.combinations(zip(values, z.tolist(), strict=True), 2):
-            assert (za <= zb) if a <= b else (za >= zb)
-
     def test_a_lone_outlier_among_equals(self) -> None:
         """MAD = 0: the paper's epsilon alone divides; without it the deviation's sign decides."""
         z = estimator(units="pixel", limit=1e4).estimate(told(magnitudes([1.0] * 9 + [1.1])))
@@ -221,35 +158,6 @@ class TestExtremes:
         assert float(z[9]) == pytest.approx(0.1 / 2e-4, rel=1e-5)
         z = estimator(units="pixel", epsilon=0).estimate(told(magnitudes([1.0] * 9 + [1.1])))
         assert z.tolist() == [0.0] * 9 + [50.0]
-
-    def test_no_cameras(self) -> None:
-        z = estimator().estimate(told(torch.zeros(0, 5, 2)))
-        assert z.tolist() == pytest.approx([FLOOR] * 5)
-
-    def test_not_finite_is_refused_by_name(self) -> None:
-        gradient = magnitudes([1.0, 2.0, 3.0])
-        gradient[0, 1, 1] = math.nan
-        with pytest.raises(ShapeError, match=r"screen gradient of view 0 at frame 1: .* index \[1, 1\]"):
-            estimator().estimate(told(gradient))
-
-    def test_l2norm_where_render_equals_the_photograph(self) -> None:
-        """The released root has derivative 0 / 0 there."""
-        context, _ = moving()
-        z = estimator(loss="l2norm").estimate(context)  # before == render exactly
-        assert torch.isfinite(z).all()
-        assert float(z.max()) > float(z.min())
-
-    @given(st.lists(st.floats(0, 1e30), min_size=1, max_size=30), st.floats(1e-6, 1e6))
-    @settings(max_examples=100, deadline=None)
-    def test_robust_without_epsilon_is_scale_free(self, values: list[float], factor: float) -> None:
-        v = torch.tensor(values, dtype=torch.float64)
-        spread = median((v - median(v)).abs())
-        if 0 < float(spread) < 1e-200 or 0 < float(spread * factor) < 1e-200:
-            return
-        a, b = robust(v, 0.0, False, 50.0), robust(v * factor, 0.0, False, 50.0)
-        scale = float(median(v)) / max(float(spread), 1e-300)  # cancellation in m - median
-        if scale < 1e6:
-            torch.testing.assert_close(a.clamp(-50, 50), b.clamp(-50, 50), rtol=1e-6, atol=1e-6)
 
 
 class TestMotion:
@@ -269,18 +177,6 @@ class TestMotion:
         z = estimator(aggregate=aggregate, **settings_).estimate(context)
         assert 8 <= int(moved.sum()) <= 30
         assert auc(z, moved) >= 0.9
-
-    def test_the_papers_defaults_rank_too(self) -> None:
-        context, moved = moving()
-        assert auc(estimator().estimate(context), moved) >= 0.9
-
-    def test_more_change_gives_more_confidence(self) -> None:
-        means = []
-        for strength in (0.0, 0.25, 0.5, 1.0):
-            context, moved = moving(strength=strength)
-            means.append(float(estimator().estimate(context)[moved].mean()))
-        assert means == sorted(means)
-        assert means[0] == pytest.approx(FLOOR)
 
     def test_noise_units_stay_calm_under_noise_and_wake_on_motion(self) -> None:
         """Camera noise alone keeps nearly everybody below p = 0.5; motion well above the noise does not."""
@@ -313,12 +209,6 @@ class TestPerturbation:
     def test_is_floored_at_zero(self) -> None:
         values = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).repeat(100)
         assert float(estimator(perturbation=2.0)._perturb(values, 1).min()) == 0.0
-
-    def test_global_generator_is_untouched(self) -> None:
-        before = torch.get_rng_state()
-        estimator(perturbation=0.5).estimate(moving()[0])
-        estimator(normalisation="noise").estimate(moving()[0])
-        assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_contradictions_are_refused() -> None:

@@ -82,7 +82,7 @@ class Narrow(Gate):
         return gates.float()
 
 
-@spoils("check_empty_and_one")
+@spoils("check_extremes")
 class NeverEmpty(Gate):
     """Takes the maximum of no logits."""
 

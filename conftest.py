@@ -42,7 +42,7 @@ LONG = (
 QUICK = ("core", "spec", "recipe", "residual", "render", "metrics", "cli", "packet", "player", "method", "plugins")
 QUICK_FILES = (
     "flow/test_closed_loop", "test_architecture", "test_docstrings", "test_markdown", "test_readme",
-    "contract/test_parts",
+    "contract/test_parts", "contract/test_rounding", "cpu_render/tests/test_cpu_contract",
 )  # fmt: skip
 #: Too slow for that in these rooms.
 NOT_QUICK = (

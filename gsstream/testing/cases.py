@@ -122,19 +122,22 @@ def rig(views: int = 3) -> Cameras:
     return Cameras(ids, np.array(viewmats).reshape(-1, 4, 4), np.tile(K, (views, 1, 1)), SIZE, SIZE)
 
 
-def scene(means: torch.Tensor, seed: int = 0, scales: torch.Tensor | None = None) -> Scene:
-    """Return small, fairly opaque blobs of random colours at ``means`` [N, 3].
+def scene(
+    means: torch.Tensor, seed: int = 0, scales: torch.Tensor | None = None, quats: torch.Tensor | None = None
+) -> Scene:
+    """Return small, fairly opaque blobs of random colours at ``means`` [N, 3], round ones unless told.
 
     Arguments:
         means: [N, 3].
-        seed: of colours and shapes.
-        scales: standard deviation, scene units.
+        seed: of colours.
+        scales: [N, 3] logarithms of the standard deviations, scene units.
+        quats: [N, 4] rotations.
     """
     n = len(means)
     g = torch.Generator().manual_seed(seed)
     return Gaussians(
         means=means,
-        quats=torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+        quats=torch.tensor([1.0, 0, 0, 0]).repeat(n, 1) if quats is None else quats,
         scales=torch.full((n, 3), -2.5) if scales is None else scales,
         opacities=torch.full((n,), 0.5),
         sh0=torch.randn(n, 1, 3, generator=g),
@@ -210,6 +213,13 @@ def _thin() -> Scene:
     return scene(means, scales=torch.tensor([-2.5, -2.5, -12.0]).repeat(40, 1))
 
 
+def _ellipsoids() -> Scene:
+    """Three different sizes and turned axes: turning a ball changes nothing, and no check would see a wrong turn."""
+    g = torch.Generator().manual_seed(7)
+    scales = torch.tensor([-2.1, -2.5, -3.1]) + 0.1 * torch.randn(200, 3, generator=g)
+    return scene(_cloud(), scales=scales, quats=torch.randn(200, 4, generator=g))
+
+
 def _moving(name: str, views: int = 3) -> World:
     return make_world(name, scene(_cloud()), rig(views), shift=0.08)
 
@@ -238,7 +248,7 @@ WORLDS: dict[str, Callable[[], World]] = {
     "coincident": lambda: make_world("coincident", scene(torch.full((40, 3), 0.25)), rig()),
     "two identical": lambda: make_world("two identical", scene(torch.full((2, 3), 0.1)), rig()),
     "line": lambda: make_world("line", scene(_line()), rig(), shift=0.05),
-    "cloud": lambda: _moving("cloud"),
+    "cloud": lambda: make_world("cloud", _ellipsoids(), rig(), shift=0.08),
     "far": lambda: make_world("far", scene(_cloud(30) + 1e6), rig()),
     "tiny": lambda: _sized("tiny", 1e-6),
     "vast": lambda: _sized("vast", 1e6),

@@ -8,6 +8,9 @@ import torch
 
 EXACT = "bitwise: the same operations on the same numbers"
 ROUNDING = "float32 rounding over a few hundred terms"
+#: Of the largest gradient of a scene. A gradient that is smaller than this all over, such as that of the rotation of
+#: round Gaussians, is what is left of large terms that cancel, and its digits are rounding.
+FLOOR = 0.01
 
 
 def equal(what: str, got: torch.Tensor, expected: torch.Tensor, tolerance: float = 0.0, why: str = EXACT) -> None:
@@ -51,6 +54,41 @@ def all_equal(
     assert set(got) == set(expected), f"{what}: expected the outputs {sorted(expected)}, got {sorted(got)}"
     for name, value in expected.items():
         equal(f"{what}: {name}", got[name], value, tolerance, why)
+
+
+def relative(
+    what: str, got: torch.Tensor, expected: torch.Tensor, tolerance: float, why: str, *, floor: float
+) -> None:
+    """Apply :func:`equal` to fractions of the largest expected value.
+
+    Arguments:
+        what: is compared, for the message.
+        got, expected: tensors.
+        tolerance: fraction of the largest expected value.
+        why: the tolerance is what it is.
+        floor: the largest value is taken to be at least this, because below it there is only rounding.
+    """
+    assert floor > 0, f"{what}: expected a floor above 0, got {floor}"
+    scale = max(float(expected.abs().max()), floor) if expected.numel() else 1.0
+    equal(f"{what}, as fractions of {scale:.3g}", got / scale, expected / scale, tolerance, why)
+
+
+def gradients_equal(
+    what: str, got: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor], tolerance: float, why: str
+) -> None:
+    """Apply :func:`relative` to every gradient of a scene, each with the same floor; the names must agree too.
+
+    Arguments:
+        what: is compared, for the message.
+        got, expected: name -> gradient.
+        tolerance: fraction of the largest expected value of that name.
+        why: the tolerance is what it is.
+    """
+    assert set(got) == set(expected), f"{what}: expected gradients of {sorted(expected)}, got {sorted(got)}"
+    largest = max(float(value.abs().max()) for value in expected.values() if value.numel())
+    assert largest > 0, f"{what}: every expected gradient is 0, so nothing would be compared"
+    for name, value in expected.items():
+        relative(f"{what}: gradient of {name}", got[name], value, tolerance, why, floor=FLOOR * largest)
 
 
 def at_most(what: str, got: torch.Tensor, bound: torch.Tensor | float, tolerance: float, why: str) -> None:

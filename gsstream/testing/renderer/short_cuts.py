@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import torch
 
 from gsstream.core.changes.motion import Moves, transformed
+from gsstream.engine.fit.backward import gradient_of
 from gsstream.engine.fit.exposure import Exposure
 from gsstream.engine.fit.judge import Judge
 from gsstream.loss.base import Loss
@@ -16,13 +17,15 @@ from gsstream.motion.pull_back import pulled_back
 from gsstream.plugins.catalog import load_catalog
 from gsstream.render.base import Comparison, Renderer, RenderSession
 from gsstream.testing.cases import SIZE, Scene, world
-from gsstream.testing.compare import equal
+from gsstream.testing.compare import equal, gradients_equal, relative
 from gsstream.testing.registry import check
 
 #: Of the largest value of a gradient. A renderer may blend what stands still once for all passes of a frame, and then
 #: a pixel whose light is nearly used up may end a Gaussian later (docs/results/cost.md).
 NEAR = 5e-3
 WHY = "the same calls, up to rounding and the end of a pixel's light"
+#: The least that slopes and curvatures of motions are measured by: a thousandth of what they are here.
+SLOPE = 1e-5
 #: What renders are compared with.
 IMAGE = torch.rand(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(4))
 
@@ -74,12 +77,8 @@ def check_renderer_short_cuts(part: Renderer) -> None:
                 continue
             value, leaves = _step_by_step(_opened(part)[0], view, rows, _comparison(loss))
             equal(f"loss {name!r}, camera {view}: loss", torch.tensor(pulled.loss), torch.tensor(value), 1e-4, WHY)
-            for (what, got), (_, leaf) in zip(pulled.gradients.items(), leaves.items(), strict=True):
-                if got.numel():
-                    assert leaf.grad is not None
-                    scale = float(leaf.grad.abs().max()) or 1.0
-                    place = f"loss {name!r}, camera {view}: gradient of {what}"
-                    equal(place, got / scale, leaf.grad / scale, NEAR, WHY)
+            got, expected = dict(pulled.gradients.items()), dict(leaves.map(gradient_of).items())
+            gradients_equal(f"loss {name!r}, camera {view}", got, expected, NEAR, WHY)
             _check_moved(part, view, loss, name)
 
 
@@ -93,17 +92,15 @@ def _check_moved(part: Renderer, view: int, loss: Loss, name: str) -> None:
     there = transformed(before, moves).map(torch.from_numpy)
     value, leaves = _step_by_step(_opened(part)[0], view, there, _comparison(loss))
     slope = torch.from_numpy(pulled_back(leaves, moves))
-    scale = float(slope.abs().max()) or 1.0
     equal(f"loss {name!r}, camera {view}: loss after motions", torch.tensor(found.loss), torch.tensor(value), 1e-4, WHY)
-    got = torch.from_numpy(found.slope) / scale
-    equal(f"loss {name!r}, camera {view}: slope of motions", got, slope / scale, NEAR, WHY)
+    got = torch.from_numpy(found.slope)
+    relative(f"loss {name!r}, camera {view}: slope of motions", got, slope, NEAR, WHY, floor=SLOPE)
     assert found.curvature is not None, f"loss {name!r}, camera {view}: pull_moved was asked for curvature, got none"
     judge = Judge(loss, 1.0, IMAGE[None].expand(view + 1, -1, -1, -1).numpy(), None)
     structure = judge.structure(_opened(part)[0], view, there)
     curvature = torch.from_numpy(curvature_of(there.means.numpy(), moves, world("cloud").cameras, view, structure))
-    scale = float(curvature.abs().max()) or 1.0
-    got = torch.from_numpy(found.curvature) / scale
-    equal(f"loss {name!r}, camera {view}: curvature of motions", got, curvature / scale, NEAR, WHY)
+    got = torch.from_numpy(found.curvature)
+    relative(f"loss {name!r}, camera {view}: curvature of motions", got, curvature, NEAR, WHY, floor=SLOPE)
 
 
 @check("renderer")
@@ -126,13 +123,14 @@ def _check_whole(part: Renderer, loss: Loss, name: str) -> None:
         return
     expected = judge.pull_whole(session, view, rows)
     equal(f"loss {name!r}, whole scene: loss", torch.tensor(found.loss), torch.tensor(expected.loss), 1e-4, WHY)
-    got_all, want_all = (
-        {**dict(pull.gradients.items()), "2-D means": pull.means2d, "colour map": pull.colours}
-        for pull in (found, expected)
-    )
-    for what, want in want_all.items():
-        got = got_all[what]
-        assert got is not None, f"loss {name!r}, whole scene: expected a gradient of {what}, got None"
-        if want is not None and want.numel():
-            scale = float(want.abs().max()) or 1.0
-            equal(f"loss {name!r}, whole scene: gradient of {what}", got / scale, want / scale, 1e-5, WHY)
+    got, want = ({**dict(pull.gradients.items()), "2-D means": pull.means2d} for pull in (found, expected))
+    gradients_equal(f"loss {name!r}, whole scene", _given(got), _given(want), 1e-5, WHY)
+    maps = _given({"colour map": found.colours}), _given({"colour map": expected.colours})
+    gradients_equal(f"loss {name!r}, whole scene", *maps, 1e-5, WHY)
+
+
+def _given(gradients: Mapping[str, torch.Tensor | None]) -> dict[str, torch.Tensor]:
+    """Return the gradients; raise AssertionError where one that was asked for is None."""
+    missing = [name for name, value in gradients.items() if value is None]
+    assert not missing, f"expected a gradient of each of {sorted(gradients)}, got None for {missing}"
+    return {name: value for name, value in gradients.items() if value is not None}

@@ -43,6 +43,16 @@ class Corners(Adapter):
         return drawn
 
 
+@spoils("check_renderer_gradient")
+class HalfTurned(Adapter):
+    """Draws rightly, and gives half the gradient by the rotation."""
+
+    def render(self, gaussians: Any, cameras: Cameras, view: int, background: Any) -> RenderOutput:
+        halved = (gaussians.quats + gaussians.quats.detach()) / 2
+        drawn: RenderOutput = super().render(replace(gaussians, quats=halved), cameras, view, background)
+        return drawn
+
+
 @spoils("check_renderer_repeatable")
 class Meddler(Reference):
     """Clamps the opacities it is given, in place."""
@@ -136,7 +146,7 @@ class Hasty(Reference):
         return session
 
 
-class _SlidesMeans(Session):
+class _TurnsTwice(Session):
     def pull_whole(self, view: int, rows: Any, comparison: Comparison) -> WholePull:
         loss: Any = comparison.loss
         assert comparison.matrix is not None
@@ -145,14 +155,13 @@ class _SlidesMeans(Session):
         images = IMAGE.expand(view + 1, -1, -1, -1).numpy()
         plain: Any = Reference().open(rows, None, self._cameras, self._background)
         found = Judge(loss, comparison.dssim, images, exposure).pull_whole(plain, view, rows)
-        assert found.means2d is not None
-        return found._replace(means2d=2 * found.means2d)
+        return found._replace(gradients=replace(found.gradients, quats=2 * found.gradients.quats))
 
 
 @spoils("check_renderer_whole")
-class Sliding(Reference):
-    """Has a short cut for whole scenes, in which 2-D means count twice."""
+class Turning(Reference):
+    """Has a short cut for whole scenes, in which rotations count twice."""
 
     def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
-        session: RenderSession = _SlidesMeans(self, gaussians, active, cameras, background)
+        session: RenderSession = _TurnsTwice(self, gaussians, active, cameras, background)
         return session

@@ -62,7 +62,7 @@ def check_sync(thumbs: Thumbnails) -> list[Finding]:
             found.append(error("sync", (
                 f"camera {cameras.ids[c]!r} is {abs(late)} frame{'s' if abs(late) > 1 else ''} "
                 f"{'late' if late > 0 else 'early'}: what moves is at another place than in the other cameras. Shift "
-                f"its frames by {-late:+d}, or run with data.time_offset={cameras.ids[c]}={late}"
+                f"its frames by {-late:+d}, or run with --source disturbed:time_offset={cameras.ids[c]}@{late}:SOURCE"
             )))  # fmt: skip
     if found and (better := _better_poses(thumbs, table)):
         return better

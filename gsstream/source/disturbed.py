@@ -4,6 +4,7 @@
 
     gsstream run --source disturbed:noise_sigma=20,seed=1:demo ...
     gsstream run --source disturbed:lost_cameras=cam03@10-20+cam05@3-4,lost_as=black:FOLDER ...
+    gsstream run --source disturbed:time_offset=cam03@2:FOLDER ...
 
 A stream names the whole URI as its recording, so that evaluating and resuming see the same disturbed images.
 """
@@ -22,9 +23,10 @@ from gsstream.source.options import DataOptions, Disturbances
 from gsstream.source.transformed import TransformedSource
 
 _KEYS = ("seed", *Disturbances.model_fields)
+_PER_CAMERA = ("lost_cameras", "time_offset")
 
 
-def parse_disturbances(text: str) -> tuple[DataOptions, int]:
+def parse_disturbances(text: str) -> tuple[Disturbances, int]:
     """Read options and seed from ``"KEY=VALUE,..."``.
 
     Raises SourceError naming an unknown key or an impossible value.
@@ -37,12 +39,12 @@ def parse_disturbances(text: str) -> tuple[DataOptions, int]:
             raise SourceError(f"disturbed source: expected KEY=VALUE,..., got {part!r}{near}; keys: {', '.join(_KEYS)}")
         if key in values:
             raise SourceError(f"disturbed source: {key!r} is given twice")
-        values[key] = _losses(value) if key == "lost_cameras" else value
+        values[key] = tuple(value.split("+")) if key in _PER_CAMERA else value
     seed = str(values.pop("seed", "0"))
     if not re.fullmatch(r"\d{1,9}", seed):
         raise SourceError(f"disturbed source: seed: expected a whole number from 0, got {seed!r}")
     try:
-        return DataOptions.model_validate(values), int(seed)
+        return Disturbances.model_validate(values), int(seed)
     except ValidationError as error:
         first = error.errors()[0]
         key = str(first["loc"][0])
@@ -50,26 +52,17 @@ def parse_disturbances(text: str) -> tuple[DataOptions, int]:
         raise SourceError(f"disturbed source: {key} = {first['input']!r}: {first['msg']} ({meaning})") from error
 
 
-def _losses(text: str) -> tuple[str, ...]:
-    """``"cam03@10-20+cam05@3-4"`` as the entries of ``lost_cameras``: frames 10 to 19 of cam03, 3 of cam05."""
-    entries = []
-    for part in text.split("+"):
-        match = re.fullmatch(r"(.+)@(\d{1,9})-(\d{1,9})", part)
-        if match is None:
-            raise SourceError(f"disturbed source: lost_cameras: expected ID@A-B+..., e.g. cam03@10-20, got {part!r}")
-        entries.append(f"{match[1]}={match[2]}:{match[3]}")
-    return tuple(entries)
-
-
 class DisturbedSource(TransformedSource):
     """A recording under disturbances that its own URI names.
 
     Arguments:
-        source: the recording itself. uri: how the user asked for it, disturbances included.
+        source: the recording itself.
+        disturbances, seed: what is done to it.
+        uri: how the user asked for it, disturbances included.
     """
 
-    def __init__(self, source: FrameSource, options: DataOptions, seed: int, uri: str) -> None:
-        super().__init__(source, options, seed)
+    def __init__(self, source: FrameSource, disturbances: Disturbances, seed: int, uri: str) -> None:
+        super().__init__(source, DataOptions(), disturbances, seed)
         self._uri = uri
 
     @property

@@ -32,7 +32,7 @@ class Disturbances(BaseModel):
     )
     noise_frames: int = Field(default=1, ge=1, description="the first so many frames are noisy (paper: frame 0 alone)")
     lost_cameras: tuple[str, ...] = Field(
-        default=(), description='"ID=A:B": this training camera gives nothing in frames A to B - 1, e.g. ["c3=10:20"]'
+        default=(), description="ID@A-B+...: this training camera gives nothing in frames A to B - 1, e.g. c3@10-20"
     )
     lost_share: float = Field(
         default=0.0, ge=0, lt=1, description="each training image after frame 0 is lost with this probability"
@@ -40,10 +40,19 @@ class Disturbances(BaseModel):
     lost_as: LostAs = Field(
         default="hold", description="a lost image is: hold: the camera's last one; black: a black one"
     )
+    time_offset: tuple[str, ...] = Field(
+        default=(), description="ID@FRAMES+...: a camera's frame t + FRAMES stands for frame t, e.g. c3@2+c5@-1"
+    )
 
 
-class DataOptions(Disturbances):
-    """Section ``data`` of a recipe: the split, corrections, and disturbances for experiments."""
+#: Nothing is done to a recording.
+UNDISTURBED = Disturbances()
+
+
+class DataOptions(BaseModel):
+    """Section ``data`` of a recipe: the split, what is done about bad images, and how images wait in memory."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
     split: JudgedBy = Field(
         default="reporting",
@@ -63,9 +72,6 @@ class DataOptions(Disturbances):
         default="none",
         description="what test cameras may give: none; points: seeds of frame 0 (the paper's released code); "
         "training: they train, too (some published numbers)",
-    )
-    time_offset: tuple[str, ...] = Field(
-        default=(), description='"ID=FRAMES" per camera: its frame t + FRAMES stands for frame t, e.g. ["c3=2"]'
     )
     bad_image: BadImage = Field(
         default="stop",

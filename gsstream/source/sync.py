@@ -84,10 +84,10 @@ def _starts(videos: Mapping[str, VideoClip], fps: float) -> list[str]:
     if not late:
         return []
     listed = ", ".join(f"{i} {frames:.1f}" for i, frames in late.items())
-    setting = ", ".join(f'"{i}={-round(frames)}"' for i, frames in late.items())
+    setting = "+".join(f"{i}@{-round(frames)}" for i, frames in late.items())
     return [
         f"by their time stamps some videos start later than the first (frames: {listed}); frames are counted, not "
-        f"timed. If the time stamps are right: --set 'data.time_offset=[{setting}]'"
+        f"timed. If the time stamps are right: --source disturbed:time_offset={setting}:SOURCE"
     ]
 
 

@@ -1,4 +1,4 @@
-"""A recording seen through ``DataOptions``: another split, shifted clocks, bad images, changed light, noise, losses."""
+"""A recording seen through ``DataOptions`` and ``Disturbances``: another split, bad images, noise, losses, ..."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from gsstream.source.base import (
     Split,
     check_index,
 )
-from gsstream.source.options import DataOptions
+from gsstream.source.options import UNDISTURBED, DataOptions, Disturbances
 from gsstream.source.sync import RecordingWarning
 from gsstream.source.transforms import (
     choose_split,
@@ -40,36 +40,37 @@ from gsstream.source.transforms import (
 SPLITS: tuple[Split, ...] = ("train", "test")
 
 
-def transformed(source: FrameSource, options: DataOptions, seed: int) -> FrameSource:
+def transformed(source: FrameSource, options: DataOptions) -> FrameSource:
     """Return ``source`` as ``options`` want it; the very same object when they change nothing.
 
     Arguments:
         source: an open recording.
         options: section ``data`` of the recipe.
-        seed: seed of the run; equal seeds give equal gains, noise and losses.
 
     Raises SourceError when an option names a camera that does not exist or leaves nothing to train on.
     """
-    return source if options.touches_nothing else TransformedSource(source, options, seed)
+    return source if options.touches_nothing else TransformedSource(source, options)
 
 
 class TransformedSource:
-    """A frame source over another one. Thread-safe when the inner source is; the same seed gives the same bits.
+    """A frame source over another one. Thread-safe when the inner source is; equal seeds give equal disturbances.
 
     Frame t of the run is frame ``start + t + offset`` of the recording for each camera, where ``start`` makes room for
     negative offsets; the run is shorter by the span of the offsets, so that no frame is shown twice.
     Order: time offset, gain (all cameras), noise, losses and the rounding of storage (training cameras).
     """
 
-    def __init__(self, source: FrameSource, options: DataOptions, seed: int) -> None:
-        self._source, self._options, self._rng = source, options, Rng(seed)
+    def __init__(
+        self, source: FrameSource, options: DataOptions, disturbances: Disturbances = UNDISTURBED, seed: int = 0
+    ) -> None:
+        self._source, self._options, self._disturbances, self._rng = source, options, disturbances, Rng(seed)
         info = source.info
         both = _joined(info.train, info.test)
         self._home: dict[str, Split] = dict.fromkeys(info.test.ids, "test")
         self._home.update(dict.fromkeys(info.train.ids, "train"))
         train, test, self._away = choose_split(options, info.train, info.test)
-        self._offsets = parse_offsets(options.time_offset, both.ids)
-        self._losses = parse_losses(options.lost_cameras, train)
+        self._offsets = parse_offsets(disturbances.time_offset, both.ids)
+        self._losses = parse_losses(disturbances.lost_cameras, train)
         used = [self._offsets.get(i, 0) for i in {*train, *test}]
         self._start = max(0, -min(used))
         frames = info.num_frames
@@ -77,8 +78,8 @@ class TransformedSource:
             frames -= self._start + max(0, *used)
             if frames < 1:
                 raise SourceError(
-                    f"data.time_offset: offsets from {min(used)} to {max(used)} leave no common frame of the "
-                    f"{info.num_frames} that {info.name!r} has; use smaller offsets"
+                    f"disturbed source: time_offset: offsets from {min(used)} to {max(used)} leave no common frame of "
+                    f"the {info.num_frames} that {info.name!r} has; use smaller offsets"
                 )
         place = both.ids.index
         self._info = replace(
@@ -167,8 +168,8 @@ class TransformedSource:
 
     def _last_shown(self, name: str, index: int) -> int | None:
         """The frame whose image this camera delivers at ``index``; None: a black one."""
-        while is_lost(self._options, self._losses, name, index, self._rng):
-            if self._options.lost_as == "black":
+        while is_lost(self._disturbances, self._losses, name, index, self._rng):
+            if self._disturbances.lost_as == "black":
                 return None
             index -= 1
         return index
@@ -190,7 +191,7 @@ class TransformedSource:
                 index -= 1
 
     def _image(self, name: str, index: int, split: Split, cache: dict[tuple[int, Split], Frame]) -> FloatArray:
-        options = self._options
+        options = self._disturbances
         image = self._read(name, self._start + index + self._offsets.get(name, 0), cache)
         image = with_gain(image, gain_at(options, index, self._rng))
         if split == "train" and options.noise_sigma > 0 and index < options.noise_frames:

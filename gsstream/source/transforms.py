@@ -1,6 +1,6 @@
 """What is done to a recording before a run sees it: who trains, time shifts, gain, noise, lost images. Pure functions.
 
-Everything is decided by the options and the run's seed. With the defaults nothing is touched.
+Everything is decided by the options and a seed. With the defaults nothing is touched.
 """
 
 from __future__ import annotations
@@ -16,36 +16,38 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError, suggest
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
-from gsstream.source.options import DataOptions
+from gsstream.source.options import DataOptions, Disturbances
 
 
 def parse_offsets(entries: Sequence[str], ids: Sequence[str]) -> dict[str, int]:
-    """Return camera -> frames, from "ID=FRAMES". Raises SourceError naming the entry."""
+    """Return camera -> frames, from "ID@FRAMES". Raises SourceError naming the entry."""
     found: dict[str, int] = {}
     for entry in entries:
-        name, _, value = entry.rpartition("=")
-        if not re.fullmatch(r"[+-]?\d+", value):
-            raise SourceError(f"data.time_offset: expected ID=FRAMES with whole frames, e.g. cam03=2, got {entry!r}")
-        found[_known("data.time_offset", name, ids, found)] = int(value)
+        name, _, value = entry.rpartition("@")
+        if not re.fullmatch(r"-?\d{1,9}", value):
+            raise SourceError(
+                f"disturbed source: time_offset: expected ID@FRAMES+..., whole frames, e.g. cam03@2, got {entry!r}"
+            )
+        found[_known("disturbed source: time_offset", name, ids, found)] = int(value)
     return found
 
 
 def parse_losses(entries: Sequence[str], ids: Sequence[str]) -> dict[str, list[range]]:
-    """Return camera -> frames in which it gives nothing, from "ID=A:B".
+    """Return camera -> frames in which it gives nothing, from "ID@A-B".
 
     Frame 0 cannot be lost: it is the key picture.
     """
     found: dict[str, list[range]] = {}
     for entry in entries:
-        name, _, value = entry.rpartition("=")
-        match = re.fullmatch(r"(\d+):(\d+)", value)
+        name, _, value = entry.rpartition("@")
+        match = re.fullmatch(r"(\d{1,9})-(\d{1,9})", value)
         first, last = (int(n) for n in match.groups()) if match else (0, 0)
         if not 1 <= first < last:
             raise SourceError(
-                f"data.lost_cameras: expected ID=A:B with 1 <= A < B, e.g. cam03=10:20, got {entry!r}; "
+                f"disturbed source: lost_cameras: expected ID@A-B with 1 <= A < B, e.g. cam03@10-20, got {entry!r}; "
                 "frame 0 needs every training camera (leave one out with data.train_cameras)"
             )
-        found.setdefault(_known("data.lost_cameras", name, ids, ()), []).append(range(first, last))
+        found.setdefault(_known("disturbed source: lost_cameras", name, ids, ()), []).append(range(first, last))
     return found
 
 
@@ -166,11 +168,11 @@ def _centers(names: tuple[str, ...], train: Cameras, test: Cameras) -> FloatArra
     return np.array([places[name] for name in names]).reshape(-1, 3)
 
 
-def gain_at(options: DataOptions, index: int, rng: Rng) -> float:
+def gain_at(options: Disturbances, index: int, rng: Rng) -> float:
     """Return the factor on all images of frame ``index``, in gain * [1 - amplitude, 1 + amplitude].
 
     Arguments:
-        options: section ``data`` of the recipe.
+        options: the disturbances.
         index: of the frame.
         rng: random streams by name and frame.
     """
@@ -204,11 +206,11 @@ def with_noise(image: FloatArray, sigma: float, camera: str, index: int, rng: Rn
     return out
 
 
-def is_lost(options: DataOptions, losses: dict[str, list[range]], camera: str, index: int, rng: Rng) -> bool:
+def is_lost(options: Disturbances, losses: dict[str, list[range]], camera: str, index: int, rng: Rng) -> bool:
     """Say whether a training camera gives nothing at a frame; never at frame 0.
 
     Arguments:
-        options: section ``data`` of the recipe.
+        options: the disturbances.
         losses: camera -> frames in which it gives nothing.
         camera: id.
         index: of the frame.

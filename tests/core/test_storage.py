@@ -12,7 +12,8 @@ from hypothesis.extra.numpy import arrays
 
 from gsstream.core.errors import ShapeError
 from gsstream.core.storage import packed, rounded, unpacked
-from gsstream.source.options import DataOptions
+from gsstream.source.disturbed import DisturbedSource
+from gsstream.source.options import DataOptions, Disturbances
 from gsstream.source.prefetch import Prefetcher
 from gsstream.source.synthetic import SyntheticSource
 from gsstream.source.transformed import transformed
@@ -50,8 +51,8 @@ def test_what_bytes_cannot_hold_is_refused(wrong: float) -> None:
 def test_frames_wait_packed_and_come_as_the_source_gives_them(storage) -> None:
     """What is decoded ahead has the values that a resumed run reads; test images are not touched."""
     recording = SyntheticSource.from_query("frames=5&views=2&width=24&height=16")
-    plain = transformed(recording, DataOptions(gain=0.9), 0)  # no longer 8 bits
-    source = transformed(recording, DataOptions(gain=0.9, images=storage), 0)
+    plain = DisturbedSource(recording, Disturbances(gain=0.9), 0, "world")  # no longer 8 bits
+    source = transformed(plain, DataOptions(images=storage))
     with Prefetcher(source, range(5), storage=storage) as frames:
         waiting = frames._pending[0].result()[0]
         assert waiting[0].images.dtype == np.dtype(storage)

@@ -11,7 +11,7 @@ from gsstream.cli.main import run_command
 from gsstream.player.playback import Playback
 from gsstream.source.open import open_source
 
-DISTURBED = "disturbed:gain_amplitude=0.3,noise_sigma=8,lost_share=0.4"
+DISTURBED = "disturbed:gain_amplitude=0.3,noise_sigma=8,lost_share=0.4,time_offset={}@1"
 
 
 def test_a_disturbed_run_resumes_to_the_same_bytes_and_is_judged_on_what_it_saw(
@@ -19,8 +19,8 @@ def test_a_disturbed_run_resumes_to_the_same_bytes_and_is_judged_on_what_it_saw(
 ) -> None:
     world = "synthetic:frames=5&views=3&width=64&height=48&supersample=1"
     name = open_source(world).info.test.ids[0]
-    options = {"data__train_views": 2, "data__time_offset": f'["{name}=1"]'}
-    world = f"{DISTURBED}:{world}"
+    options = {"data__train_views": 2}
+    world = f"{DISTURBED.format(name)}:{world}"
     once = encode(tmp_path / "whole", source=world, method="s2gs-edge", **options)
     assert len(metrics(tmp_path / "whole")) == 4  # the offset costs one frame
 
@@ -64,6 +64,6 @@ def test_the_tuning_split_knows_nothing_of_the_test_camera(
 
 
 def test_a_camera_that_is_not_there_ends_with_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(arguments(tmp_path / "o", "--set", 'data.lost_cameras=["cam9=1:2"]')) == 2
-    assert "data.lost_cameras: no camera 'cam9'" in capsys.readouterr().err
+    assert run_command(arguments(tmp_path / "o", "--set", 'data.train_cameras=["cam9"]')) == 2
+    assert "data.train_cameras: no camera 'cam9'" in capsys.readouterr().err
     assert not (tmp_path / "o" / "stream.gss").exists()

@@ -15,7 +15,7 @@ from gsstream.recipe.load import ResolvedRecipe, recipe_hash, resolve_recipe
 from gsstream.recipe.model import Recipe
 from gsstream.recipe.save import to_yaml
 from gsstream.trade.sweep.config import Scene, read_sweep
-from gsstream.trade.sweep.plan import make_plan
+from gsstream.trade.sweep.plan import Cell, make_plan
 
 FOLDER = Path(__file__).parents[2] / "configs" / "paper"
 #: Lies on others; alone it is the dense baseline with an active set.
@@ -45,7 +45,7 @@ TINY = [
 CHEAP = [
     "components 1-dense", "components 4-octree", "structure-sparsity structure", "propagation ft-0.80",
     "discretisation binary-released", "confidence constant-zero", "first-frame-noise noise-30",
-    "extensions selective-leaf", "extensions insertion",
+    "extensions selective-leaf",
 ]  # fmt: skip
 
 
@@ -55,15 +55,21 @@ def catalog() -> Catalog:
 
 
 @pytest.fixture(scope="module")
-def rows(catalog: Catalog) -> dict[str, ResolvedRecipe]:
-    """"table row" -> its recipe, with what no recording changes."""
+def points(catalog: Catalog) -> dict[str, Cell]:
+    """"table row" -> its run on the demo, with what no recording changes."""
     found = {}
     for table in TABLES:
         config = read_sweep(FOLDER / f"{table}.yaml")
         bare = config.model_copy(update={"scenes": [Scene(name="any", uri="demo")], "seeds": [0]})
         plan = make_plan(bare, FOLDER, catalog.recipe_path)
-        found |= {f"{table} {point.variant}": point.resolved for point in plan.points}
+        found |= {f"{table} {point.variant}": point for point in plan.points}
     return found
+
+
+@pytest.fixture(scope="module")
+def rows(points: dict[str, Cell]) -> dict[str, ResolvedRecipe]:
+    """"table row" -> its recipe."""
+    return {name: point.resolved for name, point in points.items()}
 
 
 def recipe_of(resolved: ResolvedRecipe, catalog: Catalog) -> Recipe:
@@ -87,11 +93,11 @@ def test_every_row_is_assembled(catalog: Catalog, rows: dict[str, ResolvedRecipe
 
 
 def test_every_row_is_another_experiment_except_those_that_are_the_same(
-    catalog: Catalog, rows: dict[str, ResolvedRecipe]
+    catalog: Catalog, points: dict[str, Cell], rows: dict[str, ResolvedRecipe]
 ) -> None:
-    groups: dict[str, set[str]] = {}
-    for name, resolved in rows.items():
-        groups.setdefault(recipe_hash(recipe_of(resolved, catalog)), set()).add(name)
+    groups: dict[tuple[str, str], set[str]] = {}
+    for name, point in points.items():
+        groups.setdefault((recipe_hash(recipe_of(point.resolved, catalog)), point.scene.uri), set()).add(name)
     several = [group for group in groups.values() if len(group) > 1]
     assert sorted(map(sorted, several)) == sorted(map(sorted, SAME))
     assert recipe_hash(full(catalog).recipe) == recipe_hash(recipe_of(rows["components 5-hfp"], catalog))
@@ -151,12 +157,12 @@ def test_the_octree_of_a_scene_reaches_its_rows_and_leaves_flat_ones_alone(catal
 
 
 @pytest.mark.parametrize("name", CHEAP)
-def test_two_frames_of_the_demo(name: str, rows: dict[str, ResolvedRecipe], tmp_path: Path) -> None:
+def test_two_frames_of_the_demo(name: str, points: dict[str, Cell], tmp_path: Path) -> None:
     recipe, out = tmp_path / "row.yaml", tmp_path / "out"
-    recipe.write_text(to_yaml(rows[name]))
+    recipe.write_text(to_yaml(points[name].resolved))
     sets = [item for value in TINY for item in ("--set", value)]
-    command = ["run", "--source", "demo", "--recipe", str(recipe), "--out", str(out), "--quiet", "--no-pictures"]
-    assert run_command([*command, "--scale", "0.5", *sets]) == 0
+    command = ["run", "--source", points[name].scene.uri, "--recipe", str(recipe), "--out", str(out), "--quiet"]
+    assert run_command([*command, "--no-pictures", "--scale", "0.5", *sets]) == 0
     later = metrics(out)[1]
     assert later["frame"] == 1
     if name == "confidence constant-zero":

@@ -175,7 +175,7 @@ def test_ply_faults_and_kinds(tmp_path: Path, world: World) -> None:
     path = folder / "points3D_downsample2.ply"
 
     def points():
-        return transformed(open_source(str(folder)), DataOptions(leak="points"), 0).points()
+        return transformed(open_source(str(folder)), DataOptions(leak="points")).points()
 
     path.write_text("ply\nformat ascii 1.0\nelement vertex 2\nproperty double x\nproperty double y\nproperty double z\n"
                     "end_header\n1 2 3\n4 5 6\n")  # fmt: skip

@@ -76,12 +76,12 @@ def test_points_with_the_test_camera_in_their_track_are_held_back(tmp_path: Path
     assert everything is not None
     np.testing.assert_allclose(everything.xyz, world.xyz, atol=1e-6)
     np.testing.assert_array_equal(np.round(everything.rgb * 255), world.rgb)
-    clean = transformed(source, DataOptions(test_cameras=("cam00",)), 0).points()
+    clean = transformed(source, DataOptions(test_cameras=("cam00",))).points()
     assert clean is not None
     rows = [p for p, track in enumerate(tracks(world)) if 0 not in track]
     assert 0 < len(rows) < len(world.xyz)
     np.testing.assert_array_equal(clean.xyz, everything.xyz[rows])
-    leaked = transformed(source, DataOptions(test_cameras=("cam00",), leak="points"), 0).points()
+    leaked = transformed(source, DataOptions(test_cameras=("cam00",), leak="points")).points()
     assert leaked is not None
     assert len(leaked) == len(everything)
 
@@ -91,10 +91,10 @@ def test_points_made_from_all_views_need_a_leak(tmp_path: Path, world: World) ->
     write_ply(folder / "points3D_downsample2.ply", world.xyz, world.rgb)
     source = open_source(str(folder))
     assert source.points() is None
-    leaked = transformed(source, DataOptions(leak="points"), 0).points()
+    leaked = transformed(source, DataOptions(leak="points")).points()
     assert leaked is not None
     np.testing.assert_allclose(leaked.xyz, world.xyz, atol=1e-6)
-    assert transformed(source, DataOptions(test_cameras=()), 0).points() is not None  # nobody judges: nothing leaks
+    assert transformed(source, DataOptions(test_cameras=())).points() is not None  # nobody judges: nothing leaks
 
 
 @pytest.mark.sfm

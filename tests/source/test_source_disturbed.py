@@ -1,4 +1,4 @@
-"""disturbed:KEY=VALUE,...:URI does what the options of ``data`` do; bad images stop, repeat or drop as asked."""
+"""disturbed:KEY=VALUE,...:URI does what its options say; bad images stop, repeat or drop as asked."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from gsstream.core.errors import EndOfRecording, SourceError
 from gsstream.engine.run.recording import reopen_recording
 from gsstream.plugins.catalog import load_catalog
 from gsstream.source.open import DEMO_FOLDER, open_source
-from gsstream.source.options import DataOptions
+from gsstream.source.options import DataOptions, Disturbances
 from gsstream.source.sync import RecordingWarning
-from gsstream.source.transformed import transformed
+from gsstream.source.transformed import TransformedSource, transformed
 
 WORLD = "synthetic:frames=12&views=4&width=16&height=12&supersample=1&motion=3"
 CASES: dict[str, tuple[str, dict[str, Any], int]] = {
@@ -26,18 +26,19 @@ CASES: dict[str, tuple[str, dict[str, Any], int]] = {
     "noise": ("noise_sigma=9,noise_frames=3,seed=4", {"noise_sigma": 9, "noise_frames": 3}, 4),
     "light": ("gain_amplitude=0.4,gain_pattern=random,seed=2", {"gain_amplitude": 0.4, "gain_pattern": "random"}, 2),
     "losses": ("lost_share=0.5,lost_as=black,seed=1", {"lost_share": 0.5, "lost_as": "black"}, 1),
-    "cameras": ("lost_cameras=NAME@3-6+NAME@8-9", {"lost_cameras": ("NAME=3:6", "NAME=8:9")}, 0),
+    "cameras": ("lost_cameras=NAME@3-6+NAME@8-9", {"lost_cameras": ("NAME@3-6", "NAME@8-9")}, 0),
+    "clocks": ("time_offset=NAME@2", {"time_offset": ("NAME@2",)}, 0),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("uri", [WORLD, "demo"])
-def test_the_wrapper_is_the_options_bit_by_bit(case, uri) -> None:
+def test_the_text_is_the_options_bit_by_bit(case, uri) -> None:
     text, options, seed = CASES[case]
     plain = open_source(uri)
     name = plain.info.train.ids[2]
     options = {k: tuple(e.replace("NAME", name) for e in v) if isinstance(v, tuple) else v for k, v in options.items()}
-    expected = transformed(plain, DataOptions(**options), seed)
+    expected = TransformedSource(plain, DataOptions(), Disturbances(**options), seed)
     whole = f"disturbed:{text.replace('NAME', name)}:{uri}"
     found = open_source(whole)
     assert found.info.uri == whole
@@ -54,9 +55,9 @@ def test_a_split_over_a_disturbed_recording_keeps_its_points_honest() -> None:
     plain = open_source(WORLD)
     name = plain.info.train.ids[1]
     split = DataOptions(test_cameras=(name,))
-    fewer = transformed(open_source(f"disturbed:gain=0.9:{WORLD}"), split, 0).points()
+    fewer = transformed(open_source(f"disturbed:gain=0.9:{WORLD}"), split).points()
     assert fewer is None or len(fewer) <= len(plain.points())
-    assert transformed(open_source(f"disturbed:gain=0.9:{WORLD}"), DataOptions(test_cameras=()), 0).points() is not None
+    assert transformed(open_source(f"disturbed:gain=0.9:{WORLD}"), DataOptions(test_cameras=())).points() is not None
 
 
 def test_it_nests_scales_and_reopens() -> None:
@@ -78,7 +79,14 @@ FAULTS = {
     "disturbed:gain=1,gain=2:demo": "given twice",
     "disturbed:seed=-1:demo": "expected a whole number",
     "disturbed:lost_cameras=cam03:demo": "expected ID@A-B",
-    "disturbed:lost_cameras=nobody@1-2:demo": "no camera 'nobody'",
+    "disturbed:lost_cameras=nobody@1-2:demo": "lost_cameras: no camera 'nobody'",
+    "disturbed:lost_cameras=cam03@5-5:demo": "expected ID@A-B with 1 <= A < B",
+    "disturbed:lost_cameras=cam03@0-5:demo": "frame 0 needs every training camera",
+    "disturbed:time_offset=cam03:demo": "expected ID@FRAMES",
+    "disturbed:time_offset=cam03@0.5:demo": "whole frames",
+    "disturbed:time_offset=cam9@1:demo": "time_offset: no camera 'cam9'",
+    "disturbed:time_offset=cam03@1+cam03@2:demo": "given twice",
+    "disturbed:time_offset=cam03@12:demo": "leave no common frame of the 12",
     "disturbed:gain=1:nowhere": "no such folder",
     "disturbed:gain=1:": "no such folder",
 }
@@ -106,7 +114,7 @@ def damaged(tmp_path: Path) -> Path:
 
 def test_by_default_a_bad_image_stops_with_its_name(damaged) -> None:
     for options in ({}, {"leak": "points"}):
-        source = transformed(open_source(str(damaged)), DataOptions(**options), 0)
+        source = transformed(open_source(str(damaged)), DataOptions(**options))
         assert source.frame(2).images.shape[0] > 1
         with pytest.raises(SourceError, match="000003"):
             source.frame(3)
@@ -114,7 +122,7 @@ def test_by_default_a_bad_image_stops_with_its_name(damaged) -> None:
 
 @pytest.mark.parametrize("policy", ["repeat", "drop"])
 def test_a_bad_image_is_repeated_or_its_frame_dropped(policy, damaged) -> None:
-    whole, source = open_source("demo"), transformed(open_source(str(damaged)), DataOptions(bad_image=policy), 0)
+    whole, source = open_source("demo"), transformed(open_source(str(damaged)), DataOptions(bad_image=policy))
     for index in range(7):
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
@@ -134,7 +142,7 @@ def test_frame_0_needs_every_image(damaged) -> None:
     name = json.loads((damaged / "cameras.json").read_text())["cameras"][0]["frames"] % 0
     (damaged / name).write_bytes(b"no picture")
     with pytest.raises(SourceError, match="000000"):
-        transformed(open_source(str(damaged)), DataOptions(bad_image="repeat"), 0).frame(0)
+        transformed(open_source(str(damaged)), DataOptions(bad_image="repeat")).frame(0)
 
 
 def test_the_end_of_a_recording_is_no_bad_image() -> None:
@@ -148,7 +156,7 @@ def test_the_end_of_a_recording_is_no_bad_image() -> None:
                 raise EndOfRecording("the recording ended after 3 frames")
             return self.inner.frame(index, split)
 
-    source = transformed(Ended(open_source(WORLD)), DataOptions(bad_image="repeat"), 0)
+    source = transformed(Ended(open_source(WORLD)), DataOptions(bad_image="repeat"))
     assert source.frame(2).index == 2
     with pytest.raises(EndOfRecording):
         source.frame(3)

@@ -8,18 +8,19 @@ import shutil
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from gsstream.core.errors import EndOfRecording, SourceError
 from gsstream.core.frame import Arrival
-from gsstream.source.base import GrowingSource
+from gsstream.source.base import FrameSource, GrowingSource
+from gsstream.source.disturbed import DisturbedSource
 from gsstream.source.multiview import MultiviewSource
 from gsstream.source.open import DEMO_FOLDER, open_source
-from gsstream.source.options import DataOptions
+from gsstream.source.options import Disturbances
 from gsstream.source.prefetch import Prefetcher
-from gsstream.source.transformed import transformed
 
 
 @pytest.fixture
@@ -27,6 +28,10 @@ def folder(tmp_path: Path) -> Path:
     """The demo recording, finished, in a place where it can be spoiled; the test camera is cam03 or so."""
     shutil.copytree(DEMO_FOLDER, tmp_path / "live")
     return tmp_path / "live"
+
+
+def disturbed(live: FrameSource, **disturbances: Any) -> DisturbedSource:
+    return DisturbedSource(live, Disturbances(**disturbances), 0, live.info.uri)
 
 
 @pytest.fixture
@@ -49,14 +54,14 @@ def test_an_absent_test_camera_is_not_measured(folder: Path, test_camera: str) -
     live = open_source(f"watch:{folder}?missing=hold&grace=0", 0.25)
     assert [len(live.frame(t, "test").cameras) for t in range(3)] == [1, 0, 1]
     assert live.frame(1).effort == 1
-    through = transformed(live, DataOptions(gain=0.5), 0)
+    through = disturbed(live, gain=0.5)
     assert [len(through.frame(t, "test").cameras) for t in range(3)] == [1, 0, 1]
     assert np.array_equal(through.frame(1).images, np.float32(0.5) * live.frame(1).images)
 
 
 def test_transforms_keep_what_a_dropped_frame_is_worth(folder: Path) -> None:
     live = open_source(f"watch:{folder}?behind=drop&queue=2", 0.25)
-    assert [transformed(live, DataOptions(gain=0.5), 0).frame(t).effort for t in (0, 9, 10)] == [0, 0, 0]
+    assert [disturbed(live, gain=0.5).frame(t).effort for t in (0, 9, 10)] == [0, 0, 0]
     assert live.frame(11).effort == 1
 
 
@@ -66,12 +71,12 @@ def test_a_frame_came_in_with_its_last_image_of_either_split(folder: Path, test_
     live = open_source(f"watch:{folder}", 0.25)
     late = live.info.train.ids[2]
     os.utime(folder / late / "000001.jpg", (0, 1012.5))
-    gained = transformed(live, DataOptions(gain=0.5), 0)
+    gained = disturbed(live, gain=0.5)
     came = [source.frame(1, split).arrival for source in (live, gained) for split in ("train", "test")]
     assert came == [Arrival(1012.5)] * 4
     os.utime(folder / test_camera / "000001.jpg", (0, 1013.5))
     assert [source.frame(1).arrival for source in (live, gained)] == [Arrival(1013.5)] * 2
-    ahead = transformed(live, DataOptions(time_offset=[f"{late}=1"]), 0)
+    ahead = disturbed(live, time_offset=(f"{late}@1",))
     assert ahead.frame(1).arrival == Arrival(1020.0), "it waits for the next image of that camera"
     assert open_source(str(folder), 0.25).frame(1).arrival is None
 
@@ -81,7 +86,7 @@ def test_a_frame_says_which_training_cameras_are_absent(folder: Path, test_camer
     name = live.info.train.ids[1]
     for camera in (name, test_camera):
         (folder / camera / "000001.jpg").unlink()
-    for source in (live, transformed(live, DataOptions(gain=0.5), 0)):
+    for source in (live, disturbed(live, gain=0.5)):
         arrivals = [source.frame(t).arrival for t in range(3)]
         assert [arrival and arrival.absent for arrival in arrivals] == [(), (name,), ()]
 
@@ -91,7 +96,7 @@ def test_a_frame_that_is_skipped_is_not_even_read(folder: Path, test_camera: str
     first = live.frame(0).images
     for camera in (live.info.train.ids[0], test_camera):
         (folder / camera / "000005.jpg").write_bytes(b"no picture")
-    for source in (live, transformed(live, DataOptions(gain=1.0, noise_frames=1), 0)):
+    for source in (live, disturbed(live, gain=1.0, noise_frames=1)):
         skipped = source.frame(5)
         assert (skipped.effort, skipped.images.tobytes()) == (0, first.tobytes()), "the last pictures stand in"
         assert skipped.arrival is not None
@@ -111,7 +116,7 @@ def test_a_frame_that_was_read_ahead_is_judged_again_when_its_turn_comes(
         for t in range(2, 12):
             (camera / f"{t:06d}.jpg").rename(later / camera.name / f"{t:06d}.jpg")
     live = open_source(f"watch:{folder}?behind={policy}&queue=2", 0.25)
-    through = transformed(live, DataOptions(gain=0.5), 0)
+    through = disturbed(live, gain=0.5)
     assert [through.frame(t).effort for t in (0, 1)] == [1, 1], "nothing waits yet"
     assert live.effort(1) == 1
     for image in later.glob("*/*.jpg"):

@@ -34,7 +34,7 @@ def open_recording(uri: str, recipe: Recipe, catalog: Catalog) -> FrameSource:
         SourceError: the recording cannot be read, or the recipe's ``data`` section names cameras it does not have.
         PluginUnavailable: the source's plugin cannot be loaded or failed to open the recording.
     """
-    return _open(uri, recipe.scale, recipe.data, recipe.seed, catalog)
+    return _open(uri, recipe.scale, recipe.data, catalog)
 
 
 def reopen_recording(uri: str, recipe: Mapping[str, Any], catalog: Catalog) -> FrameSource:
@@ -53,13 +53,13 @@ def reopen_recording(uri: str, recipe: Mapping[str, Any], catalog: Catalog) -> F
     except ValidationError as error:
         key = ".".join(map(str, error.errors()[0]["loc"]))
         raise RecipeError(f"the stream's recipe: data.{key}: {error.errors()[0]['msg']}; upgrade gsstream") from error
-    return _open(uri, float(recipe.get("scale", 1.0)), data, int(recipe.get("seed", 0)), catalog)
+    return _open(uri, float(recipe.get("scale", 1.0)), data, catalog)
 
 
-def _open(uri: str, scale: float, data: DataOptions, seed: int, catalog: Catalog) -> FrameSource:
+def _open(uri: str, scale: float, data: DataOptions, catalog: Catalog) -> FrameSource:
     source = _open_plain(uri, scale, catalog)
     try:
-        return CanonicalSource(transformed(source, data, seed), world_of(source))
+        return CanonicalSource(transformed(source, data), world_of(source))
     except BaseException:
         source.close()
         raise

@@ -223,14 +223,17 @@ def write_sheets(folder: Path, data: SweepData, scenes: Sequence[str], recording
     from gsstream.trade.jobs.folder import recording_uri
     from gsstream.trade.show.contact_sheet import sheet_of_stream
     from gsstream.trade.sweep.drive import cell_file
+    from gsstream.trade.sweep.plan import disturbed_uri
 
     out, catalog = {}, load_catalog()
     uris = {scene["name"]: scene["uri"] for scene in data.config["scenes"]}
+    disturbed = {variant["name"]: variant.get("disturbed") for variant in data.config["variants"]}
     for scene in scenes:
         group = data.of(scene)[0]
         run = group.runs[0]
         recipe = data.table.recipes[run.row["recipe"]]["values"]
-        source = reopen_recording(recording_uri(uris[scene], recordings), recipe, catalog)
+        uri = disturbed_uri(uris[scene], disturbed[run.row["variant"]], run.row["seed"])
+        source = reopen_recording(recording_uri(uri, recordings), recipe, catalog)
         frames = sorted({0, len(run.records) // 2, len(run.records) - 1})
         try:
             with tempfile.TemporaryDirectory() as temporary:

@@ -69,6 +69,11 @@ class Variant(Section):
         "file, without the settings that file makes for all",
     )
     set: dict[str, Any] = Field(default_factory=dict, description="recipe keys, e.g. stream.epochs: 10")
+    disturbed: str | None = Field(
+        default=None,
+        description="what is done to the recordings, e.g. noise_sigma=20: --source disturbed:KEY=VALUE,...:SOURCE, "
+        "with the seed of the cell",
+    )
     axes: dict[str, Axis] = Field(default_factory=dict, description="axes of this variant, besides those of all")
     base_seeds: list[int] = Field(
         default_factory=list,

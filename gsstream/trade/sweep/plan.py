@@ -96,16 +96,22 @@ def make_plan(config: SweepConfig, folder: Path, find_method: FindMethod) -> Pla
     points: list[Cell] = []
     firsts: dict[str, FirstFrameRun] = {}
     for scene, seed in itertools.product(config.scenes, _all_seeds(config)):
-        lead = _resolve(config, scene, config.variants[0], {}, seed, folder, find_method)
+        leader = config.variants[0]
+        lead = _resolve(config, scene, leader, {}, seed, folder, find_method)
         for variant in config.variants:
+            recorded = _recorded(scene, variant, seed)
             for axes in _points(config, variant, seed):
                 resolved = _resolve(config, scene, variant, axes, seed, folder, find_method)
                 first = None
                 if config.first_frame.share != "own":
-                    made = _first_frame(config, scene, lead if config.first_frame.share == "scene" else resolved, seed)
+                    shared = config.first_frame.share == "scene"
+                    one = (_recorded(scene, leader, seed), lead) if shared else (recorded, resolved)
+                    made = _first_frame(config, *one, seed)
                     first = firsts.setdefault(made.id, made).id
                 points.append(
-                    Cell(_cell_id(config, scene, resolved, first), scene, variant.name, axes, seed, resolved, first)
+                    Cell(
+                        _cell_id(config, recorded, resolved, first), recorded, variant.name, axes, seed, resolved, first
+                    )
                 )
     return Plan(config, tuple(points), firsts)
 
@@ -174,6 +180,17 @@ def _resolve(
         leaves = {path: Leaf(value, origin) for path, value in flat_settings(values, where).items()}
         layers.append(Layer(leaves, shorthand=True))
     return resolve_recipe(variant.method, find_method, files, layers=layers)
+
+
+def _recorded(scene: Scene, variant: Variant, seed: int) -> Scene:
+    """The scene as a variant sees it."""
+    uri = disturbed_uri(scene.uri, variant.disturbed, seed)
+    return scene if uri == scene.uri else scene.model_copy(update={"uri": uri})
+
+
+def disturbed_uri(uri: str, disturbed: str | None, seed: int) -> str:
+    """Return the URI of a recording under the disturbances of a variant; None: as it is."""
+    return uri if disturbed is None else f"disturbed:{disturbed},seed={seed}:{uri}"
 
 
 def _first_frame(config: SweepConfig, scene: Scene, resolved: ResolvedRecipe, seed: int) -> FirstFrameRun:

@@ -45,7 +45,8 @@ def _resolved(variant: Variant, folder: Path, within: tuple[str, ...]) -> Varian
         )
     recipe = found.recipe and os.path.relpath(file.parent / found.recipe, folder)
     settings = _laid_over(found.set, variant.set, f"variant {variant.name}: set")
-    return variant.model_copy(update={"base": None, "method": found.method, "recipe": recipe, "set": settings})
+    taken = {"base": None, "method": found.method, "recipe": recipe, "set": settings}
+    return variant.model_copy(update={**taken, "disturbed": variant.disturbed or found.disturbed})
 
 
 def _laid_over(below: Mapping[str, Any], above: Mapping[str, Any], where: str) -> dict[str, Any]:

@@ -54,7 +54,7 @@ NOT_QUICK = (
 
 def name_of(path: Path) -> str:
     """Return the name of a test file below ``tests`` or ``plugins``, without its suffix."""
-    return path.relative_to(ROOT).with_suffix("").as_posix().partition("/")[2]
+    return Path(os.path.relpath(path, ROOT)).with_suffix("").as_posix().partition("/")[2]
 
 
 def is_quick(path: Path) -> bool:
@@ -78,18 +78,46 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: places.get(name_of(item.path), len(LONG)))
 
 
-#: A part that does not claim something is not checked for it: such skips are no loss, and are counted together.
-NOT_CLAIMED = re.compile(r"not claimed: ")
+#: How a reason for skipping names what is missing: "... (apt install nodejs)".
+REMEDY = re.compile(r"\((apt|npm) install ([^)]+)\)")
 
 
-def pytest_terminal_summary(terminalreporter: Any) -> None:
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the limit that continuous integration sets."""
+    about = "fail when more tests than this are skipped"
+    parser.addoption("--most-skipped", type=int, default=None, metavar="N", help=about)
+
+
+def skip_reasons(reporter: Any) -> Counter[str]:
+    """Count the reasons for which tests were skipped."""
+    reports = reporter.stats.get("skipped", [])
+    reasons = (r.longrepr[2] if isinstance(r.longrepr, tuple) else str(r.longrepr) for r in reports)
+    return Counter(reason.removeprefix("Skipped: ") for reason in reasons)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail a session of which more was skipped than may be; a worker has no reporter and decides nothing."""
+    reporter, most = session.config.pluginmanager.get_plugin("terminalreporter"), session.config.option.most_skipped
+    too_many = most is not None and reporter is not None and skip_reasons(reporter).total() > most
+    if too_many and session.exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
     """Say what was not run, and why: a skipped test is a hole, and nobody sees it among thousands of dots."""
-    reasons: Counter[str] = Counter()
-    for report in terminalreporter.stats.get("skipped", []):
-        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
-        reason = reason.removeprefix("Skipped: ")
-        reasons["checks of claims that a part does not make" if NOT_CLAIMED.match(reason) else reason] += 1
-    if reasons:
-        terminalreporter.section("not run here, and why")
-        for reason, count in sorted(reasons.items(), key=lambda pair: (-pair[1], pair[0])):
-            terminalreporter.write_line(f"{count:5d}  {reason}")
+    reasons = skip_reasons(terminalreporter)
+    if not reasons:
+        return
+    terminalreporter.section("not run here, and why")
+    for reason, count in sorted(reasons.items(), key=lambda pair: (-pair[1], pair[0])):
+        terminalreporter.write_line(f"{count:5d}  {reason}")
+    missing: dict[str, dict[str, None]] = {}
+    for tool, names in (match for reason in reasons for match in REMEDY.findall(reason)):
+        missing.setdefault(tool, {}).update(dict.fromkeys(names.split()))
+    if missing:
+        commands = "; ".join(f"{tool} install {' '.join(names)}" for tool, names in missing.items())
+        terminalreporter.write_line(f"To run the rest: {commands}")
+    most = config.option.most_skipped
+    if most is not None and reasons.total() > most:
+        terminalreporter.write_line(f"FAILED: {reasons.total()} tests were skipped; at most {most} may be")

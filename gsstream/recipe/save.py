@@ -18,11 +18,15 @@ from gsstream.recipe.load import ResolvedRecipe, recipe_hash
 
 def to_yaml(resolved: ResolvedRecipe) -> str:
     """Return YAML text that ``load_recipe`` reads back to an equal recipe."""
-    values = resolved.recipe.model_dump(mode="json")
+    heading = f"# Resolved recipe {recipe_hash(resolved.recipe)}\n# Beside every value: where it comes from.\n"
+    return heading + values_to_yaml(resolved.recipe.model_dump(mode="json"), resolved)
+
+
+def values_to_yaml(values: Mapping[str, Any], resolved: ResolvedRecipe) -> str:
+    """Return YAML text of some of a recipe's sections, with the provenance of every value beside it."""
     widths = [len(line) for line in _dump(_tree(values, (), None, 0)).split("\n")]
     column = 2 + max((width for width in widths if width < 60), default=0)
-    heading = f"# Resolved recipe {recipe_hash(resolved.recipe)}\n# Beside every value: where it comes from.\n"
-    return heading + _dump(_tree(values, (), resolved, column))
+    return _dump(_tree(values, (), resolved, column))
 
 
 def save_resolved(path: Path, resolved: ResolvedRecipe) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -272,31 +273,52 @@ SPOILED = {
 }  # fmt: skip
 
 
+#: Of the runs that are spoiled, and of the one that is not.
+COASTING = {"method": "s2gs-edge", "motion": "coasting", "stream__epochs": 1}
+
+
+@pytest.fixture(scope="module")
+def two_frames(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, bytes]:
+    """The folder of a run as it is when frame 2 looks for its motion, and the stream of the undisturbed run."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    begun, sound = folder / "begun", Coasting.propose
+
+    def propose(self: Coasting, scene: Scene, work: FrameWork, rng: Rng) -> Any:
+        found = sound(self, scene, work, rng)
+        if found and not begun.exists():
+            shutil.copytree(folder / "run", begun)
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Coasting, "propose", propose)
+        return begun, encode(folder / "run", "--frames", "4", **COASTING)
+
+
 @pytest.mark.parametrize("how", SPOILED)
 def test_a_motion_that_does_not_fit_ends_in_one_sentence(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], how: str
+    two_frames: tuple[Path, bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str], how: str
 ) -> None:
     """Nothing written is lost, and with the part mended the run goes on to the bytes of an undisturbed one."""
     spoil, message = SPOILED[how]
     sound = Coasting.propose
+    begun, undisturbed = two_frames
+    run = shutil.copytree(begun, tmp_path / "run")
 
     def propose(self: Coasting, scene: Scene, work: FrameWork, rng: Rng) -> Any:
         found = sound(self, scene, work, rng)
         return spoil(found[0]) if found else found
 
-    options = {"method": "s2gs-edge", "motion": "coasting", "stream__epochs": 1}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Coasting, "propose", propose)
-        assert run_command(arguments(tmp_path, "--frames", "4", **options)) == 1
+        assert run_command(arguments(run, "--resume", "--frames", "4", **COASTING)) == 1
     err = capsys.readouterr().err
     # The second line says what there is and how to go on.
     assert len([line for line in err.splitlines() if not line.startswith("the stream in ")]) == 1, err
     assert err.startswith("error: motion 'Coasting' (from gsstream) failed at frame 2: ")
     assert message in err
-    with Playback(tmp_path / "stream.gss") as playback:
+    with Playback(run / "stream.gss") as playback:
         assert list(playback.frames) == [0, 1]
-    assert len(metrics(tmp_path)) == 2
+    assert len(metrics(run)) == 2
     if how != "numbers":
         return  # to the stream and to those who resume it, all of these are the same
-    resumed = encode(tmp_path, "--resume", "--frames", "4", **options)
-    assert resumed == encode(tmp_path / "undisturbed", "--frames", "4", **options)
+    assert encode(run, "--resume", "--frames", "4", **COASTING) == undisturbed

@@ -61,7 +61,9 @@ def test_every_cut_gives_nothing_or_the_first_layer():
     state, first, packet = make_layers()
     needed, expected = bytes_needed(packet), quantise_key(state.gaussians).rows(np.flatnonzero(first))
     assert 0.3 * len(packet.data) < needed < 0.8 * len(packet.data)
-    for size in range(len(packet.data) + 1):
+    ends = [0, PACKET_HEADER.size, *np.cumsum([0, *packet.sizes.values()]).tolist(), needed, len(packet.data)]
+    near = {end + step for end in ends for step in (-2, -1, 0, 1, 2)}
+    for size in sorted({*near, *range(0, len(packet.data), 17)} & set(range(len(packet.data) + 1))):
         found = first_layer(packet.data[:size])
         assert (found is None) == (size < needed), size
         assert found is None or same_bits(found.gaussians, expected), size

@@ -20,7 +20,9 @@ from gsstream.player.playback import Playback
 from gsstream.player.ply import ply_bytes
 
 CONVERTER = shutil.which(os.environ.get(CONVERTER_VARIABLE, "splat-transform"))
-needs_converter = pytest.mark.skipif(CONVERTER is None, reason="the npm package @playcanvas/splat-transform is missing")
+needs_converter = pytest.mark.skipif(
+    CONVERTER is None, reason="no splat-transform (npm install @playcanvas/splat-transform)"
+)
 
 SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
 CODES = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}

@@ -22,7 +22,9 @@ from node_runs import HERE, NODE
 CHROMIUM = os.environ.get("GSSTREAM_CHROMIUM") or next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
 )
-needs_browser = pytest.mark.skipif(NODE is None or CHROMIUM is None, reason="node or a Chromium is not installed")
+needs_browser = pytest.mark.skipif(
+    NODE is None or CHROMIUM is None, reason="node or a Chromium is not installed (apt install nodejs chromium)"
+)
 
 
 class Handler(SimpleHTTPRequestHandler):

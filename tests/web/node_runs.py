@@ -14,7 +14,7 @@ import pytest
 
 HERE = Path(__file__).parent
 NODE = shutil.which("node")
-needs_node = pytest.mark.skipif(NODE is None, reason="node is not installed")
+needs_node = pytest.mark.skipif(NODE is None, reason="node is not installed (apt install nodejs)")
 
 
 def play_in_node(streams: Sequence[bytes], folder: Path, *, timeout: float = 300) -> dict[str, Any]:

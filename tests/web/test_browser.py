@@ -8,11 +8,10 @@ import threading
 import time
 from pathlib import Path
 
-import pytest
-from node_runs import HERE, NODE
+from node_runs import HERE, NODE, needs_node
 
 
-@pytest.mark.skipif(NODE is None, reason="node is not installed")
+@needs_node
 def test_a_profile_is_removed_while_dying_processes_write_to_it(tmp_path: Path) -> None:
     """Regression: children of a killed browser wrote files between emptying the profile and removing it (ENOTEMPTY)."""
     inner = tmp_path / "profile" / "Default"

@@ -22,8 +22,7 @@ pytestmark = [
     needs_browser,
     pytest.mark.skipif(
         not all((MODULES / name / "package.json").is_file() for name in PACKAGES),
-        reason="three and @sparkjsdev/spark are not installed: npm install three @sparkjsdev/spark, "
-        "or GSSTREAM_NODE_MODULES",
+        reason="three or spark is missing in node_modules (npm install three @sparkjsdev/spark)",
     ),
 ]
 #: Spark sorts in a worker and shows the order one picture later, so several are drawn.

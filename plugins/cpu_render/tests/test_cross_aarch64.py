@@ -30,7 +30,7 @@ COMPILER, EMULATOR = cross.found(cross.COMPILERS), cross.found(cross.EMULATORS)
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(COMPILER is None, reason="no aarch64 cross compiler (apt install g++-aarch64-linux-gnu)"),
-    pytest.mark.skipif(EMULATOR is None, reason="no aarch64 emulator (apt install qemu-user-static)"),
+    pytest.mark.skipif(EMULATOR is None, reason="no aarch64 emulator (apt install qemu-user)"),
 ]
 
 ATTRIBUTES = (*SplatArrays._fields, "means2d")

@@ -3,7 +3,7 @@
 Usage: python plugins/cpu_render/tests/cross/build.py --out DIR
 
 Needs a C++20 cross compiler and user-mode emulation (on Debian and Ubuntu: apt install g++-aarch64-linux-gnu
-qemu-user-static). Writes DIR/driver; ``test_cross_aarch64.py`` runs it and compares with this machine's kernels.
+qemu-user). Writes DIR/driver; ``test_cross_aarch64.py`` runs it and compares with this machine's kernels.
 """
 
 from __future__ import annotations

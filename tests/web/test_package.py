@@ -61,14 +61,6 @@ def test_the_page_finds_every_module_that_it_names(tmp_path):
     assert (tmp_path / "site" / "vendor" / "fzstd-LICENSE").is_file()
 
 
-def test_modules_are_as_short_as_those_in_python():
-    files = [*WEB.glob("*.js"), *(WEB / "changes").glob("*.js")]
-    assert len(files) > 20
-    lines = {file.name: file.read_text().splitlines() for file in files}
-    assert not {name: len(text) for name, text in lines.items() if len(text) > 300}
-    assert not [name for name, text in lines.items() if any(len(line) > 120 for line in text)]
-
-
 def test_nothing_of_the_player_is_fetched_from_elsewhere():
     for file in [*WEB.rglob("*.js"), *WEB.rglob("*.html")]:
         text = file.read_text()

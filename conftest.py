@@ -39,10 +39,14 @@ LONG = (
     "flow/test_light_process", "player/test_player_memory", "trade/test_offline", "trade/test_compare",
 )  # fmt: skip
 #: What ``make check`` runs: rooms whose tests are cheap, and the one test of whole runs that must never fail.
-QUICK = ("core", "spec", "recipe", "residual", "render", "metrics", "cli", "packet", "player", "method", "plugins")
+QUICK = (
+    "core", "recipe", "residual", "render", "metrics", "cli", "packet", "player", "method", "plugins", "motion",
+)  # fmt: skip
+#: Of other rooms what the work of these days leans on: budgets, assembling, what is chosen by numbers, the renderer.
 QUICK_FILES = (
-    "flow/test_closed_loop", "test_architecture", "test_docstrings", "test_markdown", "test_readme",
-    "contract/test_parts", "contract/test_rounding", "cpu_render/tests/test_cpu_contract",
+    "flow/test_closed_loop", "test_architecture", "test_markdown", "test_readme", "contract/test_parts",
+    "contract/test_rounding", "cpu_render/tests/test_cpu_contract", "engine/test_budget_pace",
+    "engine/test_budget_plan", "engine/test_budget_trim", "engine/test_assemble", "engine/test_candidates",
 )  # fmt: skip
 #: Too slow for that in these rooms.
 NOT_QUICK = (

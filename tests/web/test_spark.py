@@ -76,6 +76,6 @@ def test_pictures_and_uploads(tmp_path):
             print(frame, found)
             assert found >= 30, frame
     whole, part, splats = results[-1]
-    # Everything is sent in whole lines of 512 Gaussians, of three texels for their geometry and three for their colours.
+    # Everything is sent in whole lines of 512 Gaussians, three texels for geometry and three for colours.
     assert whole == math.ceil(splats / 512) * 512 * 16 * (3 + 3)
     assert 0 < part < whole

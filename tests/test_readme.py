@@ -60,5 +60,7 @@ def test_the_python_examples_encode_and_play(tmp_path: Path) -> None:
         assert max(high for _, high in image.getextrema()) > 100
 
 
-def test_the_picture_is_small() -> None:
-    assert (ROOT / "docs" / "images" / "demo.png").stat().st_size < 300_000
+def test_the_readme_is_short_and_the_pictures_are_small() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
+    pictures = [path for path in (ROOT / "docs").rglob("*") if path.suffix in (".png", ".jpg", ".webp", ".gif")]
+    assert sum(path.stat().st_size for path in pictures) < 300_000

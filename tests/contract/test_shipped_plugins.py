@@ -1,11 +1,18 @@
-"""``gsstream check`` of all that this repository ships ends well: what a part cannot keep, it denies with a reason."""
+"""All that this repository ships keeps the contract, by default and under settings that matter to it.
+
+What a part cannot keep, it denies with a reason.
+"""
 
 from __future__ import annotations
+
+from typing import Any
 
 import pytest
 
 from gsstream.cli.main import run_command
 from gsstream.plugins.catalog import load_catalog
+from gsstream.testing.kit import run_checks
+from gsstream.testing.stepping import around
 
 SHIPPED = {
     "gsstream": "builtin", "gsstream-s2gs": "s2gs", "gsstream-queen": "queen", "gsstream-cpu-render": "cpu",
@@ -23,3 +30,41 @@ def test_everything_shipped_keeps_the_contract(distribution: str, capsys: pytest
     out = capsys.readouterr().out
     assert "\u2717" not in out, out
     assert code == 0, out
+
+
+BORN = {"gradient": 1e-6, "rounds": 1, "most": 9}
+ANCHORS = {"measure": "anchor", "change": 6.0, "step": 0.02, "turn_step": 0.002}
+CACHE = {"levels": 4, "entries": 8, "width": 8, "lr": 0.02, "box": 0.0}
+#: Whole method -> settings under which something moves, and is born, in three frames of one or two passes.
+EAGER: dict[str, list[dict[str, Any]]] = {
+    "comgs": [{
+        "motion": {"keypoints": 20, "step": 0.02, "change": 0.0}, "correction": {"every": 1, "passes": 1, "step": 1e-3},
+    }],
+    "hicom": [{"motion": {"measure": "cell", "change": 6.0, "step": 0.02}, "births": BORN}],
+    "queen": [{}, {
+        "births": {"every": 1, "after": 0, "until": 1, "gradient": 1e-6, "most": 20}, "rows": "dynamic",
+        "change": {"dynamic": 1e-8}, "rate": 1e-3, "sigma": 1e-4,
+    }],
+    "recon": [{"motion": ANCHORS, "births": BORN}],
+    "quarc": [{"motion": ANCHORS, "births": BORN, "gate": {"score": 0.1}}],
+    "stream3dgs": [{"cache": CACHE, "births": BORN}, {"cache": {**CACHE, "sent": "cells"}, "births": BORN}],
+}  # fmt: skip
+#: Part of a slot -> settings, beside the default, of which each changes what it does.
+OTHERWISE: dict[tuple[str, str], list[dict[str, Any]]] = {
+    ("gate", "binary-ste"): [{"noise": "none"}, {"temperature": 2.0}, {"clamp_gradient": True}],
+    ("propagation", "ft-pruning"): [{"tau": tau} for tau in (0.5, 0.8, 0.9, 0.95)],
+}
+ROWS = [(("stepper", name), settings) for name, rows in EAGER.items() for settings in rows]
+ROWS += [(slot, settings) for slot, rows in OTHERWISE.items() for settings in rows]
+FOUND = load_catalog().entries
+
+
+@pytest.mark.parametrize(
+    ("slot", "settings"), [pytest.param(*row, id=row[0][1]) for row in ROWS if row[0] in FOUND]
+)
+def test_under_settings_that_matter_it_keeps_the_contract(slot: tuple[str, str], settings: dict[str, Any]) -> None:
+    target = load_catalog().resolve(*slot)
+    part = target(target.Config.model_validate(settings))
+    assert [f"{result.check}: {result.message}" for result in run_checks(part) if not result.ok] == []
+    if slot[0] == "stepper":
+        assert "delta" in [step.status for step in around(part).steps], "nothing happened: the checks prove too little"

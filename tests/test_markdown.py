@@ -185,6 +185,30 @@ def test_the_pages_are_found() -> None:
     assert sum(len(list(commands(shell_lines(page)))) for page in PAGES) > 30
 
 
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("gsstream rum --source demo", "gsstream has no command 'rum'"),
+        ("gsstream run --source demo --out OUT --sauce hot", "gsstream run has no option --sauce"),
+        ("gsstream run --source demo", "gsstream run lacks --out"),
+        ("gsstream run --source demo --out OUT DIR", "gsstream run takes 0 arguments, not 1"),
+        ("gsstream play STREAM --out", "gsstream play --out lacks its value"),
+        (
+            "X=1 .venv/bin/gsstream methods && gsstream plugins sow gate/open; ls",
+            "gsstream plugins has no command 'sow'",
+        ),
+    ],
+)
+def test_wrong_calls_are_found(line: str, said: str) -> None:
+    assert [found for words in commands([line]) if (found := problem(words, complete=True))] == [said]
+
+
+def test_wrong_keys_and_methods_are_found() -> None:
+    keys = set(keys_named("--set stream.epoch=3 --set stream.epochs=3 runs/stream.gss stream.gss"))
+    assert keys - recipe_keys() == {"stream.epoch"}
+    assert list(methods_named(["run", "--method", "s3gs"])) == ["s3gs"]
+
+
 def heading_anchor(heading: str) -> str:
     text = re.sub(r"[^\w\- ]", "", heading.replace("`", "").strip().lower())
     return text.replace(" ", "-")
@@ -206,6 +230,12 @@ def test_links_lead_somewhere(page: Path) -> None:
                     yield f"{target}: no such heading"
 
     check(wrong())
+
+
+@pytest.mark.parametrize("name", BUILT)
+def test_links_of_the_pages_that_are_made_lead_somewhere(name: str) -> None:
+    targets = re.findall(r"\]\(([^)#\s]+)", BUILT[name]())
+    check([target for target in targets if ":" not in target and not (FOLDER / target).exists()])
 
 
 @pytest.mark.parametrize("page", PAGES, ids=where)

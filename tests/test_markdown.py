@@ -36,6 +36,8 @@ FOREIGN = {
     "--find-links", "--index-url", "--extra-index-url", "--no-build-isolation", "--no-deps", "--directory", "--bind",
     "--no-binary",
 }  # fmt: skip
+#: Files in which a comment or a message may name a page.
+SOURCES = {"", ".py", ".toml", ".yaml", ".js", ".mjs", ".cpp", ".hpp"}
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?<=\n\n)(?: {4}.*\n)+")
 INLINE = re.compile(r"`([^`\n]+)`")
@@ -252,6 +254,21 @@ def test_paths_exist(page: Path) -> None:
             place = ROOT / module.replace(".", "/")
             if not (place.is_dir() or place.with_suffix(".py").is_file() or PLACEHOLDER.fullmatch(place.name)):
                 yield module
+
+    check(wrong())
+
+
+def test_pages_that_code_and_settings_name_exist() -> None:
+    places = ["gsstream/**/*.*", "plugins/*/*.toml", "plugins/*/src/**/*.*", "configs/**/*.yaml", "tools/**/*.*"]
+    files = [ROOT / "Makefile", ROOT / "pyproject.toml", *(path for place in places for path in ROOT.glob(place))]
+    texts = {path: path.read_text(encoding="utf-8") for path in files if path.suffix in SOURCES}
+    assert len(texts) > 400
+
+    def wrong() -> Iterator[str]:
+        for path, text in texts.items():
+            for name in re.findall(r"(?<![\w/])docs/[\w/-]+(?:\.md)?", text):
+                if ROOT / name not in MADE and not any(ROOT.glob(f"{name}*")):
+                    yield f"{where(path)}: {name}"
 
     check(wrong())
 

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     Kind = str
 else:
     Kind = Literal[tuple(PART_KINDS)]
-#: What a name in a listing may belong to: a kind of part, or a named method (a recipe).
-KINDS: tuple[str, ...] = (*PART_KINDS, "method")
+#: What a name in a listing may belong to: a kind of part, a named method (a recipe), or a command.
+KINDS: tuple[str, ...] = (*PART_KINDS, "method", "command")
 
 hookspec = pluggy.HookspecMarker("gsstream")
 hookimpl = pluggy.HookimplMarker("gsstream")
@@ -56,4 +56,19 @@ class MethodSpec(BaseModel):
     name: str = Field(pattern=r"^[a-z][a-z0-9_-]*$", description="name used by --method")
     recipe: str = Field(pattern=r"^[\w.]+:[\w./-]+$", description="'package:path/inside/it.yaml'")
     summary: str = Field(description="one line for listings")
+    api: str = Field(default=API_VERSION, pattern=r"^\d+\.\d+$", description="plugin interface it was written for")
+
+
+class CommandSpec(BaseModel):
+    """A command of ``gsstream``, described without importing it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9-]*$", description="what is typed after 'gsstream'")
+    target: str = Field(
+        pattern=r"^[\w.]+:\w+$",
+        description="'module:function' that typer understands, or 'module:app' of a typer.Typer; imported on first use",
+    )
+    summary: str = Field(description="one line for 'gsstream --help', the first of the command's own help")
+    group: str = Field(default="Further commands", min_length=1, description="heading in 'gsstream --help'")
     api: str = Field(default=API_VERSION, pattern=r"^\d+\.\d+$", description="plugin interface it was written for")

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from multiprocessing import forkserver
 from pathlib import Path
 
-PRELOAD = ["gsstream.trade.jobs.warm", "gsstream.cli.main"]
+PRELOAD = ["gsstream_lab.jobs.warm", "gsstream.cli.main"]
 
 
 def gsstream(

@@ -11,13 +11,14 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from gsstream_lab.report.groups import read_sweep_data
+from gsstream_lab.sweep.tune import Trial, trial_of, tune_table
+
 from gsstream.core.errors import GsstreamError
+from gsstream.evaluation.records import read_lines, read_records
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.budget import budget_overrides
 from gsstream.recipe.load import resolve_recipe
-from gsstream.trade.measure.records import read_lines, read_records
-from gsstream.trade.report.groups import read_sweep_data
-from gsstream.trade.sweep.tune import Trial, trial_of, tune_table
 
 
 def held_table(

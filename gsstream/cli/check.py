@@ -27,7 +27,7 @@ class Subject:
 
 
 def check(
-    name: Annotated[str, typer.Argument(help="A part (NAME or KIND/NAME), a plugin, a method, or 'packets'.")],
+    name: Annotated[str, typer.Argument(help="A part (NAME or KIND/NAME), plugin, method or command, or 'packets'.")],
     source: Annotated[
         str | None, typer.Option("--source", help="Recording on which a source is checked; by default 'NAME:'.")
     ] = None,
@@ -37,7 +37,10 @@ def check(
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print only what did not pass, and the counts.")] = False,
 ) -> None:
-    """Check that a part, everything in a plugin, or a method keeps the contract; exit code 1 when it does not."""
+    """Check that a part, a method, or everything in a plugin keeps its contract.
+
+    Exit code 1 when it does not.
+    """
     from gsstream.plugins.catalog import load_catalog
     from gsstream.testing.kit import summary
 
@@ -72,12 +75,19 @@ def _subjects(catalog: Catalog, name: str, source: str | None, settings: list[st
         raise InputError(f"--source is the recording on which a source is checked; {name!r} holds no source")
     configured = None
     if settings:
-        if len(wanted) != 1 or wanted[0][0] in ("source", "method"):
+        if len(wanted) != 1 or wanted[0][0] in ("source", "method", "command"):
             found = ", ".join(f"{kind}/{part}" for kind, part in wanted) or name
             raise InputError(f"--set gives settings to one part, KIND/NAME; {name!r} means {found}")
         configured = _config(catalog.resolve(*wanted[0]), settings)
     # The slow imports come last, so that a mistake on the command line is answered at once.
-    from gsstream.testing.kit import run_checks, run_method_checks, run_packet_checks, skip_checks
+    from gsstream.spec import CommandSpec
+    from gsstream.testing.kit import (
+        run_checks,
+        run_command_checks,
+        run_method_checks,
+        run_packet_checks,
+        skip_checks,
+    )
     from gsstream.testing.recording import SourceUnderTest
 
     if name == "packets":
@@ -86,6 +96,10 @@ def _subjects(catalog: Catalog, name: str, source: str | None, settings: list[st
         heading = f"{kind} {part} (from {catalog.entry(kind, part).origin})"
         if kind == "method":
             yield Subject(heading, run_method_checks(part))
+        elif kind == "command":
+            entry = catalog.entry(kind, part)
+            assert isinstance(entry.spec, CommandSpec), "commands have this declaration"
+            yield Subject(heading, run_command_checks(entry.spec, entry.origin))
         elif kind == "source":
             # The demo is no folder and needs no place; any other source is asked for its simplest recording.
             guess = part if part == "demo" else f"{part}:"

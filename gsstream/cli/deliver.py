@@ -1,4 +1,4 @@
-"""``gsstream export`` and ``manifest``: streams for other programs and for web servers."""
+"""``gsstream export``: streams for other programs and for web servers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def export(
     out: Annotated[Path, typer.Option("--out", help="Folder for the files.")],
     kind: Annotated[
         str,
-        typer.Option("--format", help="ply (3DGS), spz (by splat-transform), sequence (PLYs, list)."),
+        typer.Option("--format", help="ply (3DGS), spz (by splat-transform), sequence (PLYs, list), manifest."),
     ] = "ply",
     frames: Frames = None,
     max_memory: MaxMemory = None,
@@ -25,10 +25,17 @@ def export(
         typer.Option("--origin", help="Positions in the recording's coordinates, or relative to the place of its rig."),
     ] = "recording",
 ) -> None:
-    """Write decoded frames to files that other programs open."""
+    """Write decoded frames to files that other programs open.
+
+    A manifest (stream.json) holds no frame: it lists the byte ranges of all packets, so that any static web server can
+    serve the stream.
+    """
     first, last = frame_range(frames)
     most = size_of(max_memory)
     file = stream_file(stream)
+    if kind == "manifest":
+        typer.echo(f"wrote {_manifest(file, out)}")
+        return
     from gsstream.player.export import export as export_stream
     from gsstream.player.playback import Playback
 
@@ -42,20 +49,14 @@ def export(
     fail_with(damage)
 
 
-def manifest(
-    stream: Stream,
-    out: Annotated[Path | None, typer.Option("--out", help="File to write to; default: standard output.")] = None,
-) -> None:
-    """Print byte ranges of all packets as JSON, so that any static web server can serve the stream."""
-    file = stream_file(stream)
+def _manifest(stream: Path, out: Path) -> Path:
     from gsstream.core.errors import OutputError
     from gsstream.player.manifest import manifest_json
 
-    text = manifest_json(file)
-    if out is None:
-        typer.echo(text, nl=False)
-        return
+    text, target = manifest_json(stream), out / "stream.json"
     try:
-        out.write_text(text, encoding="utf-8")
+        out.mkdir(parents=True, exist_ok=True)
+        target.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise OutputError(f"cannot write {out}: {error.strerror or error}") from error
+        raise OutputError(f"cannot write {target}: {error.strerror or error}") from error
+    return target

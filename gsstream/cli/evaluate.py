@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from gsstream.cli import options
+from gsstream.cli.grouped import grouped
 from gsstream.cli.streams import (
     Frames,
     MaxMemory,
@@ -22,78 +24,86 @@ from gsstream.cli.streams import (
 
 if TYPE_CHECKING:
     from gsstream.core.errors import PacketError
+    from gsstream.evaluation.evaluate import Evaluation
     from gsstream.metrics import OnnxLpips
-    from gsstream.trade.measure.evaluate import Evaluation
 
 
-def evaluate(
-    stream: Annotated[Path | None, typer.Argument(help="A stream (.gss), or the output folder of a run.")] = None,
-    source: Annotated[
-        str | None, typer.Option("--source", help="Recording to compare with; default: the one it was made from.")
-    ] = None,
+@dataclass(frozen=True)
+class Elsewhere:
+    """What a method left that was trained elsewhere, in place of a stream."""
+
     ply_sequence: Annotated[
         Path | None, typer.Option("--ply-sequence", help="Folder of 3DGS PLYs, one per frame, in place of a stream.")
-    ] = None,
+    ] = None
     renders: Annotated[
         Path | None, typer.Option("--renders", help="Folder of pictures, CAMERA/FRAME.png, in place of a stream.")
-    ] = None,
+    ] = None
     files: Annotated[
         Path | None,
         typer.Option("--files", help="File or folder whose bytes count, with these; default: the PLYs themselves."),
-    ] = None,
+    ] = None
     first: Annotated[
         int, typer.Option("--first", min=0, help="With these: the number in a file's name that means frame 0.")
-    ] = 0,
-    frames: Frames = None,
+    ] = 0
     recipe: Annotated[
         Path | None, typer.Option("--recipe", help="With these: YAML file with what the recording needs.")
-    ] = None,
-    scale: options.Scale = None,
+    ] = None
+    scale: options.Scale = None
+
+
+@dataclass(frozen=True)
+class LpipsOptions:
+    """A network that measures LPIPS."""
+
     lpips_onnx: Annotated[
         Path | None,
         typer.Option("--lpips-onnx", help="LPIPS as an ONNX file (docs/howto/lpips.md); default: not measured."),
-    ] = None,
+    ] = None
     lpips_range: Annotated[
         str | None,
         typer.Option(
             "--lpips-range", metavar="-1|0", help="Lower end of the range that file is given; default: its metadata."
         ),
+    ] = None
+
+
+@grouped
+def evaluate(
+    elsewhere: Elsewhere,
+    network: LpipsOptions,
+    stream: Annotated[Path | None, typer.Argument(help="A stream (.gss), or the output folder of a run.")] = None,
+    source: Annotated[
+        str | None, typer.Option("--source", help="Recording to compare with; default: the one it was made from.")
     ] = None,
+    frames: Frames = None,
     as_json: Annotated[bool, typer.Option("--json", help="Every view of every frame as JSON, for scripts.")] = False,
     max_memory: MaxMemory = None,
 ) -> None:
-    """Render the decoded frames and compare them with the recording's test cameras.
+    """Render the decoded frames and compare them with the test cameras.
 
     Also what a method left that was trained elsewhere: --ply-sequence or --renders with --source.
     """
-    _check(stream, ply_sequence, renders, source, files, recipe, scale, first)
-    lpips = _lpips(lpips_onnx, lpips_range)
-    chosen, damage = frame_range(frames), None
+    _check(stream, source, elsewhere)
+    lpips = _lpips(network.lpips_onnx, network.lpips_range)
+    chosen, damage, said = frame_range(frames), None, ""
     if stream is not None:
         evaluation, damage = _of_stream(stream, source, chosen, lpips, size_of(max_memory))
-        said = ""
     else:
-        folder = ply_sequence or renders
-        assert folder is not None, "checked above"
         assert source is not None, "checked above"
-        kind = "plys" if ply_sequence else "renders"
-        evaluation, said = _of_files(folder, kind, source, files, first, chosen, recipe, scale, lpips)
+        evaluation, said = _of_files(elsewhere, source, chosen, lpips)
     typer.echo(evaluation.to_json() if as_json else "\n\n".join(filter(None, (evaluation.table(), said))))
     fail_with(damage)
 
 
-def _check(
-    stream: Path | None, plys: Path | None, renders: Path | None, source: str | None, files: Path | None,
-    recipe: Path | None, scale: float | None, first: int,
-) -> None:  # fmt: skip
+def _check(stream: Path | None, source: str | None, other: Elsewhere) -> None:
     """Refuse options that would do nothing. Raises InputError."""
     from gsstream.core.errors import InputError
 
-    if sum(given is not None for given in (stream, plys, renders)) != 1:
+    if sum(given is not None for given in (stream, other.ply_sequence, other.renders)) != 1:
         raise InputError("expected one of STREAM, --ply-sequence DIR and --renders DIR, to say what is evaluated")
     if stream is None and source is None:
         raise InputError("--ply-sequence and --renders do not say which recording they show; name it with --source")
-    if stream is not None and any((files, recipe, scale, first)):
+    if stream is not None and any((other.files, other.recipe, other.scale, other.first)):
         raise InputError("--files, --first, --recipe and --scale belong to --ply-sequence and --renders")
 
 
@@ -110,9 +120,9 @@ def _of_stream(
     stream: Path, source: str | None, chosen: tuple[int | None, int | None], lpips: OnnxLpips | None, most: int | None
 ) -> tuple[Evaluation, PacketError | None]:
     from gsstream.engine.run.recording import reopen_recording
+    from gsstream.evaluation.evaluate import evaluate as evaluate_stream
     from gsstream.player.playback import Playback
     from gsstream.plugins.catalog import load_catalog
-    from gsstream.trade.measure.evaluate import evaluate as evaluate_stream
 
     file = stream_file(stream)
     with Playback(file, max_memory=most) as playback:
@@ -133,29 +143,32 @@ def _of_stream(
 
 
 def _of_files(
-    folder: Path, kind: str, source: str, files: Path | None, first: int, chosen: tuple[int | None, int | None],
-    recipe: Path | None, scale: float | None, lpips: OnnxLpips | None,
-) -> tuple[Evaluation, str]:  # fmt: skip
+    other: Elsewhere, source: str, chosen: tuple[int | None, int | None], lpips: OnnxLpips | None
+) -> tuple[Evaluation, str]:
     """The evaluation of a folder, and a line that says what its files take."""
     from gsstream.engine.run.recording import open_recording
+    from gsstream.evaluation.evaluate import evaluate_shown
+    from gsstream.evaluation.offline import PlySequence, Renders, bytes_line
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
-    from gsstream.trade.measure.evaluate import evaluate_shown
-    from gsstream.trade.measure.offline import PlySequence, Renders, bytes_line
 
     catalog = load_catalog()
-    overrides = options.overrides(None, scale=scale)
-    found = resolve_recipe("hold", catalog.recipe_path, [] if recipe is None else [recipe], overrides).recipe
+    files = [] if other.recipe is None else [other.recipe]
+    found = resolve_recipe("hold", catalog.recipe_path, files, options.overrides(None, scale=other.scale)).recipe
     recording = open_recording(source, found, catalog)
     try:
-        if kind == "plys":
-            shown: PlySequence | Renders = PlySequence(folder, recording.info, first, found.background)
+        if other.ply_sequence is not None:
+            shown: PlySequence | Renders = PlySequence(
+                other.ply_sequence, recording.info, other.first, found.background
+            )
         else:
-            shown = Renders(folder, recording.info, first)
+            assert other.renders is not None, "checked above"
+            shown = Renders(other.renders, recording.info, other.first)
         low, high = chosen
         frames = [t for t in shown.frames if t >= (low or 0) and (high is None or t < high)]
         evaluation = evaluate_shown(shown, recording, frames=frames, lpips=lpips, progress=progress_on("frame"))
     finally:
         recording.close()
-    counted = [files] if files is not None else [shown.file(t) for t in frames] if kind == "plys" else []
+    plys = [shown.file(t) for t in frames] if other.ply_sequence is not None else []
+    counted = plys if other.files is None else [other.files]
     return evaluation, bytes_line([path for path in counted if path is not None], len(frames))

@@ -10,18 +10,21 @@ from gsstream.cli.listing import plural, printable, table
 from gsstream.cli.streams import Stream, progress_on, stream_file
 
 if TYPE_CHECKING:
+    from gsstream.evaluation.stream_stats import StreamStats
     from gsstream.player.playback import Playback
-    from gsstream.trade.measure.stream_stats import StreamStats
 
 
 def info(
     stream: Stream,
     as_json: Annotated[bool, typer.Option("--json", help="Everything measured, packet by packet, as JSON.")] = False,
 ) -> None:
-    """Say what a stream holds: method, cameras, packets, their sizes and what they could cost at best."""
+    """Say what a stream holds: method, cameras, packets and their sizes.
+
+    Beside the sizes stands what they could be at best.
+    """
     file = stream_file(stream)
+    from gsstream.evaluation.stream_stats import stream_stats
     from gsstream.player.playback import Playback
-    from gsstream.trade.measure.stream_stats import stream_stats
 
     with Playback(file) as playback:
         if not as_json:

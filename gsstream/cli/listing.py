@@ -17,7 +17,7 @@ def table(heading: Sequence[str], rows: Iterable[Sequence[str]], indent: str = "
 
 def fitting(text: str) -> str:
     """Return a text whose tables fit the terminal that it is printed on; elsewhere it stays as it is."""
-    from gsstream.trade.measure.summary import fitted
+    from gsstream.evaluation.summary import fitted
 
     return fitted(text, shutil.get_terminal_size().columns) if sys.stdout.isatty() else text
 

@@ -13,28 +13,8 @@ import typer
 from typer.main import get_command
 
 from gsstream import API_VERSION, __version__
-from gsstream.cli import (
-    bench,
-    check,
-    compare,
-    deliver,
-    evaluate,
-    gap,
-    info,
-    methods,
-    package,
-    plugins,
-    recipe,
-    report,
-    run,
-    scaffold,
-    scene,
-    serve,
-    streams,
-    sweep,
-    tune,
-)
 from gsstream.cli.listing import printable
+from gsstream.cli.table import CommandTable
 from gsstream.core.errors import GsstreamError, InputError
 from gsstream.core.needs import missing_for_encoding
 
@@ -53,6 +33,7 @@ class GlobalOptions:
 
 app = typer.Typer(
     name="gsstream",
+    cls=CommandTable,
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
@@ -77,28 +58,6 @@ def _root(
 ) -> None:
     """Online free-viewpoint video as a stream of 3D Gaussians, built from swappable parts."""
     context.obj.debug = debug
-
-
-app.command(name="run")(run.run)
-app.command(name="play")(streams.play)
-app.command(name="evaluate")(evaluate.evaluate)
-app.command(name="gap")(gap.gap)
-app.command(name="info")(info.info)
-app.command(name="export")(deliver.export)
-app.command(name="manifest")(deliver.manifest)
-app.command(name="package")(package.package)
-app.command(name="serve")(serve.serve)
-app.command(name="sweep")(sweep.sweep)
-app.command(name="tune")(tune.tune)
-app.command(name="report")(report.report)
-app.command(name="compare")(compare.compare)
-app.command(name="check")(check.check)
-app.command(name="new-plugin")(scaffold.new_plugin)
-app.add_typer(bench.app, name="bench")
-app.add_typer(methods.app, name="methods")
-app.add_typer(plugins.app, name="plugins")
-app.add_typer(recipe.app, name="recipe")
-app.add_typer(scene.app, name="scene")
 
 
 def main(argv: Sequence[str] | None = None) -> None:

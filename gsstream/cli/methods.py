@@ -14,14 +14,21 @@ if TYPE_CHECKING:
     from gsstream.plugins.catalog import Catalog
     from gsstream.recipe.load import ResolvedRecipe
 
-app = typer.Typer(help="List the methods, or show one.", rich_markup_mode=None)
 
+def methods(
+    name: Annotated[str | None, typer.Argument(help="A method to show: its parts and the values it sets.")] = None,
+    full: Annotated[
+        bool, typer.Option("--full", help="Import the parts (slow): every setting with default, range and meaning.")
+    ] = False,
+) -> None:
+    """List the methods that --method may name, or show one."""
+    from gsstream.core.errors import InputError
 
-@app.callback(invoke_without_command=True)
-def methods(context: typer.Context) -> None:
-    """List the methods that --method may name."""
-    if context.invoked_subcommand is not None:
+    if name is not None:
+        _show(name, full)
         return
+    if full:
+        raise InputError("--full: expected a method to show in full, e.g. gsstream methods dense --full")
     from gsstream.plugins.catalog import load_catalog
 
     catalog = load_catalog()
@@ -32,14 +39,7 @@ def methods(context: typer.Context) -> None:
         typer.echo(f"warning: plugin {owner} is in quarantine: {plugin.reason}", err=True)
 
 
-@app.command()
-def show(
-    name: Annotated[str, typer.Argument(help="Name of a method.")],
-    full: Annotated[
-        bool, typer.Option("--full", help="Import the parts (slow): every setting with default, range and meaning.")
-    ] = False,
-) -> None:
-    """Show a method's parts and the values it sets."""
+def _show(name: str, full: bool) -> None:
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
 
@@ -59,7 +59,7 @@ def show(
             settings.append((".".join(path), repr(_at(values, path)), origin.label))
     if settings:
         typer.echo("\n" + table(("SETTING", "VALUE", "SET BY"), settings))
-    typer.echo(f"\nevery setting with its default and meaning: gsstream methods show {name} --full")
+    typer.echo(f"\nevery setting with its default and meaning: gsstream methods {name} --full")
 
 
 def _slots(resolved: ResolvedRecipe, catalog: Catalog) -> Iterator[tuple[str, str, str, str]]:

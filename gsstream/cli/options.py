@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 Out = Annotated[Path, typer.Option("--out", help="Output folder; must not hold another run.")]
-Method = Annotated[
-    str | None, typer.Option("--method", help="Method (see 'gsstream methods'); by default the recipe file's.")
-]
 Recipes = Annotated[
     list[Path] | None,
     typer.Option("--recipe", help="YAML file with differences from the method's recipe; repeatable, last wins."),
@@ -23,36 +21,44 @@ Settings = Annotated[
 BUDGET = typer.Option(
     "--budget", metavar="LIMITS", help="Any of time=1.0s,size=20KB,rate=2Mbit/s,memory=2GB."
 )
-Frames = Annotated[int | None, typer.Option("--frames", help="Number of frames; all by default.")]
 Scale = Annotated[float | None, typer.Option("--scale", help="Shrink images by this factor in (0, 1].")]
 FirstFrame = Annotated[
     Path | None, typer.Option("--first-frame", help="Take frame 0 over from this stream, do not reconstruct it.")
 ]
-Threads = Annotated[int, typer.Option("--threads", min=1, help="Threads of each worker.")]
-Ray = Annotated[
-    str | None,
-    typer.Option("--ray", metavar="ADDRESS", help="Run on this Ray cluster (extra: ray); 'local' starts one here."),
-]
-Resume = Annotated[bool, typer.Option("--resume", help="Continue the run that --out holds.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the run that --out holds.")]
-Diagnose = Annotated[
-    bool, typer.Option("--diagnose", help="Count Gaussians left behind by moving bodies, in metrics.jsonl.")
-]
-NoVideo = Annotated[bool, typer.Option("--no-video", help="Write no video, only still pictures.")]
-NoPictures = Annotated[
-    bool, typer.Option("--no-pictures", help="Write no contact sheet, plots or video, only the summary as text.")
-]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print only warnings and errors.")]
 
-Serve = Annotated[
-    int | None,
-    typer.Option("--serve", metavar="PORT", min=0, max=65535, help="Show the frames live at this port (extra: serve)."),
-]
+
+@dataclass(frozen=True)
+class RecipeOptions:
+    """Which recipe, and what is changed of it."""
+
+    method: Annotated[
+        str | None, typer.Option("--method", help="Method (see 'gsstream methods'); by default the recipe file's.")
+    ] = None
+    recipe: Recipes = None
+    settings: Settings = None
+    budget: Annotated[str | None, BUDGET] = None
+    frames: Annotated[int | None, typer.Option("--frames", help="Number of frames; all by default.")] = None
+    scale: Scale = None
+
+    def overrides(self) -> list[tuple[str, str]]:
+        """Return the changes as (option, KEY.PATH=VALUE), the short options last."""
+        return overrides(self.settings, budget=self.budget, frames=self.frames, scale=self.scale)
 
 
-def workers(jobs: str, default: str = "one for each processor") -> Any:
-    """Return the option --workers of a command whose workers do ``jobs``."""
-    return typer.Option("--workers", min=1, help=f"{jobs} at a time; default: {default}.")
+@dataclass(frozen=True)
+class ShownOptions:
+    """What is shown of a run besides the stream."""
+
+    no_video: Annotated[bool, typer.Option("--no-video", help="Write no video, only still pictures.")] = False
+    no_pictures: Annotated[
+        bool, typer.Option("--no-pictures", help="Write no contact sheet, plots or video, only the summary as text.")
+    ] = False
+    quiet: Quiet = False
+
+    def wanted(self) -> dict[str, bool]:
+        """Return what ``write_gallery`` is asked for."""
+        return {"pictures": not self.no_pictures, "video": not self.no_video}
 
 
 def overrides(

@@ -23,7 +23,7 @@ def package(
         typer.Option("--join-every", metavar="SECONDS", help="Seconds between points to join a segment at; 0: none."),
     ] = 10.0,
 ) -> None:
-    """Write a folder with the browser player and the stream, which any static web server can serve."""
+    """Write a folder with the browser player and the stream for any web server."""
     file = stream_file(stream)
     others = [stream_file(path) for path in rendition or []]
     from gsstream.serve.package import package as write_package

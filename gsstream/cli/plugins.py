@@ -14,16 +14,19 @@ if TYPE_CHECKING:
 
     from gsstream.plugins.catalog import Catalog, Entry
 
-app = typer.Typer(help="List plugins and parts, or show one part.", rich_markup_mode=None)
 
-
-@app.callback(invoke_without_command=True)
 def plugins(
-    context: typer.Context,
+    part: Annotated[
+        str | None, typer.Argument(help="A part to show: NAME, or KIND/NAME where several parts share a name.")
+    ] = None,
     check: Annotated[bool, typer.Option("--check", help="Import every part (slow); report those that fail.")] = False,
 ) -> None:
-    """List all plugins, healthy and quarantined, and the parts they ship."""
-    if context.invoked_subcommand is not None:
+    """List all plugins and the parts they ship, or show one part.
+
+    Of a part: its settings with their defaults, ranges and meaning, and which methods set them.
+    """
+    if part is not None:
+        _show(part)
         return
     from gsstream.plugins.catalog import load_catalog
     from gsstream.spec import KINDS
@@ -39,7 +42,7 @@ def plugins(
 
 
 def _plugin_rows(catalog: Catalog) -> Iterator[tuple[str, str, str]]:
-    from gsstream.spec import MethodSpec
+    from gsstream.plugins.discovery import spec_key
 
     for plugin in catalog.plugins:
         if plugin.specs is None:
@@ -47,8 +50,8 @@ def _plugin_rows(catalog: Catalog) -> Iterator[tuple[str, str, str]]:
         elif plugin.left_out:
             status = "left out by GSSTREAM_LOAD_PLUGINS"
         else:
-            methods = sum(isinstance(spec, MethodSpec) for spec in plugin.specs)
-            status = f"{plural(len(plugin.specs) - methods, 'part')}, {plural(methods, 'method')}"
+            kinds = [kind if kind in ("method", "command") else "part" for kind, _ in map(spec_key, plugin.specs)]
+            status = ", ".join(plural(kinds.count(kind), kind) for kind in ("part", "method", "command"))
         yield plugin.name, f"{plugin.distribution} {plugin.version}", status
 
 
@@ -72,9 +75,7 @@ def _check(catalog: Catalog) -> bool:
     return not failures
 
 
-@app.command()
-def show(part: Annotated[str, typer.Argument(help="NAME, or KIND/NAME where several parts share a name.")]) -> None:
-    """Show a part's settings with their defaults, ranges and meaning, and which methods set them."""
+def _show(part: str) -> None:
     from gsstream.core.errors import UnknownName
     from gsstream.plugins.catalog import load_catalog
     from gsstream.spec import KINDS
@@ -94,11 +95,13 @@ def show(part: Annotated[str, typer.Argument(help="NAME, or KIND/NAME where seve
 
 
 def _describe(catalog: Catalog, kind: str, name: str, entry: Entry) -> str:
-    from gsstream.spec import MethodSpec
+    from gsstream.spec import CommandSpec, MethodSpec
 
     heading = f"{kind} {name} (from {entry.origin}): {entry.spec.summary}"
+    if isinstance(entry.spec, CommandSpec):
+        return f"{heading}\nsee: gsstream {name} --help"
     if isinstance(entry.spec, MethodSpec):
-        return f"{heading}\nsee: gsstream methods show {name}"
+        return f"{heading}\nsee: gsstream methods {name}"
     target = catalog.resolve(kind, name)
     lines = [heading, f"target: {entry.spec.target}, component API {entry.spec.api}; defaults: its Config"]
     lines += [f"source: {cited}"] if (cited := getattr(target, "source", None)) else []

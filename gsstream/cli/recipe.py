@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -13,31 +12,38 @@ if TYPE_CHECKING:
     from gsstream.plugins.catalog import Catalog
     from gsstream.recipe.schema import PartSchema
 
-app = typer.Typer(
-    help="Show resolved recipes; write their schema for editors.", no_args_is_help=True, rich_markup_mode=None
-)
 
-
-@app.callback()
-def _group() -> None:
-    """Show resolved recipes; write their schema for editors."""
-
-
-@app.command()
-def show(
-    method: Annotated[str, typer.Argument(help="Name of a method.")],
+def recipe(
+    method: Annotated[
+        str | None, typer.Argument(help="Name of a method; only --schema works without one, for recipes of any.")
+    ] = None,
     recipe: options.Recipes = None,
     settings: options.Settings = None,
     full: Annotated[
         bool, typer.Option("--full", help="Import the parts (slow): check their settings, show their defaults too.")
     ] = False,
+    schema: Annotated[
+        bool, typer.Option("--schema", help="Print a JSON Schema of recipe files in place of the recipe, for editors.")
+    ] = False,
 ) -> None:
-    """Print a method's recipe as YAML, with the provenance of every value."""
+    """Print a method's recipe as YAML, with the provenance of every value.
+
+    With --schema: keys, ranges, meanings, and the settings of every installed part. An editor with a YAML language
+    server uses a file with it when the first line of a recipe says "# yaml-language-server: $schema=FILE".
+    """
+    from gsstream.core.errors import InputError
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
     from gsstream.recipe.save import to_yaml
 
     catalog = load_catalog()
+    if schema:
+        if recipe or settings or full:
+            raise InputError("--schema describes every recipe; --recipe, --set and --full change nothing in it")
+        typer.echo(_schema(method, catalog))
+        return
+    if method is None:
+        raise InputError("expected the name of a method, e.g. gsstream recipe dense; 'gsstream methods' lists them")
     resolved = resolve_recipe(method, catalog.recipe_path, recipe or (), options.overrides(settings))
     if full:
         from gsstream.engine.assembly.assemble import assemble
@@ -46,36 +52,14 @@ def show(
     typer.echo(to_yaml(resolved), nl=False)
 
 
-@app.command()
-def schema(
-    method: Annotated[
-        str | None, typer.Argument(help="Method whose parts and values the file changes; by default any.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="File to write; printed by default.")] = None,
-) -> None:
-    """Print a JSON Schema of recipe files: keys, ranges, meanings, and the settings of every installed part.
-
-    An editor with a YAML language server uses it when the first line of a recipe file says
-    "# yaml-language-server: $schema=FILE".
-    """
+def _schema(method: str | None, catalog: Catalog) -> str:
     import json
 
-    from gsstream.core.errors import OutputError
-    from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
     from gsstream.recipe.schema import recipe_schema
 
-    catalog = load_catalog()
     resolved = resolve_recipe(method, catalog.recipe_path) if method else None
-    text = json.dumps(recipe_schema(_part_schemas(catalog), resolved), indent=1, ensure_ascii=False)
-    if out is None:
-        typer.echo(text)
-        return
-    try:
-        out.write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"cannot write {out}: {error}") from error
-    typer.echo(f"wrote {out}\nfirst line of a recipe that uses it:  # yaml-language-server: $schema={out}")
+    return json.dumps(recipe_schema(_part_schemas(catalog), resolved), indent=1, ensure_ascii=False)
 
 
 def _part_schemas(catalog: Catalog) -> dict[str, dict[str, PartSchema]]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gsstream.cli import options
+from gsstream.cli.grouped import grouped
 from gsstream.cli.listing import fitting
 from gsstream.cli.serve import server_beside, serving
 from gsstream.cli.streams import stream_file
@@ -25,26 +26,21 @@ if TYPE_CHECKING:
 SUGGESTED = ("s2gs-fast", "queen")
 
 
+@grouped
 def run(
     source: Annotated[str, typer.Option("--source", help="demo, synthetic:K=V&..., watch:DIR, DIR, or LAYOUT:DIR.")],
     out: options.Out,
-    method: options.Method = None,
-    recipe: options.Recipes = None,
-    settings: options.Settings = None,
-    budget: Annotated[str | None, options.BUDGET] = None,
-    frames: options.Frames = None,
-    scale: options.Scale = None,
-    seed: Annotated[int | None, typer.Option("--seed", help="Seed of every random stream.")] = None,
-    renderer: Annotated[str | None, typer.Option("--renderer", help="Renderer: auto, cpu, reference, ...")] = None,
+    recipe: options.RecipeOptions,
+    shown: options.ShownOptions,
     first_frame: options.FirstFrame = None,
-    resume: options.Resume = False,
-    overwrite: options.Overwrite = False,
-    checks: Annotated[str | None, typer.Option("--checks", help="Look at parts: off, frame (default), step.")] = None,
-    diagnose: options.Diagnose = False,
-    no_video: options.NoVideo = False,
-    no_pictures: options.NoPictures = False,
-    quiet: options.Quiet = False,
-    serve: options.Serve = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the run that --out holds.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run that --out holds.")] = False,
+    serve: Annotated[
+        int | None,
+        typer.Option(
+            "--serve", metavar="PORT", min=0, max=65535, help="Show the frames live at this port (extra: serve)."
+        ),
+    ] = None,
 ) -> None:
     """Encode a recording as a stream of 3D Gaussians.
 
@@ -55,27 +51,28 @@ def run(
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
 
-    changes = options.overrides(settings, budget=budget, frames=frames, scale=scale, seed=seed, renderer=renderer)
     catalog = load_catalog()
-    resolved, server = resolve_recipe(method, catalog.recipe_path, recipe or (), changes), server_beside(out, serve)
+    resolved = resolve_recipe(recipe.method, catalog.recipe_path, recipe.recipe or (), recipe.overrides())
+    server = server_beside(out, serve)
     # The slow imports come last: a mistake on the command line is answered at once.
     from gsstream.engine.assembly.assemble import assemble
     from gsstream.engine.run.recording import open_recording, read_first_frame
     from gsstream.engine.run.session import run as encode
 
-    assembly = assemble(resolved, catalog, checks)
+    assembly = assemble(resolved, catalog)
     # Read before the folder is touched: --overwrite must not delete a run for the sake of a faulty recording.
     first = None if first_frame is None else read_first_frame(stream_file(first_frame))
     recording = open_recording(source, assembly.recipe, catalog)
-    wanted, say = {"pictures": not no_pictures, "video": not no_video}, _silent if quiet else _note
+    wanted, quiet = shown.wanted(), shown.quiet
+    say = _silent if quiet else _note
     try:
-        _what_is_taken(say, resolved.recipe, recording.info, named=bool(method or recipe), catalog=catalog)
+        named = bool(recipe.method or recipe.recipe)
+        _what_is_taken(say, resolved.recipe, recording.info, named=named, catalog=catalog)
         _first_look(recording, source, again=resume)
         with claim_output(out, resume=resume, overwrite=overwrite), ended_by_signals() as came, serving(server):
             try:
                 with disk_errors(out):
-                    result = encode(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first,
-                                    diagnose=diagnose)  # fmt: skip
+                    result = encode(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first)
             except GsstreamError as error:
                 _what_there_is(error, out, recording, wanted, quiet)
                 raise
@@ -157,8 +154,8 @@ def _pictures(
     ``wanted``: as ``write_gallery`` takes it. ``warned``: the run has said already that nothing fast renders here; the
     player need not say it again.
     """
+    from gsstream.evaluation.gallery import SUMMARY, write_gallery
     from gsstream.player.render import SlowRendererWarning
-    from gsstream.trade.show.gallery import SUMMARY, write_gallery
 
     if result.frames == 0:
         return

@@ -24,7 +24,7 @@ def new_plugin(
     kind: Annotated[str, typer.Option("--kind", help=f"What the part is: {', '.join(STARTABLE)}.")] = "gate",
     out: Annotated[Path | None, typer.Option("--out", help="Folder to write; by default gsstream-NAME.")] = None,
 ) -> None:
-    """Write a distribution with one working part, its settings, contract test and README."""
+    """Write a distribution with one working part, its test and README."""
     from gsstream.core.errors import InputError, OutputError, UnknownName
     from gsstream.plugins.catalog import load_catalog
 

@@ -31,7 +31,6 @@ def prepare(
     each: Annotated[bool, typer.Option("--each", help="A lens per camera; else all cameras share one.")] = False,
     frames: Annotated[int | None, typer.Option("--frames", help="Frames to take over; all by default.")] = None,
     width: Annotated[int | None, typer.Option("--width", help="Shrink pictures to this width.")] = None,
-    max_points: Annotated[int, typer.Option("--max-points", help="Points to keep.")] = 50_000,
     fps: Annotated[float, typer.Option("--fps", help="Frames per second, where poses are not given.")] = 30.0,
     quiet: options.Quiet = False,
 ) -> None:
@@ -50,7 +49,7 @@ def prepare(
 
     began = time.perf_counter()
     model = lens.upper().replace("-", "_")
-    options = PrepareOptions(tuple(test) if test else None, model, each, frames, width, max_points, fps=fps)
+    options = PrepareOptions(tuple(test) if test else None, model, each, frames, width, fps=fps)
     made = make(raw, out, options, lambda line: None if quiet else typer.echo(line))
     # The features have just been matched; how well they fit is in the report.
     found = find(lambda scale: open_source(str(out), scale), features=False)

@@ -38,7 +38,10 @@ def serve(
         typer.Option("--origin", metavar="URL", help="Another web page that may use the stream; repeatable."),
     ] = None,
 ) -> None:
-    """Serve the player and a stream, recorded or live (extra: serve). Ctrl-C ends."""
+    """Serve the player and a stream, recorded or live (extra: serve).
+
+    Ctrl-C ends.
+    """
     file = _coming(stream) if live else stream_file(stream)
     from gsstream.serve.server import Server
 

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 #: What only the extra ``encoder`` brings: everything that imports one of these encodes, measures or plots.
-ENCODER = ("torch", "kornia", "scipy", "matplotlib", "bjontegaard")
+ENCODER = ("torch", "kornia", "scipy", "matplotlib")
 #: Extra -> the parts and methods of this project's other distributions that it brings.
 SHIPPED: Mapping[str, tuple[str, ...]] = {
     "s2gs": (
@@ -20,6 +20,8 @@ SHIPPED: Mapping[str, tuple[str, ...]] = {
         "confidence/noise-normalised", "confidence/uniform-random", "confidence/view-gradient", "gate/gumbel-sigmoid",
         "propagation/hierarchical-max", "propagation/selective-leaf",
         "regularizer/expected-sparsity", "structure/octree", "update/latent",
+        "command/sweep", "command/report", "command/compare", "command/tune", "command/gap", "command/left-behind",
+        "command/bench",
     ),
     "player": ("renderer/cpu", "loss/cpu", "optimiser/cpu"),
     "methods": (

@@ -1,7 +1,5 @@
 """What is measured on decoded frames. Numpy only."""
 
-from gsstream.metrics.energy import EnergyMeter as EnergyMeter
-from gsstream.metrics.energy import total_joules as total_joules
 from gsstream.metrics.flicker import flicker as flicker
 from gsstream.metrics.flip import FLIP_VARIANT as FLIP_VARIANT
 from gsstream.metrics.flip import flip as flip

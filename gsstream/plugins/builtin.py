@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gsstream.spec import ComponentSpec, Kind, MethodSpec, hookimpl
+from gsstream.spec import CommandSpec, ComponentSpec, Kind, MethodSpec, hookimpl
 
 
 def _part(kind: Kind, name: str, target: str, summary: str) -> ComponentSpec:
@@ -53,4 +53,39 @@ def gsstream_methods() -> list[MethodSpec]:
             recipe="gsstream.recipe:methods/hold.yaml",
             summary="frame 0 and nothing after it: the floor",
         ),
+    ]
+
+
+#: group -> name -> (target in ``gsstream.cli``, first line of its help)
+_COMMANDS = {
+    "Encode": {
+        "run": ("run:run", "Encode a recording as a stream of 3D Gaussians."),
+        "scene": ("scene:app", "Prepare and validate scenes."),
+    },
+    "Watch": {
+        "play": ("streams:play", "Decode a stream and render it, without torch or the recording."),
+        "package": ("package:package", "Write a folder with the browser player and the stream for any web server."),
+        "serve": ("serve:serve", "Serve the player and a stream, recorded or live (extra: serve)."),
+        "export": ("deliver:export", "Write decoded frames to files that other programs open."),
+        "info": ("info:info", "Say what a stream holds: method, cameras, packets and their sizes."),
+    },
+    "Evaluate": {
+        "evaluate": ("evaluate:evaluate", "Render the decoded frames and compare them with the test cameras."),
+    },
+    "Extend": {
+        "methods": ("methods:methods", "List the methods that --method may name, or show one."),
+        "recipe": ("recipe:recipe", "Print a method's recipe as YAML, with the provenance of every value."),
+        "plugins": ("plugins:plugins", "List all plugins and the parts they ship, or show one part."),
+        "check": ("check:check", "Check that a part, a method, or everything in a plugin keeps its contract."),
+        "new-plugin": ("scaffold:new_plugin", "Write a distribution with one working part, its test and README."),
+    },
+}
+
+
+@hookimpl
+def gsstream_commands() -> list[CommandSpec]:
+    return [
+        CommandSpec(name=name, target=f"gsstream.cli.{target}", summary=summary, group=group)
+        for group, commands in _COMMANDS.items()
+        for name, (target, summary) in commands.items()
     ]

@@ -13,15 +13,15 @@ from typing import Any
 from gsstream.core.errors import PluginUnavailable, UnknownName
 from gsstream.core.kinds import PART_KINDS
 from gsstream.core.needs import install_part
-from gsstream.plugins.discovery import Discovered, PluginFault, discover, spec_key
-from gsstream.spec import ComponentSpec, MethodSpec
+from gsstream.plugins.discovery import Discovered, PluginFault, Spec, discover, spec_key
+from gsstream.spec import CommandSpec, ComponentSpec, MethodSpec
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A declared part or method and who ships it."""
+    """A declared part, method or command, and the distribution that ships it."""
 
-    spec: ComponentSpec | MethodSpec
+    spec: Spec
     plugin: str
     distribution: str
     version: str
@@ -37,7 +37,7 @@ class Catalog:
     """Every part by (kind, name), and every plugin, healthy or quarantined.
 
     Arguments:
-        entries: (kind, name) -> entry; methods have the kind "method".
+        entries: (kind, name) -> entry; methods have the kind "method", commands "command".
         plugins: all plugins in discovery order.
     """
 
@@ -75,15 +75,15 @@ class Catalog:
             hint = f". To install it: {cure}{hint}"
         raise UnknownName(kind, name, self.names(kind), hint)
 
-    def resolve(self, kind: str, name: str) -> type[Any]:
-        """Import a part's class and hold it against its kind.
+    def resolve(self, kind: str, name: str) -> Any:
+        """Import a part's class and hold it against its kind; of a command, its function or Typer app.
 
         Raises:
             PluginUnavailable: quarantined, not importable, or not what its declaration says.
             UnknownName: nobody declares it.
         """
         entry = self.entry(kind, name)
-        assert isinstance(entry.spec, ComponentSpec), "methods shipped as recipes have no class"
+        assert not isinstance(entry.spec, MethodSpec), "methods shipped as recipes have no class"
         try:
             return _load_target(entry.spec)
         except (Exception, SystemExit) as error:  # third-party code: any failure is reported with its owner's name
@@ -133,16 +133,20 @@ def load_catalog(plugins: Iterable[Discovered] | None = None) -> Catalog:
     return Catalog(entries, tuple(kept))
 
 
-def _load_target(spec: ComponentSpec) -> type[Any]:
+def _load_target(spec: ComponentSpec | CommandSpec) -> Any:
     module_name, _, attribute = spec.target.partition(":")
     target = getattr(importlib.import_module(module_name), attribute, None)
     if target is None:
         raise PluginFault(f"its target {spec.target!r} does not exist: {module_name} has no {attribute!r}")
+    if isinstance(spec, CommandSpec):
+        if not callable(target):
+            raise PluginFault(f"its target {spec.target!r} is a {type(target).__name__}; expected a function or Typer")
+        return target
     kind = PART_KINDS[spec.kind]
     if kind.contract is None:
         if not callable(target):
             raise PluginFault(f"its target {spec.target!r} is a {type(target).__name__}; expected a class")
-        return target  # type: ignore[no-any-return]
+        return target
     base = kind.contract_class()
     if not (isinstance(target, type) and issubclass(target, base)):
         raise PluginFault(f"its target {spec.target!r} is not a {base.__name__}: declared as {spec.kind!r}")

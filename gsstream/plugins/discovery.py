@@ -24,11 +24,12 @@ from gsstream import API_VERSION, __version__
 from gsstream.core.errors import PluginUnavailable, suggest
 from gsstream.core.versions import version_problem
 from gsstream.plugins import builtin, hookspecs
-from gsstream.spec import ENTRY_POINT_GROUP, ComponentSpec, MethodSpec
+from gsstream.spec import ENTRY_POINT_GROUP, CommandSpec, ComponentSpec, MethodSpec
 
-Spec = ComponentSpec | MethodSpec
-HOOKS: dict[str, type[Spec]] = {"gsstream_components": ComponentSpec, "gsstream_methods": MethodSpec}
-
+Spec = ComponentSpec | MethodSpec | CommandSpec
+HOOKS: dict[str, type[Spec]] = {
+    "gsstream_components": ComponentSpec, "gsstream_methods": MethodSpec, "gsstream_commands": CommandSpec,
+}  # fmt: skip
 
 #: Seconds after which a plugin that is still being imported is named.
 SLOW = 5.0
@@ -194,5 +195,7 @@ def _check_unique(declared: list[Spec]) -> None:
 
 
 def spec_key(spec: Spec) -> tuple[str, str]:
-    """Return (kind, name); named methods have the kind "method"."""
-    return ("method" if isinstance(spec, MethodSpec) else spec.kind, spec.name)
+    """Return (kind, name); named methods have the kind "method", commands "command"."""
+    if isinstance(spec, ComponentSpec):
+        return spec.kind, spec.name
+    return "method" if isinstance(spec, MethodSpec) else "command", spec.name

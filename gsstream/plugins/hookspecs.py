@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gsstream.spec import ComponentSpec, MethodSpec, hookspec
+from gsstream.spec import CommandSpec, ComponentSpec, MethodSpec, hookspec
 
 
 @hookspec
@@ -14,4 +14,10 @@ def gsstream_components() -> list[ComponentSpec]:
 @hookspec
 def gsstream_methods() -> list[MethodSpec]:
     """Return the named methods (recipes) this plugin ships."""
+    raise NotImplementedError
+
+
+@hookspec
+def gsstream_commands() -> list[CommandSpec]:
+    """Return the commands that this plugin adds to ``gsstream``."""
     raise NotImplementedError

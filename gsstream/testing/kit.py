@@ -11,7 +11,9 @@ from typing import Any, Literal
 from gsstream.core.kinds import PART_KINDS
 from gsstream.core.part import Part
 from gsstream.method.base import StreamingMethod
+from gsstream.spec import CommandSpec
 from gsstream.testing import stepping
+from gsstream.testing.command.checks import CommandUnderTest
 from gsstream.testing.packet.checks import PacketCodec
 from gsstream.testing.recording import SourceUnderTest
 from gsstream.testing.registry import CHECKS, LEAST_REASON, Check, Skip, checks_for, denied_by, kind_of
@@ -19,7 +21,7 @@ from gsstream.testing.registry import CHECKS, LEAST_REASON, Check, Skip, checks_
 Status = Literal["passed", "failed", "expected failure", "skipped"]
 #: Rooms of checks: for parts of all kinds, for each kind, for packets. Importing them fills the registry, in the order
 #: of the reports.
-ROOMS = ("common", *PART_KINDS, "packet")
+ROOMS = ("common", *PART_KINDS, "packet", "command")
 for _room in ROOMS:
     importlib.import_module(f"gsstream.testing.{_room}.checks")
 
@@ -109,6 +111,16 @@ def run_method_checks(name: str, expected_failures: Mapping[str, str] | None = N
     Raises RecipeError, UnknownName or PluginUnavailable when it cannot be assembled.
     """
     return run_subject("method", stepping.MethodUnderTest(name), expected_failures)
+
+
+def run_command_checks(spec: CommandSpec, origin: str = "here") -> list[CheckResult]:
+    """Make the checks of commands on one that is declared.
+
+    Arguments:
+        spec: the declaration.
+        origin: distribution that errors name.
+    """
+    return run_subject("command", CommandUnderTest(spec, origin))
 
 
 def run_packet_checks(codec: PacketCodec | None = None) -> list[CheckResult]:

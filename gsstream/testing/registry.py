@@ -26,7 +26,7 @@ class Check:
 
     Arguments:
         name: name of the function; stable, because expected failures are given by it.
-        kind: "common", a kind of part, "source", "method" or "packet".
+        kind: "common", a kind of part, "source", "method", "packet" or "command".
         kinds: kinds of part it is made on.
         trait: the claim (a field of the kind's ``Traits``) that calls for it; None: every part of these kinds.
         function: raises AssertionError with numbers.

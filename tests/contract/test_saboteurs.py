@@ -6,9 +6,17 @@ import sys
 from pathlib import Path
 
 import pytest
-from saboteurs import INSTALLED, METHOD_SABOTEURS, PACKET_SABOTEURS, SABOTEURS
+from saboteurs import COMMAND_SABOTEURS, INSTALLED, METHOD_SABOTEURS, PACKET_SABOTEURS, SABOTEURS
 
-from gsstream.testing.kit import CheckResult, all_checks, run_checks, run_method_checks, run_packet_checks, run_subject
+from gsstream.testing.kit import (
+    CheckResult,
+    all_checks,
+    run_checks,
+    run_command_checks,
+    run_method_checks,
+    run_packet_checks,
+    run_subject,
+)
 from gsstream.testing.stepping import MethodUnderTest
 
 
@@ -18,8 +26,8 @@ def failed(results: list[CheckResult]) -> dict[str, str]:
 
 def test_every_check_has_a_saboteur_and_every_saboteur_a_check() -> None:
     names = {entry.name for entry in all_checks()}
-    assert names == {*SABOTEURS, *PACKET_SABOTEURS, *METHOD_SABOTEURS, *INSTALLED}
-    assert len(names) == sum(map(len, (SABOTEURS, PACKET_SABOTEURS, METHOD_SABOTEURS, INSTALLED)))
+    assert names == {*SABOTEURS, *PACKET_SABOTEURS, *METHOD_SABOTEURS, *COMMAND_SABOTEURS, *INSTALLED}
+    assert len(names) == sum(map(len, (SABOTEURS, PACKET_SABOTEURS, METHOD_SABOTEURS, COMMAND_SABOTEURS, INSTALLED)))
 
 
 @pytest.mark.parametrize("check", SABOTEURS)
@@ -37,6 +45,13 @@ def test_fails_exactly_its_check(check: str) -> None:
 def test_packets_fail_exactly_their_check(check: str) -> None:
     results = run_packet_checks(PACKET_SABOTEURS[check])
     assert set(failed(results)) == {check}
+
+
+@pytest.mark.parametrize("check", COMMAND_SABOTEURS)
+def test_commands_fail_exactly_their_check(check: str) -> None:
+    found = failed(run_command_checks(COMMAND_SABOTEURS[check]))
+    assert set(found) == {check}
+    assert "imports torch" in found[check]
 
 
 @pytest.mark.parametrize("check", METHOD_SABOTEURS)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from gsstream_lab.gap.measure import GAP_FILES
 
 from gsstream.core.errors import OutputError
 from gsstream.engine.run.output import MADE_FILES, RUN_FILES, prepare_output
-from gsstream.trade.measure.gap import GAP_FILES
-from gsstream.trade.show import gallery
+from gsstream.evaluation import gallery
 
 
 def test_a_new_folder_is_created(tmp_path: Path) -> None:

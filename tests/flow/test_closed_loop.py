@@ -209,7 +209,7 @@ def test_without_pictures_a_run_is_the_same_and_they_can_follow(
 ) -> None:
     out, pictures = tmp_path / "o", {"contact_sheet.png", "frames.png"}
     with monkeypatch.context() as patch:
-        for name in ("matplotlib.figure", "gsstream.trade.show.contact_sheet", "gsstream.player.play"):
+        for name in ("matplotlib.figure", "gsstream.evaluation.contact_sheet", "gsstream.player.play"):
             patch.setitem(sys.modules, name, None)  # importing it anywhere fails
         without = encode(out, "--frames", "3", method="s2gs-edge")
     names = {path.name for path in out.iterdir()}

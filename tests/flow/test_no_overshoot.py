@@ -16,10 +16,10 @@ from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.run.recording import open_recording
+from gsstream.evaluation.records import mean
 from gsstream.packet import PlayerState
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
-from gsstream.trade.measure.records import mean
 
 EVENT = 5
 WORLD = f"synthetic:views=4&width=64&height=48&supersample=1&frames=20&noise=0.01&event={EVENT}&scene="

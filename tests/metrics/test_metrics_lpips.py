@@ -12,8 +12,8 @@ from test_trade import NUMPY, Rendered, make_stream
 
 from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError, ShapeError
+from gsstream.evaluation.evaluate import evaluate
 from gsstream.metrics import OnnxLpips
-from gsstream.trade.measure.evaluate import evaluate
 
 onnx = pytest.importorskip("onnx", reason="onnx writes the models of these tests")
 pytest.importorskip("onnxruntime", reason="onnxruntime runs the models of these tests")

@@ -13,6 +13,7 @@ from packet_scenes import decode_all, make_births, make_edit, make_key, make_pac
 from gsstream.core.changes import Births, Delta, Layout, Residual, Rows, apply_delta, in_nodes, own_nodes, row_gates
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.gaussians import ATTRIBUTES
+from gsstream.evaluation.stream_stats import stream_stats
 from gsstream.packet import (
     StreamWriter,
     decode_delta,
@@ -26,7 +27,6 @@ from gsstream.packet.bits import BitWriter, pack_blobs, unpack_blobs
 from gsstream.packet.changes.rows import HEAD_PARTS, most_births
 from gsstream.packet.gates import encode_gates
 from gsstream.packet.symbols import encode_symbols
-from gsstream.trade.measure.stream_stats import stream_stats
 
 SEEDS = st.integers(0, 2**32 - 1)
 NONE = np.zeros(0, np.int64)

@@ -38,6 +38,7 @@ from gsstream.core.changes import (
     own_nodes,
     sent_rows,
 )
+from gsstream.evaluation.stream_stats import stream_stats
 from gsstream.packet import (
     KeyState,
     PlayerState,
@@ -48,7 +49,6 @@ from gsstream.packet import (
     encode_key,
 )
 from gsstream.player.playback import Playback
-from gsstream.trade.measure.stream_stats import stream_stats
 
 SEEDS = st.integers(0, 2**32 - 1)
 

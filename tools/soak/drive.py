@@ -8,7 +8,7 @@ import math
 import time
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +19,7 @@ from gsstream.core.errors import ComponentError, InputError, PluginUnavailable, 
 from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.method.held import LeftOutWarning, RepeatedFrameWarning
 from gsstream.engine.run.recording import open_recording
-from gsstream.engine.run.session import METRICS, STREAM, run
+from gsstream.engine.run.session import METRICS, STREAM, RunListener, run
 from gsstream.method.base import Step
 from gsstream.packet import PlayerState
 from gsstream.player.playback import Playback
@@ -84,16 +84,18 @@ def run_case(case: Case, catalog: Catalog, out: Path) -> Outcome:
 def _encode_and_check(case: Case, parts: Assembly, catalog: Catalog, out: Path, digests: list[str]) -> dict[str, Any]:
     kinds: dict[str, int] = {}
 
-    def witness(step: Step[Any]) -> None:
-        digests.append(digest(step.state.player))
-        kinds[step.status] = kinds.get(step.status, 0) + 1
+    class Witness(RunListener):
+        def after(self, step: Step[Any]) -> Mapping[str, Any]:
+            digests.append(digest(step.state.player))
+            kinds[step.status] = kinds.get(step.status, 0) + 1
+            return {}
 
     source = open_recording(case.source, parts.recipe, catalog)
     try:
         with warnings.catch_warnings():
             for failed in (RepeatedFrameWarning, LeftOutWarning):
                 warnings.simplefilter("error", failed)
-            run(parts, source, out, quiet=True, witness=witness)
+            run(parts, source, out, quiet=True, listener=Witness())
     except (RepeatedFrameWarning, LeftOutWarning) as error:
         raise ComponentError(
             str(error), slot="any", part="any", distribution="any", frame=len(digests), iteration=None

@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,24 +17,31 @@ from gsstream.core.frame import Frame, PointCloud
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.memory import within_memory
 from gsstream.engine.frame0.points import gather_points, with_test_views
-from gsstream.engine.keys.resume import ended, since_key
+from gsstream.engine.run.displacement import displacement_pixels
 from gsstream.engine.run.encoder import Encoder, Listeners
 from gsstream.engine.run.live import live_metrics
 from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.run.metrics_log import append_metrics, last_written, trim_metrics
 from gsstream.engine.run.progress import RunProgress
-from gsstream.engine.run.travel import LeftBehind, displacement_pixels
 from gsstream.method.base import Step
-from gsstream.metrics import EnergyMeter
 from gsstream.packet import EncodedPacket, PlayerState, StreamReader, StreamWriter
 from gsstream.packet.base import FILE_HEADER
 from gsstream.recipe.save import save_resolved
 from gsstream.source.base import FrameSource, GrowingSource, HurriedSource, SourceInfo
 from gsstream.source.prefetch import Prefetcher
 
-#: A function that is called with every step of a run.
-Witness = Callable[[Step[Any]], None]
 STREAM, METRICS, RECIPE = "stream.gss", "metrics.jsonl", "recipe.yaml"
+
+
+class RunListener:
+    """Told of every frame of a run; does nothing unless a subclass says otherwise."""
+
+    def before(self) -> None:
+        """Called when a frame's images are in memory, before it is encoded."""
+
+    def after(self, step: Step[Any]) -> Mapping[str, Any]:
+        """Return what is to stand in the frame's line of metrics, too; its packet is written already."""
+        return {}
 
 
 @dataclass(frozen=True)
@@ -55,10 +62,7 @@ def run(
     quiet: bool = False,
     measure: bool = True,
     first_frame: PlayerState | None = None,
-    energy: EnergyMeter | None = None,
-    witness: Witness | None = None,
-    span: range | None = None,
-    diagnose: bool = False,
+    listener: RunListener | None = None,
 ) -> RunResult:
     """Encode a recording into ``out`` (stream.gss, metrics.jsonl, recipe.yaml).
 
@@ -71,13 +75,10 @@ def run(
         measure: render and compare the test cameras of every frame.
         first_frame: frame 0 of another stream (``engine.run.recording.read_first_frame``), taken over instead of being
             reconstructed again.
-        energy: counters to read around every frame; their joules stand in its metrics.
-        witness: called with every step once its packet is written.
-        span: frames to encode, by default all; the first of them is the key packet that the stream begins with.
-        diagnose: count in every frame the Gaussians that stay behind their body (``engine.run.travel``).
+        listener: told of every frame before and after it is encoded.
     """
     parts = within_memory(parts, source.info)
-    doing = _Run(parts, source, out, quiet, measure, first_frame, energy, witness, span, diagnose)
+    doing = _Run(parts, source, out, quiet, measure, first_frame, listener or RunListener())
     return doing.encode(resume)
 
 
@@ -86,14 +87,11 @@ class _Run:
 
     def __init__(
         self, parts: Assembly, source: FrameSource, out: Path, quiet: bool, measure: bool,
-        first_frame: PlayerState | None, energy: EnergyMeter | None, witness: Witness | None, span: range | None,
-        diagnose: bool,
+        first_frame: PlayerState | None, listener: RunListener,
     ) -> None:  # fmt: skip
-        self.source, self.out, self.energy, self.witness = source, out, energy, witness
-        self.start = 0 if span is None else span.start
-        self.total = _num_frames(source.info, parts.recipe.frames, None if span is None else span.stop)
+        self.source, self.out, self.listener = source, out, listener
+        self.total = _num_frames(source.info, parts.recipe.frames)
         self.held_out = HeldOut(parts.renderer, parts.recipe.background) if measure else None
-        self.left_behind = LeftBehind() if diagnose else None
         self.progress = RunProgress(self.total, quiet)
         listeners = Listeners(packet=self._write, progress=self.progress.first_frame, say=self.progress.say)
         self.encoder = Encoder(parts, source.info, self._seeds, first_frame=first_frame, listeners=listeners)
@@ -103,16 +101,11 @@ class _Run:
 
     def encode(self, resume: bool) -> RunResult:
         last = self._resume() if resume else None
-        done = self.start if last is None else last + 1
+        done = 0 if last is None else last + 1
         if last is None:
             save_resolved(self.out / RECIPE, self.encoder.parts.resolved)
         if done > 0:
             self._remember(done)
-        if last is not None and self.left_behind is not None:
-            end = ended(self.out / STREAM, last)
-            key = self.source.frame(end.key_frame)
-            for player in since_key(self.out / STREAM, end):
-                self.left_behind.follow(player, key if player.frame == end.key_frame else None)
         indices = itertools.count(done) if self.total is None else range(done, self.total)
         recipe = self.encoder.parts.recipe
         with (
@@ -133,16 +126,11 @@ class _Run:
 
     def _advance(self, train: Frame, test: Frame, waited: float) -> None:
         """Encode one frame, and write down what it cost and how good it is."""
-        joules = self.energy.read() if self.energy else {}
+        self.listener.before()
         step = self.encoder.encode(train)
-        if self.witness is not None:
-            self.witness(step)
-        metrics = {**step.metrics, "wait_seconds": waited, "live": live_metrics(train, self.written)}
-        if self.energy and joules:
-            metrics["joules"] = {name: value - joules[name] for name, value in self.energy.read().items()}
+        metrics = {**step.metrics, **self.listener.after(step)}
+        metrics |= {"wait_seconds": waited, "live": live_metrics(train, self.written)}
         metrics["displacement_pixels"] = displacement_pixels(step.state.player, train.cameras)
-        if self.left_behind is not None:
-            metrics["left_behind"] = self.left_behind.after(step.state.player, train, step.status == "key")
         # Who is behind does not spend time on the quality of what he drops: ``evaluate`` measures it.
         dropped = metrics["live"] is not None and metrics["live"]["policy"] == "dropped"
         if self.held_out and len(test.cameras) and not dropped:
@@ -170,10 +158,10 @@ class _Run:
         planned = self.encoder.controller.budget.limits_frames
         # A kill between a packet and its line leaves a frame that no table would count, and that a budget would plan
         # without: such frames are encoded again, to the same bytes. A run without any line goes on from its packets.
-        wanted = last_written(log, self.start) if planned or log.exists() else None
+        wanted = last_written(log) if planned or log.exists() else None
         last = self.encoder.resume(stream, lambda index: self.source.frame(index, "train"), wanted)
         if wanted is not None:
-            _say_what_is_lost(stream, self.start - 1 if last is None else last)
+            _say_what_is_lost(stream, -1 if last is None else last)
         self.encoder.controller.remember(trim_metrics(log, -1 if last is None else last))
         if last is None and wanted is not None:
             stream.unlink()  # it may hold sound packets of frames that are made again
@@ -200,9 +188,9 @@ def _say_what_is_lost(stream: Path, last: int) -> None:
         )  # fmt: skip
 
 
-def _num_frames(info: SourceInfo, *wanted: int | None) -> int | None:
+def _num_frames(info: SourceInfo, wanted: int | None) -> int | None:
     """None: until a growing recording ends."""
-    return min((number for number in (info.num_frames, *wanted) if number is not None), default=None)
+    return min((number for number in (info.num_frames, wanted) if number is not None), default=None)
 
 
 def _as_late(frame: Frame, source: FrameSource) -> Frame:

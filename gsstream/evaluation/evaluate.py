@@ -1,0 +1,270 @@
+"""Quality of decoded frames: what the player shows, against the recording, and against showing frame 0 for ever."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import InputError
+from gsstream.core.shapes import FloatArray
+from gsstream.evaluation.records import mean
+from gsstream.evaluation.summary import format_table
+from gsstream.metrics import (
+    SSIM_VARIANT,
+    OnnxLpips,
+    changed_mask,
+    moving_mask,
+    noise_sigma,
+    psnr,
+    slope_per_100,
+    ssim,
+)
+from gsstream.player.playback import Playback
+from gsstream.player.render import PlayerRenderer, find_renderer, render
+from gsstream.source.base import FrameSource
+
+
+@dataclass(frozen=True, slots=True)
+class ViewPair:
+    """What an extra metric is given: one test camera at one frame, [H, W, 3] in [0, 1], and the frame before it.
+
+    Arguments:
+        last_image, last_truth: of the evaluated frame before; None at the first.
+        sigma: noise of one recorded image.
+    """
+
+    image: FloatArray
+    truth: FloatArray
+    last_image: FloatArray | None
+    last_truth: FloatArray | None
+    sigma: float
+
+
+#: An extra metric of one view; nan where it is not defined.
+ViewMetric = Callable[[ViewPair], float]
+
+
+@dataclass(frozen=True, slots=True)
+class ViewQuality:
+    """One test camera at one frame; dB, SSIM, LPIPS; nan where nothing moves or not measured, inf for equal images.
+
+    ``psnr_changed``: on pixels that differ from the first frame by more than 0.1. ``extra``: name -> value of what was
+    asked for besides.
+    """
+
+    frame: int
+    camera: str
+    psnr: float
+    ssim: float
+    psnr_moving: float
+    moving_share: float
+    hold_psnr: float
+    hold_ssim: float
+    hold_psnr_moving: float
+    psnr_changed: float = math.nan
+    hold_psnr_changed: float = math.nan
+    lpips: float = math.nan
+    hold_lpips: float = math.nan
+    extra: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """All views of all frames.
+
+    Arguments:
+        views: in the order of frames, then cameras.
+        sigmas: camera -> noise of one image, [0, 1] units.
+        renderer: name of the player's renderer.
+        lpips_variant: which LPIPS was measured; None: none, and neither table nor JSON speak of it.
+    """
+
+    views: tuple[ViewQuality, ...]
+    sigmas: Mapping[str, float]
+    renderer: str
+    lpips_variant: str | None = None
+
+    def series(self, name: str) -> dict[int, float]:
+        """Return frame -> mean over cameras of a quantity of :class:`ViewQuality`, over views where it is finite."""
+        frames = sorted({view.frame for view in self.views})
+        return {t: mean(getattr(v, name) for v in self.views if v.frame == t) for t in frames}
+
+    def to_json(self) -> str:
+        """Return everything as JSON; nan and inf become null."""
+        unknown = ("extra",) if self.lpips_variant else ("lpips", "hold_lpips", "extra")
+        views = [{k: _plain(v) for k, v in asdict(view).items() if k not in unknown} for view in self.views]
+        for row, view in zip(views, self.views, strict=True):
+            row |= {name: _plain(value) for name, value in view.extra.items()}
+        variants = {"ssim_variant": SSIM_VARIANT}
+        if self.lpips_variant:
+            variants["lpips_variant"] = self.lpips_variant
+        data = {**variants, "renderer": self.renderer, "sigmas": dict(self.sigmas), "views": views}
+        return json.dumps(data, indent=1, allow_nan=False)
+
+    def table(self) -> str:
+        """Return a Markdown table of the decoded stream and of frame 0 held still.
+
+        Columns: frame 0, mean of later frames, slope, SSIM, moving pixels, LPIPS if measured.
+        """
+        names, forms = ["ssim", "psnr_moving", "psnr_changed"], [".2f", ".2f", "+.2f", ".4f", ".2f", ".2f"]
+        rows = [["", "PSNR 0", "PSNR", "dB/100", "SSIM", "moving", "changed"]]
+        if self.lpips_variant:
+            names, forms, rows = [*names, "lpips"], [*forms, ".4f"], [[*rows[0], "LPIPS"]]
+        for label, prefix in (("decoded", ""), ("frame 0 held", "hold_")):
+            whole = self.series(prefix + "psnr")
+            (first, psnr_first), later = next(iter(whole.items())), dict(list(whole.items())[1:])
+            known = {t: v for t, v in later.items() if math.isfinite(v)}
+            slope = slope_per_100(list(known), list(known.values()))
+            rest = [mean(v for t, v in self.series(prefix + n).items() if t != first) for n in names]
+            numbers = [psnr_first, mean(known.values()), slope, *rest]
+            cells = zip(numbers, forms, strict=True)
+            rows.append([label, *(format(v, form) if math.isfinite(v) else "-" for v, form in cells)])
+        variants = "; ".join(filter(None, (SSIM_VARIANT, self.lpips_variant)))
+        notes = f"{variants}; renderer {self.renderer}; means over cameras, then over frames 1..T-1"
+        return f"{format_table(rows)}\n\n{notes}"
+
+
+class Shown(Protocol):
+    """Pictures to be judged: of a stream, or of files that another program wrote."""
+
+    @property
+    def frames(self) -> Sequence[int]:
+        """Indices of frames, in the numbering of the recording."""
+
+    @property
+    def rig(self) -> Cameras:
+        """The cameras that the pictures are seen from."""
+
+    @property
+    def renderer(self) -> str:
+        """What drew them."""
+
+    def images(self, frame: int) -> Sequence[FloatArray]:
+        """Return a picture [H, W, 3] in [0, 1] for each camera of the rig; the same list where nothing changed."""
+
+
+class StreamShown:
+    """What the player shows of a stream."""
+
+    def __init__(self, playback: Playback, rig: Cameras, renderer: PlayerRenderer) -> None:
+        self.rig, self.renderer, self.frames = rig, renderer.name, playback.frames
+        self._playback, self._with = playback, renderer
+        self._last: tuple[Any, list[FloatArray]] | None = None
+
+    def images(self, frame: int) -> list[FloatArray]:
+        """Return the pictures of a frame; those of a scene that did not change are not drawn again."""
+        scene, background = self._playback.state_at(frame), self._playback.meta.background
+        if self._last is None or self._last[0] is not scene:
+            views = range(len(self.rig))
+            self._last = (
+                scene, [np.clip(render(scene, self.rig, view, background, self._with), 0, 1) for view in views]
+            )  # fmt: skip
+        return self._last[1]
+
+
+def evaluate(
+    stream: str | os.PathLike[str], source: FrameSource, *, frames: Sequence[int] | None = None,
+    split: Literal["train", "test"] = "test", renderer: PlayerRenderer | None = None,
+    lpips: OnnxLpips | None = None, extras: Mapping[str, ViewMetric] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Evaluation:  # fmt: skip
+    """Render a stream's packets with the player and compare every test view with the recording.
+
+    Arguments:
+        stream: file to read.
+        source: an open recording.
+        split: "test" or "train".
+        renderer: that draws.
+        frames, lpips, extras, progress: as for :func:`evaluate_shown`.
+
+    Raises InputError when the recording's cameras are not those of the stream, PacketError for a damaged stream.
+    """
+    renderer = find_renderer() if renderer is None else renderer
+    with Playback(stream) as playback:
+        shown = StreamShown(playback, playback.cameras(split), renderer)
+        return evaluate_shown(
+            shown, source, frames=frames, split=split, lpips=lpips, extras=extras, progress=progress
+        )
+
+
+def evaluate_shown(
+    shown: Shown, source: FrameSource, *, frames: Sequence[int] | None = None,
+    split: Literal["train", "test"] = "test", lpips: OnnxLpips | None = None,
+    extras: Mapping[str, ViewMetric] | None = None, progress: Callable[[int, int], None] | None = None,
+) -> Evaluation:  # fmt: skip
+    """Compare pictures of every test view with the recording.
+
+    Colours are clamped to [0, 1] first, as a screen would (3DGS convention). Noise is measured between the first two
+    evaluated frames; "moving" and "changed" are relative to the first evaluated frame, which is also the one held.
+
+    Arguments:
+        shown: the pictures.
+        source: an open recording.
+        frames: frame indices; default all that are shown.
+        split: "test" or "train".
+        lpips, extras: measured besides the rest; default: not measured.
+        progress: called with (done, total) after every frame.
+
+    Raises InputError when the recording's cameras are not those of the pictures.
+    """
+    rig, chosen = shown.rig, sorted(set(shown.frames if frames is None else frames))
+    if not chosen or len(rig) == 0:
+        raise InputError(f"nothing to evaluate: {len(chosen)} frames, {len(rig)} {split} cameras")
+    order = _match(rig, source.info.test if split == "test" else source.info.train, split)
+    truth_first = _truth(source, chosen[0], split, order)
+    truth_next = _truth(source, chosen[1], split, order) if len(chosen) > 1 else truth_first
+    sigmas = [noise_sigma(a, b) for a, b in zip(truth_first, truth_next, strict=True)]
+    held, views = list(shown.images(chosen[0])), []
+    last: tuple[Sequence[FloatArray | None], Sequence[FloatArray | None]] = ([None] * len(rig), [None] * len(rig))
+    for done, frame in enumerate(chosen, 1):
+        truth, images = _truth(source, frame, split, order), shown.images(frame)
+        for i, name in enumerate(rig.ids):
+            masks = (moving_mask(truth[i], truth_first[i], sigmas[i]), changed_mask(truth[i], truth_first[i]))
+            pair = ViewPair(images[i], truth[i], last[0][i], last[1][i], sigmas[i])
+            found = {key: metric(pair) for key, metric in (extras or {}).items()}
+            views.append(replace(_compare(frame, name, pair, held[i], masks, lpips), extra=found))
+        last = (images, list(truth))
+        if progress is not None:
+            progress(done, len(chosen))
+    variant = None if lpips is None else lpips.variant
+    return Evaluation(tuple(views), dict(zip(rig.ids, sigmas, strict=True)), shown.renderer, variant)
+
+
+def _compare(
+    frame: int, name: str, pair: ViewPair, held: FloatArray, masks: tuple[Any, Any], lpips: OnnxLpips | None
+) -> ViewQuality:
+    """``masks``: moving pixels, changed pixels."""
+    image, truth, (moving, changed) = pair.image, pair.truth, masks
+    distances = () if lpips is None else (lpips(image, truth), lpips(held, truth))
+    return ViewQuality(
+        frame, name, psnr(image, truth), ssim(image, truth), psnr(image, truth, moving), float(moving.mean()),
+        psnr(held, truth), ssim(held, truth), psnr(held, truth, moving), psnr(image, truth, changed),
+        psnr(held, truth, changed), *distances,
+    )  # fmt: skip
+
+
+def _truth(source: FrameSource, frame: int, split: Literal["train", "test"], order: Sequence[int]) -> FloatArray:
+    return source.frame(frame, split).images[list(order)]
+
+
+def _match(rig: Cameras, recorded: Cameras, split: str) -> list[int]:
+    """Index in the recording of every camera of the stream."""
+    missing = [name for name in rig.ids if name not in recorded.ids]
+    if missing or (rig.width, rig.height) != (recorded.width, recorded.height):
+        raise InputError(
+            f"the recording does not fit the stream: expected {split} cameras {list(rig.ids)} at {rig.width} x "
+            f"{rig.height}, got {list(recorded.ids)} at {recorded.width} x {recorded.height}; "
+            "open the recording at the scale of the run"
+        )
+    return [recorded.ids.index(name) for name in rig.ids]
+
+
+def _plain(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,93 @@
+"""The pictures of a run folder: contact sheet, per-frame plots, summary table, video."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from gsstream.engine.budget.report import budget_lines
+from gsstream.engine.run.live import live_lines
+from gsstream.evaluation.records import FrameRecord, read_lines, read_records
+from gsstream.evaluation.summary import summarise, summary_table
+from gsstream.packet import StreamMeta
+from gsstream.player.playback import Playback
+from gsstream.source.base import FrameSource
+
+STREAM, METRICS = "stream.gss", "metrics.jsonl"
+SHEET, PLOTS, SUMMARY, VIDEO = "contact_sheet.png", "frames.png", "summary.txt", "video.mp4"
+COLUMNS = 5
+NO_FILES: Mapping[int, Path] = MappingProxyType({})
+
+
+def write_gallery(out: Path, source: FrameSource, *, pictures: bool = True, video: bool = True) -> list[Path]:
+    """Write the summary and every picture a person would look for first; return what was written.
+
+    Arguments:
+        out: a run folder with a stream and metrics.
+        source: the recording, at the scale of the run.
+        pictures: without them only the summary is written, what draws them is not imported, and pictures that the
+            folder holds from before stay as they are.
+        video: among the pictures also an MP4 of the first camera, when PyAV is installed (extra ``video``).
+    """
+    with Playback(out / STREAM) as playback:
+        frames, meta = playback.frames, playback.meta
+    records = read_records(out / METRICS)
+    written = [_write_summary(out, meta, records)]
+    if not pictures:
+        return written
+    written += _still_pictures(out, source, meta, records)
+    if video and len(frames) > 1 and importlib.util.find_spec("av") is not None:
+        from gsstream.player.play import play
+
+        play(out / STREAM, out / VIDEO, camera=(meta.test.ids or meta.train.ids)[0])
+        written.append(out / VIDEO)
+    return written
+
+
+def _still_pictures(out: Path, source: FrameSource, meta: StreamMeta, records: Sequence[FrameRecord]) -> list[Path]:
+    from gsstream.evaluation.plots import plot_runs
+
+    written = [write_sheet(out, source)]
+    # Frame 0 alone, and no test camera to measure it: there is no curve to draw.
+    if len(records) > 1 or records[0].psnr:
+        title = f"{meta.title} on {source.info.name}"
+        written.append(plot_runs({meta.title: records}, out / PLOTS, title=title))
+    return written
+
+
+def _write_summary(out: Path, meta: StreamMeta, records: Sequence[FrameRecord]) -> Path:
+    text = [summary_table({meta.title: summarise(records)}), "", judges_line(meta)]
+    lines = read_lines(out / METRICS)
+    for part in (live_lines(lines), budget_lines(lines)):
+        text += ["", *part] if part else []
+    (out / SUMMARY).write_text("\n".join(text) + "\n", encoding="utf-8")
+    return out / SUMMARY
+
+
+def write_sheet(out: Path, source: FrameSource, fresh: Mapping[int, Path] = NO_FILES) -> Path:
+    """Write the contact sheet of a run: a few frames, and those that ``fresh`` has another stream for, to compare with.
+
+    Arguments:
+        out: a run folder with a stream.
+        source: the recording, at the scale of the run.
+        fresh: frame -> stream of a reconstruction of that frame from its own images alone.
+    """
+    from gsstream.evaluation.contact_sheet import sheet_of_stream
+
+    with Playback(out / STREAM) as playback:
+        frames = playback.frames
+    chosen = {int(i) for i in np.linspace(frames[0], frames[-1], min(COLUMNS, len(frames)))}
+    return sheet_of_stream(out / STREAM, source, sorted(chosen | set(fresh)), out / SHEET, fresh=fresh)
+
+
+def judges_line(meta: StreamMeta) -> str:
+    """Return the sentence that says which cameras judged a run, and by which split."""
+    if len(meta.test) == 0:
+        return "no camera judged: all of them train"
+    split = meta.recipe.get("data", {}).get("split", "reporting")
+    purpose = "training cameras left out, to choose settings" if split == "tuning" else "test cameras"
+    return f"judged by {', '.join(meta.test.ids)} ({split} split: {purpose})"

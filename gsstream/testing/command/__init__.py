@@ -1,0 +1,1 @@
+"""Checks of commands that plugins add to ``gsstream``."""

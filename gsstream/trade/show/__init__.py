@@ -1,1 +1,0 @@
-"""Pictures of a run: curves over frames, contact sheets, and the gallery of a run folder."""

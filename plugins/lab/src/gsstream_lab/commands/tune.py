@@ -1,0 +1,151 @@
+"""``gsstream tune``: a recipe that fits a budget, from a short pilot."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from gsstream.cli import options
+from gsstream.cli.grouped import grouped
+from gsstream.cli.listing import fitting, plural
+from gsstream.cli.streams import stream_file
+from gsstream_lab.commands.options import RecordingOptions
+
+if TYPE_CHECKING:
+    from gsstream.recipe.budget import Budget
+    from gsstream.recipe.model import Recipe
+    from gsstream_lab.sweep.config import Scene
+    from gsstream_lab.sweep.plan import Plan
+    from gsstream_lab.sweep.tune import Trial
+
+
+#: Frames of a pilot where none are given, the first one included.
+FRAMES = 5
+
+
+@grouped
+def tune(
+    recording: RecordingOptions,
+    budget: Annotated[str, options.BUDGET],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the pilot and of tuned.yaml; a pilot there goes on.")],
+    methods: Annotated[
+        list[str] | None,
+        typer.Option("--method", help="Method to try; repeatable; by default dense and the s2gs methods."),
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of every random stream.")] = 0,
+    first_frame: options.FirstFrame = None,
+    workers: Annotated[
+        int | None,
+        typer.Option("--workers", min=1, help="Candidates at a time; default: one for each processor, 1 with a time."),
+    ] = None,
+    quiet: options.Quiet = False,
+) -> None:
+    """Try a few recipes on a few frames and write the best that fits a budget as tuned.yaml.
+
+    Candidates are the methods as they are, with one knob changed for what is limited, and with the controller of
+    'run --budget'. The best is the one with the highest PSNR on moving pixels of the cameras that judge: some of the
+    training cameras (the tuning split); test cameras have no say. Nothing fits: the table says what came nearest,
+    nothing is written, and the exit code is 1.
+    """
+    from gsstream.plugins.catalog import load_catalog
+    from gsstream.recipe.budget import budget_overrides
+    from gsstream.recipe.load import resolve_recipe
+    from gsstream_lab.jobs.folder import recording_uri
+    from gsstream_lab.sweep.plan import make_plan
+    from gsstream_lab.sweep.tune import METHODS, pilot
+
+    catalog = load_catalog()
+    limits = _limits(resolve_recipe(None, catalog.recipe_path, (), budget_overrides(budget)).recipe, recording.source)
+    known = catalog.names("method")
+    tried = methods or [name for name in METHODS if name in known]
+    plan = make_plan(pilot(scene_of(recording, FRAMES), tried, limits, seed), Path(), catalog.recipe_path)
+    if first_frame is not None:
+        from gsstream_lab.sweep.tune import give_first_frame
+
+        give_first_frame(plan, out, stream_file(first_frame))
+    trials = _run(plan, limits, out, workers, quiet)
+    _tell(plan, trials, limits, out, recording_uri(recording.source, None))
+
+
+def scene_of(recording: RecordingOptions, frames: int) -> Scene:
+    """Return the recording of a pilot, with the number of frames where none is given."""
+    from gsstream_lab.sweep.config import Scene
+
+    return Scene(
+        name=_name(recording.source), uri=recording.source,
+        recipe=str(recording.recipe.resolve()) if recording.recipe else None, scale=recording.scale,
+        frames=recording.frames or frames, set=recording.changes(),
+    )  # fmt: skip
+
+
+def _limits(recipe: Recipe, source: str) -> Budget:
+    """The budget, with a rate turned into the size of a packet of this recording."""
+    from gsstream.engine.run.recording import open_recording
+    from gsstream.plugins.catalog import load_catalog
+    from gsstream.recipe.budget import sized
+    from gsstream_lab.jobs.folder import recording_uri
+
+    if recipe.budget.rate is None:
+        return recipe.budget
+    recording = open_recording(recording_uri(source, None), recipe, load_catalog())
+    try:
+        return sized(recipe.budget, recording.info.fps)
+    finally:
+        recording.close()
+
+
+def _run(plan: Plan, limits: Budget, out: Path, workers: int | None, quiet: bool) -> list[Trial]:
+    from gsstream_lab.jobs.executor import make_executor, usable_processors
+    from gsstream_lab.sweep.drive import run_sweep
+    from gsstream_lab.sweep.job import run_job
+    from gsstream_lab.sweep.table import read_table
+    from gsstream_lab.sweep.tune import trial_of
+
+    processors = usable_processors()
+    # Candidates that run at the same time would slow each other down.
+    workers = workers or (1 if limits.time is not None else processors)
+    executor = make_executor(run_job, workers, max(1, processors // workers))
+    run_sweep(plan, out, executor, say=(lambda _: None) if quiet else typer.echo)
+    rows = read_table(out).cells
+    return [trial_of(point.variant, rows.get(point.id, {"status": "missing"}), limits) for point in plan.points]
+
+
+def _name(uri: str) -> str:
+    """What progress lines and the table call the recording: the last word of where it is."""
+    found = re.search(r"[A-Za-z0-9][\w.+-]*", re.split(r"[/\\]", uri.partition("?")[0].rstrip("/"))[-1])
+    return found[0] if found else "scene"
+
+
+def _next(source: str, out: Path) -> str:
+    """The command that encodes the whole recording as tuned, ready for a shell."""
+    words = ["gsstream", "run", "--source", source, "--recipe", str(out / "tuned.yaml"), "--out", str(out / "run")]
+    return shlex.join(words)
+
+
+def _tell(plan: Plan, trials: list[Trial], limits: Budget, out: Path, source: str) -> None:
+    from gsstream_lab.sweep.tune import choose, nearest, tune_table, tuned_recipe
+
+    chosen = choose(trials)
+    typer.echo(fitting(tune_table(trials, chosen)))
+    if chosen is not None:
+        resolved = next(point.resolved for point in plan.points if point.variant == chosen.name)
+        (out / "tuned.yaml").write_text(tuned_recipe(resolved), encoding="utf-8")
+        typer.echo(f"\nwrote {out / 'tuned.yaml'}: {chosen.name}; next: {_next(source, out)}")
+        return
+    close = nearest(trials)
+    if close is None:
+        typer.echo("\nno candidate could be run; the table says why", err=True)
+        raise typer.Exit(1)
+    worst = f"largest packet {max(close.sizes) / 1000:.2f} KB, longest frame {max(close.seconds):.2f} s"
+    wanted = limits.model_dump(include={"time", "size", "memory"}, exclude_none=True)
+    given = ", ".join(f"{name}={value:g}" for name, value in wanted.items())
+    typer.echo(
+        f"\nnothing fits {given} (seconds, bytes): nearest is {close.name} with {close.inside} of "
+        f"{plural(close.frames, 'frame')} inside ({worst}, peak {close.memory / 1e6:.0f} MB); give more",
+        err=True,
+    )
+    raise typer.Exit(1)

@@ -1,0 +1,1 @@
+"""How far a stream lies behind fresh reconstructions of its own frames."""

@@ -1,0 +1,26 @@
+"""What this plugin ships, described without importing torch."""
+
+from __future__ import annotations
+
+from gsstream.spec import CommandSpec, hookimpl
+
+GROUP = "Measure"
+#: name -> (function or Typer app in ``gsstream_lab.commands``, one line for ``gsstream --help``)
+COMMANDS = {
+    "sweep": ("sweep:sweep", "Run every recipe of a sweep on every scene with every seed."),
+    "report": ("report:report", "Write report.html (one file, no network), report.md and its figures."),
+    "compare": ("compare:compare", "Encode one recording with several methods and show them side by side."),
+    "tune": ("tune:tune", "Try a few recipes on a few frames and write the best that fits a budget as tuned.yaml."),
+    "gap": ("gap:gap", "Reconstruct frames of a run from their own images alone and say how much better they are."),
+    "left-behind": ("left_behind:left_behind", "Count the Gaussians that stay behind the body they belong to."),
+    "bench": ("bench:app", "Measure rendering or a frame step here."),
+}
+
+
+@hookimpl
+def gsstream_commands() -> list[CommandSpec]:
+    """The commands, in the order of ``gsstream --help``."""
+    return [
+        CommandSpec(name=name, target=f"gsstream_lab.commands.{target}", summary=summary, group=GROUP)
+        for name, (target, summary) in COMMANDS.items()
+    ]

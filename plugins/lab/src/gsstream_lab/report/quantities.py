@@ -1,0 +1,99 @@
+"""What a report speaks of: every quantity with its unit, its better end, and how one run gives one number."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from gsstream.evaluation.records import FrameRecord, mean
+from gsstream.evaluation.summary import Summary, summarise
+from gsstream_lab.energy import total_joules
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A number of a run.
+
+    Arguments:
+        key: name in the table of the paper, too. title: with its unit. form: how it is printed.
+        higher: whether more is better; None: neither.
+        value: (summary, frames after the first as written, cell record) -> number, nan where it was not measured.
+    """
+
+    key: str
+    title: str
+    form: str
+    higher: bool | None
+    value: Callable[[Summary, Sequence[Row], Row], float]
+
+
+def _per_frame(name: str) -> Callable[[Summary, Sequence[Row], Row], float]:
+    return lambda _, frames, __: mean(float(frame[name]) for frame in frames if frame.get(name) is not None)
+
+
+def _per_view(name: str) -> Callable[[Summary, Sequence[Row], Row], float]:
+    """Mean over cameras, then over frames."""
+    return lambda _, frames, __: mean(
+        mean(v for v in frame[name].values() if v is not None) for frame in frames if frame.get(name)
+    )
+
+
+def _of_run(name: str) -> Callable[[Summary, Sequence[Row], Row], float]:
+    return lambda _, __, row: math.nan if row.get(name) is None else float(row[name])
+
+
+def _joules(_: Summary, frames: Sequence[Row], __: Row) -> float:
+    return mean(total_joules(frame["joules"]) for frame in frames if frame.get("joules"))
+
+
+#: In the order of tables. Means over the frames after the first, over all test cameras.
+QUANTITIES: tuple[Quantity, ...] = (
+    Quantity("psnr_first", "PSNR 0, dB", ".2f", True, lambda s, _, __: s.psnr_first),
+    Quantity("psnr", "PSNR, dB", ".2f", True, lambda s, _, __: s.psnr),
+    Quantity("psnr_moving", "moving, dB", ".2f", True, lambda s, _, __: s.psnr_moving),
+    Quantity("psnr_changed", "changed, dB", ".2f", True, lambda s, _, __: s.psnr_changed),
+    Quantity("psnr_slope", "dB/100", "+.2f", True, lambda s, _, __: s.psnr_slope),
+    Quantity("ssim", "SSIM", ".4f", True, lambda s, _, __: s.ssim),
+    Quantity("ms_ssim", "MS-SSIM", ".4f", True, _per_view("ms_ssim")),
+    Quantity("lpips", "LPIPS", ".4f", False, _per_view("lpips")),
+    Quantity("flip", "FLIP", ".4f", False, _per_view("flip")),
+    Quantity("flicker", "flicker, /255", ".3f", False, _per_view("flicker")),
+    Quantity("kb", "KB/frame", ".1f", False, lambda s, _, __: s.kb_per_frame),
+    Quantity("key_kb", "key KB", ".0f", False, lambda s, _, __: s.key_kb),
+    Quantity("seconds", "s/frame", ".2f", False, lambda s, _, __: s.seconds),
+    Quantity("cpu_seconds", "CPU s/frame", ".2f", False, _per_frame("cpu_seconds")),
+    Quantity("memory", "peak MB", ".0f", False, lambda s, _, __: s.peak_memory_mb),
+    Quantity("joules", "J/frame", ".2f", False, _joules),
+    Quantity("seconds_first", "s frame 0", ".1f", False, _of_run("first_seconds")),
+    Quantity("fps", "pictures/s", ".0f", True, _of_run("fps")),
+    Quantity("active", "active, %", ".1f", None, lambda s, _, __: 100 * s.active),
+    Quantity("gates", "gates, k", ".3f", None, lambda _, f, __: mean(x["active_gates"] / 1000 for x in f)),
+    Quantity("gaussians", "Gaussians, k", ".1f", None, lambda _, f, __: mean(x["num_gaussians"] / 1000 for x in f)),
+)
+BY_KEY: Mapping[str, Quantity] = {quantity.key: quantity for quantity in QUANTITIES}
+#: Pairs of a quality and what it is plotted against.
+GOODS, COSTS = ("psnr", "psnr_moving"), ("kb", "seconds", "cpu_seconds", "memory", "joules")
+
+
+def values_of(records: Sequence[FrameRecord], row: Row) -> dict[str, float]:
+    """Return every quantity of one run; nan for what was not measured."""
+    summary, later = summarise(records), row["frames"][1:]
+    return {quantity.key: quantity.value(summary, later, row) for quantity in QUANTITIES}
+
+
+def cell(key: str, value: float, spread: float = math.nan) -> str:
+    """Return ``31.22`` or ``31.22 ± 0.04``; "-" for what was not measured.
+
+    Arguments:
+        key: of the quantity.
+        value: mean.
+        spread: over seeds; nan: none.
+    """
+    if not math.isfinite(value):
+        return "-"
+    form = BY_KEY[key].form
+    return format(value, form) if not math.isfinite(spread) else f"{value:{form}} ± {spread:{form.lstrip('+')}}"

@@ -1,0 +1,115 @@
+"""The gap: fresh reconstructions are of their frame alone, kept, made once, and compared as the definitions say."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flow_runs import encode, metrics
+from gsstream_lab.gap.measure import Gap, GapView, fresh_files, usual_frames
+
+from gsstream.cli.main import run_command
+from gsstream.metrics import changed_mask, psnr
+from gsstream.player.playback import Playback
+from gsstream.player.render import render
+from gsstream.source.open import open_source
+
+WORLD = "synthetic:frames=4&views=4&width=48&height=36&supersample=1&motion=4"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose frame 0 starts from a plane sweep, and its gap at frames 0 and 3."""
+    out = tmp_path_factory.mktemp("gap") / "run"
+    encode(out, source=WORLD, first_frame__points="auto", method="s2gs-edge")
+    assert run_command(["gap", str(out), "--at", "3,0", "--quiet"]) == 0
+    return out
+
+
+def test_numbers_are_those_of_the_definitions(run: Path) -> None:
+    """Against the run's own measurements for the stream, and a calculation by hand for the fresh reconstruction."""
+    data = json.loads((run / "gap.json").read_text())
+    view = next(v for v in data["views"] if v["frame"] == 3)
+    line = metrics(run)[3]
+    for quantity in ("psnr", "psnr_moving", "psnr_changed"):
+        assert view[quantity] == pytest.approx(line[quantity]["test"], abs=1e-3), "the renderers differ by rounding"
+        assert data["gap"]["3"][quantity] == pytest.approx(view[f"fresh_{quantity}"] - view[quantity])
+    first, truth = (open_source(WORLD).frame(t, "test").images[0] for t in (0, 3))
+    with Playback(data["files"]["3"]) as alone:
+        assert alone.frames == range(3, 4)
+        image = np.clip(render(alone.state_at(3), alone.meta.test, 0, alone.meta.background), 0, 1)
+    assert view["fresh_psnr_changed"] == pytest.approx(psnr(image, truth, changed_mask(truth, first)))
+    assert view["fresh_psnr_changed"] > view["psnr_changed"], "two bodies far away from where the stream has them"
+
+
+def test_frame_0_is_its_own_fresh_reconstruction(run: Path) -> None:
+    """The recipe's own frame 0, by seeds of its own images: the same bits as a run whose recording ships no points."""
+    data = json.loads((run / "gap.json").read_text())
+    assert data["gap"]["0"] == {"psnr": 0.0, "psnr_moving": None, "psnr_changed": None}
+    with Playback(run / "stream.gss") as stream, Playback(data["files"]["0"]) as alone:
+        assert stream.state_at(0).means.tobytes() == alone.state_at(0).means.tobytes()
+    table = (run / "gap.txt").read_text().splitlines()
+    assert [line.split()[1] for line in table[2:5]] == ["0", "3", "mean"]
+    assert "judged by test" in table[-1]
+
+
+def test_what_is_there_is_kept_and_shared_and_other_settings_are_not_taken_for_it(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kept = {path: path.stat().st_mtime_ns for path in (run / "fresh").iterdir()}
+    assert len(kept) == 2
+    assert run_command(["gap", str(run), "--at", "0,3", "--json"]) == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out) == json.loads((run / "gap.json").read_text())
+    assert said.err.count("kept") == 2
+    assert {path: path.stat().st_mtime_ns for path in (run / "fresh").iterdir()} == kept
+    # Another method's run with the same frame 0 takes them over; other passes, and points of the recording, do not.
+    encode(tmp_path / "a", source=WORLD, first_frame__points="auto", method="s2gs-edge", stream__epochs=1)
+    cached = ["--cache", str(run / "fresh"), "--quiet"]
+    assert run_command(["gap", str(tmp_path / "a"), "--at", "3", *cached]) == 0
+    assert {path: path.stat().st_mtime_ns for path in (run / "fresh").iterdir()} == kept
+    assert fresh_files(tmp_path / "a") == {3: fresh_files(run)[3]}
+    assert run_command(["gap", str(tmp_path / "a"), "--at", "3", "--epochs", "2", *cached]) == 0
+    assert len(list((run / "fresh").iterdir())) == 3
+    assert not list((run / "fresh").glob(".*")), "nothing unfinished stays"
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--at", "4"], "the stream has frames 0 to 3, got 4"),
+        (["--at", "1,x"], "expected frames such as 10,20,29"),
+        (["--source", "demo"], "cameras"),
+    ],
+)
+def test_mistakes_are_explained(
+    run: Path, tmp_path: Path, more: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (run / "gap.json").read_bytes()
+    assert run_command(["gap", str(run), *more]) == 2
+    assert message in capsys.readouterr().err
+    assert (run / "gap.json").read_bytes() == before
+    assert run_command(["gap", str(run / "stream.gss")]) == 2
+    assert "expected the output folder" in capsys.readouterr().err
+
+
+def test_the_usual_frames_are_a_third_two_thirds_and_the_last() -> None:
+    assert usual_frames(range(90)) == [30, 59, 89]
+    assert usual_frames(range(5, 7)) == [5, 6]
+    assert usual_frames(range(1)) == [0]
+
+
+def test_means_are_over_cameras_first_and_leave_out_what_is_not_defined() -> None:
+    views = (
+        GapView(1, "a", 30, math.nan, 20, 31, math.nan, 22), GapView(1, "b", 32, 28, 24, 35, 29, 30),
+        GapView(2, "a", 10, math.nan, math.nan, 12, math.nan, math.nan),
+    )  # fmt: skip
+    gap = Gap(views, {1: Path("x"), 2: Path("y")}, 150)
+    assert gap.mean("psnr") == 20.5
+    assert gap.mean("gap_psnr") == 2.0
+    assert gap.mean("gap_psnr_changed") == 4.0
+    assert math.isnan(gap.mean("gap_psnr_moving", 2))
+    assert gap.table().splitlines()[3].split()[1::2] == ["2", "10.00", "12.00", "+2.00", *"------"]

@@ -1,0 +1,147 @@
+"""Tuning: which candidates, which of them fits, and a whole pilot on the demo recording, tiny."""
+
+from __future__ import annotations
+
+import math
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from flow_runs import WORLD, encode, metrics
+from gsstream_lab.commands.tune import _name
+from gsstream_lab.report.groups import read_sweep_data
+from gsstream_lab.sweep.table import read_table
+from gsstream_lab.sweep.tune import Trial, candidates, choose, nearest, trial_of, tune_table
+
+from gsstream.cli.main import run_command
+from gsstream.core.errors import InputError
+from gsstream.recipe.budget import Budget
+from gsstream.recipe.load import load_recipe
+from gsstream.recipe.model import Recipe
+from gsstream.source.open import open_source
+from tools.held import held_table, main
+
+TINY = ["first_frame.max_iterations=20", "first_frame.fill_points=100", "first_frame.max_points=400", "stream.epochs=2"]
+
+
+def trial(name: str, moving: float, size: int, inside: int = 4, frames: int = 4) -> Trial:
+    return Trial(name, moving + 2, moving, (size,) * frames, (0.5,) * frames, 5e8, inside)
+
+
+def row(*frames: tuple[int, float], status: str = "done") -> dict:
+    """A table's cell: (bytes, wall seconds) by frame; processor time is twice the wall's."""
+    made = [
+        {
+            "frame": t, "bytes": {"a": size - 1, "b": 1}, "seconds": {"x": s}, "cpu_seconds": 2 * s,
+            "peak_memory_mb": 300.0, "psnr": {"c": 30.0 + t}, "psnr_moving": {"c": None if t == 1 else 20.0 + t},
+        }
+        for t, (size, s) in enumerate(frames)
+    ]  # fmt: skip
+    return {"status": status, "frames": made, "error": "it broke"}
+
+
+def test_candidates_follow_what_is_limited() -> None:
+    names = [v.name for v in candidates(["m"], Budget(size=1000))]
+    assert names == ["m", "m+rate-1e-3", "m+rate-3e-3", "m+budget"]
+    names = [v.name for v in candidates(["m", "n"], Budget(time=1.0))]
+    assert names == ["m", "m+epochs-4", "m+change-12", "m+budget", "n", "n+epochs-4", "n+change-12", "n+budget"]
+    only = candidates(["m"], Budget(memory=10**9))
+    assert [(v.name, v.set) for v in only] == [("m", {"budget.memory": 10**9})]
+    both = candidates(["m"], Budget(memory=10**9, size=1000))[-1]
+    assert both.set == {"budget.memory": 10**9, "budget.size": 1000}
+
+
+def test_a_trial_is_held_against_every_limit() -> None:
+    cell = row((90_000, 9.0), (1000, 1.0), (900, 0.4), (1001, 0.4))
+    found = trial_of("x", cell, Budget(size=1000, time=1.0))
+    assert (found.inside, found.frames, found.fits) == (2, 3, False)
+    assert (found.psnr, found.moving) == (32.0, 22.5)
+    assert trial_of("x", cell, Budget(size=1001, time=1.0)).fits
+    assert trial_of("x", cell, Budget(time=1.0, clock="processor")).inside == 2
+    assert trial_of("x", cell, Budget(memory=299_000_000)).inside == 0
+    assert trial_of("x", row(status="failed"), Budget(size=99)).error == "it broke"
+
+
+def test_the_best_that_fits_is_chosen() -> None:
+    large, good, cheap = trial("large", 30.0, 9000, inside=3), trial("good", 29.0, 5000), trial("cheap", 28.99, 4000)
+    assert choose([large, good, cheap, trial("poor", 28.0, 10)]) is cheap, "a tie within 0.02 dB: fewer bytes"
+    assert choose([large, trial("good", 29.0, 5000), trial("poor", 28.0, 10)]).name == "good"  # type: ignore[union-attr]
+    assert choose([large]) is None
+    assert nearest([large, trial("far", 31.0, 100, inside=0), Trial("broken", error="x")]) is large
+    assert nearest([Trial("broken", error="x")]) is None
+    with pytest.raises(InputError, match="no camera judges") as refused:
+        choose([trial("blind", math.nan, 100)])
+    hint = re.search(r"--set '(\w+)\.(\w+)=", str(refused.value))
+    assert hint, "the message says what to do"
+    section = Recipe.model_fields[hint[1]].annotation
+    assert hint[2] in section.model_fields, "the key that the message names is one of a recipe"  # type: ignore[union-attr]
+    table = tune_table([large, good, Trial("broken", error="it broke")], good).splitlines()
+    assert "<- chosen" in table[2]
+    assert "| good" in table[2]
+    assert "failed: it broke" in table[-1]
+
+
+def test_progress_calls_the_recording_by_its_name() -> None:
+    names = {"demo": "demo", "synthetic:frames=6&views=3": "synthetic", "n3dv:/data/coffee martini/": "coffee",
+             "../rec/k.1?missing=refuse": "k.1", "/": "scene"}  # fmt: skip
+    assert {uri: _name(uri) for uri in names} == names
+
+
+def command(out: Path, budget: str, *more: str) -> list[str]:
+    sets = [item for setting in TINY for item in ("--set", setting)]
+    return ["tune", "--scene", WORLD, "--out", str(out), "--budget", budget, "--method", "s2gs-edge", "--frames", "3",
+            "--quiet", *sets, *more]  # fmt: skip
+
+
+def test_a_pilot_writes_a_recipe_that_runs_inside_the_budget(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    encode(tmp_path / "choosing", "--frames", "1", method="dense", data__split="tuning")
+    given = ("--first-frame", str(tmp_path / "choosing"))
+    assert run_command(command(tmp_path / "pilot", "size=600B", *given)) == 0
+    out = capsys.readouterr().out
+    (judge,) = open_source(WORLD).info.test.ids
+    cells = read_table(tmp_path / "pilot").cells.values()
+    assert {name for cell in cells for name in cell["frames"][0]["psnr"]}.isdisjoint({judge}), "it has no say"
+    assert "| s2gs-edge+budget " in out
+    assert out.count("<- chosen") == 1
+    tuned = load_recipe(tmp_path / "pilot" / "tuned.yaml").recipe
+    assert (tuned.frames, tuned.data.split) == (None, "reporting"), "the run itself trains on all training cameras"
+    assert len(read_sweep_data(tmp_path / "pilot").groups) == 4, "a pilot can be reported, its frame 0 was given"
+    pilot = read_sweep_data(tmp_path / "pilot")
+    rows = held_table([], "size=600B", sweep=(tmp_path / "pilot", pilot.scenes[0])).splitlines()
+    assert len(rows) == 2 + 4
+    assert any("s2gs-edge+budget" in row and " 2/2 " in row for row in rows)
+    program, *said = shlex.split(out.rpartition("next: ")[2])
+    assert program == "gsstream"
+    run_it = [*said, "--frames", "3", "--quiet", "--no-pictures", "--first-frame"]
+    assert run_command([*run_it, str(tmp_path / "choosing")]) == 0
+    assert f"judged by {judge} (reporting split" in (tmp_path / "pilot" / "run" / "summary.txt").read_text()
+    assert all(sum(line["bytes"].values()) <= 600 for line in metrics(tmp_path / "pilot" / "run")[1:])
+    # Nothing fits: said so, with the nearest; the pilot's other candidates are there already.
+    (tmp_path / "pilot" / "tuned.yaml").unlink()
+    assert run_command(command(tmp_path / "pilot", "time=1ms", *given)) == 1
+    err = capsys.readouterr().err
+    assert "nothing fits time=0.001 (seconds, bytes): nearest is " in err
+    assert not (tmp_path / "pilot" / "tuned.yaml").exists()
+    encode(tmp_path / "other", "--frames", "1", "--seed", "5", method="dense", data__split="tuning")
+    assert run_command(command(tmp_path / "pilot", "time=1ms", "--first-frame", str(tmp_path / "other"))) == 2
+    assert "from another frame 0" in capsys.readouterr().err
+
+
+def test_nonsense_is_refused_before_anything_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for budget, problem in [("size=3kb", "no unit 'kb'"), ("speed=3s", "unknown key 'speed'")]:
+        assert run_command(command(tmp_path / "no", budget)) == 2
+        assert problem in capsys.readouterr().err
+    assert run_command([*command(tmp_path / "no", "size=3KB"), "--method", "s2gz"]) == 2
+    assert "no method named 's2gz'" in capsys.readouterr().err
+    assert not (tmp_path / "no").exists()
+
+
+def test_runs_are_held_against_a_budget_they_were_not_made_under(tmp_path: Path) -> None:
+    encode(tmp_path / "free", "--frames", "3", method="s2gs-edge")
+    sizes = [sum(line["bytes"].values()) for line in metrics(tmp_path / "free")][1:]
+    assert "| free   |    1/2 |" in held_table([tmp_path / "free"], f"size={min(sizes)}B")
+    assert "| free   |    1/1 |" in held_table([tmp_path / "free"], f"size={max(sizes)}B", frames=2)
+    assert main(["--budget", "size=3kb", str(tmp_path / "free")]) == 2

@@ -1,0 +1,176 @@
+"""Sequences and pictures of methods trained elsewhere, tried on a stream's own export and its own pictures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsstream.cli.main import run_command
+from gsstream.core.errors import InputError
+from gsstream.core.gaussians import Gaussians
+from gsstream.evaluation.offline import bytes_line, numbered
+from gsstream.player.ply import ply_bytes, read_ply
+
+SOURCE = "synthetic:frames=3&views=3&width=64&height=48&supersample=1"
+SMALL = ("max_iterations=5", "fill_points=50", "max_points=200")
+
+
+@pytest.fixture(scope="module")
+def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("run") / "run"
+    command = ["run", "--method", "dense", "--source", SOURCE, "--out", str(out), "--quiet", "--no-pictures"]
+    sets = [item for value in (*SMALL, "sh_degree=1") for item in ("--set", f"first_frame.{value}")]
+    assert run_command([*command, *sets, "--set", "stream.epochs=1"]) == 0
+    return out
+
+
+def evaluated(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict:
+    capsys.readouterr()
+    assert run_command(["evaluate", *map(str, arguments), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def scene(number: int, rest: int) -> Gaussians[np.ndarray]:
+    rng = np.random.default_rng(rest)
+    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (rest, 3)}
+    return Gaussians(**{name: rng.normal(size=(number, *shape)).astype(np.float32) for name, shape in shapes.items()})
+
+
+def test_an_exported_sequence_is_as_good_as_its_stream(stream: Path, tmp_path: Path, capsys) -> None:
+    """The files are in the recording's coordinates: there and back costs no more than float32 does."""
+    out = tmp_path / "sequence"
+    assert run_command(["export", str(stream), "--format", "sequence", "--out", str(out)]) == 0
+    own = evaluated(capsys, stream)
+    theirs = evaluated(capsys, "--ply-sequence", out, "--source", SOURCE)
+    assert theirs["sigmas"] == own["sigmas"]
+    assert len(theirs["views"]) == len(own["views"]) > 0
+    for view, expected in zip(theirs["views"], own["views"], strict=True):
+        assert (view["frame"], view["camera"]) == (expected["frame"], expected["camera"])
+        for name in ("psnr", "ssim", "psnr_moving", "psnr_changed"):
+            assert view[name] == (None if expected[name] is None else pytest.approx(expected[name], abs=2e-3)), name
+    assert run_command(["evaluate", "--ply-sequence", str(out), "--source", SOURCE, "--frames", "0:2"]) == 0
+    size = sum((out / f"{frame:06d}.ply").stat().st_size for frame in (0, 1)) / 1000
+    assert f"2 files, {size:.1f} KB; {size / 2:.1f} KB/frame over 2 frames" in capsys.readouterr().out
+
+
+def test_positions_relative_to_an_offset_are_put_back(stream: Path, tmp_path: Path, capsys) -> None:
+    for origin in ("recording", "local"):
+        command = ["export", str(stream), "--format", "ply", "--out", str(tmp_path / origin), "--origin", origin]
+        assert run_command(command) == 0
+    there, local = (evaluated(capsys, "--ply-sequence", tmp_path / name, "--source", SOURCE) for name in
+                    ("recording", "local"))  # fmt: skip
+    assert [v["psnr"] for v in local["views"]] == pytest.approx([v["psnr"] for v in there["views"]], abs=2e-3)
+
+
+def test_pictures_count_like_the_stream_that_drew_them(stream: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "pictures"
+    assert run_command(["play", str(stream), "--camera", "test", "--out", str(out)]) == 0
+    own, theirs = evaluated(capsys, stream), evaluated(capsys, "--renders", out, "--source", SOURCE)
+    psnr = [[view["psnr"] for view in found["views"]] for found in (own, theirs)]
+    # The pictures have eight bits: errors of 1/255 at most, on top of ten times as large ones.
+    assert psnr[1] == pytest.approx(psnr[0], abs=0.1)
+    assert theirs["renderer"] == "elsewhere"
+    shifted = tmp_path / "from-one"
+    shifted.mkdir()
+    for path in out.rglob("*.png"):
+        path.rename(shifted / f"view_{int(path.stem) + 1}.png")
+    again = evaluated(capsys, "--renders", shifted, "--source", SOURCE, "--first", 1)
+    assert again["views"] == theirs["views"]
+    Image.new("RGB", (63, 48)).save(shifted / "view_2.png")
+    assert run_command(["evaluate", "--renders", str(shifted), "--source", SOURCE, "--first", "1"]) == 2
+    assert "expected 64 x 48 pixels as the recording has at this --scale, got 63 x 48" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("rest", [0, 3, 8, 15])
+def test_a_ply_is_read_as_it_was_written(tmp_path: Path, rest: int) -> None:
+    written, path = scene(7, rest), tmp_path / "a.ply"
+    path.write_bytes(ply_bytes(written, ["offset 1.5 -2 1e6"]))
+    read, offset = read_ply(path)
+    assert offset == (1.5, -2.0, 1e6)
+    for (name, value), (_, expected) in zip(read.items(), written.items(), strict=True):
+        assert value.tobytes() == expected.tobytes(), name
+
+
+def test_properties_in_another_order_and_of_other_types_are_read(tmp_path: Path) -> None:
+    """As other programs write them: a property more, doubles, and no normals."""
+    written = scene(3, 0)
+    columns = {
+        "red": np.zeros(3, np.uint8), "opacity": written.opacities.astype("<f8"),
+        **{f"rot_{i}": written.quats[:, i] for i in range(4)}, **{f"scale_{i}": written.scales[:, i] for i in range(3)},
+        **{f"f_dc_{i}": written.sh0[:, 0, i] for i in range(3)},
+        **{name: written.means[:, i] for i, name in enumerate("zyx")},
+    }  # fmt: skip
+    kinds = {"|u1": "uchar", "<f8": "double", "<f4": "float"}
+    head = ["ply", "format binary_little_endian 1.0", "element vertex 3"]
+    head += [f"property {kinds[value.dtype.str]} {name}" for name, value in columns.items()]
+    table = np.zeros(3, [(name, value.dtype) for name, value in columns.items()])
+    for name, value in columns.items():
+        table[name] = value
+    (tmp_path / "a.ply").write_bytes("\n".join([*head, "end_header\n"]).encode() + table.tobytes())
+    read, offset = read_ply(tmp_path / "a.ply")
+    np.testing.assert_array_equal(read.means, written.means[:, ::-1])
+    np.testing.assert_array_equal(read.opacities, written.opacities)
+    assert offset == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda data: b"solid x", "expected a PLY with the line"),
+        (lambda data: data[:-1], "bytes of vertices"),
+        (lambda data: data.replace(b"float opacity", b"float opaque!"), "missing opacity"),
+        (lambda data: data.replace(b"vertex 7", b"vertex x"), "header is not that of a 3DGS PLY"),
+        (lambda data: data.replace(b"property float x", b"property list x"), "header is not that of a 3DGS PLY"),
+        (lambda data: data.replace(b"property float y", b"property float x"), "each property once"),
+    ],
+)
+def test_files_that_are_no_such_ply_are_refused(tmp_path: Path, change, said: str) -> None:
+    path = tmp_path / "a.ply"
+    path.write_bytes(change(ply_bytes(scene(7, 0))))
+    with pytest.raises(InputError, match=said):
+        read_ply(path)
+
+
+def test_names_say_which_frame_a_file_is(tmp_path: Path) -> None:
+    for name in ("time_00012.ply", "take2_3.ply", "notes.txt"):
+        (tmp_path / name).touch()
+    assert {frame: path.name for frame, path in numbered(tmp_path, (".ply",), 2).items()} == {
+        1: "take2_3.ply", 10: "time_00012.ply",
+    }  # fmt: skip
+    with pytest.raises(InputError, match="a number from 5 on"):
+        numbered(tmp_path, (".ply",), 5)
+    (tmp_path / "b_12.ply").touch()
+    with pytest.raises(InputError, match="both frame 12"):
+        numbered(tmp_path, (".ply",), 0)
+    with pytest.raises(InputError, match=r"holds no file that ends with \.png"):
+        numbered(tmp_path, (".png",), 0)
+    with pytest.raises(InputError, match="is no folder"):
+        numbered(tmp_path / "none", (".ply",), 0)
+
+
+def test_bytes_of_folders_count_all_that_is_in_them(tmp_path: Path) -> None:
+    (tmp_path / "model" / "deep").mkdir(parents=True)
+    (tmp_path / "model" / "a").write_bytes(b"x" * 1500)
+    (tmp_path / "model" / "deep" / "b").write_bytes(b"x" * 500)
+    assert bytes_line([tmp_path / "model"], 4) == "2 files, 2.0 KB; 0.5 KB/frame over 4 frames"
+    assert bytes_line([], 4) == ""
+    with pytest.raises(InputError, match="no such file"):
+        bytes_line([tmp_path / "none"], 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "expected one of STREAM"),
+        (["a.gss", "--renders", "b"], "expected one of STREAM"),
+        (["--renders", "b"], "name it with --source"),
+        (["a.gss", "--first", "1"], "belong to --ply-sequence and --renders"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(capsys, arguments: list[str], said: str) -> None:
+    assert run_command(["evaluate", *arguments]) == 2
+    assert said in capsys.readouterr().err

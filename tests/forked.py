@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from multiprocessing import forkserver
 from pathlib import Path
 
-PRELOAD = ["gsstream_lab.jobs.warm", "gsstream.cli.main"]
+PRELOAD = ["gsstream.engine.run.session", "gsstream.evaluation.evaluate", "gsstream.cli.main"]
 
 
 def gsstream(

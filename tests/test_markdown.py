@@ -81,7 +81,7 @@ def commands(lines: list[str]) -> Iterator[list[str]]:
 
 @functools.cache
 def command_line() -> Any:
-    return get_command(app)
+    return get_command(app).load()
 
 
 def problem(words: list[str], complete: bool) -> str | None:
@@ -169,7 +169,7 @@ def methods_named(words: list[str]) -> Iterator[str]:
     yield from (word for before, word in itertools.pairwise(words) if before == "--method")
     if words[:1] == ["compare"] and len(words) > 1:
         yield from filter(None, words[1].split(","))
-    if words[:2] == ["methods", "show"]:
+    if words[:2] == ["methods"]:
         yield from words[2:3]
 
 

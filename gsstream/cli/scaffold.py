@@ -112,7 +112,7 @@ One part for gsstream: the <kind> `<name>`.
 ```
 pip install -e .
 gsstream check <kind>/<name>
-gsstream plugins show <kind>/<name>
+gsstream plugins <kind>/<name>
 gsstream run --method dense <use> --out run/
 ```
 
@@ -174,7 +174,7 @@ methods of the same code, each with a `MethodSpec` in `plugin.py`. Change them, 
 or with `pytest` for one test per check. <claims>
 """,
     "src/<package>/recipes/<name>.yaml": """\
-# The method as --method <name> finds it: what is not said here has its default (gsstream recipe show <name>).
+# The method as --method <name> finds it: what is not said here has its default (gsstream recipe <name>).
 method: <name>
 stepper: {name: <name>}
 """,

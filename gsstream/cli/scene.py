@@ -10,7 +10,9 @@ import typer
 from gsstream.cli import options
 from gsstream.core.needs import page
 
-app = typer.Typer(help="Prepare and validate scenes.", no_args_is_help=True, rich_markup_mode=None)
+app = typer.Typer(
+    help="Prepare and validate scenes.", no_args_is_help=True, rich_markup_mode=None, add_completion=False
+)
 
 
 @app.callback()

@@ -28,6 +28,12 @@ class CommandTable(TyperGroup):
         self._own = {spec.name: spec for spec in gsstream_commands()}
         self._catalog: Catalog | None = None
 
+    def load(self) -> CommandTable:
+        """Import every command, those of healthy plugins too, so that ``commands`` holds them all; slow."""
+        for name in self.list_commands(None):
+            self.get_command(None, name)
+        return self
+
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the names of all commands, in the order of ``--help``."""
         return [spec.name for _, specs in self._sections() for spec in specs]

@@ -59,7 +59,7 @@ _KINDS = (
     PartKind("growth", "gsstream.growth.base:Growth", slot=True, default="none"),
     PartKind("regularizer", "gsstream.regularizer.base:Regularizer", slot=True, default="none", behaviour=True),
     PartKind("stepper", "gsstream.method.base:StreamingMethod", default="parts"),
-    PartKind("renderer", "gsstream.render.base:Renderer", default="auto", use="--renderer <name> --source demo"),
+    PartKind("renderer", "gsstream.render.base:Renderer", default="auto", use="--set renderer=<name> --source demo"),
     PartKind("loss", "gsstream.loss.base:Loss", use="--set loss.backend=<name> --source demo"),
     PartKind("optimiser", "gsstream.optimiser.base:RowOptimiser", use=None),
     PartKind("source", None, use="--source <name>:"),

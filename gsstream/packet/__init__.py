@@ -4,6 +4,7 @@
 :class:`StreamReader` put packets into a file and find them again. Normative text: docs/reference/packet-format.md.
 """
 
+from gsstream.core.digest import hash_recipe as hash_recipe
 from gsstream.packet.base import FORMAT_VERSION as FORMAT_VERSION
 from gsstream.packet.base import EncodedPacket as EncodedPacket
 from gsstream.packet.base import PacketKind as PacketKind
@@ -21,7 +22,6 @@ from gsstream.packet.key import quantise_key as quantise_key
 from gsstream.packet.layers import FirstLayer as FirstLayer
 from gsstream.packet.layers import first_layer as first_layer
 from gsstream.packet.meta import StreamMeta as StreamMeta
-from gsstream.packet.meta import hash_recipe as hash_recipe
 from gsstream.packet.reader import Entry as Entry
 from gsstream.packet.reader import StreamReader as StreamReader
 from gsstream.packet.state import PlayerState as PlayerState

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Mapping
@@ -13,6 +12,7 @@ import numpy as np
 
 from gsstream import __version__
 from gsstream.core.cameras import Cameras
+from gsstream.core.digest import hash_recipe
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.names import check_camera_ids
 from gsstream.core.world import IDENTITY, World
@@ -75,12 +75,6 @@ class StreamMeta:
             if name in rig.ids:
                 return rig.select([rig.ids.index(name)])
         raise ShapeError(f"no camera {name!r} in this stream; known: {', '.join((*self.test.ids, *self.train.ids))}")
-
-
-def hash_recipe(recipe: Mapping[str, Any]) -> str:
-    """Return the first 16 hex digits of the SHA-256 of the canonical JSON (sorted keys, no spaces)."""
-    text = json.dumps(recipe, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def meta_to_json(meta: StreamMeta) -> bytes:

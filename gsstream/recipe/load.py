@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gsstream.core.digest import hash_recipe
 from gsstream.core.errors import RecipeError
-from gsstream.packet.meta import hash_recipe
 from gsstream.recipe.check import join_problems, keep_known, validate
 from gsstream.recipe.document import (
     DEFAULT,

@@ -1,6 +1,6 @@
 """Recipe: a run described as data. Unknown keys are refused; every field says its unit and range.
 
-Defaults here are those of the dense baseline; methods ship their own recipe files (``gsstream methods show NAME``).
+Defaults here are those of the dense baseline; methods ship their own recipe files (``gsstream methods NAME``).
 """
 
 from __future__ import annotations

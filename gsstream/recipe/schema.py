@@ -1,7 +1,7 @@
 """A JSON Schema of recipe files, for editors: completion, meaning and range of every key while one writes.
 
 A recipe file holds differences, so nothing is required, and a slot may be a bare name (``gate: always-open``). What one
-key says about another (``base`` chooses the parts) is not in the schema: ``gsstream recipe show`` has the last word.
+key says about another (``base`` chooses the parts) is not in the schema: ``gsstream recipe`` has the last word.
 """
 
 from __future__ import annotations

@@ -120,7 +120,7 @@ def test_a_bad_image_later_on_costs_only_what_comes_after_it(
         ),
         (["--source", "dmo"], "source 'dmo': no such folder and no known scheme; expected 'demo'"),
         (["--source", "synthetic:frame=3"], "unknown option 'frame'; did you mean 'frames'?"),
-        (["--renderer", "cpuu"], "no renderer named 'cpuu'; did you mean 'cpu'?"),
+        (["--set", "renderer=cpuu"], "no renderer named 'cpuu'; did you mean 'cpu'?"),
         (["--first-frame", "absent.gss"], "no stream at absent.gss: expected a .gss file or the output folder"),
     ],
     ids=lambda value: value if isinstance(value, str) else None,

@@ -66,8 +66,8 @@ def test_what_the_renderer_keeps_changes_no_byte(tmp_path: Path, monkeypatch: py
 
 def test_a_cache_without_room_changes_no_byte(tmp_path: Path, world: str) -> None:
     settings = {"method": "s2gs-edge", "source": world}
-    encode(tmp_path / "roomy", "--renderer", "cpu", **settings)
-    encode(tmp_path / "tight", "--renderer", "cpu", renderer__cache_mb=0, **settings)
+    encode(tmp_path / "roomy", "--set", "renderer=cpu", **settings)
+    encode(tmp_path / "tight", "--set", "renderer=cpu", renderer__cache_mb=0, **settings)
     assert "cache" in metrics(tmp_path / "roomy")[-1]
     assert "cache" not in metrics(tmp_path / "tight")[-1]
     assert deltas(tmp_path / "roomy") == deltas(tmp_path / "tight")

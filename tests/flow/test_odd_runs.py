@@ -21,7 +21,7 @@ GROWING = {"first_frame__densify_from": 4, "first_frame__densify_every": 4, "fir
 def test_the_reference_renderer_can_grow_a_scene(tmp_path: Path, method: str) -> None:
     """Densification asks a session for the gradient of the 2-D means."""
     settings: dict[str, Any] = {**GROWING, "stream__epochs": 4, "first_frame__densify_gradient": 1e-6}
-    encode(tmp_path, "--renderer", "reference", source=TINY_WORLD, method=method, **settings)
+    encode(tmp_path, "--set", "renderer=reference", source=TINY_WORLD, method=method, **settings)
     assert [line["status"] for line in metrics(tmp_path)] == ["key", "delta", "delta"]
 
 

@@ -32,7 +32,7 @@ def resume(out: Path, method: str) -> bytes:
 
 def test_same_seed_same_bytes(tmp_path: Path, whole: tuple[str, bytes]) -> None:
     assert encode(tmp_path / "again", method=whole[0]) == whole[1]
-    assert encode(tmp_path / "other", "--seed", "1", method=whole[0]) != whole[1]
+    assert encode(tmp_path / "other", "--set", "seed=1", method=whole[0]) != whole[1]
 
 
 def test_threads_change_no_byte(tmp_path: Path, whole: tuple[str, bytes]) -> None:
@@ -138,7 +138,7 @@ def refused(capsys: pytest.CaptureFixture[str], stream: Path, command: list[str]
 def test_another_recipe_or_recording_is_not_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     encode(tmp_path, "--frames", "2")
     stream = tmp_path / "stream.gss"
-    err = refused(capsys, stream, arguments(tmp_path, "--resume", "--seed", "3", stream__epochs=4))
+    err = refused(capsys, stream, arguments(tmp_path, "--resume", "--set", "seed=3", stream__epochs=4))
     assert "written with another recipe: seed, stream differ" in err
     assert "--overwrite" in err
     err = refused(capsys, stream, arguments(tmp_path, "--resume", method="s2gs-edge"))

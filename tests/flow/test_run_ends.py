@@ -34,7 +34,7 @@ def test_a_service_ends_a_run_politely_and_a_second_run_is_kept_out(tmp_path, ca
         until(out / "stream.gss", 3000, process)
         os.kill(process.pid, signal.SIGSTOP)  # it must not come to its end while the second run is tried
         recipe = (out / "recipe.yaml").read_bytes()
-        assert run_command(arguments(out, "--overwrite", "--seed", "7", source=LONG)) == 2
+        assert run_command(arguments(out, "--overwrite", "--set", "seed=7", source=LONG)) == 2
         assert f"process {process.pid}" in capsys.readouterr().err
         assert (out / "recipe.yaml").read_bytes() == recipe, "the refused run has touched nothing"
         os.kill(process.pid, signal.SIGTERM)

@@ -381,7 +381,7 @@ def refusal(*sets: str, method: str = "hold") -> list[str]:
 
 
 def test_keys_that_a_whole_method_does_not_read_are_refused() -> None:
-    why = "the stepper 'hold' does not read it; its own settings: gsstream plugins show stepper/hold"
+    why = "the stepper 'hold' does not read it; its own settings: gsstream plugins stepper/hold"
     assert refusal("structure.resolution=64", "gate_training.lr=0.5", "stream.epochs=3", "update.sh0.lr=1.0") == [
         "4 problems in the recipe:",
         f"  --set structure.resolution=64: structure.params: {why}",
@@ -430,7 +430,7 @@ def test_a_held_scene_is_frame_0_and_resumes(tmp_path: Path) -> None:
 def test_resuming_with_other_settings_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "o"
     assert run_command([*RUN, "--out", str(out)]) == 0
-    assert run_command([*RUN, "--out", str(out), "--resume", "--seed", "5"]) == 2
+    assert run_command([*RUN, "--out", str(out), "--resume", "--set", "seed=5"]) == 2
     assert "the stream was written with another recipe: seed differ" in capsys.readouterr().err
 
 

@@ -44,7 +44,7 @@ for command in (
     ["play", stream, "--out", out + "/png", "--frames", "0:3"],
     ["play", stream, "--out", out + "/orbit", "--camera", "orbit", "--frames", "0:2"],
     ["info", stream],
-    ["manifest", stream, "--out", out + "/s.json"],
+    ["export", stream, "--format", "manifest", "--out", out],
     ["export", stream, "--out", out + "/ply", "--frames", "0:1"],
 ):
     code = run_command(command)

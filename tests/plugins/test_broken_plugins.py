@@ -49,7 +49,7 @@ def test_all_faults_at_once(lab) -> None:
     listing = lab.cli("plugins")
     assert listing.returncode == 0, listing.stderr
     assert listing.stdout.count("quarantined: ") == len(REASONS)
-    assert lab.cli("recipe", "show", "dense").returncode == 0
+    assert lab.cli("recipe", "dense").returncode == 0
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_asking_for_a_quarantined_part_raises_from_the_original_error(lab, fault
     result = lab.python(code, asked)
     assert result.stdout.startswith(f"{cause} gate {asked!r} is not available: plugin {fault!r} (from gsstream-")
     assert REASONS[fault] in result.stdout
-    shown = lab.cli("plugins", "show", asked)
+    shown = lab.cli("plugins", asked)
     assert shown.returncode == 1
     assert REASONS[fault] in shown.stderr
 
@@ -141,7 +141,7 @@ def test_trace_prints_every_hook_call(lab) -> None:
 
 def test_unknown_names_mention_quarantine(lab) -> None:
     lab.install("raises_at_import")
-    result = lab.cli("methods", "show", "s2gz")
+    result = lab.cli("methods", "s2gz")
     assert result.returncode == 2
     assert result.stderr == (
         "error: no method named 's2gz'; known: dense, hold (1 plugin could not be loaded: see 'gsstream plugins')\n"

@@ -17,7 +17,7 @@ BROKEN = Path(__file__).parent / "broken"
 PAGE = Path(__file__).parents[2] / "docs" / "plugin-failures.md"
 RUN = [
     "run", "--source", "synthetic:frames=5&views=2&width=32&height=24&supersample=1", "--quiet", "--no-pictures",
-    "--renderer", "reference", "--set", "loss.backend=reference", "--set", "first_frame.max_iterations=3",
+    "--set", "renderer=reference", "--set", "loss.backend=reference", "--set", "first_frame.max_iterations=3",
     "--set", "first_frame.fill_points=0", "--set", "first_frame.max_points=60", "--set", "stream.epochs=1",
     "--set", "first_frame.prune_error=0",
 ]  # fmt: skip
@@ -61,10 +61,10 @@ def test_rings_one_and_two_import_and_declaration(drill) -> None:
     assert listing.returncode == 0
     assert listing.stdout.count("quarantined: ") == 5
     assert re.search(r"^gate +sound ", listing.stdout, re.MULTILINE), "the healthy plugin is listed all the same"
-    message = one_line(drill.cli("plugins", "show", "raises_at_import"), 1)
+    message = one_line(drill.cli("plugins", "raises_at_import"), 1)
     assert "ModuleNotFoundError: No module named 'a_package_nobody_has'" in message
     documented(message)
-    documented(one_line(drill.cli("plugins", "show", "gate/newer-gate"), 1))
+    documented(one_line(drill.cli("plugins", "gate/newer-gate"), 1))
 
 
 def test_ring_three_construction(drill, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import json
 from pathlib import Path
@@ -35,9 +36,9 @@ def read(path: Path) -> Any:
 
 
 def made(*args: str, folder: Path) -> Any:
-    out = folder / "schema.json"
-    assert run_command(["recipe", "schema", *args, "--out", str(out)]) == 0
-    schema = json.loads(out.read_text())
+    with (folder / "schema.json").open("w+") as file, contextlib.redirect_stdout(file):
+        assert run_command(["recipe", *args, "--schema"]) == 0
+    schema = json.loads((folder / "schema.json").read_text())
     jsonschema.Draft202012Validator.check_schema(schema)
     return Validator(schema)
 

@@ -18,7 +18,7 @@ def cli() -> str:
 
     lines = [NOTE, "# Command line", ""]
     lines += ["Exit codes: 0 done; 2 something given is wrong; 130 interrupted; 1 other.", ""]
-    for path, command in _commands(get_command(app), "gsstream"):
+    for path, command in _commands(get_command(app).load(), "gsstream"):
         lines += [f"## {path}", "", (command.help or "").strip(), ""]
         shown = [param for param in command.params if param.name != "help"]
         if shown:
@@ -54,7 +54,7 @@ def recipe() -> str:
     from gsstream.cli.plugins import setting_rows
     from gsstream.recipe.model import Recipe
 
-    lines = [NOTE, "# Recipe keys", "", "A part's own settings (`SLOT.params`): `gsstream plugins show PART`.", ""]
+    lines = [NOTE, "# Recipe keys", "", "A part's own settings (`SLOT.params`): `gsstream plugins PART`.", ""]
     lines += ["| key | type | default | meaning |", "|---|---|---|---|"]
     lines += [f"| `{key}` | {kind} | `{default}` | {text} |" for key, kind, default, text in setting_rows(Recipe)]
     return "\n".join(lines) + "\n"

@@ -117,7 +117,7 @@ def parts() -> str:
     ours = {"gsstream", *(f"gsstream-{path.parent.name.replace('_', '-')}" for path in folders)}
     catalog = load_catalog()
     lines = [NOTE, "# Settings of every part", ""]
-    lines += ["The parts of this repository. Of any part that is installed: `gsstream plugins show KIND/NAME`.", ""]
+    lines += ["The parts of this repository. Of any part that is installed: `gsstream plugins KIND/NAME`.", ""]
     for kind in KINDS:
         for name in catalog.names(kind):
             entry = catalog.entry(kind, name)

@@ -154,7 +154,7 @@ def _unread(paths: list[KeyPath], resolved: ResolvedRecipe) -> list[str]:
             f"{where}: the stepper {name!r} reads none of {len(from_base)} settings that the method {base!r} brings "
             f"({some}, ...); put it in place of another method: --method dense --set stepper={name}"
         ]
-    hint = f"the stepper {name!r} does not read it; its own settings: gsstream plugins show stepper/{name}"
+    hint = f"the stepper {name!r} does not read it; its own settings: gsstream plugins stepper/{name}"
     return [f"{resolved.near(path).where}: {'.'.join(path)}: {hint}" for path in paths]
 
 

@@ -1,4 +1,4 @@
-"""How closely a run looks at what parts return: off, frame or step (``GSSTREAM_CHECKS``, ``gsstream run --checks``).
+"""How closely a run looks at what parts return: off, frame or step (``GSSTREAM_CHECKS``).
 
 Nothing that is sent depends on the level: it decides when a wrong number is noticed, and how precisely it is named.
 """
@@ -39,7 +39,7 @@ def wanted_checks(given: str | None = None) -> Checks:
 
     Raises InputError for anything but the three levels.
     """
-    where = "--checks" if given is not None else VARIABLE
+    where = "checks" if given is not None else VARIABLE
     text = given if given is not None else os.environ.get(VARIABLE, "") or Checks.FRAME
     try:
         return Checks(text)

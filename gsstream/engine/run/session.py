@@ -37,7 +37,7 @@ class RunListener:
     """Told of every frame of a run; does nothing unless a subclass says otherwise."""
 
     def before(self) -> None:
-        """Called when a frame's images are in memory, before it is encoded."""
+        """Start what is measured: a frame's images are in memory, and it is encoded next."""
 
     def after(self, step: Step[Any]) -> Mapping[str, Any]:
         """Return what is to stand in the frame's line of metrics, too; its packet is written already."""

@@ -90,7 +90,7 @@ def test_progress_calls_the_recording_by_its_name() -> None:
 
 def command(out: Path, budget: str, *more: str) -> list[str]:
     sets = [item for setting in TINY for item in ("--set", setting)]
-    return ["tune", "--scene", WORLD, "--out", str(out), "--budget", budget, "--method", "s2gs-edge", "--frames", "3",
+    return ["tune", "--source", WORLD, "--out", str(out), "--budget", budget, "--method", "s2gs-edge", "--frames", "3",
             "--quiet", *sets, *more]  # fmt: skip
 
 
@@ -125,7 +125,7 @@ def test_a_pilot_writes_a_recipe_that_runs_inside_the_budget(
     err = capsys.readouterr().err
     assert "nothing fits time=0.001 (seconds, bytes): nearest is " in err
     assert not (tmp_path / "pilot" / "tuned.yaml").exists()
-    encode(tmp_path / "other", "--frames", "1", "--seed", "5", method="dense", data__split="tuning")
+    encode(tmp_path / "other", "--frames", "1", "--set", "seed=5", method="dense", data__split="tuning")
     assert run_command(command(tmp_path / "pilot", "time=1ms", "--first-frame", str(tmp_path / "other"))) == 2
     assert "from another frame 0" in capsys.readouterr().err
 

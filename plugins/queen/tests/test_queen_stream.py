@@ -174,5 +174,5 @@ def test_the_other_commands_know_it(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "births" in capsys.readouterr().out
     assert run_command(["evaluate", out, "--source", SOURCE]) == 0
     assert run_command(["play", out, "--out", str(tmp_path / "frames"), "--frames", "0:2"]) == 0
-    assert run_command(["methods", "show", "queen"]) == 0
+    assert run_command(["methods", "queen"]) == 0
     assert "stepper   queen" in capsys.readouterr().out

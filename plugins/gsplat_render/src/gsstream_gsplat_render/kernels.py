@@ -50,7 +50,7 @@ def load_kernels(device: str) -> Kernels:
         build = f"CUDA {torch.version.cuda}" if torch.version.cuda else "CPU only"
         raise PluginUnavailable(
             f"renderer 'gsplat': expected an NVIDIA GPU that torch can use, found none (torch {torch.__version__}, "
-            f"built for {build}); install a CUDA build of torch on a machine with a GPU, or choose --renderer cpu"
+            f"built for {build}); install a CUDA build of torch on a machine with a GPU, or choose --set renderer=cpu"
         )
     index = torch.device(device).index or 0
     if index >= torch.cuda.device_count():

@@ -13,7 +13,9 @@ import typer
 from gsstream.cli import options
 from gsstream.cli.grouped import grouped
 
-app = typer.Typer(help="Measure rendering or a frame step here.", rich_markup_mode=None, no_args_is_help=True)
+app = typer.Typer(
+    help="Measure rendering or a frame step here.", rich_markup_mode=None, no_args_is_help=True, add_completion=False
+)
 
 Repetitions = Annotated[int, typer.Option("--repetitions", min=1, help="Rounds that count; each runs all cases.")]
 

@@ -15,9 +15,9 @@ from typing import Any
 
 import pytest
 from pydantic import BaseModel
-from typer.main import get_command
 
 from gsstream.cli.main import app
+from gsstream.cli.table import whole_table
 from gsstream.core.kinds import CONTRACTS
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.model import Recipe
@@ -81,7 +81,7 @@ def commands(lines: list[str]) -> Iterator[list[str]]:
 
 @functools.cache
 def command_line() -> Any:
-    return get_command(app).load()
+    return whole_table(app)
 
 
 def problem(words: list[str], complete: bool) -> str | None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+import typer
 from typer.core import TyperCommand, TyperGroup
+from typer.main import get_command
 
 from gsstream.plugins.builtin import gsstream_commands
 from gsstream.plugins.catalog import Catalog, Entry, load_catalog
@@ -27,12 +29,6 @@ class CommandTable(TyperGroup):
         super().__init__(**settings)
         self._own = {spec.name: spec for spec in gsstream_commands()}
         self._catalog: Catalog | None = None
-
-    def load(self) -> CommandTable:
-        """Import every command, those of healthy plugins too, so that ``commands`` holds them all; slow."""
-        for name in self.list_commands(None):
-            self.get_command(None, name)
-        return self
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the names of all commands, in the order of ``--help``."""
@@ -91,3 +87,12 @@ class CommandTable(TyperGroup):
 
 def _specs(catalog: Catalog) -> Iterable[CommandSpec]:
     return (entry.spec for entry in catalog.entries.values() if isinstance(entry.spec, CommandSpec))
+
+
+def whole_table(app: typer.Typer) -> CommandTable:
+    """Return an app's table with every command imported, those of healthy plugins too; slow."""
+    table = get_command(app)
+    assert isinstance(table, CommandTable), "the app was made with cls=CommandTable"
+    for name in table.list_commands(None):
+        table.get_command(None, name)
+    return table

@@ -12,13 +12,12 @@ from tools.reference.text import NOTE, cell
 
 def cli() -> str:
     """Every command with its arguments and options."""
-    from typer.main import get_command
-
     from gsstream.cli.main import app
+    from gsstream.cli.table import whole_table
 
     lines = [NOTE, "# Command line", ""]
     lines += ["Exit codes: 0 done; 2 something given is wrong; 130 interrupted; 1 other.", ""]
-    for path, command in _commands(get_command(app).load(), "gsstream"):
+    for path, command in _commands(whole_table(app), "gsstream"):
         lines += [f"## {path}", "", (command.help or "").strip(), ""]
         shown = [param for param in command.params if param.name != "help"]
         if shown:

@@ -217,7 +217,7 @@ def test_the_papers_file_is_sound():
         table = paper_table(name)
         assert table.rows
         assert set(table.columns) <= set(BY_KEY), name
-    files = {path.stem for path in (Path(__file__).parents[2] / "configs" / "paper").glob("*.yaml")}
+    files = {path.stem for path in (Path(__file__).parents[3] / "configs" / "paper").glob("*.yaml")}
     assert files - {"full", "candidates", "extensions"} == set(content["tables"]), "every table has its sweep"
     with pytest.raises(UnknownName, match="did you mean 'components'"):
         paper_table("component")

@@ -220,7 +220,7 @@ def test_settings_flatten():
     assert flat_settings({"a.b": 1, "c": {"d.e": {"f": [1]}}}, "x") == {("a", "b"): 1, ("c", "d", "e", "f"): [1]}
 
 
-ROOT = Path(__file__).parents[2] / "configs"
+ROOT = Path(__file__).parents[3] / "configs"
 
 
 TABLES = [path for path in (ROOT / "paper").glob("*.yaml") if path.name not in ("full.yaml", "candidates.yaml")]

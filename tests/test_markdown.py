@@ -196,8 +196,8 @@ def test_the_pages_are_found() -> None:
         ("gsstream run --source demo --out OUT DIR", "gsstream run takes 0 arguments, not 1"),
         ("gsstream play STREAM --out", "gsstream play --out lacks its value"),
         (
-            "X=1 .venv/bin/gsstream methods && gsstream plugins sow gate/open; ls",
-            "gsstream plugins has no command 'sow'",
+            "X=1 .venv/bin/gsstream methods && gsstream scene sow DIR; ls",
+            "gsstream scene has no command 'sow'",
         ),
     ],
 )

@@ -9,6 +9,7 @@ import functools
 import itertools
 import re
 import shlex
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -256,6 +257,21 @@ def test_paths_exist(page: Path) -> None:
                 yield module
 
     check(wrong())
+
+
+def test_the_layers_of_the_flow_are_those_that_are_proven() -> None:
+    page = (ROOT / "docs" / "flow.md").read_text(encoding="utf-8")
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"][
+        "contracts"
+    ]
+    layers = {contract["containers"][0]: contract["layers"] for contract in contracts if "containers" in contract}
+    table = page.split("## Who may import whom\n")[1].split("\n## ")[0]
+    rows = [set(INLINE.findall(row.split("|")[1])) for row in table.splitlines() if row.startswith("| `")]
+    assert rows == [set(layer.split(" | ")) for layer in layers["gsstream"]]
+    (engine,) = re.findall(r"Inside the engine, from top to bottom: ([^.]*)\.", table)
+    assert [set(INLINE.findall(layer)) for layer in engine.split(";")] == [
+        set(layer.split(" | ")) for layer in layers["gsstream.engine"]
+    ]
 
 
 def test_pages_that_code_and_settings_name_exist() -> None:

@@ -20,8 +20,8 @@ SHIPPED: Mapping[str, tuple[str, ...]] = {
         "confidence/noise-normalised", "confidence/uniform-random", "confidence/view-gradient", "gate/gumbel-sigmoid",
         "propagation/hierarchical-max", "propagation/selective-leaf",
         "regularizer/expected-sparsity", "structure/octree", "update/latent",
-        "command/sweep", "command/report", "command/compare", "command/tune", "command/gap", "command/left-behind",
-        "command/bench",
+        "command/sweep", "command/report", "command/compare", "command/tune", "command/search",
+        "command/gap", "command/left-behind", "command/bench",
     ),
     "player": ("renderer/cpu", "loss/cpu", "optimiser/cpu"),
     "methods": (

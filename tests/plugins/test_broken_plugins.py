@@ -24,6 +24,7 @@ REASONS = {
     "hookimpl definition: gsstream_components(registry) Argument(s) {'registry'} are declared in the hookimpl but ",
     "wrong_return": "gsstream_components() returned a str in its list; expected ComponentSpec",
     "bad_spec": "ValidationError: 1 validation error for ComponentSpec kind Input should be 'structure', 'confidence',",
+    "command_clash": "declares the command 'run', which gsstream 0.1.0 already provides; rename it",
     "no_hook": "gsstream_no_hook_plugin implements no hook; expected @hookimpl on one of gsstream_components, ",
 }
 
@@ -178,3 +179,40 @@ def test_the_rule_for_versions_as_gsstream_grows(lab, speaks: str, refused: dict
         else:
             assert "quarantined" not in rows[name], "an older minor version, or the same one, is fine"
     assert advice in "".join(rows[name] for name in refused)
+
+
+def test_a_command_in_quarantine_says_why_and_costs_no_other(lab) -> None:
+    lab.install("command_clash")
+    shown = lab.cli("--help")
+    assert shown.returncode == 0
+    assert " mine " not in shown.stdout
+    asked = lab.cli("mine")
+    assert (asked.returncode, asked.stdout) == (1, "")
+    assert asked.stderr.startswith("error: the command 'mine' is not available: plugin 'command_clash'")
+    assert "already provides; rename it" in asked.stderr
+    assert lab.cli("run", "--help").returncode == 0, "gsstream's own keeps its name"
+
+
+def test_a_command_whose_target_is_broken_is_listed_and_fails_alone(lab) -> None:
+    lab.install("command_targets")
+    shown = lab.cli("--help")
+    assert shown.returncode == 0
+    assert "Mine:\n" in shown.stdout
+    assert "Nothing to import." in shown.stdout, "the listing imports no target"
+    done = lab.cli("works", "--count", "3")
+    assert (done.returncode, done.stdout) == (0, "3\n")
+    for name, reason in (("absent", "No module named 'a_package_nobody_has'"), ("odd", "doesn't support Union types")):
+        asked = lab.cli(name)
+        assert asked.returncode == 1
+        assert asked.stderr.startswith(f"error: command {name!r} (from gsstream-command-targets 0.3) cannot be used: ")
+        assert reason in asked.stderr
+        assert asked.stderr.count("\n") == 1
+    failed = lab.cli("plugins", "--check")
+    assert failed.returncode == 1
+    assert "failed: command 'absent'" in failed.stdout
+    typo = lab.cli("work")
+    assert typo.returncode == 2
+    assert "Did you mean 'works'" in typo.stderr
+    passed = lab.cli("check", "command/works")
+    assert passed.returncode == 1
+    assert "these options have no help: works count" in passed.stdout

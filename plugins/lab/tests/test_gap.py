@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from flow_runs import encode, metrics
-from gsstream_lab.gap.measure import Gap, GapView, fresh_files, usual_frames
+from gsstream_lab.gap.measure import Gap, GapView, usual_frames
 
 from gsstream.cli.main import run_command
 from gsstream.metrics import changed_mask, psnr
@@ -71,7 +71,8 @@ def test_what_is_there_is_kept_and_shared_and_other_settings_are_not_taken_for_i
     cached = ["--cache", str(run / "fresh"), "--quiet"]
     assert run_command(["gap", str(tmp_path / "a"), "--at", "3", *cached]) == 0
     assert {path: path.stat().st_mtime_ns for path in (run / "fresh").iterdir()} == kept
-    assert fresh_files(tmp_path / "a") == {3: fresh_files(run)[3]}
+    files = [json.loads((out / "gap.json").read_text())["files"] for out in (tmp_path / "a", run)]
+    assert files[0] == {"3": files[1]["3"]}
     assert run_command(["gap", str(tmp_path / "a"), "--at", "3", "--epochs", "2", *cached]) == 0
     assert len(list((run / "fresh").iterdir())) == 3
     assert not list((run / "fresh").glob(".*")), "nothing unfinished stays"

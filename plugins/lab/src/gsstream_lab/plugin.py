@@ -11,6 +11,7 @@ COMMANDS = {
     "report": ("report:report", "Write report.html (one file, no network), report.md and its figures."),
     "compare": ("compare:compare", "Encode one recording with several methods and show them side by side."),
     "tune": ("tune:tune", "Try a few recipes on a few frames and write the best that fits a budget as tuned.yaml."),
+    "search": ("search:search", "Look for settings of a recording and write the recipe as found.yaml."),
     "gap": ("gap:gap", "Reconstruct frames of a run from their own images alone and say how much better they are."),
     "left-behind": ("left_behind:left_behind", "Count the Gaussians that stay behind the body they belong to."),
     "bench": ("bench:app", "Measure rendering or a frame step here."),

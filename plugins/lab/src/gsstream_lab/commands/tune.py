@@ -120,10 +120,9 @@ def _name(uri: str) -> str:
     return found[0] if found else "scene"
 
 
-def _next(source: str, out: Path) -> str:
-    """The command that encodes the whole recording as tuned, ready for a shell."""
-    words = ["gsstream", "run", "--source", source, "--recipe", str(out / "tuned.yaml"), "--out", str(out / "run")]
-    return shlex.join(words)
+def next_command(source: str, recipe: Path, out: Path) -> str:
+    """Return the command that encodes the whole recording with a recipe, ready for a shell."""
+    return shlex.join(["gsstream", "run", "--source", source, "--recipe", str(recipe), "--out", str(out)])
 
 
 def _tell(plan: Plan, trials: list[Trial], limits: Budget, out: Path, source: str) -> None:
@@ -133,8 +132,9 @@ def _tell(plan: Plan, trials: list[Trial], limits: Budget, out: Path, source: st
     typer.echo(fitting(tune_table(trials, chosen)))
     if chosen is not None:
         resolved = next(point.resolved for point in plan.points if point.variant == chosen.name)
-        (out / "tuned.yaml").write_text(tuned_recipe(resolved), encoding="utf-8")
-        typer.echo(f"\nwrote {out / 'tuned.yaml'}: {chosen.name}; next: {_next(source, out)}")
+        file = out / "tuned.yaml"
+        file.write_text(tuned_recipe(resolved), encoding="utf-8")
+        typer.echo(f"\nwrote {file}: {chosen.name}; next: {next_command(source, file, out / 'run')}")
         return
     close = nearest(trials)
     if close is None:

@@ -1,0 +1,82 @@
+"""``gsstream search``: settings for a recording, from short runs judged on cameras that are left out."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from gsstream.cli import options
+from gsstream.cli.grouped import grouped
+from gsstream_lab.commands.options import RecordingOptions, WorkerOptions
+
+FOUND = "found.yaml"
+
+
+@grouped
+def search(
+    recording: RecordingOptions,
+    method: Annotated[str, typer.Option("--method", help="Method whose settings are looked for.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the runs and of found.yaml; a search there goes on.")],
+    where: WorkerOptions,
+    tried: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--try", metavar="KEY=A,B,...", help="Values of a recipe key; repeatable; by default degree of harmonics "
+            "and, for an octree, its root, levels and base.",
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of every random stream.")] = 0,
+    quiet: options.Quiet = False,
+) -> None:
+    """Look for settings of a recording and write the recipe as found.yaml.
+
+    One key after the other takes the value with the highest PSNR on training cameras that are left out (the tuning
+    split), while that gains more than 0.05 dB; again from the first key until none moves. Test cameras have no say. One
+    frame (the default here) judges frame 0; with --frames 5 or so the frames after it judge.
+    """
+    from gsstream.engine.assembly.assemble import assemble
+    from gsstream.plugins.catalog import load_catalog
+    from gsstream.recipe.load import resolve_recipe
+    from gsstream_lab.commands.tune import next_command, scene_of
+    from gsstream_lab.jobs.executor import make_executor
+    from gsstream_lab.jobs.folder import recording_uri
+    from gsstream_lab.sweep.job import run_job
+    from gsstream_lab.sweep.plan import make_plan
+    from gsstream_lab.sweep.search import SweepJudge, climb, usual_ladders, value_of
+    from gsstream_lab.sweep.tune import tuned_recipe
+
+    catalog = load_catalog()
+    files = [] if recording.recipe is None else [recording.recipe]
+    resolved = resolve_recipe(method, catalog.recipe_path, files, options.overrides(recording.settings))
+    parts = assemble(resolved, catalog).resolved
+    ladders = _ladders(tried) or usual_ladders(parts.recipe)
+    start = {key: value_of(parts, key) for key in ladders}
+    ladders = {key: values if start[key] in values else (start[key], *values) for key, values in ladders.items()}
+    executor = functools.partial(make_executor, run_job, where.workers, where.threads, where.ray)
+    say = (lambda _: None) if quiet else typer.echo
+    judge = SweepJudge(scene_of(recording, 1), method, seed, out, catalog.recipe_path, executor, say)
+    found = climb(start, ladders, judge)
+    key = next(iter(ladders))
+    (point,) = make_plan(judge.config(found, key, [found[key]]), Path(), catalog.recipe_path).points
+    (out / FOUND).write_text(tuned_recipe(point.resolved), encoding="utf-8")
+    typer.echo("\n".join(f"{key}: {start[key]} -> {value}" for key, value in found.items()))
+    source = recording_uri(recording.source, None)
+    typer.echo(f"\nwrote {out / FOUND}; next: {next_command(source, out / FOUND, out / 'run')}")
+
+
+def _ladders(tried: list[str] | None) -> dict[str, tuple[Any, ...]]:
+    """Key -> values of --try. Raises RecipeError or InputError."""
+    from gsstream.core.errors import InputError
+    from gsstream.recipe.document import read_override
+
+    out: dict[str, tuple[Any, ...]] = {}
+    for text in tried or ():
+        key, _, values = text.partition("=")
+        found = tuple(read_override(f"{key}={value}")[1].value for value in values.split(","))
+        if len({str(value) for value in found}) < max(2, len(found)):
+            raise InputError(f"--try {text}: expected two different values or more, such as first_frame.sh_degree=1,2")
+        out[key] = found
+    return out

@@ -25,7 +25,7 @@ def checks() -> str:
     lines += [
         "What every part promises. `gsstream check NAME` makes the checks of a part, a plugin or a method;",
         "`gsstream.testing.parametrize_with_checks` makes one test of each. A check with a claim is made on parts",
-        "whose traits claim it; of others `gsstream check` says that it is skipped, and in a test suite there is no test.",
+        "whose traits claim it; of others `gsstream check` says that it is skipped, and no test is made of it.",
         "Each check has a saboteur: a part that is wrong in one way and fails this check alone",
         "(`tests/contract/test_saboteurs.py`).",
         "",

@@ -26,17 +26,17 @@ ROOT = Path(__file__).parent
 #: Files that take longest, longest first. They are begun first: a long file that is begun last keeps one core busy
 #: while the others wait. A name that is missing here costs only time.
 LONG = (
-    "flow/test_closed_loop", "flow/test_repeat_and_resume", "flow/test_key_refresh",
-    "lab/tests/test_sweep_ray", "contract/test_new_plugin", "contract/test_tutorial", "plugins/test_six_rings",
-    "lab/tests/test_paper_configs", "web/test_page", "flow/test_budget", "contract/test_saboteurs",
-    "contract/test_shipped_plugins", "flow/test_no_overshoot", "web/test_live_page", "flow/test_odd_runs",
-    "flow/test_data_options", "web/test_decoder", "scene/test_prepare", "flow/test_cost_follows_change",
-    "flow/test_bad_input", "flow/test_growing_scene", "flow/test_trim", "web/test_page_joins",
-    "flow/test_checks", "packet/test_fuzz", "flow/test_run_ends", "flow/test_watch", "flow/test_worlds",
-    "scene/test_validate", "lab/tests/test_tune", "queen/tests/test_queen_stream", "tools/test_soak",
-    "flow/test_still_frames", "packet/test_corrupt", "init/test_init_sfm", "source/test_layout_runs",
-    "lab/tests/test_sweep_real", "tools/test_cost_scripts",
-    "flow/test_light_process", "player/test_player_memory", "evaluation/test_offline", "lab/tests/test_compare",
+    "flow/test_closed_loop", "flow/test_repeat_and_resume", "flow/test_key_refresh", "lab/tests/test_sweep_ray",
+    "cpu_render/tests/test_cross_aarch64", "contract/test_new_plugin", "contract/test_tutorial",
+    "plugins/test_six_rings", "lab/tests/test_paper_configs", "web/test_page", "flow/test_budget",
+    "contract/test_saboteurs", "contract/test_shipped_plugins", "flow/test_no_overshoot", "web/test_live_page",
+    "flow/test_odd_runs", "flow/test_data_options", "web/test_decoder", "scene/test_prepare",
+    "flow/test_cost_follows_change", "flow/test_bad_input", "flow/test_growing_scene", "flow/test_trim",
+    "web/test_page_joins", "flow/test_checks", "packet/test_fuzz", "flow/test_run_ends", "flow/test_watch",
+    "flow/test_worlds", "scene/test_validate", "lab/tests/test_tune", "queen/tests/test_queen_stream",
+    "tools/test_soak", "flow/test_still_frames", "packet/test_corrupt", "init/test_init_sfm",
+    "source/test_layout_runs", "lab/tests/test_sweep_real", "tools/test_cost_scripts", "flow/test_light_process",
+    "player/test_player_memory", "evaluation/test_offline", "lab/tests/test_compare",
 )  # fmt: skip
 #: What ``make check`` runs: rooms whose tests are cheap, and the one test of whole runs that must never fail.
 QUICK = (

@@ -125,14 +125,7 @@ def rig(views: int = 3) -> Cameras:
 def scene(
     means: torch.Tensor, seed: int = 0, scales: torch.Tensor | None = None, quats: torch.Tensor | None = None
 ) -> Scene:
-    """Return small, fairly opaque blobs of random colours at ``means`` [N, 3], round ones unless told.
-
-    Arguments:
-        means: [N, 3].
-        seed: of colours.
-        scales: [N, 3] logarithms of the standard deviations, scene units.
-        quats: [N, 4] rotations.
-    """
+    """Return small, fairly opaque blobs of random colours, round ones unless ``scales`` (logarithms) say else."""
     n = len(means)
     g = torch.Generator().manual_seed(seed)
     return Gaussians(

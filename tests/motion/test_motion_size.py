@@ -24,7 +24,7 @@ def within(max_bytes: int | None) -> Moved:
     frame = replace(open_source(SOURCE).frame(2), cameras=state.previous.cameras)
     plan = FramePlan(epochs=1, change_threshold=6.0, rate_weight=0.0, max_bytes=max_bytes)
     change = detect_change(state.previous, frame, 6.0)
-    return moved(parts, state, frame, change, Rng(0), frame.images, Allowance(plan, 0.0, float))
+    return moved(parts, state, frame, change, Rng(0), Allowance(plan, 0.0, float))
 
 
 @pytest.mark.parametrize("spare", [0, -1])

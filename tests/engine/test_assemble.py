@@ -6,12 +6,13 @@ import warnings
 
 import pytest
 
-from gsstream.core.errors import PluginUnavailable, RecipeError
+from gsstream.core.errors import InputError, PluginUnavailable, RecipeError
 from gsstream.engine.assembly.assemble import SLOTS, Assembly, SlowRendererWarning, assemble
 from gsstream.plugins.catalog import Catalog, load_catalog
 from gsstream.plugins.discovery import Discovered
 from gsstream.recipe.load import ResolvedRecipe, resolve_recipe
 from gsstream.recipe.model import ComponentRef, Recipe
+from gsstream.render.reference import ReferenceRenderer
 from gsstream.spec import ComponentSpec
 
 
@@ -93,6 +94,17 @@ def test_a_native_module_that_cannot_be_imported() -> None:
         assert assemble(Recipe(), catalog).recipe.renderer.name == "reference"
     with pytest.raises(PluginUnavailable, match=r"renderer 'cpu' \(from gsstream-cpu-render 1\) cannot be used"):
         assemble(Recipe(renderer=ComponentRef(name="cpu")), catalog)
+
+
+def test_a_wrong_setting_of_the_environment_is_an_error_and_no_reason_to_be_slow(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(self: object, config: object) -> None:
+        raise InputError("GSSTREAM_ISA: expected one of {baseline}, got 'mmx'")
+
+    monkeypatch.setattr(ReferenceRenderer, "__init__", refuse)
+    with pytest.raises(InputError, match=r"renderer 'cpu' \(from .*\) could not be built: GSSTREAM_ISA: expected one"):
+        assemble(Recipe(), renderer_plugin("gsstream.render.reference:ReferenceRenderer"))
 
 
 def test_auto_takes_no_settings(builtin: Catalog) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gsstream.confidence.base import ConfidenceEstimator
-from gsstream.core.errors import PluginUnavailable, UnknownName
+from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
 from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.core.needs import install_renderer
 from gsstream.core.part import Part
@@ -185,6 +185,9 @@ def _build(
 def _construct(slot: str, name: str, cls: type[Any], config: Any, catalog: Catalog) -> Part:
     try:
         part: Part = cls(config)
+    except InputError as error:  # a setting of the user's, such as an environment variable: no other part mends it
+        origin = catalog.entry(slot, name).origin
+        raise InputError(f"{slot} {name!r} (from {origin}) could not be built: {error}") from error
     except Exception as error:  # third-party constructor: reported with its owner's name
         origin = catalog.entry(slot, name).origin
         raise PluginUnavailable(f"{slot} {name!r} (from {origin}) could not be built: {error}") from error

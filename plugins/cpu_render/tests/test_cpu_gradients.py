@@ -13,16 +13,7 @@ from cpu_scenes import (
     relative_error,
     upstream,
 )
-from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import SplatArrays
-
-
-@pytest.fixture(params=_native.supported_isas())
-def isa(request: pytest.FixtureRequest):
-    before = _native.active_isa()
-    _native.select_isa(request.param)
-    yield request.param
-    _native.select_isa(before)
 
 
 def assert_as_reference(

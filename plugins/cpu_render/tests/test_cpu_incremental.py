@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from cpu_scenes import HEIGHT, WIDTH, equal_bits, random_splats, rasterizer, rows_of, upstream, with_rows
-from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import SplatArrays
 from test_cpu_raster_properties import masked_pixels, random_mask
 
@@ -21,27 +20,21 @@ def moved(rows: SplatArrays, seed: int, amount: float = 0.2) -> SplatArrays:
     return SplatArrays(*((a + amount * rng.normal(size=a.shape)).astype(np.float32) for a in rows))
 
 
-@pytest.mark.parametrize("isa", _native.supported_isas())
 @pytest.mark.parametrize(("count", "seed"), [(0, 0), (1, 1), (30, 2), (200, 3)])
 @pytest.mark.parametrize("masked", [False, True])
 def test_active_pass_has_the_bits_of_the_full_path(isa: str, count: int, seed: int, masked: bool) -> None:
-    before = _native.active_isa()
-    _native.select_isa(isa)
-    try:
-        splats, ids = random_splats(200, seed, 9, opaque=seed % 2 == 0), some_ids(200, count, seed)
-        mask = random_mask(seed) if masked else None
-        subject, full = rasterizer(), rasterizer()
-        subject.forward(splats)
-        subject.freeze(mask, ids)
-        for step in range(3):
-            rows = moved(rows_of(splats, ids), 10 * seed + step)
-            image, transmittance = subject.forward_active(rows)
-            gradients = subject.backward_active(*upstream(step))
-            want = full.forward(with_rows(splats, ids, rows), tile_mask=mask)
-            assert equal_bits((image, transmittance), want)
-            assert equal_bits(gradients, rows_of_gradients(full.backward(*upstream(step)), ids))
-    finally:
-        _native.select_isa(before)
+    splats, ids = random_splats(200, seed, 9, opaque=seed % 2 == 0), some_ids(200, count, seed)
+    mask = random_mask(seed) if masked else None
+    subject, full = rasterizer(), rasterizer()
+    subject.forward(splats)
+    subject.freeze(mask, ids)
+    for step in range(3):
+        rows = moved(rows_of(splats, ids), 10 * seed + step)
+        image, transmittance = subject.forward_active(rows)
+        gradients = subject.backward_active(*upstream(step))
+        want = full.forward(with_rows(splats, ids, rows), tile_mask=mask)
+        assert equal_bits((image, transmittance), want)
+        assert equal_bits(gradients, rows_of_gradients(full.backward(*upstream(step)), ids))
 
 
 def rows_of_gradients(gradients: tuple[np.ndarray, ...], ids: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -172,7 +165,6 @@ def test_bad_active_ids(ids: np.ndarray, message: str) -> None:
         subject.freeze(None, ids)
 
 
-@pytest.mark.parametrize("isa", _native.supported_isas())
 @pytest.mark.parametrize("opaque", [False, True])
 @pytest.mark.parametrize("seed", range(4))
 def test_updates_of_few_blocks_leave_what_a_forward_of_the_scene_leaves(isa: str, opaque: bool, seed: int) -> None:
@@ -180,24 +172,19 @@ def test_updates_of_few_blocks_leave_what_a_forward_of_the_scene_leaves(isa: str
 
     With opaque Gaussians pixels end early, so the place at which they did has to follow the list.
     """
-    before = _native.active_isa()
-    _native.select_isa(isa)
-    try:
-        splats = random_splats(300, seed, 4, opaque=opaque)
-        if opaque:
-            splats.opacities[::3] = 9.0
-        subject = rasterizer()
-        picture = subject.forward(splats)
-        for step in range(6):
-            ids = some_ids(300, 1 + step % 2, 10 * seed + step)
-            rows = moved(rows_of(splats, ids), 7 * seed + step)
-            rows.scales[:] = -3.5  # a pixel or two wide
-            subject.update(ids, rows, *picture)
-            splats = with_rows(splats, ids, rows)
-            fresh = rasterizer()
-            assert equal_bits(picture, fresh.forward(splats))
-            v_image = upstream(step)[0]
-            assert equal_bits(subject.backward_cached(splats, v_image), fresh.backward_cached(splats, v_image))
-            assert np.array_equal(subject.drawn_in_cache(None), fresh.drawn_in_cache(None))
-    finally:
-        _native.select_isa(before)
+    splats = random_splats(300, seed, 4, opaque=opaque)
+    if opaque:
+        splats.opacities[::3] = 9.0
+    subject = rasterizer()
+    picture = subject.forward(splats)
+    for step in range(6):
+        ids = some_ids(300, 1 + step % 2, 10 * seed + step)
+        rows = moved(rows_of(splats, ids), 7 * seed + step)
+        rows.scales[:] = -3.5  # a pixel or two wide
+        subject.update(ids, rows, *picture)
+        splats = with_rows(splats, ids, rows)
+        fresh = rasterizer()
+        assert equal_bits(picture, fresh.forward(splats))
+        v_image = upstream(step)[0]
+        assert equal_bits(subject.backward_cached(splats, v_image), fresh.backward_cached(splats, v_image))
+        assert np.array_equal(subject.drawn_in_cache(None), fresh.drawn_in_cache(None))

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from cpu_scenes import BACKGROUND, random_splats
-from gsstream_cpu_render import _native
 from gsstream_cpu_render.loss_part import CpuLoss
 from gsstream_cpu_render.renderer import CpuRenderer
 from gsstream_cpu_render.session import CpuSession
-from gsstream_cpu_render.threads import num_threads, set_num_threads
 from test_cpu_fit import some_tiles, step_by_step
 from test_cpu_renderer import replaced, rig
 
@@ -24,22 +21,6 @@ COUNT = 700  # lists of some 150 entries a tile: several cells of the layers beh
 #: Largest error of a gradient, as a share of the largest of its attribute: pixels whose transmittance fell below 1e-4
 #: take no light from Gaussians one by one, but the layer behind is not cut off there.
 BOUND = 2e-3
-
-
-@pytest.fixture(params=_native.supported_isas())
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = _native.active_isa()
-    _native.select_isa(request.param)
-    yield request.param
-    _native.select_isa(before)
-
-
-@pytest.fixture(params=[1, 2])
-def threads(request: pytest.FixtureRequest) -> Iterator[int]:
-    before = num_threads()
-    set_num_threads(request.param)
-    yield request.param
-    set_num_threads(before)
 
 
 def crowd(seed: int, opaque: bool = False) -> Scene:

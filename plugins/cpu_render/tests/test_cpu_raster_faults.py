@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import threading
@@ -10,7 +9,6 @@ import threading
 import numpy as np
 import pytest
 from cpu_scenes import HEIGHT, WIDTH, camera, random_splats, rasterizer, upstream
-from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import SplatArrays, new_gradients
 from gsstream_cpu_render.rasterizer import NumpyRasterizer
 
@@ -180,28 +178,6 @@ def test_two_objects_in_two_threads_do_not_disturb_each_other() -> None:
     for worker in workers:
         worker.join()
     assert wrong == []
-
-
-def test_instruction_set_is_chosen_by_the_environment() -> None:
-    code = "from gsstream_cpu_render import _native; print(_native.active_isa())"
-    weakest = _native.supported_isas()[0]
-    run = subprocess.run(
-        [sys.executable, "-c", code],
-        env={**os.environ, "GSSTREAM_ISA": weakest},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert run.stdout.strip() == weakest
-    run = subprocess.run(
-        [sys.executable, "-c", code],
-        env={**os.environ, "GSSTREAM_ISA": "mmx"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert "ValueError: GSSTREAM_ISA: expected one of {" in run.stderr
-    assert "got 'mmx'" in run.stderr
 
 
 def test_numpy_interface_imports_no_torch() -> None:

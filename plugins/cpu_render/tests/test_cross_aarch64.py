@@ -86,10 +86,7 @@ def emulated(driver: Path) -> dict[str, np.ndarray]:
 
 @pytest.fixture
 def baseline():
-    before = _native.active_isa()
     _native.select_isa(_native.supported_isas()[0])
-    yield
-    _native.select_isa(before)
 
 
 def assert_same_picture(got: np.ndarray, want: np.ndarray) -> None:

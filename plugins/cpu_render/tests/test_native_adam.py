@@ -1,27 +1,17 @@
 """The fused Adam against torch and against per-row Adam in float64."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from gsstream_cpu_render import _native
 from gsstream_cpu_render.adam import adam_rows
-from gsstream_cpu_render.threads import num_threads, set_num_threads
+from gsstream_cpu_render.threads import set_num_threads
 from numpy.typing import NDArray
 
 from gsstream.api import InputError, ShapeError
 
 Table = NDArray[Any]
-
-
-@pytest.fixture(autouse=True)
-def _restore_native_settings() -> Iterator[None]:
-    isa, threads = _native.active_isa(), num_threads()
-    yield
-    _native.select_isa(isa)
-    set_num_threads(threads)
 
 
 class Rows:
@@ -49,10 +39,8 @@ def fresh(param: Table) -> dict[str, Any]:
     return {"param": param.copy(), "exp_avg": zeros, "exp_avg_sq": zeros.copy(), "step": np.zeros(len(param), np.int32)}
 
 
-@pytest.mark.parametrize("isa", _native.supported_isas())
 @pytest.mark.parametrize("d", [1, 3, 4, 16, 45])
 def test_all_rows_equal_torch_in_float64(isa: str, d: int) -> None:
-    _native.select_isa(isa)
     rng = np.random.default_rng(d)
     start = rng.standard_normal((37, d)).astype(np.float32)
     reference = torch.nn.Parameter(torch.tensor(start, dtype=torch.float64))

@@ -1,6 +1,6 @@
 """The native photometric loss against float64 torch and kornia."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import kornia
@@ -8,23 +8,14 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from gsstream_cpu_render import _native
 from gsstream_cpu_render.loss import PhotometricTarget, photometric_loss, tile_shape
-from gsstream_cpu_render.threads import num_threads, set_num_threads
+from gsstream_cpu_render.threads import set_num_threads
 from numpy.typing import NDArray
 
 from gsstream.api import InputError, ShapeError
 
 Image = NDArray[np.float32]
 SIZES = [(1, 1), (3, 7), (16, 16), (17, 5), (5, 40), (33, 50), (67, 91), (20, 300)]
-
-
-@pytest.fixture(autouse=True)
-def _restore_native_settings() -> Iterator[None]:
-    isa, threads = _native.active_isa(), num_threads()
-    yield
-    _native.select_isa(isa)
-    set_num_threads(threads)
 
 
 def smooth(rng: np.random.Generator, height: int, width: int) -> Image:
@@ -110,12 +101,10 @@ def test_value_and_gradient_equal_float64(size: tuple[int, int], pair: Callable[
             assert_gradient(result.gradient, gradient, 1e-5 * (1 + weight))
 
 
-@pytest.mark.parametrize("isa", _native.supported_isas())
 @pytest.mark.parametrize("pair", PAIRS)
 def test_every_instruction_set(isa: str, pair: Callable[..., tuple[Image, Image]]) -> None:
     image, target = pair(np.random.default_rng(2), 37, 75)
     mask = np.random.default_rng(3).random(tile_shape(37, 75)) < 0.5
-    _native.select_isa(isa)
     for chosen in (None, mask):
         value, gradient = oracle(image, target, 0.2, chosen)
         result = photometric_loss(image, target, tile_mask=chosen)
@@ -170,9 +159,7 @@ def test_empty_mask_costs_nothing() -> None:
     assert not result.gradient.any()
 
 
-@pytest.mark.parametrize("isa", _native.supported_isas())
 def test_equal_images_have_exactly_no_loss_and_no_gradient(isa: str) -> None:
-    _native.select_isa(isa)
     _, image = near_pair(np.random.default_rng(9), 70, 90)
     result = photometric_loss(image, PhotometricTarget(image))
     assert result.value == 0.0

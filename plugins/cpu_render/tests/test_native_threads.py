@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 
 import pytest
 from gsstream_cpu_render import _native
@@ -13,13 +12,6 @@ from gsstream_cpu_render.bench import copy_peak, fma_peak
 from gsstream_cpu_render.threads import num_threads, set_num_threads
 
 from gsstream.api import InputError
-
-
-@pytest.fixture(autouse=True)
-def _restore_threads() -> Iterator[None]:
-    before = num_threads()
-    yield
-    set_num_threads(before)
 
 
 def total(count: int) -> int:

@@ -9,23 +9,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gsstream_cpu_render import _bench, _native
+from gsstream_cpu_render import _bench
 from gsstream_cpu_render.arrays import SplatArrays, new_gradients
 from gsstream_cpu_render.checks import Float32, refuse_value
 from gsstream_cpu_render.rasterizer import NumpyRasterizer
+from gsstream_cpu_render.threads import instruction_set as instruction_set
 from gsstream_cpu_render.threads import num_threads as num_threads
 from gsstream_cpu_render.threads import set_num_threads as set_num_threads
-
-
-def isa() -> str:
-    """The instruction set in use: avx512, avx2, baseline or neon."""
-    return str(_native.active_isa())
 
 
 def fma_peak(threads: int = 1, seconds: float = 0.2) -> float:
     """Measure 10^9 float32 operations per second (a multiply-add is two) in registers, over ``seconds`` in (0, 60]."""
     try:
-        _bench.select_isa(isa())
+        _bench.select_isa(instruction_set())
         return float(_bench.fma_peak(threads, seconds))
     except ValueError as error:
         refuse_value(str(error))
@@ -34,7 +30,7 @@ def fma_peak(threads: int = 1, seconds: float = 0.2) -> float:
 def copy_peak(threads: int = 1, megabytes: float = 64.0) -> float:
     """Measure 10^9 bytes per second, read plus written, copying ``megabytes`` (0.001 to 4096) a thread."""
     try:
-        _bench.select_isa(isa())
+        _bench.select_isa(instruction_set())
         return float(_bench.copy_peak(threads, megabytes))
     except ValueError as error:
         refuse_value(str(error))

@@ -8,10 +8,10 @@ import torch
 from pydantic import Field
 
 from gsstream.api import Cameras, Gaussians, PartConfig, Renderer, RenderOutput, RenderSession
-from gsstream_cpu_render import _native
 from gsstream_cpu_render.autograd import differentiable
 from gsstream_cpu_render.pool import lease
 from gsstream_cpu_render.session import CpuSession, FullPass
+from gsstream_cpu_render.threads import instruction_set
 from gsstream_cpu_render.view import Background
 
 MEGABYTE = 1_000_000
@@ -40,7 +40,7 @@ class CpuRenderer(Renderer):
 
     def __init__(self, config: PartConfig | None = None) -> None:
         super().__init__(config)
-        _native.active_isa()  # a wrong GSSTREAM_ISA is an error here, not in the middle of a run
+        instruction_set()  # a wrong GSSTREAM_ISA is an error here, not in the middle of a run
 
     def render(
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, background: Background

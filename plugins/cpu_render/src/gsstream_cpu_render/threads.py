@@ -1,4 +1,4 @@
-"""Threads of the native kernels."""
+"""Threads and instruction set of the native kernels."""
 
 from __future__ import annotations
 
@@ -23,3 +23,15 @@ def set_num_threads(n: int) -> None:
     if isinstance(n, bool) or not isinstance(n, int) or not 1 <= n <= 1024:
         refuse_value(f"set_num_threads: expected an integer from 1 to 1024, got {n!r}")
     _native.set_num_threads(n)
+
+
+def instruction_set() -> str:
+    """Return the instruction set in use: avx512, avx2, baseline or neon.
+
+    Default: environment variable GSSTREAM_ISA, else the strongest that this processor has.
+    Raises InputError if GSSTREAM_ISA names one that it lacks.
+    """
+    try:
+        return str(_native.active_isa())
+    except ValueError as error:
+        refuse_value(str(error))

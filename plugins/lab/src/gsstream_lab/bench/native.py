@@ -41,7 +41,7 @@ class NativeBench(Protocol):
 
     Kernel: Any
 
-    def isa(self) -> str:
+    def instruction_set(self) -> str:
         """Return the instruction set in use."""
 
     def num_threads(self) -> int: ...

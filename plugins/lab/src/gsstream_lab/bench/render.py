@@ -129,7 +129,7 @@ def bench_render(plan: RenderPlan, catalog: Catalog, progress: Progress) -> dict
         _add_floor(result, peaks.get(result["threads"]))
     return {
         "schema": SCHEMA,
-        "machine": {**machine, "isa": measuring.isa() if measuring else None},
+        "machine": {**machine, "isa": measuring.instruction_set() if measuring else None},
         "settings": {
             "points": plan.points_name, "seed": plan.seed, "repetitions": plan.repetitions, "warm_up": plan.warm_up,
         },

@@ -218,6 +218,14 @@ def follow(state: PlayerState, delta: Delta) -> PlayerState:
     return decode_packet(state, encode_delta(delta, state.layout, state.decoders, frame=state.frame + 1).data)
 
 
+def moving_state() -> tuple[PlayerState, Delta]:
+    """A state after a motion, and a motion that goes on from it."""
+    rng = np.random.default_rng(8)
+    state = begin(rng, 30, 9)
+    state = follow(state, Delta((make_motion(rng, state.scene, predicted=False),)))
+    return state, Delta((make_motion(rng, state.scene, share=0.7),))
+
+
 def make_packets(
     seed: int = 0, frames: int = 7, key_at: int = 4, edits: tuple[int, ...] = (), layers: bool = False, **sizes: int
 ) -> list[EncodedPacket]:

@@ -4,75 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable
-from typing import Any
 
-import numpy as np
 import pytest
-from packet_scenes import make_key, make_meta, make_packets, replaced, write_stream
+from packet_scenes import make_meta, make_packets, write_stream
 
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.world import World
-from gsstream.packet import StreamReader, StreamWriter, decode_key, encode_key
+from gsstream.packet import StreamReader, StreamWriter
 from gsstream.packet.base import PACKET_HEADER
-from gsstream.packet.bulk import compress
-from gsstream.packet.meta import hash_recipe, meta_from_json, meta_to_json
-
-
-def put(**values: Any) -> Callable[[dict[str, Any]], None]:
-    return lambda meta: meta.update(values)
-
-
-def in_rig(**values: Any) -> Callable[[dict[str, Any]], None]:
-    return lambda meta: meta["train"].update(values)
-
-
-def no_cameras(meta: dict[str, Any]) -> None:
-    for split in ("train", "test"):
-        meta[split] |= {"ids": [], "viewmats": [], "Ks": []}
-
-WORLD = {"rotation": [0, 1, 0, -1, 0, 0, 0, 0, 1], "offset": [5e5, 5.2e6, 300], "scale": 2.5}
-NO_WORLDS = [
-    ("scale", 0), ("scale", -1), ("scale", "1"), ("scale", True), ("offset", [1, 2]), ("offset", [1, 2, None]),
-    ("rotation", [1] * 9), ("rotation", [-1, 0, 0, 0, 1, 0, 0, 0, 1]), ("rotation", [[1, 0, 0], [0, 1, 0], [0, 0, 1]]),
-]  # fmt: skip
-LIES = {
-    **{f"fps {fps!r}": put(fps=fps) for fps in (0, -5, 1e-300, 1e300, "30", True, None, [30])},
-    **{f"width {width!r}": in_rig(width=width) for width in (0, -1, 40.9, "30", 65537, True)},
-    "too many pixels": in_rig(width=65536, height=65536),
-    "near as text": in_rig(near="0.1"),
-    "no cameras": no_cameras,
-    "method is no text": put(method=3),
-    "plugin version is no text": put(plugins={"p": 1}),
-    "background of texts": put(background=["0", "0", "0"]),
-    "source_uri is no text": put(extra={"source_uri": ["a"]}),
-    "licence is no text": put(extra={"licence": 7}),
-    **{f"world with {key} {value!r:.20}": put(world={**WORLD, key: value}) for key, value in NO_WORLDS},
-    "world is no object": put(world=[1]),
-    "world without scale": put(world={"rotation": WORLD["rotation"], "offset": WORLD["offset"]}),
-    "title is no text": put(extra={"title": ["dense"]}),
-    **{f"origin {origin!r}": put(extra={"origin": origin}) for origin in ([0, 0], 3, "abc", [0, 0, 1e39], [[0], 1, 2])},
-    "exposure without a matrix": put(extra={"exposure": {"offset": [[0, 0, 0]] * 3}}),
-    "exposure of fewer cameras": put(extra={"exposure": {"matrix": [np.eye(3).tolist()], "offset": [[0, 0, 0]]}}),
-    "exposure is a list": put(extra={"exposure": [1]}),
-    "shown before the start": put(extra={"shown": -1}),
-    "shown as text": put(extra={"shown": "1"}),
-}
-
-
-def meta_with(change: Callable[[dict[str, Any]], None]) -> bytes:
-    data = json.loads(meta_to_json(make_meta()))
-    change(data)
-    data["recipe_hash"] = hash_recipe(data["recipe"])
-    return json.dumps(data).encode()
-
-
-@pytest.mark.parametrize("lie", LIES)
-def test_lies_are_refused_with_the_place_of_the_meta(lie: str) -> None:
-    data = meta_with(LIES[lie])
-    key = encode_key(make_key(np.random.default_rng(0)))
-    with pytest.raises(PacketError, match=r"meta: .*\(at byte \d+\)"):
-        decode_key(replaced(key, "meta", compress(data)))
+from gsstream.packet.meta import meta_from_json, meta_to_json
 
 
 @pytest.mark.parametrize("number", ["1e999", "-1e999", "NaN", "Infinity"])
@@ -134,7 +74,7 @@ def test_damage_before_the_last_packet_is_never_cut_off(tmp_path) -> None:
 
 def test_a_world_comes_back_bit_by_bit_and_the_identity_is_not_written() -> None:
     assert "world" not in json.loads(meta_to_json(make_meta()))
-    world = World(tuple(float(v) for v in WORLD["rotation"]), (5e5 + 1 / 3, 5.2e6, 300.0), 1 / 7)
+    world = World((0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0), (5e5 + 1 / 3, 5.2e6, 300.0), 1 / 7)
     data = meta_to_json(dataclasses.replace(make_meta(), world=world))
     assert meta_from_json(data).world == world
     assert set(json.loads(data)["world"]) == {"rotation", "offset", "scale"}

@@ -40,7 +40,8 @@ LONG = (
 )  # fmt: skip
 #: What ``make check`` runs: rooms whose tests are cheap, and the one test of whole runs that must never fail.
 QUICK = (
-    "core", "recipe", "residual", "render", "metrics", "cli", "packet", "player", "method", "plugins", "motion",
+    "core", "recipe", "residual", "render", "metrics", "cli", "packet", "packet/lies", "player", "method", "plugins",
+    "motion",
 )  # fmt: skip
 #: Of other rooms what the work of these days leans on: budgets, assembling, what is chosen by numbers, the renderer.
 QUICK_FILES = (

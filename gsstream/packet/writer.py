@@ -15,12 +15,12 @@ from gsstream.packet.reader import Entry, StreamReader, index_body, key_offsets
 class StreamWriter:
     """An open stream. Use :meth:`open`; as a context manager it writes the index unless an exception passes."""
 
-    def __init__(self, file: BinaryIO, entries: list[Entry], offset: int, fsync: bool) -> None:
-        self._file, self.entries, self._offset, self._fsync = file, entries, offset, fsync
+    def __init__(self, file: BinaryIO, entries: list[Entry], offset: int) -> None:
+        self._file, self.entries, self._offset = file, entries, offset
 
     @classmethod
     def open(
-        cls, path: str | os.PathLike[str], *, resume: bool = False, last_frame: int | None = None, fsync: bool = False
+        cls, path: str | os.PathLike[str], *, resume: bool = False, last_frame: int | None = None
     ) -> StreamWriter:
         """Begin a stream, or with ``resume`` go on with an existing one.
 
@@ -28,13 +28,11 @@ class StreamWriter:
         ``last_frame`` every packet after that frame (a checkpoint may be older than the stream).
 
         Every packet reaches the operating system before the call that wrote it returns: a killed process loses none.
-        With ``fsync`` it also reaches the disk (and the file its folder's list): a power cut loses none either.
 
         Arguments:
             path: of the stream.
             resume: go on with the stream that is there.
             last_frame: go on after this frame; None: after the last sound packet.
-            fsync: force every packet to disk.
 
         Raises OutputError when the file exists (or, with ``resume``, cannot be opened), PacketError when it is damaged
         before its last packet: nothing is cut then.
@@ -44,10 +42,8 @@ class StreamWriter:
         try:
             if not resume or not path.exists() or path.stat().st_size < len(file_header()):
                 file = path.open("wb" if resume else "xb")
-                writer = cls(file, [], 0, fsync)
+                writer = cls(file, [], 0)
                 writer._write(file_header())
-                if fsync:
-                    _sync_folder(path.parent)
                 return writer
             entries, end = _sound_part(path, last_frame)
             file = path.open("r+b")
@@ -57,7 +53,7 @@ class StreamWriter:
             raise OutputError(f"cannot write the stream {path}: {error.strerror}") from error
         file.truncate(end)
         file.seek(end)
-        return cls(file, entries, end, fsync)
+        return cls(file, entries, end)
 
     def __enter__(self) -> StreamWriter:
         return self
@@ -96,21 +92,7 @@ class StreamWriter:
     def _write(self, data: bytes) -> None:
         self._file.write(data)
         self._file.flush()
-        if self._fsync:
-            os.fsync(self._file.fileno())
         self._offset += len(data)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make the name of a new file durable; where folders cannot be opened (Windows) the system does so itself."""
-    try:
-        descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _sound_part(path: Path, last_frame: int | None) -> tuple[list[Entry], int]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
@@ -98,12 +98,6 @@ class Budget(BaseModel):
     )  # fmt: skip
     memory: Memory | None = Field(
         default=None, ge=1, description="peak resident memory of the process, e.g. 2GB; limits Gaussians and caches"
-    )
-    clock: Literal["wall", "processor"] = Field(
-        default="wall", description="what time means: wall clock, or processor time of all threads of the process"
-    )
-    most_epochs: int = Field(
-        default=30, ge=1, description="with a time budget: most passes over the cameras that are spent on one frame"
     )
 
     @property

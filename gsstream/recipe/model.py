@@ -5,7 +5,7 @@ Defaults here are those of the dense baseline; methods ship their own recipe fil
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -16,7 +16,7 @@ SCHEMA_VERSION = "1.0"
 #: Sections of a recipe that do not influence frame 0. A section that is not listed counts as one that does.
 LATER_KEYS = (
     "schema_version", "method", "seed", "frames", "confidence", "propagation", "gate", "regularizer", "update",
-    "stepper", "stream", "gate_training", "codec", "motion", "growth",
+    "stepper", "stream", "codec", "motion", "growth",
 )  # fmt: skip
 
 
@@ -45,12 +45,6 @@ class FirstFrame(Section):
         "sfm: triangulation; sweep: points that several views agree on (plane sweep)",
     )
     max_points: int = Field(default=12_000, ge=1, description="points kept before the structure seeds anchors")
-    pixels_per_seed: float = Field(
-        default=64.0, ge=0,
-        description="at most one seed per this many training pixels (points and fill seeds each): more seeds than the "
-        "images can pin down overfit the training views",
-    )  # fmt: skip
-    fill_points: int = Field(default=5_000, ge=0, description="random seeds in uncovered common view volume")
     lr_means: float = Field(default=1.6e-4, ge=0, description="learning rate of centres, fraction of the rig's extent")
     lr_means_final: float = Field(default=1.6e-6, ge=0, description="the same at the last iteration (log-linear)")
     noise: float = Field(
@@ -63,17 +57,7 @@ class FirstFrame(Section):
         description="factor on 3DGS's learning rates of everything but the centres, which are meant for 30,000 "
         "iterations: in fewer, Gaussians that grow into place faster leave less for others to be born for; 1: as there",
     )  # fmt: skip
-    densify_from: int = Field(default=300, ge=0, description="first iteration of densification and pruning")
-    densify_every: int = Field(default=100, ge=1, description="iterations between two densifications")
-    densify_gradient: float = Field(
-        default=3e-4, gt=0, description="mean screen gradient (half-width units) above which a Gaussian is densified"
-    )
     max_gaussians: int = Field(default=60_000, ge=1, description="upper bound on the number of Gaussians")
-    pixels_per_gaussian: float = Field(
-        default=0.0, ge=0,
-        description="at most one Gaussian per this many training pixels: more than the images can pin down describe "
-        "the training cameras, not the scene; 0: max_gaussians alone bounds them",
-    )  # fmt: skip
     prune_error: float = Field(
         default=10.0, ge=0,
         description="a Gaussian goes, when growth has ended, whose absence changes all training images by less than "
@@ -105,10 +89,6 @@ class Stream(Section):
         description="tiles whose pixels differ from the last frame by more than this many sigmas of their own spread "
         "count as changed, and only Gaussians visible in them take part; 0: everything takes part",
     )  # fmt: skip
-    change_votes: float = Field(
-        default=0.5, ge=0, le=1,
-        description="least share of the views a Gaussian projects into in which it must lie in or beside changed tiles",
-    )  # fmt: skip
     release_closed: bool = Field(
         default=False,
         description="after each pass over the cameras, rows whose gate has closed leave the optimisation",
@@ -131,7 +111,6 @@ class Stream(Section):
         "repeat: the frame changes nothing, which a warning and its metrics say",
     )
     progressive: bool = Field(default=False, description="activate octree levels from floor(H/2) on (paper)")
-    progressive_omega: float = Field(default=1.5, ge=1, description="iterations per level: N_{i+1} = omega N_i")
 
     @model_validator(mode="after")
     def _refines_in_frames_and_iterations(self) -> Stream:
@@ -144,18 +123,11 @@ class Stream(Section):
 
 
 class Loss(Section):
-    """Photometric loss (1 - dssim) L1 + dssim (1 - SSIM)."""
+    """Photometric loss 0.8 L1 + 0.2 (1 - SSIM), as in 3DGS."""
 
-    dssim: float = Field(default=0.2, ge=0, le=1, description="weight of 1 - SSIM")
     backend: str = Field(
         default="auto", description="implementation; auto: the fastest that works here (all give the same value)"
     )
-
-
-class GateTraining(Section):
-    """Optimisation of the gate logits."""
-
-    lr: float = Field(default=0.1, ge=0, description="Adam learning rate of the gate logits (released code: 0.1)")
 
 
 class Codec(Section):
@@ -179,11 +151,13 @@ class Codec(Section):
         description="share of frame 0's Gaussians that stand first in its packet, those that the training images would "
         "miss most: players draw them while the rest is on its way; 1: all stand together",
     )  # fmt: skip
-    fsync: bool = Field(default=False, description="force every packet to disk before the next frame starts")
 
 
 class Recipe(Section):
     """Everything that decides the bytes of a run, besides the recording itself."""
+
+    #: Colour behind everything: black, as in the recordings of the papers.
+    background: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.0)
 
     schema_version: Literal["1.0"] = Field(default="1.0", description="version of this schema")
     method: str = Field(default="dense", description="name of the method this recipe belongs to")
@@ -206,7 +180,6 @@ class Recipe(Section):
     first_frame: FirstFrame = Field(default=FirstFrame(), description="frame 0")
     stream: Stream = Field(default=Stream(), description="later frames")
     loss: Loss = Field(default=Loss(), description="photometric loss")
-    gate_training: GateTraining = Field(default=GateTraining(), description="optimisation of gates")
     codec: Codec = Field(default=Codec(), description="packets")
     budget: Budget = Field(default=Budget(), description="what a frame may cost; nothing given: no limits")
     data: DataOptions = Field(default=DataOptions(), description="the split, and disturbances for experiments")
@@ -215,4 +188,3 @@ class Recipe(Section):
     near: float = Field(
         default=0.01, gt=0, lt=1, description="near plane, fraction of the rig's extent; nothing closer is drawn"
     )
-    background: tuple[float, float, float] = Field(default=(0.0, 0.0, 0.0), description="colour behind everything")

@@ -32,7 +32,7 @@ class Flat(Structure):
 
     def seed(self, points: PointCloud, cameras: Cameras) -> Anchors:
         if len(points) == 0:
-            raise InputError("no points to start from: expected at least 1, got 0; set first_frame.fill_points above 0")
+            raise InputError("no points to start from: expected at least 1, got 0; do the cameras have a common view?")
         positions = torch.as_tensor(points.xyz, dtype=torch.float32)
         span = positions.amax(0) - positions.amin(0)
         unit = float(span.norm()) / self.config.resolution

@@ -21,7 +21,7 @@ from gsstream.source.open import open_source
 
 SOURCE = "synthetic:frames=4&views=3&width=32&height=24&supersample=1"
 TINY = (
-    "first_frame.max_iterations=8", "first_frame.max_points=200", "first_frame.fill_points=0", "stream.epochs=1",
+    "first_frame.max_iterations=8", "first_frame.max_points=200", "stream.epochs=1",
     # Pictures of so few pixels would miss so few Gaussians that a method had nothing to do.
     "first_frame.prune_error=0",
     "first_frame.points=recording",

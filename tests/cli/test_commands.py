@@ -131,7 +131,7 @@ def run(capsys: pytest.CaptureFixture[str], *args: str) -> tuple[int, str, str]:
     ("args", "message"),
     [
         ([*RUN, "--method", "dens"], "no method named 'dens'; did you mean 'dense'?"),
-        ([*RUN, "--set", "lss.dssim=1"], "--set lss.dssim=1: unknown key 'lss'; did you mean 'loss'?"),
+        ([*RUN, "--set", "lss.backend=1"], "--set lss.backend=1: unknown key 'lss'; did you mean 'loss'?"),
         ([*RUN, "--frames", "0"], "--frames frames=0: frames: input should be greater than or equal to 1, got 0"),
         ([*RUN, "--recipe", "absent.yaml"], "cannot read the recipe absent.yaml: "),
         ([*RUN, "--budget", "siz=20KB"], "--budget siz=20KB: unknown key 'siz'; did you mean 'size'?"),

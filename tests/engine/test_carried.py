@@ -18,7 +18,7 @@ from tools.worlds import world
 
 SOURCE = "synthetic:frames=2&views=3&width=32&height=24&supersample=1"
 TINY = {
-    "first_frame.max_iterations": 12, "first_frame.max_points": 250, "first_frame.fill_points": 0, "stream.epochs": 1,
+    "first_frame.max_iterations": 12, "first_frame.max_points": 250, "stream.epochs": 1,
     "first_frame.points": "recording",
 }  # fmt: skip
 

@@ -34,7 +34,7 @@ from gsstream.testing.cases import rig, scene
 
 WORLD = "synthetic:frames=5&views=2&width=32&height=24&supersample=1"
 TINY = {
-    "first_frame.max_iterations": 6, "first_frame.max_points": 120, "first_frame.fill_points": 0, "stream.epochs": 1,
+    "first_frame.max_iterations": 6, "first_frame.max_points": 120, "stream.epochs": 1,
     "first_frame.prune_error": 0,
 }  # fmt: skip
 BAD = 2

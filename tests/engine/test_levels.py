@@ -8,7 +8,7 @@ import pytest
 from gsstream.engine.step.levels import current_level, level_schedule
 from gsstream.recipe.model import Stream
 
-PROGRESSIVE = Stream(progressive=True, progressive_omega=1.5)
+PROGRESSIVE = Stream(progressive=True)
 
 
 def units(*counts: int) -> np.ndarray:

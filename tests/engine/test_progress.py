@@ -6,12 +6,7 @@ import warnings
 
 import pytest
 
-from gsstream.core.errors import InputError
-from gsstream.core.rng import Rng
-from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.run.progress import RunProgress
-from gsstream.recipe.model import FirstFrame
-from gsstream.source.open import open_source
 
 
 class Clock:
@@ -63,10 +58,3 @@ def test_a_fast_frame_0_says_nothing_of_time(capsys) -> None:
     lines, announced = told(capsys, 0.001, 300, quiet=False)
     assert announced == []
     assert not any("left" in line for line in lines)
-
-
-def test_without_points_the_message_names_the_setting() -> None:
-    """A recording of two cameras that ships no points, and nothing filled in: there is nothing to start from."""
-    frame = open_source("synthetic:frames=1&views=2&width=16&height=12&supersample=1").frame(0)
-    with pytest.raises(InputError, match=r"ships none; set first_frame\.fill_points above 0"):
-        gather_points(lambda _: None, frame, FirstFrame(fill_points=0), Rng(0))

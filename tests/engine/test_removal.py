@@ -21,10 +21,7 @@ from gsstream.render.base import Renderer
 from gsstream.render.reference import ReferenceRenderer
 
 BLACK = (0.0, 0.0, 0.0)
-GROWING = {
-    "first_frame.max_iterations": 60, "first_frame.densify_from": 10, "first_frame.densify_every": 5,
-    "first_frame.densify_gradient": 1e-6,
-}  # fmt: skip
+GROWING = {"first_frame.max_iterations": 60}
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from gsstream.evaluation.offline import bytes_line, numbered
 from gsstream.player.ply import ply_bytes, read_ply
 
 SOURCE = "synthetic:frames=3&views=3&width=64&height=48&supersample=1"
-SMALL = ("max_iterations=5", "fill_points=50", "max_points=200")
+SMALL = ("max_iterations=5", "max_points=200")
 
 
 @pytest.fixture(scope="module")

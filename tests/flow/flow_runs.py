@@ -23,7 +23,7 @@ from gsstream.source.open import DEMO_FOLDER
 #: Six frames of an analytic scene, three training cameras, one test camera.
 WORLD = "synthetic:frames=6&views=3&width=64&height=48&supersample=1"
 TINY = {
-    "first_frame.max_iterations": 30, "first_frame.fill_points": 200, "first_frame.max_points": 800,
+    "first_frame.max_iterations": 30, "first_frame.max_points": 800,
     "stream.epochs": 3,
     # So small and so far off, the images would miss a handful of Gaussians only, too few to say anything.
     "first_frame.prune_error": 0,

@@ -168,7 +168,7 @@ sys.meta_path.insert(0, Missing())
 def test_without_the_native_module_everything_works_slowly_after_one_warning(tmp_path: Path) -> None:
     (tmp_path / "sitecustomize.py").write_text(BLOCKED)
     source = "synthetic:frames=2&views=2&width=16&height=12&supersample=1"
-    settings = {"first_frame__max_iterations": 3, "first_frame__max_points": 40, "first_frame__fill_points": 10}
+    settings = {"first_frame__max_iterations": 3, "first_frame__max_points": 40}
     command = arguments(tmp_path / "o", source=source, stream__epochs=1, **settings)
     code, _, err = finish(*command, PYTHONPATH=str(tmp_path))
     assert code == 0, err

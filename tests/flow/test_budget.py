@@ -9,6 +9,7 @@ import pytest
 from flow_runs import Witness, arguments, broken_off_in, demo_copy, encode, metrics
 
 from gsstream.cli.main import run_command
+from gsstream.engine.budget import plan
 from gsstream.packet import StreamReader
 from gsstream.player.playback import Playback
 
@@ -110,9 +111,11 @@ def test_a_time_that_cannot_be_held_is_said_frame_by_frame(tmp_path: Path) -> No
 
 
 def test_plenty_of_time_makes_the_most_passes(tmp_path: Path) -> None:
-    encode(tmp_path, "--budget", "time=5min,most_epochs=4", "--frames", "3", method="s2gs-edge", stream__epochs=2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plan, "MOST_EPOCHS", 4)
+        encode(tmp_path, "--budget", "time=5min", "--frames", "3", method="s2gs-edge", stream__epochs=2)
     assert [line["iterations"] for line in metrics(tmp_path)[1:]] == [12, 12]
-    encode(tmp_path / "p", "--budget", "time=5min,clock=processor", "--frames", "2", method="dense", stream__epochs=31)
+    encode(tmp_path / "p", "--budget", "time=5min", "--frames", "2", method="dense", stream__epochs=31)
     assert metrics(tmp_path / "p")[1]["iterations"] == 31 * 3, "the recipe's own number is never the limit"
 
 

@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from early_densify import densifying
 from flow_runs import Witness, encode, metrics
 
 from gsstream.packet import StreamReader
 from gsstream.player.playback import Playback
 
 TINY_WORLD = "synthetic:frames=3&views=3&width=16&height=12&supersample=1"
-GROWING = {"first_frame__densify_from": 4, "first_frame__densify_every": 4, "first_frame__max_iterations": 20}
-
 
 @pytest.mark.parametrize("method", ["dense", "queen-published"])
 def test_the_reference_renderer_can_grow_a_scene(tmp_path: Path, method: str) -> None:
     """Densification asks a session for the gradient of the 2-D means."""
-    settings: dict[str, Any] = {**GROWING, "stream__epochs": 4, "first_frame__densify_gradient": 1e-6}
-    encode(tmp_path, "--set", "renderer=reference", source=TINY_WORLD, method=method, **settings)
+    settings: dict[str, Any] = {"first_frame__max_iterations": 20, "stream__epochs": 4}
+    with densifying(4, 4, 1e-6):
+        encode(tmp_path, "--set", "renderer=reference", source=TINY_WORLD, method=method, **settings)
     assert [line["status"] for line in metrics(tmp_path)] == ["key", "delta", "delta"]
 
 

@@ -7,29 +7,35 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from early_densify import densifying
 
 from gsstream.engine.frame0 import refine
 from gsstream.engine.run import session
 from gsstream.packet import StreamReader
 from tests.flow import capture
-from tests.flow.flow_runs import arguments, demo_copy, encode, finish, metrics
+from tests.flow.flow_runs import arguments, demo_copy, encode, metrics
 
 #: Six iterations in each of the frames 1 to 3; Gaussians are born and pruned in the first two of them.
 REFINED: dict[str, Any] = {
-    "stream__refine_frames": 3, "stream__refine_iterations": 6, "first_frame__densify_from": 5,
-    "first_frame__densify_every": 4,
-}  # fmt: skip
+    "stream__refine_frames": 3, "stream__refine_iterations": 6,
+}
 QUICK = {"first_frame__max_iterations": 8, "first_frame__prune_error": 0, "stream__epochs": 1, "scale": 0.5}
 
-#: ``gsstream`` that is killed, as from outside, at an iteration of a frame's refinement.
-DYING = """
-import os, signal, sys
+#: A program in which Gaussians are added early, as in the tests that run in this process.
+EARLY = """
+from gsstream.engine.fit import schedule
+schedule.DENSIFY_FROM, schedule.DENSIFY_EVERY = 5, 4
 from gsstream.cli.main import main
+"""
+#: ``gsstream`` that is killed, as from outside, at an iteration of a frame's refinement.
+DYING = f"""{EARLY}
+import os, signal, sys
 from gsstream.engine.frame0 import refine
 
 frame, last = int(sys.argv.pop(1)), int(sys.argv.pop(1))
@@ -49,6 +55,12 @@ def written(stream: Path) -> list[int]:
     """Frames whose packets a stream holds."""
     with StreamReader(stream) as reader:
         return [entry.frame for entry in reader.frames]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def early_growth() -> Iterator[None]:
+    with densifying(5, 4):
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -78,10 +90,11 @@ def test_a_run_killed_in_the_refinement_resumes_to_the_same_bytes(
     assert undisturbed.startswith((tmp_path / "stream.gss").read_bytes())
     if goes_on_from == "packets":  # then the iterations of all frames that the stream holds are made again
         (tmp_path / "metrics.jsonl").unlink()
-    code, _, said = finish(*command, "--resume")
-    assert code == 0, said
-    again = goes_on_from == "lines" and packets > frame
-    assert (f"frame {frame} of the stream is made again" in said) == again
+    again = [sys.executable, "-c", f"{EARLY}main()", *command, "--resume"]
+    done = subprocess.run(again, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    told = f"frame {frame} of the stream is made again" in done.stderr
+    assert told == (goes_on_from == "lines" and packets > frame)
     assert (tmp_path / "stream.gss").read_bytes() == undisturbed
     if goes_on_from == "lines":
         assert [line["frame"] for line in metrics(tmp_path)] == list(range(6))

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from early_densify import densifying
 
 from gsstream.core.world import IDENTITY, World
 from gsstream.engine.assembly.assemble import assemble
+from gsstream.engine.fit import schedule
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.source.canonical import CanonicalSource, world_of
@@ -17,9 +20,8 @@ from tools.worlds import Moved, encode, world
 
 SOURCE = "synthetic:frames=3&views=6&width=40&height=30&supersample=1&motion=3"
 SMALL = {  # hold reads no setting of later frames
-    "first_frame.max_iterations": 80, "first_frame.pixels_per_seed": 5, "first_frame.fill_points": 0,
-    "first_frame.points": "recording", "first_frame.densify_from": 50, "first_frame.densify_every": 20,
-}  # fmt: skip
+    "first_frame.max_iterations": 80, "first_frame.points": "recording",
+}
 METHODS = ("s2gs-edge", "dense", "hold")
 SEEDS = (0, 1, 2)
 #: Without a shift float64 is exact to 1e-15, and cameras and points come out to the same bits.
@@ -28,6 +30,14 @@ SHIFTED = {
     "UTM": world(offset=(5e5, 5.2e6, 300)), "x 1e-6, turned, moved by 1e7": world(1e-6, (10, -10, 10), 8),
     "x 1e9, turned, moved by 1e7": world(1e9, (1e16, 0, -1e16), 9),
 }  # fmt: skip
+
+
+@pytest.fixture(autouse=True, scope="module")
+def many_seeds_that_grow() -> Iterator[None]:
+    with densifying(50, 20), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(schedule, "PIXELS_PER_SEED", 5)
+        patch.setattr(schedule, "FILL_POINTS", 0)
+        yield
 
 
 @functools.cache

@@ -34,7 +34,7 @@ Follow: Any = ExampleStepper  # final: only what is wrong on purpose may inherit
 
 RUN = [
     "run", "--source", SOURCE, "--method", "hold", "--quiet", "--no-pictures", "--set", "first_frame.max_iterations=5",
-    "--set", "first_frame.points=recording", "--set", "first_frame.fill_points=0",
+    "--set", "first_frame.points=recording",
 ]  # fmt: skip
 
 
@@ -382,12 +382,12 @@ def refusal(*sets: str, method: str = "hold") -> list[str]:
 
 def test_keys_that_a_whole_method_does_not_read_are_refused() -> None:
     why = "the stepper 'hold' does not read it; its own settings: gsstream plugins stepper/hold"
-    assert refusal("structure.resolution=64", "gate_training.lr=0.5", "stream.epochs=3", "update.sh0.lr=1.0") == [
+    assert refusal("structure.resolution=64", "stream.rate_weight=0.5", "stream.epochs=3", "update.sh0.lr=1.0") == [
         "4 problems in the recipe:",
         f"  --set structure.resolution=64: structure.params: {why}",
         f"  --set update.sh0.lr=1.0: update.params: {why}",
         f"  --set stream.epochs=3: stream.epochs: {why}",
-        f"  --set gate_training.lr=0.5: gate_training.lr: {why}",
+        f"  --set stream.rate_weight=0.5: stream.rate_weight: {why}",
     ]
     # Written, but not changed: a saved recipe spells every default out.
     catalog = load_catalog()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import stat
 import struct
 import subprocess
 import sys
@@ -154,7 +153,7 @@ import os, signal, sys
 from packet_scenes import make_packets
 from gsstream.packet import StreamWriter
 packets = make_packets()
-writer = StreamWriter.open(sys.argv[1], fsync=True)
+writer = StreamWriter.open(sys.argv[1])
 for packet in packets[:3]:
     writer.append(packet)
 os.write(writer._file.fileno(), packets[3].data[:-9])
@@ -177,24 +176,13 @@ def test_resume_after_a_killed_writer(tmp_path):
     assert path.read_bytes() == write_stream(tmp_path / "whole.gss", packets)
 
 
-@pytest.mark.parametrize("fsync", [False, True])
-def test_what_is_forced_to_disk(tmp_path, monkeypatch, fsync):
-    """Off: nothing. On: the folder once, and the file after every write, with all bytes handed over before."""
-    packets, path, forced = make_packets(), tmp_path / "s.gss", []
-    real = os.fsync
-
-    def recorded(descriptor):
-        real(descriptor)
-        here = os.fstat(descriptor)
-        forced.append("folder" if stat.S_ISDIR(here.st_mode) else here.st_size)
-
-    monkeypatch.setattr(os, "fsync", recorded)
-    with StreamWriter.open(path, fsync=fsync) as writer:
-        ends = [16]
+def test_another_process_sees_every_packet_at_once(tmp_path):
+    packets, path = make_packets(), tmp_path / "s.gss"
+    with StreamWriter.open(path) as writer:
+        end = 16
         for packet in packets:
-            ends.append(ends[-1] + writer.append(packet))
-            assert path.stat().st_size == ends[-1], "another process sees the packet at once"
-    assert forced == ([16, "folder", *ends[1:], path.stat().st_size] if fsync else [])
+            end += writer.append(packet)
+            assert path.stat().st_size == end
 
 
 def test_resume_cuts_a_torn_last_packet_and_unwritten_space(tmp_path):

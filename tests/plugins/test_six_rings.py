@@ -18,7 +18,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "plugin-failures.md"
 RUN = [
     "run", "--source", "synthetic:frames=5&views=2&width=32&height=24&supersample=1", "--quiet", "--no-pictures",
     "--set", "renderer=reference", "--set", "loss.backend=reference", "--set", "first_frame.max_iterations=3",
-    "--set", "first_frame.fill_points=0", "--set", "first_frame.max_points=60", "--set", "stream.epochs=1",
+    "--set", "first_frame.max_points=60", "--set", "stream.epochs=1",
     "--set", "first_frame.prune_error=0",
 ]  # fmt: skip
 

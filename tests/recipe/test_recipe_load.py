@@ -18,7 +18,7 @@ METHOD = """\
 gate: {name: soft, params: {temperature: 0.3, levels: 10}}
 stream:
   epochs: 20
-loss: {dssim: 0.1}
+codec: {first_layer: 0.1}
 """
 
 
@@ -57,14 +57,15 @@ def label(resolved: ResolvedRecipe, path: str) -> str:
 
 
 def test_each_layer_overrides_the_one_below_and_is_named(lab, tmp_path: Path) -> None:
-    resolved = lab.resolve("soft", "stream:\n  epochs: 7\nloss:\n  dssim: 0.5\n", "loss.dssim=0.75")
+    resolved = lab.resolve("soft", "stream:\n  epochs: 7\ncodec:\n  first_layer: 0.5\n", "codec.first_layer=0.75")
     recipe = resolved.recipe
-    assert (recipe.method, recipe.gate.name, recipe.stream.epochs, recipe.loss.dssim) == ("soft", "soft", 7, 0.75)
+    assert (recipe.method, recipe.gate.name) == ("soft", "soft")
+    assert (recipe.stream.epochs, recipe.codec.first_layer) == (7, 0.75)
     assert recipe.gate.params == {"temperature": 0.3, "levels": 10}
     assert label(resolved, "seed") == "default"
     assert label(resolved, "gate.params.levels") == "method soft"
     assert label(resolved, "stream.epochs") == f"file {tmp_path}/run.yaml:2"
-    assert label(resolved, "loss.dssim") == "command line"
+    assert label(resolved, "codec.first_layer") == "command line"
     assert recipe.first_frame == Recipe().first_frame
 
 
@@ -142,8 +143,8 @@ def test_messages(lab) -> None:
     assert (
         lab.refuse(None, "stream.epoch=3") == "--set stream.epoch=3: unknown key 'stream.epoch'; did you mean 'epochs'?"
     )
-    assert lab.refuse("loss:\n  dssim: 3.0\n") == (
-        "run.yaml:2:3: loss.dssim: input should be less than or equal to 1, got 3.0"
+    assert lab.refuse("codec:\n  first_layer: 3.0\n") == (
+        "run.yaml:2:3: codec.first_layer: input should be less than or equal to 1, got 3.0"
     )
     assert lab.refuse("schema_version: '1.3'\n") == (
         "run.yaml:1:1: built for recipe schema 1.3, this gsstream speaks 1.0: upgrade gsstream"
@@ -151,9 +152,9 @@ def test_messages(lab) -> None:
 
 
 def test_unknown_keys_and_bad_values_come_together(lab) -> None:
-    message = lab.refuse("loss: {dssim: 2}\nsed: 1\n", "frames=0")
+    message = lab.refuse("codec: {first_layer: 2}\nsed: 1\n", "frames=0")
     assert message.startswith("3 problems in the recipe:\n")
-    for part in ("run.yaml:1:8: loss.dssim", "run.yaml:2:1: unknown key 'sed'", "--set frames=0: frames: input"):
+    for part in ("run.yaml:1:9: codec.first_layer", "run.yaml:2:1: unknown key 'sed'", "--set frames=0: frames: input"):
         assert part in message
 
 
@@ -166,12 +167,12 @@ def test_unknown_keys_and_bad_values_come_together(lab) -> None:
         ("scale: .nan", "run.yaml:1:8: expected a finite number, got .nan"),
         ("scale: .inf", "run.yaml:1:8: expected a finite number, got .inf"),
         ("seed: 1\nseed: 2", "run.yaml:2:1: key 'seed' is given twice, first in line 1"),
-        ("loss:\n  dssim: 0\n  dssim: 0", "run.yaml:3:3: key 'loss.dssim' is given twice, first in line 2"),
+        ("codec:\n  trim: 0\n  trim: 0", "run.yaml:3:3: key 'codec.trim' is given twice, first in line 2"),
         ("3: 4", "run.yaml:1:1: a key must be a word, got '3'"),
         ("- a", "run.yaml:1:1: a recipe maps keys to values; got a single value or a list"),
         ("method: 2020-01-01", "run.yaml:1:9: '2020-01-01' reads as a date; quote it if a word is meant"),
         ("a: &x 1\nb: *x", "run.yaml:1:4: anchors and aliases (&x) are not used in recipes; write the value out"),
-        ("loss: {dssim: 0.1", "run.yaml:1:18: not valid YAML: expected ',' or '}', but got '<stream end>'"),
+        ("codec: {first_layer: 0.1", "run.yaml:1:25: not valid YAML: expected ',' or '}', but got '<stream end>'"),
         ("method: hard", "run.yaml:1:1: run.yaml belongs to the method 'hard', but --method says 'soft': leave "),
         ("base: other.yaml", "run.yaml:1:1: base: there is no file other.yaml"),
         ("base: run.yaml", "run.yaml:1:1: base: goes in a circle: "),
@@ -194,11 +195,11 @@ def test_malformed_overrides(lab, item: str) -> None:
 
 def test_yaml_is_version_1_2(lab) -> None:
     resolved = lab.resolve(
-        "soft", "first_frame: {lr_means: 1e-3}\ngate: {name: on}\nframes: null\nbackground: [0, 1, 0.5]\n"
+        "soft", "first_frame: {lr_means: 1e-3}\ngate: {name: on, params: {x: [0, 1, 0.5]}}\nframes: null\n"
     )
     assert resolved.recipe.first_frame.lr_means == 0.001
     assert resolved.recipe.gate.name == "on"
-    assert resolved.recipe.background == (0.0, 1.0, 0.5)
+    assert resolved.recipe.gate.params == {"x": [0, 1, 0.5]}
 
 
 def test_the_last_of_two_options_counts(lab) -> None:
@@ -208,7 +209,7 @@ def test_the_last_of_two_options_counts(lab) -> None:
 def test_hash_ignores_provenance_and_sees_every_value(lab) -> None:
     base = recipe_hash(lab.resolve("soft", "seed: 5\n").recipe)
     assert base == recipe_hash(lab.resolve("soft", None, "seed=5").recipe)
-    for change in ("seed=6", "gate.levels=11", "background=[0,0,0.5]", "codec.fsync=true", "loss.dssim=0.1000001"):
+    for change in ("seed=6", "gate.levels=11", "near=0.02", "data.leak=points", "codec.first_layer=0.1000001"):
         assert recipe_hash(lab.resolve("soft", "seed: 5\n", change).recipe) != base
 
 

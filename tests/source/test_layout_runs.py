@@ -12,7 +12,7 @@ from gsstream.cli.main import run_command
 from gsstream.player.playback import Playback
 
 TINY = {
-    "first_frame.max_iterations": 12, "first_frame.fill_points": 100, "first_frame.max_points": 300,
+    "first_frame.max_iterations": 12, "first_frame.max_points": 300,
     "stream.epochs": 1,
 }  # fmt: skip
 

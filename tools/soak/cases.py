@@ -79,32 +79,28 @@ def _ints(low: int, high: int) -> Draw:
 #: Always drawn: what keeps a run short.
 SHORT: Mapping[str, Draw] = MappingProxyType({
     "seed": _ints(0, 10**6), "frames": _ints(2, 8), "first_frame.max_iterations": _of(0, 1, 10, 30, 60),
-    "first_frame.max_points": _of(1, 5, 100, 400, 400, 1500, 1500), "first_frame.fill_points": _of(0, 1, 50, 300),
+    "first_frame.max_points": _of(1, 5, 100, 400, 400, 1500, 1500),
     "first_frame.max_gaussians": _of(1, 50, 600, 3000, 3000, 3000), "stream.epochs": _ints(1, 4),
 })  # fmt: skip
 #: Each drawn in some of the cases.
 SOMETIMES: Mapping[str, Draw] = MappingProxyType({
-    "scale": _of(1.0, 0.75, 0.5), "near": _logs(1e-3, 0.3), "background": _of((1.0, 1.0, 1.0), (0.2, 0.0, 3.0)),
+    "scale": _of(1.0, 0.75, 0.5), "near": _logs(1e-3, 0.3),
     "first_frame.epochs": _of(0, 1, 3, 250), "first_frame.sh_degree": _ints(0, 3),
     "first_frame.points": _of("auto", "recording", "sparse", "sweep"),
-    "first_frame.pixels_per_seed": _of(0.0, 1.0, 1000.0),
     "first_frame.lr_means": _of(0.0, 1e-2),
-    "first_frame.densify_from": _ints(0, 20), "first_frame.densify_every": _ints(1, 15),
-    "first_frame.densify_gradient": _logs(1e-6, 1e-2),
     "first_frame.exposure": _of(True), "stream.active_threshold": _of(0.0, 0.05, 0.5, 0.99, 1.0),
-    "stream.change_threshold": _of(0.0, 1.0, 6.0, 20.0, 100.0), "stream.change_votes": _of(0.0, 0.25, 0.75, 1.0),
+    "stream.change_threshold": _of(0.0, 1.0, 6.0, 20.0, 100.0),
     "stream.release_closed": _of(False, True),
     "stream.rate_weight": _of(0.0, 1e-5, 3e-4, 1e-2, 1.0), "stream.on_error": _of("raise", "repeat"),
-    "stream.progressive": _of(False, True), "stream.progressive_omega": _of(1.0, 1.5, 8.0),
+    "stream.progressive": _of(False, True),
     "stream.lr_final_factor": _of(1.0, 0.1, 1e-6),
-    "loss.dssim": _of(0.0, 0.5, 1.0), "loss.backend": _of("auto", "reference"),
-    "gate_training.lr": _of(0.0, 0.01, 1.0, 10.0), "codec.key_every": _of(0, 1, 2, 3), "codec.fsync": _of(True),
+    "loss.backend": _of("auto", "reference"),
+    "codec.key_every": _of(0, 1, 2, 3),
     "data.leak": _of("none", "points", "training"), "data.images": _of("float16", "uint8"),
 })  # fmt: skip
 #: Drawn with the others where the method is made of parts.
 OF_PARTS: Mapping[str, Draw] = MappingProxyType({
     "codec.trim": _of(0.0, 0.3, 0.9, 0.999), "budget.size": _of(16, 200, 1500, 20_000), "budget.time": _logs(1e-3, 2),
-    "budget.clock": _of("processor", "wall"),
 })  # fmt: skip
 
 
@@ -125,7 +121,7 @@ def draw_case(seed: int, index: int, catalog: Catalog) -> Case:
     method = _of(*names, *(name for name in names if name != "hold"))(rng)  # nothing ever happens in hold
     settings = {key: draw(rng) for key, draw in SHORT.items()}
     if largest:
-        settings |= {"first_frame.max_points": 1500, "first_frame.max_gaussians": 3000, "first_frame.fill_points": 300}
+        settings |= {"first_frame.max_points": 1500, "first_frame.max_gaussians": 3000}
     share = _of(0.0, 0.1, 0.3)(rng)
     settings |= {key: draw(rng) for key, draw in SOMETIMES.items() if rng.random() < share}
     if views > 2 and rng.random() < 0.1:

@@ -11,9 +11,9 @@ from gsstream.recipe.document import KeyPath
 from gsstream.recipe.model import Recipe
 
 #: Sections that, beside the slots of parts, only a method made of parts reads.
-PART_SECTIONS = ("stream", "gate_training", "codec", "budget")
+PART_SECTIONS = ("stream", "codec", "budget")
 #: Of those sections, what the engine itself reads for every method, also for frame 0, which it makes for them.
-SESSION_KEYS = ("codec.fsync", "codec.key_rate", "codec.first_layer", "budget.memory", "stream.on_error")
+SESSION_KEYS = ("codec.key_rate", "codec.first_layer", "budget.memory", "stream.on_error")
 
 
 def unheeded(

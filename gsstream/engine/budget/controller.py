@@ -34,7 +34,7 @@ class Controller:
         """Return what the frame that begins now may spend; None without a limit on frames."""
         if not self.budget.limits_frames:
             return None
-        return Allowance.start(self.budget, plan(self.budget, self._stream, self._history))
+        return Allowance.start(plan(self.budget, self._stream, self._history))
 
     def key_refusal(self, num_gaussians: int, allowance: Allowance | None) -> str | None:
         """Say why a key packet that is due must wait, judged by what the last one cost; None: it may be tried."""

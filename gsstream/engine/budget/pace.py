@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import mean
 
@@ -20,9 +20,7 @@ from gsstream.engine.budget.plan import (
     each_with,
     epochs_within,
 )
-from gsstream.recipe.budget import Budget
 
-CLOCKS: Mapping[str, Callable[[], float]] = {"wall": time.perf_counter, "processor": time.process_time}
 #: Share of the passes after which the size is first estimated: before that, residuals are still growing.
 SETTLE = 0.25
 
@@ -36,10 +34,9 @@ class Allowance:
     clock: Callable[[], float]
 
     @staticmethod
-    def start(budget: Budget, plan: FramePlan) -> Allowance:
+    def start(plan: FramePlan) -> Allowance:
         """Return an allowance that counts from now on."""
-        clock = CLOCKS[budget.clock]
-        return Allowance(plan, clock(), clock)
+        return Allowance(plan, time.perf_counter(), time.perf_counter)
 
 
 class Pace:

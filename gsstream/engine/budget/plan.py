@@ -26,6 +26,8 @@ SIZE_AIM, MOST_TRIMMED = 0.94, 2.0
 UNKNOWN_RESERVE = 0.2
 #: Share of a pass's time that does not depend on the number of candidates.
 FIXED_SHARE = 0.3
+#: Most passes over the cameras that a budget of time spends on one frame, where the recipe has fewer.
+MOST_EPOCHS = 30
 #: When fewer passes than this fit, it is better to have fewer candidates and more passes.
 LEAST_EPOCHS = 4
 #: Weights of the rate that the controller may use; recipes ship 3e-4, which halves the bytes (docs/results/trade.md).
@@ -127,7 +129,7 @@ def plan(budget: Budget, stream: Stream, history: Sequence[Past]) -> FramePlan:
         epochs=epochs,
         change_threshold=_threshold(budget, stream, recent),
         rate_weight=_weight(budget, stream, recent) if held else stream.rate_weight,
-        most_epochs=max(stream.epochs, budget.most_epochs),
+        most_epochs=max(stream.epochs, MOST_EPOCHS),
         step_scale=_step_scale(recent) if held else 1.0,
         max_bytes=size,
         correction=_correction(recent),
@@ -174,7 +176,7 @@ def _epochs(budget: Budget, stream: Stream, each: float | None, around: float) -
     """Passes that fit beside ``around`` seconds of everything else."""
     if budget.time is None:
         return stream.epochs
-    most = max(stream.epochs, budget.most_epochs)
+    most = max(stream.epochs, MOST_EPOCHS)
     return most if each is None else epochs_within(TIME_MARGIN * budget.time - around, each, most)
 
 

@@ -8,6 +8,7 @@ import torch
 
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.topology import TopologyEdit
+from gsstream.engine.fit import schedule
 from gsstream.engine.fit.schedule import MAX_SCALE, PRUNE_OPACITY
 from gsstream.recipe.model import FirstFrame
 from gsstream.render.activations import activate_opacities, activate_scales, rotation_matrices
@@ -59,7 +60,7 @@ def grow_and_prune(
     keep = (activate_opacities(gaussians.opacities) > PRUNE_OPACITY) & (largest < MAX_SCALE * extent)
     budget = max(0, settings.max_gaussians - int(keep.sum()))
     score = torch.where(keep, statistics.mean, torch.zeros_like(largest))
-    hot = (score > settings.densify_gradient).nonzero()[:, 0]
+    hot = (score > schedule.DENSIFY_GRADIENT).nonzero()[:, 0]
     hot = hot[torch.argsort(score[hot], descending=True, stable=True)][:budget].sort().values
     split = torch.zeros_like(keep)
     split[hot] = largest[hot] > SPLIT_SIZE * extent

@@ -1,4 +1,4 @@
-"""Constants of the optimisation of frame 0 that no recipe changes: rates of 3DGS, and what keeps a scene tidy.
+"""Constants of the optimisation that no recipe changes: rates of 3DGS, and what keeps a scene tidy.
 
 The rates and the rules of pruning are those of 3DGS (Kerbl et al. 2023); the penalties and the limits of fill seeds are
 gsstream's own, and held-out quality is why they are there (docs/results/index.md).
@@ -10,6 +10,15 @@ from __future__ import annotations
 OPACITY = 0.1
 #: Learning rates: raw quaternions, log scales, opacity logits, colour of degree 0 and of higher degrees.
 LR_QUATS, LR_SCALES, LR_OPACITIES, LR_SH0, LR_SHN = 0.001, 0.005, 0.05, 0.0025, 0.000125
+#: Weight in the photometric loss of 1 - SSIM (3DGS).
+DSSIM = 0.2
+#: Adam learning rate of gate logits (released code of S2GS).
+GATE_LR = 0.1
+#: First iteration of densification and pruning, and iterations from one to the next: 500 and 100 in 3DGS, whose runs
+#: are fifteen times as long.
+DENSIFY_FROM, DENSIFY_EVERY = 300, 100
+#: Mean screen gradient, in half image widths, above which a Gaussian is densified: 2e-4 in 3DGS.
+DENSIFY_GRADIENT = 3e-4
 #: Share of the iterations after which nothing is densified or pruned any more.
 DENSIFY_UNTIL = 0.6
 #: Shares of the iterations after which what the images would not miss goes: when growth has ended, and once more while
@@ -19,5 +28,10 @@ PRUNE_AT = (0.6, 0.8)
 PRUNE_OPACITY, MAX_SCALE = 0.01, 0.3
 #: Weights in the loss of the mean scale, in rig extents, and of the mean opacity.
 SCALE_PENALTY, OPACITY_PENALTY = 0.1, 0.01
+#: At most one seed per so many training pixels, for points and fill seeds each: more than the images can pin down
+#: overfit the training views.
+PIXELS_PER_SEED = 64
+#: Most random seeds in the common view volume that no point covers.
+FILL_POINTS = 5_000
 #: A fill seed is seen by this many training cameras, and no nearer to one than this fraction of the rig's extent.
 FILL_MIN_VIEWS, FILL_MIN_DISTANCE = 3, 0.3

@@ -23,7 +23,6 @@ from gsstream.engine.assembly.guard import blaming
 from gsstream.engine.fit.exposure import Exposure
 from gsstream.engine.frame0.cheaper import cheaper_rows
 from gsstream.engine.frame0.first_seen import first_rows
-from gsstream.engine.frame0.how_many import most_gaussians
 from gsstream.engine.frame0.optimise import Progress, initial_gaussians, optimise_first_frame, sort_by_node
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.init.thinning import thin_points
@@ -83,7 +82,7 @@ def seeded(parts: Assembly, points: PointCloud, frame: Frame) -> Anchors:
         points: seeds of the scene.
         frame: training images of frame 0.
     """
-    most = most_gaussians(parts.recipe.first_frame, frame)
+    most = parts.recipe.first_frame.max_gaussians
     while True:
         anchors = parts.structure.seed(points, frame.cameras)
         if len(anchors.positions) <= most or len(points) == 1:

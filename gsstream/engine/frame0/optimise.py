@@ -26,7 +26,6 @@ from gsstream.engine.fit.exposure import Exposure, ExposureFit
 from gsstream.engine.fit.judge import Judge
 from gsstream.engine.fit.nearest import neighbour_distance
 from gsstream.engine.fit.row_table import RowTable
-from gsstream.engine.frame0.how_many import most_gaussians
 from gsstream.engine.frame0.probes import TrainingViews
 from gsstream.engine.frame0.removal import not_missed
 from gsstream.recipe.model import FirstFrame
@@ -130,15 +129,14 @@ class FirstFrameRun:
         generator: torch.Generator, iterations: int,
     ) -> None:  # fmt: skip
         self.parts, self.recipe, self.frame = parts, parts.recipe, frame
-        first = parts.recipe.first_frame
-        self.settings = first.model_copy(update={"max_gaussians": most_gaussians(first, frame)})
+        self.settings = parts.recipe.first_frame
         self.renderer, self.levels = parts.renderer, levels
         self.views = len(frame.cameras)
         self.extent = frame.cameras.extent
         self.iterations, self.generator = iterations, generator
         self.table = RowTable(dict(start.items()), first_rates(self.settings, self.extent), parts.optimiser)
         in_one_go = parts.checks is not Checks.STEP
-        self.judge = Judge(parts.loss, parts.recipe.loss.dssim, frame.images, None, in_one_go)
+        self.judge = Judge(parts.loss, schedule.DSSIM, frame.images, None, in_one_go)
         #: Colour maps that are fitted along; None: those of the judge stay.
         self.exposure: ExposureFit | None = None
         self.statistics = DensifyStatistics.zeros(len(start))
@@ -154,7 +152,7 @@ class FirstFrameRun:
         s = self.settings
         view, self.parts.where.iteration = self._next_view(), iteration
         last = schedule.DENSIFY_UNTIL * self.iterations
-        densify = s.densify_from <= iteration + s.densify_every and iteration <= last
+        densify = iteration + schedule.DENSIFY_EVERY >= schedule.DENSIFY_FROM and iteration <= last
         rows = self._disturbed(self.gaussians().map(torch.Tensor.detach))
         pulled = self._pull(view, rows, densify)
         fraction = iteration / self.iterations
@@ -163,7 +161,7 @@ class FirstFrameRun:
         if densify and pulled.means2d is not None:
             size = torch.tensor([self.frame.cameras.width / 2, self.frame.cameras.height / 2])
             self.statistics = self.statistics.add(pulled.means2d * size)
-            if iteration >= s.densify_from and iteration % s.densify_every == 0:
+            if iteration >= schedule.DENSIFY_FROM and iteration % schedule.DENSIFY_EVERY == 0:
                 self._densify()
         if s.prune_error > 0 and iteration in [int(share * self.iterations) for share in schedule.PRUNE_AT]:
             self._prune()

@@ -10,7 +10,7 @@ import numpy as np
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.rng import Rng
-from gsstream.engine.fit.schedule import FILL_MIN_DISTANCE, FILL_MIN_VIEWS
+from gsstream.engine.fit import schedule
 from gsstream.init.seeding import fill_volume, photo_consistent_seeds, thin_points
 from gsstream.recipe.model import FirstFrame
 from gsstream.source.base import FrameSource, PointKind
@@ -34,19 +34,15 @@ def gather_points(
     Raises InputError when the recipe asks for a kind of points that the recording does not have, or nothing is left.
     """
     pixels = frame.images[..., 0].size
-    limit = max(1, int(pixels / settings.pixels_per_seed)) if settings.pixels_per_seed else settings.max_points
-    cloud = thin_points(_base_points(shipped, frame, settings), min(settings.max_points, limit))
-    if settings.fill_points == 0:
-        if len(cloud) == 0:
-            raise InputError("no points to start from: the recording ships none; set first_frame.fill_points above 0")
-        return cloud
+    limit = min(settings.max_points, max(1, pixels // schedule.PIXELS_PER_SEED))
+    cloud = thin_points(_base_points(shipped, frame, settings), limit)
     fill = fill_volume(
         cloud,
         frame.images,
         frame.cameras,
-        min(settings.fill_points, limit),
-        min_views=FILL_MIN_VIEWS,
-        min_distance=FILL_MIN_DISTANCE * frame.cameras.extent,
+        min(schedule.FILL_POINTS, limit),
+        min_views=schedule.FILL_MIN_VIEWS,
+        min_distance=schedule.FILL_MIN_DISTANCE * frame.cameras.extent,
         rng=rng.numpy("fill", frame.index),
     )
     return join(cloud, fill)

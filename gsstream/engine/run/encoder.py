@@ -15,7 +15,6 @@ from gsstream.core.rng import Rng
 from gsstream.core.world import snapped
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.controller import Controller
-from gsstream.engine.budget.pace import CLOCKS
 from gsstream.engine.frame0.carried import in_world
 from gsstream.engine.frame0.optimise import Progress
 from gsstream.engine.frame0.points import gather_points
@@ -94,7 +93,7 @@ class Encoder:
         """
         frame.validate()
         frame = self.at_near(frame)
-        clock = CLOCKS[self.parts.recipe.budget.clock]
+        clock = time.perf_counter
         started, worked, began = time.perf_counter(), time.process_time(), clock()
         with one_torch_thread():
             step = self._begin(frame) if self.state is None else self._step(frame)

@@ -112,7 +112,7 @@ class _Run:
             _stop_on_interrupt(self.progress.say, self.source) as stop,
             # This is also the way when resuming finds no complete frame 0: the incomplete one is cut off and made
             # again.
-            StreamWriter.open(self.out / STREAM, resume=resume, last_frame=last, fsync=recipe.codec.fsync) as writer,
+            StreamWriter.open(self.out / STREAM, resume=resume, last_frame=last) as writer,
             self.progress,
             Prefetcher(self.source, indices, storage=recipe.data.images) as frames,
         ):

@@ -17,6 +17,7 @@ from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.fit.backward import pull_back
 from gsstream.engine.fit.exposure import Exposure
 from gsstream.engine.fit.judge import Judge, shown
+from gsstream.engine.fit.schedule import DSSIM
 from gsstream.engine.step.active.candidates import VoteBook, changed_rows
 from gsstream.engine.step.active.change import MOST_PIXEL_SIGMA, Change
 from gsstream.metrics.noise import noise_sigma
@@ -48,7 +49,7 @@ class FrameView:
         self._background = parts.recipe.background
         # What the level "step" looks at, images and their gradients, is not seen where a session does all in one call.
         in_one_go = parts.checks is not Checks.STEP
-        self.judge = judge or Judge(parts.loss, parts.recipe.loss.dssim, frame.images, exposure, in_one_go)
+        self.judge = judge or Judge(parts.loss, DSSIM, frame.images, exposure, in_one_go)
         self._session = session
         self._votes = votes or (None if change is None else VoteBook(change, frame.cameras))
 

@@ -17,7 +17,7 @@ from gsstream.engine.budget.pace import Allowance, Pace
 from gsstream.engine.budget.trim import Fitted
 from gsstream.engine.state.follow import follow
 from gsstream.engine.state.stream_state import Step, StreamState
-from gsstream.engine.step.active.candidates import candidates
+from gsstream.engine.step.active.candidates import CHANGE_VOTES, candidates
 from gsstream.engine.step.active.change import detect_change
 from gsstream.engine.step.clock import PhaseClock
 from gsstream.engine.step.encode import encode_frame
@@ -67,7 +67,7 @@ def frame_step(
         confidence = parts.propagation.propagate(parts.confidence.estimate(view), state.hierarchy)
         logits = parts.gate.init(confidence)
         open_probability = parts.gate.open_probability(logits)
-        able = view.changed_rows(stream.change_votes)
+        able = view.changed_rows(CHANGE_VOTES)
         rows = candidates(able, open_probability, state.hierarchy, stream.active_threshold)
     with clock.phase("optimise"):
         problem = Problem(

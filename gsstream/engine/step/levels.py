@@ -7,6 +7,9 @@ import numpy as np
 from gsstream.core.shapes import IntArray
 from gsstream.recipe.model import Stream
 
+#: Iterations of a level in multiples of those of the level before, N_{i+1} = omega N_i: the paper leaves omega open.
+OMEGA = 1.5
+
 
 def level_schedule(stream: Stream, unit_of: IntArray) -> tuple[tuple[float, int], ...]:
     """Return pairs (fraction of the frame until which, finest level that takes part) (paper, supplement).
@@ -26,7 +29,7 @@ def level_schedule(stream: Stream, unit_of: IntArray) -> tuple[tuple[float, int]
     waiting = levels[len(levels) // 2 :]
     if len(waiting) < 2:
         return ()
-    weights = [stream.progressive_omega**i for i in range(len(waiting))]
+    weights = [OMEGA**i for i in range(len(waiting))]
     ends = np.cumsum(weights) / sum(weights)
     return tuple(zip(ends.tolist(), waiting, strict=True))
 

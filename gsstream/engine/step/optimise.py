@@ -15,6 +15,7 @@ from gsstream.engine.budget.pace import Pace, estimated_bytes
 from gsstream.engine.fit.backward import pull_back
 from gsstream.engine.fit.residual_table import JointTable, lr_factor
 from gsstream.engine.fit.row_table import RowTable
+from gsstream.engine.fit.schedule import GATE_LR
 from gsstream.engine.step.active.candidates import released
 from gsstream.engine.step.dead_gates import count_dead
 from gsstream.engine.step.levels import current_level, level_schedule
@@ -90,7 +91,7 @@ class _FrameRun:
         self.code = code = joint_code(codes, latents, self.decoder_names, problem.base)
         units = torch.from_numpy(layout.units_of(rows))
         self.table = _table(parts, code, problem.base, units, code.join_decoders(self.decoder_names))
-        rates = {"logits": parts.recipe.gate_training.lr}
+        rates = {"logits": GATE_LR}
         self.gate = RowTable({"logits": problem.logits[self.nodes]}, rates, parts.optimiser)
         # Where both parts have known formulas nothing is differentiated; with the level "step" every call is looked at.
         known = parts.checks is not Checks.STEP
@@ -125,7 +126,7 @@ class _FrameRun:
                 price=self.price,
                 logits=self.gate["logits"],
                 state=self.gate.state("logits"),
-                gate_lr=self.parts.recipe.gate_training.lr,
+                gate_lr=GATE_LR,
                 node_of=self.hierarchy.node_of,
                 num_gaussians=self.problem.hierarchy.num_gaussians,
                 rate_weight=self.pace.rate_weight / self.problem.pixels,

@@ -29,7 +29,7 @@ from gsstream.source.open import open_source
 SOURCE = "synthetic:frames=3&views=3&width=64&height=48&supersample=1"
 TINY = (
     "first_frame.max_iterations=20", "first_frame.points=recording", "first_frame.max_points=400",
-    "first_frame.fill_points=0", "stream.epochs=2",
+    "stream.epochs=2",
 )  # fmt: skip
 #: What takes part in the iterations of each, beside images, residuals, gates, their price and Adam.
 CASES = {

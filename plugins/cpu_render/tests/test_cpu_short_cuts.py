@@ -18,7 +18,7 @@ from gsstream.source.open import open_source
 SOURCE = "synthetic:frames=3&views=3&width=64&height=48&supersample=1"
 SETTINGS = (
     "first_frame.max_iterations=6", "first_frame.points=recording", "first_frame.max_points=400",
-    "first_frame.fill_points=0", "stream.epochs=2", "stream.change_threshold=12",
+    "stream.epochs=2", "stream.change_threshold=12",
 )  # fmt: skip
 
 

@@ -39,7 +39,7 @@ SAME = [
 #: Tables whose rows have other epochs than the paper's budget of 20.
 OTHER_EPOCHS = {"edge-orin": 6, "fast": 10}
 TINY = [
-    "first_frame.epochs=2", "first_frame.max_iterations=20", "first_frame.fill_points=100",
+    "first_frame.epochs=2", "first_frame.max_iterations=20",
     "first_frame.max_points=600", "stream.epochs=1", "frames=2",
 ]  # fmt: skip
 CHEAP = [

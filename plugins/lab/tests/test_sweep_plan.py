@@ -24,7 +24,7 @@ def epochs(plan):
 def test_a_grid_crosses_scenes_seeds_variants_and_axes(plan_of):
     plan = plan_of(
         "name: g\nscenes: [{name: a, uri: demo}, {name: b, uri: x, frames: 3, scale: 0.5}]\nseeds: [4, 7]\n"
-        "variants: [{name: v, method: dense}, {name: w, method: dense, set: {loss.dssim: 0.5}}]\n"
+        "variants: [{name: v, method: dense}, {name: w, method: dense, set: {first_frame.lr_factor: 0.5}}]\n"
         "axes: {stream.epochs: [1, 2], near: [0.1, 0.2]}\n"
     )
     assert len(plan.points) == 2 * 2 * 2 * 4 == len(plan.cells)
@@ -32,7 +32,8 @@ def test_a_grid_crosses_scenes_seeds_variants_and_axes(plan_of):
     last = plan.points[-1]
     assert (last.scene.name, last.variant, last.seed, last.axes) == ("b", "w", 7, {"stream.epochs": 2, "near": 0.2})
     recipe = last.resolved.recipe
-    assert (recipe.seed, recipe.frames, recipe.scale, recipe.loss.dssim, recipe.near) == (7, 3, 0.5, 0.5, 0.2)
+    assert (recipe.seed, recipe.frames, recipe.scale) == (7, 3, 0.5)
+    assert (recipe.first_frame.lr_factor, recipe.near) == (0.5, 0.2)
 
 
 def test_each_changes_one_axis_at_a_time_and_shares_equal_runs(plan_of):
@@ -59,19 +60,21 @@ def test_base_seeds_repeat_the_unchanged_variant_alone(plan_of):
 
 
 def test_settings_win_in_the_documented_order(plan_of, tmp_path):
-    (tmp_path / "v.yaml").write_text("base: dense\nstream: {epochs: 2}\nnear: 0.2\nloss: {dssim: 0.2}\nseed: 99\n")
-    (tmp_path / "s.yaml").write_text("near: 0.3\nloss: {dssim: 0.3}\nfirst_frame: {exposure: true}\n")
+    ours = "base: dense\nstream: {epochs: 2}\nnear: 0.2\nfirst_frame: {lr_factor: 0.2}\nseed: 99\n"
+    (tmp_path / "v.yaml").write_text(ours)
+    (tmp_path / "s.yaml").write_text("near: 0.3\nfirst_frame: {lr_factor: 0.3, exposure: true}\n")
     text = (
-        "name: o\nscenes: [{name: a, uri: demo, recipe: s.yaml, set: {loss.dssim: 0.4, gate_training.lr: 0.4}}]\n"
-        "set: {loss.dssim: 0.35, gate_training.lr: 0.35, stream.change_votes: 0.35}\n"
-        "variants: [{name: v, recipe: v.yaml, set: {gate_training.lr: 0.5}}]\naxes: {stream.change_votes: [0.6]}\n"
+        "name: o\nscenes: [{name: a, uri: demo, recipe: s.yaml, "
+        "set: {first_frame.lr_factor: 0.4, stream.rate_weight: 0.4}}]\n"
+        "set: {first_frame.lr_factor: 0.35, stream.rate_weight: 0.35, codec.trim: 0.35}\n"
+        "variants: [{name: v, recipe: v.yaml, set: {stream.rate_weight: 0.5}}]\naxes: {codec.trim: [0.6]}\n"
     )
     recipe = plan_of(text).points[0].resolved.recipe
-    assert (recipe.stream.epochs, recipe.near, recipe.loss.dssim) == (2, 0.3, 0.4)
-    assert (recipe.gate_training.lr, recipe.stream.change_votes) == (0.5, 0.6)
+    assert (recipe.stream.epochs, recipe.near, recipe.first_frame.lr_factor) == (2, 0.3, 0.4)
+    assert (recipe.stream.rate_weight, recipe.codec.trim) == (0.5, 0.6)
     assert (recipe.seed, recipe.first_frame.exposure) == (0, True)
     origins = plan_of(text).points[0].resolved
-    assert origins.origin(("gate_training", "lr")).label == "sweep, variant v: set"
+    assert origins.origin(("stream", "rate_weight")).label == "sweep, variant v: set"
 
 
 def test_a_slot_takes_a_name_a_mapping_and_the_short_form(plan_of):
@@ -88,8 +91,8 @@ def test_frame_0_is_shared_exactly_where_it_does_not_vary(plan_of):
     variants = "[{name: v, method: dense}, {name: w, method: dense, set: KEY}]"
     text = f"name: f\n{SCENE}seeds: [0, 1]\nvariants: {variants}\n"
     for key, count in {
-        "{stream.epochs: 3}": 2, "{gate_training.lr: 0.3}": 2, "{loss.dssim: 0.1}": 4, "{structure: other}": 4,
-        "{first_frame.epochs: 3}": 4, "{near: 0.2}": 4, "{scale: 0.5}": 4,
+        "{stream.epochs: 3}": 2, "{stream.rate_weight: 0.3}": 2, "{first_frame.lr_factor: 0.1}": 4,
+        "{structure: other}": 4, "{first_frame.epochs: 3}": 4, "{near: 0.2}": 4, "{scale: 0.5}": 4,
     }.items():  # fmt: skip
         plan = plan_of(text.replace("KEY", key))
         assert len(plan.firsts) == count, key
@@ -169,7 +172,7 @@ name: other
 variants:
   - name: a
     recipe: recipes/one.yaml
-    set: {{stream: {{epochs: 3, change_threshold: 4}}, loss.dssim: 0.5, gate: {{name: always-open}}}}
+    set: {{stream: {{epochs: 3, change_threshold: 4}}, first_frame.lr_factor: 0.5, gate: {{name: always-open}}}}
   - {{name: b, base: other.yaml#a}}
   - {{name: d, base: more.yaml}}
   - {{name: c, method: dense, axes: {{near: [1, 2]}}}}
@@ -188,15 +191,16 @@ def based(folder, plan_of, variant: str):
 def test_a_variant_starts_from_one_of_another_file(tmp_path, plan_of):
     plan = based(tmp_path, plan_of, "name: a, base: tables/other.yaml")
     recipe = plan.points[0].resolved.recipe
-    assert (recipe.stream.epochs, recipe.stream.change_threshold, recipe.loss.dssim) == (3, 4, 0.5)
+    assert (recipe.stream.epochs, recipe.stream.change_threshold, recipe.first_frame.lr_factor) == (3, 4, 0.5)
     assert (recipe.first_frame.max_points, recipe.near) == (77, 0.01), "its recipe file, not what its file sets for all"
     assert plan.config.variants[0].base is None
     for base in ("other.yaml#a", "more.yaml#b"):
         renamed = based(tmp_path, plan_of, f"name: v, base: tables/{base}")
         assert renamed.points[0].id == plan.points[0].id
-    changed = based(tmp_path, plan_of, "name: a, base: tables/other.yaml, set: {stream.epochs: 5, loss: {dssim: 0.1}}")
+    settings = "{stream.epochs: 5, first_frame: {lr_factor: 0.1}}"
+    changed = based(tmp_path, plan_of, f"name: a, base: tables/other.yaml, set: {settings}")
     recipe = changed.points[0].resolved.recipe
-    assert (recipe.stream.epochs, recipe.stream.change_threshold, recipe.loss.dssim) == (5, 4, 0.1)
+    assert (recipe.stream.epochs, recipe.stream.change_threshold, recipe.first_frame.lr_factor) == (5, 4, 0.1)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ needs_ray = pytest.mark.skipif(not HAVE_RAY, reason="needs Ray (extra: ray)")
 REAL = """
 name: real
 scenes: [{name: world, uri: "synthetic:frames=3&views=3&width=64&height=48&supersample=1", frames: 2}]
-set: {first_frame: {max_iterations: 5, fill_points: 50, max_points: 200}}
+set: {first_frame: {max_iterations: 5, max_points: 200}}
 variants: [{name: dense, method: dense}]
 axes: {stream.epochs: [1, 2]}
 """

@@ -20,7 +20,7 @@ from gsstream.player.playback import Playback
 
 SOURCE = "synthetic:frames=5&views=3&width=64&height=48&supersample=1"
 SETTINGS = {
-    "first_frame.max_iterations": 40, "first_frame.fill_points": 100, "first_frame.max_points": 500, "stream.epochs": 3,
+    "first_frame.max_iterations": 40, "first_frame.max_points": 500, "stream.epochs": 3,
     "stepper.births.every": 1, "stepper.births.gradient": 1e-4, "stepper.births.most": 30,
     "stepper.change.dynamic": 1e-7,
 }  # fmt: skip
@@ -157,7 +157,7 @@ def test_gates_close_where_they_cost(tmp_path: Path) -> None:
     [
         ("stepper.sh0.latnt=3", "unknown key 'stepper.params.sh0.latnt'; did you mean 'latent'?"),
         ("stepper.gate.gamma=0.5", "stepper.params.gate.gamma: input should be less than 0, got 0.5"),
-        ("gate_training.lr=0.5", "gate_training.lr: the stepper 'queen' does not read it"),
+        ("stream.rate_weight=0.5", "stream.rate_weight: the stepper 'queen' does not read it"),
     ],
 )
 def test_wrong_settings_are_refused(

@@ -20,6 +20,9 @@ from gsstream.core.shapes import IntArray
 from gsstream.engine.step.active.change import Change, detect_change
 from gsstream.render.base import RenderSession
 
+#: Least share of the views a Gaussian projects into in which it must lie in or beside changed tiles.
+CHANGE_VOTES = 0.75
+
 
 def candidates(
     changed: torch.Tensor, open_probability: torch.Tensor, hierarchy: Hierarchy, threshold: float

@@ -127,8 +127,7 @@ def trial_of(name: str, row: Mapping[str, Any], budget: Budget) -> Trial:
         return Trial(name, error=str(row.get("error", "it was not run")))
     later = [frame for frame in row["frames"] if frame["frame"] > 0]
     sizes = tuple(sum(frame["bytes"].values()) for frame in later)
-    wall = budget.clock == "wall"
-    seconds = tuple(float(sum(f["seconds"].values()) if wall else f["cpu_seconds"]) for f in later)
+    seconds = tuple(float(sum(f["seconds"].values())) for f in later)
     memory = [1e6 * frame["peak_memory_mb"] for frame in later]
     limits = (budget.size or math.inf, budget.time or math.inf, budget.memory or math.inf)
     costs = zip(sizes, seconds, memory, strict=True)

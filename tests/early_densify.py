@@ -1,0 +1,20 @@
+"""Densification that begins early, for fits of few iterations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from gsstream.engine.fit import schedule
+
+
+@contextmanager
+def densifying(begin: int, every: int, gradient: float = schedule.DENSIFY_GRADIENT) -> Iterator[None]:
+    """In this process Gaussians are born from this iteration of frame 0 on, once in so many."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(schedule, "DENSIFY_FROM", begin)
+        patch.setattr(schedule, "DENSIFY_EVERY", every)
+        patch.setattr(schedule, "DENSIFY_GRADIENT", gradient)
+        yield

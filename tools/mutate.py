@@ -66,7 +66,7 @@ def files_asked(root: Path, change: Change) -> list[str]:
         text = path.read_text(encoding="utf-8")
         named, slow = naming.search(text) is not None, f'/{path.stem}"' in long
         place = 0 if path.is_relative_to(own) else 2 if path.is_relative_to(flow) else 1
-        if place != 1 or (named and not slow):
+        if place != 1 or (named and not slow and path.parent.name != "web"):  # browsers cost more than they see
             ranks.append((place, slow, not named, len(text), path.relative_to(root).as_posix()))
     return [path for *_, path in sorted(ranks)]
 

@@ -18,8 +18,9 @@ from gsstream.core.shapes import FloatArray, IntArray
 #: at most 2^7 products, so its sums stay below 2^(26 + 18 + 7), which float64 holds exactly.
 ENTRY_BITS, ENTRY_RANGE = 20, 26
 WEIGHT_BITS, WEIGHT_RANGE = 14, 18
-MAX_INPUTS = 128
 MAX_LEVELS, MAX_FEATURES, MAX_LAYERS, MAX_BASE, MAX_CELLS = 16, 8, 4, 1024, 1 << 20
+#: Of a layer: no more than all levels together have features.
+MAX_INPUTS = MAX_LEVELS * MAX_FEATURES
 #: Entries of all levels together, at most.
 MAX_ENTRIES = 1 << 20
 #: What a network says of a place: a shift, and a quaternion less (1, 0, 0, 0).
@@ -82,8 +83,6 @@ class FieldShape:
             return f"growth: expected a float32 from 1 to 4, got {self.growth!r}"
         if self.levels << self.entries > MAX_ENTRIES:
             return f"entries: expected at most {MAX_ENTRIES} in all levels, got {self.levels << self.entries}"
-        if self.levels * self.features > MAX_INPUTS:
-            return f"features: expected at most {MAX_INPUTS} in all levels, got {self.levels * self.features}"
         if self.cells[-1] > MAX_CELLS:
             return f"growth: expected at most {MAX_CELLS} cells along an axis, got {self.cells[-1]}"
         return None

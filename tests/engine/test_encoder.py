@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -28,7 +30,7 @@ from gsstream.play import Playback
 WORLD = "synthetic:frames=6&views=3&width=32&height=24&supersample=1"
 TINY: Mapping[str, Any] = {
     "first_frame.max_iterations": 40, "first_frame.points": "recording", "first_frame.max_points": 250,
-    "first_frame.max_gaussians": 400, "stream.epochs": 1,
+    "stream.epochs": 1,
     # Images this small and this far off would not miss most of what the cases need.
     "first_frame.prune_error": 0,
 }  # fmt: skip
@@ -53,8 +55,18 @@ CASES: Mapping[str, Mapping[str, Any]] = {
 
 @pytest.fixture(autouse=True, scope="module")
 def growth(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """The refinement has few iterations: they, too, add Gaussians."""
-    with growth_installed(tmp_path_factory.mktemp("growth")), densifying(5, 4):
+    with growth_installed(tmp_path_factory.mktemp("growth")):
+        yield
+
+
+def early(case: str) -> AbstractContextManager[None]:
+    """A refinement has few iterations: in its cases Gaussians are added early."""
+    return densifying(5, 4) if "refined" in case else nullcontext()
+
+
+@pytest.fixture(autouse=True)
+def early_in_its_case(request: pytest.FixtureRequest) -> Iterator[None]:
+    with early(getattr(request.node, "callspec", SimpleNamespace(params={})).params.get("case", "")):
         yield
 
 
@@ -73,7 +85,8 @@ def encoder(case: str = "still", listeners: Listeners | None = None) -> Encoder:
 def whole(case: str) -> tuple[Step[Any], ...]:
     """The steps of an undisturbed encoder."""
     made = encoder(case)
-    return tuple(made.encode(frame) for frame in frames())
+    with early(case):
+        return tuple(made.encode(frame) for frame in frames())
 
 
 def packets(steps: tuple[Step[Any], ...] | list[Step[Any]]) -> list[bytes]:

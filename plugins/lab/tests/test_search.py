@@ -51,7 +51,7 @@ def test_what_fails_is_passed_over_and_nothing_but_failures_is_an_error() -> Non
 def test_the_better_setting_is_written_and_test_cameras_have_no_say(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    sets = ("structure.resolution=1024", "first_frame.max_points=200", "first_frame.fill_points=50")
+    sets = ("structure.resolution=1024", "first_frame.max_points=200")
     command = ["search", "--source", TINY_WORLD, "--method", "dense", "--out", str(tmp_path), "--workers", "1",
                "--try", "first_frame.max_iterations=0,40", *(word for s in sets for word in ("--set", s))]  # fmt: skip
     assert run_command(command) == 0

@@ -15,7 +15,7 @@ from gsstream.plugins.catalog import load_catalog
 @pytest.fixture
 def plan_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Plan]:
     """Text of a sweep's file -> plan, with the built-in methods alone."""
-    monkeypatch.setenv("GSSTREAM_LOAD_PLUGINS", "")
+    monkeypatch.setenv("GSSTREAM_LOAD_PLUGINS", "lab")
     catalog = load_catalog()
 
     def make(text: str) -> Plan:

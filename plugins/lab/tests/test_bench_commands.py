@@ -32,7 +32,7 @@ def measured(path: Path, *args: str) -> dict[str, Any]:
 def test_render_without_compiled_renderers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("GSSTREAM_LOAD_PLUGINS", "")
+    monkeypatch.setenv("GSSTREAM_LOAD_PLUGINS", "lab")
     data = measured(tmp_path / "r.json", "render", "--renderers", "reference,missing", "--threads", "1")
     assert data["schema"] == "gsstream-bench-render-1"
     assert [case["renderer"] for case in data["cases"]] == ["reference"]

@@ -119,7 +119,7 @@ def start_hanging(tmp_path: Path) -> tuple[subprocess.Popen[str], list[int]]:
     config.write_text(TWO_SEEDS + "first_frame: {share: own}\n")
     process = subprocess.Popen(
         [sys.executable, sweep_works.__file__, str(config), str(tmp_path / "out")], text=True, stderr=subprocess.PIPE,
-        env={**os.environ, "SWEEP_TEST_MARKS": str(marks), "GSSTREAM_LOAD_PLUGINS": ""},
+        env={**os.environ, "SWEEP_TEST_MARKS": str(marks), "GSSTREAM_LOAD_PLUGINS": "lab"},
         # A job in the background of a shell ignores Ctrl-C, and so would every process that its tests start.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip

@@ -92,7 +92,7 @@ def _check_cells(table, out: Path) -> None:
 
 
 def test_a_dry_run_shows_the_plan_and_writes_nothing(tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("GSSTREAM_LOAD_PLUGINS", "")
+    monkeypatch.setenv("GSSTREAM_LOAD_PLUGINS", "lab")
     config, out = tmp_path / "sweep.yaml", tmp_path / "out"
     config.write_text(SWEEP)
     assert run_command(["sweep", str(config), "--out", str(out), "--dry-run"]) == 0

@@ -30,7 +30,7 @@ measure: {fps: true}
 def start(config: Path, out: Path) -> subprocess.Popen[str]:
     code = "from gsstream.cli.main import main; main()"
     command = [sys.executable, "-c", code, "sweep", str(config), "--out", str(out), "--workers", "1"]
-    environment = {**os.environ, "GSSTREAM_LOAD_PLUGINS": "gsstream-cpu-render"}
+    environment = {**os.environ, "GSSTREAM_LOAD_PLUGINS": "gsstream-cpu-render,lab"}
     return subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment)
 
 

@@ -70,7 +70,7 @@ def test_a_seed_draws_one_change_of_each_of_some_lines(root: Path) -> None:
 def test_tests_that_name_the_module_come_first_and_whole_runs_last(root: Path) -> None:
     change = changes_of(root, ["gsstream"])[0]
     assert files_asked(root, change) == [
-        "tests/shapes/test_boxes.py", "tests/shapes/test_a_small_one.py", "tests/points/test_points.py",
+        "tests/points/test_points.py", "tests/shapes/test_boxes.py", "tests/shapes/test_a_small_one.py",
         "tests/flow/test_all.py",
     ]  # fmt: skip
 

@@ -30,6 +30,7 @@ import torch
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly, assemble
+from gsstream.engine.budget.schedule import Schedule
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.run.measure import HeldOut
@@ -38,11 +39,12 @@ from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step import frame_step
 from gsstream.engine.step.optimise import optimise
 from gsstream.engine.step.problem import Problem, Solution
+from gsstream.optimiser.joint import JointChange, add_joint, join_features
 from gsstream.packet import PlayerState, decode_packet
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe
-from gsstream.residual.joint import JointChange, add_joint, join_features, joint_code
+from gsstream.residual.joint import joint_code
 from gsstream.source.base import FrameSource, Split
 from tools.drift import Drift, there_and_back
 
@@ -89,9 +91,9 @@ class Trainer:
         """Say which scene the next frame's residual is added to."""
         self._scene, self.trained = scene, scene
 
-    def optimise(self, parts: Assembly, problem: Problem, generator: torch.Generator) -> Solution:
+    def optimise(self, parts: Assembly, problem: Problem, schedule: Schedule) -> Solution:
         """Optimise as the engine does, and note the scene with the gates that it found and unrounded residuals."""
-        solution = self._optimise(replace(parts, update=self._fine) if self._fine else parts, problem, generator)
+        solution = self._optimise(replace(parts, update=self._fine) if self._fine else parts, problem, schedule)
         if solution.latents and self._scene is not None:
             self.trained = _with_residual(self._scene, parts, problem, solution)
         return solution

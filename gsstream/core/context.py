@@ -1,8 +1,8 @@
-"""What a part may see of a frame (FrameContext), and what it may do with it (FrameWork)."""
+"""What a part may see of a frame."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from gsstream.core.hierarchy import Hierarchy
 
@@ -10,9 +10,7 @@ if TYPE_CHECKING:
     import torch
 
     from gsstream.core.cameras import Cameras
-    from gsstream.core.changes.motion import Moves
     from gsstream.core.gaussians import Gaussians
-    from gsstream.core.shapes import FloatArray
 
 
 class ScreenGradient(NamedTuple):
@@ -23,21 +21,6 @@ class ScreenGradient(NamedTuple):
 
     gradient: torch.Tensor
     visible: torch.Tensor
-
-
-class MovedPull(NamedTuple):
-    """What a view says of groups of rows that moved.
-
-    Arguments:
-        loss: of the view.
-        slope: [K, 6] its gradient by shift [per scene unit] and turn [per tan(angle / 2)] of the groups.
-        curvature: [K, 6, 6] how fast that gradient grows where a group moves on, a symmetric block for each; None where
-            nobody asked for it. See ``gsstream.motion.curvature``.
-    """
-
-    loss: float
-    slope: FloatArray
-    curvature: FloatArray | None = None
 
 
 class RowGradient(NamedTuple):
@@ -82,74 +65,3 @@ class FrameContext(Protocol):
 
     def noise_sigma(self, view: int) -> float:
         """Return the robust standard deviation of a camera's noise between two frames, in [0, 1] image units."""
-
-
-class FrameWork(FrameContext, Protocol):
-    """A frame that a part works on: it renders with some rows moving, and is told how well that explains the images.
-
-    Colour maps of the cameras are applied and pulled through where they belong; a part need not know them.
-    """
-
-    @property
-    def effort(self) -> float:
-        """Share of the usual passes that the frame is worth, above 0 to 1: less where a run is behind its recording."""
-
-    @property
-    def optimiser(self) -> Any:
-        """The optimiser of the run (``gsstream.api.RowOptimiser``), for rows that a part fits on its own."""
-
-    def changed_rows(self, least_votes: float) -> torch.Tensor:
-        """Return [N] bool: Gaussians that are seen in a tile that changed.
-
-        Arguments:
-            least_votes: least share, 0 to 1, of the views a Gaussian projects into in which it must lie in or beside a
-                changed tile. Where change is not detected, all Gaussians count.
-        """
-
-    def narrow(self, rows: torch.Tensor) -> None:
-        """Freeze all rows but [A] int64, ascending: from now on only these move."""
-
-    def pull(self, view: int, rows: Gaussians[torch.Tensor], near_change: bool = False) -> float:
-        """Render a view with these values of the rows that move, and compare it with what its camera recorded.
-
-        Arguments:
-            view: index of a training camera.
-            rows: the A rows of :meth:`narrow`, or all N; tensors with a graph get the gradient of the loss.
-            near_change: leave out the tiles that did not change and lie beside none that did.
-
-        Returns:
-            (1 - w) L1 + w (1 - SSIM), on the tiles that the rows can change.
-        """
-
-    def pull_moved(
-        self, view: int, rows: Gaussians[FloatArray], moves: Moves, near_change: bool = False, curved: bool = False
-    ) -> MovedPull | None:
-        """Return loss and gradient by shift and turn of groups, if the renderer has a call for it.
-
-        None where it has none; ``gsstream.blocks.slope_of`` asks this first and gives the gradient in any case.
-
-        Arguments:
-            view: index of a training camera.
-            rows: the A rows of :meth:`narrow` before they move.
-            moves: of these rows, which it counts from 0 to A - 1.
-            near_change: as for :meth:`pull`.
-            curved: return the curvature, too.
-        """
-
-    def structure(self, view: int, rows: Gaussians[torch.Tensor], near_change: bool = False) -> FloatArray:
-        """Return [A, 3]: how firmly the picture holds each row where it is.
-
-        Sums over the pixels of a view: the share that a row has of a pixel's light, times the structure tensor (xx, xy,
-        yy, per pixel^2) of the render there, each value weighed by 1 / (its distance from what the camera recorded).
-
-        Arguments:
-            view: index of a training camera.
-            rows: the A rows of :meth:`narrow`.
-            near_change: as for :meth:`pull`.
-        """
-
-    def shown(self, gaussians: Gaussians[torch.Tensor], view: int) -> torch.Tensor:
-        """Return [H, W, 3]: a scene as the camera of this view would record it, without a graph."""
-
-    def on(self, gaussians: Gaussians[torch.Tensor]) -> FrameWork:
-        """Return the same frame, to be worked on from another scene."""

@@ -6,7 +6,7 @@ from abc import ABC
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar, cast
 
 from pydantic import BaseModel, ConfigDict
 
@@ -25,6 +25,7 @@ class Traits:
     """
 
 
+T = TypeVar("T")
 ConfigT = TypeVar("ConfigT", bound=PartConfig)
 ConfigT_co = TypeVar("ConfigT_co", covariant=True)
 
@@ -85,3 +86,11 @@ class Part(ABC):  # noqa: B024 - each kind adds what is abstract
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (type(self), (self.config,))
+
+
+def unwrapped(part: T) -> T:
+    """Return a part, or what one has opened, without the guard that the engine may have put around it.
+
+    For a part that does something faster with another one of its own distribution, which it has to recognise.
+    """
+    return cast("T", getattr(part, "__wrapped__", part))

@@ -7,7 +7,7 @@ from typing import final
 
 import torch
 
-from gsstream.gate.base import GateSampler, RoundedSigmoid
+from gsstream.gate.base import AnalyticGate, GateSampler
 
 #: Logits that a sigmoid of float32 takes for infinity.
 FAR = 100.0
@@ -38,6 +38,6 @@ class AlwaysOpen(GateSampler):
     def bound(self, logits: torch.Tensor) -> torch.Tensor:
         return logits
 
-    def law(self) -> RoundedSigmoid:
+    def form(self) -> AnalyticGate:
         """Return a sigmoid so far up that it is 1 for every logit."""
-        return RoundedSigmoid(temperature=1.0, levels=1, margin=-FAR, bound=math.inf, shift=FAR)
+        return AnalyticGate(temperature=1.0, levels=1, open_logit=-FAR, bound=math.inf, logit_offset=FAR)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, final
 
 import torch
 
@@ -26,27 +26,28 @@ class GateTraits(Traits):
     temperature: bool = False
 
 
+@final
 @dataclass(frozen=True, slots=True)
-class RoundedSigmoid:
-    """A gate without noise whose formulas are known: a sigmoid rounded to levels, straight-through.
+class AnalyticGate:
+    """Closed form of a gate without noise: a sigmoid rounded to levels, straight-through.
 
     Arguments:
-        temperature: the soft gate is sigmoid(logit / temperature + shift).
+        temperature: the soft gate is sigmoid(logit / temperature + logit_offset).
         levels: non-zero values that it is rounded to; its gradient is that of the soft gate.
-        margin: logit at which a gate is open with probability one half; the probability is sigmoid(logit - margin).
+        open_logit: logit at which a gate is open with probability one half; it is sigmoid(logit - open_logit).
         bound: logits are kept within -bound to bound; infinity: they are not.
-        shift: 100 makes a gate that is always open, whatever its logit, and has no slope.
+        logit_offset: 100 makes a gate that is always open, whatever its logit, and has no slope.
     """
 
     temperature: float
     levels: int
-    margin: float
+    open_logit: float
     bound: float
-    shift: float = 0.0
+    logit_offset: float = 0.0
 
     def gates(self, logits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the gates [M] of logits [M], and their derivatives."""
-        x = logits / self.temperature + self.shift
+        x = logits / self.temperature + self.logit_offset
         soft = torch.sigmoid(x)
         # Divided by a tensor, as the decoder divides: a product with 1 / levels would be another number.
         levels = soft.new_tensor(float(self.levels))
@@ -54,9 +55,15 @@ class RoundedSigmoid:
 
     def probability(self, logits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the probabilities [M] that gates are open, and their derivatives by the logits [M]."""
-        x = logits - self.margin
+        x = logits - self.open_logit
         open_probability = torch.sigmoid(x)
         return open_probability, open_probability * torch.sigmoid(-x)
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class SampledGate:
+    """A gate that is sampled by calls of the part alone."""
 
 
 class GateSampler(Part):
@@ -105,9 +112,9 @@ class GateSampler(Part):
         """Return the logits projected into the bounds that the part keeps them in; say in its settings which they are.
         """
 
-    def law(self) -> RoundedSigmoid | None:
-        """Return the formulas of this gate as it is configured, where they are those of :class:`RoundedSigmoid`.
+    def form(self) -> AnalyticGate | SampledGate:
+        """Return the closed form of this gate as it is configured, where it is that of :class:`AnalyticGate`.
 
-        The engine then uses them in its inner loop and differentiates nothing; None: it calls the part.
+        A compiled optimiser may use it in its inner loop instead of calling the part.
         """
-        return None
+        return SampledGate()

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 
 from gsstream.core.changes import Rows, Scene, own_nodes
-from gsstream.core.context import FrameWork
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import IntArray
 from gsstream.growth.fitting import fitted_births, joined
+from gsstream.render.work import FrameWork
 
 #: (frame as a scene shows it, rows [P] that are pulled, the largest first) -> those that may be copied, in that order.
 Admitted = Callable[[FrameWork, torch.Tensor], torch.Tensor]

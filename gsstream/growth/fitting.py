@@ -8,10 +8,11 @@ from typing import TypeVar, cast
 import numpy as np
 import torch
 
-from gsstream.core.context import FrameWork
-from gsstream.core.gaussians import ATTRIBUTES, Gaussians
+from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
+from gsstream.render.work import FrameWork
+from gsstream.render.wrt import WrtRows
 
 Array = TypeVar("Array", torch.Tensor, FloatArray)
 #: Learning rates: those of 3DGS at the start of training; positions in standard deviations of each Gaussian.
@@ -52,14 +53,11 @@ def fitted_births(
     for _ in range(epochs):
         for place in order.permutation(len(views)):
             step += 1
-            leaves = Gaussians(**{name: values[name].detach().requires_grad_() for name in ATTRIBUTES})
-            inner.pull(views[place], leaves)
-            for name, leaf in leaves.items():
-                if leaf.grad is None:
-                    continue
-                first[name] = BETAS[0] * first[name] + (1 - BETAS[0]) * leaf.grad
-                second[name] = BETAS[1] * second[name] + (1 - BETAS[1]) * leaf.grad.square()
+            found = inner.loss_and_grad(views[place], WrtRows(Gaussians(**values)))
+            for name, grad in found.grad.items():
+                first[name] = BETAS[0] * first[name] + (1 - BETAS[0]) * grad
+                second[name] = BETAS[1] * second[name] + (1 - BETAS[1]) * grad.square()
                 way = first[name] / (1 - BETAS[0] ** step)
                 way = way / ((second[name] / (1 - BETAS[1] ** step)).sqrt() + EPSILON)
                 values[name] = values[name] - RATES[name] * (way * size if name == "means" else way)
-    return Gaussians(**{name: values[name].detach() for name in ATTRIBUTES})
+    return Gaussians(**values)

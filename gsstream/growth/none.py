@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import ClassVar, final
 
 from gsstream.core.changes import Rows, Scene
-from gsstream.core.context import FrameWork
 from gsstream.core.rng import Rng
 from gsstream.growth.base import Growth
+from gsstream.render.work import FrameWork
 
 
 @final

@@ -20,8 +20,8 @@ class Loss(Part):
     @abstractmethod
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
-    ) -> tuple[float, torch.Tensor]:
-        """Return the loss of ``image`` [H, W, 3] and its gradient [H, W, 3].
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the loss of ``image`` [H, W, 3] as a tensor [], on the CPU float64, and its gradient [H, W, 3].
 
         Arguments:
             image: [H, W, 3] rendered.

@@ -29,7 +29,7 @@ class ReferenceLoss(Loss):
 
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
-    ) -> tuple[float, torch.Tensor]:
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         leaf = image.detach().requires_grad_()
         with torch.enable_grad():
             weight = _pixel_weight(image, None if tile_mask is None else _with_neighbours(tile_mask))
@@ -40,7 +40,7 @@ class ReferenceLoss(Loss):
         if not math.isfinite(float(value.detach())):
             # A NaN pixel, or an image so large that its square overflows.
             raise ShapeError("image: expected finite values of ordinary size, got a loss that is not finite")
-        return float(value.detach()), gradient if tile_mask is None else gradient * _pixel_weight(image, tile_mask)
+        return value.detach().double(), gradient if tile_mask is None else gradient * _pixel_weight(image, tile_mask)
 
 
 def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING, Any, Protocol
 import torch
 
 from gsstream.core.changes import Layout
-from gsstream.core.context import FrameWork
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
 from gsstream.packet import PlayerState, StreamMeta
+from gsstream.render.work import FrameWork
 
 if TYPE_CHECKING:
     from gsstream.core.frame import Frame
     from gsstream.core.rng import Rng
     from gsstream.render.base import Renderer, RenderSession
+    from gsstream.render.target import ViewTarget
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class FrameTools(FrameWork, Protocol):
 
     @property
     def session(self) -> RenderSession:
-        """Opened on the scene of the frame before: ``narrow`` to the rows that may change, then ``render`` them."""
+        """Opened on the scene of the frame before; ``narrow`` it to the rows that may change."""
 
     def on(self, gaussians: Gaussians[torch.Tensor]) -> FrameTools:
         """Return the same frame, to be worked on from another scene, which gets a session of its own.
@@ -50,16 +51,13 @@ class FrameTools(FrameWork, Protocol):
         A session holds a render for every camera that was asked for, as long as something holds it.
         """
 
-    def backward(self, view: int, image: torch.Tensor, tile_mask: torch.Tensor | None = None) -> float:
-        """Judge a rendered view against what its camera recorded, and pull the loss back into its graph.
+    def view_target(self, view: int, tile_weights: torch.Tensor | None = None) -> ViewTarget:
+        """Return what renders of a view are compared with, for ``loss_and_grad`` of a session.
 
         Arguments:
             view: index of a training camera.
-            image: [H, W, 3] rendered, with a graph.
-            tile_mask: [ceil(H / 16), ceil(W / 16)] bool, tiles that count; None: all.
-
-        Returns:
-            The loss, (1 - w) L1 + w (1 - SSIM).
+            tile_weights: [ceil(H / 16), ceil(W / 16)] float32 factors on the gradients of tiles; a tile of 0 is left
+                out. None: all count once.
         """
 
 

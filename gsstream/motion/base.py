@@ -5,9 +5,9 @@ from __future__ import annotations
 from abc import abstractmethod
 
 from gsstream.core.changes import Motion, Scene
-from gsstream.core.context import FrameWork
 from gsstream.core.part import Part
 from gsstream.core.rng import Rng
+from gsstream.render.work import FrameWork
 
 
 class MotionPart(Part):

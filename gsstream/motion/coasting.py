@@ -9,12 +9,12 @@ from pydantic import Field
 
 from gsstream.core.changes import Motion, Scene
 from gsstream.core.changes.motion import moves_of
-from gsstream.core.context import FrameWork
 from gsstream.core.part import PartConfig
 from gsstream.core.rng import Rng
 from gsstream.motion.base import MotionPart
 from gsstream.motion.groups import changed_groups, displaced_groups, known_groups
 from gsstream.motion.switch import gains, some_views
+from gsstream.render.work import FrameWork
 
 
 @final

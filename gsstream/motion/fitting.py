@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Literal
 
 import numpy as np
 import torch
 
 from gsstream.core.changes import Scene
 from gsstream.core.changes.motion import Moves
-from gsstream.core.context import FrameWork
 from gsstream.core.shapes import FloatArray
-from gsstream.motion.pull_back import slope_of
+from gsstream.render.work import FrameWork
+from gsstream.render.wrt import WrtTransforms
 
 BETAS, EPSILON = (0.9, 0.99), 1e-12
 #: Squared slopes [K, 6] -> by what every number's slope is measured, squared.
@@ -41,7 +42,7 @@ class Descent:
 
 def fitted_moves(
     scene: Scene, work: FrameWork, start: Moves, unit: FloatArray, rates: Sequence[float], order: np.random.Generator,
-    measure: Measure, pull: float = 0.0, near_change: bool = False,
+    measure: Measure, pull: float = 0.0, tiles: Literal["all", "changed"] = "all",
 ) -> FloatArray:  # fmt: skip
     """Return the shifts and turns [K, 6] of groups that explain the images best.
 
@@ -54,11 +55,11 @@ def fitted_moves(
         order: draws the order of the views, anew for each pass.
         measure: what the steps of each number are divided by, squared.
         pull: weight of the mean absolute value of all numbers, in units, beside the photometric loss.
-        near_change: compare only in tiles that changed and in those beside them.
+        tiles: "changed" compares only in tiles that changed and in those beside them.
     """
     views = len(work.cameras)
     work.narrow(torch.from_numpy(start.rows))
-    base = scene.gaussians.rows(start.rows)
+    base = scene.gaussians.rows(start.rows).map(torch.from_numpy)
     local = start._replace(rows=np.arange(len(start.rows)))
     descent = Descent(np.concatenate([start.shift, start.turn], 1) / unit, measure)
     for step, rate in enumerate(rates):
@@ -66,7 +67,8 @@ def fitted_moves(
             sequence = order.permutation(views)
         values = descent.values
         moves = local._replace(shift=values[:, :3] * unit[:3], turn=values[:, 3:] * unit[3:])
-        slope = slope_of(work, int(sequence[step % views]), base, moves, near_change) * unit
+        found = work.loss_and_grad(int(sequence[step % views]), WrtTransforms(base, moves), tiles)
+        slope = found.grad.numpy() * unit
         if pull:
             slope = slope + pull * np.sign(values) / values.size
         descent.step(slope, rate)

@@ -6,9 +6,9 @@ import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.changes import Groups, Scene, groups_for
-from gsstream.core.context import FrameWork
 from gsstream.core.median import median
 from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.render.work import FrameWork
 
 
 def pixel_size(means: FloatArray, cameras: Cameras) -> float:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 
 from gsstream.core.changes import Scene
 from gsstream.core.changes.motion import Moves
-from gsstream.core.context import FrameWork
 from gsstream.core.shapes import FloatArray
-from gsstream.motion.pull_back import curved_slope_of, slope_of
+from gsstream.render.work import FrameWork
+from gsstream.render.wrt import WrtTransforms
 
 
 class Damping(NamedTuple):
@@ -64,7 +64,7 @@ class NewtonDescent:
 
 def newton_moves(
     scene: Scene, work: FrameWork, start: Moves, unit: FloatArray, iterations: int, order: np.random.Generator,
-    damping: Damping, near_change: bool = False,
+    damping: Damping, tiles: Literal["all", "changed"] = "all",
 ) -> FloatArray:  # fmt: skip
     """Return the shifts and turns [K, 6] of groups that explain the images best.
 
@@ -76,11 +76,11 @@ def newton_moves(
         iterations: views that are looked at; the curvature is measured in the first pass over them.
         order: draws the order of the views, anew for each pass.
         damping: of the steps.
-        near_change: compare only in tiles that changed and in those beside them.
+        tiles: "changed" compares only in tiles that changed and in those beside them.
     """
     views, values = len(work.cameras), 3 * work.cameras.height * work.cameras.width
     work.narrow(torch.from_numpy(start.rows))
-    base = scene.gaussians.rows(start.rows)
+    base = scene.gaussians.rows(start.rows).map(torch.from_numpy)
     local = start._replace(rows=np.arange(len(start.rows)))
     descent = NewtonDescent(np.concatenate([start.shift, start.turn], 1) / unit, damping)
     for step in range(iterations):
@@ -88,9 +88,7 @@ def newton_moves(
             sequence = order.permutation(views)
         now, view = descent.values * unit, int(sequence[step % views])
         moves = local._replace(shift=now[:, :3], turn=now[:, 3:])
-        if step < views:
-            slope, curvature = curved_slope_of(work, view, base, moves, near_change)
-            descent.step(slope * unit * values, curvature * np.outer(unit, unit) * values)
-        else:
-            descent.step(slope_of(work, view, base, moves, near_change) * unit * values)
+        found = work.loss_and_grad(view, WrtTransforms(base, moves, curvature=step < views), tiles)
+        curvature = None if found.curvature is None else found.curvature.numpy() * np.outer(unit, unit) * values
+        descent.step(found.grad.numpy() * unit * values, curvature)
     return np.asarray(descent.values * unit)

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, NamedTuple, final
+from typing import ClassVar, Literal, NamedTuple, final
 
 import numpy as np
 from pydantic import Field
 
 from gsstream.core.changes import Motion, Scene
 from gsstream.core.changes.motion import Moves, moves_of
-from gsstream.core.context import FrameWork
 from gsstream.core.part import PartConfig
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.motion.base import MotionPart
 from gsstream.motion.groups import changed_groups, known_groups
 from gsstream.motion.newton import Damping, newton_moves
+from gsstream.render.work import FrameWork
 
 
 class Units(NamedTuple):
@@ -93,5 +93,6 @@ class Rigid(MotionPart):
         config = self.config
         total = max(1, round(config.epochs * len(work.cameras) * work.effort))
         damping = Damping(config.damping, config.hold, config.longest)
-        order, near = rng.numpy("motion", work.index), not config.everywhere
-        return newton_moves(scene, work, start, units.row, total, order, damping, near)
+        order = rng.numpy("motion", work.index)
+        tiles: Literal["all", "changed"] = "all" if config.everywhere else "changed"
+        return newton_moves(scene, work, start, units.row, total, order, damping, tiles)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import ClassVar, final
 
 from gsstream.core.changes import Motion, Scene
-from gsstream.core.context import FrameWork
 from gsstream.core.rng import Rng
 from gsstream.motion.base import MotionPart
+from gsstream.render.work import FrameWork
 
 
 @final

@@ -9,9 +9,9 @@ import torch
 
 from gsstream.core.changes import Scene
 from gsstream.core.changes.motion import Moves
-from gsstream.core.context import FrameWork
 from gsstream.core.shapes import FloatArray, IntArray
-from gsstream.motion.pull_back import slope_of
+from gsstream.render.work import FrameWork
+from gsstream.render.wrt import WrtTransforms
 
 
 def gains(scene: Scene, work: FrameWork, moves: Moves, views: Sequence[int] | IntArray) -> FloatArray:
@@ -27,9 +27,10 @@ def gains(scene: Scene, work: FrameWork, moves: Moves, views: Sequence[int] | In
         views: training cameras that are asked.
     """
     work.narrow(torch.from_numpy(moves.rows))
-    base = scene.gaussians.rows(moves.rows)
+    base = scene.gaussians.rows(moves.rows).map(torch.from_numpy)
     half = moves._replace(rows=np.arange(len(moves.rows)), shift=moves.shift / 2, turn=moves.turn / 2)
-    slope = sum((slope_of(work, view, base, half) for view in views), np.zeros((len(moves.centre), 6)))
+    grads = (work.loss_and_grad(view, WrtTransforms(base, half)).grad.numpy() for view in views)
+    slope = sum(grads, np.zeros((len(moves.centre), 6)))
     return np.asarray((slope * np.concatenate([moves.shift, moves.turn], 1)).sum(1))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, final
 
 import torch
 
@@ -30,21 +30,24 @@ class RegularizerTraits(Traits):
     gate_terms: tuple[str, ...] = ()
 
 
+@final
 @dataclass(frozen=True, slots=True)
-class GatePrice:
-    """Penalty whose formula is known: the sum over rows i of p_i (gate + motion |r_i|^2), p_i as of the row's node.
+class AnalyticPenalty:
+    """Closed form of a penalty: the sum over rows i of p_i (open_weight + displacement_weight |r_i|^2).
+
+    p_i is the open probability of the row's node, r_i its position residual in cells.
 
     Arguments:
-        gate: price of a row behind an open gate.
-        motion: price of its squared position residual, per cell^2.
+        open_weight: of a row behind an open gate.
+        displacement_weight: of its squared position residual, per cell^2.
         mean: divide the sum by the number of Gaussians of the scene.
     """
 
-    gate: float
-    motion: float
+    open_weight: float
+    displacement_weight: float
     mean: bool = True
 
-    def slopes(
+    def grad(
         self, open_probability: torch.Tensor, residual: torch.Tensor, hierarchy: Hierarchy, num_gaussians: int
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the derivatives by the probabilities [M] and by the residual [A, 3].
@@ -56,10 +59,16 @@ class GatePrice:
             num_gaussians: N, the divisor of a mean.
         """
         divisor = max(num_gaussians, 1) if self.mean else 1
-        rows = self.gate + self.motion * residual.square().sum(1)
+        rows = self.open_weight + self.displacement_weight * residual.square().sum(1)
         by_probability = torch.zeros_like(open_probability).index_add_(0, hierarchy.node_of, rows) / divisor
-        weight = (2 * self.motion / divisor) * open_probability[hierarchy.node_of]
+        weight = (2 * self.displacement_weight / divisor) * open_probability[hierarchy.node_of]
         return by_probability, weight[:, None] * residual
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class AnyPenalty:
+    """A penalty that is known by calls of the part alone."""
 
 
 class Regularizer(Part):
@@ -83,9 +92,9 @@ class Regularizer(Part):
             num_gaussians: N, the divisor of a mean over the whole scene (closed rows contribute nothing).
         """
 
-    def price(self) -> GatePrice | None:
-        """Return the formula of this penalty as it is configured, where it is that of :class:`GatePrice`.
+    def form(self) -> AnalyticPenalty | AnyPenalty:
+        """Return the closed form of this penalty as it is configured, where it is that of :class:`AnalyticPenalty`.
 
-        The engine then uses it in its inner loop and differentiates nothing; None: it calls the part.
+        A compiled optimiser may use it in its inner loop instead of calling the part.
         """
-        return None
+        return AnyPenalty()

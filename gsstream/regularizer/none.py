@@ -8,7 +8,7 @@ from typing import final
 import torch
 
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.regularizer.base import GatePrice, Regularizer
+from gsstream.regularizer.base import AnalyticPenalty, Regularizer
 
 
 @final
@@ -22,5 +22,5 @@ class NoRegularizer(Regularizer):
     ) -> Mapping[str, torch.Tensor]:
         return {}
 
-    def price(self) -> GatePrice:
-        return GatePrice(0.0, 0.0)
+    def form(self) -> AnalyticPenalty:
+        return AnalyticPenalty(0.0, 0.0)

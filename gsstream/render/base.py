@@ -18,11 +18,8 @@ from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.part import Part
 from gsstream.render.output import TILE as TILE
-from gsstream.render.output import Comparison as Comparison
-from gsstream.render.output import Pulled as Pulled
 from gsstream.render.output import RenderCache as RenderCache
 from gsstream.render.output import RenderOutput as RenderOutput
-from gsstream.render.output import WholePull as WholePull
 from gsstream.render.session import RenderSession as RenderSession
 
 
@@ -92,6 +89,10 @@ class ScatterSession(RenderSession):
     ) -> None:
         self._renderer, self._gaussians, self._active = renderer, gaussians, active
         self._cameras, self._background = cameras, background
+
+    @property
+    def cameras(self) -> Cameras:
+        return self._cameras
 
     def render(
         self,

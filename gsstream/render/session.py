@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import replace
 
 import torch
 
+from gsstream.core.cameras import Cameras
 from gsstream.core.changes.motion import Moves
-from gsstream.core.context import MovedPull, RowGradient, ScreenGradient
-from gsstream.core.gaussians import Gaussians
-from gsstream.core.shapes import FloatArray
-from gsstream.render.output import Comparison, Pulled, RenderCache, RenderOutput, WholePull
+from gsstream.core.context import RowGradient, ScreenGradient
+from gsstream.core.gaussians import SH0, Gaussians
+from gsstream.render.backward import backward, gradient_of
+from gsstream.render.output import TILE, RenderCache, RenderOutput
+from gsstream.render.structure import weighed_structure
+from gsstream.render.target import ViewTarget
+from gsstream.render.transforms import curvature_of
+from gsstream.render.wrt import G, LossAndGrad, Wrt, WrtTransforms
 
 
 class RenderSession(ABC):
@@ -21,6 +27,11 @@ class RenderSession(ABC):
     renders and differentiates exactly as one opened anew would, and in which a renderer may keep whatever did not
     change. ``screen_gradient`` and ``visible`` belong to the session's scene and may be asked for at any time.
     """
+
+    @property
+    @abstractmethod
+    def cameras(self) -> Cameras:
+        """The rig."""
 
     @abstractmethod
     def render(
@@ -109,56 +120,34 @@ class RenderSession(ABC):
     def narrow(self, active: torch.Tensor) -> None:
         """Freeze all rows but ``active`` [A], ascending. Replaces an earlier choice."""
 
-    def pull(self, view: int, rows: Gaussians[torch.Tensor], comparison: Comparison) -> Pulled | None:
-        """Render camera ``view``, compare it and differentiate, in one call; None where there is no such short cut.
+    def loss_and_grad(self, view: int, target: ViewTarget, wrt: Wrt[G]) -> LossAndGrad[G]:
+        """Render camera ``view``, compare it with what it recorded, and differentiate.
 
-        It stands for ``render``, the loss's ``evaluate`` on the tiles that the rows can change, and the backward pass,
-        whose results it gives up to rounding; whoever gets None makes these calls.
+        This body is the truth. A renderer may override it with one that does the same in one call, up to rounding, and
+        calls this one for whatever that one does not cover.
 
         Arguments:
             view: index of a camera of the rig.
-            rows: the A active rows, raw parameters; no graph is looked at.
-            comparison: what the render is compared with.
+            target: what the render is compared with.
+            wrt: what is rendered, and differentiated by; no graph of its values is looked at, no ``grad`` written.
 
         Raises:
             ShapeError: rows that cannot be rendered, or a loss that is not finite.
+            NotImplementedError: 2-D means are asked for and ``render`` takes no probe.
         """
-        return None
-
-    def pull_whole(self, view: int, rows: Gaussians[torch.Tensor], comparison: Comparison) -> WholePull | None:
-        """Render a scene of which every row moves, compare it and differentiate, in one call: an iteration of frame 0.
-
-        None where there is no such short cut, as in a narrowed session; whoever gets None makes the calls that it
-        stands for: ``render`` with a probe, the loss's ``evaluate`` and the backward pass, whose results it gives up
-        to rounding.
-
-        Arguments:
-            view: index of a camera of the rig.
-            rows: all N rows, raw parameters; no graph is looked at.
-            comparison: what the render is compared with.
-
-        Raises:
-            ShapeError: rows that cannot be rendered, or a loss that is not finite.
-        """
-        return None
-
-    def pull_moved(
-        self, view: int, rows: Gaussians[FloatArray], moves: Moves, comparison: Comparison, curved: bool = False
-    ) -> MovedPull | None:
-        """Render rows after their groups moved, compare, and pull the loss back to the groups, in one call.
-
-        None where there is no such short cut, or it finds a fault: whoever asks then makes the calls that it stands for
-        (``gsstream.blocks.slope_of``, ``gsstream.motion.pull_back.curved_slope_of``), which raise the error. Results
-        are theirs up to rounding.
-
-        Arguments:
-            view: index of a camera of the rig.
-            rows: the A active rows before they move, raw parameters.
-            moves: of these rows, which it counts from 0 to A - 1.
-            comparison: what the render is compared with.
-            curved: return the curvature, too.
-        """
-        return None
+        leaves = wrt.placed().map(lambda value: value.detach().requires_grad_())
+        probe = leaves.means.new_zeros(len(leaves), 2).requires_grad_() if wrt.means2d else None
+        wanted = None if target.tile_weights is None else target.tile_weights > 0
+        output = self.render(view, leaves, probe=probe, tile_mask=wanted)
+        loss, upstream = _compared(output, target, wanted)
+        exposure, image = target.exposure, output.image
+        backward([image], [exposure.vjp(upstream) if exposure else upstream])
+        by_exposure = exposure.grad(image.detach(), upstream) if exposure and wrt.exposure else None
+        by_probe = None if probe is None else gradient_of(probe)
+        curvature = None
+        if isinstance(wrt, WrtTransforms) and wrt.curvature:
+            curvature = _curvature(self, view, target, wrt.transforms, leaves, wanted)
+        return LossAndGrad(loss, wrt.grad(leaves), curvature, by_probe, by_exposure)
 
     def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
         """Return the session of the next scene, equal bit for bit to one opened anew with ``gaussians``.
@@ -185,3 +174,33 @@ class RenderSession(ABC):
     def cache_bytes(self) -> RenderCache:
         """Return what is kept for the cameras; empty for a renderer that caches nothing."""
         return RenderCache()
+
+
+def _compared(
+    output: RenderOutput, target: ViewTarget, wanted: torch.Tensor | None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Loss [] and gradient [H, W, 3] by the recorded colours, on the tiles that the rows can change and that count."""
+    tiles = output.tiles if wanted is None else wanted if output.tiles is None else wanted & output.tiles
+    image = output.image.detach()
+    recorded = target.exposure.apply(image) if target.exposure else image
+    loss, upstream = target.loss.evaluate(recorded, target.prepared, target.dssim, tiles)
+    if target.tile_weights is not None:
+        height, width = image.shape[:2]
+        factors = target.tile_weights.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
+        upstream = upstream * factors[..., None]
+    return loss, upstream
+
+
+def _curvature(
+    session: RenderSession, view: int, target: ViewTarget, transforms: Moves, leaves: Gaussians[torch.Tensor],
+    wanted: torch.Tensor | None,
+) -> torch.Tensor:  # fmt: skip
+    """[K, 6, 6] of Gauss-Newton, from the share that each row has of a pixel's light."""
+    rows = leaves.map(torch.Tensor.detach)
+    colour = rows.sh0.clone().requires_grad_()
+    image = session.render(view, replace(rows, sh0=colour), tile_mask=wanted).image
+    recorded = target.exposure.apply(image.detach()) if target.exposure else image.detach()
+    # The gradient of a pixel by a colour is the share that its Gaussian has of the pixel's light.
+    backward([image], [weighed_structure(recorded, target.image)])
+    structure = gradient_of(colour)[:, 0].numpy() / SH0
+    return torch.from_numpy(curvature_of(rows.means.numpy(), transforms, session.cameras, view, structure))

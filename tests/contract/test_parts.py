@@ -30,12 +30,13 @@ from gsstream.api import (
 )
 from gsstream.confidence.uniform import Uniform
 from gsstream.gate.always_open import AlwaysOpen
+from gsstream.optimiser.joint import add_joint, decode_joint, join_features, joint_vjp
 from gsstream.propagation.group_max import GroupMax
 from gsstream.regularizer.none import NoRegularizer
 from gsstream.render.reference import ReferenceRenderer
 from gsstream.residual.additive import Additive, DirectCode
 from gsstream.residual.base import AttributeCode, UpdateRule, init_latents, symbols
-from gsstream.residual.joint import add_joint, decode_joint, join_features, joint_code, pull_back_joint
+from gsstream.residual.joint import joint_code
 from gsstream.structure.flat import Flat
 
 PARTS = [Flat, Uniform, GroupMax, AlwaysOpen, NoRegularizer, Additive, ReferenceRenderer]
@@ -320,7 +321,7 @@ def test_written_out_gradient_equals_autograd() -> None:
         joined, matrix = torch.cat(list(latents.values()), 1), code.join_decoders(decoders)
         change = decode_joint(code, joined, matrix, units)
         ours = add_joint(code, base, join_features(code, base), change, gates)
-        back = pull_back_joint(code, join_features(code, upstream), change, matrix, gates, units)
+        back = joint_vjp(code, join_features(code, upstream), change, matrix, gates, units)
     for (name, value), (_, truth) in zip(ours.items(), changed.items(), strict=True):
         torch.testing.assert_close(value, truth, msg=name)
     torch.testing.assert_close(back.gates, gates.grad)

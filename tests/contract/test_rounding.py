@@ -10,10 +10,10 @@ import torch
 from gsstream_cpu_render.renderer import CpuRenderer
 from gsstream_cpu_render.session import CpuSession
 
-from gsstream.render.base import WholePull
+from gsstream.render.wrt import LossAndGrad, WrtScene
 from gsstream.testing.cases import world
 from gsstream.testing.compare import gradients_equal, relative
-from gsstream.testing.renderer import short_cuts
+from gsstream.testing.renderer import loss_and_grad
 
 EPS = torch.finfo(torch.float32).eps
 
@@ -27,39 +27,39 @@ def test_every_gradient_of_the_cloud_lies_above_the_floor(monkeypatch: pytest.Mo
             above[what] = float(expected.abs().max()) / floor
 
     monkeypatch.setattr("gsstream.testing.compare.relative", record)
-    short_cuts.check_renderer_whole(CpuRenderer())
+    loss_and_grad.check_renderer_loss_and_grad_scene(CpuRenderer())
     assert any("quats" in what for what in above)
     assert min(above.values()) > 1, above
 
 
 def turned(monkeypatch: pytest.MonkeyPatch, factor: float, noise: float) -> None:
-    """Let the native short cut multiply the gradient by the rotation, and add rounding of what cancels in it."""
-    right = CpuSession.pull_whole
+    """Let the native body multiply the gradient by the rotation, and add rounding of what cancels in it."""
+    right = CpuSession.loss_and_grad
 
-    def spoilt(*arguments: Any) -> WholePull | None:
-        found = right(*arguments)
-        if found is None:  # a loss that the kernels do not have
-            return None
-        terms = float(found.gradients.scales.abs().max())
-        quats = factor * found.gradients.quats
+    def spoilt(session: CpuSession, view: int, target: Any, wrt: Any) -> LossAndGrad[Any]:
+        found = right(session, view, target, wrt)
+        if not isinstance(wrt, WrtScene):
+            return found
+        terms = float(found.grad.scales.abs().max())
+        quats = factor * found.grad.quats
         rounding = noise * EPS * terms * torch.linspace(-1, 1, quats.numel()).reshape(quats.shape)
-        return found._replace(gradients=replace(found.gradients, quats=quats + rounding))
+        return replace(found, grad=replace(found.grad, quats=quats + rounding))
 
-    monkeypatch.setattr(CpuSession, "pull_whole", spoilt)
+    monkeypatch.setattr(CpuSession, "loss_and_grad", spoilt)
 
 
 @pytest.mark.parametrize("name", ["cloud", "static"])  # "static" is round
 def test_rounding_is_no_alarm(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(short_cuts, "world", lambda _: world(name))
+    monkeypatch.setattr(loss_and_grad, "world", lambda _: world(name))
     turned(monkeypatch, factor=1.0, noise=4.0)
-    short_cuts.check_renderer_whole(CpuRenderer())
+    loss_and_grad.check_renderer_loss_and_grad_scene(CpuRenderer())
 
 
 @pytest.mark.parametrize("factor", [-1.0, 0.0, 0.999, 2.0])
 def test_a_wrong_gradient_by_the_rotation_is_an_alarm(factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
     turned(monkeypatch, factor, noise=0.0)
     with pytest.raises(AssertionError, match="gradient of quats"):
-        short_cuts.check_renderer_whole(CpuRenderer())
+        loss_and_grad.check_renderer_loss_and_grad_scene(CpuRenderer())
 
 
 def test_values_below_the_floor_are_measured_by_the_floor() -> None:

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from gsstream.engine.budget.pace import Allowance, Pace
+from gsstream.engine.budget.pace import Allowance, EpochScheduler
 from gsstream.engine.budget.plan import MOST_TRIMMED, TIME_MARGIN, UNKNOWN_RESERVE, FramePlan, Past, plan
+from gsstream.engine.budget.schedule import Schedule
 from gsstream.recipe.budget import Budget
 from gsstream.recipe.model import Stream
 
@@ -25,18 +26,18 @@ class Clock:
         return self.now
 
 
-def paced(seconds: float, effort: float = 1.0, before: float = 0.0, **known: float) -> tuple[Pace, Clock]:
+def paced(seconds: float, effort: float = 1.0, before: float = 0.0, **known: float) -> tuple[EpochScheduler, Clock]:
     clock = Clock()
     began = clock.now
     clock.now += before
     values = {"after": 1.0, "each": 0.55, **known}
     found = FramePlan(20, 6.0, 3e-4, most_epochs=30, seconds=seconds, **values)  # type: ignore[arg-type]
-    return Pace(Allowance(found, began, clock), max(1, round(effort * 20)), 3e-4, 5, effort), clock
+    return EpochScheduler(Allowance(found, began, clock), max(1, round(effort * 20)), 3e-4, 5, effort), clock
 
 
 def test_the_clock_ends_a_frame_before_its_coding_has_no_time_left() -> None:
     pace, clock = paced(5.0)
-    pace.begin(10)
+    pace.start(10)
     done = 0
     while True:
         clock.now += 0.3
@@ -51,7 +52,7 @@ def test_the_clock_ends_a_frame_before_its_coding_has_no_time_left() -> None:
 def test_a_hurried_frame_takes_its_share_of_the_time_that_passes_have(effort: float, views: int) -> None:
     """Its run is behind: time that the deadline leaves is for the frames that wait."""
     pace, clock = paced(13.0, effort, before=2.0)
-    pace.begin(10)
+    pace.start(10)
     done, over = 0, False
     while not over and done < 100:
         clock.now += 0.3
@@ -62,14 +63,14 @@ def test_a_hurried_frame_takes_its_share_of_the_time_that_passes_have(effort: fl
 
 def test_a_hurried_frame_that_has_no_time_left_is_not_given_more() -> None:
     pace, clock = paced(2.0, 0.2, before=5.0)
-    pace.begin(10)
+    pace.start(10)
     clock.now += 0.3
     assert pace.is_over()
 
 
 def test_passes_follow_what_they_took() -> None:
     pace, clock = paced(11.0)
-    pace.begin(10)
+    pace.start(10)
     assert pace.epochs == 18, "10 s, 0.55 s a pass in the frames before"
     for done, seconds, planned in ((1, 2.0, 5), (2, 1.0, 9), (3, 6.8, 3)):
         for _ in range(5):
@@ -82,24 +83,26 @@ def test_passes_follow_what_they_took() -> None:
 
 def test_the_first_number_of_passes_scales_with_the_candidates() -> None:
     few, many = (paced(11.0, each=1.0, candidates=100)[0] for _ in range(2))
-    few.begin(100)
-    many.begin(400)
+    few.start(100)
+    many.start(400)
     assert (few.epochs, many.epochs) == (10, 3)
 
 
 def test_without_an_allowance_nothing_changes() -> None:
-    pace = Pace(None, 7, 3e-4, 5)
-    pace.begin(10)
-    pace.end_epoch(1)
-    assert (pace.is_over(), pace.epochs, pace.rate_weight, pace.meets_size) == (False, 7, 3e-4, False)
+    schedule = Schedule(7, 3e-4)
+    schedule.start(10)
+    schedule.end_epoch(1)
+    schedule.weigh_bytes(1, lambda: pytest.fail("no size is to be met"))
+    schedule.finish()
+    assert (schedule.is_over(), schedule.epochs, schedule.rd_lambda, schedule.chunk) == (False, 7, 3e-4, None)
 
 
 def test_the_weight_of_a_frame_is_that_of_its_last_half() -> None:
     clock = Clock()
-    pace = Pace(Allowance(FramePlan(4, 6.0, 1e-3, max_bytes=1000), clock.now, clock), 4, 1e-3, 5)
+    pace = EpochScheduler(Allowance(FramePlan(4, 6.0, 1e-3, max_bytes=1000), clock.now, clock), 4, 1e-3, 5)
     for done in range(1, 5):
         pace.end_epoch(done)
-        pace.meet_size(done, 10 * MOST_TRIMMED * 1000)
+        pace.weigh_bytes(done, lambda: 10 * MOST_TRIMMED * 1000)
     # Made with 1e-3 (its pass is a quarter of all: looked at), then three times as much after each pass.
     assert pace.typical_weight == pytest.approx(math.sqrt(9e-3 * 27e-3))
 
@@ -107,14 +110,14 @@ def test_the_weight_of_a_frame_is_that_of_its_last_half() -> None:
 @pytest.mark.parametrize(("estimate", "after"), [(900, 1e-3), (1000, 1e-3), (1999, 1e-3), (4000, 2e-3), (235, 5e-4)])
 def test_up_to_twice_the_size_is_left_to_trimming(estimate: float, after: float) -> None:
     clock = Clock()
-    pace = Pace(Allowance(FramePlan(4, 6.0, 1e-3, max_bytes=1000), clock.now, clock), 4, 1e-3, 5)
-    pace.meet_size(2, estimate)
-    assert pace.rate_weight == pytest.approx(after, rel=0.03)
+    pace = EpochScheduler(Allowance(FramePlan(4, 6.0, 1e-3, max_bytes=1000), clock.now, clock), 4, 1e-3, 5)
+    pace.weigh_bytes(2, lambda: estimate)
+    assert pace.rd_lambda == pytest.approx(after, rel=0.03)
 
 
 def test_a_slow_first_view_does_not_end_the_frame() -> None:
     pace, clock = paced(5.0)
-    pace.begin(10)
+    pace.start(10)
     clock.now += 2.5
     assert not pace.is_over(), "1.5 s are left, and the next view will not take as long"
     clock.now += 0.4
@@ -152,9 +155,9 @@ def made(found: FramePlan, costs: Costs, slower: float = 1.0) -> Made:
     """A frame whose passes take what they take, as ``optimise`` goes through them."""
     clock = Clock()
     began = clock.now
-    pace = Pace(Allowance(found, began, clock), found.epochs, 3e-4, costs.views)
+    pace = EpochScheduler(Allowance(found, began, clock), found.epochs, 3e-4, costs.views)
     clock.now += costs.before
-    pace.begin(100)
+    pace.start(100)
     epoch, planned = 0, [pace.epochs]
     iterations = 0
     while epoch < pace.epochs:

@@ -10,10 +10,10 @@ from gsstream.core.changes import Births, Delta, Residual, Rows
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.topology import TopologyEdit
-from gsstream.engine.fit.row_table import RowTable
 from gsstream.engine.state.follow import follow
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.optimiser.adam import ReferenceAdam
+from gsstream.optimiser.row_parameters import RowParameters
 from gsstream.packet import decode_packet, encode_delta, encode_key
 from gsstream.testing.packet.checks import tiny_key
 
@@ -69,7 +69,7 @@ def test_a_packet_without_births_leaves_the_forest_alone(state):
 
 def test_per_gaussian_moments_follow_the_edit():
     """Row 1 is copied as a fresh row, row 0 goes: what stays keeps its moment, what is fresh starts at zero."""
-    table = RowTable({"x": torch.arange(40.0)[:, None]}, {"x": 0.0}, ReferenceAdam())
+    table = RowParameters({"x": torch.arange(40.0)[:, None]}, {"x": 0.0}, ReferenceAdam())
     table.step({"x": torch.arange(40.0)[:, None] + 1})
     source = torch.cat([torch.arange(1, 40), torch.tensor([1])])
     fresh = torch.arange(40) == 39

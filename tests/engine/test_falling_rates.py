@@ -11,11 +11,13 @@ import pytest
 import torch
 from flow_runs import WORLD, encode
 from gsstream_cpu_render.adam_part import CpuAdam
-from gsstream_cpu_render.residual import CpuResidualTable
+from gsstream_cpu_render.residual import CpuResidualOptimiser
 
-from gsstream.engine.fit.residual_table import JointTable, lr_factor
+from gsstream.engine.step.lr_factor import lr_factor
 from gsstream.optimiser.adam import ReferenceAdam
-from gsstream.optimiser.base import AdamState, ResidualTable
+from gsstream.optimiser.base import AdamState
+from gsstream.optimiser.joint import JointResidualOptimiser
+from gsstream.optimiser.residual import ResidualOptimiser
 from gsstream.packet import StreamReader
 from gsstream.testing.optimiser.checks import _residual_case
 
@@ -37,29 +39,27 @@ def test_a_final_factor_of_one_is_one_to_the_bit() -> None:
     assert {lr_factor(1.0, iteration, 540) for iteration in range(540)} == {1.0}
 
 
-def trained(table: ResidualTable, factors: Sequence[float | None]) -> bytes:
+def trained(table: ResidualOptimiser, factors: Sequence[float | None]) -> bytes:
     """The bits of a table after a step with each factor; None: a step that is told nothing."""
     g = torch.Generator().manual_seed(5)
     for factor in factors:
-        rows = table.rows(torch.rand(300, generator=g))
-        table.pull(rows.map(lambda value: 1e-3 * torch.randn(value.shape, generator=g)), 1e-3)
+        rows = table.forward(torch.rand(300, generator=g))
+        table.backward(rows.map(lambda value: 1e-3 * torch.randn(value.shape, generator=g)), 1e-3)
         table.latents.grad = torch.full(table.latents.shape, 1e-4)
         _ = table.step() if factor is None else table.step(factor)
     return table.latents.detach().numpy().tobytes() + table.matrix.numpy().tobytes()
 
 
-def joint(*case: Any) -> ResidualTable:
-    return JointTable(*case, ReferenceAdam())
+def joint(*case: Any) -> ResidualOptimiser:
+    return JointResidualOptimiser(*case, ReferenceAdam())
 
 
-def native(*case: Any) -> ResidualTable:
-    table = CpuAdam().residual_table(*case)
-    assert table is not None, "the kernels are older than the plugin: install it again"
-    return table
+def native(*case: Any) -> ResidualOptimiser:
+    return CpuAdam().residual_optimiser(*case)
 
 
 @pytest.mark.parametrize("make", [joint, native])
-def test_a_factor_does_what_smaller_rates_do(make: Callable[..., ResidualTable]) -> None:
+def test_a_factor_does_what_smaller_rates_do(make: Callable[..., ResidualOptimiser]) -> None:
     """Of latents and of decoders: a table whose rates are a quarter, and one that is told so in every step."""
     code, *rest = _residual_case()
     slow = replace(code, lrs=0.25 * code.lrs, decoder_lrs=0.25 * code.decoder_lrs)
@@ -71,14 +71,14 @@ def test_a_factor_does_what_smaller_rates_do(make: Callable[..., ResidualTable])
 def test_a_step_that_is_told_nothing_has_the_bits_of_the_optimiser_alone() -> None:
     """What a frame did before there was a factor: the optimiser's own step, with the rates of the code."""
     code, *rest = _residual_case()
-    table, optimiser = JointTable(code, *rest, ReferenceAdam()), ReferenceAdam()
+    table, optimiser = JointResidualOptimiser(code, *rest, ReferenceAdam()), ReferenceAdam()
     values = {"latents": table.latents.detach().clone(), "matrix": table.matrix.clone()}
     states = {name: AdamState.start(value) for name, value in values.items()}
     g = torch.Generator().manual_seed(6)
     for _ in range(3):
-        rows = table.rows(torch.ones(300))
-        table.pull(rows.map(lambda value: torch.randn(value.shape, generator=g)), 0.0)
-        gradients = {"latents": table._pulled.latents.clone(), "matrix": table._pulled.matrix.clone()}
+        rows = table.forward(torch.ones(300))
+        table.backward(rows.map(lambda value: torch.randn(value.shape, generator=g)), 0.0)
+        gradients = {"latents": table._grad.latents.clone(), "matrix": table._grad.matrix.clone()}
         optimiser.step(values, gradients, states, {"latents": code.lrs, "matrix": code.decoder_lrs})
         table.step(lr_factor(1.0, 1, 3))
         assert torch.equal(table.latents.detach(), values["latents"])
@@ -91,19 +91,19 @@ class Heard:
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self.frames: list[list[float]] = []
         self.tables: set[str] = set()
-        for kind in (JointTable, CpuResidualTable):
+        for kind in (JointResidualOptimiser, CpuResidualOptimiser):
             patch.setattr(kind, "__init__", self._opened(kind.__init__))
             patch.setattr(kind, "step", self._stepped(kind.step))
 
     def _opened(self, begin: Callable[..., None]) -> Callable[..., None]:
-        def opened(table: ResidualTable, *arguments: Any) -> None:
+        def opened(table: ResidualOptimiser, *arguments: Any) -> None:
             self.frames.append([])
             begin(table, *arguments)
 
         return opened
 
     def _stepped(self, step: Callable[..., None]) -> Callable[..., None]:
-        def stepped(table: ResidualTable, factor: float) -> None:
+        def stepped(table: ResidualOptimiser, factor: float) -> None:
             self.frames[-1].append(factor)
             self.tables.add(type(table).__name__)
             step(table, factor)
@@ -127,9 +127,9 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.mark.parametrize(
     ("level", "table", "method", "epochs"),
     [
-        ("off", "CpuResidualTable", "dense", 1),
-        ("off", "CpuResidualTable", "s2gs-paper", 3),
-        ("step", "JointTable", "s2gs-paper", 3),
+        ("off", "CpuResidualOptimiser", "dense", 1),
+        ("off", "CpuResidualOptimiser", "s2gs-paper", 3),
+        ("step", "JointResidualOptimiser", "s2gs-paper", 3),
     ],
 )
 def test_every_frame_of_a_run_falls_to_the_final_factor(
@@ -152,7 +152,7 @@ def test_a_final_factor_of_one_changes_no_byte_of_what_follows(
     """Against a run whose tables are told nothing, as before there was a factor."""
     more = {"source": WORLD, "frames": 3}
     encode(tmp_path / "one", "--first-frame", first, stream__lr_final_factor=1, **more)
-    step = CpuResidualTable.step
-    monkeypatch.setattr(CpuResidualTable, "step", lambda table, factor: step(table))
+    step = CpuResidualOptimiser.step
+    monkeypatch.setattr(CpuResidualOptimiser, "step", lambda table, factor: step(table))
     encode(tmp_path / "before", "--first-frame", first, **more)
     assert deltas(tmp_path / "one") == deltas(tmp_path / "before")

@@ -11,7 +11,7 @@ import warnings
 import weakref
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -21,13 +21,16 @@ import torch
 from gsstream.core.changes import Births, Rows
 from gsstream.core.errors import ComponentError
 from gsstream.core.frame import Frame
+from gsstream.core.part import unwrapped
 from gsstream.encode import Encoder, encoder_for, open_recording
-from gsstream.engine.assembly.guard import Guarded, guard, plain
+from gsstream.engine.assembly.guard import Guarded, guard
 from gsstream.engine.assembly.where import Where
 from gsstream.engine.method.held import RepeatedFrameWarning
 from gsstream.engine.step import frame_step as step_module
 from gsstream.gate.always_open import AlwaysOpen
+from gsstream.gate.base import SampledGate
 from gsstream.growth.base import Growth
+from gsstream.optimiser.base import RowOptimiser
 from gsstream.packet import decode_packet
 from gsstream.render.base import RenderSession
 from gsstream.testing.cases import rig, scene
@@ -69,7 +72,7 @@ FUNCTIONS: dict[tuple[str, str], tuple[bool, bool]] = {
 class Failing:
     """A part that raises in one of its functions in one frame, and otherwise does what the sound one does.
 
-    It states no formulas and has no table of its own: a part that does is not called in the inner loop.
+    It states no closed form and has no residual optimiser of its own: a part that does is not called in the inner loop.
     """
 
     def __init__(self, part: Any, function: str, where: Where, frame: int = BAD) -> None:
@@ -77,8 +80,10 @@ class Failing:
 
     def __getattr__(self, name: str) -> Any:
         value = getattr(self.part, name)
-        if name in ("law", "price", "residual_table"):
-            return lambda *_: None
+        if name == "form":
+            return SampledGate
+        if name == "residual_optimiser":
+            return partial(RowOptimiser.residual_optimiser, self)
         if name != self.function:
             return value
         if not callable(value):
@@ -106,6 +111,10 @@ class FailingSession(RenderSession):
         if name == self.failing.function:
             self.failing.fail()
         return getattr(self.session, name)(*args, **kwargs)
+
+    @property
+    def cameras(self) -> Any:
+        return self.session.cameras
 
     def render(self, *args: Any, **kwargs: Any) -> Any:
         return self._call("render", *args, **kwargs)
@@ -268,13 +277,13 @@ class TestGuard:
         assert repr(guarded) == repr(AlwaysOpen())
         assert guarded.config == AlwaysOpen().config
         assert guarded.num_levels == 1
-        assert type(plain(guarded)) is AlwaysOpen
-        assert plain(AlwaysOpen()) == AlwaysOpen()
+        assert type(unwrapped(guarded)) is AlwaysOpen
+        assert unwrapped(AlwaysOpen()) == AlwaysOpen()
 
     def test_nothing_is_guarded_twice(self) -> None:
         again = guard("gate", self.part(), Where(), self.part()._level)
         assert isinstance(again, Guarded)
-        assert type(plain(again)) is AlwaysOpen
+        assert type(unwrapped(again)) is AlwaysOpen
 
     def test_a_session_goes_with_its_owner_and_not_when_the_collector_comes(self) -> None:
         renderer, cameras = encoder("gate", lambda part, _: part).parts.renderer, rig()
@@ -282,7 +291,7 @@ class TestGuard:
         try:
             session = renderer.open(scene(torch.randn(9, 3)), None, cameras, (0.0, 0.0, 0.0))
             session.narrow(torch.arange(3))
-            seen = weakref.ref(plain(session))
+            seen = weakref.ref(unwrapped(session))
             del session
             assert seen() is None, "it holds a render of every camera: a few frames of them are a gigabyte"
         finally:

@@ -10,17 +10,18 @@ import pytest
 import torch
 
 from gsstream.cli.main import run_command
-from gsstream.engine.step.quiet_tiles import QuietTiles
+from gsstream.engine.step.active.change import Change
+from gsstream.engine.step.active.tiles import tile_weights
 
 
 def draws(share: float, number: int = 4000) -> tuple[torch.Tensor, torch.Tensor]:
-    """(tiles that changed [H, W], weights [number, H, W]) of a view with a corner that changed."""
-    changed = torch.zeros(2, 5, 7, dtype=torch.bool)
-    changed[1, :2, :3] = True
-    tiles = QuietTiles(changed, share, torch.Generator().manual_seed(1))
-    found = [tiles.weights(1) for _ in range(number)]
+    """(tiles that changed or lie beside one [H, W], weights [number, H, W]) of a view in whose corner one changed."""
+    tiles, generator = torch.zeros(2, 5, 7, dtype=torch.bool), torch.Generator().manual_seed(1)
+    tiles[1, 0, :2] = True
+    change = Change(tiles, 80, 112)
+    found = [tile_weights(change, 1, share, generator) for _ in range(number)]
     assert all(weights is not None for weights in found)
-    return changed[1], torch.stack(found)
+    return change.near[1], torch.stack(found)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.1, 0.7])
@@ -41,8 +42,8 @@ def test_no_draw_is_that_of_the_iteration_before() -> None:
 def test_all_tiles_are_looked_at_where_change_is_not_detected_or_all_are_wanted() -> None:
     generator = torch.Generator().manual_seed(1)
     before = generator.get_state()
-    assert QuietTiles(None, 0.1, generator).weights(0) is None
-    assert QuietTiles(torch.ones(1, 2, 2, dtype=torch.bool), 1.0, generator).weights(0) is None
+    assert tile_weights(None, 0, 0.1, generator) is None
+    assert tile_weights(Change(torch.ones(1, 2, 2, dtype=torch.bool), 32, 32), 0, 1.0, generator) is None
     assert torch.equal(generator.get_state(), before), "a draw that is not needed would change streams of before"
 
 

@@ -13,11 +13,11 @@ from test_encoder import TINY, WORLD, frames
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.encode import encoder_for, open_recording
-from gsstream.engine.fit.exposure import Exposure
 from gsstream.engine.frame0.probes import TrainingViews
 from gsstream.engine.frame0.removal import not_missed, removal_errors, worth_keeping
 from gsstream.packet import decode_packet
 from gsstream.render.base import Renderer
+from gsstream.render.exposure import Exposure
 from gsstream.render.reference import ReferenceRenderer
 
 BLACK = (0.0, 0.0, 0.0)

@@ -18,7 +18,6 @@ from residual_oracle import train_rows
 
 from gsstream.cli.main import run_command
 from gsstream.core.changes import Delta, Scene, apply_delta
-from gsstream.core.context import FrameWork
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.rng import Rng
 from gsstream.engine.method.held import difference_between
@@ -29,6 +28,7 @@ from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, find_renderer, render
 from gsstream.player.software import render_numpy
 from gsstream.render.reference import ReferenceRenderer
+from gsstream.render.work import FrameWork
 
 METHODS = ["dense", "s2gs-edge"]
 

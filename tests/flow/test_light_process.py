@@ -10,7 +10,7 @@ import pytest
 import torch
 from flow_runs import demo_copy
 
-from gsstream.engine.fit.backward import pull_back
+from gsstream.render.backward import backward
 
 #: Seconds and tens of megabytes each; nothing of them is ever used.
 UNWANTED = ("torch._dynamo", "torch._inductor", "sympy", "torch.fx.experimental.symbolic_shapes")
@@ -41,7 +41,7 @@ def test_pulling_back_is_the_backward_of_torch(count: int) -> None:
     g = torch.Generator().manual_seed(count)
     leaves = [[torch.randn(5, 3, generator=torch.Generator().manual_seed(7)).requires_grad_()] for _ in range(2)]
     gradients = [torch.randn(5, 3, generator=g) for _ in range(count)]
-    for (leaf,), pull in zip(leaves, (pull_back, torch.autograd.backward), strict=True):
+    for (leaf,), pull in zip(leaves, (backward, torch.autograd.backward), strict=True):
         hidden = leaf.sin() * leaf.exp()
         pull([hidden * (k + 1) + hidden.square() for k in range(count)], gradients)
     (ours,), (theirs,) = leaves

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -11,10 +12,10 @@ import torch
 from gsstream.core.changes.motion import Moves, moves_of, transformed
 from gsstream.core.gaussians import Gaussians
 from gsstream.engine.step.context import FrameView
-from gsstream.motion.curvature import curvature_of
 from gsstream.motion.groups import changed_groups, known_groups, pixel_size
 from gsstream.motion.newton import Damping, NewtonDescent, newton_moves
-from gsstream.motion.pull_back import curved_slope_of, slope_of
+from gsstream.render.transforms import curvature_of
+from gsstream.render.wrt import WrtTransforms
 from gsstream.testing.cases import world
 from gsstream.testing.working import AtWork, at_work
 
@@ -118,23 +119,25 @@ def test_the_transform_by_hand_is_that_of_the_stream() -> None:
     np.testing.assert_allclose(transformed(base, moves).means, transformed64(base, moves), atol=1e-5)
 
 
-def moving(case: AtWork) -> tuple[Gaussians[np.ndarray], Moves]:
+def moving(case: AtWork) -> tuple[Gaussians[torch.Tensor], Moves]:
     """All groups that lie in what changed, where they stand, and the work narrowed to them."""
     groups = known_groups(case.scene, case.work.cameras, 12, 2)
     able = changed_groups(groups, case.work, 0.75, 0.5)
     start = moves_of(case.scene, groups, able.astype(np.uint8), predicted=True)
     case.work.narrow(torch.from_numpy(start.rows))
-    return case.scene.gaussians.rows(start.rows), start._replace(rows=np.arange(len(start.rows)))
+    return case.scene.gaussians.rows(start.rows).map(torch.from_numpy), start._replace(rows=np.arange(len(start.rows)))
 
 
-@pytest.mark.parametrize("near", [False, True])
-def test_slopes_are_the_same_with_and_without_curvature(near: bool) -> None:
+@pytest.mark.parametrize("tiles", ["all", "changed"])
+def test_gradients_are_the_same_with_and_without_curvature(tiles: Literal["all", "changed"]) -> None:
     case = at_work()
     base, moves = moving(case)
-    slope, curvature = curved_slope_of(case.work, 1, base, moves, near)
-    np.testing.assert_allclose(slope, slope_of(case.work, 1, base, moves, near), rtol=1e-5, atol=1e-9)
-    assert curvature.shape == (len(moves.centre), 6, 6)
-    assert np.abs(curvature).max() > 0
+    found, without = (case.work.loss_and_grad(1, WrtTransforms(base, moves, curved), tiles) for curved in (True, False))
+    torch.testing.assert_close(found.grad, without.grad, rtol=1e-5, atol=1e-9)
+    assert without.curvature is None
+    assert found.curvature is not None
+    assert found.curvature.shape == (len(moves.centre), 6, 6)
+    assert float(found.curvature.abs().max()) > 0
 
 
 def test_nothing_that_changed_holds_nothing() -> None:
@@ -143,9 +146,11 @@ def test_nothing_that_changed_holds_nothing() -> None:
     case.work.narrow(torch.from_numpy(rows))
     zeros = np.zeros((1, 3))
     moves = Moves(np.arange(len(rows)), np.zeros(len(rows), np.int64), zeros, zeros, zeros)
-    slope, curvature = curved_slope_of(case.work, 0, case.scene.gaussians.rows(rows), moves, True)
-    assert not slope.any()
-    assert not curvature.any()
+    base = case.scene.gaussians.rows(rows).map(torch.from_numpy)
+    found = case.work.loss_and_grad(0, WrtTransforms(base, moves, curvature=True), "changed")
+    assert not found.grad.any()
+    assert found.curvature is not None
+    assert not found.curvature.any()
 
 
 @pytest.mark.parametrize("seed", [1, 2])

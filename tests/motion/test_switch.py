@@ -19,6 +19,7 @@ from gsstream.engine.step.context import FrameView
 from gsstream.motion.coasting import Coasting
 from gsstream.motion.groups import pixel_size
 from gsstream.motion.switch import gains, some_views
+from gsstream.render.wrt import WrtRows
 from gsstream.testing.stepping import MethodUnderTest
 from gsstream.testing.working import at_work
 
@@ -71,7 +72,7 @@ def frame_in_which(share: float, turns: bool = False) -> FrameView:
 
 def loss(work: FrameView, gaussians, view: int) -> float:  # type: ignore[no-untyped-def]
     work.narrow(torch.arange(len(gaussians)))
-    return work.pull(view, gaussians.map(lambda value: torch.from_numpy(value).requires_grad_()))
+    return float(work.loss_and_grad(view, WrtRows(gaussians.map(torch.from_numpy))).loss)
 
 
 @pytest.mark.parametrize("turns", [False, True])

@@ -24,11 +24,11 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.optimiser.adam import ReferenceAdam
 from gsstream.optimiser.base import ADAM_BETAS, ADAM_EPS, AdamState, RowOptimiser
+from gsstream.optimiser.rate import channel_spread, laplace_gradient
 from gsstream.packet.grids import KEY_BITS, from_codes, to_codes
 from gsstream.packet.symbols import decode_symbols, encode_symbols
 from gsstream.render.reference import ReferenceRenderer
 from gsstream.residual.base import init_latents
-from gsstream.residual.rate import channel_spread, laplace_gradient
 
 Measure = Callable[[int], float]
 

@@ -12,9 +12,9 @@ from gsstream.confidence.base import ConfidenceEstimator
 from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
 from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.core.needs import install_renderer
-from gsstream.core.part import Part
+from gsstream.core.part import Part, unwrapped
 from gsstream.engine.assembly.checks import Checks, wanted_checks
-from gsstream.engine.assembly.guard import guard, plain
+from gsstream.engine.assembly.guard import guard
 from gsstream.engine.assembly.heeded import unheeded
 from gsstream.engine.assembly.title import title
 from gsstream.engine.assembly.where import Where
@@ -89,7 +89,7 @@ class Assembly:
 
     def part(self, slot: str) -> Part:
         """Return the part of a slot itself, without its guard."""
-        part: Part = plain(getattr(self, slot))
+        part: Part = unwrapped(getattr(self, slot))
         return part
 
     @property

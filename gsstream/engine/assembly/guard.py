@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from inspect import getattr_static
 from pathlib import Path
 from traceback import walk_tb
 from typing import Any, TypeVar, cast
 
 from gsstream.core.errors import GsstreamError, InputError, ShapeError
+from gsstream.core.part import unwrapped
 from gsstream.engine.assembly.checks import Checks, Look
 from gsstream.engine.assembly.fault import fault
 from gsstream.engine.assembly.looks import LOOKS
 from gsstream.engine.assembly.where import Where
+from gsstream.optimiser.base import RowOptimiser
+from gsstream.optimiser.residual import ResidualOptimiser
 from gsstream.render.base import RenderSession
 
 T = TypeVar("T")
-#: The name under which the table of checks lists the sessions of a renderer; errors about them say "renderer".
-SESSION = "session"
+#: The names under which the table below and that of the checks list what parts open: sessions of a renderer, residuals
+#: of an optimiser. Errors about them name the part.
+SESSION, RESIDUAL = "session", "residual"
+#: Default bodies that call other functions of their object, by kind and name. With the level "step", and where the
+#: object has no body of its own, they run on the guard, so that each of these calls is looked at.
+BODIES: Mapping[tuple[str, str], Callable[..., Any]] = {
+    (SESSION, "loss_and_grad"): RenderSession.loss_and_grad,
+    ("optimiser", "residual_optimiser"): RowOptimiser.residual_optimiser,
+    (RESIDUAL, "run"): ResidualOptimiser.run,
+}
 
 
 @contextmanager
@@ -64,28 +76,35 @@ class Guarded:
         self._subject, self._kind = part, kind or slot
 
     @classmethod
-    def session(cls, session: RenderSession, renderer: object, where: Where, level: Checks) -> Guarded:
-        """Return a session of a renderer, behind a guard that names the renderer.
-
-        Arguments:
-            session: that a renderer has opened.
-            renderer: the part itself.
-            where: the place that errors name.
-            level: how closely results are looked at.
-        """
-        made = cls("renderer", renderer, where, level, SESSION)
-        made._subject = session
+    def opened(cls, result: object, slot: str, part: object, where: Where, level: Checks) -> object:
+        """Return what a part has opened behind a guard that names the part; any other result as it is."""
+        if not isinstance(result, (RenderSession, ResidualOptimiser)):
+            return result
+        made = cls(slot, part, where, level, SESSION if isinstance(result, RenderSession) else RESIDUAL)
+        made._subject = result
         return made
+
+    @property
+    def __wrapped__(self) -> object:
+        """The part itself (``gsstream.core.part.unwrapped``)."""
+        return self._subject
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
+        body = BODIES.get((self._kind, name))
+        if body is not None and (self._level is Checks.STEP or getattr(type(self._subject), name, None) is body):
+            # Never kept in ``__dict__``: a guard that holds itself would keep a render of every camera alive.
+            return partial(self._on_guard, body)
         value = self._value(name)
         if not callable(value) or isinstance(value, type):
             return value
         call = self._guarding(name, value)
         self.__dict__[name] = call
         return call
+
+    def _on_guard(self, body: Callable[..., Any], *args: Any, **kwargs: Any) -> object:
+        return Guarded.opened(body(self, *args, **kwargs), self._slot, self._part, self._where, self._level)
 
     def _value(self, name: str) -> Any:
         """An attribute of the part; what a property of it raises is the part's failure like any other."""
@@ -111,7 +130,7 @@ class Guarded:
                     where.pause()  # what the part fitted is over: what is wrong with the result is of no iteration
                 if look is not None:
                     look(looking, args, result)
-            return Guarded.session(result, part, where, level) if isinstance(result, RenderSession) else result
+            return Guarded.opened(result, slot, part, where, level)
 
         return call
 
@@ -134,10 +153,4 @@ def guard(slot: str, part: T, where: Where, level: Checks) -> T:
         where: the place that errors name, shared by all parts of a run.
         level: how closely results are looked at.
     """
-    return cast(T, Guarded(slot, plain(part), where, level))
-
-
-def plain(part: T) -> T:
-    """Return the part itself, without its guard."""
-    return cast(T, part._subject) if isinstance(part, Guarded) else part
-
+    return cast(T, Guarded(slot, unwrapped(part), where, level))

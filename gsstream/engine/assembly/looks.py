@@ -53,7 +53,7 @@ def _image(look: Look, args: tuple[Any, ...], result: Any) -> None:
 
 def _loss(look: Look, args: tuple[Any, ...], result: Any) -> None:
     if look.level is Checks.STEP:
-        look.values("loss", torch.tensor(result[0], dtype=torch.float64))
+        look.values("loss", result[0])
         look.values("gradient of the image", result[1])
 
 

@@ -16,6 +16,10 @@ class Where:
         """Begin a frame; no iteration of it has begun."""
         self.frame, self.iteration = frame, None
 
+    def iterate(self, first: int, place: int) -> None:
+        """Begin the iteration at this place of a series, of which the first has the number ``first``."""
+        self.iteration = first + place
+
     def count(self) -> None:
         """Begin the next iteration of a part that fits something itself: the first is 1."""
         self.iteration = 1 if self.iteration is None else self.iteration + 1

@@ -10,6 +10,7 @@ from statistics import mean
 
 import torch
 
+from gsstream.core.frame import Frame
 from gsstream.engine.budget.plan import (
     LEAST_WEIGHT,
     MOST_TRIMMED,
@@ -20,6 +21,8 @@ from gsstream.engine.budget.plan import (
     each_with,
     epochs_within,
 )
+from gsstream.engine.budget.schedule import Schedule
+from gsstream.recipe.model import Stream
 
 #: Share of the passes after which the size is first estimated: before that, residuals are still growing.
 SETTLE = 0.25
@@ -39,38 +42,36 @@ class Allowance:
         return Allowance(plan, time.perf_counter(), time.perf_counter)
 
 
-class Pace:
-    """Passes and weight of one frame, corrected by what its own passes take; lives inside one frame's optimisation.
+class EpochScheduler(Schedule):
+    """Passes and weight of one frame under a budget, corrected by what its own passes take.
 
     Arguments:
-        epochs, rate_weight: of the plan or the recipe. views: iterations of a pass.
+        epochs, rd_lambda: of the plan. views: iterations of a pass.
         effort: share of the passes that the frame is worth, and of the time that they have.
-
-    Without an allowance it is the recipe's number of passes and weight.
     """
 
     def __init__(
-        self, allowance: Allowance | None, epochs: int, rate_weight: float, views: int, effort: float = 1.0
+        self, allowance: Allowance, epochs: int, rd_lambda: float, views: int, effort: float = 1.0
     ) -> None:
-        plan = None if allowance is None else allowance.plan
-        self._timed = allowance if plan is not None and plan.seconds is not None else None
+        super().__init__(epochs, rd_lambda)
+        plan = allowance.plan
+        self._timed = allowance if plan.seconds is not None else None
+        self.chunk = 1 if self._timed else None
         # With a time budget the number of passes in the plan is a prediction, and the clock may allow more.
-        self._most = max(epochs, round(effort * plan.most_epochs)) if plan is not None and self._timed else epochs
-        self.epochs, self.rate_weight, self._effort = epochs, rate_weight, effort
+        self._most = max(epochs, round(effort * plan.most_epochs)) if self._timed else epochs
+        self._effort = effort
         self.estimate = 0.0
         self._weights: list[float] = []
         self.stopped_by_clock = False
         self._allowance, self._views = allowance, views
         #: Seconds until the optimisation began, and of it, by the budget's clock.
-        self.before = self.optimise = 0.0
-        if allowance is not None:
-            self.before = allowance.clock() - allowance.started
+        self.before, self.optimise = allowance.clock() - allowance.started, 0.0
         #: Seconds a pass is expected to take.
         self._each = 0.0
         self._iteration_began = 0.0
         self._iterations: list[float] = []
 
-    def begin(self, candidates: int) -> None:
+    def start(self, candidates: int) -> None:
         """Note that the first pass begins, with so many Gaussians."""
         if self._timed is None:
             return
@@ -95,26 +96,15 @@ class Pace:
         given_up = (1 - self._effort) * (seconds - kept - self.before)
         return self._timed.started + seconds - kept - now - max(0.0, given_up)
 
-    def close(self) -> None:
+    def finish(self) -> None:
         """Note that the optimisation has ended."""
-        if self._allowance is not None:
-            self.optimise = self._allowance.clock() - self._allowance.started - self.before
-
-    @property
-    def is_timed(self) -> bool:
-        """Whether a clock is to be asked after every iteration."""
-        return self._timed is not None
+        self.optimise = self._allowance.clock() - self._allowance.started - self.before
 
     @property
     def typical_weight(self) -> float:
         """Geometric mean over the last half of the passes: what the bytes of the frame answer to."""
-        last = self._weights[len(self._weights) // 2 :] or [self.rate_weight]
-        return math.exp(sum(map(math.log, last)) / len(last)) if min(last) > 0 else self.rate_weight
-
-    @property
-    def meets_size(self) -> bool:
-        """Whether a size is to be met, so that bytes are to be estimated after every pass."""
-        return self._allowance is not None and self._allowance.plan.max_bytes is not None
+        last = self._weights[len(self._weights) // 2 :] or [self.rd_lambda]
+        return math.exp(sum(map(math.log, last)) / len(last)) if min(last) > 0 else self.rd_lambda
 
     def is_over(self) -> bool:
         """Say, after every iteration, whether the time for another one is gone."""
@@ -152,18 +142,36 @@ class Pace:
         """
         return self._iterations[1:][-self._views :]
 
-    def meet_size(self, done: int, estimate: float) -> None:
-        """Move the weight of the rate by what a pass would have sent. ``estimate``: bytes, before the correction."""
-        assert self._allowance is not None
-        self.estimate = estimate
-        self._weights.append(self.rate_weight)
+    def weigh_bytes(self, done: int, estimate: Callable[[], float]) -> None:
+        """Move the weight of the rate by what a pass would have sent, where a size is to be met.
+
+        ``estimate``: bytes, before the correction.
+        """
         plan = self._allowance.plan
-        if plan.max_bytes is None or done < SETTLE * self.epochs:
+        if plan.max_bytes is None:
             return
-        expected = estimate * plan.correction
+        self.estimate = estimate()
+        self._weights.append(self.rd_lambda)
+        if done < SETTLE * self.epochs:
+            return
+        expected = self.estimate * plan.correction
         # Between the two bounds the weight stays, and trimming makes the packet fit.
         wanted = min(max(expected, SIZE_AIM * plan.max_bytes), MOST_TRIMMED * plan.max_bytes)
-        self.rate_weight = next_weight(self.rate_weight, expected, wanted)
+        self.rd_lambda = next_weight(self.rd_lambda, expected, wanted)
+
+
+def scheduled(stream: Stream, frame: Frame, allowance: Allowance | None) -> Schedule:
+    """Return the schedule of a frame: as the recipe, or the plan of its budget, says.
+
+    Arguments:
+        stream: section ``stream`` of the recipe.
+        frame: of which ``effort`` says what share of the epochs it is worth.
+        allowance: what it may spend; None: no limit.
+    """
+    epochs = max(1, round(stream.epochs * frame.effort))
+    if allowance is None:
+        return Schedule(epochs, stream.rate_weight)
+    return EpochScheduler(allowance, epochs, stream.rate_weight, len(frame.cameras), frame.effort)
 
 
 def next_weight(weight: float, expected: float, wanted: float) -> float:

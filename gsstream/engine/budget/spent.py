@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from gsstream.engine.budget.pace import Allowance, Pace
+from gsstream.engine.budget.pace import Allowance, EpochScheduler
 from gsstream.engine.budget.trim import Fitted
 from gsstream.recipe.model import Stream
 
 
 def spent(
-    allowance: Allowance, pace: Pace, fitted: Fitted, stream: Stream, epochs: float
+    allowance: Allowance, pace: EpochScheduler, fitted: Fitted, stream: Stream, epochs: float
 ) -> dict[str, Any]:
     """Return the entry ``budget`` of a frame, before its limits and the cost of the whole frame are added.
 

@@ -1,4 +1,4 @@
-"""Exposure: an affine colour map per training camera, fitted while frame 0 is optimised.
+"""The fit of the cameras' colour maps while frame 0 is optimised.
 
 Rigs are rarely colour-matched. Without this the Gaussians explain the differences between cameras with floaters and
 view-dependent colour, and held-out views pay. The mean map is held at identity, so a camera nobody fitted (the
@@ -11,25 +11,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-
-@dataclass(frozen=True)
-class Exposure:
-    """Colour maps of C cameras: image' = image @ matrix.T + offset. ``matrix`` [C, 3, 3], ``offset`` [C, 3]."""
-
-    matrix: torch.Tensor
-    offset: torch.Tensor
-
-    @staticmethod
-    def identity(num_cameras: int) -> Exposure:
-        return Exposure(torch.eye(3).repeat(num_cameras, 1, 1), torch.zeros(num_cameras, 3))
-
-    def apply(self, view: int, image: torch.Tensor) -> torch.Tensor:
-        """Return [H, W, 3]: scene colours as camera ``view`` records them."""
-        return torch.addmm(self.offset[view], image.reshape(-1, 3), self.matrix[view].T).reshape(image.shape)
-
-    def pull(self, view: int, gradient: torch.Tensor) -> torch.Tensor:
-        """Return the gradient with respect to scene colours, given that with respect to recorded colours [H, W, 3]."""
-        return (gradient.reshape(-1, 3) @ self.matrix[view]).reshape(gradient.shape)
+from gsstream.render.exposure import Exposure
 
 
 @dataclass(frozen=True)
@@ -46,20 +28,20 @@ class ExposureFit:
         zeros = torch.zeros(num_cameras, 12)
         return ExposureFit(Exposure.identity(num_cameras), zeros, zeros, (0,) * num_cameras)
 
-    def step(self, view: int, slope: torch.Tensor, lr: float, pull: float) -> ExposureFit:
+    def step(self, view: int, grad: torch.Tensor, lr: float, identity_weight: float) -> ExposureFit:
         """Make one Adam step of camera ``view``.
 
         Arguments:
             view: index of a training camera.
-            slope: [12] gradient of the loss by the camera's colour map (:func:`colour_slope`).
+            grad: [12] gradient of the loss by the camera's colour map.
             lr: learning rate of the matrix entries; offsets use 0.4 of it.
-            pull: weight of the quadratic pull towards identity.
+            identity_weight: of the squared distance from identity.
         """
         matrix, offset = self.exposure.matrix[view], self.exposure.offset[view]
-        slope = slope + pull * torch.cat([(matrix - torch.eye(3)).flatten(), offset])
+        grad = grad + identity_weight * torch.cat([(matrix - torch.eye(3)).flatten(), offset])
         count = self.steps[view] + 1
-        first = 0.9 * self.first[view] + 0.1 * slope
-        second = 0.999 * self.second[view] + 0.001 * slope.square()
+        first = 0.9 * self.first[view] + 0.1 * grad
+        second = 0.999 * self.second[view] + 0.001 * grad.square()
         change = lr * (first / (1 - 0.9**count)) / ((second / (1 - 0.999**count)).sqrt() + 1e-10)
         steps = (*self.steps[:view], count, *self.steps[view + 1 :])
         exposure = Exposure(
@@ -73,17 +55,6 @@ class ExposureFit:
         matrix, offset = self.exposure.matrix, self.exposure.offset
         centered = Exposure(matrix - matrix.mean(0) + torch.eye(3), offset - offset.mean(0))
         return replace(self, exposure=centered)
-
-
-def colour_slope(image: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
-    """Return [12]: the gradient of the loss by a colour map, its matrix row by row and its offset.
-
-    Arguments:
-        image: [H, W, 3] scene colours.
-        gradient: [H, W, 3] of the loss by the recorded colours.
-    """
-    pixels, upstream = image.reshape(-1, 3), gradient.reshape(-1, 3)
-    return torch.cat([(upstream.T @ pixels).flatten(), upstream.sum(0)])
 
 
 def _put(values: torch.Tensor, row: int, value: torch.Tensor) -> torch.Tensor:

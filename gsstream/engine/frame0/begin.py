@@ -20,13 +20,13 @@ from gsstream.core.rng import Rng
 from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import blaming
-from gsstream.engine.fit.exposure import Exposure
 from gsstream.engine.frame0.cheaper import cheaper_rows
 from gsstream.engine.frame0.first_seen import first_rows
 from gsstream.engine.frame0.optimise import Progress, initial_gaussians, optimise_first_frame, sort_by_node
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.init.thinning import thin_points
 from gsstream.packet import EncodedPacket, KeyState, PlayerState, StreamMeta, decode_packet, encode_key, quantise_key
+from gsstream.render.exposure import Exposure
 from gsstream.structure.base import Anchors
 
 

@@ -9,9 +9,9 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import BoolArray
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.fit.exposure import Exposure
 from gsstream.engine.frame0.probes import TrainingViews
 from gsstream.engine.frame0.removal import removal_errors
+from gsstream.render.exposure import Exposure
 
 
 def first_rows(

@@ -19,18 +19,19 @@ from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.topology import TopologyEdit
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.assembly.checks import VARIABLE, Checks, Look
+from gsstream.engine.assembly.checks import VARIABLE, Look
 from gsstream.engine.fit import schedule
 from gsstream.engine.fit.densify import DensifyStatistics, grow_and_prune
-from gsstream.engine.fit.exposure import Exposure, ExposureFit
-from gsstream.engine.fit.judge import Judge
+from gsstream.engine.fit.exposure import ExposureFit
 from gsstream.engine.fit.nearest import neighbour_distance
-from gsstream.engine.fit.row_table import RowTable
+from gsstream.engine.fit.photometric import PhotometricLoss
 from gsstream.engine.frame0.probes import TrainingViews
 from gsstream.engine.frame0.removal import not_missed
+from gsstream.optimiser.row_parameters import RowParameters
 from gsstream.recipe.model import FirstFrame
 from gsstream.render.activations import logit, rgb_to_sh0
-from gsstream.render.base import WholePull
+from gsstream.render.exposure import Exposure
+from gsstream.render.wrt import LossAndGrad, WrtScene
 from gsstream.structure.base import Anchors
 
 CENTER_EVERY = 50
@@ -134,10 +135,9 @@ class FirstFrameRun:
         self.views = len(frame.cameras)
         self.extent = frame.cameras.extent
         self.iterations, self.generator = iterations, generator
-        self.table = RowTable(dict(start.items()), first_rates(self.settings, self.extent), parts.optimiser)
-        in_one_go = parts.checks is not Checks.STEP
-        self.judge = Judge(parts.loss, schedule.DSSIM, frame.images, None, in_one_go)
-        #: Colour maps that are fitted along; None: those of the judge stay.
+        self.table = RowParameters(dict(start.items()), first_rates(self.settings, self.extent), parts.optimiser)
+        self.photometric = PhotometricLoss(parts.loss, schedule.DSSIM, frame.images, None)
+        #: Colour maps that are fitted along; None: those of the photometric loss stay.
         self.exposure: ExposureFit | None = None
         self.statistics = DensifyStatistics.zeros(len(start))
         #: [N] row of ``start`` that each Gaussian comes from.
@@ -154,18 +154,19 @@ class FirstFrameRun:
         last = schedule.DENSIFY_UNTIL * self.iterations
         densify = iteration + schedule.DENSIFY_EVERY >= schedule.DENSIFY_FROM and iteration <= last
         rows = self._disturbed(self.gaussians().map(torch.Tensor.detach))
-        pulled = self._pull(view, rows, densify)
+        found = self._loss_and_grad(view, rows, densify)
         fraction = iteration / self.iterations
         self.table.set_lr("means", self.extent * _log_linear(s.lr_means, s.lr_means_final, fraction))
-        self.table.step(self._penalised(pulled.gradients))
-        if densify and pulled.means2d is not None:
+        self.table.step(self._penalised(found.grad))
+        if found.means2d is not None:
             size = torch.tensor([self.frame.cameras.width / 2, self.frame.cameras.height / 2])
-            self.statistics = self.statistics.add(pulled.means2d * size)
+            self.statistics = self.statistics.add(found.means2d * size)
             if iteration >= schedule.DENSIFY_FROM and iteration % schedule.DENSIFY_EVERY == 0:
                 self._densify()
         if s.prune_error > 0 and iteration in [int(share * self.iterations) for share in schedule.PRUNE_AT]:
             self._prune()
-        self.smooth = pulled.loss if math.isnan(self.smooth) else 0.98 * self.smooth + 0.02 * pulled.loss
+        loss = float(found.loss)
+        self.smooth = loss if math.isnan(self.smooth) else 0.98 * self.smooth + 0.02 * loss
         return self.smooth
 
     def _disturbed(self, rows: Gaussians[torch.Tensor]) -> Gaussians[torch.Tensor]:
@@ -175,17 +176,20 @@ class FirstFrameRun:
         noise = torch.randn(rows.means.shape, generator=self.generator) * (self.settings.noise * self.extent)
         return replace(rows, means=rows.means + noise)
 
-    def _pull(self, view: int, rows: Gaussians[torch.Tensor], probed: bool) -> WholePull:
+    def _loss_and_grad(
+        self, view: int, rows: Gaussians[torch.Tensor], means2d: bool
+    ) -> LossAndGrad[Gaussians[torch.Tensor]]:
         """Loss of a view and its gradients, and the exposure step."""
         if self.exposure:
-            self.judge.exposure = self.exposure.exposure
+            self.photometric.exposure = self.exposure.exposure
         session = self.renderer.open(rows, None, self.frame.cameras, self.recipe.background)
-        pulled = self.judge.pull_whole(session, view, rows, probed)
-        if self.exposure and pulled.colours is not None:
-            self.exposure = self.exposure.step(view, pulled.colours, lr=0.005, pull=1e-3)
+        wrt = WrtScene(rows, means2d, exposure=self.exposure is not None)
+        found = session.loss_and_grad(view, self.photometric.view_target(view), wrt)
+        if self.exposure and found.exposure is not None:
+            self.exposure = self.exposure.step(view, found.exposure, lr=0.005, identity_weight=1e-3)
             if sum(self.exposure.steps) % CENTER_EVERY == 0:
                 self.exposure = self.exposure.centered()
-        return pulled
+        return found
 
     def _penalised(self, gradients: Gaussians[torch.Tensor]) -> dict[str, torch.Tensor]:
         """Gradients with those of the mean opacity and the mean scale, which need no graph."""
@@ -206,10 +210,10 @@ class FirstFrameRun:
     def _prune(self) -> None:
         """Drop what the images would not miss; what remains has time to close the gaps."""
         gaussians = self.gaussians().map(torch.Tensor.detach)
-        exposure = self.exposure.exposure if self.exposure else self.judge.exposure
+        exposure = self.exposure.exposure if self.exposure else self.photometric.exposure
         views = TrainingViews(self.renderer, self.frame, exposure, self.recipe.background)
         rows = not_missed(views, gaussians, self.generator, self.settings.prune_error)
-        self.table.keep(rows)
+        self.table.select_rows(rows)
         self.levels, self.came_from = self.levels[rows], self.came_from[rows]
         self.statistics = DensifyStatistics.zeros(len(rows))
 

@@ -14,9 +14,9 @@ import torch
 
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
-from gsstream.engine.fit.backward import gradient_of, pull_back
-from gsstream.engine.fit.exposure import Exposure
+from gsstream.render.backward import backward, gradient_of
 from gsstream.render.base import Renderer
+from gsstream.render.exposure import Exposure
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +73,10 @@ def probes(
     for view in range(len(cameras)):
         leaves = gaussians.map(lambda value: value.detach().clone().requires_grad_())
         image = session.render(view, leaves).image
-        seen = image.detach() if exposure is None else exposure.apply(view, image.detach())
+        seen = image.detach() if exposure is None else exposure[view].apply(image.detach())
         error = views.error(view, seen)
         for number in range(each):
             signs = torch.randint(0, 2, image.shape, generator=generator).to(image.dtype) * 2 - 1
-            pull_back([image], [signs if exposure is None else exposure.pull(view, signs)], again=number < each - 1)
+            upstream = signs if exposure is None else exposure[view].vjp(signs)
+            backward([image], [upstream], retain_graph=number < each - 1)
             yield Probe(leaves.map(_taken), error)

@@ -22,7 +22,6 @@ from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.densify import DensifyStatistics
-from gsstream.engine.fit.exposure import Exposure
 from gsstream.engine.frame0.axes import conjugates, quat_products
 from gsstream.engine.frame0.optimise import FirstFrameRun
 from gsstream.engine.state.refinement import Refinement
@@ -30,6 +29,7 @@ from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.packet import PlayerState
 from gsstream.recipe.model import Stream
 from gsstream.render.activations import rotation_matrices
+from gsstream.render.exposure import Exposure
 
 #: Entry of the meta of every key packet but a stream's first: the frame whose pictures its scene shows.
 SHOWN = "shown"
@@ -116,7 +116,7 @@ def advanced(
         return start
     generator = rng.stream("refine", frame.index)
     run = FirstFrameRun(start.gaussians, start.levels, frame, parts, generator, _iterations(stream))
-    run.judge.exposure, run.statistics = exposure, start.statistics
+    run.photometric.exposure, run.statistics = exposure, start.statistics
     for name, held in start.moments.items():
         run.table.load_moments(name, held)
     last = start.iterations + stream.refine_iterations

@@ -14,7 +14,7 @@ from dataclasses import replace
 import torch
 
 from gsstream.core.gaussians import Gaussians
-from gsstream.engine.fit.judge import shown
+from gsstream.engine.fit.photometric import render_exposed
 from gsstream.engine.frame0.probes import TrainingViews, probes
 
 #: Probes of a camera. A Gaussian that one camera sees is underestimated tenfold by a quarter of single probes, and by
@@ -93,6 +93,6 @@ def not_missed(
 def _mean_error(views: TrainingViews, gaussians: Gaussians[torch.Tensor]) -> float:
     cameras, error = views.frame.cameras, 0.0
     for view in range(len(cameras)):
-        seen = shown(views.renderer, gaussians, cameras, view, views.background, views.exposure)
+        seen = render_exposed(views.renderer, gaussians, cameras, view, views.background, views.exposure)
         error += views.error(view, seen)
     return error / len(cameras)

@@ -21,7 +21,7 @@ class Refinement:
         gaussians: [B] rows, raw values.
         levels: [B] int64 octree level of each.
         ancestors: [B] int64 row of the players' scene that each came from; -1: that one is gone.
-        moments: attribute -> Adam state of its rows (``RowTable.moments``); empty before the first iteration.
+        moments: attribute -> Adam state of its rows (``RowParameters.moments``); empty before the first iteration.
         statistics: of the screen gradients since Gaussians were last born.
         iterations: made so far.
     """

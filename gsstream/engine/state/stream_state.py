@@ -10,11 +10,11 @@ import torch
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.engine.fit.exposure import Exposure
 from gsstream.engine.state.refinement import Refinement
 from gsstream.method.base import Step as MethodStep
 from gsstream.packet import PlayerState
 from gsstream.render.base import RenderSession
+from gsstream.render.exposure import Exposure
 
 
 @dataclass(frozen=True)

@@ -2,31 +2,32 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.changes.motion import Moves
-from gsstream.core.context import MovedPull, RowGradient, ScreenGradient
+from gsstream.core.context import RowGradient, ScreenGradient
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.core.shapes import FloatArray
 from gsstream.core.storage import unpacked
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.assembly.checks import Checks
-from gsstream.engine.fit.backward import pull_back
-from gsstream.engine.fit.exposure import Exposure
-from gsstream.engine.fit.judge import Judge, shown
+from gsstream.engine.fit.photometric import PhotometricLoss, render_exposed
 from gsstream.engine.fit.schedule import DSSIM
 from gsstream.engine.step.active.candidates import VoteBook, changed_rows
 from gsstream.engine.step.active.change import MOST_PIXEL_SIGMA, Change
+from gsstream.engine.step.active.tiles import changed_tile_weights
 from gsstream.metrics.noise import noise_sigma
 from gsstream.optimiser.base import RowOptimiser
 from gsstream.render.base import RenderSession
+from gsstream.render.exposure import Exposure
+from gsstream.render.target import ViewTarget
+from gsstream.render.wrt import G, LossAndGrad, Wrt
 
 
 class FrameView:
-    """One frame over a decoded scene (implements ``core.context.FrameWork`` and ``method.tools.FrameTools``).
+    """One frame over a decoded scene (implements ``render.work.FrameWork`` and ``method.tools.FrameTools``).
 
     Images are as recorded; gradients are pulled through the camera's colour map, so that parts need not know it.
 
@@ -35,21 +36,19 @@ class FrameView:
         previous: training images that this scene shows.
         change: what changed since; None: everything counts as changed.
         session: a render session of this scene that is kept from before, or None.
-        judge: of the same images and colour maps, which has made of them what it needs; None: a new one.
+        photometric: loss of the same images and colour maps, with what it has made of them; None: a new one.
         votes: counted so far in the frame; None: none.
     """
 
     def __init__(
         self, parts: Assembly, gaussians: Gaussians[torch.Tensor], hierarchy: Hierarchy, frame: Frame, previous: Frame,
         exposure: Exposure | None, change: Change | None = None, session: RenderSession | None = None,
-        judge: Judge | None = None, votes: VoteBook | None = None,
+        photometric: PhotometricLoss | None = None, votes: VoteBook | None = None,
     ) -> None:  # fmt: skip
         self._parts, self._gaussians, self._hierarchy = parts, gaussians, hierarchy
         self._frame, self._previous, self._change = frame, previous, change
         self._background = parts.recipe.background
-        # What the level "step" looks at, images and their gradients, is not seen where a session does all in one call.
-        in_one_go = parts.checks is not Checks.STEP
-        self.judge = judge or Judge(parts.loss, DSSIM, frame.images, exposure, in_one_go)
+        self.photometric = photometric or PhotometricLoss(parts.loss, DSSIM, frame.images, exposure)
         self._session = session
         self._votes = votes or (None if change is None else VoteBook(change, frame.cameras))
 
@@ -97,7 +96,8 @@ class FrameView:
         return self.shown(self._gaussians, view)
 
     def shown(self, gaussians: Gaussians[torch.Tensor], view: int) -> torch.Tensor:
-        return shown(self._parts.renderer, gaussians, self.cameras, view, self._background, self.judge.exposure)
+        renderer, exposure = self._parts.renderer, self.photometric.exposure
+        return render_exposed(renderer, gaussians, self.cameras, view, self._background, exposure)
 
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
         if self._stands_still(view):
@@ -118,8 +118,8 @@ class FrameView:
         upstream = image_gradient.float()
         if self._change is not None:
             upstream = upstream * self._change.pixels(view)
-        if self.judge.exposure:
-            upstream = self.judge.exposure.pull(view, upstream)
+        if self.photometric.exposure:
+            upstream = self.photometric.exposure[view].vjp(upstream)
         return upstream.contiguous()
 
     def noise_sigma(self, view: int) -> float:
@@ -140,40 +140,16 @@ class FrameView:
     def narrow(self, rows: torch.Tensor) -> None:
         self._session = self.session_for(rows)
 
-    def pull_moved(
-        self, view: int, rows: Gaussians[FloatArray], moves: Moves, near_change: bool = False, curved: bool = False
-    ) -> MovedPull | None:
-        if not self.judge.in_one_go:
-            return None
-        comparison = self.judge.comparison(view, self._tiles(view, near_change))
-        pulled = self.session.pull_moved(view, rows, moves, comparison, curved)
-        if pulled is not None:
-            self._parts.where.count()
-        return pulled
-
-    def structure(self, view: int, rows: Gaussians[torch.Tensor], near_change: bool = False) -> FloatArray:
+    def loss_and_grad(self, view: int, wrt: Wrt[G], tiles: Literal["all", "changed"] = "all") -> LossAndGrad[G]:
         self._parts.where.count()
-        return self.judge.structure(self.session, view, rows, self._tiles(view, near_change))
+        weights = changed_tile_weights(self._change, view) if tiles == "changed" else None
+        return self.session.loss_and_grad(view, self.view_target(view, weights), wrt)
 
-    def _tiles(self, view: int, near_change: bool) -> torch.Tensor | None:
-        """Factors on the gradients of tiles; None: all count."""
-        return self._change.near[view].float() if near_change and self._change is not None else None
-
-    def pull(self, view: int, rows: Gaussians[torch.Tensor], near_change: bool = False) -> float:
-        self._parts.where.count()
-        tiles = self._tiles(view, near_change)
-        loss, gradients = self.judge.pull(self.session, view, rows, tiles)
-        pairs = [(value, gradient) for (_, value), (_, gradient) in zip(rows.items(), gradients.items(), strict=True)]
-        if learned := [(value, gradient) for value, gradient in pairs if value.requires_grad]:
-            pull_back(*zip(*learned, strict=True))
-        return loss
-
-    def backward(self, view: int, image: torch.Tensor, tile_mask: torch.Tensor | None = None) -> float:
-        self._parts.where.count()
-        return self.judge.backward(view, image, tile_mask)[0]
+    def view_target(self, view: int, tile_weights: torch.Tensor | None = None) -> ViewTarget:
+        return self.photometric.view_target(view, tile_weights)
 
     def on(self, gaussians: Gaussians[torch.Tensor], session: RenderSession | None = None) -> FrameView:
         return FrameView(
-            self._parts, gaussians, self._hierarchy, self._frame, self._previous, self.judge.exposure, self._change,
-            session, self.judge, self._votes,
+            self._parts, gaussians, self._hierarchy, self._frame, self._previous, self.photometric.exposure,
+            self._change, session, self.photometric, self._votes,
         )  # fmt: skip

@@ -8,27 +8,29 @@ from functools import partial
 from gsstream.core.changes import Delta, sent_rows
 from gsstream.engine.budget.trim import Fitted, fit
 from gsstream.engine.step.harden import rows_of
-from gsstream.engine.step.problem import Problem, Solution
+from gsstream.engine.step.problem import Solution
 from gsstream.method.packets import delta_packet
 from gsstream.packet import EncodedPacket, PlayerState
 from gsstream.packet.changes.motion import encode_motions
 
 
-def encode_frame(delta: Delta, before: PlayerState, problem: Problem, solution: Solution, trim: float) -> Fitted:
-    """Return the delta and its packet, made to fit the frame's allowance of bytes, else less the share ``trim``.
+def encode_frame(
+    delta: Delta, before: PlayerState, frame: int, solution: Solution, trim: float, budget: int | None = None
+) -> Fitted:
+    """Return the delta and its packet, made to fit ``budget``, else less the share ``trim``.
 
     Arguments:
-        problem: what the optimisation was given.
-        solution: what it found.
         delta: what the frame is to change. before: what players have before it.
+        frame: index of the frame.
+        solution: what the optimisation found.
         trim: share of the bytes to be given up where no size is asked for, 0 to 1.
+        budget: bytes that the frame may take; None: no limit.
     """
     # Packets of the same motions are made several times, and motions are never trimmed.
     motions = delta.motions
-    encoded = partial(delta_packet, before, frame=problem.frame, known=(motions, encode_motions(motions)))
+    encoded = partial(delta_packet, before, frame=frame, known=(motions, encode_motions(motions)))
     packet = encoded(delta)
     whole = Fitted(delta, packet, len(packet.data))
-    budget = None if problem.allowance is None else problem.allowance.plan.max_bytes
     limit = budget or _share(delta, encoded, whole.untrimmed, trim)
     if whole.untrimmed <= limit:
         return whole

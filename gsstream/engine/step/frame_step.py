@@ -13,12 +13,13 @@ from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
 from gsstream.core.storage import packed
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.budget.pace import Allowance, Pace
+from gsstream.engine.budget.pace import Allowance, EpochScheduler, scheduled
 from gsstream.engine.budget.trim import Fitted
 from gsstream.engine.state.follow import follow
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.active.candidates import CHANGE_VOTES, candidates
 from gsstream.engine.step.active.change import detect_change
+from gsstream.engine.step.active.tiles import tile_weights
 from gsstream.engine.step.clock import PhaseClock
 from gsstream.engine.step.encode import encode_frame
 from gsstream.engine.step.growth import grown
@@ -35,7 +36,7 @@ class Outcome(NamedTuple):
     """A step, and what a budget wants to know of it: the pace its passes were held to, and what fitting gave up."""
 
     step: Step
-    pace: Pace | None = None
+    pace: EpochScheduler | None = None
     fitted: Fitted | None = None
 
 
@@ -70,17 +71,22 @@ def frame_step(
         able = view.changed_rows(CHANGE_VOTES)
         rows = candidates(able, open_probability, state.hierarchy, stream.active_threshold)
     with clock.phase("optimise"):
+        generator, views = rng.stream("frame", frame.index), len(frame.cameras)
         problem = Problem(
-            frame.index, frame.effort, scene.layout, state.hierarchy, rows, view.gaussians.rows(rows), logits,
-            state.decoders, view.session_for(rows), view.judge, len(frame.cameras),
-            frame.cameras.width * frame.cameras.height, allowance, None if change is None else change.near,
+            scene.layout, state.hierarchy, rows, view.gaussians.rows(rows), logits, state.decoders,
+            view.session_for(rows), lambda index: view.view_target(
+                index, tile_weights(change, index, stream.quiet_tiles, generator)
+            ), views, frame.cameras.width * frame.cameras.height, generator,
+            1.0 if allowance is None else allowance.plan.step_scale,
         )  # fmt: skip
-        solution = optimise(parts, problem, rng.stream("frame", frame.index))
+        schedule = scheduled(stream, frame, allowance)
+        solution = optimise(parts, problem, schedule)
         residual = harden(parts, problem, solution)
     with clock.phase("growth"):
         delta = grown(parts, state, Delta(motions).with_residual(residual), view, rng)
     with clock.phase("code"):
-        fitted = encode_frame(delta, state.player, problem, solution, parts.recipe.codec.trim)
+        most = None if allowance is None else allowance.plan.max_bytes
+        fitted = encode_frame(delta, state.player, frame.index, solution, parts.recipe.codec.trim, most)
         player = decode_packet(state.player, fitted.packet.data)
     with clock.phase("keep"):
         # A frame that changed nothing is not what the scene shows: the next one is compared with the last that did, so
@@ -91,7 +97,8 @@ def frame_step(
         after = follow(replace(state, previous=shown, session=session), player)
     metrics = step_metrics(fitted.delta, after, fitted.packet, solution, len(rows))
     metrics |= {"changed_tiles": 1.0 if change is None else change.share, "seconds": clock.seconds}
-    return Outcome(Step(after, fitted.packet, "empty" if unchanged else "delta", metrics), solution.pace, fitted)
+    pace = schedule if isinstance(schedule, EpochScheduler) and len(rows) else None
+    return Outcome(Step(after, fitted.packet, "empty" if unchanged else "delta", metrics), pace, fitted)
 
 
 def still(state: StreamState, frame: Frame, clock: PhaseClock) -> Outcome:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -10,9 +10,8 @@ import torch
 from gsstream.core.changes import Layout
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.engine.budget.pace import Allowance, Pace
-from gsstream.engine.fit.judge import Judge
 from gsstream.render.base import RenderSession
+from gsstream.render.target import ViewTarget
 
 
 @dataclass(frozen=True)
@@ -20,22 +19,18 @@ class Problem:
     """The input of one frame's optimisation.
 
     Arguments:
-        frame: index of the frame.
-        effort: share of the recipe's epochs that the frame is worth, 0 to 1.
         layout, hierarchy: how the scene is stored and grouped.
         rows: [A] int64 candidates, ascending.
         base: those rows of the scene that the residual is added to.
         logits: [M] initial gate logits.
         decoders: attribute -> [L, D] linear decoder to go on from.
         session: a render session in which only ``rows`` change.
-        judge: compares renders with what the V cameras recorded.
-        pixels: of one view.
-        allowance: what the frame may spend; None: what the recipe says.
-        near: [V, ceil(H / 16), ceil(W / 16)] bool, tiles that every iteration looks at; None: at all.
+        target: view -> what its render is compared with in the next iteration.
+        views: training cameras; pixels: of one view.
+        generator: of noise, of the order of views and of the tiles that are looked at.
+        step_scale: factor on the update rule's quantisation steps.
     """
 
-    frame: int
-    effort: float
     layout: Layout
     hierarchy: Hierarchy
     rows: torch.Tensor
@@ -43,16 +38,11 @@ class Problem:
     logits: torch.Tensor
     decoders: Mapping[str, torch.Tensor]
     session: RenderSession
-    judge: Judge
+    target: Callable[[int], ViewTarget]
     views: int
     pixels: int
-    allowance: Allowance | None = None
-    near: torch.Tensor | None = None
-
-    @property
-    def step_scale(self) -> float:
-        """Factor on the update rule's quantisation steps."""
-        return 1.0 if self.allowance is None else self.allowance.plan.step_scale
+    generator: torch.Generator
+    step_scale: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -67,7 +57,6 @@ class Solution:
         loss: mean over the last pass, of the tiles that took part.
         iterations: views rendered.
         curvature: attribute -> [A, L], mean squared gradient of the latents: what a latent is worth, up to a factor.
-        pace: what the passes were held to.
         dead_gates: gates of rows that stayed which ended where nothing moves them (:func:`count_dead`).
     """
 
@@ -78,5 +67,4 @@ class Solution:
     loss: float = 0.0
     iterations: int = 0
     curvature: Mapping[str, torch.Tensor] = field(default_factory=dict)
-    pace: Pace | None = None
     dead_gates: int = 0

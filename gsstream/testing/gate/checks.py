@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import torch
 
-from gsstream.gate.base import GateSampler
+from gsstream.gate.base import AnalyticGate, GateSampler
 from gsstream.testing.cases import world
 from gsstream.testing.compare import ROUNDING, all_equal, at_most, equal, finite
 from gsstream.testing.drive import draw
@@ -174,20 +174,20 @@ def check_gate_state_resume(part: GateSampler) -> None:
 
 
 @check("gate")
-def check_gate_law(part: GateSampler) -> None:
-    """A gate that states its formulas keeps to them: gates, probabilities, their slopes, bounds, and no noise."""
-    law = part.law()
-    if law is None:
+def check_gate_form(part: GateSampler) -> None:
+    """A gate that states a closed form keeps to it: gates, probabilities, their derivatives, bounds, and no noise."""
+    form = part.form()
+    if not isinstance(form, AnalyticGate):
         return
     logits = torch.linspace(-9, 9, 181).requires_grad_()
     seed = torch.Generator().manual_seed(1)
-    assert part.noise(len(logits), seed) is None, "law(): expected a gate without noise, got one that draws some"
-    assert part.num_levels == law.levels, f"law(): expected {part.num_levels} levels, got {law.levels}"
-    pairs = ((part.sample(logits, None), law.gates), (part.open_probability(logits), law.probability))
+    assert part.noise(len(logits), seed) is None, "form(): expected a gate without noise, got one that draws some"
+    assert part.num_levels == form.levels, f"form(): expected {part.num_levels} levels, got {form.levels}"
+    pairs = ((part.sample(logits, None), form.gates), (part.open_probability(logits), form.probability))
     for name, (value, formula) in zip(("gates", "open probability"), pairs, strict=True):
-        slope = torch.autograd.grad(value.sum(), logits)[0] if value.requires_grad else torch.zeros_like(logits)
-        stated, slopes = formula(logits.detach())
+        grad = torch.autograd.grad(value.sum(), logits)[0] if value.requires_grad else torch.zeros_like(logits)
+        stated, derivative = formula(logits.detach())
         equal(name, value.detach(), stated, 2e-6, ROUNDING)
-        equal(f"slope of {name}", slope, slopes, 2e-6, ROUNDING)
+        equal(f"derivative of {name}", grad, derivative, 2e-6, ROUNDING)
     far = 100 * logits.detach()
-    equal("bounds", part.bound(far), far.clamp(-law.bound, law.bound))
+    equal("bounds", part.bound(far), far.clamp(-form.bound, form.bound))

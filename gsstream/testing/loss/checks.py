@@ -25,7 +25,7 @@ def _pair() -> tuple[torch.Tensor, torch.Tensor]:
     return image, target
 
 
-def _judge(part: Loss, dssim: float, mask: torch.Tensor | None = None) -> tuple[float, torch.Tensor]:
+def _judge(part: Loss, dssim: float, mask: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
     image, target = _pair()
     return part.evaluate(image, part.prepare(target), dssim, mask)
 

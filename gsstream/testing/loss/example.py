@@ -44,7 +44,7 @@ class ExampleLoss(Loss):
 
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
-    ) -> tuple[float, torch.Tensor]:
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         leaf = image.detach().requires_grad_()
         judged = inside = torch.ones_like(image[..., :1])
         if tile_mask is not None:
@@ -55,7 +55,7 @@ class ExampleLoss(Loss):
             per_pixel = (1 - dssim) * (leaf - prepared).abs() + dssim * (1 - similarity(leaf, prepared))
             value = (per_pixel * judged).mean()
             (gradient,) = torch.autograd.grad(value, leaf)
-        return float(value.detach()), gradient * inside
+        return value.detach().double(), gradient * inside
 
 
 def pixels(tiles: torch.Tensor, image: torch.Tensor) -> torch.Tensor:

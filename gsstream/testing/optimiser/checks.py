@@ -7,12 +7,19 @@ import torch
 from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.joint import JointCode
-from gsstream.engine.fit.residual_table import JointTable
+from gsstream.engine.fit.gates import TrainedGates
+from gsstream.loss.photometric import ReferenceLoss
 from gsstream.optimiser.base import ADAM_BETAS, ADAM_EPS, AdamState, RowOptimiser
+from gsstream.optimiser.joint import JointResidualOptimiser
+from gsstream.optimiser.residual import Iteration, ResidualEpoch, ResidualOptimiser
+from gsstream.render.target import ViewTarget
 from gsstream.residual.base import AttributeCode
 from gsstream.residual.joint import joint_code
+from gsstream.testing.cases import BLACK, RENDERER, world
 from gsstream.testing.compare import equal
+from gsstream.testing.gate.example import ExampleGate
 from gsstream.testing.registry import check
+from gsstream.testing.regularizer.example import ExampleRegularizer
 
 STEPS = 12
 WHY = "float32 over a dozen steps"
@@ -97,33 +104,70 @@ def _residual_case() -> tuple[JointCode, Gaussians[torch.Tensor], torch.Tensor, 
 
 
 @check("optimiser")
-def check_residual_table(part: RowOptimiser) -> None:
-    """A residual table of its own does what the residual's formulas, the rate and Adam do.
+def check_residual_optimiser(part: RowOptimiser) -> None:
+    """Its residual optimiser does what the residual's formulas, the rate and Adam do.
 
     Rows leave, bits cost something in every other step, and the learning rates fall.
     """
     code, base, units, matrix = _residual_case()
-    subject, truth = part.residual_table(code, base, units, matrix), JointTable(code, base, units, matrix, part)
-    if subject is None:
-        return
+    subject = part.residual_optimiser(code, base, units, matrix)
+    truth = JointResidualOptimiser(code, base, units, matrix, part)
     g, rows = torch.Generator().manual_seed(8), len(base)
     for step in range(STEPS):
         if step == STEPS // 2:
             kept = torch.arange(0, rows, 3)
-            for table in (subject, truth):
-                table.keep(kept)
+            for each in (subject, truth):
+                each.select_rows(kept)
             rows = len(kept)
         gates = torch.randint(0, 4, (rows,), generator=g) / 3
-        ours, theirs = subject.rows(gates), truth.rows(gates)
+        ours, theirs = subject.forward(gates), truth.forward(gates)
         for (name, one), (_, other) in zip(ours.items(), theirs.items(), strict=True):
             equal(f"{name} of step {step}", one, other, 1e-5, WHY)
-        gradients = ours.map(lambda value: 1e-3 * torch.randn(value.shape, generator=g))
+        grad = ours.map(lambda value: 1e-3 * torch.randn(value.shape, generator=g))
         weight = 1e-4 if step % 2 else 0.0
-        equal("gradient of the gates", subject.pull(gradients, weight), truth.pull(gradients, weight), 1e-5, WHY)
-        for table in (subject, truth):
-            table.latents.grad = torch.full((rows, code.width), 1e-5)
-            table.step(0.9**step)
-            assert table.latents.grad is None, "step(): expected what waits on the latents to be taken, got it left"
-        equal("latents", subject.latents.detach(), truth.latents.detach(), 1e-4, WHY)
-        equal("decoders", subject.matrix, truth.matrix, 1e-4, WHY)
-        equal("curvature", subject.curvature, truth.curvature, 1e-4, WHY)
+        equal("gradient of the gates", subject.backward(grad, weight), truth.backward(grad, weight), 1e-5, WHY)
+        for each in (subject, truth):
+            each.latents.grad = torch.full((rows, code.width), 1e-5)
+            each.step(0.9**step)
+            assert each.latents.grad is None, "step(): expected what waits on the latents to be taken, got it left"
+        _compare(subject, truth)
+    equal("position", subject.position.detach(), truth.position.detach(), 1e-4, WHY)
+
+
+@check("optimiser")
+def check_residual_optimiser_run(part: RowOptimiser) -> None:
+    """Six iterations of ``run`` find what its default body finds: residual, decoders, gates and losses."""
+    found = []
+    for body in (None, ResidualOptimiser.run):
+        case = world("cloud")
+        active, loss = torch.arange(0, len(case.gaussians), 3), ReferenceLoss()
+        session = RENDERER.open(case.gaussians, active, case.cameras, BLACK)
+        base, views = case.gaussians.rows(active), len(case.cameras)
+        latents = {"means": torch.zeros(len(active), 3), "sh0": torch.zeros(len(active), 3)}
+        codes = {"means": AttributeCode(0.05, 0.02), "sh0": AttributeCode(0.1, 0.05)}
+        code = joint_code(codes, latents, {}, base)
+        subject = part.residual_optimiser(code, base, torch.full((len(active),), 0.2), code.join_decoders({}))
+        gates = TrainedGates(
+            ExampleGate(), ExampleRegularizer(), part, 0.05, case.logits[: case.hierarchy.num_nodes], case.hierarchy,
+            active, torch.Generator().manual_seed(1),
+        )  # fmt: skip
+        frozen = torch.arange(len(active)) % 4 == 0
+        iterations = [
+            Iteration(place % views, ViewTarget(loss, case.now[place % views], 0.2, case.now[place % views]),
+                      frozen if place < 2 else None, 0.9**place)
+            for place in range(6)
+        ]  # fmt: skip
+        epoch = ResidualEpoch(session, iterations, gates, 1e-5)
+        made = subject.run(epoch) if body is None else body(subject, epoch)
+        assert len(made) == 6, f"run(): expected 6 losses, got {len(made)}"
+        found.append((subject, gates, torch.stack(made)))
+    (subject, gates, losses), (truth, wanted, expected) = found
+    _compare(subject, truth)
+    equal("logits", gates.logits.detach(), wanted.logits.detach(), 1e-4, WHY)
+    equal("losses", losses, expected, 1e-5, WHY)
+
+
+def _compare(subject: ResidualOptimiser, truth: ResidualOptimiser) -> None:
+    equal("latents", subject.latents.detach(), truth.latents.detach(), 1e-4, WHY)
+    equal("decoders", subject.matrix, truth.matrix, 1e-4, WHY)
+    equal("curvature", subject.curvature, truth.curvature, 1e-4, WHY)

@@ -9,7 +9,7 @@ import torch
 
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.shapes import check_shape
-from gsstream.regularizer.base import Regularizer
+from gsstream.regularizer.base import AnalyticPenalty, Regularizer
 from gsstream.testing.cases import World, forest, world
 from gsstream.testing.compare import ROUNDING, at_most, equal, finite
 from gsstream.testing.registry import check
@@ -164,10 +164,10 @@ def check_regularizer_uses_what_it_says(part: Regularizer) -> None:
 
 
 @check("regularizer")
-def check_regularizer_price(part: Regularizer) -> None:
-    """A penalty that states its formula keeps to it, in its slopes by probabilities and residuals."""
-    price = part.price()
-    if price is None:
+def check_regularizer_form(part: Regularizer) -> None:
+    """A penalty that states a closed form keeps to it, in its gradient by probabilities and residuals."""
+    form = part.form()
+    if not isinstance(form, AnalyticPenalty):
         return
     case = world("cloud")
     hierarchy, count = case.hierarchy, 3 * len(case.residual)
@@ -176,7 +176,7 @@ def check_regularizer_price(part: Regularizer) -> None:
     total = sum(part.penalty(probability, residual, hierarchy, count).values(), torch.zeros(()))
     leaves = (probability, residual)
     found = torch.autograd.grad(total, leaves, allow_unused=True) if total.requires_grad else (None, None)
-    stated = price.slopes(probability.detach(), residual.detach(), hierarchy, count)
+    stated = form.grad(probability.detach(), residual.detach(), hierarchy, count)
     for name, leaf, one, other in zip(("probabilities", "residuals"), leaves, found, stated, strict=True):
         one = torch.zeros_like(leaf) if one is None else one
-        equal(f"slope by {name}", one, other, 2e-6, ROUNDING)
+        equal(f"gradient by {name}", one, other, 2e-6, ROUNDING)

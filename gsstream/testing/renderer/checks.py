@@ -7,13 +7,13 @@ from dataclasses import replace
 import torch
 
 from gsstream.core.cameras import Cameras
-from gsstream.engine.fit.backward import gradient_of
+from gsstream.render.backward import gradient_of
 from gsstream.render.base import TILE, Renderer, RenderOutput
 from gsstream.render.reference import ALPHA_CUT, project
 from gsstream.testing.cases import BLACK, RENDERER, SIZE, Scene, fingerprint, world
 from gsstream.testing.compare import EXACT, at_most, equal, finite, gradients_equal, relative
 from gsstream.testing.registry import check
-from gsstream.testing.renderer import short_cuts as short_cuts  # its checks register themselves
+from gsstream.testing.renderer import loss_and_grad as loss_and_grad  # its checks register themselves
 
 WORLDS = ("empty", "one", "two identical", "line", "cloud", "far", "tiny", "vast", "thin", "unseen")
 GREY = (0.2, 0.5, 0.9)

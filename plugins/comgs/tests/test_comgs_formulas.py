@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from gsstream_comgs.correction import corrected
@@ -9,7 +11,7 @@ from gsstream_comgs.influence import Field, KeyPoints, field_of, matrices, moved
 from gsstream_comgs.settings import CorrectionSettings
 from scipy.spatial.transform import Rotation
 
-from gsstream.api import Gaussians, Layout, Scene, apply_motion
+from gsstream.api import Gaussians, Layout, LossAndGrad, Scene, Wrt, apply_motion
 from gsstream.blocks import said_by_cells
 
 RNG = np.random.default_rng(0)
@@ -109,10 +111,11 @@ class Wrong:
     def narrow(self, rows: torch.Tensor) -> None:
         self.rows = rows
 
-    def pull(self, view: int, rows: Gaussians[torch.Tensor]) -> float:
-        loss = (rows.sh0[:, 0] - self.aims[self.rows]).square().sum()
+    def loss_and_grad(self, view: int, wrt: Wrt[Any], tiles: str = "all") -> LossAndGrad[Any]:
+        leaves = wrt.placed().map(lambda value: value.detach().requires_grad_())
+        loss = (leaves.sh0[:, 0] - self.aims[self.rows]).square().sum()
         loss.backward()
-        return float(loss.detach())
+        return LossAndGrad(loss.detach(), wrt.grad(leaves))
 
 
 def test_corrections_mend_what_is_wrong_and_leave_the_rest() -> None:

@@ -11,10 +11,10 @@ from cpu_scenes import BACKGROUND, random_splats
 from gsstream_cpu_render.loss_part import CpuLoss
 from gsstream_cpu_render.renderer import CpuRenderer
 from gsstream_cpu_render.session import CpuSession
-from test_cpu_fit import some_tiles, step_by_step
+from test_cpu_fit import some_tiles
 from test_cpu_renderer import replaced, rig
 
-from gsstream.api import Comparison, Gaussians, Pulled
+from gsstream.api import CameraExposure, Gaussians, LossAndGrad, RenderSession, ViewTarget, WrtRows
 
 Scene = Gaussians[torch.Tensor]
 COUNT = 700  # lists of some 150 entries a tile: several cells of the layers behind
@@ -64,22 +64,28 @@ def begun(seed: int, g: torch.Generator) -> tuple[Scene, torch.Tensor, CpuSessio
     return whole, active, opened(whole, active)
 
 
-def comparison(dssim: float = 0.3, coloured: bool = False, tiles: torch.Tensor | None = None) -> Comparison:
+def comparison(dssim: float = 0.3, coloured: bool = False, tiles: torch.Tensor | None = None) -> ViewTarget:
     """With an image that is brighter than any render: no pixel is near the kink of the absolute difference."""
     cameras, g = rig(), torch.Generator().manual_seed(4)
-    target = CpuLoss().prepare(9 + torch.rand(cameras.height, cameras.width, 3, generator=g))
-    maps = (torch.eye(3) + 0.1 * torch.rand(3, 3, generator=g), 0.1 * torch.rand(3, generator=g)) if coloured else ()
-    return replace(Comparison(CpuLoss(), target, dssim, *maps), tiles=tiles)
+    image = 9 + torch.rand(cameras.height, cameras.width, 3, generator=g)
+    exposure = None
+    if coloured:
+        exposure = CameraExposure(torch.eye(3) + 0.1 * torch.rand(3, 3, generator=g), 0.1 * torch.rand(3, generator=g))
+    return ViewTarget(CpuLoss(), CpuLoss().prepare(image), dssim, image, exposure, tiles)
 
 
-def pulled(session: CpuSession, view: int, rows: Scene, wanted: Comparison) -> Pulled:
-    found = session.pull(view, rows, wanted)
-    assert found is not None
-    return found
+def pulled(session: CpuSession, view: int, rows: Scene, wanted: ViewTarget) -> LossAndGrad[Scene]:
+    return session.loss_and_grad(view, wanted, WrtRows(rows))
 
 
-def bits(found: Pulled) -> tuple[float, dict[str, bytes]]:
-    return found.loss, {name: value.numpy().tobytes() for name, value in found.gradients.items()}
+def step_by_step(session: CpuSession, rows: Scene, wanted: ViewTarget, view: int = 1) -> tuple[float, Scene]:
+    """The same by the body that every session has."""
+    found = RenderSession.loss_and_grad(session, view, wanted, WrtRows(rows))
+    return float(found.loss), found.grad
+
+
+def bits(found: LossAndGrad[Scene]) -> tuple[float, dict[str, bytes]]:
+    return float(found.loss), {name: value.numpy().tobytes() for name, value in found.grad.items()}
 
 
 def assert_near(got: Scene, want: Scene, bound: float = BOUND) -> None:
@@ -125,8 +131,8 @@ def test_a_pull_is_near_the_gradient_of_the_whole_scene(seed: int, dssim: float,
         found, (loss, gradients) = pulled(session, 0, rows, comparison(dssim)), step_by_step(
             opened(whole, active), rows, comparison(dssim), 0
         )
-        assert found.loss == pytest.approx(loss, rel=1e-4)
-        assert_near(found.gradients, gradients)
+        assert float(found.loss) == pytest.approx(loss, rel=1e-4)
+        assert_near(found.grad, gradients)
         if step == 2:
             active = active[::2]
             session.narrow(active)
@@ -143,7 +149,7 @@ def test_with_nothing_behind_the_active_rows_a_pull_has_the_bits_of_the_whole_sc
         found = pulled(session, 1, rows, comparison())
         loss, gradients = step_by_step(opened(whole, active), rows, comparison())
         assert found.loss == loss
-        assert bits(found)[1] == bits(found._replace(gradients=gradients))[1]
+        assert bits(found)[1] == bits(replace(found, grad=gradients))[1]
         assert all(bool(value.any()) for _, value in gradients.items())
 
 
@@ -168,7 +174,7 @@ def test_rows_that_leave_the_view_and_come_back(isa: str) -> None:
     away.means[:] += 100
     before = bits(pulled(session, 0, here, comparison()))
     gone = pulled(session, 0, away, comparison())
-    assert not any(bool(value.any()) for _, value in gone.gradients.items())
+    assert not any(bool(value.any()) for _, value in gone.grad.items())
     assert bits(pulled(session, 0, here, comparison())) == before
 
 
@@ -182,7 +188,7 @@ def test_gaussians_at_one_depth() -> None:
         rows = whole.rows(active) if step != 1 else moved(whole.rows(active), 0.0, 0.5, g)
         found = pulled(session, 0, rows, comparison())
         assert bits(found) == bits(pulled(opened(whole, active), 0, rows, comparison()))
-        assert_near(found.gradients, step_by_step(opened(whole, active), rows, comparison(), 0)[1])
+        assert_near(found.grad, step_by_step(opened(whole, active), rows, comparison(), 0)[1])
 
 
 def test_a_render_between_pulls_is_that_of_the_scene_and_changes_nothing(isa: str) -> None:
@@ -202,7 +208,7 @@ def test_a_value_that_is_not_finite_leaves_the_layers_usable() -> None:
     bad = rows.map(torch.clone)
     bad.means[3, 1] = torch.nan
     with pytest.raises(ValueError, match="expected finite values"):
-        session.pull(0, bad, comparison())
+        pulled(session, 0, bad, comparison())
     assert bits(pulled(session, 0, rows, comparison())) == before
 
 

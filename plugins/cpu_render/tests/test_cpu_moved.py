@@ -7,30 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from gsstream_cpu_render import _native
 from gsstream_cpu_render.renderer import CpuRenderer
 from test_cpu_fit import BACKGROUND, comparison, some_tiles
 from test_cpu_renderer import rig, scene
 
-from gsstream.api import Comparison, Gaussians, Moves, RenderSession
+from gsstream.api import Gaussians, LossAndGrad, Moves, RenderSession, ShapeError, ViewTarget, WrtRows, WrtTransforms
 from gsstream.core.changes.motion import transformed
-from gsstream.engine.fit.exposure import Exposure
-from gsstream.engine.fit.judge import Judge
 from gsstream.loss.photometric import ReferenceLoss
-from gsstream.motion.curvature import curvature_of
-from gsstream.motion.pull_back import pulled_back
+from gsstream.render.transforms import transform_vjp
 
 ROWS = torch.tensor([1, 2, 5, 8, 11, 13, 17])
 
 
-@pytest.fixture(autouse=True)
-def is_built() -> None:
-    assert hasattr(_native, "pull_moved"), "the kernels are older than the plugin: install it again"
-
-
-def opened() -> tuple[RenderSession, Gaussians[np.ndarray]]:
+def opened() -> tuple[RenderSession, Gaussians[torch.Tensor]]:
     whole = scene()
-    return CpuRenderer().open(whole, ROWS, rig(), BACKGROUND), whole.rows(ROWS).map(torch.Tensor.numpy)
+    return CpuRenderer().open(whole, ROWS, rig(), BACKGROUND), whole.rows(ROWS)
 
 
 def moves(seed: int = 5, groups: int = 3, size: float = 0.3) -> Moves:
@@ -41,77 +32,69 @@ def moves(seed: int = 5, groups: int = 3, size: float = 0.3) -> Moves:
     return Moves(np.arange(len(ROWS)), place, *values)
 
 
-def by_single_calls(
-    session: RenderSession, rows: Gaussians[np.ndarray], given: Moves, wanted: Comparison
-) -> tuple[float, np.ndarray]:
-    leaves = transformed(rows, given).map(lambda value: torch.from_numpy(value.copy()).requires_grad_())
-    pulled = session.pull(1, leaves.map(torch.Tensor.detach), wanted)
-    assert pulled is not None
-    for (_, leaf), (_, gradient) in zip(leaves.items(), pulled.gradients.items(), strict=True):
+def fused(given: Moves, wanted: ViewTarget, curvature: bool = False) -> LossAndGrad[torch.Tensor]:
+    session, rows = opened()
+    return session.loss_and_grad(1, wanted, WrtTransforms(rows, given, curvature))
+
+
+def by_rows(given: Moves, wanted: ViewTarget) -> tuple[torch.Tensor, np.ndarray]:
+    """Loss and gradient of the rows after they moved, passed on to their transforms."""
+    session, rows = opened()
+    there = transformed(rows.map(torch.Tensor.numpy), given)
+    leaves = there.map(lambda value: torch.from_numpy(value.copy()).requires_grad_())
+    found = session.loss_and_grad(1, wanted, WrtRows(leaves))
+    for (_, leaf), (_, gradient) in zip(leaves.items(), found.grad.items(), strict=True):
         leaf.grad = gradient
-    return pulled.loss, pulled_back(leaves, given)
+    return found.loss, transform_vjp(leaves, given)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-6, 0.3, 4.0])
 @pytest.mark.parametrize("coloured", [False, True])
-def test_one_call_has_the_bits_of_single_calls(size: float, coloured: bool, threads: int) -> None:
+def test_transforms_have_the_bits_of_rows_that_moved(size: float, coloured: bool, threads: int) -> None:
     wanted, given = comparison(coloured), moves(size=size)
-    session, rows = opened()
-    found = session.pull_moved(1, rows, given, wanted)
-    loss, slope = by_single_calls(*opened(), given, wanted)
-    assert found is not None
-    assert found[0] == loss
-    assert found[1].tobytes() == slope.tobytes()
-    assert size > 1 or np.abs(slope[:2]).max() > 0
-    assert not slope[2].any(), "a group without rows feels nothing"
+    found, (loss, grad) = fused(given, wanted), by_rows(given, wanted)
+    assert found.loss == loss
+    assert found.grad.numpy().tobytes() == grad.tobytes()
+    assert size > 1 or np.abs(grad[:2]).max() > 0
+    assert not grad[2].any(), "a group without rows has a gradient of 0"
 
 
 @pytest.mark.parametrize("coloured", [False, True])
 @pytest.mark.parametrize("some", [False, True])
-def test_curvature_is_that_of_the_structure_of_the_picture(coloured: bool, some: bool, threads: int) -> None:
-    """Of the picture as its camera records it, in the tiles that count; the slope has the same bits as without."""
-    wanted, given = comparison(coloured), moves()
-    tiles = some_tiles() if some else None
-    wanted = replace(wanted, tiles=tiles)
-    session, rows = opened()
-    found = session.pull_moved(1, rows, given, wanted, curved=True)
-    assert found is not None
+def test_curvature_is_that_of_the_default_body(coloured: bool, some: bool, threads: int) -> None:
+    """Of the picture as its camera records it, in the tiles that count; the gradient has the same bits as without."""
+    wanted, given = replace(comparison(coloured), tile_weights=some_tiles() if some else None), moves()
+    found = fused(given, wanted, curvature=True)
     assert found.curvature is not None
-    assert found.slope.tobytes() == by_single_calls(*opened(), given, wanted)[1].tobytes()
-    exposure = None
-    if coloured:
-        assert wanted.matrix is not None
-        assert wanted.offset is not None
-        exposure = Exposure(wanted.matrix.expand(2, 3, 3), wanted.offset.expand(2, 3))
-    judge = Judge(ReferenceLoss(), 0.2, np.stack([wanted.target.image] * 2), exposure)
-    there = transformed(rows, given).map(torch.from_numpy)
-    structure = judge.structure(opened()[0], 1, there, tiles)
-    expected = curvature_of(there.means.numpy(), given, rig(), 1, structure)
-    np.testing.assert_allclose(found.curvature, expected, atol=1e-4 * np.abs(expected).max())
-    assert np.abs(expected[:2]).max() > 0
-    assert not found.curvature[2].any(), "a group without rows is held by nothing"
-
-
-def test_tiles_that_are_left_out_say_nothing() -> None:
-    wanted, given = replace(comparison(), tiles=some_tiles()), moves()
+    assert found.grad.numpy().tobytes() == by_rows(given, wanted)[1].tobytes()
     session, rows = opened()
-    found = session.pull_moved(1, rows, given, wanted)
-    assert found is not None
-    assert found[1].tobytes() == by_single_calls(*opened(), given, wanted)[1].tobytes()
+    want = RenderSession.loss_and_grad(session, 1, wanted, WrtTransforms(rows, given, True)).curvature
+    np.testing.assert_allclose(found.curvature.numpy(), want.numpy(), atol=1e-4 * float(want.abs().max()))
+    assert float(want[:2].abs().max()) > 0
+    assert not found.curvature[2].any(), "a group without rows has a curvature of 0"
 
 
-def test_a_fault_and_another_loss_are_left_to_single_calls() -> None:
-    session, rows = opened()
+def test_a_fault_is_named_by_the_default_body() -> None:
     far = moves()._replace(shift=np.full((3, 3), 1e39))
-    assert session.pull_moved(1, rows, far, comparison()) is None
-    wanted = comparison()
-    assert session.pull_moved(1, rows, moves(), Comparison(ReferenceLoss(), wanted.target, 0.2)) is None
-    assert CpuRenderer().open(scene(), None, rig(), BACKGROUND).pull_moved(1, rows, moves(), wanted) is None
+    with pytest.raises(ShapeError, match="positions beyond the range of float32"):
+        fused(far, comparison())
+
+
+def test_other_losses_and_wide_sessions_take_the_default_body() -> None:
+    wanted, given = comparison(), moves()
+    other = replace(wanted, loss=ReferenceLoss(), prepared=ReferenceLoss().prepare(wanted.image))
+    session, rows = opened()
+    want = RenderSession.loss_and_grad(session, 1, other, WrtTransforms(rows, given))
+    assert torch.equal(fused(given, other).grad, want.grad)
+    whole = scene()
+    every = moves()._replace(rows=np.arange(len(whole)), place=np.arange(len(whole)) % 2)
+    wide = CpuRenderer().open(whole, None, rig(), BACKGROUND)
+    found = wide.loss_and_grad(1, wanted, WrtTransforms(whole, every))
+    assert torch.equal(found.grad, RenderSession.loss_and_grad(wide, 1, wanted, WrtTransforms(whole, every)).grad)
 
 
 def test_a_render_after_it_is_that_of_the_scene() -> None:
     session, rows = opened()
-    session.pull_moved(1, rows, moves(), comparison())
+    session.loss_and_grad(1, comparison(), WrtTransforms(rows, moves()))
     fresh, _ = opened()
-    there = rows.map(torch.from_numpy)
-    assert torch.equal(session.render(1, there).image, fresh.render(1, there).image)
+    assert torch.equal(session.render(1, rows).image, fresh.render(1, rows).image)

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from gsstream_cpu_render import _native
-from gsstream_cpu_render.residual import CpuResidualTable
+from gsstream_cpu_render.residual import CpuResidualOptimiser
 from gsstream_cpu_render.threads import num_threads, set_num_threads
 
 from gsstream.core.errors import ComponentError
 from gsstream.engine.assembly.assemble import Assembly, assemble
+from gsstream.engine.budget.schedule import Schedule
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.step import frame_step
@@ -23,7 +23,7 @@ from gsstream.engine.step.problem import Problem, Solution
 from gsstream.gate.always_open import AlwaysOpen
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
-from gsstream.regularizer.base import GatePrice
+from gsstream.regularizer.base import AnalyticPenalty
 from gsstream.source.open import open_source
 
 SOURCE = "synthetic:frames=3&views=3&width=64&height=48&supersample=1"
@@ -52,9 +52,9 @@ def captured(method: str, settings: tuple[str, ...]) -> tuple[Assembly, Problem]
     parts = assemble(resolve_recipe(method, catalog.recipe_path, (), overrides), catalog)
     source = open_source(SOURCE)
 
-    def noted(parts: Assembly, problem: Problem, generator: torch.Generator) -> Solution:
+    def noted(parts: Assembly, problem: Problem, schedule: Schedule) -> Solution:
         found.append(problem)
-        return optimise(parts, problem, generator)
+        return optimise(parts, problem, schedule)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(frame_step, "optimise", noted)
@@ -73,28 +73,29 @@ def captured(method: str, settings: tuple[str, ...]) -> tuple[Assembly, Problem]
 
 def solved(parts: Assembly, problem: Problem) -> Solution:
     problem.session.narrow(problem.rows)
-    return optimise(parts, problem, torch.Generator().manual_seed(7))
+    problem.generator.manual_seed(7)
+    stream = parts.recipe.stream
+    return optimise(parts, problem, Schedule(stream.epochs, stream.rate_weight))
 
 
 def one_by_one(parts: Assembly, problem: Problem) -> Solution:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(CpuResidualTable, "run", lambda table, work: [])
+        patch.setattr(CpuResidualOptimiser, "_native_run", lambda *_: [])
         return solved(parts, problem)
 
 
 @pytest.fixture(autouse=True)
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many iterations each native call made; also in front of what is patched later."""
-    assert hasattr(_native.ResidualTable, "run"), "the kernels are older than the plugin: install it again"
     made: list[int] = []
-    run = CpuResidualTable.run
+    run = CpuResidualOptimiser._native_run
 
-    def counted(table: CpuResidualTable, work: Any) -> list[float]:
-        losses = run(table, work)
+    def counted(table: CpuResidualOptimiser, *given: Any) -> list[torch.Tensor]:
+        losses = run(table, *given)
         made.append(len(losses))
         return losses
 
-    monkeypatch.setattr(CpuResidualTable, "run", counted)
+    monkeypatch.setattr(CpuResidualOptimiser, "_native_run", counted)
     return made
 
 
@@ -186,12 +187,12 @@ def test_a_time_budget_looks_at_its_clock_after_every_iteration(calls: list[int]
     assert set(calls) == {1}
 
 
-def test_the_law_of_gates_that_are_always_open_is_one_everywhere() -> None:
-    law = AlwaysOpen().law()
-    gates, slopes = law.gates(torch.tensor([-9.0, 0.0, 9.0]))
-    probability, slope = law.probability(torch.tensor([-9.0, 0.0, 9.0]))
+def test_the_form_of_gates_that_are_always_open_is_one_everywhere() -> None:
+    form = AlwaysOpen().form()
+    gates, slopes = form.gates(torch.tensor([-9.0, 0.0, 9.0]))
+    probability, slope = form.probability(torch.tensor([-9.0, 0.0, 9.0]))
     assert torch.equal(gates, torch.ones(3))
     assert torch.equal(probability, torch.ones(3))
     assert not slopes.any()
     assert not slope.any()
-    assert GatePrice(0, 0).gate == 0
+    assert AnalyticPenalty(0, 0).open_weight == 0

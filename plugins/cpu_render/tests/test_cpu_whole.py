@@ -13,36 +13,40 @@ from gsstream_cpu_render.threads import num_threads, set_num_threads
 from test_cpu_fit import BACKGROUND, comparison
 from test_cpu_renderer import rig, scene
 
-from gsstream.api import Comparison, Gaussians, ShapeError, WholePull
-from gsstream.engine.fit.exposure import Exposure
-from gsstream.engine.fit.judge import Judge
+from gsstream.api import (
+    CameraExposure,
+    Gaussians,
+    LossAndGrad,
+    RenderSession,
+    ShapeError,
+    ViewTarget,
+    WrtScene,
+)
 from gsstream.loss.photometric import ReferenceLoss
 from gsstream.render.reference import ReferenceRenderer
 
 VIEW = 1
 
 
-def pulled(rows: Gaussians[torch.Tensor], wanted: Comparison) -> WholePull:
-    found = CpuRenderer().open(rows, None, rig(), BACKGROUND).pull_whole(VIEW, rows, wanted)
-    assert found is not None, "the kernels are older than the plugin: install it again"
-    return found
+Found = LossAndGrad[Gaussians[torch.Tensor]]
 
 
-def judged(rows: Gaussians[torch.Tensor], wanted: Comparison, reference: bool = False) -> WholePull:
-    """The same by the calls that the engine makes where there is no short cut."""
-    part, loss = (ReferenceRenderer(), ReferenceLoss()) if reference else (CpuRenderer(), CpuLoss())
-    exposure = None
-    if wanted.matrix is not None and wanted.offset is not None:
-        exposure = Exposure(wanted.matrix.expand(2, 3, 3), wanted.offset.expand(2, 3))
-    images = np.stack([np.zeros_like(wanted.target.image), wanted.target.image])
-    return Judge(loss, wanted.dssim, images, exposure).pull_whole(
-        part.open(rows, None, rig(), BACKGROUND), VIEW, rows
-    )
+def pulled(rows: Gaussians[torch.Tensor], wanted: ViewTarget) -> Found:
+    return CpuRenderer().open(rows, None, rig(), BACKGROUND).loss_and_grad(VIEW, wanted, WrtScene(rows))
 
 
-def values(pull: WholePull) -> dict[str, torch.Tensor]:
-    named = {**dict(pull.gradients.items()), "means2d": pull.means2d}
-    return named if pull.colours is None else {**named, "colours": pull.colours}
+def judged(rows: Gaussians[torch.Tensor], wanted: ViewTarget, reference: bool = False) -> Found:
+    """The same by the body that every session has."""
+    part = ReferenceRenderer() if reference else CpuRenderer()
+    if reference:
+        wanted = replace(wanted, loss=ReferenceLoss(), prepared=ReferenceLoss().prepare(wanted.image))
+    session = part.open(rows, None, rig(), BACKGROUND)
+    return RenderSession.loss_and_grad(session, VIEW, wanted, WrtScene(rows))
+
+
+def values(found: Found) -> dict[str, torch.Tensor]:
+    named = {**dict(found.grad.items()), "means2d": found.means2d}
+    return named if found.exposure is None else {**named, "exposure": found.exposure}
 
 
 @pytest.mark.parametrize("coefficients", [1, 4, 16])
@@ -50,9 +54,9 @@ def values(pull: WholePull) -> dict[str, torch.Tensor]:
 def test_a_whole_pull_is_the_calls_it_stands_for(coloured: bool, coefficients: int, threads: int) -> None:
     rows, wanted = scene(coefficients=coefficients), comparison(coloured)
     found, want = pulled(rows, wanted), judged(rows, wanted)
-    assert found.loss == pytest.approx(want.loss, rel=1e-6)
+    assert float(found.loss) == pytest.approx(float(want.loss), rel=1e-6)
     assert values(found).keys() == values(want).keys()
-    assert ("colours" in values(found)) == coloured
+    assert ("exposure" in values(found)) == coloured
     for name, value in values(want).items():
         if value.numel() == 0:
             continue
@@ -73,7 +77,7 @@ def test_it_agrees_with_the_reference_renderer_and_loss() -> None:
     """SSIM alone, because a pixel that L1 sees from its other side has a gradient of the other sign."""
     rows, wanted = scene(), replace(comparison(coloured=True), dssim=1.0)
     found, want = pulled(rows, wanted), judged(rows, wanted, reference=True)
-    assert found.loss == pytest.approx(want.loss, rel=1e-4)
+    assert float(found.loss) == pytest.approx(float(want.loss), rel=1e-4)
     for name, value in values(want).items():
         np.testing.assert_allclose(
             values(found)[name].numpy(), value.numpy(), rtol=0, atol=1e-3 * float(value.abs().max()), err_msg=name
@@ -96,27 +100,28 @@ def test_it_has_the_same_bits_for_any_number_of_threads_and_after_any_calls() ->
 def test_the_colour_maps_slope_is_that_of_the_loss() -> None:
     """Central differences of each of its twelve numbers. SSIM alone: L1 has corners."""
     rows, wanted = scene(), replace(comparison(coloured=True), dssim=1.0)
-    slope = pulled(rows, wanted).colours
+    slope = pulled(rows, wanted).exposure
     assert slope is not None
-    assert wanted.matrix is not None
-    assert wanted.offset is not None
+    assert wanted.exposure is not None
     step = 2e-3
     for entry in range(12):
         losses = []
         for sign in (1, -1):
-            matrix, offset = wanted.matrix.clone(), wanted.offset.clone()
+            matrix, offset = wanted.exposure.matrix.clone(), wanted.exposure.offset.clone()
             (matrix.view(-1) if entry < 9 else offset)[entry % 9] += sign * step
-            losses.append(pulled(rows, replace(wanted, matrix=matrix, offset=offset)).loss)
+            losses.append(float(pulled(rows, replace(wanted, exposure=CameraExposure(matrix, offset))).loss))
         assert (losses[0] - losses[1]) / (2 * step) == pytest.approx(float(slope[entry]), rel=0.02, abs=2e-3), entry
 
 
-def test_it_leaves_other_losses_weights_of_tiles_and_narrowed_sessions_to_the_engine() -> None:
+def test_other_losses_and_weights_of_tiles_take_the_default_body() -> None:
     rows, wanted = scene(), comparison()
-    wide = CpuRenderer().open(rows, None, rig(), BACKGROUND)
-    assert wide.pull_whole(VIEW, rows, Comparison(ReferenceLoss(), wanted.target, 0.2)) is None
-    assert wide.pull_whole(VIEW, rows, replace(wanted, tiles=torch.ones(3, 4))) is None
-    wide.narrow(torch.tensor([1, 2]))
-    assert wide.pull_whole(VIEW, rows.rows(torch.tensor([1, 2])), wanted) is None
+    other = replace(wanted, loss=ReferenceLoss(), prepared=ReferenceLoss().prepare(wanted.image))
+    weighted = replace(wanted, tile_weights=torch.ones(-(-rig().height // 16), -(-rig().width // 16)))
+    for target in (other, weighted):
+        found, want = pulled(rows, target), judged(rows, target)
+        assert found.loss == want.loss
+        for name, value in values(want).items():
+            assert torch.equal(values(found)[name], value), name
 
 
 @pytest.mark.parametrize("name", ["means", "sh0"])
@@ -128,6 +133,6 @@ def test_it_names_a_value_that_is_not_finite(name: str) -> None:
 
 
 def test_it_refuses_a_target_of_another_size() -> None:
-    wanted = Comparison(CpuLoss(), CpuLoss().prepare(torch.zeros(7, 9, 3)), 0.2)
+    wanted = ViewTarget(CpuLoss(), CpuLoss().prepare(torch.zeros(7, 9, 3)), 0.2, torch.zeros(7, 9, 3))
     with pytest.raises(Exception, match="wrong shape"):
         pulled(scene(), wanted)

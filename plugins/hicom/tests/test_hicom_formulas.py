@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ from gsstream_hicom.method import HiCoM
 from gsstream_hicom.motion import cell_sides, fitted_motions
 from gsstream_hicom.settings import BirthSettings, HiCoMConfig, MotionSettings
 
-from gsstream.api import Cameras, Displacement, Gaussians, Layout, Scene, apply_motion
+from gsstream.api import Cameras, Displacement, Gaussians, Layout, LossAndGrad, Scene, Wrt, apply_motion
 from gsstream.blocks import pulled_rows
 from gsstream.testing.stepping import MethodUnderTest
 
@@ -48,13 +50,11 @@ class Pulled:
     def narrow(self, rows: torch.Tensor) -> None:
         self.rows = rows
 
-    def pull_moved(self, *given: object) -> None:
-        """Leave it to ``pull``."""
-
-    def pull(self, view: int, rows: Gaussians[torch.Tensor], near_change: bool = False) -> float:
-        loss = (rows.means - self.aims[self.rows]).square().sum()
+    def loss_and_grad(self, view: int, wrt: Wrt[Any], tiles: str = "all") -> LossAndGrad[Any]:
+        leaves = wrt.placed().map(lambda value: value.detach().requires_grad_())
+        loss = (leaves.means - self.aims[self.rows]).square().sum()
         loss.backward()
-        return float(loss.detach())
+        return LossAndGrad(loss.detach(), wrt.grad(leaves))
 
     def on(self, gaussians: Gaussians[torch.Tensor]) -> Pulled:
         return Pulled(gaussians, self.aims.numpy())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,7 @@ from gsstream_recon.method import ReCon
 from gsstream_recon.motion import fitted_motion
 from gsstream_recon.settings import BirthSettings, MotionSettings, ReConConfig
 
-from gsstream.api import Cameras, Displacement, Gaussians, Layout, Rng, Scene, apply_motion
+from gsstream.api import Cameras, Displacement, Gaussians, Layout, LossAndGrad, Rng, Scene, Wrt, apply_motion
 from gsstream.blocks import pixel_size
 from gsstream.testing.stepping import MethodUnderTest
 
@@ -45,14 +47,12 @@ class Pulled:
     def narrow(self, rows: torch.Tensor) -> None:
         self.rows = rows
 
-    def pull_moved(self, *given: object) -> None:
-        """Leave it to ``pull``."""
-
-    def pull(self, view: int, rows: Gaussians[torch.Tensor], near_change: bool = False) -> float:
-        self.seen.append(rows.means.detach().numpy().copy())
-        loss = (rows.means - self.aims[self.rows]).square().sum()
+    def loss_and_grad(self, view: int, wrt: Wrt[Any], tiles: str = "all") -> LossAndGrad[Any]:
+        leaves = wrt.placed().map(lambda value: value.detach().requires_grad_())
+        self.seen.append(leaves.means.detach().numpy().copy())
+        loss = (leaves.means - self.aims[self.rows]).square().sum()
         loss.backward()
-        return float(loss.detach())
+        return LossAndGrad(loss.detach(), wrt.grad(leaves))
 
 
 def fitted(scene: Scene, aims: np.ndarray, rows: np.ndarray, settings: MotionSettings, epochs: int = 30, **more):

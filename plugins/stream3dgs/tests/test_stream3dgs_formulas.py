@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,19 @@ from gsstream_stream3dgs.method import Stream3DGS
 from gsstream_stream3dgs.motion import fitted_cache, moved, said_by, shape_of
 from gsstream_stream3dgs.settings import BirthSettings, CacheSettings, Stream3DGSConfig
 
-from gsstream.api import Cameras, Delta, Gaussians, Layout, Rng, Scene, apply_delta, apply_field, field_rows
+from gsstream.api import (
+    Cameras,
+    Delta,
+    Gaussians,
+    Layout,
+    LossAndGrad,
+    Rng,
+    Scene,
+    Wrt,
+    apply_delta,
+    apply_field,
+    field_rows,
+)
 from gsstream.testing.stepping import MethodUnderTest
 
 RNG = np.random.default_rng(0)
@@ -131,10 +145,11 @@ class Pulled:
     def narrow(self, rows: torch.Tensor) -> None:
         self.rows = rows
 
-    def pull(self, view: int, rows: Gaussians[torch.Tensor], near_change: bool = False) -> float:
-        loss = (rows.means - self.aims[self.rows]).square().sum()
+    def loss_and_grad(self, view: int, wrt: Wrt[Any], tiles: str = "all") -> LossAndGrad[Any]:
+        leaves = wrt.placed().map(lambda value: value.detach().requires_grad_())
+        loss = (leaves.means - self.aims[self.rows]).square().sum()
         loss.backward()
-        return float(loss.detach())
+        return LossAndGrad(loss.detach(), wrt.grad(leaves))
 
 
 @pytest.mark.parametrize("sent", ["field", "cells"])

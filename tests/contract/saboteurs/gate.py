@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from gsstream.gate.base import RoundedSigmoid
+from gsstream.gate.base import AnalyticGate
 from gsstream.testing.gate.example import ExampleGate
 from saboteurs.register import spoils
 
@@ -142,9 +142,9 @@ class Smuggler(Gate):
         return gates
 
 
-@spoils("check_gate_law")
+@spoils("check_gate_form")
 class Understated(Gate):
-    """States formulas without the noise that it draws."""
+    """States a closed form without the noise that it draws."""
 
-    def law(self) -> RoundedSigmoid:
-        return RoundedSigmoid(0.3, self.num_levels, 0.0, 7.0)
+    def form(self) -> AnalyticGate:
+        return AnalyticGate(0.3, self.num_levels, 0.0, 7.0)

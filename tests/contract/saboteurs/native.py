@@ -9,8 +9,9 @@ from typing import Any
 import torch
 
 from gsstream.core.joint import JointCode
-from gsstream.engine.fit.residual_table import JointTable
 from gsstream.optimiser.adam import ReferenceAdam
+from gsstream.optimiser.joint import JointResidualOptimiser
+from gsstream.optimiser.residual import ResidualEpoch, ResidualOptimiser
 from gsstream.residual.base import AttributeCode
 from gsstream.testing.loss.example import ExampleLoss
 from gsstream.testing.update.example import ExampleUpdate
@@ -55,8 +56,8 @@ class AlwaysSome(Loss):
 
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
-    ) -> tuple[float, torch.Tensor]:
-        judged: tuple[float, torch.Tensor] = super().evaluate(image, prepared, min(dssim, 0.9), tile_mask)
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        judged: tuple[torch.Tensor, torch.Tensor] = super().evaluate(image, prepared, min(dssim, 0.9), tile_mask)
         return judged
 
 
@@ -66,9 +67,9 @@ class EmptyIsAll(Loss):
 
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
-    ) -> tuple[float, torch.Tensor]:
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         mask = tile_mask if tile_mask is not None and bool(tile_mask.any()) else None
-        judged: tuple[float, torch.Tensor] = super().evaluate(image, prepared, dssim, mask)
+        judged: tuple[torch.Tensor, torch.Tensor] = super().evaluate(image, prepared, dssim, mask)
         return judged
 
 
@@ -78,8 +79,8 @@ class Scribbler(Loss):
 
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
-    ) -> tuple[float, torch.Tensor]:
-        judged: tuple[float, torch.Tensor] = super().evaluate(image, prepared, dssim, tile_mask)
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        judged: tuple[torch.Tensor, torch.Tensor] = super().evaluate(image, prepared, dssim, tile_mask)
         image.detach().mul_(0.5)
         return judged
 
@@ -112,9 +113,28 @@ class Forgiving(Adam):
         super().step(values, sound, states, lrs)
 
 
-@spoils("check_residual_table")
+@spoils("check_residual_optimiser")
 class Hurried(Adam):
-    """Its own residual tables learn at twice the rates."""
+    """Its own residual optimiser learns at twice the rates."""
 
-    def residual_table(self, code: JointCode, *start: Any) -> JointTable:
-        return JointTable(replace(code, lrs=2 * code.lrs), *start, self)
+    def residual_optimiser(self, code: JointCode, *start: Any) -> JointResidualOptimiser:
+        return JointResidualOptimiser(replace(code, lrs=2 * code.lrs), *start, self)
+
+
+Joint: Any = JointResidualOptimiser
+
+
+class _Thaws(Joint):
+    def run(self, epoch: ResidualEpoch) -> list[torch.Tensor]:
+        iterations = [now._replace(frozen=None) for now in epoch.iterations]
+        losses: list[torch.Tensor] = super().run(replace(epoch, iterations=iterations))
+        return losses
+
+
+@spoils("check_residual_optimiser_run")
+class Thawed(Adam):
+    """Its own iterations train rows that are to wait."""
+
+    def residual_optimiser(self, code: JointCode, *start: Any) -> ResidualOptimiser:
+        made: ResidualOptimiser = _Thaws(code, *start, self)
+        return made

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.regularizer.base import GatePrice
+from gsstream.regularizer.base import AnalyticPenalty
 from gsstream.testing.regularizer.example import ExampleRegularizer
 from saboteurs.register import spoils
 
@@ -110,9 +110,9 @@ class Exchanged(Regularizer):
         return {"gates": terms["motion"], "motion": terms["gates"]}
 
 
-@spoils("check_regularizer_price")
+@spoils("check_regularizer_form")
 class Cheaper(Regularizer):
-    """States a lower price than it asks for."""
+    """States a lower penalty than it asks for."""
 
-    def price(self) -> GatePrice:
-        return GatePrice(1e-6, 0.0)
+    def form(self) -> AnalyticPenalty:
+        return AnalyticPenalty(1e-6, 0.0)

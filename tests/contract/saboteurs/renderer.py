@@ -9,12 +9,11 @@ import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.context import ScreenGradient
-from gsstream.engine.fit.exposure import Exposure
-from gsstream.engine.fit.judge import Judge
-from gsstream.render.base import Comparison, Pulled, RenderOutput, RenderSession, ScatterSession, WholePull
+from gsstream.render.base import RenderOutput, RenderSession, ScatterSession
 from gsstream.render.reference import ReferenceRenderer
+from gsstream.render.target import ViewTarget
+from gsstream.render.wrt import LossAndGrad, WrtTransforms
 from gsstream.testing.renderer.example import ExampleRenderer
-from gsstream.testing.renderer.short_cuts import IMAGE
 from saboteurs.register import spoils
 
 # The reference is final; only a saboteur may inherit from it, and only behind the type checker's back.
@@ -127,19 +126,16 @@ class Forgetful(Reference):
 
 
 class _HurriesOpacities(Session):
-    def pull(self, view: int, rows: Any, comparison: Comparison) -> Pulled:
-        leaves = rows.map(lambda value: value.detach().clone().requires_grad_())
-        output = self.render(view, leaves)
-        loss: Any = comparison.loss
-        value, gradient = loss.evaluate(output.image.detach(), comparison.target, comparison.dssim)
-        output.image.backward(gradient)
-        gradients = leaves.map(lambda leaf: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad)
-        return Pulled(value, replace(gradients, opacities=1.1 * gradients.opacities))
+    def loss_and_grad(self, view: int, target: ViewTarget, wrt: Any) -> LossAndGrad[Any]:
+        found = super().loss_and_grad(view, target, wrt)
+        if isinstance(wrt, WrtTransforms):
+            return found  # type: ignore[no-any-return]
+        return replace(found, grad=replace(found.grad, opacities=1.1 * found.grad.opacities))
 
 
-@spoils("check_renderer_short_cuts")
+@spoils("check_renderer_loss_and_grad")
 class Hasty(Reference):
-    """Has a short cut of its own, which lets opacities go a tenth further."""
+    """Differentiates by a body of its own, which lets opacities go a tenth further."""
 
     def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
         session: RenderSession = _HurriesOpacities(self, gaussians, active, cameras, background)
@@ -147,21 +143,64 @@ class Hasty(Reference):
 
 
 class _TurnsTwice(Session):
-    def pull_whole(self, view: int, rows: Any, comparison: Comparison) -> WholePull:
-        loss: Any = comparison.loss
-        assert comparison.matrix is not None
-        assert comparison.offset is not None
-        exposure = Exposure(comparison.matrix.expand(2, 3, 3), comparison.offset.expand(2, 3))
-        images = IMAGE.expand(view + 1, -1, -1, -1).numpy()
-        plain: Any = Reference().open(rows, None, self._cameras, self._background)
-        found = Judge(loss, comparison.dssim, images, exposure).pull_whole(plain, view, rows)
-        return found._replace(gradients=replace(found.gradients, quats=2 * found.gradients.quats))
+    def render(self, view: int, rows: Any, *, probe: Any = None, tile_mask: Any = None) -> RenderOutput:
+        drawn: RenderOutput = self._renderer._render(self._whole(rows), self._cameras, view, self._background, probe)
+        return drawn
+
+    def loss_and_grad(self, view: int, target: ViewTarget, wrt: Any) -> LossAndGrad[Any]:
+        found: LossAndGrad[Any] = super().loss_and_grad(view, target, wrt)
+        return replace(found, grad=replace(found.grad, quats=2 * found.grad.quats))
 
 
-@spoils("check_renderer_whole")
+@spoils("check_renderer_loss_and_grad_scene")
 class Turning(Reference):
-    """Has a short cut for whole scenes, in which rotations count twice."""
+    """Differentiates a whole scene by a body of its own, in which rotations count twice."""
 
     def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
         session: RenderSession = _TurnsTwice(self, gaussians, active, cameras, background)
+        return session
+
+
+class _ForgetsTiles(Session):
+    def loss_and_grad(self, view: int, target: ViewTarget, wrt: Any) -> LossAndGrad[Any]:
+        found: LossAndGrad[Any] = super().loss_and_grad(view, replace(target, tile_weights=None), wrt)
+        return found
+
+
+@spoils("check_renderer_grad")
+class Unweighted(Reference):
+    """Differentiates in all tiles, whatever they count."""
+
+    def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
+        session: RenderSession = _ForgetsTiles(self, gaussians, active, cameras, background)
+        return session
+
+
+class _Decays(Session):
+    def loss_and_grad(self, view: int, target: ViewTarget, wrt: Any) -> LossAndGrad[Any]:
+        found: LossAndGrad[Any] = super().loss_and_grad(view, target, wrt)
+        return replace(found, grad=found.grad.map(lambda value: value + 1e-9))
+
+
+@spoils("check_renderer_grad_unseen")
+class Decaying(Reference):
+    """Adds a little decay to every gradient, that of rows out of view too."""
+
+    def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
+        session: RenderSession = _Decays(self, gaussians, active, cameras, background)
+        return session
+
+
+class _Repairs(Session):
+    def render(self, view: int, rows: Any, **options: Any) -> RenderOutput:
+        drawn: RenderOutput = super().render(view, rows.map(torch.nan_to_num), **options)
+        return drawn
+
+
+@spoils("check_renderer_grad_refuses")
+class Repairing(Reference):
+    """Takes 0 for a value that is not a number, and says nothing."""
+
+    def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
+        session: RenderSession = _Repairs(self, gaussians, active, cameras, background)
         return session

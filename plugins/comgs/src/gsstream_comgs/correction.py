@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gsstream.api import FrameWork, Gaussians, Layout, Residual
+from gsstream.api import FrameWork, Gaussians, Layout, Residual, WrtRows
+from gsstream.blocks import rows_backward
 from gsstream_comgs.settings import CorrectionSettings
 
 #: Learning rates of frame 0 in 3DGS; centres in units of the extent.
@@ -55,7 +56,8 @@ def corrected(
     ])  # fmt: skip
     for _ in range(epochs):
         for view in order.permutation(len(work.cameras)):
-            work.pull(int(view), _masked(base, deltas, logits, unit))
+            rows_now = _masked(base, deltas, logits, unit)
+            rows_backward(rows_now, work.loss_and_grad(int(view), WrtRows(rows_now)).grad)
             torch.autograd.backward(settings.mask_weight * logits.sigmoid().mean())
             adam.step()
             adam.zero_grad()

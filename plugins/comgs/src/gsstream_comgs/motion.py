@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gsstream.api import FrameWork, IntArray, Motion, Scene
-from gsstream.blocks import neighbour_distance, pixel_size, said_by_cells
+from gsstream.api import FrameWork, IntArray, Motion, Scene, WrtRows
+from gsstream.blocks import neighbour_distance, pixel_size, rows_backward, said_by_cells
 from gsstream_comgs.influence import KeyPoints, field_of, moved_by
 from gsstream_comgs.settings import MotionSettings
 
@@ -62,7 +62,8 @@ def fitted_motion(
     views = len(work.cameras)
     for _ in range(epochs):
         for view in order.permutation(views):
-            work.pull(int(view), moved_by(base, field_of(base.means, points())))
+            there = moved_by(base, field_of(base.means, points()))
+            rows_backward(there, work.loss_and_grad(int(view), WrtRows(there)).grad)
             adam.step()
             adam.zero_grad()
     with torch.no_grad():

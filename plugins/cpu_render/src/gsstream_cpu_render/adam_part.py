@@ -7,10 +7,9 @@ from typing import final
 
 import torch
 
-from gsstream.api import AdamState, Gaussians, JointCode, ResidualTable, RowOptimiser
-from gsstream_cpu_render import _native
+from gsstream.api import AdamState, Gaussians, JointCode, ResidualOptimiser, RowOptimiser
 from gsstream_cpu_render.adam_step import step_table
-from gsstream_cpu_render.residual import CpuResidualTable
+from gsstream_cpu_render.residual import CpuResidualOptimiser
 
 
 @final
@@ -29,10 +28,7 @@ class CpuAdam(RowOptimiser):
         for name, gradient in gradients.items():
             step_table(name, values[name].detach(), gradient, states[name], lrs[name])
 
-    def residual_table(
+    def residual_optimiser(
         self, code: JointCode, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor
-    ) -> ResidualTable | None:
-        # An editable install is rebuilt only by installing again: kernels of before do without the short cut.
-        if not hasattr(_native, "ResidualTable"):
-            return None
-        return CpuResidualTable(code, base, units, matrix)
+    ) -> ResidualOptimiser:
+        return CpuResidualOptimiser(code, base, units, matrix)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsstream.api import Comparison, Gaussians, Pulled
+from gsstream.api import Gaussians, LossAndGrad, ViewTarget
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import SplatArrays, raise_on_faults, require_splats
 from gsstream_cpu_render.autograd import splats_of
@@ -55,33 +55,34 @@ class CachedView:
         self.scenes += 1
         self.rasterizer.update(ids, rows, self.image, self.transmittance)
 
-    def pull(self, rows: Gaussians[torch.Tensor], comparison: Comparison) -> Pulled:
+    def loss_and_grad(self, rows: Gaussians[torch.Tensor], target: ViewTarget) -> LossAndGrad[Gaussians[torch.Tensor]]:
         """Render the active rows, compare, differentiate."""
-        gradients = rows.map(lambda value: torch.empty(value.shape))
-        loss = self.rasterizer.pull_active(splats_of(rows), *self._compared(comparison), splats_of(gradients))
-        return Pulled(loss, gradients)
+        grad = rows.map(lambda value: torch.empty(value.shape))
+        loss = self.rasterizer.pull_active(splats_of(rows), *self._compared(target), splats_of(grad))
+        return LossAndGrad(torch.tensor(loss, dtype=torch.float64), grad)
 
-    def comparison(self, comparison: Comparison) -> Any:
+    def comparison(self, target: ViewTarget) -> Any:
         """What renders of this view are compared with, as the kernels take it."""
-        return self.rasterizer.comparison(*self._compared(comparison))
+        return self.rasterizer.comparison(*self._compared(target))
 
-    def _compared(self, comparison: Comparison) -> tuple[Any, PhotometricTarget, float, list[Any], Any]:
-        target: PhotometricTarget = comparison.target
-        colours = [None if value is None else value.contiguous().numpy() for value in
-                   (comparison.matrix, comparison.offset)]  # fmt: skip
-        weights = None if comparison.tiles is None else as_array("tiles", comparison.tiles)
-        return self.image, target, comparison.dssim, colours, weights
+    def _compared(self, target: ViewTarget) -> tuple[Any, PhotometricTarget, float, list[Any], Any]:
+        prepared: PhotometricTarget = target.prepared
+        weights = None if target.tile_weights is None else as_array("tile_weights", target.tile_weights)
+        return self.image, prepared, target.dssim, exposure_arrays(target), weights
 
     def bytes(self) -> int:
         return self.rasterizer.memory_bytes() + self.image.nbytes + self.transmittance.nbytes
 
 
+def exposure_arrays(target: ViewTarget) -> list[Any]:
+    """Matrix and offset of the camera's colour map as the kernels take them; None each without a map."""
+    if target.exposure is None:
+        return [None, None]
+    return [target.exposure.matrix.contiguous().numpy(), target.exposure.offset.contiguous().numpy()]
+
+
 def freeze_views(views: Sequence[CachedView], ids: Ids) -> None:
     """Let these rows change in all tiles, in all views at the same time."""
-    if not hasattr(_native, "freeze_views"):
-        for view in views:
-            view.freeze(ids, None)
-        return
     others = [view for view in views if not view.is_frozen(ids, None)]
     if not others:
         return
@@ -95,9 +96,7 @@ def freeze_views(views: Sequence[CachedView], ids: Ids) -> None:
 
 def update_views(views: Sequence[CachedView], ids: Ids, rows: SplatArrays, background: Float32) -> None:
     """Bring caches and renders to the scene in which these rows have these values, all views at the same time."""
-    if not views or not hasattr(_native, "update_views"):
-        for view in views:
-            view.update(ids, rows)
+    if not views:
         return
     rows = require_splats(rows, len(ids))
     for view in views:

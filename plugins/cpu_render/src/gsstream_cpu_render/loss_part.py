@@ -21,9 +21,9 @@ class CpuLoss(Loss):
 
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
-    ) -> tuple[float, torch.Tensor]:
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         mask = None if tile_mask is None else tile_mask.numpy()
         pixels = image.detach().contiguous().numpy()
         result = photometric_loss(pixels, prepared, dssim_weight=dssim, tile_mask=mask, around=True)
         assert result.gradient is not None
-        return result.value, torch.from_numpy(result.gradient)
+        return torch.tensor(result.value, dtype=torch.float64), torch.from_numpy(result.gradient)

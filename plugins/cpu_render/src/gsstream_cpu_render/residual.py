@@ -1,4 +1,4 @@
-"""The residual of a frame's rows, fused and threaded (implements ``gsstream.api.ResidualTable``)."""
+"""The residual of a frame's rows, fused and threaded (implements ``gsstream.api.ResidualOptimiser``)."""
 
 from __future__ import annotations
 
@@ -12,10 +12,13 @@ from gsstream.api import (
     ADAM_EPS,
     ATTRIBUTES,
     AdamState,
+    AnalyticGate,
+    AnalyticPenalty,
     Gaussians,
     JointCode,
-    ResidualPass,
-    ResidualTable,
+    ResidualEpoch,
+    ResidualOptimiser,
+    unwrapped,
 )
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.adam_step import step_table
@@ -26,8 +29,8 @@ from gsstream_cpu_render.session import CpuSession
 
 
 @final
-class CpuResidualTable(ResidualTable):
-    """One native call for each of ``rows`` and ``pull``; sums over rows do not depend on the number of threads.
+class CpuResidualOptimiser(ResidualOptimiser):
+    """One native call for ``forward``, for ``backward`` and for an epoch; sums do not depend on the number of threads.
 
     Arguments:
         code: columns of the attributes.
@@ -44,11 +47,16 @@ class CpuResidualTable(ResidualTable):
         self._latents = torch.zeros(len(base), code.width).requires_grad_()
         self._matrix = matrix.detach().clone()
         self._states = {"latents": AdamState.start(self._latents), "matrix": AdamState.start(self._matrix)}
-        self._pulled: tuple[torch.Tensor, torch.Tensor] | None = None
+        self._pending: tuple[torch.Tensor, torch.Tensor] | None = None
 
     @property
     def latents(self) -> torch.Tensor:
         return self._latents
+
+    @property
+    def position(self) -> torch.Tensor:
+        columns = self._code.latent.get("means")
+        return torch.zeros(len(self._units), 3) if columns is None else self._latents[:, columns]
 
     @property
     def matrix(self) -> torch.Tensor:
@@ -58,7 +66,7 @@ class CpuResidualTable(ResidualTable):
     def curvature(self) -> torch.Tensor:
         return self._states["latents"].exp_avg_sq
 
-    def rows(self, gates: torch.Tensor) -> Gaussians[torch.Tensor]:
+    def forward(self, gates: torch.Tensor) -> Gaussians[torch.Tensor]:
         self._gates = gates.float().contiguous()
         names = list(self._code.feature)
         base = {name: getattr(self._base, name) for name in names}
@@ -68,10 +76,10 @@ class CpuResidualTable(ResidualTable):
         self._native.decode(*(value.numpy() for value in inputs), *arrays)
         return replace(self._base, **out)
 
-    def pull(self, gradients: Gaussians[torch.Tensor], rate_weight: float) -> torch.Tensor:
+    def backward(self, grad: Gaussians[torch.Tensor], rd_lambda: float) -> torch.Tensor:
         upstream = []
         for name in self._code.feature:
-            value, like = getattr(gradients, name), getattr(self._base, name)
+            value, like = getattr(grad, name), getattr(self._base, name)
             if value.shape != like.shape:
                 refuse(f"gradient of {name}: expected shape {list(like.shape)}, got {list(value.shape)}")
             upstream.append(value.detach().contiguous().numpy())
@@ -79,55 +87,68 @@ class CpuResidualTable(ResidualTable):
         by_gate = torch.empty(len(latents))
         results = [value.numpy() for value in (latents, matrix, by_gate)]
         inputs = self._latents.detach(), self._units, self._gates
-        self._native.pull(*(value.numpy() for value in inputs), upstream, rate_weight, *results)
-        self._pulled = latents, matrix
+        self._native.pull(*(value.numpy() for value in inputs), upstream, rd_lambda, *results)
+        self._pending = latents, matrix
         return by_gate
 
     def step(self, lr_factor: float = 1.0) -> None:
-        if self._pulled is None:
-            refuse("step: expected a pull before it, got none; call rows, pull and step in this order")
-        latents, matrix = self._pulled
+        if self._pending is None:
+            refuse("step: expected a backward before it, got none; call forward, backward and step in this order")
+        latents, matrix = self._pending
         if self._latents.grad is not None:
             latents += self._latents.grad
             self._latents.grad = None
-        self._pulled = None
+        self._pending = None
         lrs, decoder_lrs = lr_factor * self._code.lrs, lr_factor * self._code.decoder_lrs
         step_table("latents", self._latents.detach(), latents, self._states["latents"], lrs)
         step_table("matrix", self._matrix, matrix, self._states["matrix"], decoder_lrs)
 
-    def run(self, work: ResidualPass) -> list[float]:
-        session = work.session
-        # Kernels that were built before this call existed do without it, until the plugin is installed again.
-        if not isinstance(session, CpuSession) or not hasattr(self._native, "run"):
+    def run(self, epoch: ResidualEpoch) -> list[torch.Tensor]:
+        made: list[torch.Tensor] = []
+        match epoch.gates.gate.form(), epoch.gates.regularizer.form():
+            case AnalyticGate() as gate, AnalyticPenalty() as penalty:
+                made = self._native_run(epoch, gate, penalty)
+            case _:
+                pass
+        left = epoch.after(len(made)) if made else epoch
+        return made + super().run(left) if left.iterations else made
+
+    def _native_run(self, epoch: ResidualEpoch, gate: AnalyticGate, penalty: AnalyticPenalty) -> list[torch.Tensor]:
+        """Losses of the iterations up to one in which there is a fault; none where session or loss are not native."""
+        session, gates, iterations, code = unwrapped(epoch.session), epoch.gates, epoch.iterations, self._code
+        if not isinstance(session, CpuSession):
             return []
-        ready = session.in_one_go(work.views, work.comparisons)
+        epoch.begin(0)
+        ready = session.fused_views([now.view for now in iterations], [now.target for now in iterations])
         if ready is None:
             return []
-        waiting = [None if rows is None else rows.numpy() for rows in work.waiting]
-        views = [(*pair, *rest) for pair, rest in zip(ready, zip(waiting, work.lr_factors, strict=True), strict=True)]
-        law, price, code = work.law, work.price, self._code
-        divisor = max(work.num_gaussians, 1) if price.mean else 1
-        rule = [law.temperature, law.shift, law.levels, law.margin, law.bound, price.gate, price.motion, divisor]
+        views = [
+            (*pair, None if now.frozen is None else now.frozen.numpy(), now.lr_factor)
+            for pair, now in zip(ready, iterations, strict=True)
+        ]
+        divisor = max(gates.num_gaussians, 1) if penalty.mean else 1
+        rule = [gate.temperature, gate.logit_offset, gate.levels, gate.open_logit, gate.bound, penalty.open_weight,
+                penalty.displacement_weight, divisor]  # fmt: skip
         position = code.latent["means"].start if "means" in code.latent else -1
         tables = [
             _table(values, state)
-            for values, state in ((work.logits, work.state), (self._latents, self._states["latents"]),
+            for values, state in ((gates.logits, gates.state), (self._latents, self._states["latents"]),
                                   (self._matrix, self._states["matrix"]))
         ]  # fmt: skip
-        rates = work.gate_lr, code.lrs.numpy(), code.decoder_lrs[:, 0].contiguous().numpy()
-        losses: list[float] = self._native.run(
+        rates = gates.lr, code.lrs.numpy(), code.decoder_lrs[:, 0].contiguous().numpy()
+        losses = self._native.run(
             views, native_scene(splats_of(self._base)), [ATTRIBUTES.index(name) for name in code.feature],
-            self._units.numpy(), code.steps.numpy(), work.node_of.numpy(), [float(number) for number in rule],
-            work.rate_weight, position, *tables, *rates, (*ADAM_BETAS, ADAM_EPS),
+            self._units.numpy(), code.steps.numpy(), gates.node_of.numpy(), [float(number) for number in rule],
+            epoch.rd_lambda, position, *tables, *rates, (*ADAM_BETAS, ADAM_EPS),
         )  # fmt: skip
-        return losses
+        return list(torch.tensor(losses, dtype=torch.float64))
 
-    def keep(self, rows: torch.Tensor) -> None:
+    def select_rows(self, rows: torch.Tensor) -> None:
         self._base, self._units = self._base.rows(rows), self._units[rows]
         self._latents = self._latents.detach()[rows].requires_grad_()
         state = self._states["latents"]
         self._states["latents"] = AdamState(state.exp_avg[rows], state.exp_avg_sq[rows], state.steps[rows])
-        self._pulled = None
+        self._pending = None
 
 
 def _table(values: torch.Tensor, state: AdamState) -> tuple[object, ...]:

@@ -12,19 +12,22 @@ from numpy.typing import NDArray
 
 from gsstream.api import (
     Cameras,
-    Comparison,
+    G,
     Gaussians,
     InputError,
-    MovedPull,
-    Moves,
-    Pulled,
+    LossAndGrad,
     RenderCache,
     RenderOutput,
     RenderSession,
     RowGradient,
     ScreenGradient,
-    WholePull,
+    ViewTarget,
+    Wrt,
+    WrtRows,
+    WrtScene,
+    WrtTransforms,
     check_tiles,
+    unwrapped,
 )
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import SplatArrays
@@ -32,10 +35,10 @@ from gsstream_cpu_render.autograd import differentiable, splats_of
 from gsstream_cpu_render.cached_view import CachedView, Ids, freeze_views, update_views
 from gsstream_cpu_render.checks import Float32, as_array
 from gsstream_cpu_render.loss_part import CpuLoss
-from gsstream_cpu_render.moved import moved_slope
+from gsstream_cpu_render.moved import loss_and_grad_of_transforms
 from gsstream_cpu_render.pool import Lease, Passes, lease
 from gsstream_cpu_render.view import Background
-from gsstream_cpu_render.whole import whole_pull
+from gsstream_cpu_render.whole import loss_and_grad_of_scene
 
 
 @final
@@ -67,6 +70,10 @@ class CpuSession(RenderSession):
         if active is not None:
             self.narrow(active)
 
+    @property
+    def cameras(self) -> Cameras:
+        return self._cameras
+
     def narrow(self, active: torch.Tensor) -> None:
         self._ids, self._order = _ascending(active)
         for view in self._views.values():
@@ -80,8 +87,6 @@ class CpuSession(RenderSession):
         return ScreenGradient(torch.from_numpy(gradient), torch.from_numpy(visible))
 
     def screen_gradient_rows(self, view: int, image_gradient: torch.Tensor) -> RowGradient:
-        if not hasattr(_native.Rasterizer, "pull_cached"):
-            return super().screen_gradient_rows(view, image_gradient)
         upstream = as_array("image_gradient", image_gradient.contiguous())
         splats = splats_of(self._gaussians)
         cached = self._view(view)  # its owner while the native call runs
@@ -101,7 +106,7 @@ class CpuSession(RenderSession):
             check_tiles(tiles[view], (self._cameras.height, self._cameras.width))
             if not self._refused:
                 self._view(view)
-        if not hasattr(_native, "drawn_in_views") or any(view not in self._views for view in views):
+        if any(view not in self._views for view in views):
             return super().visible_anywhere(tiles)  # caches beyond the budget are filled one at a time
         drawn = np.zeros(len(self._gaussians), np.uint8)
         if views:
@@ -127,54 +132,51 @@ class CpuSession(RenderSession):
         output = differentiable(active, rows, probe)
         return replace(output, tiles=torch.from_numpy(active.tiles))
 
-    def pull(self, view: int, rows: Gaussians[torch.Tensor], comparison: Comparison) -> Pulled | None:
-        ids = self._short_cut_rows([comparison])
-        if ids is None:
-            return None
+    def loss_and_grad(self, view: int, target: ViewTarget, wrt: Wrt[G]) -> LossAndGrad[G]:
+        found: LossAndGrad[Any] | None = None
+        if type(unwrapped(target.loss)) is CpuLoss and self._order is None:
+            narrowed = self._ids is not None
+            match wrt:
+                case WrtRows(means2d=False) if narrowed:
+                    found = self._by_rows(view, target, wrt)
+                case WrtTransforms() if narrowed:
+                    found = self._by_transforms(view, target, wrt)
+                case WrtScene() if not narrowed and target.tile_weights is None:
+                    found = loss_and_grad_of_scene(self._lease(view), target, wrt)
+                case _:
+                    pass
+        return super().loss_and_grad(view, target, wrt) if found is None else found
+
+    def _by_rows(self, view: int, target: ViewTarget, wrt: WrtRows) -> LossAndGrad[Gaussians[torch.Tensor]]:
         cached = self._view(view)  # its owner while the native call runs
-        cached.freeze(ids, None)
-        return cached.pull(rows, comparison)
+        assert self._ids is not None
+        cached.freeze(self._ids, None)
+        return cached.loss_and_grad(wrt.values, target)
 
-    def pull_whole(
-        self, view: int, rows: Gaussians[torch.Tensor], comparison: Comparison
-    ) -> WholePull | None:
-        wide = self._ids is None and comparison.tiles is None and type(comparison.loss) is CpuLoss
-        if not wide or not hasattr(_native, "pull_whole"):
-            return None
-        return whole_pull(self._lease(view), rows, comparison)
+    def _by_transforms(
+        self, view: int, target: ViewTarget, wrt: WrtTransforms
+    ) -> LossAndGrad[torch.Tensor] | None:
+        """None where there is a fault, which the default body finds words for, or the cache is beyond the budget."""
+        ready = self.fused_views([view], [target])
+        return None if ready is None else loss_and_grad_of_transforms(*ready[0], target, wrt)
 
-    def pull_moved(
-        self, view: int, rows: Gaussians[NDArray[Any]], moves: Moves, comparison: Comparison, curved: bool = False
-    ) -> MovedPull | None:
-        ready = self.in_one_go([view], [comparison]) if hasattr(_native, "pull_moved") else None
-        return None if ready is None else moved_slope(*ready[0], rows, moves, comparison, curved)
-
-    def in_one_go(self, views: Sequence[int], comparisons: Sequence[Comparison]) -> list[tuple[Any, Any]] | None:
+    def fused_views(self, views: Sequence[int], targets: Sequence[ViewTarget]) -> list[tuple[Any, Any]] | None:
         """The native rasterisers of these views, frozen to the active rows, and what they are compared with.
 
-        None where iterations have to be made one by one: rows in no order, another loss, or caches that do not all fit
-        into the budget.
+        None where iterations have to be made one by one: rows in no order, a wide session, in which nothing stands
+        still that could be left out, another loss, or caches that do not all fit into the budget.
 
         Arguments:
-            views: indices of cameras of the rig. comparisons: one for each.
+            views: indices of cameras of the rig. targets: one for each.
         """
-        ids = self._short_cut_rows(comparisons)
-        if ids is None:
+        known = all(type(unwrapped(target.loss)) is CpuLoss for target in targets)
+        if self._ids is None or self._order is not None or not known:
             return None
         cached = [self._view(view) for view in views]
-        freeze_views(cached, ids)
-        pairs = zip(cached, comparisons, strict=True)
-        ready = [(view.rasterizer.handle, view.comparison(comparison)) for view, comparison in pairs]
+        freeze_views(cached, self._ids)
+        pairs = zip(cached, targets, strict=True)
+        ready = [(view.rasterizer.handle, view.comparison(target)) for view, target in pairs]
         return ready if all(view in self._views for view in views) else None
-
-    def _short_cut_rows(self, comparisons: Sequence[Comparison]) -> Ids | None:
-        """The active rows, where the kernels can render, compare and differentiate in one call.
-
-        In a wide session nothing stands still that could be left out; rows in another order are rare. Kernels that were
-        built before such calls existed do without them, until the plugin is installed again.
-        """
-        known = all(type(comparison.loss) is CpuLoss for comparison in comparisons) and hasattr(_native, "Comparison")
-        return self._ids if known and self._order is None else None
 
     def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
         if len(gaussians) != len(self._gaussians):

@@ -5,25 +5,30 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gsstream.api import Comparison, Gaussians, WholePull
+from gsstream.api import Gaussians, LossAndGrad, ViewTarget, WrtScene
 from gsstream_cpu_render.autograd import splats_of
+from gsstream_cpu_render.cached_view import exposure_arrays
 from gsstream_cpu_render.pool import Lease
 
 
-def whole_pull(held: Lease, rows: Gaussians[torch.Tensor], comparison: Comparison) -> WholePull:
-    """Return what ``gsstream.api.RenderSession.pull_whole`` does.
+def loss_and_grad_of_scene(held: Lease, target: ViewTarget, wrt: WrtScene) -> LossAndGrad[Gaussians[torch.Tensor]]:
+    """Return loss and gradients by the rows of a whole scene.
 
     Arguments:
         held: a rasteriser of the camera.
-        rows: all N rows of the scene.
-        comparison: what the render is compared with, by the native loss; all tiles count.
+        target: what the render is compared with, by the native loss; all tiles count.
+        wrt: all N rows of the scene.
     """
-    splats = splats_of(rows.map(torch.Tensor.detach))
-    gradients = rows.map(lambda value: torch.empty(value.shape))
+    rows = wrt.values.map(torch.Tensor.detach)
+    grad = rows.map(lambda value: torch.empty(value.shape))
     means2d = torch.empty(len(rows), 2)
-    matrix, offset = (None if value is None else value.contiguous().numpy() for value in
-                      (comparison.matrix, comparison.offset))  # fmt: skip
-    colours = None if matrix is None else np.empty(12, np.float32)
-    out = (*splats_of(gradients), means2d.numpy())
-    loss = held.rasterizer.pull_whole(splats, comparison.target, comparison.dssim, (matrix, offset), out, colours)
-    return WholePull(loss, gradients, means2d, None if colours is None else torch.from_numpy(colours))
+    by_exposure = None if target.exposure is None else np.empty(12, np.float32)
+    out = (*splats_of(grad), means2d.numpy())
+    loss = held.rasterizer.pull_whole(
+        splats_of(rows), target.prepared, target.dssim, exposure_arrays(target), out, by_exposure
+    )
+    return LossAndGrad(
+        torch.tensor(loss, dtype=torch.float64), grad,
+        means2d=means2d if wrt.means2d else None,
+        exposure=torch.from_numpy(by_exposure) if by_exposure is not None and wrt.exposure else None,
+    )  # fmt: skip

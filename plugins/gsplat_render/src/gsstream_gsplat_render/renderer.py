@@ -92,6 +92,10 @@ class GsplatSession(RenderSession):
         self._targets: dict[int, Target] = {}
         self._cached: dict[int, Drawn] = {}
 
+    @property
+    def cameras(self) -> Cameras:
+        return self._cameras
+
     def render(
         self,
         view: int,

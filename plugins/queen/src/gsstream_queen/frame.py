@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import torch
 
-from gsstream.api import Cameras, FrameTools, Gaussians, Renderer, RenderSession
-from gsstream.blocks import DensifyStatistics
+from gsstream.api import Cameras, FrameTools, Gaussians, Renderer, RenderSession, WrtRows
+from gsstream.blocks import DensifyStatistics, rows_backward
 from gsstream_queen.births import densify, densify_epochs
 from gsstream_queen.settings import QueenConfig
 from gsstream_queen.trainable import NewRows, OldRows, Solution, concat
@@ -98,15 +98,15 @@ class _Frame:
         if mask is not None and not bool(mask.any()):
             return 0.0
         rows = self._values()
-        probe = torch.zeros(len(rows), 2, requires_grad=True) if watch else None
-        output = self._session.render(view, rows, probe=probe, tile_mask=mask)
-        loss = self._problem.work.backward(view, output.image, mask)
-        if probe is not None and probe.grad is not None:
-            self._watch(probe.grad)
+        target = self._problem.work.view_target(view, None if mask is None else mask.float())
+        found = self._session.loss_and_grad(view, target, WrtRows(rows, means2d=True))
+        rows_backward(rows, found.grad)
+        if watch and found.means2d is not None:
+            self._watch(found.means2d)
         self._old.step()
         for group in self._new:
             group.step()
-        return loss
+        return float(found.loss)
 
     def _watch(self, gradient: torch.Tensor) -> None:
         half = torch.tensor([self._cameras.width / 2, self._cameras.height / 2])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gsstream.api import FloatArray, FrameWork, IntArray, Motion, Scene, groups_for
+from gsstream.api import FloatArray, FrameWork, IntArray, Motion, Scene, WrtTransforms, groups_for
 from gsstream.blocks import (
     Descent,
     Moves,
@@ -14,7 +14,6 @@ from gsstream.blocks import (
     groups_within,
     moves_of,
     pixel_size,
-    slope_of,
 )
 from gsstream_recon.anchors import AnchorLevels, Level, bound, inherited
 from gsstream_recon.settings import MotionSettings
@@ -84,11 +83,13 @@ def _fitted(
     measure = each_alone if settings.measure == "each" else felt_most
     descents = [Descent(values / unit, measure) for values in start]
     work.narrow(torch.from_numpy(cells.rows))
-    base, local = scene.gaussians.rows(cells.rows), cells._replace(rows=np.arange(len(cells.rows)))
+    base = scene.gaussians.rows(cells.rows).map(torch.from_numpy)
+    local = cells._replace(rows=np.arange(len(cells.rows)))
     for _ in range(epochs):
         for view in order.permutation(len(work.cameras)):
             sums = _sums(levels, descents, unit, step)
-            slope = slope_of(work, int(view), base, local._replace(shift=sums[:, :3], turn=sums[:, 3:])) * unit
+            moves = local._replace(shift=sums[:, :3], turn=sums[:, 3:])
+            slope = work.loss_and_grad(int(view), WrtTransforms(base, moves)).grad.numpy() * unit
             for level, descent in zip(levels, descents, strict=True):
                 pull = settings.pull * np.sign(descent.values) / descent.values.size
                 descent.step(level.sum(slope) + pull, settings.lr)

@@ -9,7 +9,7 @@ from typing import Literal, final
 import torch
 from pydantic import Field
 
-from gsstream.api import GatePrice, Hierarchy, PartConfig, Regularizer, RegularizerTraits, ShapeError, check_shape
+from gsstream.api import AnalyticPenalty, Hierarchy, PartConfig, Regularizer, RegularizerTraits, ShapeError, check_shape
 
 
 @final
@@ -63,14 +63,14 @@ class ExpectedSparsity(Regularizer):
         members = torch.bincount(hierarchy.node_of, minlength=hierarchy.num_nodes)
         squares = residual.double().square().sum(1)
         energy = torch.zeros_like(probability).index_add(0, hierarchy.node_of, squares)
-        weight = self.price().motion
+        weight = self.form().displacement_weight
         terms = {
             "sparsity": (probability * members).sum() * (self.config.lambda1 / divisor),
             "motion": (probability * energy).sum() * (weight / divisor),
         }
         return {name: term.to(open_probability.dtype) for name, term in terms.items()}
 
-    def price(self) -> GatePrice:
+    def form(self) -> AnalyticPenalty:
         """The same sum as a formula."""
         weight = self.config.lambda2 * (1.0 if self.config.motion == "squared-norm" else 0.5 / 3)
-        return GatePrice(self.config.lambda1, weight, self.config.reduction == "mean")
+        return AnalyticPenalty(self.config.lambda1, weight, self.config.reduction == "mean")

@@ -10,7 +10,7 @@ from typing import Literal, final
 import torch
 from pydantic import Field
 
-from gsstream.api import GateSampler, GateTraits, PartConfig, RoundedSigmoid, check_finite
+from gsstream.api import AnalyticGate, GateSampler, GateTraits, PartConfig, SampledGate, check_finite
 
 #: Half the spacing of float32 uniforms: moves the lattice k / 2^24 into the open interval (0, 1), symmetrically.
 HALF_STEP = 2.0**-25
@@ -110,11 +110,11 @@ class GumbelSigmoid(GateSampler):
             return -torch.expm1(-torch.exp(margin.clamp_max(30.0)))
         return torch.sigmoid(margin)
 
-    def law(self) -> RoundedSigmoid | None:
+    def form(self) -> AnalyticGate | SampledGate:
         """The formulas above, without noise and without the released clamp."""
         if self.config.noise != "none" or self.config.clamp_gradient:
-            return None
-        return RoundedSigmoid(self.config.temperature, self.num_levels, self._margin, self.config.logit_bound)
+            return SampledGate()
+        return AnalyticGate(self.config.temperature, self.num_levels, self._margin, self.config.logit_bound)
 
     @property
     def _margin(self) -> float:

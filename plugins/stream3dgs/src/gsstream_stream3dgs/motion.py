@@ -5,8 +5,20 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gsstream.api import Cameras, Field, FieldShape, FrameWork, Gaussians, IntArray, Motion, Rng, Scene, field_rows
-from gsstream.blocks import pixel_size, said_by_cells
+from gsstream.api import (
+    Cameras,
+    Field,
+    FieldShape,
+    FrameWork,
+    Gaussians,
+    IntArray,
+    Motion,
+    Rng,
+    Scene,
+    WrtRows,
+    field_rows,
+)
+from gsstream.blocks import pixel_size, rows_backward, said_by_cells
 from gsstream_stream3dgs.cache import Cache, Lookup
 from gsstream_stream3dgs.settings import CacheSettings
 
@@ -38,7 +50,8 @@ def fitted_cache(
         rounded = settings.sent == "field" and epoch >= epochs * (1 - settings.rounded)
         for view in order.permutation(len(work.cameras)):
             shift, turn = cache(rounded)
-            work.pull(int(view), moved(base, shape.reach * shift, turn))
+            there = moved(base, shape.reach * shift, turn)
+            rows_backward(there, work.loss_and_grad(int(view), WrtRows(there)).grad)
             cache.step(settings.lr)
     return rows, cache
 

@@ -14,8 +14,8 @@ from gsstream.core.errors import GsstreamError
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray, IntArray
-from gsstream.engine.fit.backward import pull_back
 from gsstream.plugins.catalog import Catalog
+from gsstream.render import backward as known
 from gsstream.render.base import Renderer, RenderOutput
 from gsstream_lab.bench.floor import (
     Footprints,
@@ -222,7 +222,7 @@ def _part_steps(scene: _Scene, part: Renderer, mask: Any, active: IntArray | Non
         held.append(session.render(0, leaves, tile_mask=tiles))
 
     def backward() -> None:
-        pull_back([held[-1].image], [upstream])
+        known.backward([held[-1].image], [upstream])
 
     return Steps({"forward": forward, "backward": backward}, prepare)
 

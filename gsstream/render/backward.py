@@ -7,18 +7,25 @@ from typing import Any
 
 import torch
 
+from gsstream.core.gaussians import Gaussians
 
-def pull_back(roots: Sequence[torch.Tensor], gradients: Sequence[torch.Tensor], *, again: bool = False) -> None:
+
+def backward(roots: Sequence[torch.Tensor], gradients: Sequence[torch.Tensor], *, retain_graph: bool = False) -> None:
     """Add to every leaf what ``gradients``, one like each root, make of it: ``torch.autograd.backward``, bit for bit.
 
     That function imports a library of symbols when it is handed gradients: 0.6 s and 36 MB of every process.
-
-    Arguments:
-        roots: with a graph.
-        gradients: of these shapes.
-        again: whether other gradients of the same roots may follow.
     """
-    _Known.apply(tuple(gradients), *roots).backward(retain_graph=again)  # type: ignore[no-untyped-call]
+    _Known.apply(tuple(gradients), *roots).backward(retain_graph=retain_graph)  # type: ignore[no-untyped-call]
+
+
+def rows_backward(rows: Gaussians[torch.Tensor], grad: Gaussians[torch.Tensor]) -> None:
+    """Pass the gradient of rows, as ``loss_and_grad`` returns it, on to whatever they were computed from.
+
+    Attributes without a graph are left out.
+    """
+    pairs = [(value, gradient) for (_, value), (_, gradient) in zip(rows.items(), grad.items(), strict=True)]
+    if learned := [(value, gradient) for value, gradient in pairs if value.requires_grad]:
+        backward(*zip(*learned, strict=True))
 
 
 def gradient_of(leaf: torch.Tensor) -> torch.Tensor:

@@ -1,12 +1,38 @@
-"""How fast the slope of a group's motion grows where the group moves on: Gauss-Newton's matrix, from one picture."""
+"""Gradient and curvature of a view's loss by the rigid transforms of groups of rows."""
 
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.changes.motion import Moves
+from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
+
+
+def transform_vjp(leaves: Gaussians[torch.Tensor], moves: Moves) -> FloatArray:
+    """Return the gradient [K, 6] by shift and turn of the groups, from that of the rows that they have moved.
+
+    Arguments:
+        leaves: the A rows after they moved, with their gradients.
+        moves: of these rows, which it counts from 0 to A - 1.
+    """
+    number = len(moves.centre)
+    if leaves.means.grad is None:
+        return np.zeros((number, 6))
+    force = leaves.means.grad.numpy().astype(np.float64)
+    arm = leaves.means.detach().numpy() - (moves.centre + moves.shift)[moves.place]
+    torque = 2 * np.cross(arm, force)
+    if leaves.quats.grad is not None:
+        w, x, y, z = leaves.quats.detach().numpy().astype(np.float64).T
+        a, b, c, d = leaves.quats.grad.numpy().astype(np.float64).T
+        # A small turn v in front of a quaternion q adds (0, v) q to it.
+        torque += np.stack([
+            -a * x + b * w - c * z + d * y, -a * y + b * z + c * w - d * x, -a * z - b * y + c * x + d * w
+        ], 1)  # fmt: skip
+    both = np.concatenate([force, torque], 1)
+    return np.stack([np.bincount(moves.place, both[:, i], number) for i in range(6)], 1)
 
 
 def curvature_of(
@@ -25,7 +51,8 @@ def curvature_of(
         moves: of these rows, which it counts from 0 to A - 1.
         cameras: the training cameras.
         view: index of one of them.
-        structure: [A, 3] as ``FrameWork.structure`` gives it.
+        structure: [A, 3] sums over pixels of the share that a row has of a pixel's light, times the structure tensor of
+            the picture there (xx, xy, yy, per pixel^2).
     """
     by_row = _on_screen(means, moves, cameras, view)
     xx, xy, yy = structure.T.astype(np.float64)

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import torch
 
 from gsstream.core.topology import TopologyEdit
-from gsstream.optimiser.base import AdamState, RowOptimiser
+from gsstream.optimiser.state import AdamState
+
+if TYPE_CHECKING:
+    from gsstream.optimiser.base import RowOptimiser
 
 EMPTY: Mapping[str, torch.Tensor] = MappingProxyType({})
 
 
-class RowTable:
+class RowParameters:
     """Named leaves [n, ...], one learning rate each, moved by a :class:`RowOptimiser`."""
 
     def __init__(
@@ -41,7 +45,7 @@ class RowTable:
         lrs = {name: lr_factor * lr for name, lr in self._lrs.items()}
         self._optimiser.step(self.leaves, total, self._states, lrs)
 
-    def keep(self, rows: torch.Tensor) -> None:
+    def select_rows(self, rows: torch.Tensor) -> None:
         """Go on with these rows [K] of every leaf, and with the steps they have taken."""
         self.leaves = {name: leaf.detach()[rows].requires_grad_() for name, leaf in self.leaves.items()}
         self._states = {name: _rows(state, rows) for name, state in self._states.items()}

@@ -1,0 +1,86 @@
+"""The gates of one frame's candidates while they are trained."""
+
+from __future__ import annotations
+
+import torch
+
+from gsstream.core.hierarchy import Hierarchy
+from gsstream.gate.base import GateSampler
+from gsstream.optimiser.base import RowOptimiser
+from gsstream.optimiser.row_parameters import RowParameters
+from gsstream.optimiser.state import AdamState
+from gsstream.regularizer.base import Regularizer
+from gsstream.render.backward import backward
+
+
+class TrainedGates:
+    """Logits of the gates that have candidates behind them, moved by images and penalty.
+
+    Arguments:
+        gate, regularizer, optimiser: the parts.
+        lr: learning rate of the logits.
+        logits: [M] of all gates, as the frame begins.
+        hierarchy: of the scene.
+        rows: [A] candidates.
+        generator: of the gates' noise.
+    """
+
+    def __init__(
+        self, gate: GateSampler, regularizer: Regularizer, optimiser: RowOptimiser, lr: float, logits: torch.Tensor,
+        hierarchy: Hierarchy, rows: torch.Tensor, generator: torch.Generator,
+    ) -> None:  # fmt: skip
+        self.gate, self.regularizer, self.lr = gate, regularizer, lr
+        self.num_gaussians, self._generator, self._all = hierarchy.num_gaussians, generator, logits
+        self._nodes, node_of = torch.unique(hierarchy.node_of[rows], return_inverse=True)
+        self.hierarchy = _roots(node_of, len(self._nodes))
+        self._table = RowParameters({"logits": logits[self._nodes]}, {"logits": lr}, optimiser)
+
+    @property
+    def logits(self) -> torch.Tensor:
+        return self._table["logits"]
+
+    @property
+    def state(self) -> AdamState:
+        return self._table.state("logits")
+
+    @property
+    def node_of(self) -> torch.Tensor:
+        return self.hierarchy.node_of
+
+    def sample(self, frozen: torch.Tensor | None) -> torch.Tensor:
+        noise = self.gate.noise(self.hierarchy.num_nodes, self._generator)
+        per_row = self.gate.sample(self.logits, noise)[self.node_of]
+        return per_row if frozen is None else per_row * ~frozen
+
+    def step(self, gates: torch.Tensor, by_gate: torch.Tensor, position: torch.Tensor) -> None:
+        probability = self.gate.open_probability(self.logits)
+        # A term on the residual has a gradient by it, too; that stays on the leaf until the latents step.
+        penalty = self.regularizer.penalty(probability, position, self.hierarchy, self.num_gaussians)
+        roots = [(gates, by_gate), *((term, torch.ones_like(term)) for term in penalty.values())]
+        trained = [(root, gradient) for root, gradient in roots if root.requires_grad]
+        if not trained:
+            return
+        backward(*zip(*trained, strict=True))
+        self._table.step()
+        self.logits.data.copy_(self.gate.bound(self.logits.detach()))
+
+    def final(self) -> torch.Tensor:
+        """Return the gates [M] as they would be sent now."""
+        return self.gate.sample(self.logits.detach(), None)
+
+    def select_rows(self, rows: torch.Tensor) -> None:
+        """Go on with these rows [K] of the candidates, and with the gates that they have."""
+        self._all = self.all_logits()
+        nodes, node_of = torch.unique(self.node_of[rows], return_inverse=True)
+        self._nodes, self.hierarchy = self._nodes[nodes], _roots(node_of, len(nodes))
+        self._table.select_rows(nodes)
+
+    def all_logits(self) -> torch.Tensor:
+        """Return the logits of all gates of the scene; those that take part as they are now."""
+        return self._all.index_copy(0, self._nodes, self.logits.detach())
+
+
+def _roots(node_of: torch.Tensor, number: int) -> Hierarchy:
+    """``number`` roots and nothing else: sampling does not look at parents."""
+    roots = torch.arange(number)
+    return Hierarchy(node_of, roots, torch.zeros_like(roots))

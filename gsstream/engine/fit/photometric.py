@@ -1,0 +1,61 @@
+"""What renders of one frame are compared with: the images, by the run's loss, in the colours of each camera."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.shapes import FloatArray
+from gsstream.loss.base import Loss
+from gsstream.render.base import Renderer
+from gsstream.render.exposure import Exposure
+from gsstream.render.target import ViewTarget
+
+
+class PhotometricLoss:
+    """The photometric loss of one frame's views.
+
+    Arguments:
+        loss: the part; dssim: its weight of 1 - SSIM.
+        images: [V, H, W, 3] what the cameras recorded. What the loss makes of an image is made when it is first needed.
+        exposure: colour maps of the cameras, or None.
+    """
+
+    def __init__(self, loss: Loss, dssim: float, images: FloatArray, exposure: Exposure | None) -> None:
+        self._loss, self._dssim, self._images, self.exposure = loss, dssim, images, exposure
+        self._prepared: dict[int, Any] = {}
+
+    def view_target(self, view: int, tile_weights: torch.Tensor | None = None) -> ViewTarget:
+        """Return what renders of a view are compared with.
+
+        Arguments:
+            view: index of a training camera.
+            tile_weights: [ceil(H / 16), ceil(W / 16)] float32 factors on the gradients of tiles; None: all count once.
+        """
+        image = torch.from_numpy(self._images[view])
+        if view not in self._prepared:
+            self._prepared[view] = self._loss.prepare(image)
+        exposure = self.exposure[view] if self.exposure else None
+        return ViewTarget(self._loss, self._prepared[view], self._dssim, image, exposure, tile_weights)
+
+
+def render_exposed(
+    renderer: Renderer, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int,
+    background: tuple[float, float, float], exposure: Exposure | None,
+) -> torch.Tensor:  # fmt: skip
+    """Return [H, W, 3]: a scene as the camera of this view records it; no graph.
+
+    Arguments:
+        renderer: that draws.
+        gaussians: N rows, raw values.
+        cameras: training cameras.
+        view: index of one of them.
+        background: colour behind everything, 0 to 1.
+        exposure: colour maps of the cameras, or None.
+    """
+    with torch.no_grad():
+        image = renderer.render(gaussians, cameras, view, background).image
+    return exposure[view].apply(image) if exposure else image

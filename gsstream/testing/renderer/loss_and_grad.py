@@ -1,0 +1,186 @@
+"""What a session promises of ``loss_and_grad``: the numbers of its default body, and gradients to rely on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsstream.core.changes.motion import Moves
+from gsstream.core.errors import ComponentError, ShapeError
+from gsstream.core.gaussians import ATTRIBUTES, Gaussians
+from gsstream.loss.base import Loss
+from gsstream.loss.photometric import ReferenceLoss
+from gsstream.plugins.catalog import load_catalog
+from gsstream.render.base import TILE, Renderer, RenderSession
+from gsstream.render.exposure import CameraExposure
+from gsstream.render.target import ViewTarget
+from gsstream.render.wrt import LossAndGrad, Wrt, WrtRows, WrtScene, WrtTransforms
+from gsstream.testing.cases import SIZE, Scene, fingerprint, world
+from gsstream.testing.compare import EXACT, at_most, equal, gradients_equal, relative
+from gsstream.testing.registry import check
+
+#: Of the largest value of a gradient. A renderer may blend what stands still once for all passes of a frame, and then
+#: a pixel whose light is nearly used up may end a Gaussian later (docs/results/cost.md).
+NEAR = 5e-3
+WHY = "the same calls, up to rounding and the end of a pixel's light"
+#: The least that gradients and curvatures of transforms are measured by: a thousandth of what they are here.
+SLOPE = 1e-5
+#: What renders are compared with.
+IMAGE = torch.rand(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(4))
+GREY = (0.2, 0.5, 0.9)
+TILES = -(-SIZE // TILE)
+
+
+def losses() -> Iterator[tuple[str, Loss]]:
+    """Yield every loss that is installed, by name."""
+    catalog = load_catalog()
+    for name in catalog.names("loss"):
+        yield name, catalog.resolve("loss", name)()
+
+
+def targets(loss: Loss) -> Iterator[tuple[str, ViewTarget]]:
+    """Yield what a view may be compared with: with and without a colour map, with all tiles, some, and weights.
+
+    SSIM alone, because a pixel that L1 sees from its other side has a gradient of the other sign.
+    """
+    g = torch.Generator().manual_seed(6)
+    exposure = CameraExposure(torch.eye(3) + 0.1 * torch.randn(3, 3, generator=g), 0.1 * torch.randn(3, generator=g))
+    some = (torch.arange(TILES * TILES).reshape(TILES, TILES) % 3 > 0).float()
+    plain = ViewTarget(loss, loss.prepare(IMAGE), 1.0, IMAGE)
+    for colours, seen in (("", plain), (", colour map", replace(plain, exposure=exposure))):
+        for tiles, weights in (("", None), (", some tiles", some), (", weights of tiles", some * (1 + 3 * some.T))):
+            yield colours + tiles, replace(seen, tile_weights=weights)
+
+
+def cases() -> Iterator[tuple[str, int, ViewTarget]]:
+    """Yield every loss that is installed with every kind of target, for two cameras."""
+    for name, loss in losses():
+        for kind, target in targets(loss):
+            for view in (0, 1):
+                yield f"loss {name!r}, camera {view}{kind}", view, target
+
+
+def narrowed(part: Renderer) -> tuple[RenderSession, Scene]:
+    """Return a narrowed session, and other values of its rows."""
+    case = world("cloud")
+    active = torch.arange(0, len(case.gaussians), 9)
+    session = part.open(case.gaussians, None, case.cameras, GREY)
+    session.narrow(active)
+    g = torch.Generator().manual_seed(3)
+    return session, case.gaussians.rows(active).map(lambda v: v + 0.02 * torch.randn(v.shape, generator=g))
+
+
+def transforms(count: int) -> Moves:
+    """Return small transforms of three groups of so many rows."""
+    rng = np.random.default_rng(5)
+    parts = (0.02 * rng.standard_normal((3, 3)) for _ in range(3))
+    return Moves(np.arange(count), np.arange(count) % 3, *parts)
+
+
+def compare(what: str, got: LossAndGrad[Any], want: LossAndGrad[Any], tolerance: float) -> None:
+    """Fail unless two results have the same tensors, up to ``tolerance`` of the largest value of each."""
+    equal(f"{what}: loss", got.loss, want.loss, 1e-4, WHY)
+    if isinstance(want.grad, Gaussians):
+        ours, theirs = (_given({**dict(found.grad.items()), "2-D means": found.means2d}) for found in (got, want))
+        gradients_equal(what, ours, theirs, tolerance, WHY)
+    else:
+        relative(f"{what}: gradient", got.grad, want.grad, tolerance, WHY, floor=SLOPE)
+    for name in ("curvature", "exposure"):
+        one, other = getattr(got, name), getattr(want, name)
+        assert (one is None) == (other is None), f"{what}: {name}: expected {other!r}, got {one!r}"
+        if one is not None:
+            relative(f"{what}: {name}", one, other, tolerance, WHY, floor=SLOPE)
+
+
+def _given(gradients: dict[str, torch.Tensor | None]) -> dict[str, torch.Tensor]:
+    return {name: value for name, value in gradients.items() if value is not None}
+
+
+@check("renderer")
+def check_renderer_loss_and_grad(part: Renderer) -> None:
+    """A narrowed session's own ``loss_and_grad`` gives what the default body gives, by rows and by transforms."""
+    if type(narrowed(part)[0]).loss_and_grad is RenderSession.loss_and_grad:
+        return
+    for what, view, target in cases():
+        session, rows = narrowed(part)
+        some: tuple[Wrt[Any], ...] = WrtRows(rows), WrtTransforms(rows, transforms(len(rows)), curvature=True)
+        for wrt in some:
+            found = session.loss_and_grad(view, target, wrt)
+            want = RenderSession.loss_and_grad(narrowed(part)[0], view, target, wrt)
+            compare(f"{type(wrt).__name__}, {what}", found, want, NEAR)
+
+
+@check("renderer")
+def check_renderer_loss_and_grad_scene(part: Renderer) -> None:
+    """A wide session's own ``loss_and_grad`` gives what the default body gives by a whole scene."""
+    case = world("cloud")
+    session = part.open(case.gaussians, None, case.cameras, GREY)
+    if type(session).loss_and_grad is RenderSession.loss_and_grad:
+        return
+    for what, view, target in cases():
+        found = session.loss_and_grad(view, target, WrtScene(case.gaussians))
+        want = RenderSession.loss_and_grad(session, view, target, WrtScene(case.gaussians))
+        compare(f"WrtScene, {what}", found, want, 1e-5)
+
+
+@check("renderer")
+def check_renderer_grad(part: Renderer) -> None:
+    """Gradients repeat bit for bit, leave rows and graphs alone, add up over tiles, and are 0 where nothing counts."""
+    loss = ReferenceLoss()
+    target = ViewTarget(loss, loss.prepare(IMAGE), 0.0, IMAGE)  # without SSIM, every pixel speaks for itself
+    session, rows = narrowed(part)
+    leaves = rows.map(lambda value: value.clone().requires_grad_())
+    before = fingerprint(leaves.map(torch.Tensor.detach))
+    first, again = (session.loss_and_grad(0, target, WrtRows(leaves)).grad for _ in range(2))
+    assert fingerprint(leaves.map(torch.Tensor.detach)) == before, "loss_and_grad: the rows were changed in place"
+    left = torch.arange(TILES * TILES).reshape(TILES, TILES) % 2 == 0
+    one, other, none = (
+        session.loss_and_grad(0, replace(target, tile_weights=weights.float()), WrtRows(rows))
+        for weights in (left, ~left, left & ~left)
+    )
+    at_most("loss where no tile counts", none.loss.abs(), 0.0, 0.0, EXACT)
+    for name, value in first.items():
+        assert getattr(leaves, name).grad is None, f"loss_and_grad: a gradient was left on the caller's {name}"
+        equal(f"second gradient of {name}", getattr(again, name), value)
+        if value.numel():
+            scale = float(value.abs().max()) or 1.0
+            both = (getattr(one.grad, name) + getattr(other.grad, name)) / scale
+            equal(f"gradient of {name}, two halves of the tiles", both, value / scale, NEAR, "sums in another order")
+            at_most(f"gradient of {name} where no tile counts", getattr(none.grad, name).abs(), 0.0, 0.0, EXACT)
+
+
+@check("renderer")
+def check_renderer_grad_unseen(part: Renderer) -> None:
+    """Rows that are not in view have a gradient of exactly 0, alone and as a whole scene."""
+    case = world("unseen")
+    loss = ReferenceLoss()
+    target = ViewTarget(loss, loss.prepare(IMAGE), 0.2, IMAGE)
+    hidden = (case.gaussians.means[:, 1] > 10).nonzero()[:, 0]
+    session = part.open(case.gaussians, None, case.cameras, GREY)
+    whole = session.loss_and_grad(0, target, WrtScene(case.gaussians, means2d=False)).grad.rows(hidden)
+    session.narrow(hidden)
+    alone = session.loss_and_grad(0, target, WrtRows(case.gaussians.rows(hidden))).grad
+    for how, found in (("as a whole scene", whole), ("alone", alone)):
+        for name, value in found.items():
+            at_most(f"gradient of {name} of what is not in view, {how}", value.abs(), 0.0, 0.0, EXACT)
+
+
+@check("renderer")
+def check_renderer_grad_refuses(part: Renderer) -> None:
+    """A value that is not finite is refused, in whatever attribute it is."""
+    loss = ReferenceLoss()
+    target = ViewTarget(loss, loss.prepare(IMAGE), 0.2, IMAGE)
+    for name in ATTRIBUTES:
+        session, rows = narrowed(part)
+        if getattr(rows, name).numel() == 0:
+            continue
+        wrong = replace(rows, **{name: torch.full_like(getattr(rows, name), torch.nan)})
+        try:
+            session.loss_and_grad(0, target, WrtRows(wrong))
+        except (ShapeError, ComponentError):
+            continue
+        raise AssertionError(f"{name}: values that are not finite were accepted")

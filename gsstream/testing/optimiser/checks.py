@@ -148,7 +148,7 @@ def check_residual_optimiser_run(part: RowOptimiser) -> None:
         code = joint_code(codes, latents, {}, base)
         subject = part.residual_optimiser(code, base, torch.full((len(active),), 0.2), code.join_decoders({}))
         gates = TrainedGates(
-            ExampleGate(), ExampleRegularizer(), part, 0.05, case.logits[: case.hierarchy.num_nodes], case.hierarchy,
+            ExampleGate(), ExampleRegularizer(), part, 0.05, torch.ones(case.hierarchy.num_nodes), case.hierarchy,
             active, torch.Generator().manual_seed(1),
         )  # fmt: skip
         frozen = torch.arange(len(active)) % 4 == 0

@@ -26,7 +26,8 @@ ROOT = Path(__file__).parent
 #: Files that take longest, longest first. They are begun first: a long file that is begun last keeps one core busy
 #: while the others wait. A name that is missing here costs only time.
 LONG = (
-    "flow/test_closed_loop", "flow/test_repeat_and_resume", "flow/test_key_refresh", "lab/tests/test_sweep_ray",
+    "flow/test_closed_loop", "flow/test_repeat_and_resume", "flow/test_resume", "flow/test_key_refresh",
+    "lab/tests/test_sweep_ray",
     "cpu_render/tests/test_cross_aarch64", "contract/test_new_plugin", "contract/test_tutorial",
     "plugins/test_six_rings", "lab/tests/test_paper_configs", "web/test_page", "flow/test_budget",
     "contract/test_saboteurs", "contract/test_shipped_plugins", "flow/test_no_overshoot", "web/test_live_page",

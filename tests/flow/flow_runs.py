@@ -9,15 +9,19 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from gsstream.cli.main import run_command
+from gsstream.core.changes import Rows, in_nodes, own_nodes
 from gsstream.core.frame import Frame
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.state.stream_state import StreamState
+from gsstream.engine.step import frame_step as step_module
 from gsstream.source.open import DEMO_FOLDER
 
 #: Six frames of an analytic scene, three training cameras, one test camera.
@@ -78,6 +82,20 @@ def demo_copy(
     return folder
 
 
+#: Frames of the demo recording that a paused copy shows: it stands still from 1 to 3.
+SHOWN = (0, 1, 1, 1, 2)
+
+
+def paused(folder: Path) -> Path:
+    """A copy of the demo that repeats frame 1, image file by image file."""
+    demo_copy(folder, frames=len(SHOWN))
+    for camera in (path for path in folder.iterdir() if path.is_dir()):
+        originals = {i: (camera / f"{i:06d}.jpg").read_bytes() for i in set(SHOWN)}
+        for place, i in enumerate(SHOWN):
+            (camera / f"{place:06d}.jpg").write_bytes(originals[i])
+    return folder
+
+
 def without_test_cameras(data: dict[str, Any]) -> None:
     """An edit of cameras.json."""
     data["cameras"] = [c for c in data["cameras"] if c["split"] == "train"]
@@ -117,3 +135,25 @@ def broken_off_in(frame: int) -> Iterator[None]:
 def metrics(out: Path) -> list[dict[str, Any]]:
     """The lines of metrics.jsonl."""
     return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+
+
+def growing(monkeypatch: pytest.MonkeyPatch, method: str) -> None:
+    """Every second frame splits 20 Gaussians off and removes ten."""
+
+    def grown(parts, state, delta, view, rng):
+        player = state.player
+        if player.frame % 2:
+            return delta
+        rng = np.random.default_rng(player.frame)
+        rows = np.sort(rng.choice(len(player.gaussians), 20, replace=False))
+        copies = player.gaussians.rows(rows)
+        copies = replace(copies, means=copies.means + rng.normal(0, 0.02, (20, 3)).astype(np.float32))
+        levels = player.layout.unit_of[rows]
+        if method == "dense":
+            births = own_nodes(copies, levels, len(player.layout.node_counts))
+        else:
+            births = in_nodes(copies, player.layout.node_of[rows], levels)
+        gone = np.sort(rng.choice(len(player.gaussians), 10, replace=False))
+        return delta.with_rows(Rows(births, gone))
+
+    monkeypatch.setattr(step_module, "grown", grown)

@@ -1,12 +1,11 @@
-"""Budgets on real runs, tiny: sizes hold in the file, resumed runs give the same bytes, what cannot be held is said."""
+"""Budgets on real runs, tiny: sizes hold in the file, what cannot be held is said."""
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
-from flow_runs import Witness, arguments, broken_off_in, demo_copy, encode, metrics
+from flow_runs import Witness, arguments, demo_copy, encode, metrics
 
 from gsstream.cli.main import run_command
 from gsstream.engine.budget import plan
@@ -62,36 +61,8 @@ def test_the_encoder_goes_on_from_what_it_trimmed(tmp_path: Path, monkeypatch: p
                 assert getattr(shown, name).tobytes() == value.tobytes(), (index, name)
 
 
-@pytest.fixture(scope="module")
-def tight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An undisturbed run of six frames in a size that binds."""
-    out = tmp_path_factory.mktemp("tight")
-    encode(out, *TIGHT, method="s2gs-edge")
-    return out
-
-
-@pytest.mark.parametrize("lost", ["a line", "all lines", "half a packet"])
-def test_a_size_budget_resumes_to_the_same_bytes(tmp_path: Path, tight: Path, lost: str) -> None:
-    with broken_off_in(4):
-        assert run_command(arguments(tmp_path / "b", *TIGHT, method="s2gs-edge")) == 130
-    log = tmp_path / "b" / "metrics.jsonl"
-    lines = log.read_text().splitlines(keepends=True)
-    assert len(lines) == 4
-    if lost == "a line":  # a kill between packet and line
-        log.write_text("".join(lines[:-1]) + '{"fra')
-    if lost == "all lines":
-        log.unlink()
-    if lost == "half a packet":
-        with (tmp_path / "b" / "stream.gss").open("r+b") as file:
-            file.truncate((tmp_path / "b" / "stream.gss").stat().st_size - 9)
-    assert encode(tmp_path / "b", "--resume", *TIGHT, method="s2gs-edge") == (tight / "stream.gss").read_bytes()
-    assert [line["frame"] for line in metrics(tmp_path / "b")] == list(range(6))
-    ours, theirs = ([m["budget"]["spent"]["rate_weight"] for m in metrics(run)[1:]] for run in (tmp_path / "b", tight))
-    assert ours == theirs
-
-
-def test_another_budget_is_not_resumed(tmp_path: Path, tight: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copytree(tight, tmp_path, dirs_exist_ok=True)
+def test_another_budget_is_not_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    encode(tmp_path, "--frames", "2", *TIGHT, method="s2gs-edge")
     assert run_command(arguments(tmp_path, "--resume", "--budget", "size=2KB", method="s2gs-edge")) == 2
     assert "another recipe: budget differ" in capsys.readouterr().err
 

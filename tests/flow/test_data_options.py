@@ -1,11 +1,11 @@
-"""Runs on disturbed recordings and under ``data.*``: resuming and evaluating see the same data."""
+"""Runs on disturbed recordings and under ``data.*``: evaluating sees the same data."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
-from flow_runs import arguments, broken_off_in, encode, metrics
+from flow_runs import arguments, encode, metrics
 
 from gsstream.cli.main import run_command
 from gsstream.player.playback import Playback
@@ -14,19 +14,12 @@ from gsstream.source.open import open_source
 DISTURBED = "disturbed:gain_amplitude=0.3,noise_sigma=8,lost_share=0.4,time_offset={}@1"
 
 
-def test_a_disturbed_run_resumes_to_the_same_bytes_and_is_judged_on_what_it_saw(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_disturbed_run_is_judged_on_what_it_saw(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     world = "synthetic:frames=5&views=3&width=64&height=48&supersample=1"
     name = open_source(world).info.test.ids[0]
-    options = {"data__train_views": 2}
-    world = f"{DISTURBED.format(name)}:{world}"
-    once = encode(tmp_path / "whole", source=world, method="s2gs-edge", **options)
+    source = f"{DISTURBED.format(name)}:{world}"
+    encode(tmp_path / "whole", source=source, method="s2gs-edge", data__train_views=2)
     assert len(metrics(tmp_path / "whole")) == 4  # the offset costs one frame
-
-    with broken_off_in(2):
-        assert run_command(arguments(tmp_path / "halves", source=world, method="s2gs-edge", **options)) == 130
-    assert encode(tmp_path / "halves", "--resume", source=world, method="s2gs-edge", **options) == once
     capsys.readouterr()
     assert run_command(["evaluate", str(tmp_path / "whole")]) == 0
     mean = sum(next(iter(line["psnr"].values())) for line in metrics(tmp_path / "whole")[1:]) / 3

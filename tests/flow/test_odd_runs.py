@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ import pytest
 from early_densify import densifying
 from flow_runs import Witness, encode, metrics
 
-from gsstream.packet import StreamReader
 from gsstream.player.playback import Playback
 
 TINY_WORLD = "synthetic:frames=3&views=3&width=16&height=12&supersample=1"
@@ -38,13 +36,3 @@ def test_images_as_bytes_lose_nothing_of_8_bits(tmp_path: Path, monkeypatch: pyt
     assert len(set(scenes[0])) > 1
     if method == "s2gs-edge":
         assert witness.states[-1].previous.images.dtype == np.uint8
-
-
-def test_a_run_on_half_float_images_resumes_to_the_same_bytes(tmp_path: Path) -> None:
-    options: dict[str, Any] = {"method": "s2gs-edge", "scale": 0.5, "data__images": "float16"}
-    whole = encode(tmp_path / "whole", **options)
-    with StreamReader(tmp_path / "whole" / "stream.gss") as reader:
-        end = reader.frames[3].offset
-    shutil.copytree(tmp_path / "whole", tmp_path / "cut")
-    (tmp_path / "cut" / "stream.gss").write_bytes(whole[:end])
-    assert encode(tmp_path / "cut", "--resume", **options) == whole

@@ -1,4 +1,7 @@
-"""The same run gives the same bytes: again, with other threads, in two halves, after a kill."""
+"""The same run gives the same bytes: again, with other threads, after a kill; what is not resumed.
+
+Cuts at a known place, of runs of all kinds: test_resume.py.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ import time
 from pathlib import Path
 
 import pytest
-from flow_runs import WORLD, arguments, broken_off_in, encode, finish, metrics, start
+from flow_runs import WORLD, arguments, encode, finish, metrics, start
 
 from gsstream.cli.main import run_command
 from gsstream.packet import StreamReader
@@ -43,25 +46,6 @@ def test_threads_change_no_byte(tmp_path: Path, whole: tuple[str, bytes]) -> Non
     assert (tmp_path / "stream.gss").read_bytes() == once
 
 
-def test_two_halves_equal_the_whole(tmp_path: Path, whole: tuple[str, bytes]) -> None:
-    """Frames 0 to 2 here, broken off in frame 3; the rest in a process of its own."""
-    method, once = whole
-
-    with broken_off_in(3):
-        assert run_command(arguments(tmp_path / "o", method=method)) == 130
-    first = metrics(tmp_path / "o")
-    code, _, err = finish(*arguments(tmp_path / "o", "--resume", method=method))
-    assert (code, err) == (0, "")
-    assert (tmp_path / "o" / "stream.gss").read_bytes() == once
-    encode(tmp_path / "u", method=method)
-    lines, undisturbed = metrics(tmp_path / "o"), metrics(tmp_path / "u")
-    assert [line["frame"] for line in lines] == list(range(6))
-    assert lines[:3] == first
-    for ours, theirs in zip(lines, undisturbed, strict=True):
-        for quantity in ("psnr", "ssim", "psnr_moving", "bytes", "active_gates"):
-            assert ours.get(quantity) == theirs.get(quantity), quantity
-
-
 def test_killed_at_any_moment_it_resumes_to_the_same_bytes(tmp_path: Path, whole: tuple[str, bytes]) -> None:
     method, once = whole
     out = tmp_path / "o"
@@ -86,43 +70,17 @@ def wait_for(condition, process) -> None:
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize("kept", ["nothing", "half a header", "header", "half a key packet", "half a delta packet"])
-def test_a_torn_tail_resumes(tmp_path: Path, whole: tuple[str, bytes], kept: str) -> None:
+@pytest.mark.parametrize("kept", ["nothing", "half a header", "header", "half a key packet"])
+def test_a_torn_frame_0_is_made_again(tmp_path: Path, whole: tuple[str, bytes], kept: str) -> None:
     method, once = whole
     out = tmp_path / "o"
     out.mkdir()
     stream = out / "stream.gss"
-    stream.write_bytes(once)
-    with StreamReader(stream) as reader:
-        third = reader.frames[3]
-    sizes = {
-        "nothing": 0, "half a header": 9, "header": 16, "half a key packet": 500,
-        "half a delta packet": third.offset + third.size // 2,
-    }  # fmt: skip
+    sizes = {"nothing": 0, "half a header": 9, "header": 16, "half a key packet": 500}
     stream.write_bytes(once[: sizes[kept]])
     (out / "metrics.jsonl").write_text("".join(json.dumps({"frame": n}) + "\n" for n in range(5)) + '{"fra')
     assert resume(out, method) == once
     assert [line["frame"] for line in metrics(out)] == list(range(6))
-
-
-def test_a_finished_run_resumes_to_itself(tmp_path: Path, whole: tuple[str, bytes]) -> None:
-    method, once = whole
-    encode(tmp_path / "o", method=method)
-    assert resume(tmp_path / "o", method) == once
-
-
-def test_frame_0_of_another_stream_resumes_too(tmp_path: Path) -> None:
-    """The method that takes a frame over groups it by its own structure; resuming must find the same groups."""
-    encode(tmp_path / "dense", "--frames", "1")
-    take = ("--first-frame", str(tmp_path / "dense" / "stream.gss"))
-    once = encode(tmp_path / "a", *take, method="s2gs-edge")
-    encode(tmp_path / "b", *take, method="s2gs-edge")
-    stream = tmp_path / "b" / "stream.gss"
-    with StreamReader(stream) as reader:
-        entry = reader.frames[3]
-    with stream.open("r+b") as file:
-        file.truncate(entry.offset + 5)
-    assert encode(tmp_path / "b", "--resume", *take, method="s2gs-edge") == once
 
 
 def refused(capsys: pytest.CaptureFixture[str], stream: Path, command: list[str]) -> str:

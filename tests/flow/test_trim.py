@@ -1,11 +1,9 @@
-"""``codec.trim``: what explains least per bit is not sent, and the stream goes on from what was."""
+"""``codec.trim``: what explains least per bit is not sent."""
 
 from pathlib import Path
 
 import pytest
 from flow_runs import encode, metrics
-
-from gsstream.player.playback import Playback
 
 #: Motions give up nothing, so a share of the whole packet is one of the residual only without them.
 EDGE = {"method": "s2gs-edge", "motion": "still"}
@@ -26,13 +24,6 @@ def test_the_share_is_of_the_bytes_that_are_real(tmp_path: Path, trim: float) ->
     assert len(stream) >= sum(after)
     moved = [frame["psnr_moving"]["test"] for out in (whole, trimmed) for frame in metrics(out)[1:]]
     assert all(value is None or value > 5 for value in moved)
-
-
-def test_a_trimmed_run_cut_short_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
-    whole = encode(tmp_path, "--frames", "4", codec__trim=0.4, **EDGE)
-    assert len(Playback(tmp_path / "stream.gss")) == 4
-    (tmp_path / "stream.gss").write_bytes(whole[:-9])
-    assert encode(tmp_path, "--resume", "--frames", "4", codec__trim=0.4, **EDGE) == whole
 
 
 def test_a_share_never_takes_the_whole_change(tmp_path: Path) -> None:

@@ -1,9 +1,8 @@
-"""Whole runs, tiny: births on the wire, the player's state, resuming, settings from the recipe."""
+"""Whole runs, tiny: births on the wire, the player's state, settings from the recipe."""
 
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -98,30 +97,6 @@ def test_what_was_trained_is_what_was_sent(watched) -> None:
         moved = after.player.gaussians.means[: len(stay)] - before.player.gaussians.means[stay]
         closed = gates[before.player.layout.node_of[stay]] == 0
         assert not moved[closed].any()
-
-
-def test_resumed_in_the_middle_it_gives_the_same_bytes(tmp_path: Path, watched) -> None:
-    once = (watched[0] / "stream.gss").read_bytes()
-    assert encode(tmp_path / "again") == once
-    with Playback(watched[0] / "stream.gss") as playback:
-        third = playback.entry(3)
-    for name, size, logged in (
-        ("torn", third.offset + third.size // 2, 3), ("at the end of a packet", third.offset, 3),
-        ("a kill lost two lines", third.offset, 1), ("without a log", third.offset, 0),
-    ):  # fmt: skip
-        out = tmp_path / name
-        shutil.copytree(watched[0], out)
-        (out / "stream.gss").write_bytes(once[:size])
-        kept = (out / "metrics.jsonl").read_text().splitlines(keepends=True)[:logged]
-        if logged:
-            (out / "metrics.jsonl").write_text("".join(kept))
-        else:
-            (out / "metrics.jsonl").unlink()
-        assert encode(out, "--resume") == once, name
-        # Lines hold seconds: those that are as they were are of frames that were not encoded again.
-        assert (out / "metrics.jsonl").read_text().splitlines(keepends=True)[:logged] == kept
-        made = [line["frame"] for line in metrics(out)][logged:]
-        assert made == ([1, 2, 3, 4] if logged == 1 else [3, 4]), name
 
 
 def test_a_static_recording_costs_headers(tmp_path: Path) -> None:

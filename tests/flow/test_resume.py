@@ -20,7 +20,6 @@ WORLD = "synthetic:frames=5&views=3&width=32&height=24&supersample=1"
 STILL = f"{WORLD}&static=1"
 SMALL: dict[str, Any] = {
     "stream__epochs": 2, "first_frame__max_iterations": 8, "first_frame__max_points": 200,
-    "first_frame__fill_points": 0,
 }  # fmt: skip
 Lines = list[dict[str, Any]]
 

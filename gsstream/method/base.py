@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar, final
 
 from gsstream.core.frame import Frame
@@ -44,7 +45,7 @@ class Step(Generic[State]):
         state: what the next frame starts from.
         packet: what is written.
         status: kind of the packet.
-        metrics: numbers of this frame, plain JSON values; ``seconds`` (phase -> seconds) and ``loss`` are shown.
+        metrics: the frame's line of ``metrics.jsonl``, which the encoder fills in; a method writes to ``tools.log``.
     """
 
     state: State
@@ -58,15 +59,13 @@ class StreamingMethod(Part, Generic[State]):
 
     ``heeds`` names the recipe keys that this method reads besides what the engine itself does (frame 0, loss, renderer,
     recording, packets), for example ``("stream.epochs",)``. A run that changes a key of the parts or of later frames
-    that is not listed here is refused: no option is ignored in silence. ``least_cameras`` is how many training
-    cameras it needs: a recording with fewer is refused before anything is reconstructed. ``decodes_its_packets`` is
-    true of the engine's own method alone, whose state is made by the decoder; the packets of others are decoded and
-    compared.
+    that is not listed here is refused: no option is ignored in silence. A pattern names several: ``("stream.*",)``.
+    ``least_cameras`` is how many training cameras it needs: a recording with fewer is refused before anything is
+    reconstructed.
     """
 
     heeds: ClassVar[tuple[str, ...]] = ()
     least_cameras: ClassVar[int] = 1
-    decodes_its_packets: ClassVar[bool] = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -76,9 +75,10 @@ class StreamingMethod(Part, Generic[State]):
                 "its own; take it out"
             )
 
+    @final
     def reads(self, key: str) -> bool:
-        """Say whether this method reads a recipe key: a slot ("gate"), or a setting ("stream.epochs")."""
-        return key in self.heeds
+        """Return whether this method reads a recipe key: a slot ("gate"), or a setting ("stream.epochs")."""
+        return any(fnmatchcase(key, pattern) for pattern in self.heeds)
 
     @abstractmethod
     def begin(self, frame: Frame, tools: Tools) -> Step[State]:
@@ -112,7 +112,7 @@ class StreamingMethod(Part, Generic[State]):
 
         Arguments:
             state: before the frame, as ``step`` was given it.
-            step: what ``step`` returned for the frame; its metrics have the numbers of the engine, too.
+            step: what ``step`` returned for the frame.
             frame: training images of the frame.
             tools: what the engine can do.
         """

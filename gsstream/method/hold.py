@@ -29,7 +29,7 @@ class Hold(StreamingMethod[HoldState]):
     def begin(self, frame: Frame, tools: Tools) -> Step[HoldState]:
         first = tools.first_frame(frame)
         packet, player = send_key(first.gaussians, first.layout, first.meta, frame.index)
-        return Step(HoldState(player), packet, "key", first.metrics)
+        return Step(HoldState(player), packet, "key")
 
     def step(self, state: HoldState, frame: Frame, tools: Tools) -> Step[HoldState]:
         packet, player = send_delta(state.player, Delta())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -39,7 +40,7 @@ def send_key(gaussians: Gaussians[FloatArray], layout: Layout, meta: StreamMeta,
         frame: its index.
     """
     packet = encode_key(KeyState(gaussians.map(np.ascontiguousarray), layout, meta), frame=frame)
-    return Sent(packet, decode_packet(None, packet.data))
+    return _decoded(packet, decode_packet(None, packet.data))
 
 
 def delta_packet(
@@ -65,4 +66,8 @@ def send_delta(player: PlayerState, delta: Delta) -> Sent:
     scene.
     """
     packet = delta_packet(player, delta, frame=player.frame + 1)
-    return Sent(packet, decode_packet(player, packet.data))
+    return _decoded(packet, decode_packet(player, packet.data))
+
+
+def _decoded(packet: EncodedPacket, player: PlayerState) -> Sent:
+    return Sent(replace(packet, decoded=player), player)

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 
 from gsstream.core.changes import Layout
 from gsstream.core.gaussians import Gaussians
+from gsstream.core.log import FrameLog
 from gsstream.core.shapes import FloatArray
 from gsstream.packet import PlayerState, StreamMeta
 from gsstream.render.work import FrameWork
 
 if TYPE_CHECKING:
-    from gsstream.core.frame import Frame
+    from gsstream.core.frame import Frame, PointCloud
     from gsstream.core.rng import Rng
     from gsstream.render.base import Renderer, RenderSession
     from gsstream.render.target import ViewTarget
@@ -29,13 +30,11 @@ class FirstFrame:
         gaussians: the scene, with the values that a key packet holds.
         layout: one node per Gaussian and one unit; a method may send another.
         meta: what the key packet says about the run, colour maps of the training cameras included.
-        metrics: iterations and seconds.
     """
 
     gaussians: Gaussians[FloatArray]
     layout: Layout
     meta: StreamMeta
-    metrics: Mapping[str, Any]
 
 
 class FrameTools(FrameWork, Protocol):
@@ -61,8 +60,28 @@ class FrameTools(FrameWork, Protocol):
         """
 
 
+class FrameBudget(Protocol):
+    """What one frame may cost. A packet beyond ``max_bytes`` is sent and counted as a violation."""
+
+    @property
+    def max_bytes(self) -> int | None:
+        """Bytes of the packet, headers included; None: no limit."""
+
+    @property
+    def epochs(self) -> int:
+        """Epochs that are planned for the frame; with a limit on time a prediction."""
+
+    @property
+    def step_scale(self) -> float:
+        """Factor on quantisation steps, at least 1."""
+
+    def seconds_left(self) -> float | None:
+        """Return the seconds until the frame should be over, by the budget's clock; None: no limit."""
+
+
 class Tools(Protocol):
-    """What a method may use. Nothing here keeps state between frames."""
+    """What a method may use, the method made of parts included. Only ``log`` is written to, and it ends with the frame.
+    """
 
     @property
     def rng(self) -> Rng:
@@ -74,14 +93,41 @@ class Tools(Protocol):
     @property
     def background(self) -> tuple[float, float, float]: ...
 
-    def epochs(self, frame: Frame) -> int:
-        """Return how many passes over the training cameras a later frame is worth.
+    @property
+    def log(self) -> FrameLog:
+        """The record of this frame: wrap work into ``log.phase(name)``, write numbers by ``log.set(...)``."""
 
-        This is ``stream.epochs`` (list it in ``heeds``), or less when a live run has fallen behind.
+    @property
+    def first(self) -> PlayerState | None:
+        """Frame 0 of another stream, to be taken over; None: frame 0 is to be reconstructed."""
+
+    @property
+    def budget(self) -> FrameBudget | None:
+        """What this frame may cost; None: no limit."""
+
+    def epochs(self, frame: Frame) -> int:
+        """Return how many epochs (iterations of every training camera) a later frame is worth.
+
+        This is ``stream.epochs`` (list it in ``heeds``), or less when a budget or a live run allows less.
         """
+
+    def points(self, frame: Frame) -> PointCloud:
+        """Return the seeds of frame 0, made from its training images or from the scene that is taken over."""
+
+    def progress(self, iteration: int, iterations: int, loss: float, gaussians: int) -> None:
+        """Show how far the optimisation of frame 0 is."""
+
+    def meta(self, frame: Frame) -> StreamMeta:
+        """Return what a key packet of this frame says about the run."""
+
+    def key_refusal(self, num_gaussians: int) -> str | None:
+        """Return why a later key packet of so many Gaussians does not fit the budget now; None: it may be sent."""
 
     def first_frame(self, frame: Frame) -> FirstFrame:
         """Reconstruct frame 0 by the recipe's ``first_frame``, or take it over from another stream."""
+
+    def recorded(self, index: int) -> Frame:
+        """Return the training images of an earlier frame while a stream is resumed. Raises InputError otherwise."""
 
     def since_key(self) -> Iterator[PlayerState]:
         """Yield, while a stream is resumed, what players have after every packet from the last key packet on, in order.

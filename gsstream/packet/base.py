@@ -6,12 +6,15 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import ATTRIBUTES
+
+if TYPE_CHECKING:
+    from gsstream.packet.state import PlayerState
 
 FORMAT_MAJOR, FORMAT_MINOR = 2, 3
 FORMAT_VERSION = f"{FORMAT_MAJOR}.{FORMAT_MINOR}"
@@ -85,10 +88,12 @@ class EncodedPacket:
     Arguments:
         data: every byte, header included.
         sizes: section name -> bytes; ``header`` holds the fixed header and the section headers. The sum is len(data).
+        decoded: the state that ``decode_packet`` made of it, where it was decoded; it is not written.
     """
 
     data: bytes
     sizes: Mapping[str, int]
+    decoded: PlayerState | None = field(default=None, compare=False, repr=False)
 
     @property
     def kind(self) -> PacketKind:

@@ -25,7 +25,7 @@ from gsstream.core.part import unwrapped
 from gsstream.encode import Encoder, encoder_for, open_recording
 from gsstream.engine.assembly.guard import Guarded, guard
 from gsstream.engine.assembly.where import Where
-from gsstream.engine.method.held import RepeatedFrameWarning
+from gsstream.engine.method.repeating import RepeatedFrameWarning
 from gsstream.engine.step import frame_step as step_module
 from gsstream.gate.always_open import AlwaysOpen
 from gsstream.gate.base import SampledGate

@@ -22,7 +22,7 @@ from gsstream.engine.frame0 import refine
 from gsstream.engine.frame0.axes import nearest_axes
 from gsstream.engine.frame0.refine import carried
 from gsstream.engine.keys import keyframes
-from gsstream.engine.method.held import LeftOutWarning
+from gsstream.engine.method.repeating import LeftOutWarning
 from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.state.refinement import Refinement
 from gsstream.method.base import Step

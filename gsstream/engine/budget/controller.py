@@ -10,9 +10,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
+from gsstream.core.log import FrameLog
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.pace import Allowance
-from gsstream.engine.budget.plan import WINDOW, FramePlan, Past, past_of, plan
+from gsstream.engine.budget.plan import WINDOW, Past, past_of, plan
+from gsstream.engine.budget.spent import spent
+from gsstream.method.base import Step
+from gsstream.method.tools import FrameBudget
+from gsstream.metrics import peak_memory_mb
 from gsstream.recipe.budget import Budget
 from gsstream.recipe.model import Stream
 
@@ -30,11 +35,27 @@ class Controller:
         for line in lines if self.budget.limits_anything else ():
             self._note(line)
 
-    def allow(self) -> Allowance | None:
-        """Return what the frame that begins now may spend; None without a limit on frames."""
+    def allow(self, log: FrameLog) -> Allowance | None:
+        """Return what the frame of this log may spend; None without a limit on frames."""
         if not self.budget.limits_frames:
             return None
-        return Allowance.start(plan(self.budget, self._stream, self._history))
+        return Allowance.start(plan(self.budget, self._stream, self._history), log.elapsed())
+
+    def describe(self, budget: Allowance, step: Step[Any], views: int, log: FrameLog) -> None:
+        """Log what a frame spent of its budget, where its method made iterations.
+
+        A method that does not log its own use (``budget``) is described by its phases and the size of its packet.
+        """
+        numbers = log.numbers
+        if not numbers.get("iterations"):
+            return
+        used = numbers.get("budget") or {
+            "rate_weight": budget.plan.rate_weight, "estimate": 0.0, "stopped_by_clock": False,
+            "untrimmed": len(step.packet.data), "dropped": {},
+            "before": log.seconds("change", "motion", "confidence"),
+            "optimise": log.seconds("optimise"),
+        }  # fmt: skip
+        log.set(budget=spent(budget, used, self._stream, numbers["iterations"] / views))
 
     def key_refusal(self, num_gaussians: int, allowance: Allowance | None) -> str | None:
         """Say why a key packet that is due must wait, judged by what the last one cost; None: it may be tried."""
@@ -47,18 +68,12 @@ class Controller:
             return f"about {seconds:.2f} s where {self.budget.time:g} s are allowed for the frame"
         return None
 
-    def settle(self, metrics: dict[str, Any], seconds: float) -> dict[str, Any]:
-        """Return the metrics of a finished frame with its entry ``budget``.
-
-        Arguments:
-            metrics: of the frame.
-            seconds: what the whole frame took, by the budget's clock.
-        """
-        if not self.budget.limits_anything:
-            return metrics
-        entry = dict(metrics.get("budget", {}))
-        size, first = sum(metrics["bytes"].values()), metrics["frame"] == 0
-        actual = {"time": seconds, "size": size, "memory": 1e6 * metrics["peak_memory_mb"]}
+    def settle(self, frame: int, status: str, log: FrameLog) -> None:
+        """Complete the entry ``budget`` of a finished frame, and remember what the frame cost."""
+        numbers = log.numbers
+        entry, seconds = dict(numbers.get("budget", {})), log.elapsed()
+        size, first = sum(numbers["bytes"].values()), frame == 0
+        actual = {"time": seconds, "size": size, "memory": 1e6 * peak_memory_mb()}
         limits = {name: getattr(self.budget, name) for name in actual if getattr(self.budget, name) is not None}
         if first:  # what everything starts from is no frame of a budget (docs/howto/budget.md)
             limits = {name: limit for name, limit in limits.items() if name == "memory"}
@@ -68,10 +83,9 @@ class Controller:
         if "spent" in entry:
             entry["spent"] = {**entry["spent"], "seconds": seconds}
             entry["bound"] = [name for name in entry.get("bound", []) if name in limits]
-        settled = {**metrics, "budget": entry}
+        log.set(budget=entry)
         # As it will be read back: a resumed run must plan with the same numbers.
-        self._note(json.loads(json.dumps(settled)))
-        return settled
+        self._note(json.loads(json.dumps({"frame": frame, "status": status, **log.entry()})))
 
     def _note(self, metrics: Mapping[str, Any]) -> None:
         if metrics["status"] == "key" and metrics["num_gaussians"]:
@@ -83,8 +97,10 @@ class Controller:
             self._history = (*self._history, past)[-WINDOW:]
 
 
-def planned(parts: Assembly, frame_plan: FramePlan) -> Assembly:
-    """Return the parts with the recipe of one frame: the plan's passes, threshold and weight."""
+def planned(parts: Assembly, budget: FrameBudget) -> Assembly:
+    """Return the parts with the recipe of one frame: the plan's epochs, threshold and weight."""
+    assert isinstance(budget, Allowance)
+    frame_plan = budget.plan
     changes = {
         "epochs": frame_plan.epochs, "change_threshold": frame_plan.change_threshold,
         "rate_weight": frame_plan.rate_weight,

@@ -37,9 +37,24 @@ class Allowance:
     clock: Callable[[], float]
 
     @staticmethod
-    def start(plan: FramePlan) -> Allowance:
-        """Return an allowance that counts from now on."""
-        return Allowance(plan, time.perf_counter(), time.perf_counter)
+    def start(plan: FramePlan, elapsed: float = 0.0) -> Allowance:
+        """Return an allowance of a frame that began ``elapsed`` seconds ago."""
+        return Allowance(plan, time.perf_counter() - elapsed, time.perf_counter)
+
+    @property
+    def max_bytes(self) -> int | None:
+        return self.plan.max_bytes
+
+    @property
+    def epochs(self) -> int:
+        return self.plan.epochs
+
+    @property
+    def step_scale(self) -> float:
+        return self.plan.step_scale
+
+    def seconds_left(self) -> float | None:
+        return None if self.plan.seconds is None else self.started + self.plan.seconds - self.clock()
 
 
 class EpochScheduler(Schedule):

@@ -69,7 +69,8 @@ def past_of(metrics: Mapping[str, Any]) -> Past | None:
     if spent is None:
         return None
     return Past(
-        frame=int(metrics["frame"]), epochs=float(spent["epochs"]), candidates=int(metrics["candidate_gaussians"]),
+        frame=int(metrics["frame"]), epochs=float(spent["epochs"]),
+        candidates=int(metrics.get("candidate_gaussians", metrics["num_gaussians"])),
         before=float(spent["before"]), optimise=float(spent["optimise"]),
         after=float(spent["seconds"]) - float(spent["before"]) - float(spent["optimise"]),
         weight=float(spent["rate_weight"]), step_scale=float(spent["step_scale"]),

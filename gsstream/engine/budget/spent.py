@@ -1,7 +1,8 @@
-"""What one optimised frame spent of its allowance, in the words of ``metrics.jsonl``."""
+"""What one frame spent of its budget, in the words of ``metrics.jsonl``."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from gsstream.engine.budget.pace import Allowance, EpochScheduler
@@ -9,34 +10,35 @@ from gsstream.engine.budget.trim import Fitted
 from gsstream.recipe.model import Stream
 
 
-def spent(
-    allowance: Allowance, pace: EpochScheduler, fitted: Fitted, stream: Stream, epochs: float
-) -> dict[str, Any]:
+def usage(pace: EpochScheduler, fitted: Fitted) -> dict[str, Any]:
+    """Return what the optimisation of a frame used, and what fitting its packet gave up: raw numbers for the log."""
+    return {
+        "rate_weight": pace.typical_weight, "estimate": pace.estimate, "stopped_by_clock": pace.stopped_by_clock,
+        "untrimmed": fitted.untrimmed, "before": pace.before, "optimise": pace.optimise,
+        "dropped": {"symbols": fitted.symbols, "gates": fitted.gates, "births": fitted.births},
+    }  # fmt: skip
+
+
+def spent(budget: Allowance, used: Mapping[str, Any], stream: Stream, epochs: float) -> dict[str, Any]:
     """Return the entry ``budget`` of a frame, before its limits and the cost of the whole frame are added.
 
-    Arguments:
-        allowance: what the frame was allowed.
-        pace: what its passes were held to.
-        fitted: its packet, and what fitting it gave up.
-        stream: the recipe's own settings, from which the plan departed.
-        epochs: passes made.
+    ``used`` is that of :func:`usage`; ``stream`` holds the recipe's own settings, from which the plan departed.
     """
-    plan = allowance.plan
+    plan = budget.plan
     given_up: dict[str, Any] = {}
     if plan.max_bytes is not None:
-        if pace.typical_weight > 1.05 * stream.rate_weight:
-            given_up["rate_weight"] = [stream.rate_weight, pace.typical_weight]
+        if used["rate_weight"] > 1.05 * stream.rate_weight:
+            given_up["rate_weight"] = [stream.rate_weight, used["rate_weight"]]
         if plan.step_scale > 1:
             given_up["step_scale"] = plan.step_scale
-        dropped = {"symbols": fitted.symbols, "gates": fitted.gates, "births": fitted.births}
-        given_up |= {name: number for name, number in dropped.items() if number}
+        given_up |= {name: number for name, number in used["dropped"].items() if number}
     bound = ["size"] if given_up else []
     if plan.seconds is not None:
-        if epochs < stream.epochs and pace.stopped_by_clock:
+        if epochs < stream.epochs and used["stopped_by_clock"]:
             given_up["epochs"] = stream.epochs - epochs
         if plan.change_threshold > stream.change_threshold:
             given_up["change_threshold"] = [stream.change_threshold, plan.change_threshold]
-        if pace.stopped_by_clock:
+        if used["stopped_by_clock"]:
             bound.append("time")
     known = {"time": plan.predicted_seconds, "size": plan.predicted_bytes}
     return {
@@ -44,8 +46,8 @@ def spent(
         "bound": bound,
         "given_up": given_up,
         "spent": {
-            "epochs": epochs, "planned_epochs": plan.epochs, "rate_weight": pace.typical_weight,
-            "step_scale": plan.step_scale, "change_threshold": plan.change_threshold, "estimate": pace.estimate,
-            "untrimmed": fitted.untrimmed, "before": pace.before, "optimise": pace.optimise,
+            "epochs": epochs, "planned_epochs": plan.epochs, "rate_weight": used["rate_weight"],
+            "step_scale": plan.step_scale, "change_threshold": plan.change_threshold, "estimate": used["estimate"],
+            "untrimmed": used["untrimmed"], "before": used["before"], "optimise": used["optimise"],
         },
     }  # fmt: skip

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -22,54 +21,39 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import blaming
 from gsstream.engine.frame0.cheaper import cheaper_rows
 from gsstream.engine.frame0.first_seen import first_rows
-from gsstream.engine.frame0.optimise import Progress, initial_gaussians, optimise_first_frame, sort_by_node
+from gsstream.engine.frame0.optimise import initial_gaussians, optimise_first_frame, sort_by_node
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.init.thinning import thin_points
+from gsstream.method.tools import Tools
 from gsstream.packet import EncodedPacket, KeyState, PlayerState, StreamMeta, decode_packet, encode_key, quantise_key
 from gsstream.render.exposure import Exposure
 from gsstream.structure.base import Anchors
 
 
-def begin(
-    parts: Assembly, points: PointCloud, frame: Frame, meta: StreamMeta, rng: Rng, progress: Progress
-) -> Step:
+def begin(parts: Assembly, frame: Frame, tools: Tools) -> Step:
     """Reconstruct frame 0 and write it as a key packet.
 
-    Arguments:
-        parts: the live parts of the recipe.
-        rng: random streams by name and frame.
-        progress: told about the iterations.
-        points: seeds (never derived from test cameras).
-        frame: training images of frame 0.
-        meta: what the key packet says about the run; the exposure fit is added to it.
+    Its seeds (``tools.points``) are never derived from test cameras; the fitted exposure is added to ``tools.meta``.
     """
     check_cameras(frame.cameras, 1, "a frame")
-    clock = [time.perf_counter()]
-    anchors = seeded(parts, points, frame)
-    clock.append(time.perf_counter())
-    start = initial_gaussians(anchors, parts.recipe.first_frame)
-    found = optimise_first_frame(start, anchors.levels, frame, parts, rng, progress)
-    clock.append(time.perf_counter())
-    # Positions are float32 in the packet too, so the hierarchy of the decoded scene is the one built here.
-    cheaper = cheaper_rows(parts, found.gaussians, frame, found.exposure, rng)
-    decoded = quantise_key(cheaper.map(lambda t: t.numpy())).map(torch.from_numpy)
-    hierarchy, levels, decoded = arrange(parts, decoded, found.levels, anchors)
-    layout = make_layout(hierarchy, levels, anchors)
-    first = first_rows(parts, decoded, frame, found.exposure, rng)
-    state, packet = key_state(
-        parts, decoded, layout, hierarchy, frame, meta, found.exposure, anchors.origin, rng, first
-    )
-    clock.append(time.perf_counter())
-    metrics: dict[str, Any] = {
-        "bytes": dict(packet.sizes),
-        "num_gaussians": len(decoded),
-        "active_gaussians": len(decoded),
-        "num_gates": len(layout.node_counts),
-        "active_gates": 0,
-        "iterations": found.iterations,
-        "seconds": dict(zip(("seed", "optimise", "code"), np.diff(clock).tolist(), strict=True)),
-    }
-    return Step(state, packet, "key", metrics)
+    log, rng = tools.log, tools.rng
+    with log.phase("seed"):
+        anchors = seeded(parts, tools.points(frame), frame)
+    with log.phase("optimise"):
+        start = initial_gaussians(anchors, parts.recipe.first_frame)
+        found = optimise_first_frame(start, anchors.levels, frame, parts, rng, tools.progress)
+    with log.phase("code"):
+        # Positions are float32 in the packet too, so the hierarchy of the decoded scene is the one built here.
+        cheaper = cheaper_rows(parts, found.gaussians, frame, found.exposure, rng)
+        decoded = quantise_key(cheaper.map(lambda t: t.numpy())).map(torch.from_numpy)
+        hierarchy, levels, decoded = arrange(parts, decoded, found.levels, anchors)
+        layout = make_layout(hierarchy, levels, anchors)
+        first = first_rows(parts, decoded, frame, found.exposure, rng)
+        state, packet = key_state(
+            parts, decoded, layout, hierarchy, frame, tools.meta(frame), found.exposure, anchors.origin, rng, first
+        )
+    log.set(iterations=found.iterations)
+    return Step(state, packet, "key")
 
 
 def seeded(parts: Assembly, points: PointCloud, frame: Frame) -> Anchors:
@@ -191,7 +175,7 @@ def key_state(
         player=player, hierarchy=hierarchy, previous=frame, decoders=decoders,
         exposure=exposure_from_meta(player.meta), key_frame=player.frame,
     )  # fmt: skip
-    return state, packet
+    return state, replace(packet, decoded=player)
 
 
 def exposure_to_meta(exposure: Exposure | None) -> dict[str, Any]:

@@ -9,7 +9,6 @@ them; those of the last frame precede it, because that packet brings what they m
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +25,7 @@ from gsstream.engine.frame0.axes import conjugates, quat_products
 from gsstream.engine.frame0.optimise import FirstFrameRun
 from gsstream.engine.state.refinement import Refinement
 from gsstream.engine.state.stream_state import Step, StreamState
+from gsstream.method.tools import Tools
 from gsstream.packet import PlayerState
 from gsstream.recipe.model import Stream
 from gsstream.render.activations import rotation_matrices
@@ -35,25 +35,18 @@ from gsstream.render.exposure import Exposure
 SHOWN = "shown"
 
 
-def refined(parts: Assembly, state: StreamState, step: Step, frame: Frame, rng: Rng) -> Step:
+def refined(parts: Assembly, state: StreamState, step: Step, frame: Frame, tools: Tools) -> Step:
     """Return a step whose state has the refinement after this frame; as it is where the recipe asks for none.
 
-    Arguments:
-        parts: the live parts of the recipe.
-        state: before the frame.
-        step: the frame as it was encoded.
-        frame: its training images; one that is skipped only moves what is refined.
-        rng: random streams by name and frame.
+    ``state`` is that before the frame. A frame that is skipped only moves what is refined.
     """
     if not is_refining(parts.recipe.stream, state):
         return step
-    started = time.perf_counter()
-    after = step.state
-    before = state.refinement or begun(state.player)
-    found = advanced(parts, before, state.player, after.player, frame, state.exposure, rng)
-    metrics = {**step.metrics, "refine_iterations": found.iterations - before.iterations}
-    metrics["seconds"] = {**metrics["seconds"], "refine": time.perf_counter() - started}
-    return replace(step, state=replace(after, refinement=found), metrics=metrics)
+    with tools.log.phase("refine"):
+        after, before = step.state, state.refinement or begun(state.player)
+        found = advanced(parts, before, state.player, after.player, frame, state.exposure, tools.rng)
+    tools.log.set(refine_iterations=found.iterations - before.iterations)
+    return replace(step, state=replace(after, refinement=found))
 
 
 def follows_packet(stream: Stream, state: StreamState, frame: Frame) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -13,31 +12,25 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
-from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import arrange, decoded_anchors, exposure_from_meta, key_state, make_layout
 from gsstream.engine.frame0.first_seen import first_rows
 from gsstream.engine.state.stream_state import Step
+from gsstream.method.tools import Tools
 from gsstream.packet import PlayerState, StreamMeta, quantise_key
 from gsstream.structure.base import Anchors
 
 
-def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
+def begin_from(parts: Assembly, frame: Frame, tools: Tools) -> Step:
     """Start from the decoded frame 0 of another stream, grouped by this method.
 
     Methods can then be compared on the same scene.
 
-    Arguments:
-        parts: the live parts of the recipe.
-        first: what players have of that frame 0.
-        frame: training images of frame 0.
-        meta: what the key packet says about the run.
-        rng: random streams by name and frame.
-
     Raises InputError when the recipe asks for another degree of spherical harmonics than the stream has, when a camera
     that judges here took part in it, or when its colour maps are of other cameras.
     """
-    started = time.perf_counter()
+    first, meta, rng = tools.first, tools.meta(frame), tools.rng
+    assert first is not None
     _check_views(first.meta, frame.cameras, () if parts.recipe.data.leak == "training" else meta.test.ids)
     if first.gaussians.sh_degree != parts.recipe.first_frame.sh_degree:
         raise InputError(
@@ -46,26 +39,19 @@ def begin_from(parts: Assembly, first: PlayerState, frame: Frame, meta: StreamMe
         )
     # A delta may have put Gaussians between the positions that a key packet can say. They are grouped as players will
     # have them, or a resumed run would find other groups.
-    held = replace(first, scene=replace(first.scene, gaussians=quantise_key(first.gaussians)))
-    gaussians = held.gaussians.map(torch.from_numpy)
-    anchors = taken_anchors(parts, held, frame)
-    hierarchy, levels, gaussians = arrange(parts, gaussians, anchors.levels, anchors)
-    layout = make_layout(hierarchy, levels, anchors)
-    exposure = exposure_from_meta(first.meta)
-    first_seen = first_rows(parts, gaussians, frame, exposure, rng)
-    state, packet = key_state(
-        parts, gaussians, layout, hierarchy, frame, meta, exposure, anchors.origin, rng, first_seen
-    )
-    metrics = {
-        "bytes": dict(packet.sizes),
-        "num_gaussians": len(gaussians),
-        "active_gaussians": len(gaussians),
-        "num_gates": len(layout.node_counts),
-        "active_gates": 0,
-        "iterations": 0,
-        "seconds": {"code": time.perf_counter() - started},
-    }
-    return Step(state, packet, "key", metrics)
+    with tools.log.phase("code"):
+        decoded = replace(first, scene=replace(first.scene, gaussians=quantise_key(first.gaussians)))
+        gaussians = decoded.gaussians.map(torch.from_numpy)
+        anchors = taken_anchors(parts, decoded, frame)
+        hierarchy, levels, gaussians = arrange(parts, gaussians, anchors.levels, anchors)
+        layout = make_layout(hierarchy, levels, anchors)
+        exposure = exposure_from_meta(first.meta)
+        first_seen = first_rows(parts, gaussians, frame, exposure, rng)
+        state, packet = key_state(
+            parts, gaussians, layout, hierarchy, frame, meta, exposure, anchors.origin, rng, first_seen
+        )
+    tools.log.set(iterations=0)
+    return Step(state, packet, "key")
 
 
 def _check_views(theirs: StreamMeta, cameras: Cameras, judges: tuple[str, ...]) -> None:

@@ -6,7 +6,6 @@ grids of a key packet and grouped anew, and the encoder goes on from it as any p
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import torch
@@ -20,14 +19,14 @@ from gsstream.engine.frame0.cheaper import cheaper_rows
 from gsstream.engine.frame0.first_seen import first_rows
 from gsstream.engine.frame0.refine import SHOWN, is_refined
 from gsstream.engine.state.stream_state import Step, StreamState
-from gsstream.engine.step.tools import RunTools
+from gsstream.method.tools import Tools
 from gsstream.packet import StreamMeta, quantise_key
 
 #: Why a frame became a key packet: the refined first frame is ready.
 REFINED = "refined"
 
 
-def refresh(parts: Assembly, step: Step, frame: Frame, tools: RunTools) -> Step:
+def refresh(parts: Assembly, step: Step, frame: Frame, tools: Tools) -> Step:
     """Return ``step``, or when the recipe asks for a key packet at this frame, the step that writes one instead of it.
 
     A key packet that the budget refuses, or whose frame is skipped, stays due: the next frame tries again. Pure, like a
@@ -43,19 +42,18 @@ def refresh(parts: Assembly, step: Step, frame: Frame, tools: RunTools) -> Step:
     if reason is None:
         return step
     # A skipped frame stays an empty packet: it must not fail, and a key packet would take the time that skipping saves.
-    refused = "the frame is skipped" if frame.effort == 0 else tools.refuse_key(len(state.gaussians))
+    refused = "the frame is skipped" if frame.effort == 0 else tools.key_refusal(len(state.gaussians))
     if refused is not None:
-        return _postponed(step, reason, refused)
-    started = time.perf_counter()
+        return _postponed(step, reason, refused, tools)
     # A refined scene was fitted to the pictures of this frame; another may show older ones.
     made, shown = (refined_key, frame) if reason == REFINED else (decoded_again, state.previous)
-    after = made(parts, state, frame, tools.meta(frame), tools.rng)
-    max_bytes = None if tools.allowance is None else tools.allowance.plan.max_bytes
+    with tools.log.phase("key"):
+        after = made(parts, state, frame, tools.meta(frame), tools.rng)
+    max_bytes = None if tools.budget is None else tools.budget.max_bytes
     if max_bytes is not None and len(after.packet.data) > max_bytes:
-        return _postponed(step, reason, f"{len(after.packet.data)} bytes where {max_bytes} are allowed")
-    metrics = {**step.metrics, **after.metrics, "key_reason": reason}
-    metrics["seconds"] = {**metrics["seconds"], "key": time.perf_counter() - started}
-    return Step(replace(after.state, previous=shown), after.packet, "key", metrics)
+        return _postponed(step, reason, f"{len(after.packet.data)} bytes where {max_bytes} are allowed", tools)
+    tools.log.set(key_reason=reason)
+    return Step(replace(after.state, previous=shown), after.packet, "key")
 
 
 def _due(parts: Assembly, step: Step) -> str | None:
@@ -71,8 +69,9 @@ def _due(parts: Assembly, step: Step) -> str | None:
     return "period" if every and state.player.frame - state.key_frame >= every else None
 
 
-def _postponed(step: Step, reason: str, refused: str) -> Step:
-    return replace(step, metrics={**step.metrics, "key_postponed": f"{reason}: {refused}"})
+def _postponed(step: Step, reason: str, refused: str, tools: Tools) -> Step:
+    tools.log.set(key_postponed=f"{reason}: {refused}")
+    return step
 
 
 def refined_key(parts: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
@@ -124,5 +123,4 @@ def _keyed(
     after, packet = key_state(
         parts, gaussians, layout, hierarchy, frame, meta, state.exposure, anchors.origin, rng, first
     )
-    metrics = {"bytes": dict(packet.sizes), "num_gaussians": len(gaussians), "num_gates": len(layout.node_counts)}
-    return Step(after, packet, "key", metrics)
+    return Step(after, packet, "key")

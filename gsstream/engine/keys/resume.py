@@ -18,7 +18,7 @@ from gsstream.engine.frame0.refine import SHOWN, advanced, begun, is_refining
 from gsstream.engine.state.follow import follow
 from gsstream.engine.state.refinement import Refinement
 from gsstream.engine.state.stream_state import StreamState
-from gsstream.engine.step.tools import RunTools
+from gsstream.method.tools import Tools
 from gsstream.packet import PacketKind, PlayerState, StreamMeta, StreamReader, decode_packet
 from gsstream.packet.base import FILE_HEADER
 from gsstream.source.base import SourceInfo
@@ -116,7 +116,7 @@ def state_after(parts: Assembly, states: Iterable[PlayerState], rng: Rng) -> Str
     return state
 
 
-def refinement_after(parts: Assembly, state: StreamState, tools: RunTools) -> Refinement | None:
+def refinement_after(parts: Assembly, state: StreamState, tools: Tools) -> Refinement | None:
     """Return the first frame as far as it was refined: made again from the packets and pictures since its key packet.
 
     Arguments:
@@ -127,14 +127,13 @@ def refinement_after(parts: Assembly, state: StreamState, tools: RunTools) -> Re
     stream = parts.recipe.stream
     if not is_refining(stream, state) or state.player.frame == state.key_frame:
         return None
-    assert tools.images is not None
     found: Refinement | None = None
     before = state.player
     for player in tools.since_key():
         if found is None:
             found = begun(player)
         else:
-            frame = tools.images(player.frame)
+            frame = tools.recorded(player.frame)
             found = advanced(parts, found, before, player, frame, state.exposure, tools.rng)
         before = player
     return found

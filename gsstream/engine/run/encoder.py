@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
+from gsstream.core.log import FrameLog
 from gsstream.core.rng import Rng
 from gsstream.core.world import snapped
 from gsstream.engine.assembly.assemble import Assembly
@@ -20,7 +21,7 @@ from gsstream.engine.frame0.optimise import Progress
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.frame0.taken import cloud_of
 from gsstream.engine.keys.resume import check_stream, ended, since_key
-from gsstream.engine.method.held import begin_held, follow_up_held, step_held
+from gsstream.engine.method.wrapped import wrapped
 from gsstream.engine.run.threads import one_torch_thread
 from gsstream.engine.step.tools import RunTools
 from gsstream.method.base import Step
@@ -70,15 +71,25 @@ class Encoder:
         listeners: Listeners | None = None, place: bool = False,
     ) -> None:  # fmt: skip
         held = sized(parts.recipe.budget, info.fps)
+        self.controller = Controller(held, parts.recipe.stream)
         self.parts = replace(parts, recipe=parts.recipe.model_copy(update={"budget": held}))
         self.info, self._place = info, place
         self.rng = Rng(parts.recipe.seed)
         self.near = parts.recipe.near * info.train.extent
         #: State after the last frame; None before frame 0.
         self.state: Any = None
-        self.controller = Controller(held, parts.recipe.stream)
         self._first = None if first_frame is None else in_world(first_frame, info.world)
         self._seeds, self._listeners = seeds or self._swept, listeners or Listeners()
+
+    @property
+    def parts(self) -> Assembly:
+        """The live parts; setting them makes the method anew."""
+        return self._parts
+
+    @parts.setter
+    def parts(self, parts: Assembly) -> None:
+        self._parts = parts
+        self.method = wrapped(parts, self.controller)
 
     def encode(self, frame: Frame) -> Step[Any]:
         """Encode the next frame: the first as a key packet, later ones as the method decides.
@@ -93,22 +104,17 @@ class Encoder:
         """
         frame.validate()
         frame = self.at_near(frame)
-        clock = time.perf_counter
-        started, worked, began = time.perf_counter(), time.process_time(), clock()
+        log, worked = FrameLog(), time.process_time()
+        tools = self._tools(log=log)
         with one_torch_thread():
-            step = self._begin(frame) if self.state is None else self._step(frame)
+            step = self._begin(frame, tools) if self.state is None else self._step(frame, tools)
+        step = replace(step, packet=replace(step.packet, decoded=None))  # a queue of packets must not hold scenes
         self._listeners.packet(step.packet)
         if self.state is not None:  # only now: whoever waits for the packet does not wait for this
             with one_torch_thread():
-                step = follow_up_held(self._tools(), self.state, step, frame)
-        total, cpu = time.perf_counter() - started, time.process_time() - worked
-        seconds = step.metrics["seconds"]
-        metrics: dict[str, Any] = {
-            "frame": frame.index, "status": step.status, **step.metrics,
-            "seconds": {**seconds, "other": max(0.0, total - sum(seconds.values()))},
-            "cpu_seconds": cpu, "peak_memory_mb": peak_memory_mb(),
-        }  # fmt: skip
-        step = replace(step, metrics=self.controller.settle(metrics, clock() - began))
+                step = self.method.follow_up(self.state, step, frame, tools)
+        log.set(cpu_seconds=time.process_time() - worked, peak_memory_mb=peak_memory_mb())
+        step = replace(step, metrics={"frame": frame.index, "status": step.status, **log.entry()})
         self.state = step.state
         return step
 
@@ -132,11 +138,11 @@ class Encoder:
         # The title is what the stream says: equal recipes may be called otherwise by another version.
         self.parts = replace(self.parts, title=end.player.meta.title)
         tools = self._tools(
-            replay=lambda: since_key(stream, end), images=lambda index: self.at_near(image(index))
+            replay=lambda: since_key(stream, end), recorded=lambda index: self.at_near(image(index))
         )
         self.parts.where.enter(end.player.frame)
         with one_torch_thread():
-            self.state = self.parts.stepper.resume(end.player, self.at_near(image(end.shown)), tools)
+            self.state = self.method.resume(end.player, self.at_near(image(end.shown)), tools)
         return end.player.frame
 
     def at_near(self, frame: Frame) -> Frame:
@@ -144,23 +150,19 @@ class Encoder:
         cameras = snapped(self.info.world.cameras_back(frame.cameras)) if self._place else frame.cameras
         return replace(frame, cameras=replace(cameras, near=self.near))
 
-    def _begin(self, frame: Frame) -> Step[Any]:
-        return begin_held(self._tools(), frame)
+    def _begin(self, frame: Frame, tools: RunTools) -> Step[Any]:
+        return self.method.begin(frame, tools)
 
-    def _step(self, frame: Frame) -> Step[Any]:
+    def _step(self, frame: Frame, tools: RunTools) -> Step[Any]:
         expected = self.state.player.frame + 1
         if frame.index != expected:
             raise InputError(f"frame {frame.index}: expected frame {expected}, frames are encoded in order")
-        allowance = self.controller.allow()
-        tools = self._tools(
-            allowance=allowance, refuse_key=lambda number: self.controller.key_refusal(number, allowance)
-        )
-        return step_held(tools, self.state, frame)
+        return self.method.step(self.state, frame, tools)
 
     def _tools(self, **changes: Any) -> RunTools:
-        given: dict[str, Any] = {"points": self._points, "replay": _nothing, **changes}
         return RunTools(
-            self.parts, self.rng, self._meta, first=self._first, progress=self._listeners.progress, **given
+            self.parts, self.rng, self._meta, self._points, first=self._first, progress=self._listeners.progress,
+            **changes,
         )
 
     def _points(self, frame: Frame) -> PointCloud:
@@ -185,9 +187,3 @@ class Encoder:
             extra={"source_uri": info.uri, "licence": info.licence, "title": self.parts.title},
             world=info.world,
         )
-
-
-def _nothing() -> Iterator[PlayerState]:
-    return iter(())
-
-

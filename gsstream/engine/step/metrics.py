@@ -1,4 +1,4 @@
-"""Numbers of one frame step that need no rendering."""
+"""Numbers of a frame: those that follow from its packet, for every method, and those of a step made of parts."""
 
 from __future__ import annotations
 
@@ -6,50 +6,60 @@ from typing import Any
 
 import numpy as np
 
-from gsstream.core.changes import Delta, changing_rows
-from gsstream.engine.state.stream_state import StreamState
+from gsstream.core.changes import changing_rows, row_gates
+from gsstream.core.log import FrameLog
 from gsstream.engine.step.problem import Solution
-from gsstream.packet import EncodedPacket
+from gsstream.packet import EncodedPacket, PacketKind, PlayerState
 from gsstream.render.base import RenderCache, RenderSession
 
 
-def step_metrics(
-    delta: Delta, after: StreamState, packet: EncodedPacket, solution: Solution | None, candidates: int
-) -> dict[str, Any]:
-    """Return the numbers of a frame.
-
-    Arguments:
-        delta: what was sent.
-        after: the state after the frame.
-        packet: that holds it.
-        solution: what the optimisation found; None in a frame without one.
-        candidates: Gaussians that took part.
-    """
-    before = after.player.before or after.player.layout
-    gates = delta.gates(before)
+def step_numbers(solution: Solution | None, candidates: int, session: RenderSession | None) -> dict[str, Any]:
+    """Return what the optimisation did (None: there was none), and what the renderer keeps for the next frame."""
     return {
-        "bytes": dict(packet.sizes),
-        "active_gaussians": 0 if delta.residual is None else changing_rows(delta.residual),
-        "sent_gaussians": int(np.asarray(before.node_counts)[gates != 0].sum()),
-        "num_gaussians": len(after.player.gaussians),
-        "active_gates": int((gates != 0).sum()),
-        "num_gates": len(gates),
-        "moving_groups": sum(int(np.count_nonzero(motion.moving)) for motion in delta.motions),
-        "displaced_gaussians": 0 if after.player.scene.moved is None else len(after.player.scene.moved.rows),
         "dead_gates": 0 if solution is None else solution.dead_gates,
-        "births": 0 if delta.births is None else len(delta.births),
-        "deaths": len(delta.deaths),
         "candidate_gaussians": candidates,
         "loss": 0.0 if solution is None else solution.loss,
         "iterations": 0 if solution is None else solution.iterations,
+        **_cache(session),
     }
 
 
-def cache_metrics(session: RenderSession | None) -> dict[str, Any]:
-    """Return what the renderer keeps from frame to frame; nothing where it keeps nothing."""
+def _cache(session: RenderSession | None) -> dict[str, Any]:
     cache = RenderCache() if session is None else session.cache_bytes()
     if not cache.per_view:
         return {}
     per_pair = round(cache.per_camera_and_gaussian, 1)
     known = {"mb": cache.total / 1e6, "cameras": len(cache.per_view), "bytes_per_camera_and_gaussian": per_pair}
     return {"cache": known}
+
+
+def log_packet(log: FrameLog, player: PlayerState, packet: EncodedPacket) -> None:
+    """Log the sizes and counts that follow from a packet and the state it was decoded to.
+
+    Of a key packet that takes the place of a delta packet only sizes are logged: what changed in the frame stays.
+    """
+    sizes = {
+        "bytes": dict(packet.sizes),
+        "num_gaussians": len(player.gaussians),
+        "num_gates": len(player.layout.node_counts),
+    }
+    counts = _counts(player, packet)
+    if packet.kind is PacketKind.KEY:
+        counts = {name: log.numbers.get(name, count) for name, count in counts.items()}
+    log.set(**sizes, **counts)
+
+
+def _counts(player: PlayerState, packet: EncodedPacket) -> dict[str, int]:
+    rows = sent = 0 if packet.kind is PacketKind.EMPTY else len(player.gaussians)
+    births = gates = deaths = moving = 0
+    delta, before, moved = player.delta, player.before, player.scene.moved
+    if packet.kind is PacketKind.DELTA and delta is not None and before is not None:
+        births, deaths = 0 if delta.births is None else len(delta.births), len(delta.deaths)
+        rows = births + (0 if delta.residual is None else changing_rows(delta.residual))
+        sent = int((row_gates(before, delta) > 0).sum())
+        gates = int((delta.gates(before) != 0).sum()) + births
+        moving = sum(int(np.count_nonzero(motion.moving)) for motion in delta.motions)
+    return {
+        "active_gaussians": rows, "sent_gaussians": sent, "active_gates": gates, "births": births, "deaths": deaths,
+        "moving_groups": moving, "displaced_gaussians": 0 if moved is None else len(moved.rows),
+    }  # fmt: skip

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 
+from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.log import FrameLog
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.pace import Allowance
@@ -21,6 +23,10 @@ from gsstream.packet import PlayerState, StreamMeta
 from gsstream.render.base import Renderer
 
 
+def _not_resuming(index: int) -> Frame:
+    raise InputError(f"frame {index} was asked for: recorded frames can be read only while a stream is resumed")
+
+
 @dataclass(frozen=True)
 class RunTools:
     """What a run lends to its method.
@@ -30,24 +36,26 @@ class RunTools:
         rng: random streams by name and frame.
         meta: makes what a key packet says about the run, from the frame that is to be sent.
         points: makes the seeds of frame 0, from its training images.
+        log: the record of the frame.
         first: frame 0 of another stream, to be taken over; or None.
         progress: told about the iterations of frame 0.
-        allowance: what a budget lets the next frame spend; None: what the recipe says.
-        refuse_key: number of Gaussians -> why a key packet cannot be paid for now, or None.
+        budget: what the frame may spend; None: what the recipe says.
+        key_refusal: number of Gaussians -> why a key packet cannot be paid for now, or None.
         replay: the states of players since the last key packet, while a stream is being resumed.
-        images: frame index -> its training images, while a stream is being resumed.
+        recorded: frame index -> its training images, while a stream is being resumed.
     """
 
     parts: Assembly
     rng: Rng
     meta: Callable[[Frame], StreamMeta]
     points: Callable[[Frame], PointCloud]
+    log: FrameLog = field(default_factory=FrameLog)
     first: PlayerState | None = None
     progress: Progress = lambda *_: None
-    allowance: Allowance | None = None
-    refuse_key: Callable[[int], str | None] = lambda _: None
+    budget: Allowance | None = None
+    key_refusal: Callable[[int], str | None] = lambda _: None
     replay: Callable[[], Iterator[PlayerState]] = lambda: iter(())
-    images: Callable[[int], Frame] | None = None
+    recorded: Callable[[int], Frame] = _not_resuming
 
     @property
     def renderer(self) -> Renderer:
@@ -58,20 +66,16 @@ class RunTools:
         return self.parts.recipe.background
 
     def epochs(self, frame: Frame) -> int:
-        return max(1, round(self.parts.recipe.stream.epochs * frame.effort))
+        epochs = self.parts.recipe.stream.epochs if self.budget is None else self.budget.epochs
+        return max(1, round(epochs * frame.effort))
 
     def since_key(self) -> Iterator[PlayerState]:
         return self.replay()
 
     def first_frame(self, frame: Frame) -> FirstFrame:
-        meta = self.meta(frame)
-        if self.first is not None:
-            step = begin_from(self.parts, self.first, frame, meta, self.rng)
-        else:
-            step = begin(self.parts, self.points(frame), frame, meta, self.rng, self.progress)
-        player = step.state.player
-        metrics = {name: step.metrics[name] for name in ("iterations", "seconds")}
-        return FirstFrame(player.gaussians, player.layout, player.meta, metrics)
+        make = begin if self.first is None else begin_from
+        player = make(self.parts, frame, self).state.player
+        return FirstFrame(player.gaussians, player.layout, player.meta)
 
     def open(self, player: PlayerState, previous: Frame, frame: Frame) -> FrameView:
         roots = torch.arange(len(player.layout.node_counts))

@@ -47,7 +47,7 @@ class ExampleStepper(StreamingMethod[Carried]):
         # One node holds all Gaussians: one gate, and the same symbols in every row cost next to nothing.
         layout = replace(first.layout, node_counts=np.array([len(first.gaussians)], np.int32))
         packet, player = send_key(first.gaussians, layout, first.meta, frame.index)
-        return Step(Carried(player), packet, "key", first.metrics)
+        return Step(Carried(player), packet, "key")
 
     def step(self, state: Carried, frame: Frame, tools: Tools) -> Step[Carried]:
         work = tools.open(state.player, frame, frame)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -54,41 +53,37 @@ class ComGS(StreamingMethod[ComGSState]):
         first = tools.first_frame(frame)
         layout = Layout.flat(len(first.gaussians), frame.cameras.extent)
         packet, player = send_key(first.gaussians, layout, first.meta, frame.index)
-        return Step(ComGSState(player, frame), packet, "key", first.metrics)
+        return Step(ComGSState(player, frame), packet, "key")
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> ComGSState:
         return ComGSState(player, shown)
 
     def step(self, state: ComGSState, frame: Frame, tools: Tools) -> Step[ComGSState]:
-        clock = [time.perf_counter()]
-        still = np.array_equal(state.previous.images, frame.images)
-        # At a key frame what is still wrong is corrected, whether something moves or not.
-        key = frame.index % self.config.correction.every == 0
-        if frame.effort == 0 or (still and not key):
-            return self._send(state, frame, Delta())
-        epochs, order = tools.epochs(frame), tools.rng.numpy("comgs", frame.index)
-        scene, delta = state.player.scene, Delta()
-        work = tools.open(state.player, state.previous, frame)
-        settings, means = self.config.motion, work.gaussians.means
-        rows = rows_in_change(work.session, means, state.previous, frame, settings.change, settings.votes)
-        motion = fitted_motion(scene, work, rows, epochs, self.config.motion, order) if len(rows) else None
-        if motion is not None:
-            delta = Delta((motion,))
-            scene = apply_motion(scene, motion)[0]
-        clock.append(time.perf_counter())
-        if key:
-            passes = max(1, round(epochs * self.config.correction.passes))
-            work = work.on(scene.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
-            residual = corrected(work, scene.layout, passes, self.config.correction, order)
-            delta = delta.with_residual(residual)
-        clock.append(time.perf_counter())
-        step = self._send(state, frame, delta)
-        clock.append(time.perf_counter())
-        facts = {
-            "moving_groups": 0 if motion is None else int(motion.moving.sum()), "corrected": key,
-            "seconds": dict(zip(("motion", "optimise", "code"), np.diff(clock).tolist(), strict=True)),
-        }  # fmt: skip
-        return replace(step, metrics={**step.metrics, **facts})
+        with tools.log.phase("motion"):
+            still = np.array_equal(state.previous.images, frame.images)
+            # At a key frame what is still wrong is corrected, whether something moves or not.
+            key = frame.index % self.config.correction.every == 0
+            if frame.effort == 0 or (still and not key):
+                return self._send(state, frame, Delta())
+            epochs, order = tools.epochs(frame), tools.rng.numpy("comgs", frame.index)
+            scene, delta = state.player.scene, Delta()
+            work = tools.open(state.player, state.previous, frame)
+            settings, means = self.config.motion, work.gaussians.means
+            rows = rows_in_change(work.session, means, state.previous, frame, settings.change, settings.votes)
+            motion = fitted_motion(scene, work, rows, epochs, self.config.motion, order) if len(rows) else None
+            if motion is not None:
+                delta = Delta((motion,))
+                scene = apply_motion(scene, motion)[0]
+        with tools.log.phase("optimise"):
+            if key:
+                passes = max(1, round(epochs * self.config.correction.passes))
+                work = work.on(scene.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
+                residual = corrected(work, scene.layout, passes, self.config.correction, order)
+                delta = delta.with_residual(residual)
+        with tools.log.phase("code"):
+            step = self._send(state, frame, delta)
+        tools.log.set(corrected=key)
+        return step
 
     def _send(self, state: ComGSState, frame: Frame, delta: Delta) -> Step[ComGSState]:
         packet, player = send_delta(state.player, delta)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -58,37 +57,32 @@ class HiCoM(StreamingMethod[HiCoMState]):
         number = len(first.gaussians)
         layout = Layout.flat(number, frame.cameras.extent)
         packet, player = send_key(first.gaussians, layout, first.meta, frame.index)
-        return Step(HiCoMState(player, frame, number), packet, "key", first.metrics)
+        return Step(HiCoMState(player, frame, number), packet, "key")
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> HiCoMState:
         return HiCoMState(player, shown, len(next(tools.since_key()).gaussians))
 
     def step(self, state: HiCoMState, frame: Frame, tools: Tools) -> Step[HiCoMState]:
-        clock = [time.perf_counter()]
-        if frame.effort == 0 or np.array_equal(state.previous.images, frame.images):
-            return self._send(state, frame, Delta())
-        epochs = tools.epochs(frame)
-        for_births = max(1, round(self.config.births.share * epochs)) if self.config.births.share else 0
-        scene = state.player.scene
-        work = tools.open(state.player, state.previous, frame)
-        settings, means = self.config.motion, work.gaussians.means
-        rows = rows_in_change(work.session, means, state.previous, frame, settings.change, settings.votes)
-        order = tools.rng.numpy("hicom", frame.index)
-        motions, moved = fitted_motions(
-            scene, work, rows, max(1, epochs - for_births), self.config.motion, order
-        )
-        work = work.on(moved.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
-        clock.append(time.perf_counter())
-        change = self._rows(moved, state.number, work, for_births, tools) if for_births else Rows()
-        clock.append(time.perf_counter())
-        step = self._send(state, frame, Delta(motions).with_rows(change))
-        clock.append(time.perf_counter())
-        facts = {
-            "iterations": epochs * len(frame.cameras), "births": 0 if change.births is None else len(change.births),
-            "deaths": len(change.deaths), "moving_groups": [int(motion.moving.sum()) for motion in motions],
-            "seconds": dict(zip(("motion", "growth", "code"), np.diff(clock).tolist(), strict=True)),
-        }  # fmt: skip
-        return replace(step, metrics={**step.metrics, **facts})
+        with tools.log.phase("motion"):
+            if frame.effort == 0 or np.array_equal(state.previous.images, frame.images):
+                return self._send(state, frame, Delta())
+            epochs = tools.epochs(frame)
+            for_births = max(1, round(self.config.births.share * epochs)) if self.config.births.share else 0
+            scene = state.player.scene
+            work = tools.open(state.player, state.previous, frame)
+            settings, means = self.config.motion, work.gaussians.means
+            rows = rows_in_change(work.session, means, state.previous, frame, settings.change, settings.votes)
+            order = tools.rng.numpy("hicom", frame.index)
+            motions, moved = fitted_motions(
+                scene, work, rows, max(1, epochs - for_births), self.config.motion, order
+            )
+            work = work.on(moved.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
+        with tools.log.phase("growth"):
+            change = self._rows(moved, state.number, work, for_births, tools) if for_births else Rows()
+        with tools.log.phase("code"):
+            step = self._send(state, frame, Delta(motions).with_rows(change))
+        tools.log.set(iterations=epochs * len(frame.cameras))
+        return step
 
     def _rows(self, scene: Scene, number: int, work: FrameTools, epochs: int, tools: Tools) -> Rows:
         """As many of the least opaque leave as there are more than in frame 0; then this frame's are born."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -61,7 +60,7 @@ class Queen(StreamingMethod[QueenState]):
         first = tools.first_frame(frame)
         layout = Layout.flat(len(first.gaussians), frame.cameras.extent)
         packet, player = send_key(first.gaussians, layout, first.meta, frame.index)
-        return Step(QueenState(player, frame, self._weights(player, tools)), packet, "key", first.metrics)
+        return Step(QueenState(player, frame, self._weights(player, tools)), packet, "key")
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> QueenState:
         return QueenState(player, shown, self._weights(player, tools))
@@ -75,49 +74,43 @@ class Queen(StreamingMethod[QueenState]):
         return {**drawn, **sent}
 
     def step(self, state: QueenState, frame: Frame, tools: Tools) -> Step[QueenState]:
-        clock = [time.perf_counter()]
         if frame.effort == 0:
-            return self._send(state, frame, tools, Delta(), {})
+            return self._send(state, frame, tools, Delta())
         work = tools.open(state.player, state.previous, frame)
-        change = gradient_difference(work, self.config.change)
-        clock.append(time.perf_counter())
-        if not bool((change.difference > 0).any()):
-            # Not a pixel differs from the images before: nothing to learn.
-            return self._send(state, frame, tools, Delta(), {})
-        dynamic = change.difference > self.config.change.dynamic
-        active = torch.arange(len(dynamic)) if self.config.rows == "all" else dynamic.nonzero()[:, 0]
-        if len(active) == 0:
-            return self._send(state, frame, tools, Delta(), {})
-        logits = initial_logits(change.difference, change.seen, self.config.gate)[active]
-        problem = Problem(
-            work, tools.renderer, tools.background, active, dynamic, self._masks(work, dynamic, tools), logits,
-            state.weights, tools.epochs(frame),
-        )  # fmt: skip
-        result = optimise(self.config, problem, tools.rng.stream("queen", frame.index))
-        clock.append(time.perf_counter())
-        delta = self._harden(state.player, active, result)
-        step = self._send(state, frame, tools, delta, {"loss": result.loss, "iterations": result.iterations})
-        clock.append(time.perf_counter())
+        with tools.log.phase("confidence"):
+            change = gradient_difference(work, self.config.change)
+            dynamic = change.difference > self.config.change.dynamic
+            active = torch.arange(len(dynamic)) if self.config.rows == "all" else dynamic.nonzero()[:, 0]
+        # Without a pixel that differs from the images before there is nothing to learn.
+        if not bool((change.difference > 0).any()) or len(active) == 0:
+            return self._send(state, frame, tools, Delta())
+        with tools.log.phase("optimise"):
+            logits = initial_logits(change.difference, change.seen, self.config.gate)[active]
+            problem = Problem(
+                work, tools.renderer, tools.background, active, dynamic, self._masks(work, dynamic, tools), logits,
+                state.weights, tools.epochs(frame),
+            )  # fmt: skip
+            result = optimise(self.config, problem, tools.rng.stream("queen", frame.index))
+        with tools.log.phase("code"):
+            delta = self._harden(state.player, active, result)
+            step = self._send(state, frame, tools, delta)
         shifts = None if delta.residual is None else delta.residual.symbols.get("means")
-        facts = {
-            "dynamic_gaussians": int(dynamic.sum()), "births": len(result.born), "deaths": int(result.gone.sum()),
-            "moved_gaussians": 0 if shifts is None else int(shifts.any(1).sum()),
-            "seconds": dict(zip(("confidence", "optimise", "code"), np.diff(clock).tolist(), strict=True)),
-        }  # fmt: skip
-        return replace(step, metrics={**step.metrics, **facts})
+        tools.log.set(
+            loss=result.loss, iterations=result.iterations, dynamic_gaussians=int(dynamic.sum()),
+            moved_gaussians=0 if shifts is None else int(shifts.any(1).sum()),
+        )  # fmt: skip
+        return step
 
     def _masks(self, work: FrameTools, dynamic: torch.Tensor, tools: Tools) -> list[torch.Tensor] | None:
         if self.config.mask.share == 0:
             return None
         return changed_tiles(work, dynamic, tools.renderer, self.config.mask)
 
-    def _send(
-        self, state: QueenState, frame: Frame, tools: Tools, delta: Delta, metrics: dict[str, object]
-    ) -> Step[QueenState]:
+    def _send(self, state: QueenState, frame: Frame, tools: Tools, delta: Delta) -> Step[QueenState]:
         packet, player = send_delta(state.player, delta)
         if delta.is_empty:
-            return Step(replace(state, player=player), packet, "empty", metrics)
-        return Step(QueenState(player, frame, self._weights(player, tools)), packet, "delta", metrics)
+            return Step(replace(state, player=player), packet, "empty")
+        return Step(QueenState(player, frame, self._weights(player, tools)), packet, "delta")
 
     def _harden(self, player: PlayerState, active: torch.Tensor, result: Result) -> Delta:
         """The integers of the rows in which any is not zero; rows that leave send none."""

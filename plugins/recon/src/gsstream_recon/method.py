@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -55,41 +54,35 @@ class AnchoredMethod(StreamingMethod[ReConState]):
         number = len(first.gaussians)
         layout = Layout.flat(number, frame.cameras.extent)
         packet, player = send_key(first.gaussians, layout, first.meta, frame.index)
-        return Step(ReConState(player, frame, number), packet, "key", first.metrics)
+        return Step(ReConState(player, frame, number), packet, "key")
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> ReConState:
         anchors = anchors_after(tools.since_key(), self.config.motion, tools.rng)
         return ReConState(player, shown, len(next(tools.since_key()).gaussians), anchors)
 
     def step(self, state: ReConState, frame: Frame, tools: Tools) -> Step[ReConState]:
-        clock = [time.perf_counter()]
-        if frame.effort == 0 or np.array_equal(state.previous.images, frame.images):
-            return self._send(state, frame, Delta(), state.anchors)
-        epochs = tools.epochs(frame)
-        for_births = max(1, round(self.config.births.share * epochs)) if self.config.births.share else 0
-        scene, settings = state.player.scene, self.config.motion
-        work = tools.open(state.player, state.previous, frame)
-        means = work.gaussians.means
-        rows = rows_in_change(work.session, means, state.previous, frame, settings.change, settings.votes)
-        anchors = due(state.anchors, frame.index, len(scene.gaussians), settings, tools.rng)
-        motion = fitted_motion(
-            scene, work, rows, (state.anchors, anchors), max(1, epochs - for_births), settings,
-            tools.rng.numpy("recon", frame.index), self.rounded,
-        )  # fmt: skip
-        moved = scene if motion is None else apply_motion(scene, motion)[0]
-        work = work.on(moved.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
-        clock.append(time.perf_counter())
-        change = self._rows(moved, state.number, work, for_births, tools) if for_births else Rows()
-        clock.append(time.perf_counter())
-        step = self._send(state, frame, Delta(() if motion is None else (motion,)).with_rows(change), anchors)
-        clock.append(time.perf_counter())
-        facts = {
-            "iterations": epochs * len(frame.cameras), "births": 0 if change.births is None else len(change.births),
-            "deaths": len(change.deaths), "moving_groups": 0 if motion is None else int(motion.moving.sum()),
-            "anchors": [len(level) for level in anchors.rows],
-            "seconds": dict(zip(("motion", "growth", "code"), np.diff(clock).tolist(), strict=True)),
-        }  # fmt: skip
-        return replace(step, metrics={**step.metrics, **facts})
+        with tools.log.phase("motion"):
+            if frame.effort == 0 or np.array_equal(state.previous.images, frame.images):
+                return self._send(state, frame, Delta(), state.anchors)
+            epochs = tools.epochs(frame)
+            for_births = max(1, round(self.config.births.share * epochs)) if self.config.births.share else 0
+            scene, settings = state.player.scene, self.config.motion
+            work = tools.open(state.player, state.previous, frame)
+            means = work.gaussians.means
+            rows = rows_in_change(work.session, means, state.previous, frame, settings.change, settings.votes)
+            anchors = due(state.anchors, frame.index, len(scene.gaussians), settings, tools.rng)
+            motion = fitted_motion(
+                scene, work, rows, (state.anchors, anchors), max(1, epochs - for_births), settings,
+                tools.rng.numpy("recon", frame.index), self.rounded,
+            )  # fmt: skip
+            moved = scene if motion is None else apply_motion(scene, motion)[0]
+            work = work.on(moved.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
+        with tools.log.phase("growth"):
+            change = self._rows(moved, state.number, work, for_births, tools) if for_births else Rows()
+        with tools.log.phase("code"):
+            step = self._send(state, frame, Delta(() if motion is None else (motion,)).with_rows(change), anchors)
+        tools.log.set(iterations=epochs * len(frame.cameras), anchors=[len(level) for level in anchors.rows])
+        return step
 
     def _rows(self, scene: Scene, number: int, work: FrameTools, epochs: int, tools: Tools) -> Rows:
         """As many of the least opaque leave as there are more than in frame 0; then this frame's are born."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -59,42 +58,36 @@ class Stream3DGS(StreamingMethod[Stream3DGSState]):
         number = len(first.gaussians)
         layout = Layout.flat(number, frame.cameras.extent)
         packet, player = send_key(first.gaussians, layout, first.meta, frame.index)
-        return Step(Stream3DGSState(player, frame, number), packet, "key", first.metrics)
+        return Step(Stream3DGSState(player, frame, number), packet, "key")
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> Stream3DGSState:
         return Stream3DGSState(player, shown, len(next(tools.since_key()).gaussians))
 
     def step(self, state: Stream3DGSState, frame: Frame, tools: Tools) -> Step[Stream3DGSState]:
-        clock = [time.perf_counter()]
-        if frame.effort == 0 or np.array_equal(state.previous.images, frame.images):
-            return self._send(state, frame, Delta())
-        epochs = tools.epochs(frame)
-        for_births = max(1, round(self.config.births.share * epochs)) if self.config.births.share else 0
-        scene = state.player.scene
-        work = tools.open(state.player, state.previous, frame)
-        rows = rows_in_change(
-            work.session, work.gaussians.means, state.previous, frame, self.config.cache.change, self.config.cache.votes
-        )
-        # Those of the frame before are given up: they neither move nor hide what does.
-        rows = rows[rows < state.number]
-        work = work.on(work.gaussians.rows(slice(0, state.number)))
-        passes = max(1, epochs - for_births)
-        found = fitted_cache(scene, work, rows, passes, self.config.cache, tools.rng) if len(rows) else None
-        said = None if found is None else said_by(scene, *found, frame.cameras, self.config.cache)
-        moves = Delta(() if said is None else (said,))
-        moved = apply_delta(scene, moves)
-        work = work.on(moved.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
-        clock.append(time.perf_counter())
-        change = self._rows(moved, state.number, work, for_births, tools)
-        clock.append(time.perf_counter())
-        step = self._send(state, frame, moves.with_rows(change))
-        clock.append(time.perf_counter())
-        facts = {
-            "iterations": epochs * len(frame.cameras), "births": 0 if change.births is None else len(change.births),
-            "deaths": len(change.deaths), "moving_groups": sum(int(motion.moving.sum()) for motion in moves.motions),
-            "seconds": dict(zip(("motion", "growth", "code"), np.diff(clock).tolist(), strict=True)),
-        }  # fmt: skip
-        return replace(step, metrics={**step.metrics, **facts})
+        with tools.log.phase("motion"):
+            if frame.effort == 0 or np.array_equal(state.previous.images, frame.images):
+                return self._send(state, frame, Delta())
+            epochs = tools.epochs(frame)
+            for_births = max(1, round(self.config.births.share * epochs)) if self.config.births.share else 0
+            scene = state.player.scene
+            work = tools.open(state.player, state.previous, frame)
+            cache, means = self.config.cache, work.gaussians.means
+            rows = rows_in_change(work.session, means, state.previous, frame, cache.change, cache.votes)
+            # Those of the frame before are given up: they neither move nor hide what does.
+            rows = rows[rows < state.number]
+            work = work.on(work.gaussians.rows(slice(0, state.number)))
+            passes = max(1, epochs - for_births)
+            found = fitted_cache(scene, work, rows, passes, self.config.cache, tools.rng) if len(rows) else None
+            said = None if found is None else said_by(scene, *found, frame.cameras, self.config.cache)
+            moves = Delta(() if said is None else (said,))
+            moved = apply_delta(scene, moves)
+            work = work.on(moved.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
+        with tools.log.phase("growth"):
+            change = self._rows(moved, state.number, work, for_births, tools)
+        with tools.log.phase("code"):
+            step = self._send(state, frame, moves.with_rows(change))
+        tools.log.set(iterations=epochs * len(frame.cameras))
+        return step
 
     def _rows(self, scene: Scene, number: int, work: FrameTools, epochs: int, tools: Tools) -> Rows:
         """Those of the frame before leave, which stand behind the rows of frame 0; then this frame's are born."""

@@ -1,0 +1,72 @@
+"""``stream.on_error: repeat``: a frame whose method fails repeats the one before it, as an empty packet."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from typing import Any
+
+from gsstream.core.errors import ComponentError, ShapeError
+from gsstream.core.frame import Frame
+from gsstream.method.base import Step, StreamingMethod
+from gsstream.method.tools import Tools
+from gsstream.packet import PlayerState
+
+
+class RepeatedFrameWarning(UserWarning):
+    """A part failed, and its frame was sent as "nothing changed"."""
+
+
+class LeftOutWarning(UserWarning):
+    """A part failed in work that follows a frame's packet, which is sound and out; the work was left out."""
+
+
+class Repeating(StreamingMethod[Any]):
+    """Calls a method; where it fails, calls it again with the same frame at effort 0.
+
+    That call must be answered by an empty packet. A method that sends something else breaks its contract, and the
+    failure is raised.
+
+    Arguments:
+        method: that may fail.
+    """
+
+    source = "gsstream"
+    _method: StreamingMethod[Any]
+
+    def __init__(self, method: StreamingMethod[Any]) -> None:
+        super().__init__()
+        vars(self).update(_method=method)
+
+    def begin(self, frame: Frame, tools: Tools) -> Step[Any]:
+        return self._method.begin(frame, tools)
+
+    def step(self, state: Any, frame: Frame, tools: Tools) -> Step[Any]:
+        mark = tools.log.mark()
+        try:
+            return self._method.step(state, frame, tools)
+        except (ComponentError, ShapeError) as error:
+            tools.log.give_up(error, mark)
+            step = self._method.step(state, replace(frame, effort=0.0), tools)
+            if step.status != "empty":
+                raise
+            warnings.warn(
+                f"frame {frame.index} repeats the one before it: {error}", RepeatedFrameWarning, stacklevel=2
+            )
+            return step
+
+    def follow_up(self, state: Any, step: Step[Any], frame: Frame, tools: Tools) -> Step[Any]:
+        mark = tools.log.mark()
+        try:
+            return self._method.follow_up(state, step, frame, tools)
+        except (ComponentError, ShapeError) as error:
+            tools.log.give_up(error, mark)
+            found = self._method.follow_up(state, step, replace(frame, effort=0.0), tools)
+            warnings.warn(
+                f"frame {frame.index}: its packet is sound, but the work that follows it failed and is left out: "
+                f"{error}", LeftOutWarning, stacklevel=2
+            )  # fmt: skip
+            return found
+
+    def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> Any:
+        return self._method.resume(player, shown, tools)

@@ -11,7 +11,9 @@ import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from gsstream.core import log as log_module
 from gsstream.core.errors import RecipeError
+from gsstream.core.log import FrameLog
 from gsstream.engine.budget.controller import Controller
 from gsstream.engine.budget.pace import estimated_bytes, next_weight
 from gsstream.engine.budget.plan import (
@@ -23,6 +25,8 @@ from gsstream.engine.budget.plan import (
     plan,
 )
 from gsstream.engine.budget.report import budget_lines
+from gsstream.method.base import Step
+from gsstream.packet import encode_empty
 from gsstream.packet.symbols import encode_symbols
 from gsstream.recipe.budget import Budget, budget_overrides
 from gsstream.recipe.model import Stream
@@ -180,16 +184,28 @@ def test_estimated_bytes_are_hardly_less_and_little_more_than_those_of_the_coder
     assert 0.99 * coded <= estimated_bytes(torch.from_numpy(symbols)) <= 1.05 * coded + 100
 
 
-def line(frame: int, size: int, **more: object) -> dict[str, object]:
-    base = {"frame": frame, "status": "delta", "bytes": {"all": size}, "num_gaussians": 10, "peak_memory_mb": 100.0}
-    return {**base, "seconds": {"code": 1.0}, "candidate_gaussians": 5, **more}
+class Clock:
+    """A clock that is set by hand, and frames whose logs run by it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.seconds = 0.0
+        monkeypatch.setattr(log_module.time, "perf_counter", lambda: self.seconds)
+
+    def settled(self, controller: Controller, frame: int, size: int, seconds: float, status: str = "delta") -> FrameLog:
+        """Return the log of a frame of so many bytes and seconds, after the controller has settled it."""
+        log = FrameLog()
+        log.set(bytes={"all": size}, num_gaussians=10, candidate_gaussians=5)
+        with log.phase("code"):
+            self.seconds += seconds
+        controller.settle(frame, status, log)
+        return log
 
 
-def test_violations_are_written_down_and_summed_up() -> None:
-    budget = Budget(size=1000, time=2.0)
-    controller = Controller(budget, Stream())
-    lines = [controller.settle(line(0, 99_000, status="key"), 90.0)]
-    lines += [controller.settle(line(t, 990 + 10 * t), 1.5 + 0.5 * (t == 3)) for t in range(1, 4)]
+def test_violations_are_written_down_and_summed_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    controller, clock = Controller(Budget(size=1000, time=2.0), Stream()), Clock(monkeypatch)
+    logs = [clock.settled(controller, 0, 99_000, 90.0, "key")]
+    logs += [clock.settled(controller, t, 990 + 10 * t, 1.5 + 0.5 * (t == 3)) for t in range(1, 4)]
+    lines = [{"frame": frame, **log.entry()} for frame, log in enumerate(logs)]
     assert [entry["budget"]["violated"] for entry in lines] == [[], [], ["size"], ["size"]]
     assert lines[0]["budget"]["limits"] == {}, "frame 0 is what a budget starts from"
     text = "\n".join(budget_lines(lines))
@@ -199,15 +215,41 @@ def test_violations_are_written_down_and_summed_up() -> None:
     assert budget_lines([{"frame": 0}]) == []
 
 
-def test_a_key_packet_waits_until_it_can_be_paid() -> None:
+def test_a_key_packet_waits_until_it_can_be_paid(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock(monkeypatch)
+
+    def refusal(controller: Controller, number: int) -> str | None:
+        return controller.key_refusal(number, controller.allow(FrameLog()))
+
     controller = Controller(Budget(size=1000), Stream())
-    assert controller.key_refusal(10, controller.allow()) is None, "nothing is known yet"
-    controller.settle(line(0, 5000, status="key"), 1.0)
-    assert controller.key_refusal(10, controller.allow()) == "about 5000 bytes where 1000 are allowed"
-    assert controller.key_refusal(1, controller.allow()) is None
+    assert refusal(controller, 10) is None, "nothing is known yet"
+    clock.settled(controller, 0, 5000, 1.0, "key")
+    assert refusal(controller, 10) == "about 5000 bytes where 1000 are allowed"
+    assert refusal(controller, 1) is None
     slow = Controller(Budget(time=0.5), Stream())
-    slow.settle(line(0, 5000, status="key"), 1.0)
-    assert "where 0.5 s are allowed" in str(slow.key_refusal(10, slow.allow()))
+    clock.settled(slow, 0, 5000, 1.0, "key")
+    assert "where 0.5 s are allowed" in str(refusal(slow, 10))
+
+
+@pytest.mark.parametrize("logged", [False, True])
+def test_a_method_that_logs_no_use_of_its_budget_is_described_by_its_phases(
+    logged: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    controller, clock, log = Controller(Budget(size=1000, time=9.0), Stream()), Clock(monkeypatch), FrameLog()
+    budget = controller.allow(log)
+    assert budget is not None
+    for phase, seconds in (("motion", 1.0), ("optimise", 4.0), ("code", 0.5)):
+        with log.phase(phase):
+            clock.seconds += seconds
+    if logged:
+        log.set(iterations=6)
+    packet = encode_empty(frame=1)
+    controller.describe(budget, Step(None, packet, "empty"), 3, log)
+    assert ("budget" in log.numbers) == logged, "a frame without iterations says nothing of what epochs cost"
+    if logged:
+        spent = log.numbers["budget"]["spent"]
+        assert (spent["epochs"], spent["before"], spent["optimise"]) == (2, 1.0, 4.0)
+        assert spent["untrimmed"] == len(packet.data)
 
 
 def test_a_frame_starts_with_the_recipes_weight_or_less_where_bytes_were_left() -> None:

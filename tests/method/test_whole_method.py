@@ -491,7 +491,10 @@ class TestTools:
         assert float(work.session.loss_and_grad(0, target, WrtRows(work.gaussians)).loss) == 0
         weights[0, 1] = 1
         found = work.session.loss_and_grad(0, target, WrtRows(work.gaussians))
-        assert 0 < float(found.loss) < float(work.loss_and_grad(0, WrtRows(work.gaussians)).loss)
+        drawn = work.session.visible(0, weights > 0)
+        moved = found.grad.means.abs().amax(1) > 0
+        assert bool(moved.any()), "the tile that counts has Gaussians"
+        assert not bool((moved & ~drawn).any()), "no other Gaussian has a gradient"
 
     def test_a_frame_that_is_worth_less_has_fewer_epochs(self, begun) -> None:
         subject, _, _, now = begun

@@ -42,12 +42,10 @@ class Listeners:
         packet: every packet, as soon as it is made and before the work that follows it (``follow_up`` of a method);
             what it does counts as part of the frame.
         progress: iterations of frame 0.
-        say: one line for a person.
     """
 
     packet: Callable[[EncodedPacket], object] = lambda _: None
     progress: Progress = lambda *_: None
-    say: Callable[[str], None] = lambda _: None
 
 
 class Encoder:

@@ -38,15 +38,10 @@ def read_metrics(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
         yield number, line
 
 
-def last_written(path: Path, start: int = 0) -> int:
-    """Return the last frame up to which no line is missing, -1 when that of the first frame is.
-
-    Arguments:
-        path: of ``metrics.jsonl``.
-        start: first frame of the run.
-    """
+def last_written(path: Path) -> int:
+    """Return the last frame up to which no line of ``metrics.jsonl`` is missing, -1 when that of frame 0 is."""
     frames = {int(line["frame"]) for line in _written(path)}
-    return next(frame for frame in itertools.count(start) if frame not in frames) - 1 if start in frames else -1
+    return next(frame for frame in itertools.count() if frame not in frames) - 1
 
 
 def trim_metrics(path: Path, last: int) -> list[dict[str, Any]]:

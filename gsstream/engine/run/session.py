@@ -93,7 +93,7 @@ class _Run:
         self.total = _num_frames(source.info, parts.recipe.frames)
         self.held_out = HeldOut(parts.renderer, parts.recipe.background) if measure else None
         self.progress = RunProgress(self.total, quiet)
-        listeners = Listeners(packet=self._write, progress=self.progress.first_frame, say=self.progress.say)
+        listeners = Listeners(packet=self._write, progress=self.progress.first_frame)
         self.encoder = Encoder(parts, source.info, self._seeds, first_frame=first_frame, listeners=listeners)
         self.writer: StreamWriter
         #: When the last packet was complete in the file, seconds since 1970.

@@ -16,6 +16,8 @@ from gsstream.core.needs import APART, ENCODER, SHIPPED, install, install_part, 
 from gsstream.plugins.catalog import load_catalog
 
 ROOT = Path(__file__).parents[2]
+#: Where messages name extras.
+PLACES = ("gsstream", "plugins/lab/src")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS = {name: [Requirement(text) for text in texts] for name, texts in PROJECT["optional-dependencies"].items()}
 
@@ -45,7 +47,7 @@ def test_every_part_of_the_other_distributions_is_brought_by_the_extra_that_is_n
 
 
 def test_extras_that_messages_name_exist() -> None:
-    texts = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "gsstream").rglob("*.py"))
+    texts = "".join(path.read_text(encoding="utf-8") for place in PLACES for path in (ROOT / place).rglob("*.py"))
     named = set(re.findall(r"install_extra\(['\"](\w+)['\"]\)", texts))
     assert {"video", "sfm", "ray", "player", "s2gs"} <= named <= set(EXTRAS)
     assert set(ENCODER) <= brought_by("s2gs")
@@ -65,7 +67,7 @@ def test_the_command_is_of_the_environment_that_runs(monkeypatch: pytest.MonkeyP
 
 
 def test_pages_that_messages_name_are_there() -> None:
-    texts = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "gsstream").rglob("*.py"))
+    texts = "".join(path.read_text(encoding="utf-8") for place in PLACES for path in (ROOT / place).rglob("*.py"))
     named = re.findall(r"\{?page\(['\"]([\w/.-]+)['\"]\)", texts)
     assert len(named) >= 2
     assert all(Path(page(name)).is_file() for name in named)

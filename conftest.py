@@ -31,18 +31,18 @@ LONG = (
     "cpu_render/tests/test_cross_aarch64", "contract/test_new_plugin", "contract/test_tutorial",
     "plugins/test_six_rings", "lab/tests/test_paper_configs", "web/test_page", "flow/test_budget",
     "contract/test_saboteurs", "contract/test_shipped_plugins", "flow/test_no_overshoot", "web/test_live_page",
-    "flow/test_odd_runs", "flow/test_data_options", "web/test_decoder", "scene/test_prepare",
+    "flow/test_odd_runs", "flow/test_data_options", "web/test_decoder", "input/prepare/test_prepare",
     "flow/test_cost_follows_change", "flow/test_bad_input", "flow/test_growing_scene", "flow/test_trim",
     "web/test_page_joins", "flow/test_checks", "packet/test_fuzz", "flow/test_run_ends", "flow/test_watch",
-    "flow/test_worlds", "scene/test_validate", "lab/tests/test_tune", "queen/tests/test_queen_stream",
-    "tools/test_soak", "flow/test_still_frames", "packet/test_corrupt", "init/test_init_sfm",
-    "source/test_layout_runs", "lab/tests/test_sweep_real", "tools/test_cost_scripts", "flow/test_light_process",
-    "player/test_player_memory", "evaluation/test_offline", "lab/tests/test_compare",
+    "flow/test_worlds", "input/prepare/test_validate", "lab/tests/test_tune", "queen/tests/test_queen_stream",
+    "tools/test_soak", "flow/test_still_frames", "packet/test_corrupt", "input/seeds/test_init_sfm",
+    "input/recordings/test_layout_runs", "lab/tests/test_sweep_real", "tools/test_cost_scripts",
+    "flow/test_light_process", "player/test_player_memory", "evaluation/test_offline", "lab/tests/test_compare",
 )  # fmt: skip
 #: What ``make check`` runs: rooms whose tests are cheap, and the one test of whole runs that must never fail.
 QUICK = (
-    "core", "recipe", "residual", "render", "metrics", "cli", "packet", "packet/lies", "player", "method", "plugins",
-    "motion",
+    "core", "recipe", "parts/update", "parts/render", "metrics", "cli", "packet", "packet/lies", "player", "method",
+    "plugins", "parts/motion",
 )  # fmt: skip
 #: Of other rooms what the work of these days leans on: budgets, assembling, what is chosen by numbers, the renderer.
 QUICK_FILES = (

@@ -25,14 +25,14 @@ from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.run.encoder import Encoder as Encoder
 from gsstream.engine.run.encoder import Listeners as Listeners
 from gsstream.engine.run.recording import open_recording as _open
+from gsstream.input.recordings.base import FrameSource as FrameSource
+from gsstream.input.recordings.base import SourceInfo
+from gsstream.input.recordings.canonical import CanonicalSource, world_of
 from gsstream.method.base import Step as Step
 from gsstream.packet import StreamWriter as StreamWriter
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe as Recipe
-from gsstream.source.base import FrameSource as FrameSource
-from gsstream.source.base import SourceInfo
-from gsstream.source.canonical import CanonicalSource, world_of
 
 
 def recipe_for(method: str, settings: Mapping[str, Any] | None = None) -> Recipe:

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import torch
 
 from gsstream.core.gaussians import Gaussians
-from gsstream.optimiser.joint import JointChange, add_joint, decode_joint, join_features
-from gsstream.residual.base import UpdateRule
-from gsstream.residual.joint import JointCode, joint_code
+from gsstream.parts.optimiser.joint import JointChange, add_joint, decode_joint, join_features
+from gsstream.parts.update.base import UpdateRule
+from gsstream.parts.update.joint import JointCode, joint_code
 
 
 def quantise(latents: torch.Tensor, step: float) -> torch.Tensor:

@@ -21,10 +21,10 @@ from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.run.recording import open_recording, read_first_frame
+from gsstream.input.recordings.base import FrameSource
 from gsstream.packet import PlayerState
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
-from gsstream.source.base import FrameSource
 
 
 def measure(

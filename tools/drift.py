@@ -28,13 +28,13 @@ from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.run.recording import open_recording
+from gsstream.input.recordings.base import FrameSource, Split
 from gsstream.method.base import MethodState
 from gsstream.metrics.trend import slope_per_100
 from gsstream.packet import StreamWriter
 from gsstream.player.playback import Playback
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
-from gsstream.source.base import FrameSource, Split
 
 SPLITS: tuple[Split, ...] = ("train", "test")
 

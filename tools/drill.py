@@ -30,9 +30,9 @@ from gsstream.core.errors import GsstreamError, InputError, OutputError
 from gsstream.engine.run.live import live_lines
 from gsstream.engine.run.session import METRICS, RECIPE
 from gsstream.evaluation.records import mean, read_lines
-from gsstream.source.calibration import CALIBRATION_FILE, frame_path, read_calibration
-from gsstream.source.multiview import POINTS_FILE
-from gsstream.source.open import DEMO_FOLDER
+from gsstream.input.recordings.calibration import CALIBRATION_FILE, frame_path, read_calibration
+from gsstream.input.recordings.multiview import POINTS_FILE
+from gsstream.input.recordings.open import DEMO_FOLDER
 from tools.drift import there_and_back
 
 WATCH = "behind=drop&ready=rename"

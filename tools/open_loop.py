@@ -39,13 +39,13 @@ from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step import frame_step
 from gsstream.engine.step.optimise import optimise
 from gsstream.engine.step.problem import Problem, Solution
-from gsstream.optimiser.joint import JointChange, add_joint, join_features
+from gsstream.input.recordings.base import FrameSource, Split
 from gsstream.packet import PlayerState, decode_packet
+from gsstream.parts.optimiser.joint import JointChange, add_joint, join_features
+from gsstream.parts.update.joint import joint_code
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe
-from gsstream.residual.joint import joint_code
-from gsstream.source.base import FrameSource, Split
 from tools.drift import Drift, there_and_back
 
 SPLITS: tuple[Split, ...] = ("train", "test")

@@ -21,9 +21,9 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.shapes import FloatArray
+from gsstream.parts.render.reference import composite, project
 from gsstream.player.playback import Playback
 from gsstream.player.render import find_renderer, render
-from gsstream.render.reference import composite, project
 
 KINDS = {"float16": torch.float16, "bfloat16": torch.bfloat16}
 #: Strips of rows of a picture in which records are looked at, and the rows of each.

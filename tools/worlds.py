@@ -25,12 +25,12 @@ from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.run.measure import HeldOut
+from gsstream.input.recordings.base import FrameSource, PointKind, SourceInfo, Split
+from gsstream.input.recordings.canonical import CanonicalSource, world_of
+from gsstream.input.recordings.open import open_source
+from gsstream.input.recordings.transformed import transformed
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
-from gsstream.source.base import FrameSource, PointKind, SourceInfo, Split
-from gsstream.source.canonical import CanonicalSource, world_of
-from gsstream.source.open import open_source
-from gsstream.source.transformed import transformed
 
 
 class Moved:

@@ -18,9 +18,9 @@ from gsstream.core.errors import ComponentError, GsstreamError, OutputError, Rec
 
 if TYPE_CHECKING:
     from gsstream.engine.run.session import RunResult
+    from gsstream.input.recordings.base import FrameSource, SourceInfo
     from gsstream.plugins.catalog import Catalog
     from gsstream.recipe.model import Recipe
-    from gsstream.source.base import FrameSource, SourceInfo
 
 #: Methods that are recommended where none is named, best first.
 SUGGESTED = ("s2gs-fast", "queen")
@@ -111,7 +111,7 @@ def _first_look(recording: FrameSource, uri: str, *, again: bool) -> None:
     """Warn of poses that cannot be right, before an hour is spent on them; who comes ``again`` has been warned."""
     if again:
         return
-    from gsstream.scene.pose_checks import first_look
+    from gsstream.input.prepare.pose_checks import first_look
 
     for finding in first_look(recording):
         warnings.warn(f"[{finding.code}] {finding.message}. All checks: gsstream scene validate {uri}", stacklevel=2)

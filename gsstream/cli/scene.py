@@ -43,11 +43,11 @@ def prepare(
     """
     import time
 
-    from gsstream.scene.prepare import PrepareOptions
-    from gsstream.scene.prepare import prepare as make
-    from gsstream.scene.report import write_report
-    from gsstream.scene.validate import validate as find
-    from gsstream.source.open import open_source
+    from gsstream.input.prepare.prepare import PrepareOptions
+    from gsstream.input.prepare.prepare import prepare as make
+    from gsstream.input.prepare.report import write_report
+    from gsstream.input.prepare.validate import validate as find
+    from gsstream.input.recordings.open import open_source
 
     began = time.perf_counter()
     model = lens.upper().replace("-", "_")
@@ -77,10 +77,10 @@ def validate(
     """Say what is wrong with a scene, and what to do. Exit code 2 when a run would be wasted on it."""
     from gsstream.core.errors import InputError
     from gsstream.engine.run.recording import open_recording
+    from gsstream.input.prepare.findings import CHECKS
+    from gsstream.input.prepare.validate import validate as find
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.model import Recipe
-    from gsstream.scene.findings import CHECKS
-    from gsstream.scene.validate import validate as find
 
     if frames < 1:
         raise InputError(f"--frames: expected at least 1, got {frames}")

@@ -48,20 +48,24 @@ class PartKind:
 
 
 _KINDS = (
-    PartKind("structure", "gsstream.structure.base:Structure", slot=True, default="flat", behaviour=True),
+    PartKind("structure", "gsstream.parts.structure.base:Structure", slot=True, default="flat", behaviour=True),
     PartKind(
-        "confidence", "gsstream.confidence.base:ConfidenceEstimator", slot=True, default="uniform", behaviour=True
+        "confidence", "gsstream.parts.confidence.base:ConfidenceEstimator", slot=True, default="uniform", behaviour=True
     ),
-    PartKind("propagation", "gsstream.propagation.base:Propagation", slot=True, default="group-max", behaviour=True),
-    PartKind("gate", "gsstream.gate.base:GateSampler", slot=True, default="always-open", behaviour=True),
-    PartKind("motion", "gsstream.motion.base:MotionPart", slot=True, default="still"),
-    PartKind("update", "gsstream.residual.base:UpdateRule", slot=True, default="additive"),
-    PartKind("growth", "gsstream.growth.base:Growth", slot=True, default="none"),
-    PartKind("regularizer", "gsstream.regularizer.base:Regularizer", slot=True, default="none", behaviour=True),
+    PartKind(
+        "propagation", "gsstream.parts.propagation.base:Propagation", slot=True, default="group-max", behaviour=True
+    ),
+    PartKind("gate", "gsstream.parts.gate.base:GateSampler", slot=True, default="always-open", behaviour=True),
+    PartKind("motion", "gsstream.parts.motion.base:MotionPart", slot=True, default="still"),
+    PartKind("update", "gsstream.parts.update.base:UpdateRule", slot=True, default="additive"),
+    PartKind("growth", "gsstream.parts.growth.base:Growth", slot=True, default="none"),
+    PartKind("regularizer", "gsstream.parts.regularizer.base:Regularizer", slot=True, default="none", behaviour=True),
     PartKind("stepper", "gsstream.method.base:StreamingMethod", default="parts"),
-    PartKind("renderer", "gsstream.render.base:Renderer", default="auto", use="--set renderer=<name> --source demo"),
-    PartKind("loss", "gsstream.loss.base:Loss", use="--set loss.backend=<name> --source demo"),
-    PartKind("optimiser", "gsstream.optimiser.base:RowOptimiser", use=None),
+    PartKind(
+        "renderer", "gsstream.parts.render.base:Renderer", default="auto", use="--set renderer=<name> --source demo"
+    ),
+    PartKind("loss", "gsstream.parts.loss.base:Loss", use="--set loss.backend=<name> --source demo"),
+    PartKind("optimiser", "gsstream.parts.optimiser.base:RowOptimiser", use=None),
     PartKind("source", None, use="--source <name>:"),
 )
 

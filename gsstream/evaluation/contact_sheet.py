@@ -20,11 +20,11 @@ from gsstream.core.changes import row_gates
 from gsstream.core.errors import InputError
 from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.core.shapes import FloatArray
+from gsstream.input.recordings.base import FrameSource
 from gsstream.metrics import changed_mask, psnr
 from gsstream.packet import PlayerState
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, render, to_bytes
-from gsstream.source.base import FrameSource
 
 #: Errors are shown this much larger than they are.
 ERROR_GAIN = 4

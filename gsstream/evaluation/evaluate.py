@@ -16,6 +16,7 @@ from gsstream.core.errors import InputError
 from gsstream.core.shapes import FloatArray
 from gsstream.evaluation.records import mean
 from gsstream.evaluation.summary import format_table
+from gsstream.input.recordings.base import FrameSource
 from gsstream.metrics import (
     SSIM_VARIANT,
     OnnxLpips,
@@ -28,7 +29,6 @@ from gsstream.metrics import (
 )
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, find_renderer, render
-from gsstream.source.base import FrameSource
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,9 @@ from gsstream.engine.budget.report import budget_lines
 from gsstream.engine.run.live import live_lines
 from gsstream.evaluation.records import FrameRecord, read_lines, read_records
 from gsstream.evaluation.summary import summarise, summary_table
+from gsstream.input.recordings.base import FrameSource
 from gsstream.packet import StreamMeta
 from gsstream.player.playback import Playback
-from gsstream.source.base import FrameSource
 
 STREAM, METRICS = "stream.gss", "metrics.jsonl"
 SHEET, PLOTS, SUMMARY, VIDEO = "contact_sheet.png", "frames.png", "summary.txt", "video.mp4"

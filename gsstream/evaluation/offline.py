@@ -13,10 +13,10 @@ from PIL import Image
 
 from gsstream.core.errors import InputError
 from gsstream.core.shapes import FloatArray
+from gsstream.input.recordings.base import SourceInfo
+from gsstream.input.recordings.images import PICTURE_FORMATS
 from gsstream.player.ply import read_ply
 from gsstream.player.render import find_renderer, render
-from gsstream.source.base import SourceInfo
-from gsstream.source.images import PICTURE_FORMATS
 
 _PICTURES = (".png", ".jpg", ".jpeg")
 

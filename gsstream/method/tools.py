@@ -13,13 +13,13 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.log import FrameLog
 from gsstream.core.shapes import FloatArray
 from gsstream.packet import PlayerState, StreamMeta
-from gsstream.render.work import FrameWork
+from gsstream.parts.render.work import FrameWork
 
 if TYPE_CHECKING:
     from gsstream.core.frame import Frame, PointCloud
     from gsstream.core.rng import Rng
-    from gsstream.render.base import Renderer, RenderSession
-    from gsstream.render.target import ViewTarget
+    from gsstream.parts.render.base import Renderer, RenderSession
+    from gsstream.parts.render.target import ViewTarget
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """A slow forward rasteriser in plain numpy, tile by tile: the player's renderer where no compiled one is installed.
 
-Same conventions as gsstream/render (which needs torch): pixel-corner origin, 0.3 px blur, alpha cut 1/255, alpha clamp
-0.999, a Gaussian counts while the transmittance before it exceeds 1e-4, nothing at or before the near plane. A test
-holds the two together.
+Same conventions as gsstream/parts/render (which needs torch): pixel-corner origin, 0.3 px blur, alpha cut 1/255, alpha
+clamp 0.999, a Gaussian counts while the transmittance before it exceeds 1e-4, nothing at or before the near plane. A
+test holds the two together.
 """
 
 from __future__ import annotations

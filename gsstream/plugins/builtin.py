@@ -9,34 +9,38 @@ def _part(kind: Kind, name: str, target: str, summary: str) -> ComponentSpec:
     return ComponentSpec(kind=kind, name=name, target=f"gsstream.{target}", summary=summary)
 
 
+def _source(name: str, summary: str) -> ComponentSpec:
+    return _part("source", name, "input.recordings.open:open_source", summary)
+
+
 @hookimpl
 def gsstream_components() -> list[ComponentSpec]:
     return [
-        _part("structure", "flat", "structure.flat:Flat", "each Gaussian is its own node"),
-        _part("confidence", "uniform", "confidence.uniform:Uniform", "everything may have changed"),
-        _part("propagation", "group-max", "propagation.group_max:GroupMax", "a node is as suspect as its worst member"),
-        _part("gate", "always-open", "gate.always_open:AlwaysOpen", "no sparsity: every gate is 1"),
-        _part("regularizer", "none", "regularizer.none:NoRegularizer", "nothing costs anything"),
-        _part("update", "additive", "residual.additive:Additive", "gated change added to raw attributes"),
-        _part("motion", "still", "motion.still:Still", "nothing is carried along"),
-        _part("motion", "coasting", "motion.coasting:Coasting", "what moved goes on moving"),
-        _part("motion", "rigid", "motion.rigid:Rigid", "one fitted rigid motion per group"),
-        _part("growth", "none", "growth.none:NoGrowth", "nothing is born and nothing leaves"),
+        _part("structure", "flat", "parts.structure.flat:Flat", "each Gaussian is its own node"),
+        _part("confidence", "uniform", "parts.confidence.uniform:Uniform", "everything may have changed"),
+        _part("propagation", "group-max", "parts.propagation.group_max:GroupMax", "maximum over the members of a node"),
+        _part("gate", "always-open", "parts.gate.always_open:AlwaysOpen", "no sparsity: every gate is 1"),
+        _part("regularizer", "none", "parts.regularizer.none:NoRegularizer", "nothing costs anything"),
+        _part("update", "additive", "parts.update.additive:Additive", "gated change added to raw attributes"),
+        _part("motion", "still", "parts.motion.still:Still", "nothing is carried along"),
+        _part("motion", "coasting", "parts.motion.coasting:Coasting", "what moved goes on moving"),
+        _part("motion", "rigid", "parts.motion.rigid:Rigid", "one fitted rigid motion per group"),
+        _part("growth", "none", "parts.growth.none:NoGrowth", "nothing is born and nothing leaves"),
         _part("stepper", "parts", "engine.method.parts:PartsMethod", "the slots of the recipe, one after the other"),
         _part("stepper", "hold", "method.hold:Hold", "frame 0 and nothing after it"),
-        _part("renderer", "reference", "render.reference:ReferenceRenderer", "pure torch, slow, defines the truth"),
-        _part("loss", "reference", "loss.photometric:ReferenceLoss", "L1 + D-SSIM in torch, slow, defines the truth"),
-        _part("optimiser", "reference", "optimiser.adam:ReferenceAdam", "Adam by rows in torch, defines the truth"),
-        _part("source", "demo", "source.open:open_source", "the small recording that ships with gsstream"),
-        _part("source", "synthetic", "source.open:open_source", "an analytic moving scene: synthetic:KEY=VALUE&..."),
-        _part("source", "watch", "source.open:open_source", "a folder that grows: watch:DIR?KEY=VALUE&..."),
-        _part("source", "folder", "source.open:open_source", "a folder of images per camera with cameras.json"),
-        _part("source", "n3dv", "source.open:open_source", "cam00.mp4 ... (or frames) and poses_bounds.npy"),
-        _part("source", "meetroom", "source.open:open_source", "cam_0.mp4 ... (or frames) and poses_bounds.npy"),
-        _part("source", "enerf", "source.open:open_source", "EasyMocap: intri.yml, extri.yml, images/00/"),
-        _part("source", "panoptic", "source.open:open_source", "Dynamic 3D Gaussians: train_meta.json, ims/"),
-        _part("source", "colmap", "source.open:open_source", "a COLMAP model with images or videos"),
-        _part("source", "nerfstudio", "source.open:open_source", "transforms.json with images or videos"),
+        _part("renderer", "reference", "parts.render.reference:ReferenceRenderer", "pure torch: slow, the truth"),
+        _part("loss", "reference", "parts.loss.photometric:ReferenceLoss", "L1 + D-SSIM in torch: slow, the truth"),
+        _part("optimiser", "reference", "parts.optimiser.adam:ReferenceAdam", "Adam by rows in torch: the truth"),
+        _source("demo", "the small recording that ships with gsstream"),
+        _source("synthetic", "an analytic moving scene: synthetic:KEY=VALUE&..."),
+        _source("watch", "a folder that grows: watch:DIR?KEY=VALUE&..."),
+        _source("folder", "a folder of images per camera with cameras.json"),
+        _source("n3dv", "cam00.mp4 ... (or frames) and poses_bounds.npy"),
+        _source("meetroom", "cam_0.mp4 ... (or frames) and poses_bounds.npy"),
+        _source("enerf", "EasyMocap: intri.yml, extri.yml, images/00/"),
+        _source("panoptic", "Dynamic 3D Gaussians: train_meta.json, ims/"),
+        _source("colmap", "a COLMAP model with images or videos"),
+        _source("nerfstudio", "transforms.json with images or videos"),
     ]
 
 

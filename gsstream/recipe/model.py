@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from gsstream.input.recordings.options import DataOptions
 from gsstream.recipe.budget import Budget
-from gsstream.source.options import DataOptions
 
 SCHEMA_VERSION = "1.0"
 #: Sections of a recipe that do not influence frame 0. A section that is not listed counts as one that does.

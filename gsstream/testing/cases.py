@@ -17,8 +17,8 @@ from gsstream.core.context import RowGradient, ScreenGradient
 from gsstream.core.frame import PointCloud
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.render.reference import ReferenceRenderer
-from gsstream.structure.base import Anchors
+from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.parts.structure.base import Anchors
 
 RENDERER = ReferenceRenderer()
 BLACK = (0.0, 0.0, 0.0)

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from gsstream.core.part import Part
-from gsstream.gate.base import GateSampler
+from gsstream.parts.gate.base import GateSampler
 from gsstream.testing.cases import World
 from gsstream.testing.registry import kind_of
 

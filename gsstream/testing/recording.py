@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from gsstream.core.errors import SourceError
-from gsstream.source.base import FrameSource
+from gsstream.input.recordings.base import FrameSource
 
 
 class Skip(Exception):

@@ -12,12 +12,12 @@ from gsstream.core.frame import Frame
 from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.run.encoder import Encoder
+from gsstream.input.recordings.open import open_source
 from gsstream.method.base import Step, StreamingMethod
 from gsstream.packet import PlayerState, decode_packet
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import ComponentRef
-from gsstream.source.open import open_source
 
 SOURCE = "synthetic:frames=4&views=3&width=32&height=24&supersample=1"
 TINY = (

@@ -13,8 +13,8 @@ from gsstream.core.part import Part
 from gsstream.core.rng import Rng
 from gsstream.engine.step.active.change import Change, detect_change
 from gsstream.engine.step.context import FrameView
+from gsstream.input.recordings.open import open_source
 from gsstream.method.base import Step
-from gsstream.source.open import open_source
 from gsstream.testing.stepping import SOURCE, MethodUnderTest
 
 #: Sigmas beyond which tiles count as changed.

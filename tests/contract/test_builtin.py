@@ -8,24 +8,24 @@ from typing import final
 import pytest
 import torch
 
-from gsstream.confidence.uniform import Uniform
 from gsstream.core.kinds import CONTRACTS, PART_KINDS
 from gsstream.engine.method.parts import PartsMethod
-from gsstream.gate.always_open import AlwaysOpen
-from gsstream.gate.base import GateSampler
-from gsstream.growth.none import NoGrowth
-from gsstream.loss.photometric import ReferenceLoss
+from gsstream.input.recordings.open import open_source
 from gsstream.method.hold import Hold
-from gsstream.motion.coasting import Coasting
-from gsstream.motion.rigid import Rigid
-from gsstream.motion.still import Still
-from gsstream.optimiser.adam import ReferenceAdam
-from gsstream.propagation.group_max import GroupMax
-from gsstream.regularizer.none import NoRegularizer
-from gsstream.render.reference import ReferenceRenderer
-from gsstream.residual.additive import Additive
-from gsstream.source.open import open_source
-from gsstream.structure.flat import Flat
+from gsstream.parts.confidence.uniform import Uniform
+from gsstream.parts.gate.always_open import AlwaysOpen
+from gsstream.parts.gate.base import GateSampler
+from gsstream.parts.growth.none import NoGrowth
+from gsstream.parts.loss.photometric import ReferenceLoss
+from gsstream.parts.motion.coasting import Coasting
+from gsstream.parts.motion.rigid import Rigid
+from gsstream.parts.motion.still import Still
+from gsstream.parts.optimiser.adam import ReferenceAdam
+from gsstream.parts.propagation.group_max import GroupMax
+from gsstream.parts.regularizer.none import NoRegularizer
+from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.parts.structure.flat import Flat
+from gsstream.parts.update.additive import Additive
 from gsstream.testing import SourceUnderTest, parametrize_with_checks, run_checks
 from gsstream.testing.confidence.example import ExampleConfidence
 from gsstream.testing.gate.example import ExampleGate

@@ -13,10 +13,10 @@ import pytest
 from gsstream.core.kinds import CONTRACTS
 from gsstream.core.part import Part
 from gsstream.engine.run.recording import open_recording
+from gsstream.input.recordings.prefetch import Prefetcher
 from gsstream.plugins.catalog import load_catalog
 from gsstream.plugins.discovery import Discovered
 from gsstream.recipe.model import Recipe
-from gsstream.source.prefetch import Prefetcher
 from gsstream.spec import ComponentSpec
 from gsstream.testing import run_checks
 from gsstream.testing.registry import BEHAVED, kind_of

@@ -28,16 +28,16 @@ from gsstream.api import (
     Scene,
     apply_delta,
 )
-from gsstream.confidence.uniform import Uniform
-from gsstream.gate.always_open import AlwaysOpen
-from gsstream.optimiser.joint import add_joint, decode_joint, join_features, joint_vjp
-from gsstream.propagation.group_max import GroupMax
-from gsstream.regularizer.none import NoRegularizer
-from gsstream.render.reference import ReferenceRenderer
-from gsstream.residual.additive import Additive, DirectCode
-from gsstream.residual.base import AttributeCode, UpdateRule, init_latents, symbols
-from gsstream.residual.joint import joint_code
-from gsstream.structure.flat import Flat
+from gsstream.parts.confidence.uniform import Uniform
+from gsstream.parts.gate.always_open import AlwaysOpen
+from gsstream.parts.optimiser.joint import add_joint, decode_joint, join_features, joint_vjp
+from gsstream.parts.propagation.group_max import GroupMax
+from gsstream.parts.regularizer.none import NoRegularizer
+from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.parts.structure.flat import Flat
+from gsstream.parts.update.additive import Additive, DirectCode
+from gsstream.parts.update.base import AttributeCode, UpdateRule, init_latents, symbols
+from gsstream.parts.update.joint import joint_code
 
 PARTS = [Flat, Uniform, GroupMax, AlwaysOpen, NoRegularizer, Additive, ReferenceRenderer]
 

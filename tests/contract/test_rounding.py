@@ -10,7 +10,7 @@ import torch
 from gsstream_cpu_render.renderer import CpuRenderer
 from gsstream_cpu_render.session import CpuSession
 
-from gsstream.render.wrt import LossAndGrad, WrtScene
+from gsstream.parts.render.wrt import LossAndGrad, WrtScene
 from gsstream.testing.cases import world
 from gsstream.testing.compare import gradients_equal, relative
 from gsstream.testing.renderer import loss_and_grad

@@ -12,9 +12,9 @@ from test_player import ARC, look_at
 
 from gsstream.core.errors import OutputError, PacketError, ShapeError, SourceError
 from gsstream.core.names import MAX_NAME_BYTES, check_camera_ids, child
+from gsstream.input.recordings.open import open_source
 from gsstream.packet import StreamMeta
 from gsstream.packet.meta import meta_from_json, meta_to_json
-from gsstream.source.open import open_source
 
 HOSTILE = [
     "../x", "..", ".", "", "/abs", "a/b", "a\\b", "C:x", "nul", "CON.png", "COM1", "a\0b", "a\nb", "a\x1b]0;t\x07",
@@ -78,7 +78,7 @@ def test_pictures_of_many_cameras_stay_beside_each_other(tmp_path: Path) -> None
 
 
 def test_prepare_writes_nothing_for_a_hostile_rig(tmp_path: Path) -> None:
-    from gsstream.scene.prepare import PrepareOptions, prepare
+    from gsstream.input.prepare.prepare import PrepareOptions, prepare
 
     raw = tmp_path / "raw"
     raw.mkdir()

@@ -12,11 +12,11 @@ from hypothesis.extra.numpy import arrays
 
 from gsstream.core.errors import ShapeError
 from gsstream.core.storage import packed, rounded, unpacked
-from gsstream.source.disturbed import DisturbedSource
-from gsstream.source.options import DataOptions, Disturbances
-from gsstream.source.prefetch import Prefetcher
-from gsstream.source.synthetic import SyntheticSource
-from gsstream.source.transformed import transformed
+from gsstream.input.recordings.disturbed import DisturbedSource
+from gsstream.input.recordings.options import DataOptions, Disturbances
+from gsstream.input.recordings.prefetch import Prefetcher
+from gsstream.input.recordings.synthetic import SyntheticSource
+from gsstream.input.recordings.transformed import transformed
 
 UNIT = arrays(np.float32, (5, 3), elements=st.floats(0, 1, width=32))
 ERROR = {"float32": 0.0, "float16": 2.0**-12, "uint8": 1 / 510 + 1e-7}

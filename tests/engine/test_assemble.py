@@ -8,11 +8,11 @@ import pytest
 
 from gsstream.core.errors import InputError, PluginUnavailable, RecipeError
 from gsstream.engine.assembly.assemble import SLOTS, Assembly, SlowRendererWarning, assemble
+from gsstream.parts.render.reference import ReferenceRenderer
 from gsstream.plugins.catalog import Catalog, load_catalog
 from gsstream.plugins.discovery import Discovered
 from gsstream.recipe.load import ResolvedRecipe, resolve_recipe
 from gsstream.recipe.model import ComponentRef, Recipe
-from gsstream.render.reference import ReferenceRenderer
 from gsstream.spec import ComponentSpec
 
 
@@ -84,7 +84,7 @@ def renderer_plugin(target: str) -> Catalog:
 def test_auto_takes_the_cpu_renderer_when_it_works() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assembly = assemble(Recipe(), renderer_plugin("gsstream.render.reference:ReferenceRenderer"))
+        assembly = assemble(Recipe(), renderer_plugin("gsstream.parts.render.reference:ReferenceRenderer"))
     assert assembly.recipe.renderer.name == "cpu"
 
 
@@ -104,7 +104,7 @@ def test_a_wrong_setting_of_the_environment_is_an_error_and_no_reason_to_be_slow
 
     monkeypatch.setattr(ReferenceRenderer, "__init__", refuse)
     with pytest.raises(InputError, match=r"renderer 'cpu' \(from .*\) could not be built: GSSTREAM_ISA: expected one"):
-        assemble(Recipe(), renderer_plugin("gsstream.render.reference:ReferenceRenderer"))
+        assemble(Recipe(), renderer_plugin("gsstream.parts.render.reference:ReferenceRenderer"))
 
 
 def test_auto_takes_no_settings(builtin: Catalog) -> None:

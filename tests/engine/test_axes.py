@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from gsstream.core.gaussians import Gaussians
 from gsstream.engine.frame0.axes import nearest_axes
-from gsstream.render.activations import rotation_matrices
+from gsstream.parts.render.activations import rotation_matrices
 
 
 def drawn(seed: int, rows: int = 200) -> Gaussians[torch.Tensor]:

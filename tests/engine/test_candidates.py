@@ -15,8 +15,8 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.engine.step.active.candidates import VoteBook, candidates, changed_rows, released
 from gsstream.engine.step.active.change import Change
-from gsstream.render.base import TILE, RenderSession, ScatterSession
-from gsstream.render.reference import ReferenceRenderer
+from gsstream.parts.render.base import TILE, RenderSession, ScatterSession
+from gsstream.parts.render.reference import ReferenceRenderer
 from gsstream.testing.cases import BLACK, scene
 
 WIDTH, HEIGHT, FOCAL = 56, 40, 40.0

@@ -12,9 +12,9 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.topology import TopologyEdit
 from gsstream.engine.state.follow import follow
 from gsstream.engine.state.stream_state import StreamState
-from gsstream.optimiser.adam import ReferenceAdam
-from gsstream.optimiser.row_parameters import RowParameters
 from gsstream.packet import decode_packet, encode_delta, encode_key
+from gsstream.parts.optimiser.adam import ReferenceAdam
+from gsstream.parts.optimiser.row_parameters import RowParameters
 from gsstream.testing.packet.checks import tiny_key
 
 

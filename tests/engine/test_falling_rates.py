@@ -14,11 +14,11 @@ from gsstream_cpu_render.adam_part import CpuAdam
 from gsstream_cpu_render.residual import CpuResidualOptimiser
 
 from gsstream.engine.step.lr_factor import lr_factor
-from gsstream.optimiser.adam import ReferenceAdam
-from gsstream.optimiser.base import AdamState
-from gsstream.optimiser.joint import JointResidualOptimiser
-from gsstream.optimiser.residual import ResidualOptimiser
 from gsstream.packet import StreamReader
+from gsstream.parts.optimiser.adam import ReferenceAdam
+from gsstream.parts.optimiser.base import AdamState
+from gsstream.parts.optimiser.joint import JointResidualOptimiser
+from gsstream.parts.optimiser.residual import ResidualOptimiser
 from gsstream.testing.optimiser.checks import _residual_case
 
 FACTORS = (1.0, 0.5, 0.01)

@@ -27,12 +27,12 @@ from gsstream.engine.assembly.guard import Guarded, guard
 from gsstream.engine.assembly.where import Where
 from gsstream.engine.method.repeating import RepeatedFrameWarning
 from gsstream.engine.step import frame_step as step_module
-from gsstream.gate.always_open import AlwaysOpen
-from gsstream.gate.base import SampledGate
-from gsstream.growth.base import Growth
-from gsstream.optimiser.base import RowOptimiser
 from gsstream.packet import decode_packet
-from gsstream.render.base import RenderSession
+from gsstream.parts.gate.always_open import AlwaysOpen
+from gsstream.parts.gate.base import SampledGate
+from gsstream.parts.growth.base import Growth
+from gsstream.parts.optimiser.base import RowOptimiser
+from gsstream.parts.render.base import RenderSession
 from gsstream.testing.cases import rig, scene
 
 WORLD = "synthetic:frames=5&views=2&width=32&height=24&supersample=1"

@@ -27,7 +27,7 @@ from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.state.refinement import Refinement
 from gsstream.method.base import Step
 from gsstream.packet import PlayerState, quantise_key
-from gsstream.render.activations import rotation_matrices
+from gsstream.parts.render.activations import rotation_matrices
 
 WORLD = "synthetic:frames=6&views=4&width=48&height=32&supersample=1&static=1"
 SETTINGS: Mapping[str, Any] = {

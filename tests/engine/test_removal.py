@@ -16,9 +16,9 @@ from gsstream.encode import encoder_for, open_recording
 from gsstream.engine.frame0.probes import TrainingViews
 from gsstream.engine.frame0.removal import not_missed, removal_errors, worth_keeping
 from gsstream.packet import decode_packet
-from gsstream.render.base import Renderer
-from gsstream.render.exposure import Exposure
-from gsstream.render.reference import ReferenceRenderer
+from gsstream.parts.render.base import Renderer
+from gsstream.parts.render.exposure import Exposure
+from gsstream.parts.render.reference import ReferenceRenderer
 
 BLACK = (0.0, 0.0, 0.0)
 GROWING = {"first_frame.max_iterations": 60}

@@ -21,11 +21,11 @@ from gsstream.evaluation.evaluate import evaluate
 from gsstream.evaluation.plots import plot_runs
 from gsstream.evaluation.records import FrameRecord, read_lines, read_records
 from gsstream.evaluation.summary import summarise, summary_table
+from gsstream.input.recordings.base import SourceInfo
 from gsstream.packet import KeyState, StreamMeta, StreamWriter, encode_delta, encode_empty, encode_key
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, render
 from gsstream.player.software import render_numpy
-from gsstream.source.base import SourceInfo
 
 NUMPY = PlayerRenderer("numpy", render_numpy)
 

@@ -22,7 +22,7 @@ from gsstream.core.frame import Frame
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step import frame_step as step_module
-from gsstream.source.open import DEMO_FOLDER
+from gsstream.input.recordings.open import DEMO_FOLDER
 
 #: Six frames of an analytic scene, three training cameras, one test camera.
 WORLD = "synthetic:frames=6&views=3&width=64&height=48&supersample=1"

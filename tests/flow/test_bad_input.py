@@ -280,7 +280,7 @@ def test_a_source_of_a_plugin_is_opened_and_its_faults_are_its_own(
             return [ComponentSpec(kind="source", name="mine", target=target, summary="the analytic scene again")]
 
         def open_mine(uri, scale):
-            from gsstream.source.open import open_source
+            from gsstream.input.recordings.open import open_source
 
             if uri == "mine:bad":
                 raise RuntimeError("the cable is loose")

@@ -18,14 +18,14 @@ from gsstream.engine.assembly.checks import Checks, Look, wanted_checks
 from gsstream.engine.assembly.where import Where
 from gsstream.engine.run.recording import open_recording
 from gsstream.engine.run.session import run
-from gsstream.gate.always_open import AlwaysOpen
-from gsstream.gate.base import GateSampler
-from gsstream.loss.base import Loss
-from gsstream.optimiser.base import RowOptimiser
+from gsstream.parts.gate.always_open import AlwaysOpen
+from gsstream.parts.gate.base import GateSampler
+from gsstream.parts.loss.base import Loss
+from gsstream.parts.optimiser.base import RowOptimiser
+from gsstream.parts.render.base import Renderer, RenderOutput, ScatterSession
+from gsstream.parts.render.reference import ReferenceRenderer
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
-from gsstream.render.base import Renderer, RenderOutput, ScatterSession
-from gsstream.render.reference import ReferenceRenderer
 
 CATALOG = load_catalog()
 SMALL = "synthetic:frames=3&views=3&width=24&height=16&supersample=1"

@@ -22,13 +22,13 @@ from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.rng import Rng
 from gsstream.engine.method.checked import difference_between
 from gsstream.engine.step import frame_step as step_module
-from gsstream.motion.coasting import Coasting
 from gsstream.packet import PacketKind
+from gsstream.parts.motion.coasting import Coasting
+from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.parts.render.work import FrameWork
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, find_renderer, render
 from gsstream.player.software import render_numpy
-from gsstream.render.reference import ReferenceRenderer
-from gsstream.render.work import FrameWork
 
 METHODS = ["dense", "s2gs-edge"]
 

@@ -8,8 +8,8 @@ import pytest
 from flow_runs import arguments, encode, metrics
 
 from gsstream.cli.main import run_command
+from gsstream.input.recordings.open import open_source
 from gsstream.player.playback import Playback
-from gsstream.source.open import open_source
 
 DISTURBED = "disturbed:gain_amplitude=0.3,noise_sigma=8,lost_share=0.4,time_offset={}@1"
 

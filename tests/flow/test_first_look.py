@@ -14,8 +14,8 @@ from gsstream.cli.main import run_command
 from gsstream.core.frame import Frame
 from gsstream.encode import open_recording
 from gsstream.engine.run.measure import HeldOut
+from gsstream.input.prepare.pose_checks import check_poses, first_look
 from gsstream.plugins.catalog import load_catalog
-from gsstream.scene.pose_checks import check_poses, first_look
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 #: Poses as others write them, and what undoes it.

@@ -10,7 +10,7 @@ import pytest
 import torch
 from flow_runs import demo_copy
 
-from gsstream.render.backward import backward
+from gsstream.parts.render.backward import backward
 
 #: Seconds and tens of megabytes each; nothing of them is ever used.
 UNWANTED = ("torch._dynamo", "torch._inductor", "sympy", "torch.fx.experimental.symbolic_shapes")

@@ -18,10 +18,10 @@ from gsstream.cli.main import run_command
 from gsstream.encode import in_own_world
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.run.session import STREAM, run
+from gsstream.input.recordings.open import open_source
 from gsstream.packet import StreamReader
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
-from gsstream.source.open import open_source
 from tests.flow import capture
 from tests.flow.flow_runs import TINY, arguments, demo_copy, encode, metrics, start
 

@@ -12,10 +12,10 @@ from early_densify import densifying
 from gsstream.core.world import IDENTITY, World
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.fit import schedule
+from gsstream.input.recordings.canonical import CanonicalSource, world_of
+from gsstream.input.recordings.open import open_source
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
-from gsstream.source.canonical import CanonicalSource, world_of
-from gsstream.source.open import open_source
 from tools.worlds import Moved, encode, world
 
 SOURCE = "synthetic:frames=3&views=6&width=40&height=30&supersample=1&motion=3"

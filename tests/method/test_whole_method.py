@@ -18,17 +18,17 @@ from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.method.checked import difference_between
 from gsstream.engine.method.repeating import LeftOutWarning, RepeatedFrameWarning
 from gsstream.engine.run.encoder import Encoder, Listeners
+from gsstream.input.recordings.open import open_source
 from gsstream.method.base import StreamingMethod
 from gsstream.method.hold import Hold, HoldState
 from gsstream.method.packets import send_delta
 from gsstream.packet import PacketKind
+from gsstream.parts.render.exposure import Exposure
+from gsstream.parts.render.wrt import WrtRows
 from gsstream.player.playback import Playback
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe
-from gsstream.render.exposure import Exposure
-from gsstream.render.wrt import WrtRows
-from gsstream.source.open import open_source
 from gsstream.testing.stepper.checks import check_method_closed_loop, check_method_resume
 from gsstream.testing.stepper.example import ExampleStepper
 from gsstream.testing.stepping import SOURCE, MethodUnderTest

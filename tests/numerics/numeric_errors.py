@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from numeric_scenes import camera, random_scene, rendered, upstream, worst
 
-from gsstream.loss.base import Loss
-from gsstream.loss.photometric import ReferenceLoss
+from gsstream.parts.loss.base import Loss
+from gsstream.parts.loss.photometric import ReferenceLoss
+from gsstream.parts.render.base import Renderer
+from gsstream.parts.render.reference import ReferenceRenderer, composite, evaluate_sh, project
 from gsstream.player.software import render_numpy
-from gsstream.render.base import Renderer
-from gsstream.render.reference import ReferenceRenderer, composite, evaluate_sh, project
 from gsstream.testing.cases import rig
 
 Measure = Callable[[int], float]

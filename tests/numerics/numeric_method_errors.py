@@ -22,13 +22,13 @@ from gsstream.core.changes import Delta, Layout, Residual, Scene, apply_delta
 from gsstream.core.frame import PointCloud
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.optimiser.adam import ReferenceAdam
-from gsstream.optimiser.base import ADAM_BETAS, ADAM_EPS, AdamState, RowOptimiser
-from gsstream.optimiser.rate import channel_spread, laplace_gradient
 from gsstream.packet.grids import KEY_BITS, from_codes, to_codes
 from gsstream.packet.symbols import decode_symbols, encode_symbols
-from gsstream.render.reference import ReferenceRenderer
-from gsstream.residual.base import init_latents
+from gsstream.parts.optimiser.adam import ReferenceAdam
+from gsstream.parts.optimiser.base import ADAM_BETAS, ADAM_EPS, AdamState, RowOptimiser
+from gsstream.parts.optimiser.rate import channel_spread, laplace_gradient
+from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.parts.update.base import init_latents
 
 Measure = Callable[[int], float]
 

@@ -12,7 +12,7 @@ import torch
 from numeric_bounds import BOUNDS
 from numeric_scenes import camera, draws, random_scene, rendered, upstream, worst
 
-from gsstream.render.reference import ReferenceRenderer
+from gsstream.parts.render.reference import ReferenceRenderer
 
 native = pytest.importorskip("gsstream_cpu_render._native", reason="gsstream-cpu-render is not installed")
 threads = pytest.importorskip("gsstream_cpu_render.threads")

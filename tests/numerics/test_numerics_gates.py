@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numeric_scenes import some
 
 from gsstream.engine.step.dead_gates import count_dead
-from gsstream.gate.always_open import AlwaysOpen
+from gsstream.parts.gate.always_open import AlwaysOpen
 
 EXTREMES = torch.tensor([-1e4, -100.0, -17.5, -6.9, -1e-30, 0.0, 1e-30, 6.9, 17.5, 100.0, 1e4])
 

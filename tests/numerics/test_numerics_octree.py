@@ -13,7 +13,7 @@ from numeric_scenes import blobs, camera, some
 
 from gsstream.core.errors import GsstreamError
 from gsstream.core.frame import PointCloud
-from gsstream.structure.base import Anchors
+from gsstream.parts.structure.base import Anchors
 
 
 def cloud(xyz: object) -> PointCloud:

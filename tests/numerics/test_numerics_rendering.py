@@ -16,9 +16,9 @@ from numeric_scenes import Scene, blobs, camera, rendered, upstream, worst
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError
+from gsstream.parts.render.base import Renderer
+from gsstream.parts.render.reference import ReferenceRenderer
 from gsstream.player.software import render_numpy
-from gsstream.render.base import Renderer
-from gsstream.render.reference import ReferenceRenderer
 
 BACK = (0.2, 0.5, 0.9)
 

@@ -22,8 +22,8 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.packet import decode_delta, encode_delta, quantise_key
 from gsstream.packet.grids import KEY_BITS, MAX_CODE, from_codes, to_codes
 from gsstream.packet.symbols import MAX_BINS, decode_symbols, encode_symbols
-from gsstream.residual.additive import Additive, DirectCode
-from gsstream.residual.base import MAX_SYMBOL, symbols
+from gsstream.parts.update.additive import Additive, DirectCode
+from gsstream.parts.update.base import MAX_SYMBOL, symbols
 
 
 def layout(nodes: int = 6, rows: int = 2) -> Layout:

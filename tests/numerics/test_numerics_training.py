@@ -22,10 +22,10 @@ from gsstream.core.errors import ComponentError, ShapeError
 from gsstream.core.frame import Frame
 from gsstream.engine.step.active.change import detect_change
 from gsstream.engine.step.optimise import _FrameRun
+from gsstream.input.recordings.open import open_source
 from gsstream.metrics import psnr
-from gsstream.optimiser.adam import ReferenceAdam
-from gsstream.optimiser.base import MAX_GRADIENT, AdamState, RowOptimiser
-from gsstream.source.open import open_source
+from gsstream.parts.optimiser.adam import ReferenceAdam
+from gsstream.parts.optimiser.base import MAX_GRADIENT, AdamState, RowOptimiser
 from gsstream.testing.stepper.checks import SOURCE, MethodUnderTest
 
 

@@ -85,9 +85,9 @@ def test_lying_declarations_are_found_when_used(lab) -> None:
     assert check.returncode == 1
     for name, reason in {
         "gate 'no-module'": "ModuleNotFoundError: No module named 'a_module_nobody_has'",
-        "gate 'no-class'": "its target 'gsstream.gate.always_open:Gate' does not exist: gsstream.gate.always_open",
-        "gate 'wrong-kind'": "its target 'gsstream.structure.flat:Flat' is not a GateSampler: declared as 'gate'",
-        "gate 'not-a-class'": "its target 'gsstream.gate.base:__doc__' is not a GateSampler: declared as 'gate'",
+        "gate 'no-class'": "its target 'gsstream.parts.gate.always_open:Gate' does not exist: gsstream.parts.gate",
+        "gate 'wrong-kind'": "its target 'gsstream.parts.structure.flat:Flat' is not a GateSampler: declared as 'gate'",
+        "gate 'not-a-class'": "its target 'gsstream.parts.gate.base:__doc__' is not a GateSampler: declared as 'gate'",
         "gate 'unfinished'": "leaves these methods of GateSampler unwritten: ",
         "method 'no-recipe'": "its recipe 'gsstream.recipe:methods/absent.yaml' does not exist",
     }.items():
@@ -109,7 +109,8 @@ from gsstream.spec import ComponentSpec, hookimpl
 
 @hookimpl
 def gsstream_components():
-    return [ComponentSpec(kind="gate", name="mine", target="gsstream.gate.always_open:AlwaysOpen", summary="mine")]
+    target = "gsstream.parts.gate.always_open:AlwaysOpen"
+    return [ComponentSpec(kind="gate", name="mine", target=target, summary="mine")]
 """
 
 

@@ -66,7 +66,7 @@ def test_version_rule(written: str, spoken: str, advice: str | None) -> None:
 
 
 def spec(name: str) -> ComponentSpec:
-    return ComponentSpec(kind="gate", name=name, target="gsstream.gate.always_open:AlwaysOpen", summary="a gate")
+    return ComponentSpec(kind="gate", name=name, target="gsstream.parts.gate.always_open:AlwaysOpen", summary="a gate")
 
 
 def test_a_name_declared_twice_quarantines_the_second_plugin_as_a_whole() -> None:

@@ -136,7 +136,7 @@ def test_ring_five_a_failed_frame_is_repeated_when_the_recipe_says_so(drill, tmp
 SOURCE = """
 from dataclasses import replace
 
-from gsstream.source.open import open_source
+from gsstream.input.recordings.open import open_source
 from gsstream.spec import ComponentSpec, hookimpl
 
 

@@ -68,8 +68,8 @@ def hooks() -> str:
     from gsstream.cli.plugins import setting_rows
     from gsstream.core.kinds import CONTRACTS, PART_KINDS
     from gsstream.core.part import Traits
+    from gsstream.input.recordings.base import FrameSource
     from gsstream.plugins import hookspecs
-    from gsstream.source.base import FrameSource
     from gsstream.spec import KINDS, ComponentSpec, MethodSpec
 
     lines = [NOTE, "# Hooks, specs and contracts of parts", "", "## Hooks", ""]

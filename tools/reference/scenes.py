@@ -11,11 +11,11 @@ from tools.reference.text import NOTE, ROOT
 
 def scene_checks() -> str:
     """Every check of ``scene validate``, and what it says about the bad scenes of the tests."""
-    from gsstream.scene.findings import CHECKS
+    from gsstream.input.prepare.findings import CHECKS
 
     sys.path.insert(0, str(ROOT))
     try:
-        table = importlib.import_module("tests.scene.bad_scenes")
+        table = importlib.import_module("tests.input.prepare.bad_scenes")
     finally:
         sys.path.remove(str(ROOT))
     messages = json.loads(table.MESSAGES.read_text(encoding="utf-8"))

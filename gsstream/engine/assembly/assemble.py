@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from gsstream.confidence.base import ConfidenceEstimator
 from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
 from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.core.needs import install_renderer
@@ -18,22 +17,23 @@ from gsstream.engine.assembly.guard import guard
 from gsstream.engine.assembly.heeded import unheeded
 from gsstream.engine.assembly.title import title
 from gsstream.engine.assembly.where import Where
-from gsstream.gate.base import GateSampler
-from gsstream.growth.base import Growth
-from gsstream.loss.base import Loss
 from gsstream.method.base import StreamingMethod
-from gsstream.motion.base import MotionPart
-from gsstream.optimiser.base import RowOptimiser
+from gsstream.parts.confidence.base import ConfidenceEstimator
+from gsstream.parts.gate.base import GateSampler
+from gsstream.parts.growth.base import Growth
+from gsstream.parts.loss.base import Loss
+from gsstream.parts.motion.base import MotionPart
+from gsstream.parts.optimiser.base import RowOptimiser
+from gsstream.parts.propagation.base import Propagation
+from gsstream.parts.regularizer.base import Regularizer
+from gsstream.parts.render.base import Renderer
+from gsstream.parts.structure.base import Structure
+from gsstream.parts.update.base import UpdateRule
 from gsstream.plugins.catalog import Catalog
-from gsstream.propagation.base import Propagation
 from gsstream.recipe.check import join_problems, validate
 from gsstream.recipe.document import KeyPath, Origin
 from gsstream.recipe.load import ResolvedRecipe
 from gsstream.recipe.model import ComponentRef, Recipe
-from gsstream.regularizer.base import Regularizer
-from gsstream.render.base import Renderer
-from gsstream.residual.base import UpdateRule
-from gsstream.structure.base import Structure
 
 SLOTS = (*METHOD_SLOTS, "stepper", "renderer")
 #: Everything that is called behind a guard.

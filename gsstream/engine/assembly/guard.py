@@ -16,9 +16,9 @@ from gsstream.engine.assembly.checks import Checks, Look
 from gsstream.engine.assembly.fault import fault
 from gsstream.engine.assembly.looks import LOOKS
 from gsstream.engine.assembly.where import Where
-from gsstream.optimiser.base import RowOptimiser
-from gsstream.optimiser.residual import ResidualOptimiser
-from gsstream.render.base import RenderSession
+from gsstream.parts.optimiser.base import RowOptimiser
+from gsstream.parts.optimiser.residual import ResidualOptimiser
+from gsstream.parts.render.base import RenderSession
 
 T = TypeVar("T")
 #: The names under which the table below and that of the checks list what parts open: sessions of a renderer, residuals

@@ -10,7 +10,7 @@ from typing import Any
 
 from gsstream.core.errors import InputError
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.source.base import SourceInfo
+from gsstream.input.recordings.base import SourceInfo
 
 #: Interpreter, torch, the renderer and the engine with everything a run imports (measured, docs/results/trade.md).
 PROCESS = 280_000_000

@@ -10,8 +10,8 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.topology import TopologyEdit
 from gsstream.engine.fit import schedule
 from gsstream.engine.fit.schedule import MAX_SCALE, PRUNE_OPACITY
+from gsstream.parts.render.activations import activate_opacities, activate_scales, rotation_matrices
 from gsstream.recipe.model import FirstFrame
-from gsstream.render.activations import activate_opacities, activate_scales, rotation_matrices
 
 SPLIT_SHRINK = 1.6  # 3DGS: both halves of a split Gaussian are 1.6 times smaller
 SPLIT_SIZE = 0.01  # 3DGS: larger than this fraction of the extent is split, smaller is cloned

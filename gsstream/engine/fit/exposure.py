@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from gsstream.render.exposure import Exposure
+from gsstream.parts.render.exposure import Exposure
 
 
 @dataclass(frozen=True)

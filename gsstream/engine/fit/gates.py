@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.gate.base import GateSampler
-from gsstream.optimiser.base import RowOptimiser
-from gsstream.optimiser.row_parameters import RowParameters
-from gsstream.optimiser.state import AdamState
-from gsstream.regularizer.base import Regularizer
-from gsstream.render.backward import backward
+from gsstream.parts.gate.base import GateSampler
+from gsstream.parts.optimiser.base import RowOptimiser
+from gsstream.parts.optimiser.row_parameters import RowParameters
+from gsstream.parts.optimiser.state import AdamState
+from gsstream.parts.regularizer.base import Regularizer
+from gsstream.parts.render.backward import backward
 
 
 class TrainedGates:

@@ -9,10 +9,10 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
-from gsstream.loss.base import Loss
-from gsstream.render.base import Renderer
-from gsstream.render.exposure import Exposure
-from gsstream.render.target import ViewTarget
+from gsstream.parts.loss.base import Loss
+from gsstream.parts.render.base import Renderer
+from gsstream.parts.render.exposure import Exposure
+from gsstream.parts.render.target import ViewTarget
 
 
 class PhotometricLoss:

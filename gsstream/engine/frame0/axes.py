@@ -13,7 +13,7 @@ from dataclasses import replace
 import torch
 
 from gsstream.core.gaussians import Gaussians
-from gsstream.render.activations import rotation_matrices
+from gsstream.parts.render.activations import rotation_matrices
 
 _HALF = 0.5**0.5
 

@@ -23,11 +23,11 @@ from gsstream.engine.frame0.cheaper import cheaper_rows
 from gsstream.engine.frame0.first_seen import first_rows
 from gsstream.engine.frame0.optimise import initial_gaussians, optimise_first_frame, sort_by_node
 from gsstream.engine.state.stream_state import Step, StreamState
-from gsstream.init.thinning import thin_points
+from gsstream.input.seeds.thinning import thin_points
 from gsstream.method.tools import Tools
 from gsstream.packet import EncodedPacket, KeyState, PlayerState, StreamMeta, decode_packet, encode_key, quantise_key
-from gsstream.render.exposure import Exposure
-from gsstream.structure.base import Anchors
+from gsstream.parts.render.exposure import Exposure
+from gsstream.parts.structure.base import Anchors
 
 
 def begin(parts: Assembly, frame: Frame, tools: Tools) -> Step:

@@ -21,7 +21,7 @@ from gsstream.engine.frame0.axes import nearest_axes
 from gsstream.engine.frame0.probes import TrainingViews, probes
 from gsstream.engine.frame0.rounding import codes_nearby, codes_towards_zero
 from gsstream.packet.grids import KEY_BITS, color_codes, color_slopes, from_codes
-from gsstream.render.exposure import Exposure
+from gsstream.parts.render.exposure import Exposure
 
 #: How far a code may move, in steps of its grid: a colour by 0.04, an axis by 7 degrees, a scale by a factor of 2.7, an
 #: opacity by a logit. View-dependent colour may go to zero from anywhere.

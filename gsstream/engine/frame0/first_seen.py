@@ -11,7 +11,7 @@ from gsstream.core.shapes import BoolArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.probes import TrainingViews
 from gsstream.engine.frame0.removal import removal_errors
-from gsstream.render.exposure import Exposure
+from gsstream.parts.render.exposure import Exposure
 
 
 def first_rows(

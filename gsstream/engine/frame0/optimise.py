@@ -27,12 +27,12 @@ from gsstream.engine.fit.nearest import neighbour_distance
 from gsstream.engine.fit.photometric import PhotometricLoss
 from gsstream.engine.frame0.probes import TrainingViews
 from gsstream.engine.frame0.removal import not_missed
-from gsstream.optimiser.row_parameters import RowParameters
+from gsstream.parts.optimiser.row_parameters import RowParameters
+from gsstream.parts.render.activations import logit, rgb_to_sh0
+from gsstream.parts.render.exposure import Exposure
+from gsstream.parts.render.wrt import LossAndGrad, WrtScene
+from gsstream.parts.structure.base import Anchors
 from gsstream.recipe.model import FirstFrame
-from gsstream.render.activations import logit, rgb_to_sh0
-from gsstream.render.exposure import Exposure
-from gsstream.render.wrt import LossAndGrad, WrtScene
-from gsstream.structure.base import Anchors
 
 CENTER_EVERY = 50
 Progress = Callable[[int, int, float, int], None]

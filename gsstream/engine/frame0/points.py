@@ -11,9 +11,9 @@ from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.rng import Rng
 from gsstream.engine.fit import schedule
-from gsstream.init.seeding import fill_volume, photo_consistent_seeds, thin_points
+from gsstream.input.recordings.base import FrameSource, PointKind
+from gsstream.input.seeds.seeding import fill_volume, photo_consistent_seeds, thin_points
 from gsstream.recipe.model import FirstFrame
-from gsstream.source.base import FrameSource, PointKind
 
 #: With fewer points than this a scene cannot be reconstructed: "auto" then looks for more by a plane sweep.
 SPARSE = 2000
@@ -98,7 +98,7 @@ def _base_points(
 
 
 def _triangulate(frame: Frame) -> PointCloud:
-    from gsstream.init.sfm import triangulate_points
+    from gsstream.input.seeds.sfm import triangulate_points
 
     return triangulate_points(frame.images, frame.cameras)
 

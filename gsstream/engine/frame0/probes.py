@@ -14,9 +14,9 @@ import torch
 
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
-from gsstream.render.backward import backward, gradient_of
-from gsstream.render.base import Renderer
-from gsstream.render.exposure import Exposure
+from gsstream.parts.render.backward import backward, gradient_of
+from gsstream.parts.render.base import Renderer
+from gsstream.parts.render.exposure import Exposure
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,9 +27,9 @@ from gsstream.engine.state.refinement import Refinement
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.method.tools import Tools
 from gsstream.packet import PlayerState
+from gsstream.parts.render.activations import rotation_matrices
+from gsstream.parts.render.exposure import Exposure
 from gsstream.recipe.model import Stream
-from gsstream.render.activations import rotation_matrices
-from gsstream.render.exposure import Exposure
 
 #: Entry of the meta of every key packet but a stream's first: the frame whose pictures its scene shows.
 SHOWN = "shown"

@@ -18,7 +18,7 @@ from gsstream.engine.frame0.first_seen import first_rows
 from gsstream.engine.state.stream_state import Step
 from gsstream.method.tools import Tools
 from gsstream.packet import PlayerState, StreamMeta, quantise_key
-from gsstream.structure.base import Anchors
+from gsstream.parts.structure.base import Anchors
 
 
 def begin_from(parts: Assembly, frame: Frame, tools: Tools) -> Step:

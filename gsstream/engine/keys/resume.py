@@ -18,10 +18,10 @@ from gsstream.engine.frame0.refine import SHOWN, advanced, begun, is_refining
 from gsstream.engine.state.follow import follow
 from gsstream.engine.state.refinement import Refinement
 from gsstream.engine.state.stream_state import StreamState
+from gsstream.input.recordings.base import SourceInfo
 from gsstream.method.tools import Tools
 from gsstream.packet import PacketKind, PlayerState, StreamMeta, StreamReader, decode_packet
 from gsstream.packet.base import FILE_HEADER
-from gsstream.source.base import SourceInfo
 
 #: Keys that may differ when a run is resumed, by section; besides them, ``frames``.
 ENDING = {"data": ("bad_image",), "stream": ("on_error",)}

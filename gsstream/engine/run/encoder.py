@@ -24,11 +24,11 @@ from gsstream.engine.keys.resume import check_stream, ended, since_key
 from gsstream.engine.method.wrapped import wrapped
 from gsstream.engine.run.threads import one_torch_thread
 from gsstream.engine.step.tools import RunTools
+from gsstream.input.recordings.base import SourceInfo
 from gsstream.method.base import Step
 from gsstream.metrics import peak_memory_mb
 from gsstream.packet import EncodedPacket, PlayerState, StreamMeta
 from gsstream.recipe.budget import sized
-from gsstream.source.base import SourceInfo
 
 #: Makes the seeds of frame 0 from its training images.
 Seeds = Callable[[Frame], PointCloud]

@@ -10,14 +10,14 @@ from typing import Any
 from pydantic import ValidationError
 
 from gsstream.core.errors import GsstreamError, PacketError, PluginUnavailable, RecipeError
+from gsstream.input.recordings.base import FrameSource
+from gsstream.input.recordings.canonical import CanonicalSource, world_of
+from gsstream.input.recordings.open import open_source
+from gsstream.input.recordings.options import DataOptions
+from gsstream.input.recordings.transformed import transformed
 from gsstream.packet import PlayerState, StreamReader, decode_packet
 from gsstream.plugins.catalog import Catalog
 from gsstream.recipe.model import Recipe
-from gsstream.source.base import FrameSource
-from gsstream.source.canonical import CanonicalSource, world_of
-from gsstream.source.open import open_source
-from gsstream.source.options import DataOptions
-from gsstream.source.transformed import transformed
 
 
 def open_recording(uri: str, recipe: Recipe, catalog: Catalog) -> FrameSource:

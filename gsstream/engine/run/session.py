@@ -23,12 +23,12 @@ from gsstream.engine.run.live import live_metrics
 from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.run.metrics_log import append_metrics, last_written, trim_metrics
 from gsstream.engine.run.progress import RunProgress
+from gsstream.input.recordings.base import FrameSource, GrowingSource, HurriedSource, SourceInfo
+from gsstream.input.recordings.prefetch import Prefetcher
 from gsstream.method.base import Step
 from gsstream.packet import EncodedPacket, PlayerState, StreamReader, StreamWriter
 from gsstream.packet.base import FILE_HEADER
 from gsstream.recipe.save import save_resolved
-from gsstream.source.base import FrameSource, GrowingSource, HurriedSource, SourceInfo
-from gsstream.source.prefetch import Prefetcher
 
 STREAM, METRICS, RECIPE = "stream.gss", "metrics.jsonl", "recipe.yaml"
 

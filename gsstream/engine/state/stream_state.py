@@ -13,8 +13,8 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.engine.state.refinement import Refinement
 from gsstream.method.base import Step as MethodStep
 from gsstream.packet import PlayerState
-from gsstream.render.base import RenderSession
-from gsstream.render.exposure import Exposure
+from gsstream.parts.render.base import RenderSession
+from gsstream.parts.render.exposure import Exposure
 
 
 @dataclass(frozen=True)

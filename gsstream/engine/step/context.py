@@ -19,11 +19,11 @@ from gsstream.engine.step.active.candidates import VoteBook, changed_rows
 from gsstream.engine.step.active.change import MOST_PIXEL_SIGMA, Change
 from gsstream.engine.step.active.tiles import changed_tile_weights
 from gsstream.metrics.noise import noise_sigma
-from gsstream.optimiser.base import RowOptimiser
-from gsstream.render.base import RenderSession
-from gsstream.render.exposure import Exposure
-from gsstream.render.target import ViewTarget
-from gsstream.render.wrt import G, LossAndGrad, Wrt
+from gsstream.parts.optimiser.base import RowOptimiser
+from gsstream.parts.render.base import RenderSession
+from gsstream.parts.render.exposure import Exposure
+from gsstream.parts.render.target import ViewTarget
+from gsstream.parts.render.wrt import G, LossAndGrad, Wrt
 
 
 class FrameView:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from gsstream.gate.base import GateSampler
+from gsstream.parts.gate.base import GateSampler
 
 #: Spacing of float32 below 1: a smaller slope changes no gate by a logit's step.
 RESOLUTION = 2.0**-24

@@ -8,7 +8,7 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import blaming
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.context import FrameView
-from gsstream.growth.none import NoGrowth
+from gsstream.parts.growth.none import NoGrowth
 
 
 def grown(parts: Assembly, state: StreamState, delta: Delta, view: FrameView, rng: Rng) -> Delta:

@@ -13,8 +13,8 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import VARIABLE, Look
 from gsstream.engine.step.problem import Problem, Solution
 from gsstream.packet import quantise_decoders
-from gsstream.residual.base import coarser
-from gsstream.residual.base import symbols as residual_symbols
+from gsstream.parts.update.base import coarser
+from gsstream.parts.update.base import symbols as residual_symbols
 
 #: Largest symbol of 32 bits that float32 represents: anything between it and 2^31 would be rounded up to 2^31.
 MOST_SYMBOL = 2.0**31 - 256

@@ -7,7 +7,7 @@ import torch
 from gsstream.core.changes import Delta, Scene, sent_rows
 from gsstream.engine.step.context import FrameView
 from gsstream.packet import PlayerState
-from gsstream.render.base import RenderSession
+from gsstream.parts.render.base import RenderSession
 
 
 def kept_session(view: FrameView, scene: Scene, delta: Delta, player: PlayerState) -> RenderSession | None:

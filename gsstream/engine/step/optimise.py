@@ -21,9 +21,9 @@ from gsstream.engine.step.dead_gates import count_dead
 from gsstream.engine.step.levels import current_level, level_schedule
 from gsstream.engine.step.lr_factor import lr_factor
 from gsstream.engine.step.problem import Problem, Solution
-from gsstream.optimiser.residual import Iteration, ResidualEpoch
-from gsstream.residual.base import coarser, init_latents
-from gsstream.residual.joint import joint_code
+from gsstream.parts.optimiser.residual import Iteration, ResidualEpoch
+from gsstream.parts.update.base import coarser, init_latents
+from gsstream.parts.update.joint import joint_code
 
 #: Rows leave only when at least a tenth of them can: each time, every view has to be frozen anew.
 WORTH_LEAVING = 0.9

@@ -10,8 +10,8 @@ import torch
 from gsstream.core.changes import Layout
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.render.base import RenderSession
-from gsstream.render.target import ViewTarget
+from gsstream.parts.render.base import RenderSession
+from gsstream.parts.render.target import ViewTarget
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from gsstream.engine.frame0.taken import begin_from
 from gsstream.engine.step.context import FrameView
 from gsstream.method.tools import FirstFrame
 from gsstream.packet import PlayerState, StreamMeta
-from gsstream.render.base import Renderer
+from gsstream.parts.render.base import Renderer
 
 
 def _not_resuming(index: int) -> Frame:

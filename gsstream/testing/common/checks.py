@@ -21,7 +21,7 @@ from pydantic import BaseModel, ValidationError
 from gsstream.core.errors import InputError
 from gsstream.core.kinds import CONTRACTS
 from gsstream.core.part import Part
-from gsstream.gate.base import GateSampler
+from gsstream.parts.gate.base import GateSampler
 from gsstream.testing.cases import EXTREMES, World, fingerprint, world
 from gsstream.testing.compare import ROUNDING, all_equal, finite
 from gsstream.testing.drive import behaviour_of, draw, outputs

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gsstream.confidence.base import ConfidenceEstimator
+from gsstream.parts.confidence.base import ConfidenceEstimator
 from gsstream.testing.cases import World
 from gsstream.testing.drive import Behaviour, Outputs
 

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import torch
 
-from gsstream.confidence.base import ConfidenceEstimator
+from gsstream.parts.confidence.base import ConfidenceEstimator
 from gsstream.testing.cases import world
 from gsstream.testing.compare import at_most, equal, finite
 from gsstream.testing.registry import check

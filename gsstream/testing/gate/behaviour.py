@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gsstream.gate.base import GateSampler
+from gsstream.parts.gate.base import GateSampler
 from gsstream.testing.cases import World
 from gsstream.testing.drive import Behaviour, Outputs, draw, poison_logits
 

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import torch
 
-from gsstream.gate.base import AnalyticGate, GateSampler
+from gsstream.parts.gate.base import AnalyticGate, GateSampler
 from gsstream.testing.cases import world
 from gsstream.testing.compare import ROUNDING, all_equal, at_most, equal, finite
 from gsstream.testing.drive import draw

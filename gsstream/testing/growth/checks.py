@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from gsstream.core.changes import Rows, apply_rows
-from gsstream.growth.base import Growth
 from gsstream.packet.changes.rows import encode_rows_change
+from gsstream.parts.growth.base import Growth
 from gsstream.testing.cases import fingerprint
 from gsstream.testing.registry import check
 from gsstream.testing.working import at_work, check_closed_loop

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from gsstream.loss.base import Loss
-from gsstream.loss.photometric import ReferenceLoss
+from gsstream.parts.loss.base import Loss
+from gsstream.parts.loss.photometric import ReferenceLoss
 from gsstream.testing.cases import fingerprint
 from gsstream.testing.compare import at_most, equal, finite, relative
 from gsstream.testing.registry import check

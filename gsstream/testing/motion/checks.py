@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from gsstream.core.changes import Motion, apply_motion
-from gsstream.motion.base import MotionPart
 from gsstream.packet.base import Section
 from gsstream.packet.changes.motion import decode_motions, encode_motions
+from gsstream.parts.motion.base import MotionPart
 from gsstream.testing.cases import fingerprint
 from gsstream.testing.registry import check
 from gsstream.testing.working import at_work, check_closed_loop

@@ -8,13 +8,13 @@ from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.joint import JointCode
 from gsstream.engine.fit.gates import TrainedGates
-from gsstream.loss.photometric import ReferenceLoss
-from gsstream.optimiser.base import ADAM_BETAS, ADAM_EPS, AdamState, RowOptimiser
-from gsstream.optimiser.joint import JointResidualOptimiser
-from gsstream.optimiser.residual import Iteration, ResidualEpoch, ResidualOptimiser
-from gsstream.render.target import ViewTarget
-from gsstream.residual.base import AttributeCode
-from gsstream.residual.joint import joint_code
+from gsstream.parts.loss.photometric import ReferenceLoss
+from gsstream.parts.optimiser.base import ADAM_BETAS, ADAM_EPS, AdamState, RowOptimiser
+from gsstream.parts.optimiser.joint import JointResidualOptimiser
+from gsstream.parts.optimiser.residual import Iteration, ResidualEpoch, ResidualOptimiser
+from gsstream.parts.render.target import ViewTarget
+from gsstream.parts.update.base import AttributeCode
+from gsstream.parts.update.joint import joint_code
 from gsstream.testing.cases import BLACK, RENDERER, world
 from gsstream.testing.compare import equal
 from gsstream.testing.gate.example import ExampleGate

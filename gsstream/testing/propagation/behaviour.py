@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gsstream.propagation.base import Propagation
+from gsstream.parts.propagation.base import Propagation
 from gsstream.testing.cases import World
 from gsstream.testing.drive import Behaviour, Outputs, poison_logits
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 
 from gsstream.core.hierarchy import Hierarchy, tree_roots
-from gsstream.propagation.base import Propagation
+from gsstream.parts.propagation.base import Propagation
 from gsstream.testing.cases import World, flat, world
 from gsstream.testing.compare import ROUNDING, at_most, equal, finite
 from gsstream.testing.registry import check

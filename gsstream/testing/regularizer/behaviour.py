@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from gsstream.regularizer.base import Regularizer
+from gsstream.parts.regularizer.base import Regularizer
 from gsstream.testing.cases import World
 from gsstream.testing.drive import Behaviour, Outputs
 

@@ -9,7 +9,7 @@ import torch
 
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.shapes import check_shape
-from gsstream.regularizer.base import AnalyticPenalty, Regularizer
+from gsstream.parts.regularizer.base import AnalyticPenalty, Regularizer
 from gsstream.testing.cases import World, forest, world
 from gsstream.testing.compare import ROUNDING, at_most, equal, finite
 from gsstream.testing.registry import check

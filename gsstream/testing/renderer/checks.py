@@ -7,9 +7,9 @@ from dataclasses import replace
 import torch
 
 from gsstream.core.cameras import Cameras
-from gsstream.render.backward import gradient_of
-from gsstream.render.base import TILE, Renderer, RenderOutput
-from gsstream.render.reference import ALPHA_CUT, project
+from gsstream.parts.render.backward import gradient_of
+from gsstream.parts.render.base import TILE, Renderer, RenderOutput
+from gsstream.parts.render.reference import ALPHA_CUT, project
 from gsstream.testing.cases import BLACK, RENDERER, SIZE, Scene, fingerprint, world
 from gsstream.testing.compare import EXACT, at_most, equal, finite, gradients_equal, relative
 from gsstream.testing.registry import check

@@ -15,7 +15,8 @@ from gsstream.testing.cases import RENDERER
 class ExampleRenderer(Renderer):
     """The reference renderer in another coat; put calls of your library in its place.
 
-    Sessions, masks and caches have defaults that are right and slow: ``gsstream/render/base.py`` says what to override.
+    Sessions, masks and caches have defaults that are right and slow: ``gsstream/parts/render/base.py`` describes
+    what to override.
     """
 
     source = "gsstream"

@@ -11,7 +11,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.shapes import check_finite, check_shape
-from gsstream.source.base import FrameSource, SingleImages, Split
+from gsstream.input.recordings.base import FrameSource, SingleImages, Split
 from gsstream.testing.recording import Skip, SourceUnderTest
 from gsstream.testing.registry import check
 

@@ -14,9 +14,9 @@ from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray, check_finite
+from gsstream.input.recordings.open import open_source
 from gsstream.method.base import Step
 from gsstream.packet import PlayerState, StreamWriter, quantise_key
-from gsstream.source.open import open_source
 from gsstream.testing.cases import fingerprint
 from gsstream.testing.registry import check
 from gsstream.testing.stepping import FRAMES, SOURCE, MethodUnderTest

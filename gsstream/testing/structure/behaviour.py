@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gsstream.structure.base import Structure
+from gsstream.parts.structure.base import Structure
 from gsstream.testing.cases import World
 from gsstream.testing.drive import Behaviour, Outputs
 

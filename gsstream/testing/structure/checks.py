@@ -10,7 +10,7 @@ import torch
 from gsstream.core.errors import InputError
 from gsstream.core.frame import PointCloud
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.structure.base import Structure
+from gsstream.parts.structure.base import Structure
 from gsstream.testing.cases import World, world
 from gsstream.testing.compare import finite
 from gsstream.testing.registry import check

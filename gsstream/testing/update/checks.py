@@ -9,11 +9,11 @@ import torch
 
 from gsstream.core.changes import Layout, Residual, apply_residual, sent_rows
 from gsstream.core.gaussians import ATTRIBUTES
-from gsstream.optimiser.joint import add_joint, decode_joint, join_features
 from gsstream.packet import quantise_decoders
 from gsstream.packet.base import MAX_CHANNELS
-from gsstream.residual.base import UpdateRule, init_latents, symbols
-from gsstream.residual.joint import joint_code
+from gsstream.parts.optimiser.joint import add_joint, decode_joint, join_features
+from gsstream.parts.update.base import UpdateRule, init_latents, symbols
+from gsstream.parts.update.joint import joint_code
 from gsstream.testing.cases import fingerprint, world
 from gsstream.testing.compare import equal
 from gsstream.testing.registry import check

@@ -7,7 +7,7 @@ import torch
 from gsstream_cpu_render.adam_part import CpuAdam
 
 from gsstream.api import AdamState, RowOptimiser, ShapeError
-from gsstream.optimiser.adam import ReferenceAdam
+from gsstream.parts.optimiser.adam import ReferenceAdam
 
 SHAPES = {"means": (37, 3), "latents": (37, 8), "logits": (5,), "sh": (37, 4, 3), "none": (0, 3)}
 LRS = {"means": 1e-2, "latents": 3e-3, "logits": 0.1, "sh": 0.0, "none": 1.0}

@@ -23,8 +23,8 @@ from gsstream.api import (
     ViewTarget,
     WrtRows,
 )
-from gsstream.loss.photometric import ReferenceLoss
-from gsstream.render.base import TILE
+from gsstream.parts.loss.photometric import ReferenceLoss
+from gsstream.parts.render.base import TILE
 from gsstream.testing.optimiser.checks import _residual_case
 
 BACKGROUND = (0.2, 0.5, 0.9)

@@ -13,8 +13,8 @@ from test_cpu_renderer import rig, scene
 
 from gsstream.api import Gaussians, LossAndGrad, Moves, RenderSession, ShapeError, ViewTarget, WrtRows, WrtTransforms
 from gsstream.core.changes.motion import transformed
-from gsstream.loss.photometric import ReferenceLoss
-from gsstream.render.transforms import transform_vjp
+from gsstream.parts.loss.photometric import ReferenceLoss
+from gsstream.parts.render.transforms import transform_vjp
 
 ROWS = torch.tensor([1, 2, 5, 8, 11, 13, 17])
 

@@ -20,11 +20,11 @@ from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.step import frame_step
 from gsstream.engine.step.optimise import optimise
 from gsstream.engine.step.problem import Problem, Solution
-from gsstream.gate.always_open import AlwaysOpen
+from gsstream.input.recordings.open import open_source
+from gsstream.parts.gate.always_open import AlwaysOpen
+from gsstream.parts.regularizer.base import AnalyticPenalty
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
-from gsstream.regularizer.base import AnalyticPenalty
-from gsstream.source.open import open_source
 
 SOURCE = "synthetic:frames=3&views=3&width=64&height=48&supersample=1"
 TINY = (

@@ -12,7 +12,7 @@ from gsstream_cpu_render.pool import release_idle_memory
 from gsstream_cpu_render.renderer import CpuRenderer
 
 from gsstream.api import Cameras, Gaussians, RenderOutput, ShapeError
-from gsstream.render.reference import ReferenceRenderer
+from gsstream.parts.render.reference import ReferenceRenderer
 
 N = 120
 

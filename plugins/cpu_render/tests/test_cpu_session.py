@@ -12,7 +12,7 @@ from gsstream_cpu_render.renderer import CpuRenderer
 from test_cpu_renderer import N, grads, leaves, pull, replaced, rig, scene, upstream
 
 from gsstream.api import Gaussians, InputError, Renderer, RenderSession, ScatterSession, ScreenGradient
-from gsstream.render.reference import ReferenceRenderer
+from gsstream.parts.render.reference import ReferenceRenderer
 
 Scene = Gaussians[torch.Tensor]
 

@@ -11,9 +11,9 @@ from gsstream_cpu_render import _native, native
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.run.encoder import Encoder
+from gsstream.input.recordings.open import open_source
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
-from gsstream.source.open import open_source
 
 SOURCE = "synthetic:frames=3&views=3&width=64&height=48&supersample=1"
 SETTINGS = (

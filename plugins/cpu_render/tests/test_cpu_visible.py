@@ -13,7 +13,7 @@ from gsstream_cpu_render.renderer import CpuRenderer
 from gsstream_cpu_render.threads import num_threads, set_num_threads
 
 from gsstream.api import Cameras, Gaussians, InputError, RenderSession, ScatterSession, ShapeError
-from gsstream.render.reference import ReferenceRenderer, footprint_in_image
+from gsstream.parts.render.reference import ReferenceRenderer, footprint_in_image
 
 Scene = Gaussians[torch.Tensor]
 N = 150

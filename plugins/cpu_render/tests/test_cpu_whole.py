@@ -22,8 +22,8 @@ from gsstream.api import (
     ViewTarget,
     WrtScene,
 )
-from gsstream.loss.photometric import ReferenceLoss
-from gsstream.render.reference import ReferenceRenderer
+from gsstream.parts.loss.photometric import ReferenceLoss
+from gsstream.parts.render.reference import ReferenceRenderer
 
 VIEW = 1
 

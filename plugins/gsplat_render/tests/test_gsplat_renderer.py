@@ -15,7 +15,7 @@ from gsstream_gsplat_render.renderer import GsplatRenderer, GsplatSession, scree
 from torch_kernels import TORCH_KERNELS
 
 from gsstream.api import Cameras, Gaussians, PluginUnavailable, RenderOutput, ShapeError
-from gsstream.render.reference import ReferenceRenderer
+from gsstream.parts.render.reference import ReferenceRenderer
 
 N, WIDTH, HEIGHT = 120, 49, 37  # the size is no multiple of a tile
 BACKGROUND = (0.2, 0.5, 0.9)

@@ -11,8 +11,8 @@ import torch
 from gsstream_gsplat_render.kernels import Kernels
 
 from gsstream.api import Cameras, Gaussians
-from gsstream.render.reference import evaluate_sh, footprint_in_image
-from gsstream.render.reference import project as reference_project
+from gsstream.parts.render.reference import evaluate_sh, footprint_in_image
+from gsstream.parts.render.reference import project as reference_project
 
 NAN = float("nan")
 

@@ -12,10 +12,10 @@ from flow_runs import encode, metrics
 from gsstream_lab.gap.measure import Gap, GapView, usual_frames
 
 from gsstream.cli.main import run_command
+from gsstream.input.recordings.open import open_source
 from gsstream.metrics import changed_mask, psnr
 from gsstream.player.playback import Playback
 from gsstream.player.render import render
-from gsstream.source.open import open_source
 
 WORLD = "synthetic:frames=4&views=4&width=48&height=36&supersample=1&motion=4"
 

@@ -9,7 +9,7 @@ import pytest
 from gsstream_lab.left_behind import LeftBehind
 
 from gsstream.engine.run.displacement import displacement_pixels, screen_ways
-from gsstream.source.open import open_source
+from gsstream.input.recordings.open import open_source
 
 WORLD = "synthetic:scene=stop&event=90&frames=20&views=5&width=96&height=72&supersample=1&shadows=0"
 AT = 12

@@ -14,8 +14,8 @@ from gsstream_lab.sweep.table import read_table
 
 from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError
+from gsstream.input.recordings.open import open_source
 from gsstream.recipe.load import load_recipe
-from gsstream.source.open import open_source
 
 TINY_WORLD = "synthetic:frames=2&views=5&width=32&height=24&supersample=1"
 LADDERS = {"a": (0, 1, 2, 3), "b": (0, 1, 2, 3)}

@@ -16,10 +16,10 @@ from gsstream_lab.sweep.tune import Trial, candidates, choose, nearest, trial_of
 
 from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError
+from gsstream.input.recordings.open import open_source
 from gsstream.recipe.budget import Budget
 from gsstream.recipe.load import load_recipe
 from gsstream.recipe.model import Recipe
-from gsstream.source.open import open_source
 from tools.held import held_table, main
 
 TINY = ["first_frame.max_iterations=20", "first_frame.max_points=400", "stream.epochs=2"]

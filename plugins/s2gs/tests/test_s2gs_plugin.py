@@ -17,8 +17,8 @@ from ruamel.yaml import YAML
 from s2gs_scene import gaussians
 
 from gsstream.api import ConfidenceEstimator, GateSampler, Part, Propagation, Regularizer, Structure, UpdateRule
+from gsstream.parts.update.base import init_latents
 from gsstream.recipe.model import Recipe
-from gsstream.residual.base import init_latents
 
 KINDS = {
     "structure": Structure, "confidence": ConfidenceEstimator, "propagation": Propagation,

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from gsstream.gate.base import AnalyticGate
+from gsstream.parts.gate.base import AnalyticGate
 from gsstream.testing.gate.example import ExampleGate
 from saboteurs.register import spoils
 

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 
 from gsstream.core.frame import Frame
+from gsstream.input.recordings.open import open_source
 from gsstream.method.base import Step
 from gsstream.packet import KeyState, PlayerState, decode_packet, encode_key
-from gsstream.source.open import open_source
 from gsstream.testing.cases import fingerprint
 from gsstream.testing.stepping import FRAMES, SOURCE, MethodUnderTest
 

@@ -9,10 +9,10 @@ from typing import Any
 import torch
 
 from gsstream.core.joint import JointCode
-from gsstream.optimiser.adam import ReferenceAdam
-from gsstream.optimiser.joint import JointResidualOptimiser
-from gsstream.optimiser.residual import ResidualEpoch, ResidualOptimiser
-from gsstream.residual.base import AttributeCode
+from gsstream.parts.optimiser.adam import ReferenceAdam
+from gsstream.parts.optimiser.joint import JointResidualOptimiser
+from gsstream.parts.optimiser.residual import ResidualEpoch, ResidualOptimiser
+from gsstream.parts.update.base import AttributeCode
 from gsstream.testing.loss.example import ExampleLoss
 from gsstream.testing.update.example import ExampleUpdate
 from saboteurs.register import spoils

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.regularizer.base import AnalyticPenalty
+from gsstream.parts.regularizer.base import AnalyticPenalty
 from gsstream.testing.regularizer.example import ExampleRegularizer
 from saboteurs.register import spoils
 

@@ -9,10 +9,10 @@ import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.context import ScreenGradient
-from gsstream.render.base import RenderOutput, RenderSession, ScatterSession
-from gsstream.render.reference import ReferenceRenderer
-from gsstream.render.target import ViewTarget
-from gsstream.render.wrt import LossAndGrad, WrtTransforms
+from gsstream.parts.render.base import RenderOutput, RenderSession, ScatterSession
+from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.parts.render.target import ViewTarget
+from gsstream.parts.render.wrt import LossAndGrad, WrtTransforms
 from gsstream.testing.renderer.example import ExampleRenderer
 from saboteurs.register import spoils
 

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.structure.base import Anchors
+from gsstream.parts.structure.base import Anchors
 from gsstream.testing.structure.example import ExampleStructure
 from saboteurs.register import spoils
 

@@ -4,10 +4,10 @@ from gsstream.spec import ComponentSpec, MethodSpec, hookimpl
 
 _TARGETS = {
     "no-module": "a_module_nobody_has:Gate",
-    "no-class": "gsstream.gate.always_open:Gate",
-    "wrong-kind": "gsstream.structure.flat:Flat",
-    "not-a-class": "gsstream.gate.base:__doc__",
-    "unfinished": "gsstream.gate.base:GateSampler",
+    "no-class": "gsstream.parts.gate.always_open:Gate",
+    "wrong-kind": "gsstream.parts.structure.flat:Flat",
+    "not-a-class": "gsstream.parts.gate.base:__doc__",
+    "unfinished": "gsstream.parts.gate.base:GateSampler",
 }
 
 

@@ -18,7 +18,7 @@ from gsstream.core.frame import Frame
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.shapes import IntArray
 from gsstream.engine.step.active.change import Change, detect_change
-from gsstream.render.base import RenderSession
+from gsstream.parts.render.base import RenderSession
 
 #: Least share of the views a Gaussian projects into in which it must lie in or beside changed tiles.
 CHANGE_VOTES = 0.75

@@ -16,9 +16,9 @@ from gsstream.core.projection import inside, project
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.core.storage import packed, unpacked
 from gsstream.engine.run.displacement import screen_ways
+from gsstream.input.recordings.base import FrameSource
 from gsstream.metrics.moving import changed_mask, dilate
 from gsstream.packet import PacketKind, PlayerState, StreamReader, decode_packet
-from gsstream.source.base import FrameSource
 
 #: Raw opacity below which a Gaussian is not looked for: it shows less than a tenth of its colour.
 FAINT = -2.2

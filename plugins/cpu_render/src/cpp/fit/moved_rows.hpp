@@ -1,7 +1,7 @@
 // Rows that move in rigid groups, rendered from where they are now, and the gradient by the groups' transforms: what
 // every iteration of a fit of motions does. The arithmetic is that of gsstream.core.changes.motion.transformed and of
-// gsstream.motion.pull_back, float64 in the same order, so that the results are the same bits, and that of
-// gsstream.motion.curvature.
+// gsstream.parts.motion.pull_back, float64 in the same order, so that the results are the same bits, and that of
+// gsstream.parts.motion.curvature.
 #pragma once
 #include <cstddef>
 #include <cstdint>

@@ -12,7 +12,7 @@ namespace gsstream_cpu {
 constexpr std::size_t ROW_CHUNK = 256;     // rows whose sums are taken together, so that they do not depend on threads
 constexpr std::size_t PADDING = 16;        // columns come in multiples of the widest vector
 constexpr std::size_t MOST_FEATURES = 64;  // 59 with harmonics of degree 3
-constexpr float LEAST_SPREAD = 0.3f;       // symbols; see gsstream.residual.rate.MIN_SPREAD
+constexpr float LEAST_SPREAD = 0.3f;       // symbols; see gsstream.parts.update.rate.MIN_SPREAD
 
 struct ResidualBlock {
   std::size_t latent, latents;  // columns of the latents

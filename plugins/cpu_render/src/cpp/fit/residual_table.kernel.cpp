@@ -75,7 +75,7 @@ void price(const ResidualPullJob& job, float* scales, float* tails, float* costs
   }
 }
 
-// Derivative by the latent of `weight` times the bits of its symbol; see gsstream.residual.rate.laplace_gradient.
+// Derivative by the latent of `weight` times the bits of its symbol; see gsstream.parts.update.rate.laplace_gradient.
 GSS_INLINE Floats rate_slope(const ResidualPullJob& job, std::size_t l, Floats latent) {
   const Floats half = broadcast(0.5f), scale = load(job.scale + l), tail = load(job.tail + l);
   const Floats u = latent / load(job.forward.steps + l), magnitude = max(u, -u);

@@ -1,4 +1,4 @@
-// The structure of a picture, pixel by pixel: gsstream.render.structure.weighed_structure.
+// The structure of a picture, pixel by pixel: gsstream.parts.render.structure.weighed_structure.
 #pragma once
 #include <cstddef>
 

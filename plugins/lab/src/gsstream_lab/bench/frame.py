@@ -24,12 +24,12 @@ from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.state.stream_state import Step, StreamState
+from gsstream.input.recordings.base import SourceInfo
 from gsstream.metrics import peak_memory_mb, psnr
 from gsstream.packet import KeyState, PlayerState, StreamMeta, decode_packet, encode_key
+from gsstream.parts.render.base import TILE
 from gsstream.plugins.catalog import Catalog
 from gsstream.recipe.model import ComponentRef, Recipe
-from gsstream.render.base import TILE
-from gsstream.source.base import SourceInfo
 from gsstream_lab.bench.scene import (
     OBJECT_CENTER,
     OBJECT_RADIUS,

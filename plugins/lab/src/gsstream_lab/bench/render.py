@@ -14,9 +14,9 @@ from gsstream.core.errors import GsstreamError
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.parts.render import backward as known
+from gsstream.parts.render.base import Renderer, RenderOutput
 from gsstream.plugins.catalog import Catalog
-from gsstream.render import backward as known
-from gsstream.render.base import Renderer, RenderOutput
 from gsstream_lab.bench.floor import (
     Footprints,
     Peak,

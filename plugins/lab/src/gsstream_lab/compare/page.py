@@ -6,8 +6,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from gsstream.input.recordings.base import FrameSource
 from gsstream.player.playback import Playback
-from gsstream.source.base import FrameSource
 from gsstream_lab.compare.pictures import picture_files
 from gsstream_lab.report.build import all_runs, where_it_ran
 from gsstream_lab.report.document import Block, Heading, Picture, Table, Text

@@ -15,11 +15,11 @@ from PIL import Image, ImageDraw, ImageFont
 from gsstream.core.shapes import FloatArray
 from gsstream.evaluation.contact_sheet import changed_most
 from gsstream.evaluation.evaluate import StreamShown
+from gsstream.input.recordings.base import FrameSource
 from gsstream.metrics import changed_mask, psnr
 from gsstream.player.play import write_pictures
 from gsstream.player.playback import Playback
 from gsstream.player.render import find_renderer, to_bytes
-from gsstream.source.base import FrameSource
 
 TRUTH = "ground truth"
 _LINE, _GAP = 15, 4

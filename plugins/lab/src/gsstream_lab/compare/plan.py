@@ -10,9 +10,9 @@ from typing import Any, Literal
 
 from gsstream.core.errors import RecipeError
 from gsstream.evaluation.records import mean
+from gsstream.input.recordings.options import JudgedBy
 from gsstream.plugins.catalog import Catalog
 from gsstream.recipe.load import resolve_recipe
-from gsstream.source.options import JudgedBy
 from gsstream_lab.report.groups import SweepData
 from gsstream_lab.sweep.config import FirstFrame, Measure, Scene, SweepConfig, Variant
 

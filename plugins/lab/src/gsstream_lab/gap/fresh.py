@@ -16,10 +16,10 @@ from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.budget.memory import within_memory
 from gsstream.engine.run.encoder import Encoder, Listeners
 from gsstream.engine.run.output import write_whole
+from gsstream.input.recordings.base import FrameSource, SourceInfo, check_index
 from gsstream.packet import EncodedPacket, StreamMeta, StreamWriter
 from gsstream.plugins.catalog import Catalog
 from gsstream.recipe.model import LATER_KEYS, Recipe
-from gsstream.source.base import FrameSource, SourceInfo, check_index
 
 #: Called with (frame, iterations done, iterations in all).
 Progress = Callable[[int, int, int], None]

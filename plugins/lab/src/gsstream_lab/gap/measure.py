@@ -15,10 +15,10 @@ from gsstream.core.errors import InputError
 from gsstream.core.shapes import FloatArray
 from gsstream.evaluation.records import mean
 from gsstream.evaluation.summary import format_table
+from gsstream.input.recordings.base import FrameSource
 from gsstream.metrics import changed_mask, moving_mask, noise_sigma, psnr
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, find_renderer, render
-from gsstream.source.base import FrameSource
 
 #: What ``gsstream gap`` writes into the folder of a run: the table, and every number behind it.
 GAP_FILES = ("gap.txt", "gap.json")

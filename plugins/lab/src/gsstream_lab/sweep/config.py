@@ -12,9 +12,9 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from gsstream.core.errors import RecipeError
+from gsstream.input.recordings.options import JudgedBy
 from gsstream.recipe.check import Model, join_problems, validate
 from gsstream.recipe.document import Empty, Origin, read_file
-from gsstream.source.options import JudgedBy
 
 SCHEMA_VERSION = "1.0"
 _NAME = r"^[A-Za-z0-9][\w.+-]*$"

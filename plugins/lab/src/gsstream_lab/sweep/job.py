@@ -22,7 +22,7 @@ from gsstream_lab.sweep.config import Measure
 if TYPE_CHECKING:
     from gsstream.engine.assembly.assemble import Assembly
     from gsstream.evaluation.evaluate import Evaluation
-    from gsstream.source.base import FrameSource
+    from gsstream.input.recordings.base import FrameSource
 
 #: Fields of a record that say which view it is about; all others are numbers, extra metrics included.
 _PLACE = ("frame", "camera", "extra")

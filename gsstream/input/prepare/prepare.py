@@ -1,0 +1,253 @@
+"""``gsstream scene prepare``: from raw synchronised recordings to a scene that a run can take.
+
+Poses by structure from motion on frame 0, or the given ones; pinhole pictures of one size; points thinned to what the
+cameras look at. Test cameras take no part in poses, lenses and points of the others.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import InputError, OutputError, suggest
+from gsstream.core.frame import PointCloud
+from gsstream.core.names import child
+from gsstream.core.shapes import FloatArray
+from gsstream.input.prepare.raw import RawCamera, find_cameras, first_frames
+from gsstream.input.prepare.undistort import Undistortion, undistortion
+from gsstream.input.recordings.calibration import CALIBRATION_FILE, SCHEMA, cut_to, read_calibration
+from gsstream.input.seeds.mapping import Lens, Mapping, reconstruct, triangulate
+from gsstream.input.seeds.thinning import thin_points
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class PrepareOptions:
+    """How a scene is made.
+
+    Arguments:
+        test: ids of test cameras; None: those of a given calibration.
+        model: lens model of structure from motion (a key of ``init.mapping.LENSES``).
+        each: every camera has a lens of its own; else all share one where all pictures have one size.
+        frames: at most so many frames; None: all.
+        width: pictures are shrunk to this width; None: that of the smallest camera. Pictures of other shapes are
+            shrunk evenly and cut around their middle.
+        max_points: points kept.
+        max_error: points with a larger mean reprojection error are dropped, pixels.
+        fps: frames per second of the recording, when it is not given elsewhere.
+    """
+
+    test: tuple[str, ...] | None = None
+    model: str = "SIMPLE_RADIAL"
+    each: bool = False
+    frames: int | None = None
+    width: int | None = None
+    max_points: int = 50_000
+    max_error: float = 2.0
+    fps: float = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """What was made: ``mapping`` of all raw cameras, ``rig`` of those that are in the scene, and its points."""
+
+    names: tuple[str, ...]
+    left_out: tuple[str, ...]
+    test: tuple[str, ...]
+    mapping: Mapping
+    rig: Cameras
+    points: PointCloud
+    bounds: FloatArray
+    frames: int
+    known_poses: bool
+
+
+def prepare(raw: Path, out: Path, options: PrepareOptions, say: Say) -> Prepared:
+    """Make the scene ``out`` (cameras.json, pictures, points_frame0.npz).
+
+    Arguments:
+        raw: folder with the raw recording.
+        out: folder to make.
+        options: lens, test cameras, size.
+        say: called with lines for a person.
+
+    Raises SourceError for a raw recording that cannot be read, InputError when structure from motion fails or finds
+    fewer than two training cameras, OutputError when ``out`` exists and is not an empty folder.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise OutputError(f"{out} exists and is not an empty folder; choose another --out")
+    cameras = find_cameras(raw)
+    names = tuple(camera.name for camera in cameras)
+    known = read_calibration(raw, to_size=True) if (raw / CALIBRATION_FILE).exists() else None
+    test = options.test if options.test is not None else known.test.ids if known else ()
+    for name in test:
+        if name not in names:
+            raise InputError(f"--test: no camera {name!r}{suggest(name, names)}")
+    say(f"{len(cameras)} cameras, {len(test)} of them for testing only; {'known' if known else 'unknown'} poses")
+    say("reading frame 0")
+    images = first_frames(cameras)
+    poses = None if known is None else _joined(known.train, known.test)
+    say(f"matching features of {len(cameras)} pictures; minutes for tens of cameras, longer for large pictures")
+    mapping = _map(cameras, images, poses, test, options)
+    kept = [i for i, there in enumerate(mapping.registered) if there]
+    if sum(names[i] not in test for i in kept) < 2:
+        raise InputError(
+            f"structure from motion placed {len(kept)} of {len(names)} cameras; expected at least two for training. "
+            "The views may be too far apart or show too little texture: give poses (cameras.json beside the pictures)"
+        )
+    say(f"placed {len(kept)} of {len(names)} cameras, {len(mapping.xyz)} points")
+    lenses = _pinholes([cameras[i] for i in kept], mapping, kept, options)
+    target = _target([cameras[i] for i in kept], options)
+    rig = Cameras(
+        tuple(names[i] for i in kept), mapping.viewmats[kept], np.stack([K for K, _ in lenses]), *target
+    )  # fmt: skip
+    points, bounds = _points(mapping, rig, options)
+    say(f"kept {len(points)} points; writing pictures")
+    frames = _write_pictures([cameras[i] for i in kept], [lens for _, lens in lenses], out, options)
+    fps = known.fps if known else options.fps
+    _write(out, raw, rig, test, points, bounds, frames, fps, "" if known is None else known.licence)
+    left_out = tuple(name for i, name in enumerate(names) if i not in kept)
+    return Prepared(names, left_out, test, mapping, rig, points, bounds, frames, known is not None)
+
+
+def _map(
+    cameras: list[RawCamera], images: list[FloatArray], known: Cameras | None, test: Sequence[str],
+    options: PrepareOptions,
+) -> Mapping:  # fmt: skip
+    one_size = len({camera.size for camera in cameras}) == 1
+    held = [i for i, camera in enumerate(cameras) if camera.name in test]
+    if known is None:
+        # Pictures of different sizes come from different lenses.
+        shared = one_size and not options.each
+        return reconstruct(images, model=options.model, shared=shared, held=held)
+    training = [i for i in range(len(cameras)) if i not in held]
+    cut = [
+        images[i] if one_size else _given(cameras[i], known, i).apply(images[i]) for i in training
+    ]
+    found = triangulate(np.stack(cut), known.select(training))
+    # The test cameras' poses are given; nothing of theirs is used.
+    error, seen = np.full(len(cameras), np.nan), np.zeros(len(cameras), np.int64)
+    error[training], seen[training] = found.camera_error, found.camera_points
+    lenses = [found.lenses[0]] * len(cameras)
+    for i, camera in enumerate(cameras):
+        lenses[i] = _raw_lens(camera, known, i)
+    return replace(found, viewmats=known.viewmats, lenses=tuple(lenses), camera_error=error, camera_points=seen)
+
+
+def _given(camera: RawCamera, known: Cameras, i: int) -> Undistortion:
+    """How a picture of a given pinhole camera is brought to the size of the rig; ``known.Ks`` are those of the rig."""
+    lens = _raw_lens(camera, known, i)
+    return undistortion(lens, camera.size, (known.width, known.height))
+
+
+def _raw_lens(camera: RawCamera, known: Cameras, i: int) -> Lens:
+    """The given pinhole of a camera in pixels of its own pictures."""
+    back = np.linalg.inv(cut_to(np.eye(3), camera.size, (known.width, known.height)))
+    K = back @ known.Ks[i]
+    return Lens("PINHOLE", (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+
+
+def _target(cameras: list[RawCamera], options: PrepareOptions) -> tuple[int, int]:
+    width, height = (min(camera.size[axis] for camera in cameras) for axis in (0, 1))
+    if options.width is None or options.width == width:
+        return width, height
+    if not 0 < options.width < width:
+        raise InputError(f"--width: expected 1 to {width} (recordings are never enlarged), got {options.width}")
+    return options.width, max(1, round(height * options.width / width))
+
+
+def _pinholes(
+    cameras: list[RawCamera], mapping: Mapping, kept: list[int], options: PrepareOptions
+) -> list[tuple[FloatArray, Undistortion | None]]:
+    """(K, how to undistort) per camera; None: its pictures are taken over as they are."""
+    target = _target(cameras, options)
+    made: dict[tuple[Lens, tuple[int, int]], Undistortion] = {}
+    out: list[tuple[FloatArray, Undistortion | None]] = []
+    for camera, index in zip(cameras, kept, strict=True):
+        lens = mapping.lenses[index]
+        if not lens.distorts and target == camera.size:
+            out.append((lens.K, None))
+            continue
+        key = (lens, camera.size)
+        if key not in made:
+            made[key] = undistortion(lens, camera.size, target)
+        out.append((made[key].K, made[key]))
+    return out
+
+
+def _points(mapping: Mapping, rig: Cameras, options: PrepareOptions) -> tuple[PointCloud, FloatArray]:
+    """Trustworthy points inside the bounds, thinned; bounds [2, 3]: the middle 98 % of them, and a tenth around."""
+    good = np.isfinite(mapping.xyz).all(1) & (mapping.error <= options.max_error)
+    if not good.any():
+        raise InputError(
+            f"no point has a reprojection error of at most {options.max_error:g} pixels ({len(mapping.xyz)} points "
+            "were found): the poses do not fit the pictures, see 'gsstream scene validate'"
+        )
+    xyz, rgb = mapping.xyz[good], mapping.rgb[good]
+    low, high = np.percentile(xyz, [1, 99], axis=0)
+    margin = 0.1 * (high - low)
+    bounds = np.stack([low - margin, high + margin])
+    inside = ((xyz >= bounds[0]) & (xyz <= bounds[1])).all(1)
+    colors = rgb[inside].astype(np.float32) / np.float32(255)
+    cloud = PointCloud(xyz[inside].astype(np.float64), colors, f"triangulated from {len(rig)} cameras")
+    return thin_points(cloud, options.max_points), bounds
+
+
+def _write_pictures(
+    cameras: list[RawCamera], lenses: list[Undistortion | None], out: Path, options: PrepareOptions
+) -> int:
+    """Pictures of all cameras; the number of frames that all of them have."""
+    counts = []
+    for camera, lens in zip(cameras, lenses, strict=True):
+        folder = child(out, camera.name)
+        folder.mkdir(parents=True)
+        if lens is None and not camera.is_video and camera.files[0].suffix.lower() in (".png", ".jpg"):
+            chosen = camera.files[: options.frames]
+            for t, path in enumerate(chosen):
+                shutil.copyfile(path, folder / f"{t:06d}{path.suffix.lower()}")
+            counts.append(len(chosen))
+            continue
+        count = 0
+        for count, image in enumerate(camera.frames(options.frames), start=1):
+            shown = image if lens is None else lens.apply(image)
+            pixels = np.round(np.clip(shown, 0, 1) * 255).astype(np.uint8)
+            Image.fromarray(pixels).save(folder / f"{count - 1:06d}.png", compress_level=3)
+        counts.append(count)
+    return min(counts)
+
+
+def _write(
+    out: Path, raw: Path, rig: Cameras, test: Sequence[str], points: PointCloud, bounds: FloatArray, frames: int,
+    fps: float, licence: str,
+) -> None:  # fmt: skip
+    entries: list[dict[str, Any]] = []
+    for i, name in enumerate(rig.ids):
+        suffix = next((out / name).glob("000000.*")).suffix
+        entries.append({
+            "id": name, "split": "test" if name in test else "train", "width": rig.width, "height": rig.height,
+            "K": rig.Ks[i].tolist(), "w2c": rig.viewmats[i].tolist(), "frames": f"{name}/%06d{suffix}",
+        })  # fmt: skip
+    data = {
+        "schema": SCHEMA, "name": raw.name, "fps": fps, "frames": frames, "licence": licence,
+        "bounds": bounds.tolist(), "cameras": entries,
+    }  # fmt: skip
+    (out / CALIBRATION_FILE).write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    np.savez(out / "points_frame0.npz", xyz=points.xyz, rgb=np.round(points.rgb * 255).astype(np.uint8))
+
+
+def _joined(train: Cameras, test: Cameras) -> Cameras:
+    return replace(
+        train,
+        ids=(*train.ids, *test.ids),
+        viewmats=np.concatenate([train.viewmats, test.viewmats]),
+        Ks=np.concatenate([train.Ks, test.Ks]),
+    )

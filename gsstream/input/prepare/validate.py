@@ -1,0 +1,131 @@
+"""``gsstream scene validate``: everything that can be known to be wrong with a scene before a run.
+
+The checks go from cheap to dear and stop at the first stage with an error, so that one fault gives one message and not
+its consequences too.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import InputError, SourceError
+from gsstream.core.frame import Frame
+from gsstream.core.needs import install_extra
+from gsstream.input.prepare.findings import Finding, error, note
+from gsstream.input.prepare.match_checks import check_matches
+from gsstream.input.prepare.picture_checks import Thumbnails, check_blank, check_change, check_same, read_thumbnails
+from gsstream.input.prepare.pose_checks import check_poses
+from gsstream.input.prepare.rig_checks import check_axes, check_intrinsics, check_overlap, check_placement
+from gsstream.input.prepare.sync_checks import check_sync
+from gsstream.input.recordings.base import FilesMissing, FrameSource
+from gsstream.input.recordings.canonical import as_filed
+from gsstream.input.seeds.matching import match_images
+
+#: Width of the pictures that are compared over time, and of those whose features are matched.
+SMALL, LARGE = 160, 640
+FRAMES = 40
+
+Open = Callable[[float], FrameSource]
+
+
+def validate(open_scene: Open, *, frames: int = FRAMES, features: bool = True) -> list[Finding]:
+    """Return findings about a recording, errors first; none when it is fine.
+
+    Arguments:
+        open_scene: opens the recording at a scale in (0, 1].
+        frames: how many frames, from the first, have their pictures compared.
+        features: match features between the cameras at frame 0 (needs pycolmap; most of the time goes here).
+    """
+    try:
+        source = open_scene(1.0)
+    except SourceError as fault:
+        return [error("files" if isinstance(fault, FilesMissing) else "calibration", str(fault))]
+    try:
+        found: list[Finding] = []
+        for stage in _stages(source, open_scene, frames, features):
+            found += _merged(stage)
+            if any(finding.severity == "error" for finding in stage):
+                break
+    finally:
+        source.close()
+    return sorted(found, key=lambda finding: ("error", "warning", "note").index(finding.severity))
+
+
+def _merged(found: list[Finding]) -> list[Finding]:
+    """More than two findings of one kind are said once."""
+    if len(found) < 3 or len({(finding.code, finding.severity) for finding in found}) > 1:
+        return found
+    return [replace(found[0], message=f"{found[0].message} ({len(found) - 1} more like this)")]
+
+
+def rig_of(source: FrameSource) -> Cameras:
+    """Return training cameras, then test cameras."""
+    train, test = source.info.train, source.info.test
+    return replace(
+        train,
+        ids=(*train.ids, *test.ids),
+        viewmats=np.concatenate([train.viewmats, test.viewmats]),
+        Ks=np.concatenate([train.Ks, test.Ks]),
+    )
+
+
+def _stages(source: FrameSource, open_scene: Open, frames: int, features: bool) -> Iterator[list[Finding]]:
+    source = as_filed(source)
+    rig, train = rig_of(source), source.info.train
+    yield check_intrinsics(rig)
+    try:
+        points = source.points()
+    except SourceError as fault:
+        yield [error("files", str(fault))]
+        return
+    yield check_placement(rig, len(train), points)
+    yield check_axes(rig)
+    yield check_overlap(train, train.ids)
+    try:
+        thumbs = _thumbnails(source, open_scene, rig, frames)
+        first = source.frame(0, "train"), source.frame(0, "test")
+    except SourceError as fault:
+        yield [error("images", str(fault))]
+        return
+    yield check_blank(thumbs)
+    yield check_same(thumbs)
+    yield check_change(thumbs)
+    # Before clocks: where poses do not fit, what moves seems to be at different places although clocks may be right.
+    yield check_poses(first[0])
+    clocks = check_sync(thumbs)
+    if clocks and features:
+        # The same for poses that are wrong in a way that no convention explains.
+        yield [finding for finding in _matched(rig, *first, rig_only=True) if finding.severity == "error"]
+    yield clocks
+    if features:
+        yield _matched(rig, *first)
+
+
+def _thumbnails(source: FrameSource, open_scene: Open, rig: Cameras, frames: int) -> Thumbnails:
+    small = open_scene(min(1.0, SMALL / rig.width))
+    try:
+        known = source.info.num_frames
+        return read_thumbnails(as_filed(small), rig, frames if known is None else min(frames, known))
+    finally:
+        small.close()
+
+
+def _matched(rig: Cameras, train: Frame, test: Frame, *, rig_only: bool = False) -> list[Finding]:
+    if importlib.util.find_spec("pycolmap") is None:
+        return [note("epipolar", f"the calibration was not compared with the pictures: {install_extra('sfm')}")]
+    images = np.concatenate([train.images, test.images])
+    factor = -(-rig.width // LARGE)
+    height, width = rig.height // factor, rig.width // factor
+    cut = images[:, : height * factor, : width * factor]
+    images = cut.reshape(len(images), height, factor, width, factor, 3).mean((2, 4), dtype=np.float32)
+    # The crop keeps the image corner, so only the size changes before the scale does.
+    cameras = replace(rig, width=width * factor, height=height * factor).scaled(width, height)
+    try:
+        return check_matches(cameras, match_images(images), rig_only=rig_only)
+    except InputError as fault:
+        return [note("epipolar", f"the calibration was not compared with the pictures: {fault}")]

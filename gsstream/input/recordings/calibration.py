@@ -1,0 +1,246 @@
+"""cameras.json, schema "opencv-multiview-1": the rig, its split and where each camera's images lie."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import ShapeError, SourceError
+from gsstream.core.names import check_camera_ids
+from gsstream.input.recordings.base import Split
+
+SCHEMA = "opencv-multiview-1"
+#: Beyond these a file describes no recording; checked before anything is allocated or opened.
+MAX_SIDE, MAX_FRAMES, MAX_TEXT, MAX_PATTERN = 1 << 16, 10_000_000, 1 << 20, 1000
+CALIBRATION_FILE = "cameras.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What cameras.json says. ``patterns`` maps camera id to its image path pattern relative to the folder.
+
+    ``num_frames`` is 0 where a growing recording does not say yet.
+    """
+
+    name: str
+    fps: float
+    num_frames: int
+    licence: str
+    train: Cameras
+    test: Cameras
+    patterns: dict[str, str]
+
+
+def read_calibration(folder: Path, *, growing: bool = False, to_size: bool = False) -> Calibration:
+    """Read and check ``folder/cameras.json``.
+
+    Arguments:
+        folder: of the recording.
+        growing: the number of frames may be left out.
+        to_size: cameras of several sizes are given as they are once cut to the smallest width and height, where
+            pictures are about to be brought to that size; else they are an error.
+
+    Raises SourceError saying which file, camera or key is wrong, and what was expected.
+    """
+    if not folder.is_dir():
+        raise SourceError(f"{folder}: no such folder; expected a recording with {CALIBRATION_FILE} and its images")
+    path = folder / CALIBRATION_FILE
+    data = _load_json(path)
+    cameras = data.get("cameras")
+    if not isinstance(cameras, list) or not cameras or not all(isinstance(c, dict) for c in cameras):
+        raise SourceError(f"{path}: 'cameras' must be a non-empty list of objects, got {_brief(cameras)}")
+    ids = [_camera_id(path, camera, index) for index, camera in enumerate(cameras)]
+    if len(set(ids)) != len(ids):
+        twice = sorted({i for i in ids if ids.count(i) > 1})
+        raise SourceError(f"{path}: camera ids must be unique, these occur more than once: {', '.join(twice)}")
+    rig = _rig(path, ids, cameras, to_size)
+    splits = _splits(path, ids, cameras, data.get("test_cameras"))
+    train = [i for i, split in enumerate(splits) if split == "train"]
+    if not train:
+        raise SourceError(f'{path}: there is no training camera; give at least one camera "split": "train"')
+    return Calibration(
+        name=_text(path, "name", data.get("name", folder.name), MAX_PATTERN),
+        fps=_positive(path, "fps", data.get("fps", 30.0)),
+        num_frames=0 if growing and "frames" not in data else _count(path, data.get("frames")),
+        licence=_text(path, "licence", data.get("licence", ""), MAX_TEXT),
+        train=rig.select(train),
+        test=rig.select([i for i, split in enumerate(splits) if split == "test"]),
+        patterns={i: _pattern(path, i, camera) for i, camera in zip(ids, cameras, strict=True)},
+    )
+
+
+def _load_json(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise SourceError(
+            f"{path}: no such file; a recording folder holds {CALIBRATION_FILE} (schema {SCHEMA!r}) beside its images"
+        ) from error
+    except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, numbers of thousands of digits, deep nesting
+        raise SourceError(f"{path}: not valid JSON: {error}") from error
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error}") from error
+    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
+        got = data.get("schema") if isinstance(data, dict) else type(data).__name__
+        raise SourceError(f'{path}: expected "schema": "{SCHEMA}", got {got!r}; convert the calibration to it')
+    return data
+
+
+def _rig(path: Path, ids: list[str], cameras: list[dict[str, Any]], to_size: bool) -> Cameras:
+    sizes = {i: _size(path, i, camera) for i, camera in zip(ids, cameras, strict=True)}
+    first = sizes[ids[0]]
+    for camera_id, size in sizes.items():
+        if size != first and not to_size:
+            raise SourceError(
+                f"{path}: all cameras of a rig must share one image size, but {ids[0]!r} is {first[0]} x {first[1]} "
+                f"and {camera_id!r} is {size[0]} x {size[1]}; 'gsstream scene prepare' brings them to one"
+            )
+    poses = np.stack([_matrix(path, i, c, "w2c", 4) for i, c in zip(ids, cameras, strict=True)])
+    intrinsics = np.stack([_matrix(path, i, c, "K", 3) for i, c in zip(ids, cameras, strict=True)])
+    if to_size:
+        first = min(w for w, _ in sizes.values()), min(h for _, h in sizes.values())
+        intrinsics = np.stack([cut_to(K, sizes[i], first) for i, K in zip(ids, intrinsics, strict=True)])
+    rig = Cameras(tuple(ids), poses, intrinsics, *first)
+    try:
+        rig.validate()
+    except ShapeError as error:
+        raise SourceError(f"{path}: {error}") from error
+    for i, camera_id in enumerate(ids):
+        if not np.allclose(poses[i, 3], (0, 0, 0, 1)) or not np.allclose(intrinsics[i, 2], (0, 0, 1)):
+            raise SourceError(f"{path}: camera {camera_id!r}: the last row of w2c must be 0 0 0 1 and of K 0 0 1")
+    return rig
+
+
+def cut_to(K: np.ndarray[Any, Any], size: tuple[int, int], target: tuple[int, int]) -> np.ndarray[Any, Any]:
+    """Return intrinsics [3, 3] of pictures shrunk evenly until they cover ``target``, and cut around their middle.
+
+    Arguments:
+        K: [3, 3] before, pixels, corner origin.
+        size, target: (width, height) before and after. Sides whose shares agree within a pixel are shrunk each by its
+            own share, so that rounded heights cut nothing.
+    """
+    across, down = target[0] / size[0], target[1] / size[1]
+    if abs(across * size[1] - target[1]) < 1:
+        scaled: np.ndarray[Any, Any] = np.diag([across, down, 1.0]) @ K
+        return scaled
+    factor = max(across, down)
+    out: np.ndarray[Any, Any] = np.diag([factor, factor, 1.0]) @ K
+    out[:2, 2] -= (factor * np.array(size) - np.array(target)) / 2
+    return out
+
+
+def _splits(path: Path, ids: list[str], cameras: list[dict[str, Any]], named: Any) -> list[Split]:
+    if named is not None and not (isinstance(named, list) and all(isinstance(name, str) for name in named)):
+        raise SourceError(f"{path}: 'test_cameras' must be a list of camera ids, got {_brief(named)}")
+    test = set(named or [])
+    if unknown := sorted(str(t) for t in test - set(ids)):
+        names = ", ".join(map(repr, unknown))
+        raise SourceError(f"{path}: test camera {names} does not exist; cameras: {', '.join(ids)}")
+    splits: list[Split] = []
+    for camera_id, camera in zip(ids, cameras, strict=True):
+        split = camera.get("split", "test" if camera_id in test else "train")
+        if split not in ("train", "test"):
+            raise SourceError(f'{path}: camera {camera_id!r}: split must be "train" or "test", got {split!r}')
+        if named is not None and (split == "test") != (camera_id in test):
+            raise SourceError(
+                f"{path}: camera {camera_id!r} has split {split!r}, which contradicts 'test_cameras' {sorted(test)}"
+            )
+        splits.append(split)
+    return splits
+
+
+def _camera_id(path: Path, camera: dict[str, Any], index: int) -> str:
+    camera_id = camera.get("id")
+    if not isinstance(camera_id, str) or not camera_id:
+        raise SourceError(f"{path}: camera number {index} needs a non-empty text 'id', got {_brief(camera_id)}")
+    try:
+        check_camera_ids([camera_id])
+    except ShapeError as error:
+        raise SourceError(f"{path}: {error}") from error
+    return camera_id
+
+
+def _size(path: Path, camera_id: str, camera: dict[str, Any]) -> tuple[int, int]:
+    width, height = camera.get("width"), camera.get("height")
+    if type(width) is int and type(height) is int and 1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE:
+        return width, height
+    raise SourceError(
+        f"{path}: camera {camera_id!r}: width and height must be positive whole pixels up to {MAX_SIDE}, got "
+        f"{_brief(width)} x {_brief(height)}"
+    )
+
+
+def _matrix(path: Path, camera_id: str, camera: dict[str, Any], key: str, side: int) -> np.ndarray[Any, Any]:
+    try:
+        matrix = np.asarray(camera.get(key), dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise SourceError(f"{path}: camera {camera_id!r}: {key} is not a matrix of numbers ({error})") from error
+    if matrix.shape != (side, side):
+        raise SourceError(
+            f"{path}: camera {camera_id!r}: {key} must be a {side} x {side} matrix, got shape {list(matrix.shape)}"
+        )
+    return matrix
+
+
+def _pattern(path: Path, camera_id: str, camera: dict[str, Any]) -> str:
+    pattern = camera.get("frames")
+    if not isinstance(pattern, str) or not pattern:
+        raise SourceError(
+            f"{path}: camera {camera_id!r} has no frames; "
+            f'give "frames" as a path pattern such as "{camera_id}/%06d.png"'
+        )
+    if len(pattern) > MAX_PATTERN or re.search(r"%[^a-zA-Z]*\d{3}", pattern):
+        raise SourceError(f"{path}: camera {camera_id!r}: 'frames' {_brief(pattern)} is longer than a path can be")
+    try:
+        example = frame_path(pattern, 0)
+    except (TypeError, ValueError) as error:
+        raise SourceError(
+            f"{path}: camera {camera_id!r}: 'frames' {pattern!r} must hold one integer conversion "
+            f"such as %06d ({error})"
+        ) from error
+    if PurePosixPath(example).is_absolute() or ".." in PurePosixPath(example).parts:
+        raise SourceError(f"{path}: camera {camera_id!r}: 'frames' {pattern!r} must stay inside the recording's folder")
+    return pattern
+
+
+def frame_path(pattern: str, index: int) -> str:
+    """Return the relative path of a frame; a pattern without a conversion names the one image of a static set."""
+    return pattern % index if "%" in pattern else pattern
+
+
+def _count(path: Path, frames: Any) -> int:
+    if type(frames) is not int or not 1 <= frames <= MAX_FRAMES:
+        raise SourceError(
+            f"{path}: 'frames' must be the number of frames, at least 1 and at most {MAX_FRAMES}, got {_brief(frames)}"
+        )
+    return frames
+
+
+def _text(path: Path, key: str, value: Any, most: int) -> str:
+    """A text that streams, plots and terminals can carry; other plain values are written out."""
+    text = str(value)
+    if len(text) > most:
+        raise SourceError(f"{path}: {key!r} is {len(text)} letters long; expected at most {most}")
+    # The name of a folder may hold bytes that are not UTF-8; in a JSON text they are an error.
+    if path.parent.name != text and any("\ud800" <= sign <= "\udfff" for sign in text):
+        raise SourceError(f"{path}: {key!r} holds half of a character (a lone surrogate); write it as UTF-8")
+    return text
+
+
+def _positive(path: Path, key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 1e6:
+        raise SourceError(f"{path}: {key!r} must be a positive number below a million, got {_brief(value)}")
+    return float(value)
+
+
+def _brief(value: Any) -> str:
+    if isinstance(value, int) and abs(value) >= 10**60:
+        return "a number of more than 60 digits"
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,105 @@
+"""A recording in coordinates that its own cameras define, whatever those of its files are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import SourceError
+from gsstream.core.frame import Frame, PointCloud
+from gsstream.core.world import World, own_world, snapped
+from gsstream.input.recordings.base import FrameSource, GrowingSource, HurriedSource, PointKind, SourceInfo, Split
+
+#: Points farther from the rig than this many of its extents leave the range in which positions can be coded.
+FARTHEST = 1e12
+
+
+def world_of(source: FrameSource) -> World:
+    """Return the world that a recording's cameras define, training and test cameras together.
+
+    So it does not depend on the split.
+
+    Arguments:
+        source: an open recording, in the coordinates of its files.
+    """
+    train, test = source.info.train, source.info.test
+    rig = replace(
+        train,
+        ids=(*train.ids, *test.ids),
+        viewmats=np.concatenate([train.viewmats, test.viewmats]),
+        Ks=np.concatenate([train.Ks, test.Ks]),
+    )
+    return own_world(rig, source.points)
+
+
+def as_filed(source: FrameSource) -> FrameSource:
+    """Return a recording in the coordinates of its files, for checks of what the files say.
+
+    Poses that were written the wrong way round are mended by inverting them in those coordinates, and in no others.
+
+    Arguments:
+        source: an open recording; closing it closes the result.
+    """
+    return source.filed if isinstance(source, CanonicalSource) else source
+
+
+class CanonicalSource:
+    """A frame source over another one: the same images, with cameras and points in the coordinates of a world.
+
+    ``info.world`` leads back. Thread-safe when the inner source is.
+
+    Arguments:
+        source: an open recording, in the coordinates of its files.
+        world: :func:`world_of` it, or of the recording that it shows a part of.
+    """
+
+    def __init__(self, source: FrameSource, world: World) -> None:
+        self._source, self._world = source, world
+        info = source.info
+        self._info = replace(info, train=self._placed(info.train), test=self._placed(info.test), world=world)
+
+    @property
+    def info(self) -> SourceInfo:
+        """The inner recording's, with cameras in this world."""
+        return self._info
+
+    @property
+    def filed(self) -> FrameSource:
+        """The inner recording, in the coordinates of its files."""
+        return self._source
+
+    def frame(self, index: int, split: Split = "train") -> Frame:
+        """Read one instant. Raises SourceError as the inner source does."""
+        frame = self._source.frame(index, split)
+        return replace(frame, cameras=self._placed(frame.cameras))
+
+    def points(self, kind: PointKind = "recording") -> PointCloud | None:
+        """Return the inner source's points in this world, float32. Raises SourceError for one that is absurdly far."""
+        cloud = self._source.points(kind)
+        if cloud is None:
+            return None
+        xyz = self._world.points_back(cloud.xyz)
+        if len(xyz) and not float(np.abs(xyz).max()) < FARTHEST:
+            raise SourceError(
+                f"points of {self._info.name!r} ({cloud.origin}): expected positions within {FARTHEST:g} times the "
+                f"size of the rig, got one at {float(np.abs(xyz).max()):g}; take it out of the file"
+            )
+        return replace(cloud, xyz=xyz.astype(np.float32))
+
+    def interrupt(self) -> None:
+        """End the waits of an inner source that grows; others never wait."""
+        if isinstance(self._source, GrowingSource):
+            self._source.interrupt()
+
+    def effort(self, index: int) -> float:
+        """Return what a frame of an inner source that grows is worth now; 1 of any other."""
+        return self._source.effort(index) if isinstance(self._source, HurriedSource) else 1.0
+
+    def close(self) -> None:
+        """Close the inner source."""
+        self._source.close()
+
+    def _placed(self, rig: Cameras) -> Cameras:
+        return snapped(self._world.cameras_back(rig))

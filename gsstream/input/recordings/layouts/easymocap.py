@@ -1,0 +1,138 @@
+"""ENeRF-Outdoor and other EasyMocap recordings: intri.yml, extri.yml, images/00/000000.jpg (or videos/00.mp4).
+
+OpenCV file storage. ``names``: camera ids. intri.yml: ``K_00`` 3 x 3 in pixels with (0, 0) in the *centre* of the first
+pixel (OpenCV's convention; half a pixel is added on reading), ``dist_00`` k1, k2, p1, p2, k3. extri.yml: ``Rot_00``
+3 x 3 (or ``R_00``, a rotation vector) and ``T_00``: world to camera, OpenCV axes, usually metres.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+from ruamel.yaml.nodes import MappingNode, ScalarNode, SequenceNode
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import SourceError
+from gsstream.core.shapes import FloatArray
+from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, folder_clip
+from gsstream.input.recordings.distortion import Lens
+from gsstream.input.recordings.poses import from_pixel_centers, from_rotation_vector
+from gsstream.input.recordings.recorded import Recording
+from gsstream.input.recordings.sync import RecordingWarning
+
+INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
+
+
+def looks_like(folder: Path) -> bool:
+    """Say whether there is an intri.yml beside an extri.yml."""
+    return (folder / INTRINSICS).is_file() and (folder / EXTRINSICS).is_file()
+
+
+def read(folder: Path) -> Recording:
+    """Read ENeRF-Outdoor: 18 cameras, 1920 x 1080, 30 frames per second; the first camera (00) judges (paper)."""
+    intri, extri = _load(folder / INTRINSICS), _load(folder / EXTRINSICS)
+    names = intri.get("names")
+    if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):
+        raise SourceError(f"{folder / INTRINSICS}: 'names' must list the cameras")
+    clips = {n: clip for n in sorted(names) if (clip := _clip_of(folder, n)) is not None}
+    if not clips:
+        raise SourceError(f"{folder}: no pictures of any camera; expected images/NAME/000000.jpg or videos/NAME.mp4")
+    if blind := sorted(set(names) - set(clips)):
+        note = f"{folder / INTRINSICS}: cameras without pictures are left out: {', '.join(blind)}"
+        warnings.warn(note, RecordingWarning, stacklevel=2)
+    names = list(clips)
+    poses, Ks, lenses = [], [], {}
+    for name in names:
+        Ks.append(from_pixel_centers(_matrix(folder / INTRINSICS, intri, f"K_{name}", (3, 3))))
+        poses.append(_pose(folder / EXTRINSICS, extri, name))
+        lens = _lens(folder / INTRINSICS, intri, name)
+        if lens is not None and not lens.is_identity:
+            lenses[name] = lens
+    rig = Cameras(tuple(names), np.stack(poses), np.stack(Ks), *clips[names[0]].size)
+    return Recording(
+        name=folder.resolve().name,
+        where=str(folder / INTRINSICS),
+        rig=rig,
+        clips=clips,
+        test=(names[0],),
+        lenses=lenses,
+        licence="see the data set",
+    )
+
+
+def _clip_of(folder: Path, name: str) -> Clip | None:
+    if (folder / "images" / name).is_dir():
+        return folder_clip(folder / "images" / name)
+    for suffix in VIDEO_SUFFIXES:
+        if (path := folder / "videos" / f"{name}{suffix}").is_file():
+            from gsstream.input.recordings.video import VideoClip
+
+            return VideoClip(path)
+    return None
+
+
+def _load(path: Path) -> dict[str, Any]:
+    """OpenCV's YAML: a first line that YAML does not know, and matrices under a tag of their own."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        # "%YAML:1.0" is no YAML directive; "- 00" in a list of names must stay a text.
+        body = "\n".join(line for line in text.splitlines() if not line.startswith("%YAML"))
+        node = YAML(typ="safe", pure=True).compose(body)
+    except (OSError, UnicodeDecodeError) as error:
+        raise SourceError(f"{path}: cannot be read: {error}") from error
+    except YAMLError as error:
+        place = str(error).splitlines()
+        raise SourceError(f"{path}: not valid YAML: {place[0] if place else error}") from error
+    if not isinstance(node, MappingNode):
+        raise SourceError(f"{path}: expected names, K_00, ... as keys")
+    return {str(key.value): _plain(value) for key, value in node.value}
+
+
+def _plain(node: Any) -> Any:
+    """Texts stay texts: "00" is a name, and numbers are read where a matrix is wanted."""
+    if isinstance(node, MappingNode):
+        return {str(key.value): _plain(value) for key, value in node.value}
+    if isinstance(node, SequenceNode):
+        return [_plain(item) for item in node.value]
+    return node.value if isinstance(node, ScalarNode) else None
+
+
+def _matrix(path: Path, data: dict[str, Any], key: str, shape: tuple[int, ...]) -> FloatArray:
+    entry = data.get(key)
+    values = entry.get("data") if isinstance(entry, dict) else None
+    if values is None:
+        raise SourceError(f"{path}: no matrix {key!r}; every camera in 'names' needs one")
+    try:
+        matrix = np.array([float(v) for v in values])
+    except (TypeError, ValueError) as error:
+        raise SourceError(f"{path}: {key!r} holds something that is not a number ({error})") from error
+    if matrix.size != np.prod(shape):
+        raise SourceError(f"{path}: {key!r} must hold {int(np.prod(shape))} numbers, got {matrix.size}")
+    return matrix.reshape(shape)
+
+
+def _pose(path: Path, data: dict[str, Any], name: str) -> FloatArray:
+    pose = np.eye(4)
+    if f"Rot_{name}" in data:
+        pose[:3, :3] = _matrix(path, data, f"Rot_{name}", (3, 3))
+    else:
+        pose[:3, :3] = from_rotation_vector(_matrix(path, data, f"R_{name}", (3,)))
+    pose[:3, 3] = _matrix(path, data, f"T_{name}", (3,))
+    return pose
+
+
+def _lens(path: Path, data: dict[str, Any], name: str) -> Lens | None:
+    for key in (f"dist_{name}", f"D_{name}"):
+        entry = data.get(key)
+        if isinstance(entry, dict):
+            count = len(entry.get("data") or ())
+            if count not in (4, 5):
+                raise SourceError(f"{path}: {key!r} must hold k1, k2, p1, p2 and maybe k3, got {count} numbers")
+            k1, k2, p1, p2, *k3 = _matrix(path, data, key, (count,)).tolist()
+            return Lens("radial", (k1, k2, *k3), (p1, p2))
+    return None

@@ -1,0 +1,142 @@
+"""CMU Panoptic as Dynamic 3D Gaussians ships it: train_meta.json, test_meta.json, ims/CAMERA/000000.jpg.
+
+Per instant t and camera c: ``k[t][c]`` 3 x 3 pixels, ``w2c[t][c]`` 4 x 4 world to camera with OpenCV axes,
+``fn[t][c]`` the picture below ims/, ``cam_id[t][c]``; ``w``, ``h`` once. Intrinsics are used with the origin at the
+image corner, as that project's renderer does. World units are about metres. Pictures are undistorted already.
+``init_pt_cld.npz``: ``data`` [P, 7] xyz, rgb in [0, 1], foreground; it comes from depth sensors, not from the cameras.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import SourceError
+from gsstream.core.frame import PointCloud
+from gsstream.input.recordings.clips import Clip, ImageClip
+from gsstream.input.recordings.recorded import Recording, SeenPoints
+
+TRAIN, TEST, IMAGES, POINTS = "train_meta.json", "test_meta.json", "ims", "init_pt_cld.npz"
+
+
+def looks_like(folder: Path) -> bool:
+    """Say whether there is a train_meta.json beside ims/."""
+    return (folder / TRAIN).is_file() and (folder / IMAGES).is_dir()
+
+
+def read(folder: Path) -> Recording:
+    """Read CMU Panoptic: 27 training cameras, 640 x 360, 150 frames; those of test_meta.json judge (0, 10, 15, 30)."""
+    ids: list[str] = []
+    poses, intrinsics = [], []
+    clips: dict[str, Clip] = {}
+    sizes = set()
+    test: tuple[str, ...] = ()
+    for name in (TRAIN, TEST):
+        path = folder / name
+        if name == TEST and not path.is_file():
+            continue
+        meta = _load(path)
+        sizes.add((_whole(path, meta, "w"), _whole(path, meta, "h")))
+        names = [f"cam{number}" for number in _fixed(path, meta, "cam_id")]
+        files = _files(path, meta, len(names))
+        for c, camera in enumerate(names):
+            if camera in clips:
+                raise SourceError(f"{path}: camera {camera!r} is there twice, in {TRAIN} and {TEST} or within one")
+            clips[camera] = ImageClip([folder / IMAGES / row[c] for row in files])
+        ids += names
+        poses.append(_matrices(path, meta, "w2c", len(names), 4))
+        intrinsics.append(_matrices(path, meta, "k", len(names), 3))
+        test = tuple(names) if name == TEST else test
+    if len(sizes) != 1:
+        raise SourceError(f"{folder / TEST}: the size of the pictures differs from {TRAIN}: {sorted(sizes)}")
+    rig = Cameras(tuple(ids), np.concatenate(poses), np.concatenate(intrinsics), *sizes.pop())
+    return Recording(
+        name=folder.resolve().name,
+        where=str(folder / TRAIN),
+        rig=rig,
+        clips=clips,
+        test=test,
+        points=lambda: _points(folder / POINTS, len(ids)),
+        licence="CMU Panoptic: research use only",
+    )
+
+
+def _load(path: Path) -> dict[str, Any]:
+    try:
+        meta = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error}") from error
+    except ValueError as error:
+        raise SourceError(f"{path}: not valid JSON: {error}") from error
+    known = meta if isinstance(meta, dict) else {}
+    if missing := [key for key in ("w", "h", "k", "w2c", "fn", "cam_id") if key not in known]:
+        raise SourceError(f"{path}: expected the keys w, h, k, w2c, fn, cam_id; missing: {', '.join(missing)}")
+    return known
+
+
+def _whole(path: Path, meta: dict[str, Any], key: str) -> int:
+    if type(meta[key]) is not int or meta[key] < 1:
+        raise SourceError(f"{path}: {key!r} must be a positive number of pixels, got {meta[key]!r}")
+    return int(meta[key])
+
+
+def _fixed(path: Path, meta: dict[str, Any], key: str) -> list[Any]:
+    """A list per instant that must be the same at every instant."""
+    rows = meta[key]
+    if not isinstance(rows, list) or not rows or not isinstance(rows[0], list) or not rows[0]:
+        raise SourceError(f"{path}: {key!r} must be a list per instant of lists per camera")
+    for t, row in enumerate(rows):
+        if row != rows[0]:
+            raise SourceError(f"{path}: {key!r} of instant {t} differs from instant 0; cameras must stay the same")
+    first: list[Any] = rows[0]
+    return first
+
+
+def _files(path: Path, meta: dict[str, Any], cameras: int) -> list[list[str]]:
+    rows: list[list[str]] = meta["fn"]
+    good = isinstance(rows, list) and all(
+        isinstance(row, list) and len(row) == cameras and all(isinstance(f, str) for f in row) for row in rows
+    )
+    if not good or len(rows) != len(meta["cam_id"]):
+        raise SourceError(f"{path}: 'fn' must name one picture per instant and camera ({cameras} cameras)")
+    for name in rows[0]:
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            raise SourceError(f"{path}: picture {name!r} must stay inside {IMAGES}/")
+    return rows
+
+
+def _matrices(path: Path, meta: dict[str, Any], key: str, cameras: int, side: int) -> np.ndarray[Any, Any]:
+    try:
+        values = np.asarray(meta[key], np.float64)
+    except (TypeError, ValueError) as error:
+        raise SourceError(f"{path}: {key!r} is not an array of numbers ({error})") from error
+    if values.shape[1:] != (cameras, side, side) or len(values) == 0:
+        raise SourceError(
+            f"{path}: {key!r} must be [instants, {cameras} cameras, {side}, {side}], got {list(values.shape)}"
+        )
+    moved = ~(np.abs(values - values[:1]).max((1, 2, 3)) <= 1e-6 * np.abs(values[0]).max())
+    if moved.any():
+        raise SourceError(
+            f"{path}: {key!r} changes with time, first at instant {int(moved.argmax())}; only cameras that stand still "
+            "are supported"
+        )
+    first: np.ndarray[Any, Any] = values[0]
+    return first
+
+
+def _points(path: Path, cameras: int) -> SeenPoints | None:
+    if not path.is_file():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            data = arrays["data"]
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise SourceError(f"{path}: expected a numpy archive with an array 'data': {error}") from error
+    if data.ndim != 2 or data.shape[1] not in (6, 7) or not np.isfinite(data).all():
+        raise SourceError(f"{path}: expected 'data' [P, 7] of finite numbers, got {list(data.shape)}")
+    cloud = PointCloud(data[:, :3].astype(np.float64), data[:, 3:6].astype(np.float32), path.name)
+    return SeenPoints(cloud, np.zeros((len(cloud), cameras), bool))

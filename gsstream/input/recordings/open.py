@@ -1,0 +1,92 @@
+"""Turn what the user typed into a frame source."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gsstream.core.errors import SourceError
+from gsstream.input.recordings.base import FrameSource
+from gsstream.input.recordings.detect import LAYOUTS, detect, read_layout
+from gsstream.input.recordings.multiview import MultiviewSource
+from gsstream.input.recordings.recorded import RecordedSource
+
+DEMO_FOLDER = Path(__file__).parent / "demo" / "pickblocks_tiny_160"
+_KNOWN = (
+    "'demo' (a small recording inside the package), "
+    "'synthetic:' with options such as 'synthetic:frames=40&views=8' (an analytic scene of any length), "
+    "'watch:DIR' (a folder that is still being written), "
+    "'disturbed:KEY=VALUE,...:' before any of them (an experiment), "
+    f"or the path of a folder, read by its layout or as you say: folder:DIR, {':DIR, '.join(LAYOUTS)}:DIR"
+)
+
+
+def open_source(uri: str, scale: float = 1.0) -> FrameSource:
+    """Open a recording.
+
+    Arguments:
+        uri: ``demo``, ``synthetic:key=value&...``, ``watch:DIR?key=value&...``, the path of a folder in a known layout,
+            LAYOUT:DIR, or ``disturbed:key=value,...:`` before any of these.
+        scale: images are shrunk by this factor in (0, 1] on reading.
+
+    Raises SourceError for an unknown uri, naming what exists, and for a faulty recording.
+    """
+    if uri == "demo":
+        return MultiviewSource(DEMO_FOLDER, scale=scale, uri=uri)
+    scheme, separator, rest = uri.partition(":")
+    if separator and scheme == "synthetic":
+        from gsstream.input.recordings.synthetic import SyntheticSource
+
+        return SyntheticSource.from_query(rest, scale=scale, uri=uri)
+    if separator and scheme == "watch":
+        from gsstream.input.recordings.watch import WatchSource
+
+        return WatchSource.from_query(rest, scale=scale)
+    if separator and scheme == "disturbed":
+        return _disturbed(rest, scale, uri)
+    named = scheme if separator and scheme in (*LAYOUTS, "folder") else None
+    folder = Path(rest if named else uri)
+    # Path takes an empty text for the current folder, which is never what was meant.
+    if not (uri and _exists(folder)) and not named:
+        raise SourceError(f"source {uri[:200]!r}: no such folder and no known scheme; expected {_KNOWN}")
+    if named == "nerfstudio" and not _exists(folder):
+        return _nerfstudio(rest, scale, uri)
+    layout = named or detect(folder)
+    if layout == "folder":
+        return MultiviewSource(folder, scale=scale, uri=uri)
+    return RecordedSource(read_layout(layout, folder), scale=scale, uri=uri)
+
+
+def _disturbed(rest: str, scale: float, uri: str) -> FrameSource:
+    """``disturbed:KEY=VALUE,...:URI``. Raises SourceError for an unknown key, and what opening URI raises."""
+    from gsstream.input.recordings.disturbed import DisturbedSource, parse_disturbances
+
+    text, colon, inner = rest.partition(":")
+    if not colon:
+        raise SourceError(f"source {uri[:200]!r}: expected disturbed:KEY=VALUE,...:URI, e.g. disturbed:gain=0.8:demo")
+    options, seed = parse_disturbances(text)
+    source = open_source(inner, scale)
+    try:
+        return DisturbedSource(source, options, seed, uri)
+    except SourceError:
+        source.close()
+        raise
+
+
+def _nerfstudio(rest: str, scale: float, uri: str) -> FrameSource:
+    """``nerfstudio:DIR?missing=refuse``. Raises SourceError for another option."""
+    from gsstream.input.recordings.layouts.nerfstudio import read
+
+    text, _, query = rest.partition("?")
+    if query not in ("", "missing=refuse", "missing=skip"):
+        raise SourceError(f"source {uri[:200]!r}: expected ?missing=skip or ?missing=refuse, got ?{query[:100]}")
+    if not Path(text).is_dir():
+        return RecordedSource(read_layout("nerfstudio", Path(text)), scale=scale, uri=uri)
+    return RecordedSource(read(Path(text), "refuse" if query.endswith("refuse") else "skip"), scale=scale, uri=uri)
+
+
+def _exists(folder: Path) -> bool:
+    """Whether there is such a folder or file. Raises SourceError for a text that cannot be a path at all."""
+    try:
+        return folder.exists()
+    except (OSError, ValueError) as error:
+        raise SourceError(f"source {str(folder)[:200]!r} cannot be a path: {error}") from error

@@ -1,0 +1,110 @@
+"""Decode frames ahead of their use, on threads, with bounded memory."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from types import TracebackType
+
+from gsstream.core.errors import EndOfRecording, GsstreamError, InputError, SourceError
+from gsstream.core.frame import Frame
+from gsstream.core.storage import Storage, packed, unpacked
+from gsstream.input.recordings.base import FrameSource, GrowingSource
+from gsstream.input.recordings.canonical import as_filed
+
+FramePair = tuple[Frame, Frame]
+
+
+class Prefetcher:
+    """Iterate (training frame, test frame) pairs in the given order, at most ``depth`` pairs ahead of the consumer.
+
+    Memory: ``depth`` pairs plus the one the consumer holds. An error while reading a frame is raised when that frame's
+    turn comes, after all earlier frames were delivered; iteration then ends. It also ends, without an error, where a
+    growing recording does. Use as a context manager, or call
+    ``close``, so that threads end even when the consumer stops early.
+
+    Arguments:
+        source: where frames come from; its ``frame`` must be callable from several threads.
+        indices: which frames, in which order.
+        depth: pairs decoded ahead, at least 1.
+        workers: decoding threads, at least 1.
+        storage: how training images wait; they are delivered as float32.
+    """
+
+    def __init__(
+        self, source: FrameSource, indices: Iterable[int], *, depth: int = 2, workers: int = 1,
+        storage: Storage = "float32",
+    ) -> None:  # fmt: skip
+        if depth < 1 or workers < 1:
+            raise InputError(f"prefetcher: depth and workers must be at least 1, got depth {depth}, workers {workers}")
+        self._source, self._storage = source, storage
+        self._todo = iter(indices)
+        self._pending: deque[Future[tuple[FramePair, float]]] = deque()
+        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="gsstream-prefetch")
+        self._decode_seconds: list[float] = []
+        for _ in range(depth):
+            self._submit()
+
+    @property
+    def decode_seconds(self) -> tuple[float, ...]:
+        """Seconds one thread spent reading each delivered pair, in order of delivery."""
+        return tuple(self._decode_seconds)
+
+    def __iter__(self) -> Iterator[FramePair]:
+        return self
+
+    def __next__(self) -> FramePair:
+        if not self._pending:
+            self.close()
+            raise StopIteration
+        try:
+            pair, seconds = self._pending.popleft().result()
+        except EndOfRecording:
+            self.close()
+            raise StopIteration from None
+        except BaseException:
+            self.close()
+            raise
+        self._submit()
+        self._decode_seconds.append(seconds)
+        return replace(pair[0], images=unpacked(pair[0].images)), pair[1]
+
+    def __enter__(self) -> Prefetcher:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Drop what is decoded, cancel what is queued and wait for the reads in progress (one pair per thread)."""
+        for future in self._pending:
+            future.cancel()
+        self._pending.clear()
+        self._todo = iter(())
+        if isinstance(self._source, GrowingSource):
+            self._source.interrupt()
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def _submit(self) -> None:
+        # Taking one index at a time keeps the bound even for an endless stream of indices.
+        for index in self._todo:
+            self._pending.append(self._pool.submit(_read_pair, self._source, index, self._storage))
+            break
+
+
+def _read_pair(source: FrameSource, index: int, storage: Storage) -> tuple[FramePair, float]:
+    start = time.perf_counter()
+    try:
+        train = source.frame(index, "train")
+        pair = replace(train, images=packed(train.images, storage)), source.frame(index, "test")
+    except GsstreamError:
+        raise
+    except Exception as error:  # a source may be a plugin's: its failure is reported with its name
+        name = type(as_filed(source)).__name__
+        raise SourceError(f"{name} could not read frame {index}: {type(error).__name__}: {error}") from error
+    return pair, time.perf_counter() - start

@@ -1,0 +1,164 @@
+"""A calibrated rig whose cameras are clips: what every reader of a layout returns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import ShapeError, SourceError
+from gsstream.core.frame import Frame, PointCloud
+from gsstream.core.names import check_camera_ids
+from gsstream.core.shapes import BoolArray, FloatArray
+from gsstream.input.recordings.base import PointKind, SourceInfo, Split, check_index
+from gsstream.input.recordings.clips import PREPARE, Clip
+from gsstream.input.recordings.distortion import Lens, Undistorter, pinhole_intrinsics
+from gsstream.input.recordings.multiview import scaled_size
+from gsstream.input.recordings.sync import align
+
+
+@dataclass(frozen=True, slots=True)
+class SeenPoints:
+    """Points and who took part in them: ``seen`` [P, C] bool over the cameras of the rig, in its order."""
+
+    cloud: PointCloud
+    seen: BoolArray
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """What a reader found on disk.
+
+    Arguments:
+        name: short name.
+        where: the calibration file, for messages.
+        rig: all cameras, world-to-camera, OpenCV axes, corner origin; ``Ks`` are those of the images as stored.
+        clips: camera id -> its pictures, in the order of the rig.
+        test: ids of the cameras that only judge.
+        fps: frames per second; videos know better.
+        lenses: camera id -> distortion, where there is any.
+        points: reads points of frame 0; None when none ship.
+    """
+
+    name: str
+    where: str
+    rig: Cameras
+    clips: Mapping[str, Clip]
+    test: tuple[str, ...] = ()
+    fps: float = 30.0
+    lenses: Mapping[str, Lens] = field(default_factory=dict)
+    points: Callable[[], SeenPoints | None] = lambda: None
+    licence: str = ""
+
+
+class RecordedSource:
+    """Frames of a :class:`Recording`. Thread-safe.
+
+    Cameras with distortion are resampled on reading, to the widest pinhole image without empty corners; ``info`` holds
+    the intrinsics of what ``frame`` delivers.
+
+    Arguments:
+        scale: factor in (0, 1] on width and height; images are area-averaged and intrinsics follow.
+        uri: how the user asked for it.
+
+    Raises SourceError when clips and calibration disagree, or clips among themselves.
+    """
+
+    def __init__(self, recording: Recording, *, scale: float = 1.0, uri: str) -> None:
+        self._recording = recording
+        rig = _checked(recording)
+        self._target = scaled_size((rig.width, rig.height), scale)
+        self._alignment = align(recording.name, recording.clips)
+        self._undistort: dict[str, Undistorter] = {}
+        flat = self._flattened(rig).scaled(*self._target)
+        test = [i for i, name in enumerate(rig.ids) if name in recording.test]
+        train = [i for i, name in enumerate(rig.ids) if name not in recording.test]
+        if not train:
+            raise SourceError(f"{recording.where}: there is no training camera among {', '.join(rig.ids)}")
+        self._info = SourceInfo(
+            name=recording.name,
+            uri=uri,
+            num_frames=self._alignment.num_frames,
+            fps=self._alignment.fps or recording.fps,
+            train=flat.select(train),
+            test=flat.select(test),
+            licence=recording.licence,
+        )
+
+    @property
+    def info(self) -> SourceInfo:
+        """What the recording says about itself; cameras at the size that ``frame`` delivers."""
+        return self._info
+
+    def frame(self, index: int, split: Split = "train") -> Frame:
+        """Read one instant. Raises SourceError naming the file when a picture is missing or damaged."""
+        cameras = self._info.train if split == "train" else self._info.test
+        check_index(self._info, index)
+        images: FloatArray = np.empty((len(cameras), cameras.height, cameras.width, 3), np.float32)
+        for row, name in enumerate(cameras.ids):
+            images[row] = self.image(index, name)
+        return Frame(index, index / self._info.fps, images, cameras)
+
+    def image(self, index: int, camera: str) -> FloatArray:
+        """Return one camera's image [H, W, 3] float32 in [0, 1]."""
+        check_index(self._info, index)
+        image = self._recording.clips[camera].read(index + self._alignment.skip[camera], self._target)
+        return self._undistort[camera](image) if camera in self._undistort else image
+
+    def points(self, kind: PointKind = "recording") -> PointCloud | None:
+        """Return the points that ship, without those in which a test camera took part; None when none are left."""
+        return self.points_without(self._info.test.ids, kind)
+
+    def points_without(self, cameras: Sequence[str], kind: PointKind = "recording") -> PointCloud | None:
+        """Return the points in which none of these cameras took part; None when none are left."""
+        found = self._recording.points()
+        if found is None:
+            return None
+        barred = [i for i, name in enumerate(self._recording.rig.ids) if name in cameras]
+        keep = ~found.seen[:, barred].any(1)
+        if not keep.any():
+            return None
+        return replace(found.cloud, xyz=found.cloud.xyz[keep], rgb=found.cloud.rgb[keep])
+
+    def close(self) -> None:
+        """Close the clips."""
+        for clip in self._recording.clips.values():
+            clip.close()
+
+    def _flattened(self, rig: Cameras) -> Cameras:
+        """The rig with the intrinsics of the pinhole images that are delivered."""
+        Ks = rig.Ks.copy()
+        scale = np.diag([self._target[0] / rig.width, self._target[1] / rig.height, 1.0])
+        for i, name in enumerate(rig.ids):
+            lens = self._recording.lenses.get(name)
+            if lens is None or lens.is_identity:
+                continue
+            where = f"{self._recording.where}: camera {name!r}"
+            Ks[i] = pinhole_intrinsics(lens, rig.Ks[i], (rig.width, rig.height), where)
+            self._undistort[name] = Undistorter(lens, scale @ rig.Ks[i], scale @ Ks[i], self._target)
+        return replace(rig, Ks=Ks)
+
+
+def _checked(recording: Recording) -> Cameras:
+    """The rig, once its clips are known to fit it."""
+    rig = recording.rig
+    try:
+        check_camera_ids(rig.ids)
+        rig.validate()
+    except ShapeError as error:
+        raise SourceError(f"{recording.where}: {error}") from error
+    if not len(rig):
+        raise SourceError(f"{recording.where}: no cameras")
+    for name in recording.test:
+        if name not in rig.ids:
+            raise SourceError(f"{recording.where}: test camera {name!r} does not exist; cameras: {', '.join(rig.ids)}")
+    for name, clip in recording.clips.items():
+        if clip.size != (rig.width, rig.height):
+            raise SourceError(
+                f"{clip.where}: pictures of camera {name!r} are {clip.size[0]} x {clip.size[1]} pixels, but "
+                f"{recording.where} is for {rig.width} x {rig.height}; all cameras of a rig share one size: correct "
+                f"the calibration, or {PREPARE}"
+            )
+    return rig

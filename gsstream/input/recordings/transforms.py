@@ -1,0 +1,223 @@
+"""What is done to a recording before a run sees it: who trains, time shifts, gain, noise, lost images. Pure functions.
+
+Everything is decided by the options and a seed. With the defaults nothing is touched.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import SourceError, suggest
+from gsstream.core.rng import Rng
+from gsstream.core.shapes import FloatArray
+from gsstream.input.recordings.options import DataOptions, Disturbances
+
+
+def parse_offsets(entries: Sequence[str], ids: Sequence[str]) -> dict[str, int]:
+    """Return camera -> frames, from "ID@FRAMES". Raises SourceError naming the entry."""
+    found: dict[str, int] = {}
+    for entry in entries:
+        name, _, value = entry.rpartition("@")
+        if not re.fullmatch(r"-?\d{1,9}", value):
+            raise SourceError(
+                f"disturbed source: time_offset: expected ID@FRAMES+..., whole frames, e.g. cam03@2, got {entry!r}"
+            )
+        found[_known("disturbed source: time_offset", name, ids, found)] = int(value)
+    return found
+
+
+def parse_losses(entries: Sequence[str], ids: Sequence[str]) -> dict[str, list[range]]:
+    """Return camera -> frames in which it gives nothing, from "ID@A-B".
+
+    Frame 0 cannot be lost: it is the key picture.
+    """
+    found: dict[str, list[range]] = {}
+    for entry in entries:
+        name, _, value = entry.rpartition("@")
+        match = re.fullmatch(r"(\d{1,9})-(\d{1,9})", value)
+        first, last = (int(n) for n in match.groups()) if match else (0, 0)
+        if not 1 <= first < last:
+            raise SourceError(
+                f"disturbed source: lost_cameras: expected ID@A-B with 1 <= A < B, e.g. cam03@10-20, got {entry!r}; "
+                "frame 0 needs every training camera (leave one out with data.train_cameras)"
+            )
+        found.setdefault(_known("disturbed source: lost_cameras", name, ids, ()), []).append(range(first, last))
+    return found
+
+
+def _known(key: str, name: str, ids: Sequence[str], taken: Sequence[str] | dict[str, int]) -> str:
+    if name not in ids:
+        raise SourceError(f"{key}: no camera {name!r}{suggest(name, ids)}")
+    if name in taken:
+        raise SourceError(f"{key}: camera {name!r} is given twice")
+    return name
+
+
+class ChosenSplit(NamedTuple):
+    """Ids of the cameras that train, of those that judge, and of those that a run must see nothing of."""
+
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+    away: tuple[str, ...] = ()
+
+
+def choose_split(options: DataOptions, train: Cameras, test: Cameras) -> ChosenSplit:
+    """Return who trains and who judges, as the options of a recipe ask for.
+
+    Arguments:
+        options: section ``data`` of the recipe; of it ``split``, ``test_cameras``, ``train_cameras``, ``train_views``
+            and ``leak``.
+        train, test: cameras of the recording's own split.
+
+    Raises SourceError for unknown or repeated ids, a camera on both sides, no training camera left, or a leak in the
+    tuning split.
+    """
+    ids = (*train.ids, *test.ids)
+    tests = test.ids if options.test_cameras is None else _named("data.test_cameras", options.test_cameras, ids)
+    left = tuple(i for i in ids if i not in tests)
+    trains = left if options.train_cameras is None else _named("data.train_cameras", options.train_cameras, ids)
+    if both := [i for i in trains if i in tests]:
+        raise SourceError(
+            f"data.train_cameras: {', '.join(both)} would train and test; name other cameras, or say "
+            "data.leak=training if that is meant"
+        )
+    if options.train_views is not None:
+        trains = _far_apart(trains, options.train_views, train, test)
+    if options.split == "tuning":
+        return _for_tuning(options, trains, tests, _centers(trains, train, test))
+    if options.leak == "training":
+        trains = (*trains, *tests)
+    if not trains:
+        raise SourceError(f"data: no training camera is left; test cameras: {', '.join(tests)}")
+    return ChosenSplit(trains, tests)
+
+
+#: One training camera in so many judges in the tuning split, rounded to the nearest number, and at least one.
+TRAINING_TO_JUDGES = 6
+
+
+def _for_tuning(
+    options: DataOptions, trains: tuple[str, ...], tests: tuple[str, ...], centers: FloatArray
+) -> ChosenSplit:
+    """The tuning split of a reporting split; ``centers`` [T, 3] are those of its training cameras."""
+    if options.leak != "none":
+        raise SourceError(
+            f"data.split: the tuning split takes the test cameras away, got data.leak={options.leak}, which uses "
+            "them; choose settings with data.leak=none"
+        )
+    if len(trains) < 2:
+        raise SourceError(
+            f"data.split: the tuning split needs two training cameras, one of which judges; got {len(trains)}"
+        )
+    count = max(1, (len(trains) + TRAINING_TO_JUDGES // 2) // TRAINING_TO_JUDGES)
+    judges = [trains[i] for i in _medoids(centers, count)]
+    return ChosenSplit(tuple(i for i in trains if i not in judges), tuple(judges), tests)
+
+
+def _medoids(centers: FloatArray, count: int) -> list[int]:
+    """Rows of ``count`` of the points to which the others are nearest (k-medoids by swaps), in order.
+
+    Judges that lie farthest apart would be the rim of the rig, where no training camera is left around them. Medoids
+    are spread over the whole rig and lie in the middle of their neighbours, as test cameras usually do.
+    """
+    apart = np.linalg.norm(centers[:, None].astype(np.float64) - centers[None], axis=2)
+    rows = range(len(centers))
+
+    def cost(chosen: list[int]) -> float:
+        return float(apart[:, chosen].min(1).sum())
+
+    chosen: list[int] = []
+    for _ in range(count):
+        chosen.append(min((i for i in rows if i not in chosen), key=lambda i: cost([*chosen, i])))
+    # A swap has to gain more than rounding, so that it ends and cameras in regular rows give the same answer anywhere.
+    while True:
+        swaps = [[*chosen[:k], i, *chosen[k + 1 :]] for k in range(count) for i in rows if i not in chosen]
+        best = min(swaps, key=cost, default=chosen)
+        if cost(best) >= cost(chosen) * (1 - 1e-6):
+            return sorted(chosen)
+        chosen = best
+
+
+def _named(key: str, wanted: tuple[str, ...], ids: tuple[str, ...]) -> tuple[str, ...]:
+    for position, name in enumerate(wanted):
+        _known(key, name, ids, wanted[:position])
+    return wanted
+
+
+def _far_apart(names: tuple[str, ...], count: int, train: Cameras, test: Cameras) -> tuple[str, ...]:
+    """The first ``count`` cameras of a farthest-point order, so that fewer views are a subset of more; in rig order."""
+    if count > len(names):
+        raise SourceError(f"data.train_views: there are only {len(names)} training cameras, got {count}")
+    centers = _centers(names, train, test)
+    chosen = [int(np.linalg.norm(centers - centers.mean(0), axis=1).argmin())]
+    while len(chosen) < count:
+        gaps = np.linalg.norm(centers[:, None] - centers[None, chosen], axis=2).min(1)
+        gaps[chosen] = -1  # cameras may share a place
+        chosen.append(int(gaps.argmax()))
+    return tuple(names[i] for i in sorted(chosen))
+
+
+def _centers(names: tuple[str, ...], train: Cameras, test: Cameras) -> FloatArray:
+    places = dict(zip((*train.ids, *test.ids), np.concatenate([train.centers, test.centers]), strict=True))
+    return np.array([places[name] for name in names]).reshape(-1, 3)
+
+
+def gain_at(options: Disturbances, index: int, rng: Rng) -> float:
+    """Return the factor on all images of frame ``index``, in gain * [1 - amplitude, 1 + amplitude].
+
+    Arguments:
+        options: the disturbances.
+        index: of the frame.
+        rng: random streams by name and frame.
+    """
+    if options.gain_pattern == "sine":
+        wave = math.sin(2 * math.pi * index / options.gain_period)
+    else:
+        wave = float(rng.numpy("data gain", index).uniform(-1, 1))
+    return options.gain * (1 + options.gain_amplitude * wave)
+
+
+def with_gain(image: FloatArray, factor: float) -> FloatArray:
+    """Return the image times a factor; what exceeds 1 saturates, as in a camera."""
+    if factor == 1:
+        return image
+    out: FloatArray = np.minimum(image * np.float32(factor), np.float32(1))
+    return out
+
+
+def with_noise(image: FloatArray, sigma: float, camera: str, index: int, rng: Rng) -> FloatArray:
+    """Return the image with Gaussian noise of ``sigma`` 8-bit levels, clipped to [0, 1] (paper, first-frame noise).
+
+    Arguments:
+        image: [H, W, 3] in [0, 1].
+        sigma: 8-bit levels.
+        camera: id.
+        index: of the frame.
+        rng: random streams by name and frame.
+    """
+    noise = rng.numpy(f"data noise {camera}", index).standard_normal(image.shape, np.float32)
+    out: FloatArray = np.clip(image + noise * np.float32(sigma / 255), 0, 1)
+    return out
+
+
+def is_lost(options: Disturbances, losses: dict[str, list[range]], camera: str, index: int, rng: Rng) -> bool:
+    """Say whether a training camera gives nothing at a frame; never at frame 0.
+
+    Arguments:
+        options: the disturbances.
+        losses: camera -> frames in which it gives nothing.
+        camera: id.
+        index: of the frame.
+        rng: random streams by name and frame.
+    """
+    if index == 0:
+        return False
+    if any(index in frames for frames in losses.get(camera, ())):
+        return True
+    return options.lost_share > 0 and bool(rng.numpy(f"data loss {camera}", index).random() < options.lost_share)

@@ -1,0 +1,280 @@
+"""A recording that is still being written: follow a folder of images, frame by frame, until its end is clear."""
+
+from __future__ import annotations
+
+import threading
+import time
+import warnings
+from collections.abc import Collection
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from gsstream.core.errors import EndOfRecording, SourceError
+from gsstream.core.frame import Arrival, Frame, PointCloud
+from gsstream.core.shapes import FloatArray
+from gsstream.input.recordings.base import PointKind, SourceInfo, Split
+from gsstream.input.recordings.calibration import CALIBRATION_FILE, Calibration, frame_path, read_calibration
+from gsstream.input.recordings.images import read_image
+from gsstream.input.recordings.multiview import POINTS_FILE, read_points, scaled_size
+from gsstream.input.recordings.watch_options import WatchOptions
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """What is delivered as one frame: ``effort``, and from which earlier frame cameras are held.
+
+    ``skipped``: the run is behind; nobody looks at its files, and the last images of all training cameras stand in.
+    """
+
+    effort: float = 1.0
+    held: tuple[tuple[str, int], ...] = ()
+    skipped: bool = False
+
+
+_WHOLE = _Plan()
+
+
+class WatchSource:
+    """Frames of a growing folder in the layout of cameras.json. ``frame`` waits until the frame is there.
+
+    A frame once delivered never changes: a file that is written again later is not read again by the run. On a finished
+    folder, and when nothing is dropped or held, it delivers what :class:`MultiviewSource` does.
+
+    Arguments:
+        folder: holds cameras.json from the start ("frames" may be left out), images come as they are captured.
+        uri: how the user asked for it. ``info.uri`` is the folder: streams name the recording, not how it was followed.
+
+    Raises SourceError at construction for a faulty calibration.
+    """
+
+    def __init__(self, folder: Path, options: WatchOptions, *, scale: float = 1.0) -> None:
+        self._folder, self._options = folder, options
+        calibration = read_calibration(folder, growing=True)
+        _check_patterns(folder, calibration)
+        self._native = (calibration.train.width, calibration.train.height)
+        self._target = scaled_size(self._native, scale)
+        self._patterns = calibration.patterns
+        self._ids = (*calibration.train.ids, *calibration.test.ids)
+        self._train = frozenset(calibration.train.ids)
+        self._declared = calibration.num_frames or None
+        self._info = SourceInfo(
+            name=calibration.name,
+            uri=str(folder),
+            num_frames=self._declared,
+            fps=calibration.fps,
+            train=calibration.train.scaled(*self._target),
+            test=calibration.test.scaled(*self._target),
+            licence=calibration.licence,
+        )
+        self._plans: dict[int, _Plan] = {}  # only frames that are not delivered whole
+        self._next, self._skip_to, self._newest = 0, 0, 0
+        self._decoded: dict[tuple[str, int], FloatArray] = {}  # of the frame that is waited for
+        self._faults: dict[str, str] = {}
+        self._last: dict[str, int] = {}
+        self._stop, self._planning = threading.Event(), threading.Lock()
+
+    @classmethod
+    def from_query(cls, rest: str, *, scale: float = 1.0) -> WatchSource:
+        """Build from ``"DIR?timeout=10&behind=drop"``. Raises SourceError naming an unknown or impossible option."""
+        folder, _, query = rest.partition("?")
+        if not folder:
+            raise SourceError("watch source: expected watch:DIR or watch:DIR?key=value&..., got no folder")
+        return cls(Path(folder), WatchOptions.from_query(query), scale=scale)
+
+    @property
+    def info(self) -> SourceInfo:
+        """What is known now: ``num_frames`` is None until it is declared or the end has been seen."""
+        return self._info
+
+    def frame(self, index: int, split: Split = "train") -> Frame:
+        """Wait for one instant and read it.
+
+        Raises EndOfRecording when the recording ended before it. Test cameras are left out of a frame in which one of
+        them is absent, so that nothing is measured against an image of another time.
+        """
+        if index < 0:
+            raise SourceError(f"recording {self._info.name!r} has no frame {index}; frames are counted from 0")
+        plan = self._plan(index)
+        cameras = self._info.train if split == "train" else self._info.test
+        held = dict(plan.held)
+        if split == "test" and (plan.skipped or any(camera_id in held for camera_id in cameras.ids)):
+            cameras = cameras.select([])
+        images: FloatArray = np.empty((len(cameras), self._target[1], self._target[0], 3), np.float32)
+        for i, camera_id in enumerate(cameras.ids):
+            images[i] = self._image(camera_id, held.get(camera_id, index))
+        arrival = self._arrival(index, () if plan.skipped else held)
+        return Frame(index, index / self._info.fps, images, cameras, plan.effort, arrival)
+
+    def effort(self, index: int) -> float:
+        """Return what a frame is worth now that its turn has come: more may wait than when it was read ahead."""
+        return 1.0 if index == 0 else min(self._plan(index).effort, self._effort(index))
+
+    def points(self, kind: PointKind = "recording") -> PointCloud | None:
+        """Return points that were written beside cameras.json before the run began, or None."""
+        path = self._folder / POINTS_FILE
+        return read_points(path, kind) if path.exists() else None
+
+    def interrupt(self) -> None:
+        """End all waits: frames that are not there yet raise EndOfRecording from now on."""
+        self._stop.set()
+
+    def close(self) -> None:
+        """End all waits; nothing stays open between reads."""
+        self.interrupt()
+
+    def _arrival(self, index: int, held: Collection[str]) -> Arrival:
+        """How a frame came in; test cameras count as to when, for it was not handed over before they were there."""
+        came = self._newest_of(set(self._ids).difference(held), index)
+        return Arrival(came, tuple(name for name in self._info.train.ids if name in held))
+
+    def _image(self, camera_id: str, index: int) -> FloatArray:
+        """The image that was decoded to see that it is whole, while it is at hand; else read again."""
+        ready = self._decoded.get((camera_id, index))
+        return read_image(self._path(camera_id, index), self._native, self._target) if ready is None else ready
+
+    def _path(self, camera_id: str, index: int) -> Path:
+        return self._folder / frame_path(self._patterns[camera_id], index)
+
+    def _plan(self, index: int) -> _Plan:
+        """Decide frame by frame, once: what was decided stays, whoever asks."""
+        if index >= self._next:
+            with self._planning:
+                while self._next <= index:
+                    plan = self._decide(self._next)
+                    if plan != _WHOLE:
+                        before = self._plans.get(self._next - 1)
+                        self._plans[self._next] = before if before == plan else plan
+                    if not plan.skipped:
+                        self._last |= dict.fromkeys(set(self._ids) - {name for name, _ in plan.held}, self._next)
+                    self._next += 1
+        return self._plans.get(index, _WHOLE)
+
+    def _decide(self, index: int) -> _Plan:
+        if self._info.num_frames is not None and index >= self._info.num_frames:
+            raise EndOfRecording(f"the recording ended after {self._info.num_frames} frames")
+        if 0 < index < self._skip_to:  # images of all training cameras came, and newer ones
+            return _Plan(0.0, tuple((name, self._last[name]) for name in self._info.train.ids), skipped=True)
+        absent = self._wait(index)
+        untrained = [name for name in absent if name in self._train]
+        held = tuple((name, self._last[name]) for name in absent)
+        if untrained and self._options.missing == "drop":
+            return _Plan(0.0, held)
+        return _Plan(self._effort(index), held)
+
+    def _effort(self, index: int) -> float:
+        """1 while the run keeps up; less when more frames wait than the queue may hold."""
+        if self._options.behind == "block":
+            return 1.0
+        if index < self._skip_to:
+            return 0.0
+        self._newest = max(self._newest, index)
+        last = float("inf") if self._declared is None else self._declared - 1
+        while self._newest < last and all(self._path(name, self._newest + 1).exists() for name in self._train):
+            self._newest += 1
+        waiting = self._newest - index
+        if waiting <= self._options.queue:
+            return 1.0
+        if self._options.behind == "hurry":
+            return max(self._options.least_effort, self._options.queue / waiting)
+        self._skip_to = self._newest
+        return 0.0
+
+    def _wait(self, index: int) -> list[str]:
+        """Wait until every camera's image is there and whole, or the policy gives up; the cameras that are absent."""
+        seen: dict[str, tuple[int, int]] = {}
+        whole: set[str] = set()
+        self._decoded, self._faults = {}, {}
+        changed = began = time.monotonic()
+        while True:
+            ended = (self._folder / self._options.end).exists()
+            before = dict(seen)
+            open_names = [name for name in self._ids if name not in whole]
+            settled = [name for name in open_names if self._settled(name, index, seen, changed, ended)]
+            whole |= {name for name in settled if self._decodes(name, index)}
+            absent = [name for name in self._ids if name not in whole]
+            if not absent:
+                return []
+            now = time.monotonic()
+            changed = now if seen != before else changed
+            if self._give_up(index, absent, whole, now - began):
+                return absent
+            if ended or self._stop.is_set() or now - changed >= self._options.timeout:
+                self._end(index, absent, ended)
+            self._stop.wait(self._options.poll)
+
+    def _settled(
+        self, name: str, index: int, seen: dict[str, tuple[int, int]], changed: float, ended: bool
+    ) -> bool:
+        """Whether a camera's file counts as written; ``seen`` remembers (size, time of change) of the last look."""
+        try:
+            state = self._path(name, index).stat()
+        except FileNotFoundError:
+            return False
+        known, seen[name] = seen.get(name), (state.st_size, state.st_mtime_ns)
+        if state.st_size == 0:
+            return False
+        if self._options.ready == "rename" or ended or self._path(name, index + 1).exists():
+            return True
+        still = known == seen[name] and time.monotonic() - changed >= self._options.settle
+        return still or time.time() - state.st_mtime >= self._options.settle
+
+    def _decodes(self, name: str, index: int) -> bool:
+        """A writer may stall in the middle of a file; what does not decode is not there yet."""
+        try:
+            self._decoded[name, index] = read_image(self._path(name, index), self._native, self._target)
+        except SourceError as error:
+            self._faults[name] = str(error)
+            return False
+        return True
+
+    def _give_up(self, index: int, absent: list[str], whole: set[str], waited: float) -> bool:
+        """Whether the absent cameras have had their grace, counted from the newest image of the others."""
+        if self._options.missing == "wait" or not whole or index == 0:
+            return False
+        if all(self._path(name, index + 1).exists() for name in absent):
+            return True  # they have moved on: this image will not come
+        # Times of files are those of the writer's clock, which may be ahead of ours or behind: they are compared with
+        # each other, never with the time here.
+        newest, later = (self._newest_of(whole, frame) for frame in (index, index + 1))
+        passed = 0.0 if newest is None or later is None else later - newest
+        return max(waited, passed) >= self._options.grace
+
+    def _newest_of(self, names: set[str], index: int) -> float | None:
+        """Time of the newest image of a frame, by the writer's clock; None: none of them is there (any more)."""
+        times = []
+        for name in names:
+            with suppress(FileNotFoundError):
+                times.append(self._path(name, index).stat().st_mtime)
+        return max(times, default=None)
+
+    def _end(self, index: int, absent: list[str], ended: bool) -> None:
+        """Nothing more will come: say why when it is not what the writer announced, and raise EndOfRecording."""
+        if index == 0 and not self._stop.is_set():
+            raise SourceError(
+                f"{self._folder}: frame 0 needs every camera{self._lacking(absent)}; start the capture before the run "
+                "ends its wait (timeout=), or take the camera out of cameras.json"
+            )
+        self._info = replace(self._info, num_frames=index)
+        partly = len(absent) < len(self._ids)
+        reason = f"{self._options.end} was written" if ended else f"nothing came for {self._options.timeout:g} s"
+        if not self._stop.is_set() and (partly or not ended):
+            lacking = f"; frame {index} is left out{self._lacking(absent)}" if partly else ""
+            warnings.warn(f"{self._folder}: the recording ends after {index} frames: {reason}{lacking}", stacklevel=2)
+        raise EndOfRecording(f"the recording ended after {index} frames")
+
+    def _lacking(self, absent: list[str]) -> str:
+        """What is known of the cameras whose image did not come, with the first one's reason when there is one."""
+        fault = next((f": {self._faults[name]}" for name in absent if name in self._faults), "")
+        return f" (no whole image of {', '.join(absent)}{fault})"
+
+
+def _check_patterns(folder: Path, calibration: Calibration) -> None:
+    for name, pattern in calibration.patterns.items():
+        if "%" not in pattern:
+            raise SourceError(
+                f"{folder / CALIBRATION_FILE}: camera {name!r}: 'frames' {pattern!r} names a single image; a growing "
+                "recording needs a pattern such as %06d"
+            )

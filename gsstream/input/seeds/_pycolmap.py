@@ -1,0 +1,298 @@
+"""The one module that imports pycolmap: ``python -m gsstream.input.seeds._pycolmap TASK FOLDER`` in its own process.
+
+zlib comes first on purpose: pycolmap 4.1 and later carry a zlib of their own, and when they are the first to load the
+system's one, the two mix and the next compression corrupts the heap. Loaded first, the system's zlib binds to itself.
+"""
+
+from __future__ import annotations
+
+import os
+import zlib  # noqa: F401  must precede pycolmap, see above
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+IMAGES, RIG, RESULT, MATCHES = "images", "rig.npz", "points.npz", "matches.npz"
+
+
+def triangulate(folder: Path) -> None:
+    """Triangulate SIFT matches of ``folder/images/*.png`` with the known poses of ``folder/rig.npz``.
+
+    Writes ``folder/points.npz``: xyz [P, 3] float64, rgb [P, 3] uint8, error [P] pixels, track [P] views.
+    Deterministic: fixed seeds, features in the order of names, one thread for all else. SIFT only: the wheel's learned
+    features end the process.
+    """
+    database = extract(folder, most=8192)
+    with np.load(folder / RIG) as rig, pycolmap.Database.open(database) as db:
+        reconstruction = _known_rig(db, rig["viewmats"], rig["Ks"], *map(int, rig["size"]))
+    match_all(database)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed = 1, 0
+    sparse = folder / "sparse"
+    sparse.mkdir()
+    reconstruction = pycolmap.triangulate_points(reconstruction, database, folder / IMAGES, sparse, options=options)
+    points = reconstruction.points3D
+    order = sorted(points)
+    np.savez(
+        folder / RESULT,
+        xyz=np.array([points[i].xyz for i in order]).reshape(-1, 3),
+        rgb=np.array([points[i].color for i in order], np.uint8).reshape(-1, 3),
+        error=np.array([points[i].error for i in order]),
+        track=np.array([points[i].track.length() for i in order], np.int64),
+        **observations(reconstruction, points, order),
+    )
+
+
+def extract(folder: Path, most: int, mode: str = "PER_IMAGE", model: str = "SIMPLE_RADIAL") -> Path:
+    """Find SIFT features of ``folder/images``, at most ``most`` per image; return the path of the new database.
+
+    Images are worked on at the same time, so they are finished in any order; the database that is returned has them in
+    the order of their names, and so the same input gives the same numbers whatever the machine.
+
+    Arguments:
+        folder: that holds ``images``. most: features per image.
+        mode: how cameras are shared among images, in COLMAP's words. model: lens model, COLMAP's name.
+    """
+    pycolmap.set_random_seed(0)
+    scratch, database = folder / "features.db", folder / "database.db"
+    extraction, reader = pycolmap.FeatureExtractionOptions(), pycolmap.ImageReaderOptions()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    extraction.num_threads, extraction.use_gpu = cores, False
+    # Small images hold little contrast per octave; the stock threshold finds too few points below 640 pixels.
+    extraction.sift.peak_threshold, extraction.sift.max_num_features = 0.002, most
+    reader.camera_model = model
+    pycolmap.extract_features(
+        scratch, folder / IMAGES, camera_mode=getattr(pycolmap.CameraMode, mode), reader_options=reader,
+        extraction_options=extraction,
+    )  # fmt: skip
+    _in_order(scratch, database)
+    return database
+
+
+def _in_order(source: Path, target: Path) -> None:
+    """Copy cameras, images and features into a new database, numbered in the order of the images' names."""
+    cameras: dict[int, Any] = {}
+    rigs: dict[int, int] = {}
+    with pycolmap.Database.open(source) as old, pycolmap.Database.open(target) as new:
+        for image in sorted(old.read_all_images(), key=lambda image: image.name):
+            if image.camera_id not in cameras:
+                camera = old.read_camera(image.camera_id)
+                camera.camera_id = pycolmap.INVALID_CAMERA_ID
+                camera.camera_id = new.write_camera(camera)
+                rig = pycolmap.Rig()
+                rig.add_ref_sensor(camera.sensor_id)
+                cameras[image.camera_id], rigs[image.camera_id] = camera, new.write_rig(rig)
+            own = pycolmap.Image(name=image.name, camera_id=cameras[image.camera_id].camera_id)
+            own.image_id = number = new.write_image(own)
+            frame = pycolmap.Frame()
+            frame.rig_id = rigs[image.camera_id]
+            frame.add_data_id(own.data_id)
+            new.write_frame(frame)
+            new.write_keypoints(number, old.read_keypoints(image.image_id))
+            new.write_descriptors(number, old.read_descriptors(image.image_id))
+
+
+def match_all(database: Path) -> None:
+    """Match all pairs of images and verify each pair's geometry."""
+    matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    matching.num_threads, matching.use_gpu = 1, False
+    verification.ransac.random_seed = 0
+    pycolmap.match_exhaustive(database, matching_options=matching, verification_options=verification)
+
+
+def match(folder: Path) -> None:
+    """Find verified matches of ``folder/images``.
+
+    They are pairs [K, 2], counts [K], first and second [sum of counts, 2] pixels.
+
+    Writes ``folder/matches.npz``. Nothing is known about the cameras, so each pair is verified without calibration.
+    """
+    database = extract(folder, most=2048)
+    match_all(database)
+    pairs, counts, first, second = [], [], [np.zeros((0, 2))], [np.zeros((0, 2))]
+    with pycolmap.Database.open(database) as db:
+        images = sorted(db.read_all_images(), key=lambda image: image.name)
+        keypoints = [np.asarray(db.read_keypoints(image.image_id), np.float64)[:, :2] for image in images]
+        for a in range(len(images)):
+            for b in range(a + 1, len(images)):
+                ids = images[a].image_id, images[b].image_id
+                if not db.exists_two_view_geometry(*ids):
+                    continue
+                inliers = np.asarray(db.read_two_view_geometry(*ids).inlier_matches, np.int64).reshape(-1, 2)
+                pairs.append((a, b))
+                counts.append(len(inliers))
+                first.append(keypoints[a][inliers[:, 0]])
+                second.append(keypoints[b][inliers[:, 1]])
+    np.savez(
+        folder / MATCHES,
+        pairs=np.array(pairs, np.int64).reshape(-1, 2),
+        counts=np.array(counts, np.int64),
+        first=np.concatenate(first),
+        second=np.concatenate(second),
+    )
+
+
+def observations(reconstruction: Any, points: Any, order: list[int]) -> dict[str, Any]:
+    """Return who saw each point: ``seen_point`` [S], ``seen_image`` [S], ``seen_error`` [S] pixels.
+
+    An image is given by the number in its name.
+
+    Arguments:
+        reconstruction: COLMAP's. points: its points, by id.
+        order: ids of the points, in the order of the rows.
+    """
+    point, image, off = [], [], []
+    for row, key in enumerate(order):
+        for element in points[key].track.elements:
+            shown = reconstruction.images[element.image_id]
+            point.append(row)
+            image.append(int(Path(shown.name).stem))
+            there = shown.project_point(points[key].xyz)
+            off.append(np.inf if there is None else np.linalg.norm(there - shown.points2D[element.point2D_idx].xy))
+    return {
+        "seen_point": np.array(point, np.int64),
+        "seen_image": np.array(image, np.int64),
+        "seen_error": np.array(off, np.float64),
+    }
+
+
+def _known_rig(db: Any, viewmats: Any, Ks: Any, width: int, height: int) -> Any:
+    """A reconstruction without points whose cameras and poses are the given ones, with the database's numbering."""
+    reconstruction = pycolmap.Reconstruction()
+    for image in db.read_all_images():
+        index = int(Path(image.name).stem)
+        K = Ks[index]
+        camera = db.read_camera(image.camera_id)
+        camera.model = pycolmap.CameraModelId.PINHOLE
+        camera.width, camera.height = width, height
+        camera.params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+        camera.has_prior_focal_length = True
+        db.update_camera(camera)
+        reconstruction.add_camera_with_trivial_rig(camera)
+        pose = pycolmap.Rigid3d(viewmats[index, :3])
+        keyed = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
+        reconstruction.add_image_with_trivial_frame(keyed, pose)
+    return reconstruction
+
+
+def reconstruct(folder: Path) -> None:
+    """Find poses, intrinsics and points from ``folder/images/*.png`` and what ``folder/job.npz`` asks for.
+
+    job: model (COLMAP's name), shared (one camera for all), held (numbers of images that take no part in the mapping:
+    they are registered against the finished points, which they do not change).
+
+    Writes ``folder/points.npz`` (as :func:`triangulate`) with viewmats [C, 4, 4] (NaN: not registered) and params.
+    """
+    with np.load(folder / "job.npz") as job:
+        model, shared, held = str(job["model"]), bool(job["shared"]), {int(i) for i in job["held"]}
+    database = extract(folder, most=4096, mode="SINGLE" if shared else "PER_IMAGE", model=model)
+    match_all(database)
+    with pycolmap.Database.open(database) as db:
+        images = {int(Path(image.name).stem): image for image in db.read_all_images()}
+        known = {index: db.read_camera(image.camera_id) for index, image in images.items()}
+    best = _map(folder, database, [image.name for index, image in sorted(images.items()) if index not in held])
+    poses = {int(Path(image.name).stem): image.cam_from_world() for image in best.images.values() if image.has_pose}
+    cameras = {int(Path(image.name).stem): best.cameras[image.camera_id] for image in best.images.values()}
+    held_error = np.full(len(images), np.nan)
+    for index in sorted(held):
+        camera = next(iter(best.cameras.values())) if shared else known[index]
+        poses[index], held_error[index] = _register(database, images, best, index, camera, refine=not shared)
+        cameras[index] = camera
+    viewmats = np.full((len(images), 4, 4), np.nan)
+    for index, pose in poses.items():
+        if pose is not None:
+            viewmats[index] = np.vstack([pose.matrix(), (0, 0, 0, 1)])
+    order = sorted(best.points3D)
+    points = best.points3D
+    np.savez(
+        folder / RESULT,
+        viewmats=viewmats,
+        held_error=held_error,
+        cameras=np.array([cameras.get(index, known[index]).params for index in sorted(images)]),
+        xyz=np.array([points[i].xyz for i in order]).reshape(-1, 3),
+        rgb=np.array([points[i].color for i in order], np.uint8).reshape(-1, 3),
+        error=np.array([points[i].error for i in order]),
+        track=np.array([points[i].track.length() for i in order], np.int64),
+        **observations(best, points, order),
+    )
+
+
+def _map(folder: Path, database: Path, names: list[str]) -> Any:
+    """The mapping with most images, then least error, over a few settings: stock ones fail on few small images."""
+    best, rank = None, (0, 0.0)
+    for attempt, (inliers, angle, least) in enumerate(((100, 16.0, 30), (40, 8.0, 15))):
+        options = pycolmap.IncrementalPipelineOptions()
+        options.num_threads, options.random_seed, options.min_model_size = 1, 0, 2
+        options.image_names = names
+        options.mapper.init_min_num_inliers, options.mapper.init_min_tri_angle = inliers, angle
+        options.mapper.abs_pose_min_num_inliers = least
+        sparse = folder / f"sparse{attempt}"
+        sparse.mkdir()
+        for made in pycolmap.incremental_mapping(database, folder / IMAGES, sparse, options=options).values():
+            score = (made.num_reg_images(), -made.compute_mean_reprojection_error())
+            if best is None or score > rank:
+                best, rank = made, score
+        if rank[0] == len(names):
+            break
+    if best is None:
+        raise SystemExit("no pair of images shares enough features to begin with")
+    return best
+
+
+def _register(database: Path, images: Any, best: Any, index: int, camera: Any, refine: bool) -> Any:
+    """Pose of an image from its matches with mapped images, and its error in pixels; (None, nan) without a pose.
+
+    ``refine``: the camera's focal length and distortion are fitted too, in place.
+    """
+    flat, solid = [], []
+    mine = images[index]
+    with pycolmap.Database.open(database) as db:
+        keypoints = np.asarray(db.read_keypoints(mine.image_id), np.float64)[:, :2]
+        for other in best.images.values():
+            if not db.exists_two_view_geometry(mine.image_id, other.image_id):
+                continue
+            matches = np.asarray(db.read_two_view_geometry(mine.image_id, other.image_id).inlier_matches, np.int64)
+            for here, there in matches.reshape(-1, 2):
+                point = other.points2D[int(there)]
+                if point.has_point3D():
+                    flat.append(keypoints[here])
+                    solid.append(best.points3D[point.point3D_id].xyz)
+    if len(flat) < 12:
+        return None, np.nan
+    estimation, refinement = pycolmap.AbsolutePoseEstimationOptions(), pycolmap.AbsolutePoseRefinementOptions()
+    estimation.ransac.random_seed = 0
+    estimation.estimate_focal_length = refine
+    refinement.refine_focal_length = refinement.refine_extra_params = refine
+    found = pycolmap.estimate_and_refine_absolute_pose(
+        np.array(flat), np.array(solid), camera, estimation_options=estimation, refinement_options=refinement
+    )
+    if found is None:
+        return None, np.nan
+    inside = np.asarray(found["inlier_mask"], bool)
+    local = np.array([found["cam_from_world"] * xyz for xyz in np.array(solid)[inside]])
+    off = np.linalg.norm(camera.img_from_cam(local) - np.array(flat)[inside], axis=1)
+    return found["cam_from_world"], float(off.mean())
+
+
+def undistortion(folder: Path) -> None:
+    """Find where pinhole rays fall on the image of a real lens.
+
+    The lens is ``folder/lens.npz`` (model, params, size, rays [M, 2]).
+
+    Writes ``folder/places.npz``: uv [M, 2] pixels.
+    """
+    with np.load(folder / "lens.npz") as lens:
+        width, height = map(int, lens["size"])
+        camera = pycolmap.Camera(model=str(lens["model"]), width=width, height=height, params=lens["params"])
+        rays = np.hstack([lens["rays"], np.ones((len(lens["rays"]), 1))])
+    np.savez(folder / "places.npz", uv=np.asarray(camera.img_from_cam(rays), np.float64))
+
+
+TASKS = {"triangulate": triangulate, "match": match, "reconstruct": reconstruct, "undistortion": undistortion}
+
+if __name__ == "__main__":
+    import sys
+
+    TASKS[sys.argv[1]](Path(sys.argv[2]))

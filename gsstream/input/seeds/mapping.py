@@ -1,0 +1,143 @@
+"""Poses, lenses and points of one instant by structure from motion, in its own process. Needs ``gsstream[sfm]``."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import InputError
+from gsstream.core.shapes import BoolArray, FloatArray, IntArray
+from gsstream.input.seeds.sfm import run_pycolmap, write_images, write_rig
+
+#: Number of focal lengths among the parameters of a lens model; the principal point follows, then the distortion.
+LENSES = {"PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "OPENCV_FISHEYE": 2}
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """``model``: a key of LENSES (COLMAP's names); ``params``: focal lengths, principal point, distortion."""
+
+    model: str
+    params: tuple[float, ...]
+
+    @property
+    def K(self) -> FloatArray:
+        """[3, 3] intrinsics without distortion, pixels."""
+        count = LENSES[self.model]
+        fx, fy = self.params[0], self.params[count - 1]
+        return np.array([[fx, 0, self.params[count]], [0, fy, self.params[count + 1]], [0, 0, 1.0]])
+
+    @property
+    def distorts(self) -> bool:
+        """Whether any coefficient of distortion is not zero (a fisheye lens distorts with none)."""
+        return self.model == "OPENCV_FISHEYE" or any(self.params[LENSES[self.model] + 2 :])
+
+
+@dataclass(frozen=True, slots=True)
+class Mapping:
+    """What structure from motion found.
+
+    Arguments:
+        viewmats: [C, 4, 4]; NaN where a camera was not registered.
+        lenses: C lenses.
+        xyz, rgb, error, track: P points, their colours (uint8), reprojection errors (pixels) and numbers of views.
+        camera_error: [C] mean reprojection error, pixels; NaN where nothing is known.
+        camera_points: [C] points that each camera sees.
+    """
+
+    viewmats: FloatArray
+    lenses: tuple[Lens, ...]
+    xyz: FloatArray
+    rgb: IntArray
+    error: FloatArray
+    track: IntArray
+    camera_error: FloatArray
+    camera_points: IntArray
+
+    @property
+    def registered(self) -> BoolArray:
+        """[C] bool."""
+        return np.asarray(np.isfinite(self.viewmats).all(axis=(1, 2)))
+
+
+def reconstruct(
+    images: Sequence[FloatArray] | FloatArray, *, model: str = "SIMPLE_RADIAL", shared: bool = True,
+    held: Sequence[int] = (), timeout: float = 1800.0,
+) -> Mapping:  # fmt: skip
+    """Map C images [H, W, 3] in [0, 1] of one instant; of different sizes, unless they share a lens.
+
+    Arguments:
+        images: C images of one instant, [H, W, 3] each.
+        model: lens model, a key of LENSES.
+        shared: all cameras have one lens.
+        held: indices of cameras (test cameras) that take no part: no feature of theirs moves a pose or a point; they
+            are registered against the finished points.
+        timeout: seconds after which the process is ended.
+
+    The same input gives the same result. Raises InputError when pycolmap is missing or finds nothing to begin with.
+    """
+    if model not in LENSES:
+        raise InputError(f"lens model: expected one of {', '.join(LENSES)}, got {model!r}")
+    with tempfile.TemporaryDirectory(prefix="gsstream-sfm-") as name:
+        folder = Path(name)
+        write_images(folder, images)
+        np.savez(folder / "job.npz", model=model, shared=shared, held=np.array(held, np.int64))
+        run_pycolmap("reconstruct", folder, timeout)
+        with np.load(folder / "points.npz") as result:
+            found = dict(result)
+    lenses = tuple(Lens(model, tuple(map(float, params))) for params in found["cameras"])
+    return _mapping(found, found["viewmats"], lenses)
+
+
+def triangulate(images: FloatArray, cameras: Cameras, *, timeout: float = 1800.0) -> Mapping:
+    """Triangulate points of [C, H, W, 3] images in [0, 1] with known poses and pinhole lenses.
+
+    Each comes with what every camera saw.
+
+    Arguments:
+        images: [C, H, W, 3] in [0, 1].
+        cameras: the C cameras.
+        timeout: seconds.
+    """
+    with tempfile.TemporaryDirectory(prefix="gsstream-sfm-") as name:
+        folder = Path(name)
+        write_images(folder, images)
+        write_rig(folder, cameras)
+        run_pycolmap("triangulate", folder, timeout)
+        with np.load(folder / "points.npz") as result:
+            found = dict(result)
+    lenses = tuple(Lens("PINHOLE", (K[0, 0], K[1, 1], K[0, 2], K[1, 2])) for K in cameras.Ks)
+    return _mapping(found, cameras.viewmats, lenses)
+
+
+def _mapping(found: dict[str, Any], viewmats: FloatArray, lenses: tuple[Lens, ...]) -> Mapping:
+    count = len(lenses)
+    seen = np.bincount(found["seen_image"], minlength=count)
+    total = np.bincount(found["seen_image"], weights=found["seen_error"], minlength=count)
+    error = np.divide(total, seen, out=np.full(count, np.nan), where=seen > 0)
+    if "held_error" in found:
+        error = np.where(seen > 0, error, found["held_error"])
+    return Mapping(viewmats, lenses, found["xyz"], found["rgb"], found["error"], found["track"], error, seen)
+
+
+def lens_places(lens: Lens, size: tuple[int, int], rays: FloatArray) -> FloatArray:
+    """Return pixels [M, 2] at which a lens shows the directions ``rays`` [M, 2] (x / z, y / z).
+
+    Arguments:
+        lens: model and parameters.
+        size: (width, height).
+        rays: [M, 2] x / z and y / z.
+    """
+    with tempfile.TemporaryDirectory(prefix="gsstream-lens-") as name:
+        folder = Path(name)
+        np.savez(folder / "lens.npz", model=lens.model, params=np.array(lens.params), size=np.array(size), rays=rays)
+        run_pycolmap("undistortion", folder, 120.0)
+        with np.load(folder / "places.npz") as result:
+            places: FloatArray = result["uv"]
+    return places

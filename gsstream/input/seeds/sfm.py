@@ -1,0 +1,96 @@
+"""Sparse points of frame 0 by triangulation with the known poses; training images only. Needs ``gsstream[sfm]``."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import InputError
+from gsstream.core.frame import PointCloud
+from gsstream.core.needs import install_extra
+from gsstream.core.shapes import FloatArray, check_finite, check_shape
+
+
+def triangulate_points(
+    images: FloatArray, cameras: Cameras, *, max_error: float = 2.0, timeout: float = 900.0
+) -> PointCloud:
+    """Match SIFT features between all pairs of training images and triangulate them with the given poses.
+
+    Runs in a process of its own, so that an abort inside the native library does not take this one down.
+
+    Arguments:
+        cameras: the C cameras.
+        images: [C, H, W, 3] float32 in [0, 1] of C >= 2 training cameras.
+        max_error: points with a larger mean reprojection error are dropped, pixels.
+        timeout: seconds after which the process is ended.
+
+    Returns points in scene units with the mean colour of their features. The same input gives the same points.
+    Raises InputError when pycolmap is not installed, when the process fails, and when nothing could be triangulated.
+    """
+    check_shape("images", images, (len(cameras), cameras.height, cameras.width, 3))
+    check_finite("images", images)
+    with tempfile.TemporaryDirectory(prefix="gsstream-sfm-") as name:
+        folder = Path(name)
+        write_images(folder, images)
+        write_rig(folder, cameras)
+        run_pycolmap("triangulate", folder, timeout)
+        with np.load(folder / "points.npz") as result:
+            keep = np.isfinite(result["xyz"]).all(1) & (result["error"] <= max_error)
+            xyz, rgb = result["xyz"][keep], result["rgb"][keep]
+    if len(xyz) == 0:
+        raise InputError(
+            f"structure from motion found no points in {len(cameras)} training images of {cameras.width} x "
+            f"{cameras.height}: check the poses (world-to-camera, OpenCV axes), or use larger images"
+        )
+    colors = rgb.astype(np.float32) / np.float32(255)
+    return PointCloud(xyz.astype(np.float32), colors, f"triangulated from {len(cameras)} training images")
+
+
+def write_images(folder: Path, images: Iterable[FloatArray]) -> None:
+    """Write C images [H, W, 3] in [0, 1] where the pycolmap process looks for them, numbered."""
+    (folder / "images").mkdir()
+    for i, image in enumerate(images):
+        pixels = np.round(image * 255).astype(np.uint8)
+        Image.fromarray(pixels).save(folder / "images" / f"{i:04d}.png", compress_level=1)
+
+
+def write_rig(folder: Path, cameras: Cameras) -> None:
+    """Write the known poses and pinhole intrinsics for the pycolmap process."""
+    size = np.array([cameras.width, cameras.height])
+    np.savez(folder / "rig.npz", viewmats=cameras.viewmats, Ks=cameras.Ks, size=size)
+
+
+def run_pycolmap(task: str, folder: Path, timeout: float) -> None:
+    """Run one task of ``gsstream.input.seeds._pycolmap`` on a folder, in a process of its own.
+
+    Arguments:
+        task: name of a function there.
+        folder: with its input; its output goes there, too.
+        timeout: seconds.
+
+    Raises InputError when pycolmap is not installed, and when the process fails or takes more than ``timeout`` seconds.
+    """
+    if importlib.util.find_spec("pycolmap") is None:
+        raise InputError(
+            f"structure from motion needs pycolmap, which is not installed: {install_extra('sfm')}, "
+            "or give the recording a points_frame0.npz"
+        )
+    command = [sys.executable, "-m", "gsstream.input.seeds._pycolmap", task, str(folder)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise InputError(
+            f"structure from motion did not finish within {timeout:g} s; shrink the images (scale) or give points"
+        ) from error
+    if done.returncode != 0:
+        how = f"was ended by signal {-done.returncode}" if done.returncode < 0 else f"exited with {done.returncode}"
+        tail = " | ".join(done.stderr.strip().splitlines()[-3:])
+        raise InputError(f"structure from motion: the pycolmap process {how}: {tail}")

@@ -1,0 +1,101 @@
+"""Gaussians that are copied where the images pull at the scene, and fitted while the rest holds still."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from gsstream.core.changes import Rows, Scene, own_nodes
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.rng import Rng
+from gsstream.core.shapes import IntArray
+from gsstream.parts.growth.fitting import fitted_births, joined
+from gsstream.parts.render.work import FrameWork
+
+#: (frame as a scene shows it, rows [P] that are pulled, the largest first) -> those that may be copied, in that order.
+Admitted = Callable[[FrameWork, torch.Tensor], torch.Tensor]
+
+
+def replaced_by_copies(
+    scene: Scene, deaths: IntArray, work: FrameWork, epochs: int, rng: Rng, *, gradient: float, most: int, rounds: int,
+    prune_opacity: float, admitted: Admitted | None = None,
+) -> Rows:  # fmt: skip
+    """Return the change of rows in which some leave and the frame's copies are born, each a node of its own.
+
+    Arguments:
+        scene: N rows, after the frame's motions.
+        deaths: [D] int64 rows that leave, ascending.
+        work, epochs, rng, gradient, most, rounds, prune_opacity, admitted: as for :func:`fitted_copies`.
+    """
+    kept = scene.gaussians.rows(np.delete(np.arange(len(scene.gaussians)), deaths)).map(torch.from_numpy)
+    born = fitted_copies(
+        kept, work, epochs, rng, gradient=gradient, most=most, rounds=rounds, prune_opacity=prune_opacity,
+        admitted=admitted,
+    ).map(lambda value: value.numpy())
+    if not len(born):
+        return Rows(deaths=deaths)
+    return Rows(own_nodes(born, np.zeros(len(born), np.uint8), len(scene.layout.node_counts)), deaths)
+
+
+def fitted_copies(
+    scene: Gaussians[torch.Tensor], work: FrameWork, epochs: int, rng: Rng, *, gradient: float, most: int, rounds: int,
+    prune_opacity: float, admitted: Admitted | None = None,
+) -> Gaussians[torch.Tensor]:  # fmt: skip
+    """Return the Gaussians that a frame adds to a scene, raw values.
+
+    Arguments:
+        scene: N rows, after the frame's motions and without those that leave.
+        work: the frame.
+        epochs: passes over the training cameras, spread over the rounds.
+        rng: random streams by name and frame.
+        gradient: as for :func:`pulled_rows`.
+        most: Gaussians that are added at most.
+        rounds: times that the scene is searched for places.
+        prune_opacity: opacity below which an added Gaussian is given up, 0 to 1.
+        admitted: chooses among the places that are found; None: all of them.
+    """
+    born = scene.rows(slice(0, 0))
+    views = list(range(len(work.cameras)))
+    for round_ in range(rounds):
+        passes = epochs * (round_ + 1) // rounds - epochs * round_ // rounds
+        room = most - len(born)
+        if not passes or (room <= 0 and not len(born)):
+            continue
+        copies = _copies(work.on(joined(scene, born) if len(born) else scene), gradient, max(0, room), admitted)
+        born = joined(born, copies) if len(born) else copies
+        if not len(born):
+            continue
+        born = fitted_births(scene, born, work, views, passes, rng)
+        born = born.rows(born.opacities.sigmoid() >= prune_opacity)
+    return born
+
+
+def _copies(work: FrameWork, gradient: float, room: int, admitted: Admitted | None) -> Gaussians[torch.Tensor]:
+    """Copies of at most ``room`` Gaussians. What is rendered for it, a render for every camera, goes with the call."""
+    places = pulled_rows(work, gradient)
+    if admitted is not None:
+        places = admitted(work, places)
+    return work.gaussians.rows(places[:room].sort().values)
+
+
+def pulled_rows(work: FrameWork, gradient: float) -> torch.Tensor:
+    """Return the rows [P] whose mean screen gradient exceeds a bound, the largest first.
+
+    The gradient is that of the mean absolute difference between what a view shows and what its camera recorded; the
+    mean is over the views in which it is not zero.
+
+    Arguments:
+        work: the frame, seen from the scene that is searched.
+        gradient: the bound, in half image widths.
+    """
+    half = torch.tensor([work.cameras.width / 2, work.cameras.height / 2])
+    total, count = torch.zeros(len(work.gaussians)), torch.zeros(len(work.gaussians))
+    for view in range(len(work.cameras)):
+        difference = work.previous_render(view) - work.image(view)
+        norm = (work.screen_gradient(view, difference.sign() / difference.numel()).gradient * half).norm(dim=1)
+        total, count = total + norm, count + (norm > 0)
+    pull = total / count.clamp_min(1)
+    hot = (pull > gradient).nonzero()[:, 0]
+    return hot[torch.argsort(pull[hot], descending=True, stable=True)]

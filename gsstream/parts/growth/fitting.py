@@ -1,0 +1,63 @@
+"""Fitting newborn Gaussians to the images before they are sent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar, cast
+
+import numpy as np
+import torch
+
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.rng import Rng
+from gsstream.core.shapes import FloatArray
+from gsstream.parts.render.work import FrameWork
+from gsstream.parts.render.wrt import WrtRows
+
+Array = TypeVar("Array", torch.Tensor, FloatArray)
+#: Learning rates: those of 3DGS at the start of training; positions in standard deviations of each Gaussian.
+RATES = {"means": 0.1, "quats": 1e-2, "scales": 0.02, "opacities": 0.1, "sh0": 0.02, "shN": 1e-3}
+BETAS, EPSILON = (0.9, 0.99), 1e-15
+
+
+def joined(scene: Gaussians[Array], born: Gaussians[Array]) -> Gaussians[Array]:
+    """Return the rows of both, those of ``born`` behind those of ``scene``."""
+    values = {}
+    for name, value in scene.items():
+        both = (value, getattr(born, name))
+        values[name] = torch.cat(both) if isinstance(value, torch.Tensor) else np.concatenate(both)
+    return cast("Gaussians[Array]", Gaussians(**values))
+
+
+def fitted_births(
+    scene: Gaussians[torch.Tensor], born: Gaussians[torch.Tensor], work: FrameWork, views: Sequence[int], epochs: int,
+    rng: Rng,
+) -> Gaussians[torch.Tensor]:  # fmt: skip
+    """Return the newborn, optimised in these views while the scene holds still.
+
+    Arguments:
+        scene: N rows, raw values, as they are without what the newborn replace.
+        born: B rows, raw values.
+        work: the frame.
+        views: training cameras to fit to.
+        epochs: passes over them.
+        rng: of the order of views.
+    """
+    inner = work.on(joined(scene, born))
+    inner.narrow(torch.arange(len(scene), len(scene) + len(born)))
+    values = {name: value.clone() for name, value in born.items()}
+    first = {name: torch.zeros_like(value) for name, value in values.items()}
+    second = {name: torch.zeros_like(value) for name, value in values.items()}
+    size = born.scales.exp().mean(1, keepdim=True)
+    order, step = rng.numpy("growth/order", work.index), 0
+    for _ in range(epochs):
+        for place in order.permutation(len(views)):
+            step += 1
+            found = inner.loss_and_grad(views[place], WrtRows(Gaussians(**values)))
+            for name, grad in found.grad.items():
+                first[name] = BETAS[0] * first[name] + (1 - BETAS[0]) * grad
+                second[name] = BETAS[1] * second[name] + (1 - BETAS[1]) * grad.square()
+                way = first[name] / (1 - BETAS[0] ** step)
+                way = way / ((second[name] / (1 - BETAS[1] ** step)).sqrt() + EPSILON)
+                values[name] = values[name] - RATES[name] * (way * size if name == "means" else way)
+    return Gaussians(**values)

@@ -1,0 +1,20 @@
+"""None: the number of Gaussians stays what frame 0 made it."""
+
+from __future__ import annotations
+
+from typing import ClassVar, final
+
+from gsstream.core.changes import Rows, Scene
+from gsstream.core.rng import Rng
+from gsstream.parts.growth.base import Growth
+from gsstream.parts.render.work import FrameWork
+
+
+@final
+class NoGrowth(Growth):
+    """Proposes no births and no deaths (the null part, and S2GS as published)."""
+
+    source: ClassVar[str] = "gsstream"
+
+    def propose(self, after: Scene, work: FrameWork, rng: Rng) -> Rows | None:
+        return None

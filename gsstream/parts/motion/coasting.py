@@ -1,0 +1,56 @@
+"""Coasting: what moved in the last frame goes on moving."""
+
+from __future__ import annotations
+
+from typing import ClassVar, final
+
+import numpy as np
+from pydantic import Field
+
+from gsstream.core.changes import Motion, Scene
+from gsstream.core.changes.motion import moves_of
+from gsstream.core.part import PartConfig
+from gsstream.core.rng import Rng
+from gsstream.parts.motion.base import MotionPart
+from gsstream.parts.motion.groups import changed_groups, displaced_groups, known_groups
+from gsstream.parts.motion.switch import gains, some_views
+from gsstream.parts.render.work import FrameWork
+
+
+@final
+class Coasting(MotionPart):
+    """Lets every group that was displaced in the last frame, and lies in what changed now, continue at its velocity.
+
+    The velocity is the mean over the group's displaced rows, which every player computes from the packets so far: a
+    moving group costs about a bit. Where nothing changed nothing moves, so a velocity dies when its body stops.
+    """
+
+    class Config(PartConfig):
+        pixels: float = Field(default=8.0, gt=0, le=1000, description="side of a group, pixels at median distance")
+        shades: int = Field(default=1, ge=1, le=16, description="classes of brightness that split the groups of a cell")
+        votes: float = Field(
+            default=0.5, ge=0, le=1, description="share of its views in which a Gaussian must lie in changed tiles"
+        )
+        share: float = Field(default=0.5, ge=0, le=1, description="share of a group's Gaussians that must lie there")
+        displaced: float = Field(
+            default=0.1, ge=0, le=1, description="share of a group's Gaussians that the last frame must have displaced"
+        )
+        asked: float = Field(
+            default=0.5, ge=0, le=1, description="share of the cameras that judge each group, in turn; 0: none does"
+        )
+
+    source: ClassVar[str] = "gsstream"
+
+    def propose(self, scene: Scene, work: FrameWork, rng: Rng) -> tuple[Motion, ...]:
+        if scene.moved is None:
+            return ()
+        groups = known_groups(scene, work.cameras, self.config.pixels, self.config.shades)
+        config = self.config
+        moving = displaced_groups(groups, scene, config.displaced)
+        moving &= changed_groups(groups, work, config.votes, config.share)
+        if config.asked and moving.any():
+            moves = moves_of(scene, groups, moving.astype(np.uint8), predicted=True)
+            change = gains(scene, work, moves, some_views(len(work.cameras), config.asked, work.index))
+            moving[np.flatnonzero(moving)[change >= 0]] = False
+        symbols = np.zeros((int(moving.sum()), 6), np.int32)
+        return (Motion(groups.cell, groups.shades, moving.astype(np.uint8), symbols),)

@@ -1,0 +1,81 @@
+"""Which groups a motion part works with: their size in pixels, and which of them lie in what changed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.changes import Groups, Scene, groups_for
+from gsstream.core.median import median
+from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.parts.render.work import FrameWork
+
+
+def pixel_size(means: FloatArray, cameras: Cameras) -> float:
+    """Return how wide a pixel is at the scene's median distance from the cameras, scene units.
+
+    Arguments:
+        means: [N, 3] centres, N > 0.
+    """
+    columns = np.ascontiguousarray(means.T, np.float64)
+    widths, x, y, z = np.empty((len(cameras), len(means))), *np.empty_like(columns)
+    for width, at, K in zip(widths, cameras.centers, cameras.Ks, strict=True):
+        for axis, (column, offset) in enumerate(zip((x, y, z), at, strict=True)):
+            np.subtract(columns[axis], offset, out=column)
+            np.multiply(column, column, out=column)
+        np.add(np.add(x, y, out=x), z, out=x)
+        np.divide(np.sqrt(x, out=x), K[0, 0], out=width)
+    return float(median(widths))
+
+
+def known_groups(scene: Scene, cameras: Cameras, pixels: float, shades: int) -> Groups:
+    """Return the groups that the scene has had since the last key packet, else those of a grid.
+
+    A cell that is known stays: it was measured on the scene of the last key packet, which a resumed run does not have.
+
+    Arguments:
+        scene: decoded, as both ends have it.
+        cameras: training cameras.
+        pixels: side of a cell, in pixels at the scene's median distance.
+        shades: number of classes of brightness, 1 to 16.
+    """
+    if scene.groups is not None and scene.groups.shades == shades:
+        return scene.groups
+    cell = float(np.float32(max(pixels * pixel_size(scene.gaussians.means, cameras), 1e-6)))
+    return groups_for(scene, cell, shades)
+
+
+def changed_groups(groups: Groups, work: FrameWork, votes: float, share: float) -> IntArray:
+    """Return [G] bool: groups of which at least this share of the rows lie in what changed.
+
+    Arguments:
+        groups: G groups of the rows of the scene.
+        work: the frame.
+        votes: as for ``work.changed_rows``. share: 0 to 1.
+    """
+    changed = work.changed_rows(votes).numpy()
+    total = np.bincount(groups.group_of, minlength=groups.count)
+    hit = np.bincount(groups.group_of[changed], minlength=groups.count)
+    return np.asarray((total > 0) & (hit > 0) & (hit >= share * total))
+
+
+def groups_within(groups: Groups, rows: IntArray) -> IntArray:
+    """Return [G] bool: groups of which at least half of the rows, and at least one, are among ``rows`` [A]."""
+    total = np.bincount(groups.group_of, minlength=groups.count)
+    hit = np.bincount(groups.group_of[rows], minlength=groups.count)
+    return np.asarray((hit > 0) & (2 * hit >= total))
+
+
+def displaced_groups(groups: Groups, scene: Scene, share: float) -> IntArray:
+    """Return [G] bool: groups of which the last frame displaced some row, and at least this share of them.
+
+    Arguments:
+        groups: G groups of the rows of the scene.
+        scene: decoded, as both ends have it.
+        share: 0 to 1.
+    """
+    if scene.moved is None:
+        return np.zeros(groups.count, bool)
+    total = np.bincount(groups.group_of, minlength=groups.count)
+    hit = np.bincount(groups.group_of[scene.moved.rows], minlength=groups.count)
+    return np.asarray((hit > 0) & (hit >= share * total))

@@ -1,0 +1,94 @@
+"""Fitting the transforms of groups to the images by damped Gauss-Newton steps, one view at a time."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+
+from gsstream.core.changes import Scene
+from gsstream.core.changes.motion import Moves
+from gsstream.core.shapes import FloatArray
+from gsstream.parts.render.work import FrameWork
+from gsstream.parts.render.wrt import WrtTransforms
+
+
+class Damping(NamedTuple):
+    """What holds steps back where the images say little.
+
+    Arguments:
+        share: of the mean curvature of a group's six numbers, or of all groups if that is larger, is added to each.
+        hold: curvature that is added besides, per pixel^2, of the sum over the values of a picture.
+        longest: the longest step of a number, pixels.
+    """
+
+    share: float
+    hold: float
+    longest: float
+
+
+class NewtonDescent:
+    """Descends along slopes of one view after another, each divided by the curvature of all views seen so far.
+
+    Recursive least squares: after a pass every view has had its say with equal weight, and what a later one adds is
+    ever less. In a further pass views are taken to curve as they did in the first.
+
+    Arguments:
+        values: [K, 6] where it begins, in pixels.
+        damping: of the steps.
+    """
+
+    def __init__(self, values: FloatArray, damping: Damping) -> None:
+        self.values, self._damping = values, damping
+        self._total, self._measured, self._seen = np.zeros((len(values), 6, 6)), 0, 0
+
+    def step(self, slope: FloatArray, curvature: FloatArray | None = None) -> None:
+        """Replace ``values``: one step against a view's slope [K, 6].
+
+        Arguments:
+            slope: by the values, of the sum over the values of a picture.
+            curvature: [K, 6, 6] of the same; None: as the mean of those before, so not in the first step.
+        """
+        self._seen += 1
+        if curvature is not None:
+            self._total += curvature
+            self._measured += 1
+        matrix = self._total * (self._seen / self._measured)
+        mean = np.trace(matrix, axis1=1, axis2=2) / 6
+        added = self._damping.share * np.maximum(mean, mean.mean()) + self._damping.hold
+        step = np.linalg.solve(matrix + added[:, None, None] * np.eye(6), slope[..., None])[..., 0]
+        longest = np.abs(step).max(1, keepdims=True)
+        self.values = self.values - step * np.minimum(1.0, self._damping.longest / np.maximum(longest, 1e-12))
+
+
+def newton_moves(
+    scene: Scene, work: FrameWork, start: Moves, unit: FloatArray, iterations: int, order: np.random.Generator,
+    damping: Damping, tiles: Literal["all", "changed"] = "all",
+) -> FloatArray:  # fmt: skip
+    """Return the shifts and turns [K, 6] of groups that explain the images best.
+
+    Arguments:
+        scene: decoded, as both ends have it.
+        work: the frame, seen from this scene; it is narrowed to the rows that move.
+        start: where the fit begins.
+        unit: [6] what a pixel is for shift x, y, z [scene units] and turn x, y, z [tan(angle / 2)].
+        iterations: views that are looked at; the curvature is measured in the first pass over them.
+        order: draws the order of the views, anew for each pass.
+        damping: of the steps.
+        tiles: "changed" compares only in tiles that changed and in those beside them.
+    """
+    views, values = len(work.cameras), 3 * work.cameras.height * work.cameras.width
+    work.narrow(torch.from_numpy(start.rows))
+    base = scene.gaussians.rows(start.rows).map(torch.from_numpy)
+    local = start._replace(rows=np.arange(len(start.rows)))
+    descent = NewtonDescent(np.concatenate([start.shift, start.turn], 1) / unit, damping)
+    for step in range(iterations):
+        if step % views == 0:
+            sequence = order.permutation(views)
+        now, view = descent.values * unit, int(sequence[step % views])
+        moves = local._replace(shift=now[:, :3], turn=now[:, 3:])
+        found = work.loss_and_grad(view, WrtTransforms(base, moves, curvature=step < views), tiles)
+        curvature = None if found.curvature is None else found.curvature.numpy() * np.outer(unit, unit) * values
+        descent.step(found.grad.numpy() * unit * values, curvature)
+    return np.asarray(descent.values * unit)

@@ -1,0 +1,98 @@
+"""Rigid groups: every group that lies in what changed gets a rotation and a shift, fitted to the images."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal, NamedTuple, final
+
+import numpy as np
+from pydantic import Field
+
+from gsstream.core.changes import Motion, Scene
+from gsstream.core.changes.motion import Moves, moves_of
+from gsstream.core.part import PartConfig
+from gsstream.core.rng import Rng
+from gsstream.core.shapes import FloatArray
+from gsstream.parts.motion.base import MotionPart
+from gsstream.parts.motion.groups import changed_groups, known_groups
+from gsstream.parts.motion.newton import Damping, newton_moves
+from gsstream.parts.render.work import FrameWork
+
+
+class Units(NamedTuple):
+    """The sizes of one unit: ``shift`` [scene units] is a pixel, ``turn`` [tan(angle / 2)] moves a group's edge as far.
+    """
+
+    shift: float
+    turn: float
+
+    @property
+    def row(self) -> FloatArray:
+        """[6] units of shift and turn, side by side."""
+        return np.array([self.shift] * 3 + [self.turn] * 3)
+
+
+@final
+class Rigid(MotionPart):
+    """Fits one rigid transform per group, starting from the last frame's, and codes what corrects the prediction.
+
+    A few passes over the training cameras move the groups' six numbers each, by damped Gauss-Newton steps after every
+    view; only the Gaussians of groups that lie in what changed are rendered anew. A group that ends within ``least``
+    pixels of where it stood is left alone.
+    """
+
+    class Config(PartConfig):
+        pixels: float = Field(default=12.0, gt=0, le=1000, description="side of a group, pixels at median distance")
+        shades: int = Field(default=2, ge=1, le=16, description="classes of brightness that split the groups of a cell")
+        votes: float = Field(
+            default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in changed tiles"
+        )
+        share: float = Field(default=0.5, ge=0, le=1, description="share of a group's Gaussians that must lie there")
+        epochs: int = Field(
+            default=2, ge=1, le=100, description="passes over the training cameras; a hurried frame makes its share"
+        )
+        damping: float = Field(
+            default=0.1, ge=0, le=100, description="share of a group's mean curvature that is added to it"
+        )
+        hold: float = Field(
+            default=40.0, gt=0, le=1e6, description="curvature that holds every group back besides, per pixel^2"
+        )
+        longest: float = Field(default=0.5, gt=0, le=10, description="longest step of an iteration, pixels")
+        step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
+        everywhere: bool = Field(
+            default=True,
+            description="compare in all tiles that the groups are seen in; false: in those that changed or lie beside",
+        )
+        least: float = Field(default=0.25, ge=0, le=10, description="motions below this many pixels are dropped")
+
+    source: ClassVar[str] = "gsstream; groups of one rigid motion as in HiCoM"
+
+    def propose(self, scene: Scene, work: FrameWork, rng: Rng) -> tuple[Motion, ...]:
+        config = self.config
+        groups = known_groups(scene, work.cameras, config.pixels, config.shades)
+        able = changed_groups(groups, work, config.votes, config.share)
+        if not able.any():
+            return ()
+        # The scene changes little between key packets, so a pixel is measured once, when its groups are formed.
+        pixel = groups.cell / config.pixels
+        # Half a cell from the centre, an angle a moves a point by a * cell / 2 = tan(a / 2) * cell.
+        units = Units(pixel, pixel / groups.cell)
+        start = moves_of(scene, groups, able.astype(np.uint8), predicted=True)
+        found = self._fitted(scene, work, start, units, rng)
+        steps = np.float32(config.step * units.shift), np.float32(config.step * units.turn)
+        step = np.array([float(steps[0])] * 3 + [float(steps[1])] * 3)
+        predicted = np.concatenate([start.shift, start.turn], 1)
+        symbols = np.rint((found - predicted) / step).astype(np.int32)
+        total = np.abs((predicted + symbols * step) / units.row).max(1)
+        kept = total >= config.least
+        moving = np.zeros(groups.count, np.uint8)
+        moving[np.flatnonzero(able)[kept]] = 1
+        return (Motion(groups.cell, groups.shades, moving, symbols[kept], float(steps[0]), float(steps[1])),)
+
+    def _fitted(self, scene: Scene, work: FrameWork, start: Moves, units: Units, rng: Rng) -> FloatArray:
+        """[K, 6] shift and turn of the groups that explain the images best."""
+        config = self.config
+        total = max(1, round(config.epochs * len(work.cameras) * work.effort))
+        damping = Damping(config.damping, config.hold, config.longest)
+        order = rng.numpy("motion", work.index)
+        tiles: Literal["all", "changed"] = "all" if config.everywhere else "changed"
+        return newton_moves(scene, work, start, units.row, total, order, damping, tiles)

@@ -1,0 +1,20 @@
+"""Still: nothing is moved before the residual."""
+
+from __future__ import annotations
+
+from typing import ClassVar, final
+
+from gsstream.core.changes import Motion, Scene
+from gsstream.core.rng import Rng
+from gsstream.parts.motion.base import MotionPart
+from gsstream.parts.render.work import FrameWork
+
+
+@final
+class Still(MotionPart):
+    """Proposes no motion: every frame starts from where the last one ended (the null part, and S2GS as published)."""
+
+    source: ClassVar[str] = "gsstream"
+
+    def propose(self, scene: Scene, work: FrameWork, rng: Rng) -> tuple[Motion, ...]:
+        return ()

@@ -1,0 +1,46 @@
+"""Which groups are better off where a motion leads than where they stand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from gsstream.core.changes import Scene
+from gsstream.core.changes.motion import Moves
+from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.parts.render.work import FrameWork
+from gsstream.parts.render.wrt import WrtTransforms
+
+
+def gains(scene: Scene, work: FrameWork, moves: Moves, views: Sequence[int] | IntArray) -> FloatArray:
+    """Return the change [K] of the loss, summed over views, that each group's move brings about; below 0 it helps.
+
+    It is the slope of the loss half-way, along the move: for a loss that is quadratic between the two ends it is their
+    difference, and one pass over the views answers for every group at once.
+
+    Arguments:
+        scene: decoded, before the motion.
+        work: the frame; narrowed to the rows that move.
+        moves: K groups and how each would move.
+        views: training cameras that are asked.
+    """
+    work.narrow(torch.from_numpy(moves.rows))
+    base = scene.gaussians.rows(moves.rows).map(torch.from_numpy)
+    half = moves._replace(rows=np.arange(len(moves.rows)), shift=moves.shift / 2, turn=moves.turn / 2)
+    grads = (work.loss_and_grad(view, WrtTransforms(base, half)).grad.numpy() for view in views)
+    slope = sum(grads, np.zeros((len(moves.centre), 6)))
+    return np.asarray((slope * np.concatenate([moves.shift, moves.turn], 1)).sum(1))
+
+
+def some_views(number: int, share: float, frame: int) -> IntArray:
+    """Return the views that take their turn in a frame: a share of all, evenly spread, others in the next frame.
+
+    Arguments:
+        number: of training cameras.
+        share: of them, 0 to 1; at least one is asked.
+        frame: index of the frame.
+    """
+    count = max(1, round(share * number))
+    return np.unique((np.arange(count) * number // count + frame) % number)

@@ -1,0 +1,59 @@
+"""RowOptimiser: Adam on tables of which every row counts its own steps."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+
+import torch
+
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.joint import JointCode
+from gsstream.core.part import Part
+from gsstream.parts.optimiser.joint import JointResidualOptimiser
+from gsstream.parts.optimiser.residual import ResidualOptimiser
+from gsstream.parts.optimiser.state import ADAM_BETAS as ADAM_BETAS
+from gsstream.parts.optimiser.state import ADAM_EPS as ADAM_EPS
+from gsstream.parts.optimiser.state import MAX_GRADIENT as MAX_GRADIENT
+from gsstream.parts.optimiser.state import AdamState as AdamState
+
+
+class RowOptimiser(Part):
+    """Adam (Kingma and Ba 2015, algorithm 1; betas 0.9 / 0.999, eps 1e-15) with each row's bias corrected by its count.
+
+    Where all rows take all steps this is ``torch.optim.Adam``, to 1e-6.
+    """
+
+    @abstractmethod
+    def step(
+        self,
+        values: Mapping[str, torch.Tensor],
+        gradients: Mapping[str, torch.Tensor],
+        states: Mapping[str, AdamState],
+        lrs: Mapping[str, float | torch.Tensor],
+    ) -> None:
+        """Update every named table that has a gradient. Changes ``values`` and ``states`` in place.
+
+        Arguments:
+            values: name -> [n, ...] float32, contiguous; leaves of a graph are allowed.
+            gradients: like the table each; names that are missing are not moved and count no step.
+            states: their moments.
+            lrs: their learning rates, >= 0: one number, [d] by column of [n, d], or [n, 1] by row.
+
+        Raises:
+            ShapeError: shapes that differ, a gradient that is not finite or beyond MAX_GRADIENT (that table is not
+                changed then).
+        """
+
+    def residual_optimiser(
+        self, code: JointCode, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor
+    ) -> ResidualOptimiser:
+        """Return the optimiser of a frame's residual, from zero latents on. By default it is made of :meth:`step`.
+
+        Arguments:
+            code: columns of the attributes.
+            base: the A rows that the residual is added to.
+            units: [A] unit of the position of each row, scene units.
+            matrix: [L, D] decoders to start from.
+        """
+        return JointResidualOptimiser(code, base, units, matrix, self)

@@ -1,0 +1,173 @@
+"""Renderer: Gaussians and one camera in, an image and gradients out.
+
+Conventions: pixel-corner origin, 0.3 px screen-space blur, alpha cut at 1/255, alpha clamped at 0.999, a Gaussian
+counts while the transmittance before it exceeds 1e-4, near plane ``cameras.near``. Tiles are 16 x 16 pixels.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.context import ScreenGradient
+from gsstream.core.errors import ShapeError
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.part import Part
+from gsstream.parts.render.output import TILE as TILE
+from gsstream.parts.render.output import RenderCache as RenderCache
+from gsstream.parts.render.output import RenderOutput as RenderOutput
+from gsstream.parts.render.session import RenderSession as RenderSession
+
+
+class Renderer(Part):
+    """A differentiable rasteriser."""
+
+    @abstractmethod
+    def render(
+        self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, background: tuple[float, float, float]
+    ) -> RenderOutput:
+        """Render one camera of the rig; differentiable in every attribute.
+
+        Arguments:
+            gaussians: N rows, raw values. cameras: the rig.
+            view: index of one of its cameras. background: colour behind everything, 0 to 1.
+        """
+
+    def screen_gradient(
+        self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, image_gradient: torch.Tensor
+    ) -> ScreenGradient:
+        """Pull an upstream image gradient [H, W, 3] back to the 2-D means (pixels) of a scene on black.
+
+        By default a session is asked. A renderer that opens a ``ScatterSession`` overrides this method: that session
+        asks its renderer.
+
+        Arguments:
+            gaussians: N rows, raw values. cameras: the rig.
+            view: index of one of its cameras. image_gradient: [H, W, 3].
+
+        Raises:
+            NotImplementedError: neither the renderer nor its session knows the gradient of the 2-D means.
+        """
+        session = self.open(gaussians, None, cameras, (0.0, 0.0, 0.0))
+        if type(session).screen_gradient is ScatterSession.screen_gradient:
+            name = type(self).__name__
+            raise NotImplementedError(
+                f"{name}: expected 'screen_gradient', or an 'open' whose session has its own, got neither; write one"
+            )
+        return session.screen_gradient(view, image_gradient)
+
+    def open(
+        self,
+        gaussians: Gaussians[torch.Tensor],
+        active: torch.Tensor | None,
+        cameras: Cameras,
+        background: tuple[float, float, float],
+    ) -> RenderSession:
+        """Open a session in which only the rows ``active`` [A] (None: all) change. Renderers may cache the rest.
+
+        Arguments:
+            gaussians: N rows, raw values. active: [A] rows that change, ascending; None: all.
+            cameras: the rig. background: colour behind everything, 0 to 1.
+        """
+        return ScatterSession(self, gaussians, active, cameras, background)
+
+
+class ScatterSession(RenderSession):
+    """The session every renderer has: put the active rows back and render everything."""
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        gaussians: Gaussians[torch.Tensor],
+        active: torch.Tensor | None,
+        cameras: Cameras,
+        background: tuple[float, float, float],
+    ) -> None:
+        self._renderer, self._gaussians, self._active = renderer, gaussians, active
+        self._cameras, self._background = cameras, background
+
+    @property
+    def cameras(self) -> Cameras:
+        return self._cameras
+
+    def render(
+        self,
+        view: int,
+        rows: Gaussians[torch.Tensor],
+        *,
+        probe: torch.Tensor | None = None,
+        tile_mask: torch.Tensor | None = None,
+    ) -> RenderOutput:
+        if probe is not None:
+            name = type(self._renderer).__name__
+            raise NotImplementedError(f"{name} offers no gradient of the 2-D means in a session")
+        return self._renderer.render(self._whole(rows), self._cameras, view, self._background)
+
+    def _whole(self, rows: Gaussians[torch.Tensor]) -> Gaussians[torch.Tensor]:
+        """The session's scene with the active rows put into their places."""
+        if self._active is None:
+            return rows
+        base = dict(self._gaussians.items())
+        return Gaussians(**{n: base[n].index_copy(0, self._active, value) for n, value in rows.items()})
+
+    def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
+        return self._renderer.screen_gradient(self._gaussians, self._cameras, view, image_gradient)
+
+    def visible(self, view: int, tiles: torch.Tensor) -> torch.Tensor:
+        size = self._cameras.height, self._cameras.width
+        scene = self._gaussians
+        return drawn_rows(lambda g: self._renderer.render(g, self._cameras, view, (0.0,) * 3), scene, size, tiles)
+
+    def narrow(self, active: torch.Tensor) -> None:
+        self._active = active
+
+    def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
+        return self._renderer.open(gaussians, None, self._cameras, self._background)
+
+
+def drawn_rows(
+    render: Callable[[Gaussians[torch.Tensor]], RenderOutput],
+    gaussians: Gaussians[torch.Tensor],
+    size: tuple[int, int],
+    tiles: torch.Tensor,
+) -> torch.Tensor:
+    """Find by differentiation who is drawn in marked tiles: ``RenderSession.visible`` of any differentiable renderer.
+
+    The derivative of the image by the colour of a Gaussian is the sum of its weights alpha * transmittance, which are
+    positive where it is drawn and zero elsewhere, so nothing can cancel. All are drawn in grey, because a colour that
+    is clamped at 0 has no derivative.
+
+    Arguments:
+        render: draws a whole scene; differentiable by its colours. gaussians: the scene, N rows.
+        size: (H, W) of the image, pixels. tiles: [ceil(H / 16), ceil(W / 16)] bool.
+
+    Returns:
+        [N] bool.
+
+    Raises:
+        ShapeError: ``tiles`` of another shape or dtype.
+    """
+    check_tiles(tiles, size)
+    inside = tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[: size[0], : size[1]]
+    fixed = gaussians.map(torch.Tensor.detach)
+    colours = torch.zeros_like(fixed.sh0).requires_grad_()
+    with torch.enable_grad():
+        image = render(replace(fixed, sh0=colours, shN=torch.zeros_like(fixed.shN))).image
+        if not image.requires_grad:  # nothing is drawn at all
+            return torch.zeros(len(fixed), dtype=torch.bool)
+        (weights,) = torch.autograd.grad(image, colours, inside[..., None].expand_as(image).to(image.dtype))
+    return (weights > 0).flatten(1).any(1)
+
+
+def check_tiles(tiles: torch.Tensor, size: tuple[int, int]) -> None:
+    """Raise ShapeError unless ``tiles`` is bool [ceil(H / 16), ceil(W / 16)] for an image of ``size`` (H, W)."""
+    wanted = [-(-side // TILE) for side in size]
+    if tiles.dtype != torch.bool or list(tiles.shape) != wanted:
+        raise ShapeError(
+            f"tiles: expected bool {wanted} ({TILE} x {TILE} pixel tiles of a {size[1]} x {size[0]} image), got "
+            f"{tiles.dtype} {list(tiles.shape)}; give one mark per tile"
+        )

@@ -1,0 +1,58 @@
+"""What a part that fits something may do with a frame."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+import torch
+
+from gsstream.core.context import FrameContext
+from gsstream.core.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from gsstream.parts.render.wrt import G, LossAndGrad, Wrt
+
+
+class FrameWork(FrameContext, Protocol):
+    """A frame that a part works on: it renders with some rows moving, and is told how well that explains the images.
+
+    Colour maps of the cameras are applied and pulled through where they belong; a part need not know them.
+    """
+
+    @property
+    def effort(self) -> float:
+        """Share of the usual passes that the frame is worth, above 0 to 1: less where a run is behind its recording."""
+
+    @property
+    def optimiser(self) -> Any:
+        """The optimiser of the run (``gsstream.api.RowOptimiser``), for rows that a part fits on its own."""
+
+    def changed_rows(self, least_votes: float) -> torch.Tensor:
+        """Return [N] bool: Gaussians that are seen in a tile that changed.
+
+        Arguments:
+            least_votes: least share, 0 to 1, of the views a Gaussian projects into in which it must lie in or beside a
+                changed tile. Where change is not detected, all Gaussians count.
+        """
+
+    def narrow(self, rows: torch.Tensor) -> None:
+        """Freeze all rows but [A] int64, ascending: from now on only these move."""
+
+    def loss_and_grad(self, view: int, wrt: Wrt[G], tiles: Literal["all", "changed"] = "all") -> LossAndGrad[G]:
+        """Render a view, compare it with what its camera recorded, and differentiate.
+
+        Arguments:
+            view: index of a training camera.
+            wrt: the A rows of :meth:`narrow` (or all N), or the transforms of groups of them.
+            tiles: "changed" leaves out the tiles that did not change and lie beside none that did.
+
+        Returns:
+            (1 - w) L1 + w (1 - SSIM) on the tiles that the rows can change, and its gradient. Values that were computed
+            from others pass it on with ``gsstream.blocks.rows_backward``.
+        """
+
+    def shown(self, gaussians: Gaussians[torch.Tensor], view: int) -> torch.Tensor:
+        """Return [H, W, 3]: a scene as the camera of this view would record it, without a graph."""
+
+    def on(self, gaussians: Gaussians[torch.Tensor]) -> FrameWork:
+        """Return the same frame, to be worked on from another scene."""

@@ -1,0 +1,49 @@
+"""Flat structure: each Gaussian is its own node."""
+
+from __future__ import annotations
+
+from typing import final
+
+import torch
+from pydantic import Field
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import InputError
+from gsstream.core.frame import PointCloud
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.part import PartConfig
+from gsstream.parts.structure.base import Anchors, Structure, StructureTraits
+
+
+@final
+class Flat(Structure):
+    """No grouping: M = N, every node a root. Anchors are the points themselves."""
+
+    source = "gsstream"
+
+    class Config(PartConfig):
+        resolution: int = Field(
+            default=1024, ge=1, le=65536,
+            description="position residuals are measured in (scene diameter / resolution); 1 to 65536",
+        )  # fmt: skip
+
+    traits = StructureTraits(idempotent=True, local=True, lays_grid=False)
+
+    def seed(self, points: PointCloud, cameras: Cameras) -> Anchors:
+        if len(points) == 0:
+            raise InputError("no points to start from: expected at least 1, got 0; do the cameras have a common view?")
+        positions = torch.as_tensor(points.xyz, dtype=torch.float32)
+        span = positions.amax(0) - positions.amin(0)
+        unit = float(span.norm()) / self.config.resolution
+        return Anchors(
+            positions=positions,
+            colors=torch.as_tensor(points.rgb, dtype=torch.float32),
+            levels=torch.zeros(len(positions), dtype=torch.int64),
+            cell_sizes=torch.tensor([unit if unit > 0 else 1.0]),
+            origin=positions.amin(0),
+        )
+
+    def build(self, gaussians: Gaussians[torch.Tensor], anchors: Anchors) -> Hierarchy:
+        index = torch.arange(len(gaussians))
+        return Hierarchy(node_of=index, parent=index, level=torch.zeros_like(index))

@@ -1,0 +1,94 @@
+"""The prefetcher: order, bound, the place of errors, and threads that end."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+
+import numpy as np
+import pytest
+
+from gsstream.core.errors import InputError, SourceError
+from gsstream.core.frame import Frame
+from gsstream.input.recordings.base import SourceInfo, Split
+from gsstream.input.recordings.prefetch import Prefetcher
+from gsstream.input.recordings.synthetic import SyntheticSource
+
+
+class Watched:
+    """A real source that records which frames were asked for, and fails at one of them."""
+
+    def __init__(self, faulty: int | None = None) -> None:
+        self._source = SyntheticSource.from_query("frames=1000&views=2&width=8&height=8&supersample=1")
+        self._faulty = faulty
+        self.asked: list[int] = []
+
+    @property
+    def info(self) -> SourceInfo:
+        return self._source.info
+
+    def frame(self, index: int, split: Split = "train") -> Frame:
+        if split == "train":
+            self.asked.append(index)
+        if index == self._faulty:
+            raise SourceError(f"frame {index} is damaged")
+        return self._source.frame(index, split)
+
+    def points(self) -> None:
+        return None
+
+    def close(self) -> None:
+        self._source.close()
+
+
+def prefetch_threads() -> list[threading.Thread]:
+    return [t for t in threading.enumerate() if t.name.startswith("gsstream-prefetch")]
+
+
+@pytest.mark.parametrize(("depth", "workers"), [(1, 1), (3, 2), (8, 4)])
+def test_order_content_and_bound(depth: int, workers: int) -> None:
+    source = Watched()
+    with Prefetcher(source, itertools.count(2, 3), depth=depth, workers=workers) as frames:
+        for step, (train, test) in zip(range(6), frames, strict=False):
+            assert (train.index, test.index) == (2 + 3 * step, 2 + 3 * step)
+            np.testing.assert_array_equal(train.images, source._source.frame(train.index).images)
+            assert len(source.asked) <= step + 1 + depth
+        # zip stops after taking the sixth item from range first, so six pairs were delivered.
+        assert len(frames.decode_seconds) == 6
+    assert prefetch_threads() == []
+
+
+def test_an_error_surfaces_at_its_frame_and_ends_the_iteration() -> None:
+    frames = Prefetcher(Watched(faulty=3), range(10), depth=6, workers=3)
+    assert [next(frames)[0].index for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(SourceError, match="frame 3 is damaged"):
+        next(frames)
+    assert list(frames) == []
+    assert prefetch_threads() == []
+
+
+def test_the_end_is_reached_once_and_close_may_be_repeated() -> None:
+    frames = Prefetcher(Watched(), range(3), depth=5)
+    assert [pair[0].index for pair in frames] == [0, 1, 2]
+    frames.close()
+    frames.close()
+    assert list(frames) == []
+    assert list(Prefetcher(Watched(), [])) == []
+
+
+def test_closing_early_asks_for_nothing_more() -> None:
+    source = Watched()
+    frames = Prefetcher(source, range(1000), depth=2)
+    next(frames)
+    frames.close()
+    asked = len(source.asked)
+    assert asked <= 4
+    assert list(frames) == []
+    assert len(source.asked) == asked
+    assert prefetch_threads() == []
+
+
+@pytest.mark.parametrize(("depth", "workers"), [(0, 1), (1, 0)])
+def test_bounds_below_one_are_refused(depth: int, workers: int) -> None:
+    with pytest.raises(InputError, match="must be at least 1"):
+        Prefetcher(Watched(), range(3), depth=depth, workers=workers)

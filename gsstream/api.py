@@ -5,7 +5,7 @@ Importing this module imports torch (the parts are torch code); ``gsstream.spec`
 
 from gsstream import API_VERSION as API_VERSION
 from gsstream.core.cameras import Cameras as Cameras
-from gsstream.core.changes import Births as Births
+from gsstream.core.changes import AddedGaussians as AddedGaussians
 from gsstream.core.changes import Delta as Delta
 from gsstream.core.changes import Displacement as Displacement
 from gsstream.core.changes import Field as Field
@@ -21,10 +21,10 @@ from gsstream.core.changes import apply_field as apply_field
 from gsstream.core.changes import apply_motion as apply_motion
 from gsstream.core.changes import field_rows as field_rows
 from gsstream.core.changes import groups_for as groups_for
-from gsstream.core.changes import in_nodes as in_nodes
-from gsstream.core.changes import own_nodes as own_nodes
+from gsstream.core.changes import add_to_nodes as add_to_nodes
+from gsstream.core.changes import add_as_nodes as add_as_nodes
 from gsstream.core.changes import sent_rows as sent_rows
-from gsstream.core.changes.motion import Moves as Moves
+from gsstream.core.changes.motion import GroupTransforms as GroupTransforms
 from gsstream.core.context import FrameContext as FrameContext
 from gsstream.core.context import RowGradient as RowGradient
 from gsstream.core.context import ScreenGradient as ScreenGradient
@@ -44,7 +44,7 @@ from gsstream.core.gaussians import Gaussians as Gaussians
 from gsstream.core.hierarchy import Hierarchy as Hierarchy
 from gsstream.core.hierarchy import tree_max as tree_max
 from gsstream.core.hierarchy import tree_roots as tree_roots
-from gsstream.core.joint import JointCode as JointCode
+from gsstream.core.joint import JointLayout as JointLayout
 from gsstream.core.part import Part as Part
 from gsstream.core.part import PartConfig as PartConfig
 from gsstream.core.part import Traits as Traits
@@ -102,7 +102,7 @@ from gsstream.parts.render.base import drawn_rows as drawn_rows
 from gsstream.parts.render.exposure import CameraExposure as CameraExposure
 from gsstream.parts.render.target import ImageLoss as ImageLoss
 from gsstream.parts.render.target import ViewTarget as ViewTarget
-from gsstream.parts.render.work import FrameWork as FrameWork
+from gsstream.parts.render.work import FitContext as FitContext
 from gsstream.parts.render.wrt import G as G
 from gsstream.parts.render.wrt import LossAndGrad as LossAndGrad
 from gsstream.parts.render.wrt import Wrt as Wrt

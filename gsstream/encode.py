@@ -18,16 +18,16 @@ from typing import Any
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame as Frame
-from gsstream.core.world import own_world, snapped
+from gsstream.core.world import rig_similarity, snap_cameras
 from gsstream.engine.assembly.assemble import Assembly as Assembly
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.run.encoder import Encoder as Encoder
-from gsstream.engine.run.encoder import Listeners as Listeners
+from gsstream.engine.run.encoder import Callbacks as Callbacks
 from gsstream.engine.run.recording import open_recording as _open
 from gsstream.input.recordings.base import FrameSource as FrameSource
 from gsstream.input.recordings.base import SourceInfo
-from gsstream.input.recordings.canonical import CanonicalSource, world_of
+from gsstream.input.recordings.canonical import CanonicalSource, recording_similarity
 from gsstream.method.base import Step as Step
 from gsstream.packet import StreamWriter as StreamWriter
 from gsstream.plugins.catalog import load_catalog
@@ -67,7 +67,7 @@ def open_recording(uri: str, recipe: Recipe | None = None) -> Iterator[FrameSour
         source.close()
 
 
-def in_own_world(source: FrameSource) -> FrameSource:
+def to_rig_coordinates(source: FrameSource) -> FrameSource:
     """Return a recording in the coordinates that its rig defines, so that units and origin of its files do not matter.
 
     :func:`open_recording` has done it already; a source of your own has not.
@@ -75,17 +75,17 @@ def in_own_world(source: FrameSource) -> FrameSource:
     Arguments:
         source: an open recording, in any coordinates.
     """
-    return CanonicalSource(source, world_of(source))
+    return CanonicalSource(source, recording_similarity(source))
 
 
 def encoder_for(
-    method: str, source: FrameSource, settings: Mapping[str, Any] | None = None, listeners: Listeners | None = None
+    method: str, source: FrameSource, settings: Mapping[str, Any] | None = None, listeners: Callbacks | None = None
 ) -> Encoder:
     """Return an encoder of a recording, before its frame 0.
 
     Arguments:
         method: a name of ``gsstream methods``.
-        source: an open recording, of :func:`open_recording` or :func:`in_own_world`; its points seed frame 0.
+        source: an open recording, of :func:`open_recording` or :func:`to_rig_coordinates`; its points seed frame 0.
         settings: as for :func:`recipe_for`.
         listeners: what is told of the work.
     """
@@ -98,12 +98,12 @@ def encoder_for(
     return encoder
 
 
-def encoder_of_rig(
+def encoder_for_rig(
     method: str, cameras: Cameras, *, fps: float = 30.0, settings: Mapping[str, Any] | None = None, name: str = "rig"
 ) -> Encoder:
     """Return an encoder of images that come from anywhere; frame 0 is seeded by a plane sweep over them.
 
-    The stream lies in coordinates that the rig defines: cameras of frames are taken there by :meth:`Encoder.at_near`,
+    The stream lies in coordinates that the rig defines: cameras of frames are taken there by :meth:`Encoder.with_near_plane`,
     and what a player shows is taken back by ``meta.world``.
 
     Arguments:
@@ -113,8 +113,8 @@ def encoder_of_rig(
         settings: as for :func:`recipe_for`.
         name: what the stream says of its origin.
     """
-    world = own_world(cameras)
+    world = rig_similarity(cameras)
     info = SourceInfo(
-        name, f"rig:{name}", None, fps, snapped(world.cameras_back(cameras)), cameras.select([]), world=world
+        name, f"rig:{name}", None, fps, snap_cameras(world.inverse_cameras(cameras)), cameras.select([]), world=world
     )
     return Encoder(assemble(recipe_for(method, settings), load_catalog()), info, place=True)

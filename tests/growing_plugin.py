@@ -13,8 +13,8 @@ import pytest
 import torch
 from pydantic import Field
 
-from gsstream.api import FrameWork, Growth, PartConfig, Rng, Rows, Scene, in_nodes, own_nodes
-from gsstream.blocks import fitted_births
+from gsstream.api import FitContext, Growth, PartConfig, Rng, Rows, Scene, add_to_nodes, add_as_nodes
+from gsstream.blocks import fit_added
 from gsstream.spec import ComponentSpec, hookimpl
 
 
@@ -27,7 +27,7 @@ class CopyGrowth(Growth):
     class Config(PartConfig):
         per_frame: int = Field(default=24, ge=1, le=1000, description="Gaussians born in a frame, half as many leave")
 
-    def propose(self, after: Scene, work: FrameWork, rng: Rng) -> Rows | None:
+    def propose(self, after: Scene, work: FitContext, rng: Rng) -> Rows | None:
         changed = np.flatnonzero(work.changed_rows(0.5).numpy())
         number = min(self.config.per_frame, len(changed))
         if not number:
@@ -38,13 +38,13 @@ class CopyGrowth(Growth):
         beside = generator.normal(0, 0.5, (number, 3)) * np.exp(copies.scales).mean(1, keepdims=True)
         copies = replace(copies, means=(copies.means + beside).astype(np.float32))
         scene, views = after.gaussians.map(torch.from_numpy), range(len(work.cameras))
-        fitted = fitted_births(scene, copies.map(torch.from_numpy), work, views, 1, rng).map(torch.Tensor.numpy)
+        fitted = fit_added(scene, copies.map(torch.from_numpy), work, views, 1, rng).map(torch.Tensor.numpy)
         layout = after.layout
         units = layout.unit_of[rows]
         births = (
-            in_nodes(fitted, layout.node_of[rows], units)
+            add_to_nodes(fitted, layout.node_of[rows], units)
             if work.index % 2
-            else own_nodes(fitted, units, len(layout.node_counts))
+            else add_as_nodes(fitted, units, len(layout.node_counts))
         )
         faintest = np.argsort(after.gaussians.opacities, kind="stable")[: number // 2]
         return Rows(births, np.sort(faintest))

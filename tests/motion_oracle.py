@@ -66,8 +66,8 @@ class World:
             if motion.predicted:
                 past = [self.moved[row] for row in rows if row in self.moved]
                 shift, turn = mean_of([was[0] for was in past]), mean_of([was[1] for was in past])
-            shift = [a + s * motion.shift_step for a, s in zip(shift, symbols[:3], strict=True)]
-            turn = [a + s * motion.turn_step for a, s in zip(turn, symbols[3:], strict=True)]
+            shift = [a + s * motion.translation_step for a, s in zip(shift, symbols[:3], strict=True)]
+            turn = [a + s * motion.rotation_step for a, s in zip(turn, symbols[3:], strict=True)]
             for row in rows:
                 self.means[row], self.quats[row] = moved_row(self.means[row], self.quats[row], centre, shift, turn)
         return touched

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import torch
 
 from gsstream.core.gaussians import Gaussians
-from gsstream.parts.optimiser.joint import JointChange, add_joint, decode_joint, join_features
+from gsstream.parts.optimiser.joint import JointResidual, add_joint, decode_joint, join_features
 from gsstream.parts.update.base import UpdateRule
-from gsstream.parts.update.joint import JointCode, joint_code
+from gsstream.parts.update.joint import JointLayout, joint_layout
 
 
 def quantise(latents: torch.Tensor, step: float) -> torch.Tensor:
@@ -75,9 +75,9 @@ def apply_residual(
 def decode_rows(
     rule: UpdateRule, base: Gaussians[torch.Tensor], latents: Mapping[str, torch.Tensor],
     decoders: Mapping[str, torch.Tensor], units: torch.Tensor,
-) -> tuple[JointCode, JointChange]:  # fmt: skip
+) -> tuple[JointLayout, JointResidual]:  # fmt: skip
     """The joint table of these latents and what they decode to, as the engine computes it while it trains."""
-    code = joint_code(rule.codes(), latents, decoders, base)
+    code = joint_layout(rule.codes(), latents, decoders, base)
     table = torch.cat(list(latents.values()), 1)
     return code, decode_joint(code, table, code.join_decoders(decoders), units)
 

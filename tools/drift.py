@@ -121,7 +121,7 @@ def _encode(
         at = there_and_back(index, length)
         train, test = (replace(source.frame(at, split), index=index) for split in SPLITS)
         step = encoder.encode(train)
-        quality = held_out.measure(step.state, encoder.at_near(test)) if len(test.cameras) else {}
+        quality = held_out.measure(step.state, encoder.with_near_plane(test)) if len(test.cameras) else {}
         yield step.status, writer.append(step.packet), quality, step.state
 
 

@@ -27,7 +27,7 @@ from statistics import median
 from typing import Any
 
 from gsstream.core.errors import GsstreamError, InputError, OutputError
-from gsstream.engine.run.live import live_lines
+from gsstream.engine.run.live import latency_lines
 from gsstream.engine.run.session import METRICS, RECIPE
 from gsstream.evaluation.records import mean, read_lines
 from gsstream.input.recordings.calibration import CALIBRATION_FILE, frame_path, read_calibration
@@ -129,7 +129,7 @@ def drill(finished: Path, out: Path, fps: float, frames: int, watch: str, option
             "processors": os.cpu_count(), "load_before": load, "load_after": os.getloadavg()[0],
             "used_by_the_run": used / seconds, "used_by_others": others,
         },
-        "said": live_lines(lines),
+        "said": latency_lines(lines),
     }  # fmt: skip
 
 
@@ -174,7 +174,7 @@ def evaluated(out: Path, frames: int) -> dict[str, float | None]:
     command = [*GSSTREAM, "evaluate", str(out / "run"), "--source", str(out / "capture"), "--json"]
     views = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)["views"]
     later = [view for view in views if view["frame"] > 0]
-    names = ("psnr", "psnr_moving", "psnr_changed", "hold_psnr", "hold_psnr_changed")
+    names = ("psnr", "psnr_moving", "psnr_changed", "static_psnr", "static_psnr_changed")
     found = {name: mean(view[name] for view in later if view[name] is not None) for name in names}
     return {name: None if math.isnan(value) else value for name, value in found.items()}
 

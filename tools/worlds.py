@@ -26,7 +26,7 @@ from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.run.measure import HeldOut
 from gsstream.input.recordings.base import FrameSource, PointKind, SourceInfo, Split
-from gsstream.input.recordings.canonical import CanonicalSource, world_of
+from gsstream.input.recordings.canonical import CanonicalSource, recording_similarity
 from gsstream.input.recordings.open import open_source
 from gsstream.input.recordings.transformed import transformed
 from gsstream.plugins.catalog import load_catalog
@@ -106,7 +106,7 @@ def encode(parts: Assembly, source: FrameSource) -> tuple[dict[str, float], str]
         for name in ATTRIBUTES:
             values = getattr(step.state.player.gaussians, name)
             digest.update(np.ascontiguousarray(values).tobytes())
-        test = held_out.measure(step.state, encoder.at_near(source.frame(index, "test")))
+        test = held_out.measure(step.state, encoder.with_near_plane(source.frame(index, "test")))
         line = {name: next(iter(test[name].values())) for name in ("psnr", "psnr_moving")}
         lines.append({**line, "kb": len(step.packet.data) / 1000})
     found = {"psnr_0": lines[0]["psnr"], "key_kb": lines[0]["kb"]}
@@ -134,7 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sets = [("--set", text) for text in (*given.sets, f"seed={seed}")]
         parts = assemble(resolve_recipe(given.method, catalog.recipe_path, given.recipe, sets), catalog)
         moved = Moved(open_source(given.source, parts.recipe.scale), where)
-        own = IDENTITY if given.as_filed else world_of(moved)
+        own = IDENTITY if given.to_file_coordinates else recording_similarity(moved)
         source = CanonicalSource(transformed(moved, parts.recipe.data), own)
         found, digest = encode(parts, source)
         numbers = [f"{found[key]:.2f}" for key in ("psnr_0", "psnr", "psnr_moving", "key_kb", "kb")]

@@ -147,7 +147,7 @@ def _of_files(
 ) -> tuple[Evaluation, str]:
     """The evaluation of a folder, and a line that says what its files take."""
     from gsstream.engine.run.recording import open_recording
-    from gsstream.evaluation.evaluate import evaluate_shown
+    from gsstream.evaluation.evaluate import evaluate_frames
     from gsstream.evaluation.offline import PlySequence, Renders, bytes_line
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
@@ -166,7 +166,7 @@ def _of_files(
             shown = Renders(other.renders, recording.info, other.first)
         low, high = chosen
         frames = [t for t in shown.frames if t >= (low or 0) and (high is None or t < high)]
-        evaluation = evaluate_shown(shown, recording, frames=frames, lpips=lpips, progress=progress_on("frame"))
+        evaluation = evaluate_frames(shown, recording, frames=frames, lpips=lpips, progress=progress_on("frame"))
     finally:
         recording.close()
     plys = [shown.file(t) for t in frames] if other.ply_sequence is not None else []

@@ -66,8 +66,8 @@ def _slots(resolved: ResolvedRecipe, catalog: Catalog) -> Iterator[tuple[str, st
     """(slot, part, who ships it, what it is)."""
     from gsstream.recipe.model import ComponentRef
 
-    # Slots of parts say nothing about a method that brings a stepper of its own.
-    own = ("stepper",) if resolved.recipe.stepper.name != "parts" else METHOD_SLOTS
+    # Slots of parts say nothing about a method that brings a streaming_method of its own.
+    own = ("streaming_method",) if resolved.recipe.streaming_method.name != "parts" else METHOD_SLOTS
     for slot, ref in resolved.recipe:
         if isinstance(ref, ComponentRef) and slot in (*own, "renderer"):
             found = catalog.entries.get((slot, ref.name))

@@ -67,7 +67,7 @@ def run(
     say = _silent if quiet else _note
     try:
         named = bool(recipe.method or recipe.recipe)
-        _what_is_taken(say, resolved.recipe, recording.info, named=named, catalog=catalog)
+        _reused_lines(say, resolved.recipe, recording.info, named=named, catalog=catalog)
         _first_look(recording, source, again=resume)
         with claim_output(out, resume=resume, overwrite=overwrite), ended_by_signals() as came, serving(server):
             try:
@@ -92,7 +92,7 @@ def _silent(_: str) -> None:
     pass
 
 
-def _what_is_taken(
+def _reused_lines(
     say: Callable[[str], None], recipe: Recipe, info: SourceInfo, *, named: bool, catalog: Catalog
 ) -> None:
     """Say what nobody asked for and a person would want to know: method, frames, test cameras."""

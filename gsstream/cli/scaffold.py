@@ -61,7 +61,7 @@ def files(name: str, kind: str) -> Mapping[str, str]:
     values["kit"] = ", ".join([*(["SourceUnderTest"] if kind in SUBJECTS else []), "parametrize_with_checks"])
     values["claims"] = CLAIMS.get(kind, CLAIMS[""])
     values["api"] = gsstream.API_VERSION  # stated, so that a later gsstream knows what it was written for
-    templates = {**TEMPLATES, **METHOD_TEMPLATES} if kind == "stepper" else TEMPLATES
+    templates = {**TEMPLATES, **METHOD_TEMPLATES} if kind == "streaming_method" else TEMPLATES
     texts = {path: _fill(text, values) for path, text in templates.items()}
     return {
         **{_fill(path, values): text for path, text in texts.items()},
@@ -153,14 +153,14 @@ def test_contract(check) -> None:
     check()
 ''',
 }
-#: A stepper is a whole method: it is shipped with a recipe, so that ``--method`` finds it.
+#: A streaming_method is a whole method: it is shipped with a recipe, so that ``--method`` finds it.
 METHOD_TEMPLATES: Mapping[str, str] = {
     "README.md": """\
 # gsstream-<name>
 
 <summary>
 
-One method for gsstream: `<name>`, as the stepper of that name and a recipe that takes it.
+One method for gsstream: `<name>`, as the streaming_method of that name and a recipe that takes it.
 
 ```
 pip install -e .
@@ -176,7 +176,7 @@ or with `pytest` for one test per check. <claims>
     "src/<package>/recipes/<name>.yaml": """\
 # The method as --method <name> finds it: what is not said here has its default (gsstream recipe <name>).
 method: <name>
-stepper: {name: <name>}
+streaming_method: {name: <name>}
 """,
     PLUGIN: TEMPLATES[PLUGIN].replace("ComponentSpec,", "ComponentSpec, MethodSpec,")
     + '''

@@ -46,7 +46,7 @@ def serve(
     from gsstream.serve.server import Server
 
     server = Server(
-        file, live=live, host=host, port=port, token=token or None, origins=origin or (), most_viewers=viewers
+        file, live=live, host=host, port=port, token=token or None, origins=origin or (), max_viewers=viewers
     )
     typer.echo(f"{file}: {server.url} (Ctrl-C ends)")
     server.run()

@@ -39,7 +39,7 @@ def sh_basis(directions: FloatArray, degree: int) -> FloatArray:
     return np.stack(basis)
 
 
-def turned_harmonics(shN: FloatArray, rotation: FloatArray) -> FloatArray:
+def rotate_sh(shN: FloatArray, rotation: FloatArray) -> FloatArray:
     """Return coefficients [N, K - 1, 3] of the same colours after the world has been turned.
 
     What was seen from direction d is seen from ``rotation @ d`` afterwards. Harmonics of one degree turn among

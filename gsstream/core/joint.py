@@ -13,7 +13,7 @@ Columns = Mapping[str, slice]
 
 
 @dataclass(frozen=True)
-class JointCode:
+class JointLayout:
     """The places of each attribute's latents and features in the tables that hold all attributes side by side.
 
     Arguments:

@@ -60,7 +60,7 @@ _KINDS = (
     PartKind("update", "gsstream.parts.update.base:UpdateRule", slot=True, default="additive"),
     PartKind("growth", "gsstream.parts.growth.base:Growth", slot=True, default="none"),
     PartKind("regularizer", "gsstream.parts.regularizer.base:Regularizer", slot=True, default="none", behaviour=True),
-    PartKind("stepper", "gsstream.method.base:StreamingMethod", default="parts"),
+    PartKind("streaming_method", "gsstream.method.base:StreamingMethod", default="parts"),
     PartKind(
         "renderer", "gsstream.parts.render.base:Renderer", default="auto", use="--set renderer=<name> --source demo"
     ),

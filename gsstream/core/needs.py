@@ -25,11 +25,11 @@ SHIPPED: Mapping[str, tuple[str, ...]] = {
     ),
     "player": ("renderer/cpu", "loss/cpu", "optimiser/cpu"),
     "methods": (
-        "method/queen", "method/queen-published", "method/queen-m", "method/queen-s", "stepper/queen",
-        "method/hicom", "method/hicom-published", "stepper/hicom", "method/comgs-s", "method/comgs-l", "stepper/comgs",
-        "method/stream3dgs", "method/stream3dgs-cells", "stepper/stream3dgs",
-        "method/recon", "method/recon-published", "stepper/recon",
-        "method/quarc", "method/quarc-published", "stepper/quarc",
+        "method/queen", "method/queen-published", "method/queen-m", "method/queen-s", "streaming_method/queen",
+        "method/hicom", "method/hicom-published", "streaming_method/hicom", "method/comgs-s", "method/comgs-l", "streaming_method/comgs",
+        "method/stream3dgs", "method/stream3dgs-cells", "streaming_method/stream3dgs",
+        "method/recon", "method/recon-published", "streaming_method/recon",
+        "method/quarc", "method/quarc-published", "streaming_method/quarc",
         "propagation/ft-pruning", "gate/binary-ste", "confidence/onnx",
     ),
 }  # fmt: skip

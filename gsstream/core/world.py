@@ -2,7 +2,7 @@
 
 A similarity, ``x_recording = scale * rotation @ x_stream + offset`` in float64. Recordings come in any unit, turned and
 moved at will; float32 arithmetic, an octree along the axes and absolute thresholds are not indifferent to that. So a
-recording is opened in a frame that its own cameras define (:func:`own_world`), and whatever people read or write is
+recording is opened in a frame that its own cameras define (:func:`rig_similarity`), and whatever people read or write is
 taken back to the recording's coordinates.
 """
 
@@ -17,7 +17,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError
 from gsstream.core.frame import PointCloud
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.harmonics import turned_harmonics
+from gsstream.core.harmonics import rotate_sh
 from gsstream.core.shapes import FloatArray
 
 #: Cameras in a stream's own coordinates are rounded to this: far below what a calibration knows, far above the noise of
@@ -26,7 +26,7 @@ GRID = 2.0**-30
 #: Camera centres that differ by less than this share of their distance to the origin are one place, up to rounding.
 COINCIDENT = 1e-12
 #: A mean of unit vectors shorter than this says nothing about a direction.
-LEAST_MEAN = 0.1
+MIN_MEAN = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ class World:
         """Return points [N, 3] of the stream in the recording's coordinates, float64."""
         return np.asarray(self.scale * (np.asarray(xyz, np.float64) @ self.matrix.T) + np.array(self.offset))
 
-    def points_back(self, xyz: FloatArray) -> FloatArray:
+    def inverse_points(self, xyz: FloatArray) -> FloatArray:
         """Return points [N, 3] of the recording in the stream's coordinates, float64."""
         return np.asarray((np.asarray(xyz, np.float64) - np.array(self.offset)) @ self.matrix / self.scale)
 
@@ -95,7 +95,7 @@ class World:
         viewmats[:, :3, 3] = self.scale * rig.viewmats[:, :3, 3] - viewmats[:, :3, :3] @ np.array(self.offset)
         return replace(rig, viewmats=viewmats, near=self.scale * rig.near)
 
-    def cameras_back(self, rig: Cameras) -> Cameras:
+    def inverse_cameras(self, rig: Cameras) -> Cameras:
         """Return cameras of the recording in the stream's coordinates."""
         viewmats = rig.viewmats.copy()
         viewmats[:, :3, :3] = rig.viewmats[:, :3, :3] @ self.matrix
@@ -117,14 +117,14 @@ class World:
         return Gaussians(
             means=self.points(scene.means), quats=quats,
             scales=np.asarray(scene.scales, np.float64) + np.log(self.scale),
-            opacities=scene.opacities, sh0=scene.sh0, shN=turned_harmonics(scene.shN, self.matrix),
+            opacities=scene.opacities, sh0=scene.sh0, shN=rotate_sh(scene.shN, self.matrix),
         )  # fmt: skip
 
 
 IDENTITY = World()
 
 
-def own_world(rig: Cameras, points: Callable[[], PointCloud | None] = lambda: None) -> World:
+def rig_similarity(rig: Cameras, points: Callable[[], PointCloud | None] = lambda: None) -> World:
     """Return the world that a rig defines for itself: the same, up to rounding, however the rig is moved or turned.
 
     Its origin is the mean of the camera centres. One unit is the rig's extent; cameras that all stand in one place have
@@ -153,7 +153,7 @@ def own_world(rig: Cameras, points: Callable[[], PointCloud | None] = lambda: No
     return _world(rotation, offset, distance if distance > 0 else 1.0)
 
 
-def snapped(rig: Cameras) -> Cameras:
+def snap_cameras(rig: Cameras) -> Cameras:
     """Return cameras whose poses are rounded to ``GRID``; what was a rotation is one still."""
     viewmats = np.rint(rig.viewmats / GRID) * GRID + 0.0
     rotations = viewmats[:, :3, :3]
@@ -189,8 +189,8 @@ def _axes(rig: Cameras) -> FloatArray:
     forward = rig.viewmats[:, 2, :3]
     level = forward - np.outer(forward @ up, up)
     ahead = level.mean(0)
-    if np.linalg.norm(ahead) < LEAST_MEAN:
-        clear = np.flatnonzero(np.linalg.norm(level, axis=1) >= LEAST_MEAN)
+    if np.linalg.norm(ahead) < MIN_MEAN:
+        clear = np.flatnonzero(np.linalg.norm(level, axis=1) >= MIN_MEAN)
         # Cameras that all look along "up" show another direction by their x axes.
         ahead = level[clear[0]] if len(clear) else np.cross(up, rig.viewmats[0, 0, :3])
     x = ahead - (ahead @ up) * up

@@ -122,14 +122,14 @@ def sheet_of_stream(
             active = None if frame == playback.frames[0] else render(painted, rig, 0, (0.0, 0.0, 0.0), renderer)
             alone = _alone(fresh[frame], frame, rig, renderer) if fresh and frame in fresh else None
             title = f"frame {frame}   {psnr(image, truth):.2f} dB"
-            columns.append(Column(title, truth, image, active, alone, changed_most(truth, first)))
+            columns.append(Column(title, truth, image, active, alone, most_changed_window(truth, first)))
     out = Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     contact_sheet(columns, f"{meta.title} on {meta.source}, camera {rig.ids[0]}").save(out)
     return out
 
 
-def changed_most(truth: FloatArray, first: FloatArray) -> tuple[slice, slice] | None:
+def most_changed_window(truth: FloatArray, first: FloatArray) -> tuple[slice, slice] | None:
     """Return rows and columns of the window with the most changed pixels; None when there are none.
 
     Arguments:
@@ -162,7 +162,7 @@ def paint_gates(state: PlayerState) -> Gaussians[FloatArray]:
     share: FloatArray = np.zeros(len(gaussians), np.float32)
     if state.delta is not None and state.before is not None:
         share = row_gates(state.before, state.delta)
-        if state.scene.moved is not None and not state.delta.edits_rows:
+        if state.scene.moved is not None and not state.delta.has_row_edit:
             share[state.scene.moved.rows] = 1.0
     closed, opened = np.array(_CLOSED), np.array(_OPEN)
     color = closed + share[:, None] * (opened - closed)

@@ -65,13 +65,13 @@ class ViewQuality:
     ssim: float
     psnr_moving: float
     moving_share: float
-    hold_psnr: float
-    hold_ssim: float
-    hold_psnr_moving: float
+    static_psnr: float
+    static_ssim: float
+    static_psnr_moving: float
     psnr_changed: float = math.nan
-    hold_psnr_changed: float = math.nan
+    static_psnr_changed: float = math.nan
     lpips: float = math.nan
-    hold_lpips: float = math.nan
+    static_lpips: float = math.nan
     extra: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -98,7 +98,7 @@ class Evaluation:
 
     def to_json(self) -> str:
         """Return everything as JSON; nan and inf become null."""
-        unknown = ("extra",) if self.lpips_variant else ("lpips", "hold_lpips", "extra")
+        unknown = ("extra",) if self.lpips_variant else ("lpips", "static_lpips", "extra")
         views = [{k: _plain(v) for k, v in asdict(view).items() if k not in unknown} for view in self.views]
         for row, view in zip(views, self.views, strict=True):
             row |= {name: _plain(value) for name, value in view.extra.items()}
@@ -150,7 +150,7 @@ class Shown(Protocol):
         """Return a picture [H, W, 3] in [0, 1] for each camera of the rig; the same list where nothing changed."""
 
 
-class StreamShown:
+class StreamFrames:
     """What the player shows of a stream."""
 
     def __init__(self, playback: Playback, rig: Cameras, renderer: PlayerRenderer) -> None:
@@ -182,19 +182,19 @@ def evaluate(
         source: an open recording.
         split: "test" or "train".
         renderer: that draws.
-        frames, lpips, extras, progress: as for :func:`evaluate_shown`.
+        frames, lpips, extras, progress: as for :func:`evaluate_frames`.
 
     Raises InputError when the recording's cameras are not those of the stream, PacketError for a damaged stream.
     """
     renderer = find_renderer() if renderer is None else renderer
     with Playback(stream) as playback:
-        shown = StreamShown(playback, playback.cameras(split), renderer)
-        return evaluate_shown(
+        shown = StreamFrames(playback, playback.cameras(split), renderer)
+        return evaluate_frames(
             shown, source, frames=frames, split=split, lpips=lpips, extras=extras, progress=progress
         )
 
 
-def evaluate_shown(
+def evaluate_frames(
     shown: Shown, source: FrameSource, *, frames: Sequence[int] | None = None,
     split: Literal["train", "test"] = "test", lpips: OnnxLpips | None = None,
     extras: Mapping[str, ViewMetric] | None = None, progress: Callable[[int, int], None] | None = None,

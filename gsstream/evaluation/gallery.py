@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from gsstream.engine.budget.report import budget_lines
-from gsstream.engine.run.live import live_lines
+from gsstream.engine.run.live import latency_lines
 from gsstream.evaluation.records import FrameRecord, read_lines, read_records
 from gsstream.evaluation.summary import summarise, summary_table
 from gsstream.input.recordings.base import FrameSource
@@ -60,9 +60,9 @@ def _still_pictures(out: Path, source: FrameSource, meta: StreamMeta, records: S
 
 
 def _write_summary(out: Path, meta: StreamMeta, records: Sequence[FrameRecord]) -> Path:
-    text = [summary_table({meta.title: summarise(records)}), "", judges_line(meta)]
+    text = [summary_table({meta.title: summarise(records)}), "", held_out_line(meta)]
     lines = read_lines(out / METRICS)
-    for part in (live_lines(lines), budget_lines(lines)):
+    for part in (latency_lines(lines), budget_lines(lines)):
         text += ["", *part] if part else []
     (out / SUMMARY).write_text("\n".join(text) + "\n", encoding="utf-8")
     return out / SUMMARY
@@ -84,7 +84,7 @@ def write_sheet(out: Path, source: FrameSource, fresh: Mapping[int, Path] = NO_F
     return sheet_of_stream(out / STREAM, source, sorted(chosen | set(fresh)), out / SHEET, fresh=fresh)
 
 
-def judges_line(meta: StreamMeta) -> str:
+def held_out_line(meta: StreamMeta) -> str:
     """Return the sentence that says which cameras judged a run, and by which split."""
     if len(meta.test) == 0:
         return "no camera judged: all of them train"

@@ -224,7 +224,7 @@ def _plain_bytes(state: PlayerState, rows: IntArray) -> int:
     if delta.births is not None:
         born = float16_bytes(delta.births.gaussians, ATTRIBUTES, np.arange(len(delta.births)))
     names = () if delta.residual is None else tuple(delta.residual.symbols)
-    if not delta.edits_rows:
+    if not delta.has_row_edit:
         return float16_bytes(state.gaussians, names, rows)
     assert state.before is not None
     source = gather_rows(state.before.node_of, delta.births, delta.deaths)

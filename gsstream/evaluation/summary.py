@@ -70,7 +70,7 @@ def summarise(records: Sequence[FrameRecord]) -> Summary:
 
 
 #: Frames of the shortest run whose slope is shown: over fewer, dB per 100 frames is noise times a large number.
-LEAST_FOR_SLOPE = 10
+MIN_FOR_SLOPE = 10
 _COLUMNS: Mapping[str, tuple[str, str]] = {
     "frames": ("T", "{:d}"), "psnr_first": ("PSNR 0", "{:.2f}"), "psnr": ("PSNR", "{:.2f}"),
     "psnr_slope": ("dB/100", "{:+.2f}"), "psnr_moving": ("moving", "{:.2f}"),
@@ -85,7 +85,7 @@ def summary_table(runs: Mapping[str, Summary]) -> str:
     """Return a Markdown table, one row per run; "-" where nothing was measured."""
     rows = [["run", *(title for title, _ in _COLUMNS.values())]]
     for name, summary in runs.items():
-        known = replace(summary, psnr_slope=math.nan) if summary.frames < LEAST_FOR_SLOPE else summary
+        known = replace(summary, psnr_slope=math.nan) if summary.frames < MIN_FOR_SLOPE else summary
         rows.append([name, *(_cell(getattr(known, key), form) for key, (_, form) in _COLUMNS.items())])
     return format_table(rows)
 

@@ -57,15 +57,15 @@ class Step(Generic[State]):
 class StreamingMethod(Part, Generic[State]):
     """A method. Pure: state goes in and comes out, random numbers come from ``tools.rng`` by name and frame.
 
-    ``heeds`` names the recipe keys that this method reads besides what the engine itself does (frame 0, loss, renderer,
+    ``recipe_keys`` names the recipe keys that this method reads besides what the engine itself does (frame 0, loss, renderer,
     recording, packets), for example ``("stream.epochs",)``. A run that changes a key of the parts or of later frames
     that is not listed here is refused: no option is ignored in silence. A pattern names several: ``("stream.*",)``.
-    ``least_cameras`` is how many training cameras it needs: a recording with fewer is refused before anything is
+    ``min_cameras`` is how many training cameras it needs: a recording with fewer is refused before anything is
     reconstructed.
     """
 
-    heeds: ClassVar[tuple[str, ...]] = ()
-    least_cameras: ClassVar[int] = 1
+    recipe_keys: ClassVar[tuple[str, ...]] = ()
+    min_cameras: ClassVar[int] = 1
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -78,7 +78,7 @@ class StreamingMethod(Part, Generic[State]):
     @final
     def reads(self, key: str) -> bool:
         """Return whether this method reads a recipe key: a slot ("gate"), or a setting ("stream.epochs")."""
-        return any(fnmatchcase(key, pattern) for pattern in self.heeds)
+        return any(fnmatchcase(key, pattern) for pattern in self.recipe_keys)
 
     @abstractmethod
     def begin(self, frame: Frame, tools: Tools) -> Step[State]:

@@ -13,7 +13,7 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.log import FrameLog
 from gsstream.core.shapes import FloatArray
 from gsstream.packet import PlayerState, StreamMeta
-from gsstream.parts.render.work import FrameWork
+from gsstream.parts.render.work import FitContext
 
 if TYPE_CHECKING:
     from gsstream.core.frame import Frame, PointCloud
@@ -37,7 +37,7 @@ class FirstFrame:
     meta: StreamMeta
 
 
-class FrameTools(FrameWork, Protocol):
+class FrameTools(FitContext, Protocol):
     """One frame as a method works on it: what parts see of it, and the render session itself."""
 
     @property
@@ -108,7 +108,7 @@ class Tools(Protocol):
     def epochs(self, frame: Frame) -> int:
         """Return how many epochs (iterations of every training camera) a later frame is worth.
 
-        This is ``stream.epochs`` (list it in ``heeds``), or less when a budget or a live run allows less.
+        This is ``stream.epochs`` (list it in ``recipe_keys``), or less when a budget or a live run allows less.
         """
 
     def points(self, frame: Frame) -> PointCloud:

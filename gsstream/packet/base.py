@@ -105,7 +105,7 @@ class EncodedPacket:
 
 
 @contextmanager
-def located(offset: int) -> Iterator[None]:
+def add_offset(offset: int) -> Iterator[None]:
     """Give a PacketError that does not know where it happened the offset of the section being read."""
     try:
         yield

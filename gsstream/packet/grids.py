@@ -71,7 +71,7 @@ def color_codes(values: FloatArray, bits: int) -> FloatArray:
     return np.asarray(_to_luma(flat) * _color_scale(bits, flat.shape[1]))
 
 
-def color_slopes(gradients: FloatArray, bits: int) -> FloatArray:
+def color_grads(gradients: FloatArray, bits: int) -> FloatArray:
     """Return the derivative [N, width] float64 by the codes of colours, from that by the colours themselves.
 
     Arguments:

@@ -19,7 +19,7 @@ from gsstream.packet.base import (
     PacketKind,
     build_packet,
     expect,
-    located,
+    add_offset,
     most_gaussians,
 )  # fmt: skip
 from gsstream.packet.bits import pack_blobs, unpack_blobs
@@ -86,9 +86,9 @@ def decode_key(data: bytes, *, offset: int = 0) -> KeyState:
             f"key packet: expected sections {sorted(wanted)} in any order, or {list(ORDER)} in this one, got "
             f"{list(sections)}", offset,
         )  # fmt: skip
-    with located(sections["meta"].offset):
+    with add_offset(sections["meta"].offset):
         meta = meta_from_json(decompress(sections["meta"].data, MAX_META))
-    with located(sections["layout"].offset):
+    with add_offset(sections["layout"].offset):
         layout = _decode_layout(sections["layout"].data, most_gaussians(len(data)))
     number = len(layout.unit_of)
     if "layers" in sections:

@@ -24,7 +24,7 @@ from gsstream.packet.base import (
     SECTION_IDS,
     PacketKind,
     Section,
-    located,
+    add_offset,
     most_gaussians,
     parse_header,
     split_sections,
@@ -42,8 +42,8 @@ _LAYERS = struct.Struct("<III")
 _START = PACKET_HEADER.size + SECTION_HEADER.size + _LAYERS.size
 
 #: Sections that the checksum of the first layer covers, and all sections of a packet with layers, in their order.
-_SHOWN = ("meta", *ATTRIBUTES)
-ORDER = ("layers", *_SHOWN, "layout", "rest")
+_VISIBLE = ("meta", *ATTRIBUTES)
+ORDER = ("layers", *_VISIBLE, "layout", "rest")
 
 
 class FirstLayer(NamedTuple):
@@ -83,7 +83,7 @@ def in_layers(
         for rows in (first, ~first)
     )
     payloads = {"meta": meta, "layout": layout, **now}
-    body = b"".join(SECTION_HEADER.pack(SECTION_IDS[name], len(payloads[name])) + payloads[name] for name in _SHOWN)
+    body = b"".join(SECTION_HEADER.pack(SECTION_IDS[name], len(payloads[name])) + payloads[name] for name in _VISIBLE)
     payloads["layers"] = _LAYERS.pack(int(first.sum()), len(body), zlib.crc32(body))
     mask = encode_symbols(first[:, None].astype(np.int32))
     payloads["rest"] = pack_blobs([mask, *(later[name] for name in ATTRIBUTES)])
@@ -100,14 +100,14 @@ def decode_layers(data: bytes, sections: Mapping[str, Section], number: int, off
         offset: place of the packet in the file, for errors.
     """
     rest = sections["rest"]
-    with located(sections["layers"].offset):
+    with add_offset(sections["layers"].offset):
         in_first, size, checksum = read_head(sections["layers"].data)
         if size != sections["layout"].offset - SECTION_HEADER.size - offset - _START or in_first > number:
             raise PacketError(f"layers: {in_first} of {number} Gaussians in {size} bytes cannot be")
         if zlib.crc32(data[_START : _START + size]) != checksum:
             raise PacketError("layers: the checksum of the first layer does not match")
     now = decode_rows(sections, in_first)
-    with located(rest.offset):
+    with add_offset(rest.offset):
         mask, *parts = unpack_blobs(rest.data, 1 + len(ATTRIBUTES))
         first = _mask(decode_symbols(mask, number, 1)[:, 0], in_first)
         later = decode_rows({name: Section(part, rest.offset) for name, part in zip(ATTRIBUTES, parts, strict=True)},
@@ -142,8 +142,8 @@ def _first_layer(data: bytes) -> FirstLayer | None:
     body = data[_START : _START + size]
     if len(body) < size or in_first > most_gaussians(len(body)) or zlib.crc32(body) != checksum:
         return None
-    sections = split_sections(body, len(_SHOWN), _START)
-    if tuple(sections) != _SHOWN:
+    sections = split_sections(body, len(_VISIBLE), _START)
+    if tuple(sections) != _VISIBLE:
         return None
     meta = meta_from_json(decompress(sections["meta"].data, MAX_META))
     return FirstLayer(decode_rows(sections, in_first), meta, header.frame)

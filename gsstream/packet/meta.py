@@ -18,7 +18,7 @@ from gsstream.core.names import check_camera_ids
 from gsstream.core.world import IDENTITY, World
 
 MAX_SIDE, MAX_PIXELS = 1 << 16, 1 << 27
-LEAST_FPS, MOST_FPS = 0.01, 100_000.0
+MIN_FPS, MAX_FPS = 0.01, 100_000.0
 #: Conventions every value of a stream of this format follows.
 CONVENTIONS: Mapping[str, str] = {
     "viewmats": "world-to-camera, OpenCV axes", "Ks": "pixels, pixel-corner origin", "quats": "wxyz",
@@ -120,8 +120,8 @@ def meta_from_json(data: bytes) -> StreamMeta:
 
 def _check(meta: StreamMeta) -> None:
     """Everything that must hold of a stream's meta besides its types. Raises TypeError or ValueError."""
-    if not LEAST_FPS <= meta.fps <= MOST_FPS:
-        raise ValueError(f"fps: expected {LEAST_FPS:g} to {MOST_FPS:g} frames per second, got {meta.fps!r}")
+    if not MIN_FPS <= meta.fps <= MAX_FPS:
+        raise ValueError(f"fps: expected {MIN_FPS:g} to {MAX_FPS:g} frames per second, got {meta.fps!r}")
     if not all(math.isfinite(value) for value in meta.background):
         raise ValueError(f"background: expected three finite numbers, got {meta.background}")
     if not len(meta.train) + len(meta.test):

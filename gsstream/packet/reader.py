@@ -28,7 +28,7 @@ class Entry(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class UnfinishedTail:
+class TruncatedTail:
     """Bytes after the last complete packet: a packet that was being written. ``size`` bytes from ``offset``."""
 
     offset: int
@@ -53,7 +53,7 @@ class StreamReader:
         except OSError as error:
             raise SourceError(f"cannot open the stream {self.path}: {error.strerror}; expected a .gss file") from error
         self.entries: list[Entry] = []
-        self.unfinished: UnfinishedTail | None = None
+        self.unfinished: TruncatedTail | None = None
         self.damage: PacketError | None = None
         try:
             #: Format version of the file, "major.minor".
@@ -93,7 +93,7 @@ class StreamReader:
                 offset = self.end
                 entry = self._entry_at(offset, total)
                 if entry is None:
-                    self.unfinished = UnfinishedTail(offset, total - offset)
+                    self.unfinished = TruncatedTail(offset, total - offset)
                     return
                 self.entries.append(entry)
         except PacketError as error:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray, IntArray
-from gsstream.packet.base import WIDTHS, Section, located
+from gsstream.packet.base import WIDTHS, Section, add_offset
 from gsstream.packet.grids import KEY_BITS, MAX_BITS, MAX_CODE, fold_quats, from_codes, to_codes, unfold_quats
 from gsstream.packet.positions import decode_positions, encode_positions, quantise_positions
 from gsstream.packet.symbols import decode_symbols, encode_symbols
@@ -55,11 +55,11 @@ def decode_rows(sections: Mapping[str, Section], number: int) -> Gaussians[Float
     """Decode ``number`` rows that :func:`encode_rows` wrote. Raises PacketError with the offset of the section."""
     arrays: dict[str, FloatArray] = {}
     for name in KEY_BITS:
-        with located(sections[name].offset):
+        with add_offset(sections[name].offset):
             codes, bits = _decode_codes(name, sections[name].data, number)
             arrays[name] = _shaped(name, from_codes(name, codes, bits))
         if name == "scales":
-            with located(sections["means"].offset):
+            with add_offset(sections["means"].offset):
                 arrays["means"] = decode_positions(sections["means"].data, codes, bits)
     return Gaussians(**arrays)
 

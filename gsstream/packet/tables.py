@@ -13,7 +13,7 @@ from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.shapes import IntArray
 from gsstream.packet.base import MAX_GAUSSIANS, PacketKind, Section
 from gsstream.packet.bits import unpack_blobs
-from gsstream.packet.changes.rows import HEAD_PARTS, decode_births
+from gsstream.packet.changes.rows import HEAD_PARTS, decode_added
 from gsstream.packet.gates import decode_gates, run_tokens
 from gsstream.packet.layers import read_head
 from gsstream.packet.pattern import decode_pattern
@@ -98,7 +98,7 @@ def _delta_tables(data: Mapping[str, bytes], layout: Layout) -> Iterator[Table]:
         gone, _ = decode_gates(data["deaths"], len(layout.unit_of))
         yield _runs_table("deaths", data["deaths"], gone)
     if "births" in data:
-        yield from _birth_tables(data["births"], layout)
+        yield from _added_tables(data["births"], layout)
 
 
 def _residual_tables(data: Mapping[str, bytes], layout: Layout) -> Iterator[Table]:
@@ -126,9 +126,9 @@ def _runs_table(name: str, data: bytes, marks: IntArray) -> Table:
     return Table(name, len(data), sum(best) + plain_bits)
 
 
-def _birth_tables(data: bytes, layout: Layout) -> Iterator[Table]:
+def _added_tables(data: bytes, layout: Layout) -> Iterator[Table]:
     nodes = len(layout.node_counts)
-    births = decode_births(Section(data, 0), nodes, len(layout.units), MAX_GAUSSIANS)
+    births = decode_added(Section(data, 0), nodes, len(layout.units), MAX_GAUSSIANS)
     blobs = unpack_blobs(data, HEAD_PARTS + len(ATTRIBUTES))
     used, _ = decode_gates(blobs[2], nodes + len(births.parents))
     yield _table("births", blobs[1], len(births.parents), 1)

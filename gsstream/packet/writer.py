@@ -45,7 +45,7 @@ class StreamWriter:
                 writer = cls(file, [], 0)
                 writer._write(file_header())
                 return writer
-            entries, end = _sound_part(path, last_frame)
+            entries, end = _valid_part(path, last_frame)
             file = path.open("r+b")
         except FileExistsError as error:
             raise OutputError(f"{path} exists; resume it or choose another place") from error
@@ -95,7 +95,7 @@ class StreamWriter:
         self._offset += len(data)
 
 
-def _sound_part(path: Path, last_frame: int | None) -> tuple[list[Entry], int]:
+def _valid_part(path: Path, last_frame: int | None) -> tuple[list[Entry], int]:
     """Packets to keep and the byte after them."""
     with StreamReader(path) as reader:
         if reader.version != FORMAT_VERSION:

@@ -13,7 +13,7 @@ import zstandard
 
 from gsstream.core.errors import InputError
 from gsstream.packet import PacketKind, PlayerState
-from gsstream.packet.base import MAX_META, Section, located, parse_packet
+from gsstream.packet.base import MAX_META, Section, add_offset, parse_packet
 from gsstream.packet.bits import BitReader, unpack_blobs
 
 #: Bytes at the peak for every number of a Gaussian in a key packet or a birth (4 of them stay), for every Gaussian
@@ -93,6 +93,6 @@ def _births(sections: dict[str, Section]) -> int:
     if "births" not in sections:
         return 0
     section = sections["births"]
-    with located(section.offset):
+    with add_offset(section.offset):
         # The number stands in the first bits; a head may be as long as the packet, and bits take memory, too.
         return BitReader(unpack_blobs(section.data, 2)[0][:16]).gamma() + 1

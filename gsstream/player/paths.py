@@ -15,7 +15,7 @@ PATHS = ("orbit", "spiral")
 #: A rig with a larger gap than this between neighbouring cameras does not surround what it looks at, radians.
 OPEN_GAP = np.pi / 2
 #: Half of the smallest swing, radians: a single camera, or a few side by side, still show some parallax.
-LEAST_SWING = np.pi / 18
+MIN_SWING = np.pi / 18
 
 
 def camera_path(kind: str, rig: Cameras, number: int) -> Cameras:
@@ -90,7 +90,7 @@ def _angles(cameras: FloatArray, number: int) -> FloatArray:
     if gaps[widest] <= OPEN_GAP:
         return np.asarray(along)
     start, span = places[(widest + 1) % len(places)], 2 * np.pi - gaps[widest]
-    half, middle = max(0.5 * span, LEAST_SWING), start + 0.5 * span
+    half, middle = max(0.5 * span, MIN_SWING), start + 0.5 * span
     # The first camera is at angle 0 and somewhere on the arc; the swing begins there.
     first = (np.pi - middle) % (2 * np.pi) - np.pi
     phase = np.arcsin(np.clip(first / half, -1, 1))

@@ -18,7 +18,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError, OutputError
 from gsstream.core.needs import install_extra
 from gsstream.core.shapes import FloatArray
-from gsstream.player.between import Moments, moments
+from gsstream.player.interpolation import Moments, frame_times
 from gsstream.player.camera_file import read_path
 from gsstream.player.paths import PATHS, camera_path, resized
 from gsstream.player.playback import Playback
@@ -72,7 +72,7 @@ def play(
         for frame in chosen:
             playback.entry(frame)
         rate = playback.meta.fps if fps is None else fps
-        times = moments(chosen, playback.meta.fps, rate) if fps is not None else [float(frame) for frame in chosen]
+        times = frame_times(chosen, playback.meta.fps, rate) if fps is not None else [float(frame) for frame in chosen]
         cameras = choose_cameras(playback, camera, len(times))
         cameras = cameras if size is None else resized(cameras, *size)
         if playback.limit is not None:

@@ -17,7 +17,7 @@ from gsstream.packet import Entry, PacketKind, PlayerState, StreamMeta, StreamRe
 from gsstream.player.memory import MemoryLimit
 
 
-class UnfinishedStreamWarning(UserWarning):
+class TruncatedStreamWarning(UserWarning):
     """The file ends in the middle of a packet: a run that is still writing, or was killed. What is before it plays."""
 
 
@@ -91,7 +91,7 @@ class Playback:
             start, stop: frames ``start`` to ``stop`` - 1 are wanted; default: from the first, to the last.
 
         Returns the wanted frames before the first damaged packet, and that damage; None where there is none. What the
-        file loses after the damage counts as wanted where ``stop`` is not given. Warns (UnfinishedStreamWarning) when
+        file loses after the damage counts as wanted where ``stop`` is not given. Warns (TruncatedStreamWarning) when
         the last packet is not complete and the frames up to the last are wanted.
 
         Raises InputError for frames that are not in the stream, the damage when it leaves no frame to play.
@@ -115,7 +115,7 @@ class Playback:
             warnings.warn(
                 f"{self.reader.path} ends in an unfinished packet ({tail.size} bytes from byte {tail.offset}): its run "
                 f"is still writing or was killed; frames {first} to {end - 1} are complete",
-                UnfinishedStreamWarning, stacklevel=2,
+                TruncatedStreamWarning, stacklevel=2,
             )  # fmt: skip
         lost = self.reader.damage if stop is None or stop > end else None
         return range(start, end if stop is None else min(stop, end)), lost

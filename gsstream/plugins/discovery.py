@@ -110,7 +110,7 @@ def _entry_points() -> list[tuple[importlib.metadata.EntryPoint, str, str]]:
 
 def _inspect(name: str, distribution: str, version: str, load: Any) -> Discovered:
     declared: list[Spec] = []
-    late = threading.Timer(SLOW, _say_who_is_slow, (name, distribution))
+    late = threading.Timer(SLOW, _warn_slow, (name, distribution))
     late.daemon = True
     late.start()
     try:
@@ -125,7 +125,7 @@ def _inspect(name: str, distribution: str, version: str, load: Any) -> Discovere
     return Discovered(name, distribution, version, tuple(declared))
 
 
-def _say_who_is_slow(name: str, distribution: str) -> None:
+def _warn_slow(name: str, distribution: str) -> None:
     """A plugin that hangs at import takes everything with it; so its name is said while it does."""
     print(
         f"gsstream: the plugin {name!r} (from {distribution}) has been loading for {SLOW:g} seconds; "

@@ -14,7 +14,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from gsstream.core.errors import RecipeError, suggest
 
 #: Bytes of an empty packet.
-LEAST_SIZE = 16
+MIN_SIZE = 16
 SECONDS = {"s": 1.0, "ms": 1e-3, "min": 60.0}
 BITS = {"bit/s": 1.0, "kbit/s": 1e3, "Mbit/s": 1e6, "Gbit/s": 1e9}
 BYTES = {"B": 1.0, "bytes": 1.0, "KB": 1e3, "MB": 1e6, "GB": 1e9}
@@ -49,8 +49,8 @@ def _bytes(value: Any) -> Any:
 
 def _packet(value: Any) -> Any:
     size = _bytes(value)
-    if isinstance(size, int) and not isinstance(size, bool) and size < LEAST_SIZE:
-        raise ValueError(f"expected a size greater than or equal to {LEAST_SIZE} bytes, those of an empty packet")
+    if isinstance(size, int) and not isinstance(size, bool) and size < MIN_SIZE:
+        raise ValueError(f"expected a size greater than or equal to {MIN_SIZE} bytes, those of an empty packet")
     return size
 
 
@@ -67,7 +67,7 @@ Seconds = Annotated[
     float, BeforeValidator(_seconds, json_schema_input_type=Annotated[float, Field(gt=0)] | _text(SECONDS))
 ]
 Packet = Annotated[
-    int, BeforeValidator(_packet, json_schema_input_type=Annotated[float, Field(ge=LEAST_SIZE)] | _text(BYTES))
+    int, BeforeValidator(_packet, json_schema_input_type=Annotated[float, Field(ge=MIN_SIZE)] | _text(BYTES))
 ]
 Memory = Annotated[int, BeforeValidator(_bytes, json_schema_input_type=Annotated[float, Field(ge=1)] | _text(BYTES))]
 
@@ -89,7 +89,7 @@ class Budget(BaseModel):
         "depend on the clock",
     )  # fmt: skip
     size: Packet | None = Field(
-        default=None, ge=LEAST_SIZE, description="bytes of a frame's packet, e.g. 20KB; an empty packet has 16"
+        default=None, ge=MIN_SIZE, description="bytes of a frame's packet, e.g. 20KB; an empty packet has 16"
     )
     rate: Rate | None = Field(
         default=None, gt=0,
@@ -123,10 +123,10 @@ def sized(budget: Budget, fps: float) -> Budget:
     if budget.rate is None:
         return budget
     share = math.floor(budget.rate / 8 / fps)
-    if share < LEAST_SIZE:
+    if share < MIN_SIZE:
         raise RecipeError(
             f"budget.rate: {budget.rate:g} bit/s are {budget.rate / 8 / fps:.1f} bytes for each of {fps:g} frames a "
-            f"second, and an empty packet has {LEAST_SIZE}; give at least {LEAST_SIZE * 8 * fps / 1000:.1f} kbit/s"
+            f"second, and an empty packet has {MIN_SIZE}; give at least {MIN_SIZE * 8 * fps / 1000:.1f} kbit/s"
         )
     return budget.model_copy(update={"rate": None, "size": min(share, budget.size or share)})
 

@@ -14,7 +14,7 @@ from gsstream.recipe.document import Empty, KeyPath, Layer, Leaf, Origin
 from gsstream.recipe.model import SCHEMA_VERSION, ComponentRef, Recipe
 
 #: Problems that are told at once; whoever wrote more of them gave the wrong file.
-MOST_PROBLEMS = 30
+MAX_PROBLEMS = 30
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -36,7 +36,7 @@ def keep_known(layer: Layer, problems: list[str]) -> dict[KeyPath, Leaf]:
     known: dict[KeyPath, Leaf] = {}
     refused: set[KeyPath] = set()
     for path, leaf in layer.leaves.items():
-        if len(problems) >= MOST_PROBLEMS:
+        if len(problems) >= MAX_PROBLEMS:
             problems.append("and more")
             break
         full, problem, upto = _full_path(path, leaf, layer.shorthand)

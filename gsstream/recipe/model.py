@@ -16,7 +16,7 @@ SCHEMA_VERSION = "1.0"
 #: Sections of a recipe that do not influence frame 0. A section that is not listed counts as one that does.
 LATER_KEYS = (
     "schema_version", "method", "seed", "frames", "confidence", "propagation", "gate", "regularizer", "update",
-    "stepper", "stream", "codec", "motion", "growth",
+    "streaming_method", "stream", "codec", "motion", "growth",
 )  # fmt: skip
 
 
@@ -76,7 +76,7 @@ class Stream(Section):
         description="factor on the learning rates of residuals at the last iteration of a frame, log-linear from 1 at "
         "the first; the rate of gates stays",
     )  # fmt: skip
-    quiet_tiles: float = Field(
+    static_tile_share: float = Field(
         default=1.0, gt=0, le=1,
         description="share of the tiles in which nothing changed that an iteration looks at, drawn anew each time; "
         "changed tiles and those beside them are always looked at",
@@ -89,11 +89,11 @@ class Stream(Section):
         description="tiles whose pixels differ from the last frame by more than this many sigmas of their own spread "
         "count as changed, and only Gaussians visible in them take part; 0: everything takes part",
     )  # fmt: skip
-    release_closed: bool = Field(
+    freeze_closed: bool = Field(
         default=False,
         description="after each pass over the cameras, rows whose gate has closed leave the optimisation",
     )
-    rate_weight: float = Field(
+    rd_lambda: float = Field(
         default=0.0, ge=0, le=1,
         description="weight in the loss of the residual's estimated bits per pixel of one view; 0: none",
     )  # fmt: skip
@@ -133,7 +133,7 @@ class Loss(Section):
 class Codec(Section):
     """How packets are written."""
 
-    key_every: int = Field(
+    key_interval: int = Field(
         default=0, ge=0, description="most frames from one key packet to the next, which replaces a delta; 0: no period"
     )
     trim: float = Field(
@@ -141,7 +141,7 @@ class Codec(Section):
         description="share of each delta packet's bytes given up, the symbols and gates that explain least per bit; "
         "not read under a budget of size, which trims as far as it must",
     )  # fmt: skip
-    key_rate: float = Field(
+    key_rd_lambda: float = Field(
         default=0.1, ge=0,
         description="squared error that a bit of frame 0 must save, in mean squared errors of one channel of a "
         "training image's pixel; 0: every value is rounded to the nearest",
@@ -170,7 +170,7 @@ class Recipe(Section):
     regularizer: ComponentRef = Field(default=ComponentRef(name="none"), description="what openness costs")
     update: ComponentRef = Field(default=ComponentRef(name="additive"), description="how a gated change is applied")
     growth: ComponentRef = Field(default=ComponentRef(name="none"), description="which Gaussians are born and leave")
-    stepper: ComponentRef = Field(
+    streaming_method: ComponentRef = Field(
         default=ComponentRef(name="parts"),
         description="what goes from frame to frame; parts: the slots above; other methods bring their own",
     )

@@ -64,14 +64,14 @@ class Rules:
         return bool(urlsplit(origin).netloc != request.headers.get("host"))
 
 
-def make_app(stream: Path, *, live: bool, rules: Rules, most_viewers: int, hub_of: list[Hub]) -> Starlette:
+def make_app(stream: Path, *, live: bool, rules: Rules, max_viewers: int, hub_of: list[Hub]) -> Starlette:
     """Return the application that serves a stream.
 
     Arguments:
         stream: the file; it need not exist yet.
         live: whether the page shows the newest frame as it comes, not the recording from its beginning.
         rules: who may look.
-        most_viewers: how many may watch live at a time.
+        max_viewers: how many may watch live at a time.
         hub_of: the hub is put here once the server runs.
     """
     from starlette.applications import Starlette
@@ -84,7 +84,7 @@ def make_app(stream: Path, *, live: bool, rules: Rules, most_viewers: int, hub_o
 
     @contextlib.asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
-        hub = Hub(follower, most_viewers=most_viewers)
+        hub = Hub(follower, max_viewers=max_viewers)
         follower.look()
         hub_of.append(hub)
         looking = asyncio.create_task(hub.run())

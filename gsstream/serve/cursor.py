@@ -12,21 +12,21 @@ from gsstream.serve.follow import Follower
 class Cursor:
     """The place of one viewer in a stream that is followed.
 
-    A viewer begins at the newest key packet. One that is more than ``most_behind`` packets late goes on at the newest
+    A viewer begins at the newest key packet. One that is more than ``max_lag`` packets late goes on at the newest
     key packet as soon as there is one ahead; until then it gets every packet, because each needs the one before.
     The file is the queue: nothing is kept for a viewer but its place.
     """
 
-    def __init__(self, follower: Follower, *, most_behind: int = 30, after: tuple[int, bytes] | None = None) -> None:
+    def __init__(self, follower: Follower, *, max_lag: int = 30, after: tuple[int, bytes] | None = None) -> None:
         """Begin at the newest key packet, or after a packet that the viewer has.
 
         Arguments:
             follower: the stream.
-            most_behind: packets that a viewer may be late before it leaves some out.
+            max_lag: packets that a viewer may be late before it leaves some out.
             after: number of the last frame that the viewer has, and the first 16 bytes of its packet, by which it is
                 recognised; what is not recognised is ignored.
         """
-        self.follower, self.most_behind = follower, most_behind
+        self.follower, self.max_lag = follower, max_lag
         self.generation = follower.generation
         #: Times that packets were left out.
         self.jumps = 0
@@ -43,7 +43,7 @@ class Cursor:
         newest = stream.keys[-1]
         if self._place is None:
             self._place = newest
-        elif newest > self._place and (self._broken or stream.count - self._place > self.most_behind):
+        elif newest > self._place and (self._broken or stream.count - self._place > self.max_lag):
             self._place, self._broken = newest, False
             self.jumps += 1
         if self._broken or self._place >= stream.count:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from starlette.websockets import WebSocket
 
 #: Seconds between two looks at the file, and between two at who writes it.
-LOOK, LOOK_AT_WRITER = 0.01, 0.5
+LOOK, WRITER_POLL_SECONDS = 0.01, 0.5
 #: Seconds between two answers to one viewer.
 ANSWER = 0.2
 
@@ -23,15 +23,15 @@ ANSWER = 0.2
 class Hub:
     """Everything that viewers of one stream share. Lives on one event loop."""
 
-    def __init__(self, follower: Follower, *, most_viewers: int, most_behind: int = 30) -> None:
+    def __init__(self, follower: Follower, *, max_viewers: int, max_lag: int = 30) -> None:
         """Serve the stream of a follower.
 
         Arguments:
             follower: the stream; looked at by :meth:`run` alone.
-            most_viewers: how many may watch at a time.
-            most_behind: packets that a viewer may be late before it is moved to a later key packet.
+            max_viewers: how many may watch at a time.
+            max_lag: packets that a viewer may be late before it is moved to a later key packet.
         """
-        self.follower, self.most_viewers, self.most_behind = follower, most_viewers, most_behind
+        self.follower, self.max_viewers, self.max_lag = follower, max_viewers, max_lag
         self.viewers: set[Cursor] = set()
         self.state = State("waiting")
         self._news = asyncio.Event()
@@ -41,7 +41,7 @@ class Hub:
         asked = 0.0
         while True:
             changed, now = self.follower.look(), time.monotonic()
-            if changed or now > asked + LOOK_AT_WRITER:
+            if changed or now > asked + WRITER_POLL_SECONDS:
                 asked, before, self.state = now, self.state, self.follower.state()
                 if changed or self.state != before:
                     news, self._news = self._news, asyncio.Event()
@@ -55,10 +55,10 @@ class Hub:
             socket: the connection.
             after: what the viewer has already, see :class:`Cursor`.
         """
-        if len(self.viewers) >= self.most_viewers:
-            await socket.close(1013, f"{self.most_viewers} viewers are watching already")
+        if len(self.viewers) >= self.max_viewers:
+            await socket.close(1013, f"{self.max_viewers} viewers are watching already")
             return
-        cursor = Cursor(self.follower, most_behind=self.most_behind, after=after)
+        cursor = Cursor(self.follower, max_lag=self.max_lag, after=after)
         self.viewers.add(cursor)
         tasks = [asyncio.create_task(self._send(socket, cursor)), asyncio.create_task(_answer(socket))]
         try:

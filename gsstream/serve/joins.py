@@ -28,14 +28,14 @@ _LEVEL = 15
 _LIMIT = 1 << 30
 
 
-def follow(source: IntArray, state: PlayerState) -> IntArray:
+def track_rows(source: IntArray, state: PlayerState) -> IntArray:
     """Return [N'] int64: which row of the key packet each row is after the packet that led to ``state``; -1 is none.
 
     Arguments:
         source: [N] the same of the frame before.
         state: after the packet.
     """
-    if state.delta is None or not state.delta.edits_rows:
+    if state.delta is None or not state.delta.has_row_edit:
         return source
     assert state.before is not None
     births = state.delta.births
@@ -50,7 +50,7 @@ def encode_join(key: PlayerState, state: PlayerState, source: IntArray) -> bytes
     Arguments:
         key: after the key packet.
         state: the state to join at, without another key packet between the two.
-        source: [N] which row of ``key`` each row of ``state`` was, -1 for rows born since (see :func:`follow`).
+        source: [N] which row of ``key`` each row of ``state`` was, -1 for rows born since (see :func:`track_rows`).
     """
     facts: dict[str, Any] = {"number": len(state.gaussians), "decoders": {}, "groups": None}
     arrays: list[IntArray | FloatArray] = []

@@ -19,7 +19,7 @@ from gsstream.core.errors import InputError, OutputError
 from gsstream.core.shapes import IntArray
 from gsstream.packet import FORMAT_VERSION, Entry, PacketKind, StreamReader, decode_key, decode_packet
 from gsstream.packet.base import file_header
-from gsstream.serve.joins import encode_join, follow
+from gsstream.serve.joins import encode_join, track_rows
 
 MANIFEST = "stream.json"
 SEGMENTS = "segments"
@@ -71,7 +71,7 @@ def package(
         for name in old - new:
             (folder / name).unlink(missing_ok=True)
     except BaseException as error:
-        _take_back(folder, old)
+        _remove_partial(folder, old)
         if isinstance(error, OSError):
             raise OutputError(f"cannot write the package {folder}: {error.strerror or error}") from error
         raise
@@ -101,7 +101,7 @@ def _old_files(folder: Path) -> set[str]:
     return {name for name in files if Path(name).parent == Path(SEGMENTS) and Path(name).suffix in (".gss", ".gsj")}
 
 
-def _take_back(folder: Path, old: set[str]) -> None:
+def _remove_partial(folder: Path, old: set[str]) -> None:
     """Remove what a package that failed had written beside the files of the one before."""
     for path in (folder / SEGMENTS).glob("*"):
         if f"{SEGMENTS}/{path.name}" not in old:
@@ -153,7 +153,7 @@ def _write_segment(reader: StreamReader, entries: Sequence[Entry], folder: Path,
             join = {"frame": entry.frame, "offset": shift + entry.offset, "file": name, "bytes": len(data)}
             segment["joins"].append(join)
         state = decode_packet(state, reader.read(entry), offset=entry.offset)
-        source = follow(source, state)
+        source = track_rows(source, state)
     return segment
 
 

@@ -25,9 +25,9 @@ LOOPBACK = "127.0.0.1"
 _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 #: Bytes that the system takes from us before the viewer has taken those before them, and milliseconds after which a
 #: viewer that takes nothing is cut off. Both where the system knows them.
-_UNSENT, _PATIENCE = 128 << 10, 60_000
+_UNSENT, _TIMEOUT_MS = 128 << 10, 60_000
 #: Largest message of a viewer; it only asks for the time.
-_MOST_ASKED = 1024
+_MAX_MESSAGE_BYTES = 1024
 
 
 class Server:
@@ -38,7 +38,7 @@ class Server:
 
     def __init__(
         self, stream: str | os.PathLike[str], *, live: bool = False, host: str = LOOPBACK, port: int = 8000,
-        token: str | None = None, origins: Sequence[str] = (), most_viewers: int = 16,
+        token: str | None = None, origins: Sequence[str] = (), max_viewers: int = 16,
     ) -> None:  # fmt: skip
         """Take the address.
 
@@ -49,7 +49,7 @@ class Server:
             port: 0 takes any that is free.
             token: what viewers must add to the address; None: nothing.
             origins: other web pages that may use the stream, e.g. https://example.org.
-            most_viewers: how many may watch live at a time.
+            max_viewers: how many may watch live at a time.
 
         Raises InputError without starlette and uvicorn or for an impossible origin, OutputError when nothing can be
         served at this address.
@@ -62,10 +62,10 @@ class Server:
         if not loopback and token is None:
             warnings.warn(f"everybody who reaches {host} may look; --token lets in only who knows it", stacklevel=2)
         hosts = (*_LOOPBACK_NAMES, *names) if loopback else None
-        self.token, self.most_viewers = token, most_viewers
+        self.token, self.max_viewers = token, max_viewers
         self._hubs: list[Hub] = []
         self.app = make_app(
-            Path(stream), live=live, rules=Rules(token, tuple(origins), hosts), most_viewers=most_viewers,
+            Path(stream), live=live, rules=Rules(token, tuple(origins), hosts), max_viewers=max_viewers,
             hub_of=self._hubs,
         )  # fmt: skip
         self._socket = _listen(host, port)
@@ -112,8 +112,8 @@ class Server:
 
         config = uvicorn.Config(
             self.app, log_config=None, access_log=False, log_level="warning", lifespan="on", server_header=False,
-            ws="websockets-sansio", ws_max_size=_MOST_ASKED, ws_per_message_deflate=False, ws_ping_interval=20,
-            ws_ping_timeout=60, limit_concurrency=4 * self.most_viewers + 64, timeout_graceful_shutdown=1,
+            ws="websockets-sansio", ws_max_size=_MAX_MESSAGE_BYTES, ws_per_message_deflate=False, ws_ping_interval=20,
+            ws_ping_timeout=60, limit_concurrency=4 * self.max_viewers + 64, timeout_graceful_shutdown=1,
         )  # fmt: skip
         server = uvicorn.Server(config)
         self._loop = asyncio.get_running_loop()
@@ -136,7 +136,7 @@ def _listen(host: str, port: int) -> socket.socket:
         if hasattr(socket, "TCP_NOTSENT_LOWAT"):
             listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _UNSENT)
         if hasattr(socket, "TCP_USER_TIMEOUT"):
-            listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _PATIENCE)
+            listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _TIMEOUT_MS)
         listener.bind((host, port))
         # At once: whoever was told the address may come before the server is ready, and no other server gets it.
         listener.listen(128)

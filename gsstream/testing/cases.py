@@ -155,7 +155,7 @@ def forest(n: int) -> Hierarchy:
     return Hierarchy(torch.arange(n) * 7 % 12 + 3, parent, torch.tensor([0] * 3 + [1] * 12))
 
 
-def make_world(name: str, before: Scene, cameras: Cameras, *, shift: float = 0.0) -> World:
+def make_case(name: str, before: Scene, cameras: Cameras, *, shift: float = 0.0) -> World:
     """Return a world whose Gaussians with x > 0.3 and in view move by ``shift`` between the frames.
 
     Arguments:
@@ -214,12 +214,12 @@ def _ellipsoids() -> Scene:
 
 
 def _moving(name: str, views: int = 3) -> World:
-    return make_world(name, scene(_cloud()), rig(views), shift=0.08)
+    return make_case(name, scene(_cloud()), rig(views), shift=0.08)
 
 
 def _sized(name: str, factor: float) -> World:
     """A cloud, its points and its cameras in another unit of length: its images are the same."""
-    base = make_world(name, scene(_cloud(30)), rig(), shift=0.08)
+    base = make_case(name, scene(_cloud(30)), rig(), shift=0.08)
     blobs, cameras, anchors, viewmats = base.gaussians, base.cameras, base.anchors, base.cameras.viewmats.copy()
     viewmats[:, :3, 3] *= factor
     lengths = {key: factor * getattr(anchors, key) for key in ("positions", "cell_sizes", "origin")}
@@ -231,24 +231,24 @@ def _sized(name: str, factor: float) -> World:
 
 
 def _huge(name: str) -> World:
-    world = make_world(name, scene(_cloud(24)), rig())
-    return replace(world, logits=1e4 * torch.sign(world.logits))
+    get_case = make_case(name, scene(_cloud(24)), rig())
+    return replace(get_case, logits=1e4 * torch.sign(get_case.logits))
 
 
 WORLDS: dict[str, Callable[[], World]] = {
-    "empty": lambda: make_world("empty", scene(torch.zeros(0, 3)), rig()),
-    "one": lambda: make_world("one", scene(torch.tensor([[0.1, 0.0, 0.0]])), rig()),
-    "coincident": lambda: make_world("coincident", scene(torch.full((40, 3), 0.25)), rig()),
-    "two identical": lambda: make_world("two identical", scene(torch.full((2, 3), 0.1)), rig()),
-    "line": lambda: make_world("line", scene(_line()), rig(), shift=0.05),
-    "cloud": lambda: make_world("cloud", _ellipsoids(), rig(), shift=0.08),
-    "far": lambda: make_world("far", scene(_cloud(30) + 1e6), rig()),
+    "empty": lambda: make_case("empty", scene(torch.zeros(0, 3)), rig()),
+    "one": lambda: make_case("one", scene(torch.tensor([[0.1, 0.0, 0.0]])), rig()),
+    "coincident": lambda: make_case("coincident", scene(torch.full((40, 3), 0.25)), rig()),
+    "two identical": lambda: make_case("two identical", scene(torch.full((2, 3), 0.1)), rig()),
+    "line": lambda: make_case("line", scene(_line()), rig(), shift=0.05),
+    "cloud": lambda: make_case("cloud", _ellipsoids(), rig(), shift=0.08),
+    "far": lambda: make_case("far", scene(_cloud(30) + 1e6), rig()),
     "tiny": lambda: _sized("tiny", 1e-6),
     "vast": lambda: _sized("vast", 1e6),
-    "thin": lambda: make_world("thin", _thin(), rig(), shift=0.05),
-    "static": lambda: make_world("static", scene(_cloud()), rig()),
+    "thin": lambda: make_case("thin", _thin(), rig(), shift=0.05),
+    "static": lambda: make_case("static", scene(_cloud()), rig()),
     "moving": lambda: _moving("moving"),
-    "unseen": lambda: make_world("unseen", scene(_unseen()), rig(), shift=0.08),
+    "unseen": lambda: make_case("unseen", scene(_unseen()), rig(), shift=0.08),
     "one camera": lambda: _moving("one camera", 1),
     "huge logits": lambda: _huge("huge logits"),
 }
@@ -265,7 +265,7 @@ def _made(name: str) -> World:
     return WORLDS[name]()
 
 
-def world(name: str) -> World:
+def get_case(name: str) -> World:
     """Return a fresh copy of a named world, so that a part that spoils its inputs spoils nobody else's."""
     fresh: World = _copy(_made(name))
     return fresh

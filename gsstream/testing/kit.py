@@ -12,11 +12,11 @@ from gsstream.core.kinds import PART_KINDS
 from gsstream.core.part import Part
 from gsstream.method.base import StreamingMethod
 from gsstream.spec import CommandSpec
-from gsstream.testing import stepping
+from gsstream.testing import method_driver
 from gsstream.testing.command.checks import CommandUnderTest
 from gsstream.testing.packet.checks import PacketCodec
 from gsstream.testing.recording import SourceUnderTest
-from gsstream.testing.registry import CHECKS, LEAST_REASON, Check, Skip, checks_for, denied_by, kind_of
+from gsstream.testing.registry import CHECKS, MIN_REASON, Check, Skip, checks_for, expected_failure_of, kind_of
 
 Status = Literal["passed", "failed", "expected failure", "skipped"]
 #: Rooms of checks: for parts of all kinds, for each kind, for packets. Importing them fills the registry, in the order
@@ -55,7 +55,7 @@ def run_check(entry: Check, subject: Any, expected: str | None = None) -> CheckR
             missing = f"not claimed: {type(subject.claims()).__name__}.{entry.trait}"
             return CheckResult(entry.name, name, "skipped", missing)
         if entry.kind == "method" and isinstance(subject, StreamingMethod):
-            subject = stepping.around(subject)
+            subject = method_driver.around(subject)
         entry.function(subject)
     except Skip as reason:
         return CheckResult(entry.name, name, "skipped", str(reason))
@@ -110,7 +110,7 @@ def run_method_checks(name: str, expected_failures: Mapping[str, str] | None = N
 
     Raises RecipeError, UnknownName or PluginUnavailable when it cannot be assembled.
     """
-    return run_subject("method", stepping.MethodUnderTest(name), expected_failures)
+    return run_subject("method", method_driver.MethodUnderTest(name), expected_failures)
 
 
 def run_command_checks(spec: CommandSpec, origin: str = "here") -> list[CheckResult]:
@@ -139,7 +139,7 @@ def run_subject(kind: str, subject: Any, expected: Mapping[str, str] | None = No
     given = dict(expected or {})
     entries = checks_for(kind)
     _check_reasons(given, [entry.name for entry in entries])
-    expected = {**denied_by(subject), **given}
+    expected = {**expected_failure_of(subject), **given}
     return [run_check(entry, subject, expected.get(entry.name)) for entry in entries]
 
 
@@ -159,7 +159,7 @@ def parametrize_with_checks(
     _check_reasons(expected, known)
     cases = []
     for place, part in enumerate(parts):
-        reasons = {**denied_by(part), **expected}
+        reasons = {**expected_failure_of(part), **expected}
         label = type(part).__name__ if len(parts) == 1 else f"{type(part).__name__}{place}"
         for entry in checks_for(kind_of(part)):
             if not _is_test(entry, part):
@@ -192,9 +192,9 @@ def _check_reasons(expected: Mapping[str, str], known: Iterable[str]) -> None:
     for name, reason in expected.items():
         if name not in known:
             raise ValueError(f"expected_failures: no check named {name!r} is made on this kind of part")
-        if len(reason.strip()) < LEAST_REASON:
+        if len(reason.strip()) < MIN_REASON:
             raise ValueError(
-                f"expected_failures[{name!r}]: expected a reason of at least {LEAST_REASON} characters, got {reason!r}"
+                f"expected_failures[{name!r}]: expected a reason of at least {MIN_REASON} characters, got {reason!r}"
             )
 
 

@@ -15,7 +15,7 @@ from gsstream.testing.recording import SourceUnderTest
 BEHAVED = tuple(name for name, kind in PART_KINDS.items() if kind.behaviour)
 
 #: Characters of a reason why a check fails, at least: enough for a sentence, too many for "todo".
-LEAST_REASON = 20
+MIN_REASON = 20
 
 CheckFunction = TypeVar("CheckFunction", bound=Callable[..., None])
 
@@ -80,7 +80,7 @@ def checks_for(kind: str) -> list[Check]:
     return [entry for entry in CHECKS.values() if kind in entry.kinds]
 
 
-def denied_by(subject: object) -> dict[str, str]:
+def expected_failure_of(subject: object) -> dict[str, str]:
     """Check -> why it fails, of all that a part denies; nothing for what is no part, or a part that cannot say it."""
     if not isinstance(subject, Part):
         return {}

@@ -11,11 +11,11 @@ import torch
 from gsstream.core.changes import Scene
 from gsstream.core.part import Part
 from gsstream.core.rng import Rng
-from gsstream.engine.step.active.change import Change, detect_change
-from gsstream.engine.step.context import FrameView
+from gsstream.engine.step.active.change import Change, detect_changed_tiles
+from gsstream.engine.step.context import EngineContext
 from gsstream.input.recordings.open import open_source
 from gsstream.method.base import Step
-from gsstream.testing.stepping import SOURCE, MethodUnderTest
+from gsstream.testing.method_driver import SOURCE, MethodUnderTest
 
 #: Sigmas beyond which tiles count as changed.
 THRESHOLD = 6.0
@@ -23,11 +23,11 @@ THRESHOLD = 6.0
 INDEX = 7
 
 
-class AtWork(NamedTuple):
+class FitFixture(NamedTuple):
     """What a part is given: the decoded scene, the frame it works on, random streams."""
 
     scene: Scene
-    work: FrameView
+    work: EngineContext
     rng: Rng
 
 
@@ -38,7 +38,7 @@ def _before() -> tuple[MethodUnderTest, Step[Any]]:
     return method, method.chain()[1]
 
 
-def at_work(*, changed: bool = True) -> AtWork:
+def fit_fixture(*, changed: bool = True) -> FitFixture:
     """Return frame 2 of a tiny recording, to be worked on.
 
     Arguments:
@@ -46,13 +46,13 @@ def at_work(*, changed: bool = True) -> AtWork:
     """
     method, step = _before()
     state, frame = step.state, open_source(SOURCE).frame(2)
-    change = detect_change(state.previous, frame, THRESHOLD)
+    change = detect_changed_tiles(state.previous, frame, THRESHOLD)
     assert change is not None
     if not changed:
         change = Change(torch.zeros_like(change.tiles), change.height, change.width)
     frame = replace(frame, index=INDEX, cameras=state.previous.cameras)
-    view = FrameView(method.parts, state.gaussians, state.hierarchy, frame, state.previous, state.exposure, change)
-    return AtWork(state.player.scene, view, Rng(method.parts.recipe.seed))
+    view = EngineContext(method.parts, state.gaussians, state.hierarchy, frame, state.previous, state.exposure, change)
+    return FitFixture(state.player.scene, view, Rng(method.parts.recipe.seed))
 
 
 def method_with(slot: str, part: Part) -> MethodUnderTest:

@@ -11,15 +11,15 @@ import torch
 from gsstream.core.kinds import CONTRACTS, PART_KINDS
 from gsstream.engine.method.parts import PartsMethod
 from gsstream.input.recordings.open import open_source
-from gsstream.method.hold import Hold
+from gsstream.method.static import Hold
 from gsstream.parts.confidence.uniform import Uniform
 from gsstream.parts.gate.always_open import AlwaysOpen
 from gsstream.parts.gate.base import GateSampler
 from gsstream.parts.growth.none import NoGrowth
 from gsstream.parts.loss.photometric import ReferenceLoss
-from gsstream.parts.motion.coasting import Coasting
+from gsstream.parts.motion.constant_velocity import Coasting
 from gsstream.parts.motion.rigid import Rigid
-from gsstream.parts.motion.still import Still
+from gsstream.parts.motion.none import Still
 from gsstream.parts.optimiser.adam import ReferenceAdam
 from gsstream.parts.propagation.group_max import GroupMax
 from gsstream.parts.regularizer.none import NoRegularizer
@@ -34,7 +34,7 @@ from gsstream.testing.loss.example import ExampleLoss
 from gsstream.testing.propagation.example import ExamplePropagation
 from gsstream.testing.regularizer.example import ExampleRegularizer
 from gsstream.testing.source.example import ExampleSource
-from gsstream.testing.stepper.example import ExampleStepper
+from gsstream.testing.streaming_method.example import ExampleMethod
 from gsstream.testing.structure.example import ExampleStructure
 from gsstream.testing.update.example import ExampleUpdate
 
@@ -44,7 +44,7 @@ BUILTIN = [
     Still(), Coasting(), Rigid(), NoGrowth(),
 ]  # fmt: skip
 EXAMPLES = [ExampleStructure(), ExampleConfidence(), ExamplePropagation(), ExampleGate(), ExampleRegularizer()]
-EXAMPLES += [ExampleStepper(), ExampleUpdate(), ExampleLoss()]
+EXAMPLES += [ExampleMethod(), ExampleUpdate(), ExampleLoss()]
 TINY = "synthetic:frames=4&views=3&width=32&height=24&supersample=1"
 SOURCES = [SourceUnderTest(ExampleSource, "square:"), SourceUnderTest(open_source, "demo")]
 SOURCES += [SourceUnderTest(open_source, TINY)]

@@ -36,7 +36,7 @@ CLAIMS: dict[str, dict[str, Any]] = {
         "differentiable": True, "weights": ("lambda1", "lambda2"), "gate_terms": ("sparsity",),
     },
     "regularizer/none": {},
-    "structure/flat": {"idempotent": True, "local": True, "lays_grid": False},
+    "structure/flat": {"idempotent": True, "local": True, "has_grid": False},
     "structure/octree": {"idempotent": True, "local": True},
 }  # fmt: skip
 #: Parts that cannot be made from their default settings.

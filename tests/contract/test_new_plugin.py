@@ -33,7 +33,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, st
         assert run_command(["new-plugin", f"my-{kind}", "--kind", kind, "--out", str(folder / kind)]) == 0
         install(folder / kind, folder / "site")
     commands = [f"check {kind}/my-{kind}" for kind in STARTABLE]
-    commands += ["check method/my-stepper", "recipe my-stepper"]  # a whole method is one of --method
+    commands += ["check method/my-streaming_method", "recipe my-streaming_method"]  # a whole method is one of --method
     done = python(folder / "site", "-c", ALL, json.dumps(commands), str(folder / "results.json"), cwd=folder)
     assert done.returncode == 0, done.stdout + done.stderr
     return json.loads((folder / "results.json").read_text())
@@ -50,11 +50,11 @@ def test_passes_the_contract_untouched(kind: str, results: dict[str, tuple[int, 
 
 
 def test_a_whole_method_is_one_of_the_methods(results: dict[str, tuple[int, str, str]]) -> None:
-    code, out, err = results["check method/my-stepper"]
+    code, out, err = results["check method/my-streaming_method"]
     assert code == 0, out + err
     assert "(skipped)" not in out
-    _, out, err = results["recipe my-stepper"]
-    assert "method: my-stepper" in out, err
+    _, out, err = results["recipe my-streaming_method"]
+    assert "method: my-streaming_method" in out, err
 
 
 def test_its_own_test_suite_and_lint_are_green(tmp_path: Path) -> None:

@@ -36,8 +36,8 @@ from gsstream.parts.regularizer.none import NoRegularizer
 from gsstream.parts.render.reference import ReferenceRenderer
 from gsstream.parts.structure.flat import Flat
 from gsstream.parts.update.additive import Additive, DirectCode
-from gsstream.parts.update.base import AttributeCode, UpdateRule, init_latents, symbols
-from gsstream.parts.update.joint import joint_code
+from gsstream.parts.update.base import AttributeCode, UpdateRule, init_latents, quantise_latents
+from gsstream.parts.update.joint import joint_layout
 
 PARTS = [Flat, Uniform, GroupMax, AlwaysOpen, NoRegularizer, Additive, ReferenceRenderer]
 
@@ -201,7 +201,7 @@ class TestQuantise:
         latents = {"opacities": torch.tensor([[value]], dtype=torch.float32)}
         base = make(1).map(torch.from_numpy)
         _, change = decode_rows(rule, base, latents, {}, torch.ones(1))
-        symbol = symbols(rule.codes(), latents)["opacities"].numpy()
+        symbol = quantise_latents(rule.codes(), latents)["opacities"].numpy()
         assert np.array_equal(change.latents.numpy(), symbol.astype(np.float32) * np.float32(step))
 
 
@@ -227,7 +227,7 @@ def transmitted(
     trained = train_rows(rule, base, gate, latents, decoders, units)
     residual = Residual(
         gates, levels,
-        {name: value.numpy() for name, value in symbols(rule.codes(), latents).items()},
+        {name: value.numpy() for name, value in quantise_latents(rule.codes(), latents).items()},
         {name: code.step for name, code in rule.codes().items()},
         {name: value.numpy() for name, value in decoders.items()},
     )  # fmt: skip
@@ -317,7 +317,7 @@ def test_written_out_gradient_equals_autograd() -> None:
     pairs = zip(changed.items(), upstream.items(), strict=True)
     sum((value * weight).sum() for (_, value), (_, weight) in pairs).backward()
     with torch.no_grad():
-        code = joint_code(rule.codes(), latents, decoders, base)
+        code = joint_layout(rule.codes(), latents, decoders, base)
         joined, matrix = torch.cat(list(latents.values()), 1), code.join_decoders(decoders)
         change = decode_joint(code, joined, matrix, units)
         ours = add_joint(code, base, join_features(code, base), change, gates)
@@ -336,9 +336,9 @@ def test_written_out_gradient_equals_autograd() -> None:
 
 def test_joint_table_of_attributes_that_do_not_change() -> None:
     base = make(4).map(torch.from_numpy)
-    none = joint_code(Additive().codes(), init_latents(Additive(), base.rows(torch.arange(0))), {}, base)
+    none = joint_layout(Additive().codes(), init_latents(Additive(), base.rows(torch.arange(0))), {}, base)
     assert tuple(join_features(none, base.rows(torch.arange(0))).shape) == (0, none.trained.shape[1])
-    code = joint_code(Additive().codes(), {}, {}, base)
+    code = joint_layout(Additive().codes(), {}, {}, base)
     change = decode_joint(code, torch.zeros(4, 0), code.join_decoders({}), torch.ones(4))
     same = add_joint(code, base, join_features(code, base), change, torch.ones(4))
     assert all(torch.equal(a, b) for (_, a), (_, b) in zip(same.items(), base.items(), strict=True))

@@ -17,7 +17,7 @@ from gsstream.testing.kit import (
     run_packet_checks,
     run_subject,
 )
-from gsstream.testing.stepping import MethodUnderTest
+from gsstream.testing.method_driver import MethodUnderTest
 
 
 def failed(results: list[CheckResult]) -> dict[str, str]:

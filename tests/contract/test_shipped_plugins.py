@@ -12,7 +12,7 @@ import pytest
 from gsstream.cli.main import run_command
 from gsstream.plugins.catalog import load_catalog
 from gsstream.testing.kit import run_checks
-from gsstream.testing.stepping import around
+from gsstream.testing.method_driver import around
 
 SHIPPED = {
     "gsstream": "builtin", "gsstream-s2gs": "s2gs", "gsstream-queen": "queen", "gsstream-cpu-render": "cpu",
@@ -34,7 +34,7 @@ def test_everything_shipped_keeps_the_contract(distribution: str, capsys: pytest
 
 
 BORN = {"gradient": 1e-6, "rounds": 1, "most": 9}
-ANCHORS = {"measure": "anchor", "change": 6.0, "step": 0.02, "turn_step": 0.002}
+ANCHORS = {"measure": "anchor", "change": 6.0, "step": 0.02, "rotation_step": 0.002}
 CACHE = {"levels": 4, "entries": 8, "width": 8, "lr": 0.02, "box": 0.0}
 #: Whole method -> settings under which something moves, and is born, in three frames of one or two passes.
 EAGER: dict[str, list[dict[str, Any]]] = {
@@ -55,7 +55,7 @@ OTHERWISE: dict[tuple[str, str], list[dict[str, Any]]] = {
     ("gate", "binary-ste"): [{"noise": "none"}, {"temperature": 2.0}, {"clamp_gradient": True}],
     ("propagation", "ft-pruning"): [{"tau": tau} for tau in (0.5, 0.8, 0.9, 0.95)],
 }
-ROWS = [(("stepper", name), settings) for name, rows in EAGER.items() for settings in rows]
+ROWS = [(("streaming_method", name), settings) for name, rows in EAGER.items() for settings in rows]
 ROWS += [(slot, settings) for slot, rows in OTHERWISE.items() for settings in rows]
 FOUND = load_catalog().entries
 
@@ -67,5 +67,5 @@ def test_under_settings_that_matter_it_keeps_the_contract(slot: tuple[str, str],
     target = load_catalog().resolve(*slot)
     part = target(target.Config.model_validate(settings))
     assert [f"{result.check}: {result.message}" for result in run_checks(part) if not result.ok] == []
-    if slot[0] == "stepper":
+    if slot[0] == "streaming_method":
         assert "delta" in [step.status for step in around(part).steps], "nothing happened: the checks prove too little"

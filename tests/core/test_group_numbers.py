@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsstream.core.changes import Layout, Scene, groups_for
-from gsstream.core.changes.motion import HALF_GRID, MOST_CELLS
+from gsstream.core.changes.motion import HALF_GRID, MAX_CELLS_PER_ROW
 from gsstream.core.gaussians import SH0, Gaussians
 
 ROWS, CELL = 300, 0.25
@@ -25,7 +25,7 @@ def test_groups_are_numbered_as_sorting_their_cells_would(reach: float, shades: 
 
     index = np.floor(means.astype(np.float64) / CELL)
     cells = np.clip(index, -HALF_GRID, HALF_GRID - 1).astype(int)
-    assert (np.ptp(cells, axis=0).prod() > MOST_CELLS * ROWS) == (reach > 1), "both ways are looked at"
+    assert (np.ptp(cells, axis=0).prod() > MAX_CELLS_PER_ROW * ROWS) == (reach > 1), "both ways are looked at"
     red, green, blue = colours[:, 0].astype(np.float64).T
     bright = 0.5 + SH0 * (0.25 * red + 0.5 * green + 0.25 * blue)
     tones = np.clip(np.floor(bright * shades), 0, shades - 1).astype(int).tolist()

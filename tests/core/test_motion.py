@@ -12,7 +12,7 @@ from motion_oracle import World
 from scipy.spatial.transform import Rotation
 
 from gsstream.core.changes import (
-    Births,
+    AddedGaussians,
     Delta,
     Groups,
     Layout,
@@ -23,8 +23,8 @@ from gsstream.core.changes import (
     apply_delta,
     apply_motion,
     groups_for,
-    in_nodes,
-    own_nodes,
+    add_to_nodes,
+    add_as_nodes,
 )
 from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import Gaussians
@@ -257,8 +257,8 @@ def test_groups_are_those_of_the_text(seed: int, cell: np.float32, shades: int) 
     assert (found.group_of.tolist(), found.count) == (world.group_of, world.count)
 
 
-def born(number: int, nodes: object) -> Births:
-    return in_nodes(scene_of(np.full((number, 3), 50.0)).gaussians, np.asarray(nodes), np.zeros(number, np.uint8))
+def born(number: int, nodes: object) -> AddedGaussians:
+    return add_to_nodes(scene_of(np.full((number, 3), 50.0)).gaussians, np.asarray(nodes), np.zeros(number, np.uint8))
 
 
 def spread() -> Scene:
@@ -309,7 +309,7 @@ def test_first_rows_that_are_born_join_the_first_old_row() -> None:
 
 @pytest.mark.parametrize("births", [0, 3])
 def test_without_an_old_row_the_groups_are_forgotten(births: int) -> None:
-    new = own_nodes(scene_of(np.ones((3, 3))).gaussians, np.zeros(3), 3) if births else None
+    new = add_as_nodes(scene_of(np.ones((3, 3))).gaussians, np.zeros(3), 3) if births else None
     after = play(spread(), Rows(new, np.arange(6)))
     assert after.groups is None
     assert play(after, move(after, predicted=True)).groups.count == (1 if births else 0)
@@ -342,7 +342,7 @@ def test_misfits_are_refused_in_words() -> None:
     bad = {
         "a mark for each of 6 groups": dataclasses.replace(motion, moving=motion.moving[:-1]),
         "6 symbols for each of 6 moving groups": dataclasses.replace(motion, symbols=motion.symbols[:-1]),
-        "beyond the range of float32": dataclasses.replace(motion, symbols=motion.symbols + 2**30, shift_step=1e38),
+        "beyond the range of float32": dataclasses.replace(motion, symbols=motion.symbols + 2**30, translation_step=1e38),
     }
     for message, wrong in bad.items():
         with pytest.raises(ShapeError, match=message):

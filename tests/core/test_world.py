@@ -13,7 +13,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError
 from gsstream.core.frame import PointCloud
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.world import IDENTITY, World, own_world, snapped
+from gsstream.core.world import IDENTITY, World, rig_similarity, snap_cameras
 from gsstream.player.software import render_numpy
 
 K = np.array([[60.0, 0, 24], [0, 60.0, 18], [0, 0, 1]])
@@ -84,18 +84,18 @@ def test_a_rig_defines_the_same_world_wherever_it_stands(name, where):
     where = replace(where, offset=tuple(where.scale * value for value in where.offset))  # up to 1e7 rig sizes
     here, there = RIGS[name], where.cameras(RIGS[name])
     moved = replace(POINTS, xyz=where.points(POINTS.xyz))
-    own, theirs = own_world(here, lambda: POINTS), own_world(there, lambda: moved)
+    own, theirs = rig_similarity(here, lambda: POINTS), rig_similarity(there, lambda: moved)
     known = 1e-9 * max(1.0, np.abs(where.offset).max() / where.scale / 1e5)  # float64 far from the origin
-    assert theirs.cameras_back(there).viewmats == pytest.approx(own.cameras_back(here).viewmats, abs=known)
-    assert theirs.points_back(moved.xyz) == pytest.approx(own.points_back(POINTS.xyz), abs=10 * known)
+    assert theirs.inverse_cameras(there).viewmats == pytest.approx(own.inverse_cameras(here).viewmats, abs=known)
+    assert theirs.inverse_points(moved.xyz) == pytest.approx(own.inverse_points(POINTS.xyz), abs=10 * known)
     assert theirs.is_near(where.after(own))
 
 
 @pytest.mark.parametrize("name", RIGS)
 def test_a_rigs_own_world_is_upright_and_of_unit_size(name):
-    own = own_world(RIGS[name], lambda: POINTS)
+    own = rig_similarity(RIGS[name], lambda: POINTS)
     own.validate()
-    placed = own.cameras_back(RIGS[name])
+    placed = own.inverse_cameras(RIGS[name])
     assert placed.centers.mean(0) == pytest.approx(np.zeros(3), abs=1e-9)
     if name not in ("one", "one place"):
         assert placed.extent == pytest.approx(1)
@@ -111,17 +111,17 @@ def test_a_rigs_own_world_is_upright_and_of_unit_size(name):
 def test_the_order_of_the_cameras_does_not_matter(name):
     cameras = RIGS[name]
     backwards = cameras.select(range(len(cameras))[::-1])
-    assert own_world(backwards, lambda: POINTS) == own_world(cameras, lambda: POINTS)
+    assert rig_similarity(backwards, lambda: POINTS) == rig_similarity(cameras, lambda: POINTS)
 
 
 def test_a_rig_without_extent_is_measured_by_its_points():
     cameras = RIGS["one place"]
     distance = np.median(np.linalg.norm(POINTS.xyz - cameras.centers.mean(0), axis=1))
-    assert own_world(cameras, lambda: POINTS).scale == pytest.approx(distance)
-    assert own_world(cameras).scale == 1
+    assert rig_similarity(cameras, lambda: POINTS).scale == pytest.approx(distance)
+    assert rig_similarity(cameras).scale == 1
     empty = replace(POINTS, xyz=POINTS.xyz[:0])
-    assert own_world(cameras, lambda: empty).scale == 1
-    assert own_world(cameras.select([])) == IDENTITY
+    assert rig_similarity(cameras, lambda: empty).scale == 1
+    assert rig_similarity(cameras.select([])) == IDENTITY
 
 
 def test_rotations_that_are_rounded_do_not_move_cameras_of_a_far_rig():
@@ -129,12 +129,12 @@ def test_rotations_that_are_rounded_do_not_move_cameras_of_a_far_rig():
     far = similarity(3, 1.0, 5e6).cameras(RIGS["arc"])
     rounded = replace(far, viewmats=far.viewmats.copy())
     rounded.viewmats[:, :3, :3] = np.round(far.viewmats[:, :3, :3], 6)
-    own = own_world(rounded)
+    own = rig_similarity(rounded)
     # What a file with such rotations says: x_camera = R x + t, with R as it is written.
     points = far.centers.mean(0) + np.random.default_rng(1).normal(size=(20, 3))
     seen = np.einsum("cij,nj->cni", rounded.viewmats[:, :3, :3], points) + rounded.viewmats[:, None, :3, 3]
-    placed = own.cameras_back(rounded)
-    again = np.einsum("cij,nj->cni", placed.viewmats[:, :3, :3], own.points_back(points))
+    placed = own.inverse_cameras(rounded)
+    again = np.einsum("cij,nj->cni", placed.viewmats[:, :3, :3], own.inverse_points(points))
     again += placed.viewmats[:, None, :3, 3]
     assert own.scale * again == pytest.approx(seen, abs=1e-6)
 
@@ -144,7 +144,7 @@ def test_rotations_that_are_rounded_do_not_move_cameras_of_a_far_rig():
 def test_worlds_invert_and_follow_each_other(first, second):
     xyz = np.random.default_rng(1).normal(size=(8, 3))
     lost = 1e-14 * (1 + np.abs(first.offset).max() / first.scale)  # float64 far from the origin
-    assert first.points_back(first.points(xyz)) == pytest.approx(xyz, abs=lost)
+    assert first.inverse_points(first.points(xyz)) == pytest.approx(xyz, abs=lost)
     chained, direct = first.after(second).points(xyz), first.points(second.points(xyz))
     assert chained == pytest.approx(direct, rel=1e-9, abs=1e-12 * np.abs(direct).max())
     there = first.inverse().points(first.points(xyz))
@@ -188,11 +188,11 @@ def test_the_identity_changes_no_bit():
 def test_rounded_poses_are_still_rotations_and_forget_the_noise():
     cameras = RIGS["ring"]
     noise = np.random.default_rng(0).uniform(-1e-13, 1e-13, cameras.viewmats.shape)
-    rounded = snapped(cameras)
+    rounded = snap_cameras(cameras)
     assert np.abs(rounded.viewmats - cameras.viewmats).max() < 4 * 2.0**-30
     turns = rounded.viewmats[:, :3, :3]
     assert turns @ turns.transpose(0, 2, 1) == pytest.approx(np.tile(np.eye(3), (8, 1, 1)), abs=1e-15)
-    assert np.array_equal(snapped(replace(cameras, viewmats=cameras.viewmats + noise)).viewmats, rounded.viewmats)
+    assert np.array_equal(snap_cameras(replace(cameras, viewmats=cameras.viewmats + noise)).viewmats, rounded.viewmats)
 
 
 @pytest.mark.parametrize("fault", [

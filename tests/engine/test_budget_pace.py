@@ -9,8 +9,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from gsstream.engine.budget.pace import Allowance, EpochScheduler
-from gsstream.engine.budget.plan import MOST_TRIMMED, TIME_MARGIN, UNKNOWN_RESERVE, FramePlan, Past, plan
+from gsstream.engine.budget.epoch_scheduler import Allowance, EpochScheduler
+from gsstream.engine.budget.plan import MAX_TRIMMED, TIME_MARGIN, UNKNOWN_RESERVE, FramePlan, Past, plan
 from gsstream.engine.budget.schedule import Schedule
 from gsstream.recipe.budget import Budget
 from gsstream.recipe.model import Stream
@@ -31,7 +31,7 @@ def paced(seconds: float, effort: float = 1.0, before: float = 0.0, **known: flo
     began = clock.now
     clock.now += before
     values = {"after": 1.0, "each": 0.55, **known}
-    found = FramePlan(20, 6.0, 3e-4, most_epochs=30, seconds=seconds, **values)  # type: ignore[arg-type]
+    found = FramePlan(20, 6.0, 3e-4, max_epochs=30, seconds=seconds, **values)  # type: ignore[arg-type]
     return EpochScheduler(Allowance(found, began, clock), max(1, round(effort * 20)), 3e-4, 5, effort), clock
 
 
@@ -102,9 +102,9 @@ def test_the_weight_of_a_frame_is_that_of_its_last_half() -> None:
     pace = EpochScheduler(Allowance(FramePlan(4, 6.0, 1e-3, max_bytes=1000), clock.now, clock), 4, 1e-3, 5)
     for done in range(1, 5):
         pace.end_epoch(done)
-        pace.weigh_bytes(done, lambda: 10 * MOST_TRIMMED * 1000)
+        pace.weigh_bytes(done, lambda: 10 * MAX_TRIMMED * 1000)
     # Made with 1e-3 (its pass is a quarter of all: looked at), then three times as much after each pass.
-    assert pace.typical_weight == pytest.approx(math.sqrt(9e-3 * 27e-3))
+    assert pace.mean_rate_weight == pytest.approx(math.sqrt(9e-3 * 27e-3))
 
 
 @pytest.mark.parametrize(("estimate", "after"), [(900, 1e-3), (1000, 1e-3), (1999, 1e-3), (4000, 2e-3), (235, 5e-4)])

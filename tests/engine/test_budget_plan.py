@@ -15,13 +15,13 @@ from gsstream.core import log as log_module
 from gsstream.core.errors import RecipeError
 from gsstream.core.log import FrameLog
 from gsstream.engine.budget.controller import Controller
-from gsstream.engine.budget.pace import estimated_bytes, next_weight
+from gsstream.engine.budget.epoch_scheduler import estimated_bytes, next_rate_weight
 from gsstream.engine.budget.plan import (
-    LEAST_WEIGHT,
-    MOST_WEIGHT,
+    MIN_WEIGHT,
+    MAX_WEIGHT,
     TIME_MARGIN,
     Past,
-    epochs_within,
+    epochs_in,
     plan,
 )
 from gsstream.engine.budget.report import budget_lines
@@ -34,7 +34,7 @@ from gsstream.recipe.model import Stream
 SECONDS = st.floats(1e-3, 10)
 PASTS = st.builds(
     Past, frame=st.just(1), epochs=st.floats(0.1, 30), candidates=st.integers(1, 10_000), before=SECONDS,
-    optimise=SECONDS, after=SECONDS, weight=st.floats(LEAST_WEIGHT, MOST_WEIGHT), step_scale=st.floats(1, 4),
+    optimise=SECONDS, after=SECONDS, weight=st.floats(MIN_WEIGHT, MAX_WEIGHT), step_scale=st.floats(1, 4),
     threshold=st.floats(0, 24), estimate=st.floats(0, 1e5), untrimmed=st.integers(16, 100_000),
     size=st.integers(16, 100_000),
 )  # fmt: skip
@@ -115,7 +115,7 @@ def test_a_size_plans_within_it_and_leaves_time_alone(stream: Stream, history: l
     found = plan(Budget(size=size), stream, history)
     assert found.max_bytes == size
     assert found.predicted_bytes is None or found.predicted_bytes <= size
-    assert LEAST_WEIGHT <= found.rate_weight <= MOST_WEIGHT
+    assert MIN_WEIGHT <= found.rd_lambda <= MAX_WEIGHT
     assert 1 <= found.step_scale <= 4
     assert found.epochs == stream.epochs, "bytes must not depend on what the clock said"
     assert found.change_threshold == stream.change_threshold
@@ -127,8 +127,8 @@ def test_a_size_plans_within_it_and_leaves_time_alone(stream: Stream, history: l
 @given(STREAMS, HISTORIES)
 def test_without_limits_the_recipe_is_the_plan(stream: Stream, history: list[Past]) -> None:
     found = plan(Budget(), stream, history)
-    assert (found.epochs, found.change_threshold, found.rate_weight) == (
-        stream.epochs, stream.change_threshold, stream.rate_weight
+    assert (found.epochs, found.change_threshold, found.rd_lambda) == (
+        stream.epochs, stream.change_threshold, stream.rd_lambda
     )  # fmt: skip
     assert (found.step_scale, found.max_bytes, found.seconds) == (1.0, None, None)
 
@@ -145,8 +145,8 @@ def test_too_few_passes_raise_the_threshold_and_plenty_lower_it_again() -> None:
 
 
 def test_steps_get_coarser_only_when_the_weight_is_spent() -> None:
-    stream, small = Stream(rate_weight=3e-4), Budget(size=1000)
-    spent = replace(USUAL, weight=MOST_WEIGHT, untrimmed=3000, size=1000)
+    stream, small = Stream(rd_lambda=3e-4), Budget(size=1000)
+    spent = replace(USUAL, weight=MAX_WEIGHT, untrimmed=3000, size=1000)
     assert plan(small, stream, [spent]).step_scale == pytest.approx(math.sqrt(2))
     assert plan(small, stream, [replace(spent, weight=1e-3)]).step_scale == 1.0
     assert plan(small, stream, [replace(USUAL, step_scale=2.0)]).step_scale == pytest.approx(math.sqrt(2))
@@ -154,16 +154,16 @@ def test_steps_get_coarser_only_when_the_weight_is_spent() -> None:
 
 @given(st.floats(0, 100), st.floats(1e-6, 10), st.integers(1, 40))
 def test_passes_fill_the_time(seconds: float, each: float, most: int) -> None:
-    epochs = epochs_within(seconds, each, most)
+    epochs = epochs_in(seconds, each, most)
     assert 1 <= epochs <= most
     assert epochs == 1 or epochs * each <= seconds * (1 + 1e-6)
     assert epochs == most or (epochs + 1) * each > seconds * (1 - 1e-6)
 
 
-@given(st.floats(LEAST_WEIGHT, MOST_WEIGHT), st.floats(0, 1e6), st.floats(1, 1e6))
+@given(st.floats(MIN_WEIGHT, MAX_WEIGHT), st.floats(0, 1e6), st.floats(1, 1e6))
 def test_the_weight_moves_towards_the_size(weight: float, expected: float, wanted: float) -> None:
-    after = next_weight(weight, expected, wanted)
-    assert LEAST_WEIGHT <= after <= MOST_WEIGHT
+    after = next_rate_weight(weight, expected, wanted)
+    assert MIN_WEIGHT <= after <= MAX_WEIGHT
     assert after >= weight if expected > wanted else after <= weight
 
 
@@ -253,10 +253,10 @@ def test_a_method_that_logs_no_use_of_its_budget_is_described_by_its_phases(
 
 
 def test_a_frame_starts_with_the_recipes_weight_or_less_where_bytes_were_left() -> None:
-    stream, size = Stream(rate_weight=3e-4), Budget(size=10_000)
-    assert plan(size, stream, []).rate_weight == 3e-4
+    stream, size = Stream(rd_lambda=3e-4), Budget(size=10_000)
+    assert plan(size, stream, []).rd_lambda == 3e-4
     known = replace(USUAL, weight=2e-4)
-    starts = [plan(size, stream, [replace(known, untrimmed=n)]).rate_weight for n in (3000, 9400, 13_000, 99_000)]
+    starts = [plan(size, stream, [replace(known, untrimmed=n)]).rd_lambda for n in (3000, 9400, 13_000, 99_000)]
     assert starts == sorted(starts)
     assert starts[0] == 1e-4
     assert starts[1] == pytest.approx(2e-4, rel=1e-3)

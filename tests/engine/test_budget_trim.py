@@ -7,9 +7,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from gsstream.core.changes import Delta, Layout, Motion, Residual, Rows, Scene, own_nodes, sent_rows
+from gsstream.core.changes import Delta, Layout, Motion, Residual, Rows, Scene, add_as_nodes, sent_rows
 from gsstream.core.gaussians import Gaussians
-from gsstream.engine.budget.trim import _GATE_BITS, _Table, fit
+from gsstream.engine.budget.trim import _GATE_BITS, _Table, trim_to_size
 from gsstream.packet import EncodedPacket, encode_delta, encode_empty, quantise_decoders
 from gsstream.packet.delta import decode_delta
 
@@ -34,7 +34,7 @@ def scene(seed: int, *, spread: float = 4.0, share: float = 0.7, births: int = 0
             means=g.normal(size=(births, 3)), quats=g.normal(size=(births, 4)), scales=g.normal(size=(births, 3)),
             opacities=g.normal(size=births), sh0=g.normal(size=(births, 1, 3)), shN=np.zeros((births, 0, 3)),
         ).map(lambda value: np.asarray(value, np.float32))  # fmt: skip
-        born = own_nodes(colour, np.zeros(births, np.uint8), NODES)
+        born = add_as_nodes(colour, np.zeros(births, np.uint8), NODES)
     residual = Residual(gates, 10, symbols, dict.fromkeys(symbols, 0.5), quantise_decoders(decoders))
     delta = Delta((residual,)).with_rows(Rows(born))
     curvature = {name: g.exponential(size=value.shape) for name, value in symbols.items()}
@@ -62,7 +62,7 @@ def test_a_packet_never_exceeds_a_feasible_size(seed: int, share: float, spread:
     encode = encoder(layout)
     whole = len(encode(delta).data)
     limit = max(16, int(share * whole))
-    fitted = fit(delta, encode(delta), curvature, layout, encode, limit)
+    fitted = trim_to_size(delta, encode(delta), curvature, layout, encode, limit)
     assert len(fitted.packet.data) <= limit
     assert fitted.untrimmed == whole
     if whole <= limit:
@@ -93,7 +93,7 @@ def test_the_limit_is_nearly_used(seed: int) -> None:
     encode = encoder(layout)
     for share in (0.9, 0.6, 0.35):
         limit = int(share * len(encode(delta).data))
-        assert len(fit(delta, encode(delta), curvature, layout, encode, limit).packet.data) >= 0.85 * limit
+        assert len(trim_to_size(delta, encode(delta), curvature, layout, encode, limit).packet.data) >= 0.85 * limit
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -104,7 +104,7 @@ def test_what_matters_stays(seed: int) -> None:
     dear = np.repeat(np.arange(len(opened)) % 2 == 0, layout.node_counts[opened])
     curvature = {name: value * np.where(dear, 1000.0, 1.0)[:, None] for name, value in curvature.items()}
     encode = encoder(layout)
-    fitted = fit(delta, encode(delta), curvature, layout, encode, int(0.5 * len(encode(delta).data)))
+    fitted = trim_to_size(delta, encode(delta), curvature, layout, encode, int(0.5 * len(encode(delta).data)))
     kept = fitted.delta.residual.gates[opened] != 0
     assert kept[0::2].mean() > 0.8
     assert kept[1::2].mean() < 0.1
@@ -113,7 +113,7 @@ def test_what_matters_stays(seed: int) -> None:
 def test_births_go_when_nothing_else_helps() -> None:
     delta, curvature, layout = scene(1, births=40)
     encode = encoder(layout)
-    plain = fit(delta, encode(delta), curvature, layout, encode, 400)
+    plain = trim_to_size(delta, encode(delta), curvature, layout, encode, 400)
     assert plain.delta.births is None
     assert plain.births == 40
     assert len(plain.packet.data) <= 400
@@ -125,16 +125,16 @@ def test_a_motion_stays_while_symbols_go_and_goes_last_of_all() -> None:
     motion = Motion(0.5, 1, np.array([1, 0, 1], np.uint8), np.full((2, 6), 3, np.int32), 0.25, 0.25)
     delta = Delta((motion, *delta.changes))
     encode = encoder(layout)
-    fitted = fit(delta, encode(delta), curvature, layout, encode, len(encode(delta).data) // 2)
+    fitted = trim_to_size(delta, encode(delta), curvature, layout, encode, len(encode(delta).data) // 2)
     assert fitted.delta.motions == (motion,)
     assert fitted.symbols > 0
-    assert fit(delta, encode(delta), curvature, layout, encode, 16).delta.is_empty
+    assert trim_to_size(delta, encode(delta), curvature, layout, encode, 16).delta.is_empty
 
 
 def test_an_empty_packet_is_the_last_resort() -> None:
     delta, curvature, layout = scene(2)
     encode = encoder(layout)
-    fitted = fit(delta, encode(delta), curvature, layout, encode, 16)
+    fitted = trim_to_size(delta, encode(delta), curvature, layout, encode, 16)
     assert fitted.delta.is_empty
     assert len(fitted.packet.data) == 16
     assert fitted.gates == np.count_nonzero(delta.residual.gates)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.engine.step.active.candidates import VoteBook, candidates, changed_rows, released
+from gsstream.engine.step.active.candidates import VoteCache, candidates, changed_rows, keep_mask
 from gsstream.engine.step.active.change import Change
 from gsstream.parts.render.base import TILE, RenderSession, ScatterSession
 from gsstream.parts.render.reference import ReferenceRenderer
@@ -128,7 +128,7 @@ def test_votes_that_are_known_are_those_counted_anew(seed: int, moved: int, grow
     rng = np.random.default_rng(seed)
     means = torch.from_numpy(rng.uniform([-4, -3, -1], [4, 3, 6], (40, 3)).astype(np.float32))
     change = Change(torch.from_numpy(rng.random((3, 3, 4)) < 0.3), HEIGHT, WIDTH)
-    book = VoteBook(change, rig(3))
+    book = VoteCache(change, rig(3))
     after = means.clone()
     after[rng.permutation(40)[:moved]] += 1.0
     if grown:
@@ -160,8 +160,8 @@ def test_rows_leave_when_their_gate_rounds_to_closed(nodes: int, rows: int, seed
     waiting = rng.random(rows) < 0.3
     hierarchy = flat(node_of, nodes)
     stays = [round(gates[node] * levels) > 0 for node in node_of]
-    assert released(torch.from_numpy(gates), levels, hierarchy, None).tolist() == stays
-    found = released(torch.from_numpy(gates), levels, hierarchy, torch.from_numpy(waiting))
+    assert keep_mask(torch.from_numpy(gates), levels, hierarchy, None).tolist() == stays
+    found = keep_mask(torch.from_numpy(gates), levels, hierarchy, torch.from_numpy(waiting))
     assert found.tolist() == [bool(a or b) for a, b in zip(stays, waiting, strict=True)]
 
 

@@ -11,7 +11,7 @@ import pytest
 from gsstream.core.errors import OutputError
 from gsstream.core.world import IDENTITY
 from gsstream.encode import encoder_for, open_recording
-from gsstream.engine.frame0.carried import in_world
+from gsstream.engine.frame0.reproject import to_stream_coordinates
 from gsstream.packet import KeyState, PlayerState, StreamWriter, decode_packet, encode_key
 from gsstream.player.render import render
 from tools.worlds import world
@@ -40,13 +40,13 @@ def test_a_scene_of_other_coordinates_is_brought_into_those_of_the_run():
     scene = where.gaussians(player.gaussians).map(lambda values: np.asarray(values, np.float32))
     layout = replace(player.layout, units=np.float32(30.0) * player.layout.units)
     foreign = replace(player, scene=replace(player.scene, gaussians=scene, layout=layout), meta=theirs)
-    taken = in_world(foreign, player.meta.world)
+    taken = to_stream_coordinates(foreign, player.meta.world)
     assert taken.layout.units == pytest.approx(player.layout.units, rel=1e-5)
     assert taken.meta.train.viewmats == pytest.approx(player.meta.train.viewmats, abs=1e-9)
     pictures = [render(s.gaussians, player.meta.train, 1, renderer=None) for s in (player, taken)]
     assert pictures[0].std() > 0.03
     assert np.abs(pictures[0] - pictures[1]).max() < 0.01
-    assert in_world(player, player.meta.world) is player
+    assert to_stream_coordinates(player, player.meta.world) is player
 
 
 def test_a_stream_of_other_coordinates_is_not_continued(tmp_path):

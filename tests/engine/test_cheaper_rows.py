@@ -15,10 +15,10 @@ from test_encoder import TINY, WORLD, frames
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.encode import encoder_for, open_recording
-from gsstream.engine.frame0.cheaper import REACH, cheaper_rows, felt_codes
-from gsstream.engine.frame0.rounding import codes_nearby, codes_towards_zero
+from gsstream.engine.frame0.rd_quantise import REACH, rd_quantise, code_sensitivity
+from gsstream.engine.frame0.rounding import rd_codes_nearby, rd_codes_to_zero
 from gsstream.packet import EncodedPacket, decode_packet
-from gsstream.packet.grids import KEY_BITS, color_codes, color_slopes, from_codes, to_codes
+from gsstream.packet.grids import KEY_BITS, color_codes, color_grads, from_codes, to_codes
 
 
 def drawn(seed: int, rows: int = 400, width: int = 6) -> tuple[np.ndarray, np.ndarray]:
@@ -38,7 +38,7 @@ def cost(codes: np.ndarray, exact: np.ndarray, felt: np.ndarray, weight: float) 
 
 def test_without_weight_every_code_is_the_nearest() -> None:
     exact, felt = drawn(0)
-    for codes in (codes_towards_zero(exact, felt, 0.0), codes_nearby(exact, felt, 0.0, 5)):
+    for codes in (rd_codes_to_zero(exact, felt, 0.0), rd_codes_nearby(exact, felt, 0.0, 5)):
         assert np.array_equal(codes, np.rint(exact))
         assert codes.dtype == np.int32
 
@@ -46,7 +46,7 @@ def test_without_weight_every_code_is_the_nearest() -> None:
 @given(st.integers(0, 1000), st.floats(-6, 3))
 def test_codes_cost_no_more_than_rounding_and_move_towards_zero(seed: int, exponent: float) -> None:
     exact, felt = drawn(seed)
-    codes = codes_towards_zero(exact, felt, 10**exponent)
+    codes = rd_codes_to_zero(exact, felt, 10**exponent)
     nearest = np.rint(exact)
     assert cost(codes, exact, felt, 10**exponent) <= cost(nearest, exact, felt, 10**exponent) * (1 + 1e-9)
     assert np.all((np.abs(codes) <= np.abs(nearest)) & (codes * nearest >= 0))
@@ -55,7 +55,7 @@ def test_codes_cost_no_more_than_rounding_and_move_towards_zero(seed: int, expon
 @given(st.integers(0, 1000), st.floats(-6, 3), st.integers(0, 9))
 def test_codes_nearby_cost_no_more_and_stay_within_reach(seed: int, exponent: float, reach: int) -> None:
     exact, felt = drawn(seed)
-    codes = codes_nearby(exact - 40, felt, 10**exponent, reach)
+    codes = rd_codes_nearby(exact - 40, felt, 10**exponent, reach)
     nearest = np.rint(exact - 40)
     assert cost(codes, exact - 40, felt, 10**exponent) <= cost(nearest, exact - 40, felt, 10**exponent) * (1 + 1e-9)
     assert int(np.abs(codes - nearest).max()) <= reach
@@ -64,15 +64,15 @@ def test_codes_nearby_cost_no_more_and_stay_within_reach(seed: int, exponent: fl
 @pytest.mark.parametrize("weight", [1e-30, 1e30])
 def test_extremes(weight: float) -> None:
     exact, felt = drawn(3)
-    codes = codes_towards_zero(exact, felt, weight)
+    codes = rd_codes_to_zero(exact, felt, weight)
     assert np.array_equal(codes, np.rint(exact) if weight < 1 else np.zeros_like(exact))
-    near = codes_nearby(exact, felt, weight, 3)
+    near = rd_codes_nearby(exact, felt, weight, 3)
     assert np.array_equal(near, np.rint(exact)) if weight < 1 else int(np.abs(near - exact).max()) <= 3
 
 
 @pytest.mark.parametrize("exact", [np.zeros((5, 3)), np.full((1, 3), -4.4), np.zeros((0, 3)), np.zeros((4, 0))])
 def test_odd_tables(exact: np.ndarray) -> None:
-    for codes in (codes_towards_zero(exact, np.ones_like(exact), 1e-9), codes_nearby(exact, exact + 9, 1e-9, 4)):
+    for codes in (rd_codes_to_zero(exact, np.ones_like(exact), 1e-9), rd_codes_nearby(exact, exact + 9, 1e-9, 4)):
         assert np.array_equal(codes, np.rint(exact))
 
 
@@ -80,7 +80,7 @@ def test_slopes_of_codes_are_those_of_finite_differences() -> None:
     rng = np.random.default_rng(1)
     values = rng.normal(size=(7, 8, 3)).astype(np.float32)
     weights = rng.normal(size=values.shape)
-    slopes = color_slopes(weights, KEY_BITS["shN"])
+    slopes = color_grads(weights, KEY_BITS["shN"])
     codes = to_codes("shN", values, KEY_BITS["shN"])
     for column in range(codes.shape[1]):
         more = codes.copy()
@@ -93,7 +93,7 @@ def test_slopes_of_codes_are_those_of_finite_differences() -> None:
 @cache
 def key_packet(rate: float) -> tuple[EncodedPacket, Any]:
     with open_recording(WORLD) as source:
-        made = encoder_for("s2gs-edge", source, {**TINY, "codec.key_rate": rate, "codec.first_layer": 1})
+        made = encoder_for("s2gs-edge", source, {**TINY, "codec.key_rd_lambda": rate, "codec.first_layer": 1})
     step = made.encode(frames()[0])
     return step.packet, made
 
@@ -124,7 +124,7 @@ def test_what_moves_stays_within_reach() -> None:
     scene, codes = scene_of(packet).map(torch.from_numpy), []
     for rate in (0.0, 1e6):
         parts, rng = key_packet(rate)[1].parts, Rng(0)
-        found = cheaper_rows(parts, scene, frames()[0], None, rng)
+        found = rd_quantise(parts, scene, frames()[0], None, rng)
         assert torch.equal(found.means, scene.means)
         codes.append({name: to_codes(name, getattr(found, name).numpy(), bits) for name, bits in KEY_BITS.items()})
     for name, reach in REACH.items():
@@ -139,7 +139,7 @@ def test_what_is_felt_is_what_a_code_changes(name: str) -> None:
     """Of the most felt code of every attribute, by two renders of every view."""
     packet, encoder = key_packet(0.0)
     scene, frame = scene_of(packet).map(torch.from_numpy), frames()[0]
-    felt = sum(felt_codes(encoder.parts, scene, frame, None, Rng(seed).stream("a", 0))[0][name] for seed in range(24))
+    felt = sum(code_sensitivity(encoder.parts, scene, frame, None, Rng(seed).stream("a", 0))[0][name] for seed in range(24))
     felt = felt / 24
     row, column = np.unravel_index(int(felt.argmax()), felt.shape)
     bits = KEY_BITS[name]
@@ -163,4 +163,4 @@ def test_a_scene_without_gaussians_stays_one() -> None:
     """A refinement of a few iterations may prune everything: it was refused with an error of numpy's."""
     packet, encoder = key_packet(0.1)
     scene = scene_of(packet).map(torch.from_numpy).rows(torch.zeros(0, dtype=torch.int64))
-    assert len(cheaper_rows(encoder.parts, scene, frames()[0], None, Rng(0))) == 0
+    assert len(rd_quantise(encoder.parts, scene, frames()[0], None, Rng(0))) == 0

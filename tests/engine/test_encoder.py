@@ -19,7 +19,7 @@ from growing_plugin import growth_installed
 from gsstream.cli.main import run_command
 from gsstream.core.errors import ComponentError, InputError, RecipeError, ShapeError
 from gsstream.core.frame import Frame
-from gsstream.encode import Encoder, Listeners, encoder_for, encoder_of_rig, open_recording
+from gsstream.encode import Encoder, Callbacks, encoder_for, encoder_for_rig, open_recording
 from gsstream.engine.frame0.begin import decoded_anchors
 from gsstream.engine.keys.resume import rebuild_hierarchy
 from gsstream.method.base import Step
@@ -45,11 +45,11 @@ CASES: Mapping[str, Mapping[str, Any]] = {
     "still": {"motion": "still"},
     "coasting": {"motion": "coasting"},
     "rigid": {**MOVING},
-    "keys": {"motion": "coasting", "codec.key_every": 2},
+    "keys": {"motion": "coasting", "codec.key_interval": 2},
     "growing": {**GROWING, "motion": "coasting"},
-    "growing rigid with keys": {**GROWING, **MOVING, "codec.key_every": 3},
+    "growing rigid with keys": {**GROWING, **MOVING, "codec.key_interval": 3},
     "refined": {**REFINING, **MOVING},
-    "growing refined with keys": {**GROWING, **REFINING, "motion": "coasting", "codec.key_every": 2},
+    "growing refined with keys": {**GROWING, **REFINING, "motion": "coasting", "codec.key_interval": 2},
 }
 
 
@@ -76,7 +76,7 @@ def frames(uri: str = WORLD) -> tuple[Frame, ...]:
         return tuple(source.frame(index) for index in range(source.info.num_frames or 0))
 
 
-def encoder(case: str = "still", listeners: Listeners | None = None) -> Encoder:
+def encoder(case: str = "still", listeners: Callbacks | None = None) -> Encoder:
     with open_recording(WORLD) as source:
         return encoder_for("s2gs-edge", source, {**TINY, **CASES[case]}, listeners)
 
@@ -122,7 +122,7 @@ def test_the_cases_are_what_they_say() -> None:
         assert any(line["moving_groups"] > 0 for line in later) == (settings["motion"] != "still"), case
         assert any(line["births"] > 0 for line in later) == ("growth" in settings), case
         # The refined first frame comes first, periods of key packets after it.
-        every, refined = settings.get("codec.key_every", 6), settings.get("stream.refine_frames")
+        every, refined = settings.get("codec.key_interval", 6), settings.get("stream.refine_frames")
         due = range(0, 6, every) if refined is None else {0, *range(refined, 6, every)}
         assert [frame for frame, kind in enumerate(kinds) if kind == "key"] == sorted(due), case
         reasons = [line["key_reason"] for line in later if "key_reason" in line]
@@ -261,7 +261,7 @@ def test_a_stream_without_a_frame_begins_anew(tmp_path: Path) -> None:
 
 def test_listeners_are_told_in_order() -> None:
     told: list[tuple[str, Any]] = []
-    listeners = Listeners(
+    listeners = Callbacks(
         packet=lambda packet: told.append(("packet", packet.frame)),
         progress=lambda *_: told.append(("progress", None)),
     )
@@ -284,7 +284,7 @@ def test_a_listener_that_fails_is_not_hidden_and_the_frame_can_be_sent_again() -
             refuse.clear()
             raise OSError("no space left on device")
 
-    made = encoder("coasting", Listeners(packet=full))
+    made = encoder("coasting", Callbacks(packet=full))
     made.encode(frames()[0])
     before = made.state
     with pytest.raises(OSError, match="no space left"):
@@ -297,7 +297,7 @@ def test_a_listener_that_fails_is_not_hidden_and_the_frame_can_be_sent_again() -
 def test_a_rig_needs_no_recording(tmp_path: Path) -> None:
     """Images from anywhere: the seeds are swept from them, and the stream plays."""
     rig, settings = frames()[0].cameras, {**TINY, "first_frame.points": "auto", "motion": "coasting"}
-    made = encoder_of_rig("s2gs-edge", rig, fps=25.0, settings=settings, name="studio")
+    made = encoder_for_rig("s2gs-edge", rig, fps=25.0, settings=settings, name="studio")
     steps = tuple(made.encode(frame) for frame in frames()[:3])
     assert steps[0].status == "key"
     with Playback(write(tmp_path / "rig.gss", steps)) as stream:
@@ -307,7 +307,7 @@ def test_a_rig_needs_no_recording(tmp_path: Path) -> None:
         assert len(stream.cameras("test")) == 0
         for frame, step in enumerate(steps):
             same_bits(stream.player_state(frame).gaussians, step.state.player.gaussians)
-    again = encoder_of_rig("s2gs-edge", rig, fps=25.0, settings=settings, name="studio")
+    again = encoder_for_rig("s2gs-edge", rig, fps=25.0, settings=settings, name="studio")
     assert packets([again.encode(frame) for frame in frames()[:3]]) == packets(steps)
 
 

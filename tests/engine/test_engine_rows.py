@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from gsstream.core.changes import Births, Delta, Residual, Rows
+from gsstream.core.changes import AddedGaussians, Delta, Residual, Rows
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.topology import TopologyEdit
-from gsstream.engine.state.follow import follow
+from gsstream.engine.state.next_state import next_state
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.packet import decode_packet, encode_delta, encode_key
 from gsstream.parts.optimiser.adam import ReferenceAdam
@@ -38,10 +38,10 @@ def state() -> StreamState:
 def step(state: StreamState, delta: Delta) -> StreamState:
     player = state.player
     packet = encode_delta(delta, player.layout, player.decoders, frame=player.frame + 1)
-    return follow(state, decode_packet(player, packet.data))
+    return next_state(state, decode_packet(player, packet.data))
 
 
-def delta_of(births: Births | None, deaths: list[int] | None = None) -> Delta:
+def delta_of(births: AddedGaussians | None, deaths: list[int] | None = None) -> Delta:
     return Delta((Rows(births, np.array(deaths or [], np.int64)),))
 
 
@@ -49,7 +49,7 @@ def test_the_forest_grows_with_the_packet(state):
     nodes = len(state.player.layout.node_counts)
     # Two new nodes: one below node 4 (which is below node 0), one below that one, and a new root.
     parents = np.array([4, nodes, nodes + 2])
-    born = Births(scene(4), np.array([2, nodes, nodes + 1, nodes + 2]), np.zeros(4, np.uint8), parents)
+    born = AddedGaussians(scene(4), np.array([2, nodes, nodes + 1, nodes + 2]), np.zeros(4, np.uint8), parents)
     after = step(state, delta_of(born, [0, 7]))
     after.hierarchy.validate()
     assert after.hierarchy.num_gaussians == len(after.player.gaussians) == 42

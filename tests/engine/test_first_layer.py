@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from test_encoder import REFINING, TINY, WORLD, frames
 
 from gsstream.encode import encoder_for, open_recording
-from gsstream.engine.frame0.first_seen import most_missed
+from gsstream.engine.frame0.first_layer import largest_error_mask
 from gsstream.packet import EncodedPacket, PacketKind, decode_packet, encode_key, first_layer
 from gsstream.packet.base import parse_packet
 from gsstream.packet.key import KeyState
@@ -20,7 +20,7 @@ from gsstream.packet.key import KeyState
 
 @given(st.lists(st.sampled_from([0.0, 0.5, 1.0, 7.0, 1e30]), max_size=40), st.floats(0.01, 1))
 def test_those_chosen_are_missed_most(errors: list[float], share: float) -> None:
-    chosen = most_missed(torch.tensor(errors, dtype=torch.float64), share)
+    chosen = largest_error_mask(torch.tensor(errors, dtype=torch.float64), share)
     values = np.array(errors)
     assert chosen.sum() == min(len(errors), max(1, round(share * len(errors))))
     if chosen.any() and not chosen.all():
@@ -66,7 +66,7 @@ def test_a_refined_key_packet_has_layers_and_a_periodic_one_has_none() -> None:
     keys = [packet for packet in refined if packet.kind == PacketKind.KEY]
     assert len(keys) == 2
     assert all(first_layer(packet.data) is not None for packet in keys)
-    first, *_, last = packets(3, **{"codec.key_every": 2, "codec.first_layer": 0.5})
+    first, *_, last = packets(3, **{"codec.key_interval": 2, "codec.first_layer": 0.5})
     assert (first.kind, last.kind) == (PacketKind.KEY, PacketKind.KEY)
     assert "rest" in parse_packet(first.data)[1]
     assert "rest" not in parse_packet(last.data)[1]

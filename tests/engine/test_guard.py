@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 import torch
 
-from gsstream.core.changes import Births, Rows
+from gsstream.core.changes import AddedGaussians, Rows
 from gsstream.core.errors import ComponentError
 from gsstream.core.frame import Frame
 from gsstream.core.part import unwrapped
 from gsstream.encode import Encoder, encoder_for, open_recording
 from gsstream.engine.assembly.guard import Guarded, guard
-from gsstream.engine.assembly.where import Where
+from gsstream.engine.assembly.call_location import Where
 from gsstream.engine.method.repeating import RepeatedFrameWarning
 from gsstream.engine.step import frame_step as step_module
 from gsstream.packet import decode_packet
@@ -159,7 +159,7 @@ def encoder(slot: str, make: Callable[[Any, Where], Any], **settings: Any) -> En
 def spoiled(slot: str, function: str, **settings: Any) -> Encoder:
     key, _ = FUNCTIONS[slot, function]
     if key:
-        settings["codec.key_every"] = BAD
+        settings["codec.key_interval"] = BAD
     if slot == "session":
         return encoder("renderer", lambda part, where: FailingRenderer(part, function, where), **settings)
     return encoder(slot, lambda part, where: Failing(part, function, where), **settings)
@@ -231,7 +231,7 @@ class Odd(Growth):
 
 def _births(after: Any, **changes: Any) -> Rows:
     given = {"nodes": np.zeros(1, np.int64), "unit_of": np.zeros(1, np.uint8), "parents": np.zeros(0, np.int64)}
-    return Rows(Births(after.gaussians.rows(np.array([0])), **{**given, **changes}))
+    return Rows(AddedGaussians(after.gaussians.rows(np.array([0])), **{**given, **changes}))
 
 
 ODD = {
@@ -303,7 +303,7 @@ class TestGuard:
 
     def test_every_part_of_an_assembly_is_guarded_once(self) -> None:
         parts = encoder("gate", lambda part, _: part).parts
-        for slot in ("structure", "confidence", "gate", "motion", "growth", "stepper", "renderer", "loss", "optimiser"):
+        for slot in ("structure", "confidence", "gate", "motion", "growth", "streaming_method", "renderer", "loss", "optimiser"):
             assert isinstance(getattr(parts, slot), Guarded)
             assert not isinstance(parts.part(slot), Guarded)
         with pytest.raises(ComponentError, match=r"propagation .* failed at frame None"):

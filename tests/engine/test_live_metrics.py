@@ -9,7 +9,7 @@ import pytest
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Arrival, Frame
-from gsstream.engine.run.live import COUNTED, late_words, live_lines, live_metrics
+from gsstream.engine.run.live import COUNTED, latency_words, latency_lines, live_metrics
 
 RIG = Cameras(
     ("a", "b"), np.eye(4)[None].repeat(2, 0).astype(np.float32), np.eye(3)[None].repeat(2, 0).astype(np.float32), 8, 8
@@ -45,23 +45,23 @@ def test_a_clock_that_is_ahead_shows_and_nothing_is_said_of_recordings_that_are_
     assert early is not None
     assert gone is not None
     assert (early["latency_seconds"], gone["latency_seconds"]) == (-1.0, None)
-    assert late_words({"live": gone}) == ["latency unknown"]
+    assert latency_words({"live": gone}) == ["latency unknown"]
     assert entry(1, 1.0, None) is None
-    assert late_words({"live": None}) == late_words({}) == live_lines([{"frame": 0}, {"frame": 1, "live": None}]) == []
+    assert latency_words({"live": None}) == latency_words({}) == latency_lines([{"frame": 0}, {"frame": 1, "live": None}]) == []
 
 
 def test_the_summary_leaves_dropped_frames_out_of_the_latency_and_counts_them() -> None:
     lines = [line(0, 40.0), line(1, 4.0), line(2, 3.0, "hurried"), line(3, 90.0, "dropped"), line(4, 1.0, "held"),
              line(5, 80.0, "missing"), line(6, 2.0), line(7, 70.0, "dropped")]  # fmt: skip
-    assert live_lines(lines) == [
+    assert latency_lines(lines) == [
         "latency from image to packet: frame 0 40.00 s; later frames: median 2.50 s, worst 4.00 s (frame 1)",
         "of 7 later frames: 2 dropped because the run was behind, 1 dropped because a camera's image did not come, "
         "1 hurried, 1 with held images",
         "frames dropped by a run that was behind are not measured above; gsstream evaluate measures all",
     ]
-    assert live_lines(lines[:1]) == ["latency from image to packet: frame 0 40.00 s"]
-    assert live_lines([line(0, None), line(1, None)])[0].endswith("unknown, the images were gone")
-    assert live_lines([line(3, 0.5)]) == [
+    assert latency_lines(lines[:1]) == ["latency from image to packet: frame 0 40.00 s"]
+    assert latency_lines([line(0, None), line(1, None)])[0].endswith("unknown, the images were gone")
+    assert latency_lines([line(3, 0.5)]) == [
         "latency from image to packet: later frames: median 0.50 s, worst 0.50 s (frame 3)",
         "of 1 later frames: none was dropped, hurried or held",
     ], "a run of which only the end is at hand"
@@ -69,6 +69,6 @@ def test_the_summary_leaves_dropped_frames_out_of_the_latency_and_counts_them() 
 
 @pytest.mark.parametrize("policy", [None, *COUNTED])
 def test_every_policy_has_words(policy: str | None) -> None:
-    assert late_words(line(2, 0.256, policy))[0] == "0.26 s late"
-    assert len(late_words(line(2, 0.256, policy))) == 1 + (policy is not None)
-    assert len(live_lines([line(2, 0.2, policy)])) == 2 + (policy == "dropped")
+    assert latency_words(line(2, 0.256, policy))[0] == "0.26 s late"
+    assert len(latency_words(line(2, 0.256, policy))) == 1 + (policy is not None)
+    assert len(latency_lines([line(2, 0.2, policy)])) == 2 + (policy == "dropped")

@@ -49,7 +49,7 @@ def test_all_tiles_are_looked_at_where_change_is_not_detected_or_all_are_wanted(
 
 def psnr(out: Path, share: float, *more: str) -> float:
     """Mean over the test views of the last of three frames, in which a small body moves before a large wall."""
-    sets = [f"stream.quiet_tiles={share}", "first_frame.max_iterations=150", "stream.epochs=6"]
+    sets = [f"stream.static_tile_share={share}", "first_frame.max_iterations=150", "stream.epochs=6"]
     arguments = [part for text in sets for part in ("--set", text)]
     source = "synthetic:frames=3&views=4&width=96&height=64&supersample=1"
     run_command(["run", "--source", source, "--method", "s2gs-edge", "--out", str(out), "--quiet", "--no-pictures",

@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 import torch
 
-from gsstream.core.changes import Births, Delta, Layout, Rows, Scene
+from gsstream.core.changes import AddedGaussians, Delta, Layout, Rows, Scene
 from gsstream.core.errors import ComponentError
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
-from gsstream.encode import Encoder, Listeners, encoder_for, open_recording
+from gsstream.encode import Encoder, Callbacks, encoder_for, open_recording
 from gsstream.engine.fit.densify import DensifyStatistics
 from gsstream.engine.frame0 import refine
 from gsstream.engine.frame0.axes import nearest_axes
-from gsstream.engine.frame0.refine import carried
+from gsstream.engine.frame0.refine import track_motion
 from gsstream.engine.keys import keyframes
-from gsstream.engine.method.repeating import LeftOutWarning
+from gsstream.engine.method.repeating import SkippedWorkWarning
 from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.state.refinement import Refinement
 from gsstream.method.base import Step
@@ -100,7 +100,7 @@ def told(monkeypatch: pytest.MonkeyPatch, efforts: tuple[float, ...]) -> list[st
 
     monkeypatch.setattr(refine.FirstFrameRun, "step", watched)
     with open_recording(WORLD) as source:
-        listeners = Listeners(packet=lambda packet: out.append(f"{packet.kind.name.lower()} {packet.frame}"))
+        listeners = Callbacks(packet=lambda packet: out.append(f"{packet.kind.name.lower()} {packet.frame}"))
         made = encoder_for("s2gs-edge", source, SETTINGS, listeners)
     for frame, effort in zip(frames(), efforts, strict=True):
         made.encode(replace(frame, effort=effort))
@@ -122,7 +122,7 @@ def test_a_skipped_frame_is_not_taken_for_the_last(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize("every", [1, 2])
 def test_no_period_of_key_packets_ends_the_refinement(every: int) -> None:
-    made = steps(**{"codec.key_every": every})
+    made = steps(**{"codec.key_interval": every})
     due = {0, *range(3, 6, every)}
     assert [frame for frame, step in enumerate(made) if step.status == "key"] == sorted(due)
     assert made[3].metrics["key_reason"] == "refined"
@@ -160,7 +160,7 @@ def test_a_refinement_that_fails_is_left_out_and_its_iterations_are_made_later()
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             lines.append(made.encode(frame).metrics)
-        said = [str(one.message) for one in caught if one.category is LeftOutWarning]
+        said = [str(one.message) for one in caught if one.category is SkippedWorkWarning]
         assert len(said) == (frame.index == 2), said
     assert [line["status"] for line in lines] == ["key", "empty", "empty", "empty", "key", "empty"]
     assert [line.get("refine_iterations", 0) for line in lines] == [0, 20, 0, 20, 20, 0]
@@ -198,7 +198,7 @@ def test_what_came_of_a_gaussian_keeps_its_place_and_turn_relative_to_it(seed: i
     for name in ("means", "quats"):  # row 2 rests
         getattr(after, name)[2] = getattr(before, name)[2]
     ancestors = [0, 0, 1, 2, 3, -1]
-    got = carried(refinement(mine, ancestors), player(before, [4]), player(after, [4])).gaussians
+    got = track_motion(refinement(mine, ancestors), player(before, [4]), player(after, [4])).gaussians
     was, now = (rotation_matrices(torch.from_numpy(g.quats)).double().numpy() for g in (before, after))
     old, new = (rotation_matrices(torch.from_numpy(np.asarray(g.quats))).double().numpy() for g in (mine, got))
     for row, ancestor in enumerate(ancestors[:5]):
@@ -216,32 +216,32 @@ def test_what_came_of_a_gaussian_keeps_its_place_and_turn_relative_to_it(seed: i
 def test_rows_that_leave_and_join_are_followed() -> None:
     before, mine, born = some(4, 0), some(4, 1), some(1, 2)
     # Row 1, the last of the first node, leaves, and one is born in its place.
-    births = Births(born, np.zeros(1, np.int64), np.zeros(1, np.uint8), np.zeros(0, np.int64))
+    births = AddedGaussians(born, np.zeros(1, np.int64), np.zeros(1, np.uint8), np.zeros(0, np.int64))
     after = Gaussians(**{
         name: np.concatenate([value[[0]], getattr(born, name), value[[2, 3]]]) for name, value in before.items()
     })
     after.means[3] += 1.0
     delta = Delta((Rows(births, np.array([1], np.int64)),))
-    found = carried(refinement(mine, [0, 1, 2, 3]), player(before, [2, 2]), player(after, [2, 2], delta))
+    found = track_motion(refinement(mine, [0, 1, 2, 3]), player(before, [2, 2]), player(after, [2, 2], delta))
     assert found.ancestors.tolist() == [0, -1, 2, 3]
     assert found.gaussians.means[3].numpy() == pytest.approx(mine.means[3] + 1.0, abs=1e-5)
     assert torch.equal(found.gaussians.means[:3], torch.from_numpy(mine.means[:3]))
 
 
 def test_the_key_packet_holds_the_refined_scene() -> None:
-    made = encoder(**{"codec.key_rate": 0})
+    made = encoder(**{"codec.key_rd_lambda": 0})
     for frame in frames()[:3]:
         made.encode(frame)
     before = made.state.refinement
     found: list[Refinement] = []
-    original = keyframes.refined_key
+    original = keyframes.refined_key_step
 
     def watched(parts: Any, state: Any, *rest: Any) -> Step[Any]:
         found.append(state.refinement)
         return original(parts, state, *rest)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(keyframes, "refined_key", watched)
+        patch.setattr(keyframes, "refined_key_step", watched)
         step = made.encode(frames()[3])
     assert found[0].iterations == before.iterations + 20 == 60
     ours = quantise_key(nearest_axes(found[0].gaussians).map(lambda t: t.numpy()))

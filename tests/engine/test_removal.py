@@ -13,8 +13,8 @@ from test_encoder import TINY, WORLD, frames
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.encode import encoder_for, open_recording
-from gsstream.engine.frame0.probes import TrainingViews
-from gsstream.engine.frame0.removal import not_missed, removal_errors, worth_keeping
+from gsstream.engine.frame0.hutchinson import TrainingViews
+from gsstream.engine.frame0.prune import prune_by_error, removal_errors, retained_rows
 from gsstream.packet import decode_packet
 from gsstream.parts.render.base import Renderer
 from gsstream.parts.render.exposure import Exposure
@@ -83,17 +83,17 @@ def test_what_nobody_sees_goes_and_what_is_seen_alone_stays(renderer: Renderer) 
     both = Gaussians(**{name: torch.cat([getattr(scene, name), getattr(far, name)]) for name, _ in scene.items()})
     errors, error = removal_errors(TrainingViews(renderer, frames()[0], None, BLACK), both, Rng(0).stream("a", 0))
     assert float(errors[-1]) == 0.0
-    kept = worth_keeping(errors, 0.1 * error)
+    kept = retained_rows(errors, 0.1 * error)
     assert len(scene) not in kept.tolist()
     assert len(kept) > 0
 
 
 def test_where_nothing_is_felt_all_remain_and_order_is_kept() -> None:
-    assert worth_keeping(torch.tensor([0.0, 2.0, 0.0, 3.0]), 0.0).tolist() == [1, 3]
-    assert worth_keeping(torch.tensor([3.0, 1.0, 2.0]), 1.5).tolist() == [0, 2]
-    assert worth_keeping(torch.zeros(3), 0.0).tolist() == [0, 1, 2]
-    assert worth_keeping(torch.ones(2), 5.0).tolist() == [0, 1]
-    assert worth_keeping(torch.zeros(0), 1.0).tolist() == []
+    assert retained_rows(torch.tensor([0.0, 2.0, 0.0, 3.0]), 0.0).tolist() == [1, 3]
+    assert retained_rows(torch.tensor([3.0, 1.0, 2.0]), 1.5).tolist() == [0, 2]
+    assert retained_rows(torch.zeros(3), 0.0).tolist() == [0, 1, 2]
+    assert retained_rows(torch.ones(2), 5.0).tolist() == [0, 1]
+    assert retained_rows(torch.zeros(0), 1.0).tolist() == []
 
 
 def test_a_run_has_fewer_gaussians_that_show_nearly_the_same(renderer: Renderer) -> None:
@@ -123,7 +123,7 @@ def test_of_equal_gaussians_none_is_missed_and_yet_not_all_go(renderer: Renderer
     whole = error(torch.arange(len(many)))
     errors, _ = removal_errors(TrainingViews(renderer, frames()[0], None, BLACK), many, drawn())
     least = float(errors.max()) / whole / 2
-    assert error(worth_keeping(errors, least * whole)) > 1.5 * whole, "otherwise this says nothing"
-    kept = not_missed(TrainingViews(renderer, frames()[0], None, BLACK), many, drawn(), least)
+    assert error(retained_rows(errors, least * whole)) > 1.5 * whole, "otherwise this says nothing"
+    kept = prune_by_error(TrainingViews(renderer, frames()[0], None, BLACK), many, drawn(), least)
     assert error(kept) <= 1.25 * whole * (1 + 1e-4)
     assert torch.equal(kept, kept.sort().values)

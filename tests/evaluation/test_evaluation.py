@@ -16,7 +16,7 @@ from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.engine.run.metrics_log import last_written, trim_metrics
-from gsstream.evaluation.contact_sheet import Column, changed_most, contact_sheet, sheet_of_stream
+from gsstream.evaluation.contact_sheet import Column, most_changed_window, contact_sheet, sheet_of_stream
 from gsstream.evaluation.evaluate import evaluate
 from gsstream.evaluation.plots import plot_runs
 from gsstream.evaluation.records import FrameRecord, read_lines, read_records
@@ -94,14 +94,14 @@ def test_a_perfect_stream_beats_holding_frame_0(tmp_path):
         assert view.ssim == pytest.approx(1)
         moved = view.frame > 0
         assert (view.moving_share > 0) == moved
-        assert math.isfinite(view.hold_psnr) == moved
+        assert math.isfinite(view.static_psnr) == moved
         if moved:
-            assert view.hold_psnr_moving < view.hold_psnr < 50
+            assert view.static_psnr_moving < view.static_psnr < 50
             assert view.psnr_moving == math.inf
             assert view.psnr_changed == math.inf
             # Where something moves is where holding is worst, the more so without the rim.
-            assert view.hold_psnr_changed < view.hold_psnr_moving
-    assert result.series("hold_psnr")[3] < result.series("hold_psnr")[1] == result.series("hold_psnr")[2]
+            assert view.static_psnr_changed < view.static_psnr_moving
+    assert result.series("static_psnr")[3] < result.series("static_psnr")[1] == result.series("static_psnr")[2]
 
 
 def test_noise_gives_the_psnr_and_sigma_it_must(tmp_path):
@@ -258,10 +258,10 @@ def test_the_close_up_is_where_most_pixels_changed():
     """Against every window, one by one."""
     draw = np.random.default_rng(3)
     first, truth = np.zeros((31, 44, 3), np.float32), np.zeros((31, 44, 3), np.float32)
-    assert changed_most(truth, first) is None
+    assert most_changed_window(truth, first) is None
     truth[draw.random((31, 44)) < 0.05] = 0.5
     truth[20:, 30:][draw.random((11, 14)) < 0.6] = 0.5
-    rows, columns = changed_most(truth, first)
+    rows, columns = most_changed_window(truth, first)
     changed = (truth > 0.1).any(-1)
     counts = {
         (y, x): changed[y : y + 10, x : x + 14].sum() for y, x in itertools.product(range(22), range(31))

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from gsstream.cli.main import run_command
-from gsstream.core.changes import Rows, in_nodes, own_nodes
+from gsstream.core.changes import Rows, add_to_nodes, add_as_nodes
 from gsstream.core.frame import Frame
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.state.stream_state import StreamState
@@ -150,9 +150,9 @@ def growing(monkeypatch: pytest.MonkeyPatch, method: str) -> None:
         copies = replace(copies, means=copies.means + rng.normal(0, 0.02, (20, 3)).astype(np.float32))
         levels = player.layout.unit_of[rows]
         if method == "dense":
-            births = own_nodes(copies, levels, len(player.layout.node_counts))
+            births = add_as_nodes(copies, levels, len(player.layout.node_counts))
         else:
-            births = in_nodes(copies, player.layout.node_of[rows], levels)
+            births = add_to_nodes(copies, player.layout.node_of[rows], levels)
         gone = np.sort(rng.choice(len(player.gaussians), 10, replace=False))
         return delta.with_rows(Rows(births, gone))
 

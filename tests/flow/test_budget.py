@@ -41,7 +41,7 @@ def test_sizes_hold_in_the_file_and_are_reported(held: Path) -> None:
         assert entry["limits"] == {"size": SIZE}
         assert entry["violated"] == []
         assert entry["bound"] == ["size"]
-        assert {"symbols", "rate_weight"} & set(entry["given_up"])
+        assert {"symbols", "rd_lambda"} & set(entry["given_up"])
         assert entry["spent"]["untrimmed"] >= sum(line["bytes"].values())
     summary = (held / "out" / "summary.txt").read_text()
     assert f"budget size {SIZE / 1000:.2f} KB: 3 of 3 frames inside" in summary
@@ -128,7 +128,7 @@ def test_seeds_are_limited_as_well_as_growth(tmp_path: Path) -> None:
 
 def test_a_whole_method_has_no_budget_of_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(arguments(tmp_path, "--budget", "size=1KB", method="hold")) == 2
-    assert "budget.size: the stepper 'hold' does not read it" in capsys.readouterr().err
+    assert "budget.size: the streaming_method 'hold' does not read it" in capsys.readouterr().err
 
 
 def test_a_budget_is_data(tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ from flow_runs import TINY, WORLD, finish
 from gsstream.core.errors import ComponentError, GsstreamError, InputError
 from gsstream.engine.assembly import checks as checks_module
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.engine.assembly.checks import Checks, Look, wanted_checks
-from gsstream.engine.assembly.where import Where
+from gsstream.engine.assembly.checks import Checks, Look, requested_checks
+from gsstream.engine.assembly.call_location import Where
 from gsstream.engine.run.recording import open_recording
 from gsstream.engine.run.session import run
 from gsstream.parts.gate.always_open import AlwaysOpen
@@ -134,7 +134,7 @@ class WrongOptimiser(RowOptimiser):
 def assembly(level: str | None, method: str = "dense", **parts: Any) -> Assembly:
     keys = {**TINY, "first_frame.max_iterations": 0, "first_frame.max_points": 60, "stream.epochs": 3}
     # Some of the parts below count their renders, and rounding frame 0 makes some, as layers do.
-    keys |= {"codec.key_rate": 0, "codec.first_layer": 1}
+    keys |= {"codec.key_rd_lambda": 0, "codec.first_layer": 1}
     sets = [("--set", f"{key}={value}") for key, value in keys.items()]
     return replace(assemble(resolve_recipe(method, CATALOG.recipe_path, (), sets), CATALOG, level), **parts)
 
@@ -258,7 +258,7 @@ def test_off_still_looks_at_shapes(tmp_path: Path) -> None:
 
 def test_where_the_level_comes_from(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("GSSTREAM_CHECKS", raising=False)
-    assert wanted_checks() is Checks.FRAME
+    assert requested_checks() is Checks.FRAME
     assert assembly(None).checks is Checks.FRAME
     monkeypatch.setenv("GSSTREAM_CHECKS", "step")
     assert assembly(None).checks is Checks.STEP
@@ -267,7 +267,7 @@ def test_where_the_level_comes_from(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="GSSTREAM_CHECKS: expected one of off, frame, step, got 'Steps'"):
         assembly(None)
     with pytest.raises(InputError, match="checks: expected one of off, frame, step, got ''"):
-        wanted_checks("")
+        requested_checks("")
 
 
 def test_a_wrong_level_ends_the_command_before_anything_is_written(tmp_path: Path) -> None:

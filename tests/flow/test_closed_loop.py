@@ -23,9 +23,9 @@ from gsstream.core.rng import Rng
 from gsstream.engine.method.checked import difference_between
 from gsstream.engine.step import frame_step as step_module
 from gsstream.packet import PacketKind
-from gsstream.parts.motion.coasting import Coasting
+from gsstream.parts.motion.constant_velocity import Coasting
 from gsstream.parts.render.reference import ReferenceRenderer
-from gsstream.parts.render.work import FrameWork
+from gsstream.parts.render.work import FitContext
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, find_renderer, render
 from gsstream.player.software import render_numpy
@@ -267,7 +267,7 @@ SPOILED = {
     "a cell of zero": (lambda motion: (replace(motion, cell=0.0),), "cell: expected a float32 above 0"),
     "no shades": (lambda motion: (replace(motion, shades=0),), "shades: expected 1 to 16"),
     "beyond everything": (
-        lambda motion: (replace(motion, symbols=np.full_like(motion.symbols, 2**31 - 1), shift_step=9e8),), "motion",
+        lambda motion: (replace(motion, symbols=np.full_like(motion.symbols, 2**31 - 1), translation_step=9e8),), "motion",
     ),
     "too many": (lambda motion: (motion,) * 9, "at most 8 motions"),
 }  # fmt: skip
@@ -283,7 +283,7 @@ def two_frames(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, bytes]:
     folder = tmp_path_factory.mktemp("undisturbed")
     begun, sound = folder / "begun", Coasting.propose
 
-    def propose(self: Coasting, scene: Scene, work: FrameWork, rng: Rng) -> Any:
+    def propose(self: Coasting, scene: Scene, work: FitContext, rng: Rng) -> Any:
         found = sound(self, scene, work, rng)
         if found and not begun.exists():
             shutil.copytree(folder / "run", begun)
@@ -304,7 +304,7 @@ def test_a_motion_that_does_not_fit_ends_in_one_sentence(
     begun, undisturbed = two_frames
     run = shutil.copytree(begun, tmp_path / "run")
 
-    def propose(self: Coasting, scene: Scene, work: FrameWork, rng: Rng) -> Any:
+    def propose(self: Coasting, scene: Scene, work: FitContext, rng: Rng) -> Any:
         found = sound(self, scene, work, rng)
         return spoil(found[0]) if found else found
 

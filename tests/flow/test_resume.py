@@ -167,5 +167,5 @@ def test_it_resumes_to_the_same_bytes(
     for ours, theirs in zip(lines, undisturbed[first:], strict=True):
         for quantity in ("status", "psnr", "ssim", "psnr_moving", "bytes", "active_gates", "num_gaussians"):
             assert ours.get(quantity) == theirs.get(quantity), quantity
-        spent = [json.dumps(line.get("budget", {}).get("spent", {}).get("rate_weight")) for line in (ours, theirs)]
+        spent = [json.dumps(line.get("budget", {}).get("spent", {}).get("rd_lambda")) for line in (ours, theirs)]
         assert spent[0] == spent[1]

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from gsstream.cli.main import run_command
-from gsstream.encode import in_own_world
+from gsstream.encode import to_rig_coordinates
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.run.session import STREAM, run
 from gsstream.input.recordings.open import open_source
@@ -57,7 +57,7 @@ def watch(source: str, out: Path, **settings) -> list[bytes]:
     values = {**TINY, **{key.replace("__", "."): value for key, value in {**QUICK, **settings}.items()}}
     catalog = load_catalog()
     resolved = resolve_recipe("dense", catalog.recipe_path, (), [("test", f"{k}={v}") for k, v in values.items()])
-    recording = in_own_world(open_source(source, resolved.recipe.scale))
+    recording = to_rig_coordinates(open_source(source, resolved.recipe.scale))
     run(assemble(resolved, catalog), recording, prepared(out), quiet=True)
     return packets(out / STREAM)
 

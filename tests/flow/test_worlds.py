@@ -12,7 +12,7 @@ from early_densify import densifying
 from gsstream.core.world import IDENTITY, World
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.fit import schedule
-from gsstream.input.recordings.canonical import CanonicalSource, world_of
+from gsstream.input.recordings.canonical import CanonicalSource, recording_similarity
 from gsstream.input.recordings.open import open_source
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
@@ -41,13 +41,13 @@ def many_seeds_that_grow() -> Iterator[None]:
 
 
 @functools.cache
-def found(method: str, where: World, seed: int = 0, as_filed: bool = False) -> tuple[dict[str, float], str]:
+def found(method: str, where: World, seed: int = 0, to_file_coordinates: bool = False) -> tuple[dict[str, float], str]:
     catalog = load_catalog()
     epochs = {} if method == "hold" else {"stream.epochs": 2}
     sets = [("--set", f"{key}={value}") for key, value in {**SMALL, **epochs, "seed": seed}.items()]
     parts = assemble(resolve_recipe(method, catalog.recipe_path, (), sets), catalog)
     moved = Moved(open_source(SOURCE), where)
-    return encode(parts, CanonicalSource(moved, IDENTITY if as_filed else world_of(moved)))
+    return encode(parts, CanonicalSource(moved, IDENTITY if to_file_coordinates else recording_similarity(moved)))
 
 
 def numbers(result: tuple[dict[str, float], str]) -> np.ndarray:
@@ -75,5 +75,5 @@ def test_turned_and_scaled_worlds_give_the_same_bits(method):
 
 def test_coordinates_of_the_files_would_have_lost_quality():
     """That the test above can fail: the same recording without a world of its own."""
-    far = numbers(found("hold", SHIFTED["UTM"], as_filed=True))
+    far = numbers(found("hold", SHIFTED["UTM"], to_file_coordinates=True))
     assert far[0] < numbers(found("hold", SHIFTED["UTM"]))[0] - 1

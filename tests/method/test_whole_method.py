@@ -16,11 +16,11 @@ from gsstream.core.errors import ComponentError, RecipeError
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.method.checked import difference_between
-from gsstream.engine.method.repeating import LeftOutWarning, RepeatedFrameWarning
-from gsstream.engine.run.encoder import Encoder, Listeners
+from gsstream.engine.method.repeating import SkippedWorkWarning, RepeatedFrameWarning
+from gsstream.engine.run.encoder import Encoder, Callbacks
 from gsstream.input.recordings.open import open_source
 from gsstream.method.base import StreamingMethod
-from gsstream.method.hold import Hold, HoldState
+from gsstream.method.static import Hold, StaticState
 from gsstream.method.packets import send_delta
 from gsstream.packet import PacketKind
 from gsstream.parts.render.exposure import Exposure
@@ -29,11 +29,11 @@ from gsstream.player.playback import Playback
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe
-from gsstream.testing.stepper.checks import check_method_closed_loop, check_method_resume
-from gsstream.testing.stepper.example import ExampleStepper
-from gsstream.testing.stepping import SOURCE, MethodUnderTest
+from gsstream.testing.streaming_method.checks import check_method_closed_loop, check_method_resume
+from gsstream.testing.streaming_method.example import ExampleMethod
+from gsstream.testing.method_driver import SOURCE, MethodUnderTest
 
-Follow: Any = ExampleStepper  # final: only what is wrong on purpose may inherit from it
+Follow: Any = ExampleMethod  # final: only what is wrong on purpose may inherit from it
 
 RUN = [
     "run", "--source", SOURCE, "--method", "hold", "--quiet", "--no-pictures", "--set", "first_frame.max_iterations=5",
@@ -54,7 +54,7 @@ def spoilt(wrong) -> StreamingMethod:
 
 def with_scene(step, **changes):
     player = step.state.player
-    return replace(step, state=HoldState(replace(player, scene=replace(player.scene, **changes))))
+    return replace(step, state=StaticState(replace(player, scene=replace(player.scene, **changes))))
 
 
 def drift(step):
@@ -78,12 +78,12 @@ def regroup(step):
 
 
 def stand_still(step):
-    return replace(step, state=HoldState(replace(step.state.player, frame=0)))
+    return replace(step, state=StaticState(replace(step.state.player, frame=0)))
 
 
 def keep_decoder(step):
     player = replace(step.state.player, decoders={"sh0": np.ones((1, 3), np.float32)})
-    return replace(step, state=HoldState(player))
+    return replace(step, state=StaticState(player))
 
 
 def other_layout(step):
@@ -121,7 +121,7 @@ def test_a_state_that_players_do_not_have_is_an_error(wrong, message: str) -> No
     with pytest.raises(ComponentError) as caught:
         subject.step(start.state, open_source(SOURCE).frame(1))
     assert message in str(caught.value)
-    assert (caught.value.slot, caught.value.part, caught.value.frame) == ("stepper", "Wrong", 1)
+    assert (caught.value.slot, caught.value.part, caught.value.frame) == ("streaming_method", "Wrong", 1)
 
 
 def test_a_packet_that_lies_about_what_it_was_decoded_to_is_found_where_every_step_is_checked() -> None:
@@ -154,7 +154,7 @@ def test_groups_are_compared_field_by_field(begun, field: str, value: Any) -> No
 def test_a_packet_of_another_frame_is_an_error() -> None:
     def repeat(step):
         packet, player = send_delta(step.state.player, Delta())
-        return replace(step, packet=packet, state=HoldState(player))
+        return replace(step, packet=packet, state=StaticState(player))
 
     subject = MethodUnderTest("dense", spoilt(repeat))
     start = subject.begin(open_source(SOURCE).frame(0))
@@ -168,7 +168,7 @@ def test_what_a_method_raises_is_reported_with_its_name() -> None:
 
     subject = MethodUnderTest("dense", spoilt(fail))
     start = subject.begin(open_source(SOURCE).frame(0))
-    with pytest.raises(ComponentError, match=r"stepper 'Wrong' .* failed at frame 1: RuntimeError: out of ideas"):
+    with pytest.raises(ComponentError, match=r"streaming_method 'Wrong' .* failed at frame 1: RuntimeError: out of ideas"):
         subject.step(start.state, open_source(SOURCE).frame(1))
 
 
@@ -258,7 +258,7 @@ def test_the_packet_is_out_before_the_work_that_follows_it() -> None:
 
     subject = pondering(ponder)
     source = open_source(SOURCE)
-    listeners = Listeners(packet=lambda packet: told.append(("packet", packet.frame)))
+    listeners = Callbacks(packet=lambda packet: told.append(("packet", packet.frame)))
     encoder = Encoder(subject.parts, source.info, lambda _: source.points("recording"), listeners=listeners)
     steps = [encoder.encode(source.frame(index)) for index in range(3)]
     assert told == [("packet", 0), ("packet", 1), ("follow up", 1), ("packet", 2), ("follow up", 2)]
@@ -298,7 +298,7 @@ def test_what_has_been_handed_out_is_not_changed_afterwards(wrong, message: str)
     with pytest.raises(ComponentError, match="its follow_up changed what has been handed out: ") as caught:
         subject.step(start.state, open_source(SOURCE).frame(1))
     assert message in str(caught.value)
-    assert (caught.value.slot, caught.value.part, caught.value.frame) == ("stepper", "Wrong", 1)
+    assert (caught.value.slot, caught.value.part, caught.value.frame) == ("streaming_method", "Wrong", 1)
 
 
 
@@ -312,10 +312,10 @@ def test_what_fails_after_a_packet_leaves_the_encoder_as_it_was_and_gives_the_pa
         return step
 
     subject, source = pondering(ponder), open_source(SOURCE)
-    listeners = Listeners(packet=sent.append)
+    listeners = Callbacks(packet=sent.append)
     encoder = Encoder(subject.parts, source.info, lambda _: source.points("recording"), listeners=listeners)
     before = encoder.encode(source.frame(0)).state
-    with pytest.raises(ComponentError, match=r"stepper 'Wrong' .* failed at frame 1: RuntimeError: out of ideas"):
+    with pytest.raises(ComponentError, match=r"streaming_method 'Wrong' .* failed at frame 1: RuntimeError: out of ideas"):
         encoder.encode(source.frame(1))
     assert encoder.state is before
     encoder.encode(source.frame(1))
@@ -334,7 +334,7 @@ def test_what_fails_after_a_packet_is_left_out_when_the_recipe_says_so() -> None
 
     subject, source = repeating(pondering(ponder)), open_source(SOURCE)
     start = subject.begin(source.frame(0))
-    with pytest.warns(LeftOutWarning, match=r"frame 1: its packet is sound, but .* left out: stepper 'Wrong'"):
+    with pytest.warns(SkippedWorkWarning, match=r"frame 1: its packet is sound, but .* left out: streaming_method 'Wrong'"):
         step = subject.step(start.state, source.frame(1))
     assert asked == [1, 0]
     assert step.state.about == -1
@@ -401,33 +401,33 @@ def refusal(*sets: str, method: str = "hold") -> list[str]:
 
 
 def test_keys_that_a_whole_method_does_not_read_are_refused() -> None:
-    why = "the stepper 'hold' does not read it; its own settings: gsstream plugins stepper/hold"
-    assert refusal("structure.resolution=64", "stream.rate_weight=0.5", "stream.epochs=3", "update.sh0.lr=1.0") == [
+    why = "the streaming_method 'hold' does not read it; its own settings: gsstream plugins streaming_method/hold"
+    assert refusal("structure.resolution=64", "stream.rd_lambda=0.5", "stream.epochs=3", "update.sh0.lr=1.0") == [
         "4 problems in the recipe:",
         f"  --set structure.resolution=64: structure.params: {why}",
         f"  --set update.sh0.lr=1.0: update.params: {why}",
         f"  --set stream.epochs=3: stream.epochs: {why}",
-        f"  --set stream.rate_weight=0.5: stream.rate_weight: {why}",
+        f"  --set stream.rd_lambda=0.5: stream.rd_lambda: {why}",
     ]
     # Written, but not changed: a saved recipe spells every default out.
     catalog = load_catalog()
     sets = [("--set", text) for text in ("renderer=reference", "stream.epochs=20", "structure.resolution=1024")]
     assembly = assemble(resolve_recipe("hold", catalog.recipe_path, (), sets), catalog)
-    assert isinstance(assembly.part("stepper"), Hold)
+    assert isinstance(assembly.part("streaming_method"), Hold)
     assert assemble(assembly.recipe, catalog).recipe == assembly.recipe
 
 
 def test_settings_of_a_whole_method() -> None:
-    wanted = "unknown key 'stepper.params.speed'; none are registered"
-    assert refusal("stepper.speed=3") == [f"--set stepper.speed=3: {wanted}"]
-    assert "stepper.name: no stepper named 'hodl'; did you mean 'hold'?" in refusal("stepper=hodl")[0]
-    assert wanted in refusal("stepper.speed=3", method="dense")[0]
+    wanted = "unknown key 'streaming_method.params.speed'; none are registered"
+    assert refusal("streaming_method.speed=3") == [f"--set streaming_method.speed=3: {wanted}"]
+    assert "streaming_method.name: no streaming_method named 'hodl'; did you mean 'hold'?" in refusal("streaming_method=hodl")[0]
+    assert wanted in refusal("streaming_method.speed=3", method="dense")[0]
 
 
 def test_any_recipe_may_name_one(tmp_path: Path) -> None:
     """``--set whole=NAME`` is enough to run a part that ships no recipe."""
     command = [text if text != "hold" else "dense" for text in RUN]
-    assert run_command([*command, "--set", "stepper=hold", "--out", str(tmp_path / "o")]) == 0
+    assert run_command([*command, "--set", "streaming_method=hold", "--out", str(tmp_path / "o")]) == 0
     with Playback(tmp_path / "o" / "stream.gss") as playback:
         assert [playback.entry(f).kind for f in playback.frames] == [PacketKind.KEY, *[PacketKind.EMPTY] * 3]
 
@@ -450,7 +450,7 @@ def test_resuming_with_other_settings_is_refused(tmp_path: Path, capsys: pytest.
 
 def test_the_benchmark_of_the_parts_refuses_a_whole_method(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(["bench", "frame", "--method", "hold", "--quick"]) == 2
-    assert "expected a method made of parts, got the stepper 'hold'" in capsys.readouterr().err
+    assert "expected a method made of parts, got the streaming_method 'hold'" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")
@@ -510,7 +510,7 @@ RECORDINGS = sorted(
 
 @pytest.mark.parametrize("file", RECORDINGS, ids=[file.stem for file in RECORDINGS])
 def test_the_recipe_of_a_recording_serves_every_method(file: Path) -> None:
-    """It says how frame 0 is made, which the engine does for all; `codec.key_rate` was refused by all but the parts."""
+    """It says how frame 0 is made, which the engine does for all; `codec.key_rd_lambda` was refused by all but the parts."""
     catalog = load_catalog()
     for method in catalog.names("method"):
         sets = [("--set", "renderer=reference")]

@@ -179,10 +179,10 @@ def test_evaluation_has_lpips_only_when_it_was_measured(tmp_path):
     assert head.split("|")[-2].strip() == "LPIPS"
     assert metric.variant in notes
     assert f"{np.mean([v.lpips for v in measured.views if v.frame]):.4f}" == decoded.split("|")[-2].strip()
-    assert f"{np.mean([v.hold_lpips for v in measured.views if v.frame]):.4f}" == held.split("|")[-2].strip()
+    assert f"{np.mean([v.static_lpips for v in measured.views if v.frame]):.4f}" == held.split("|")[-2].strip()
     for view in measured.views:
         moved = view.frame > 0
-        assert (view.hold_lpips > view.lpips > 0) if moved else (view.hold_lpips == view.lpips)
+        assert (view.static_lpips > view.lpips > 0) if moved else (view.static_lpips == view.lpips)
     data = json.loads(measured.to_json())
     assert data["lpips_variant"] == metric.variant
     assert [v["lpips"] for v in data["views"]] == [v.lpips for v in measured.views]

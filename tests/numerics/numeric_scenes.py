@@ -15,7 +15,7 @@ from hypothesis import settings
 from gsstream.core.cameras import Cameras
 from gsstream.core.context import ScreenGradient
 from gsstream.core.gaussians import Gaussians
-from gsstream.testing.cases import World, make_world, rig, scene
+from gsstream.testing.cases import World, make_case, rig, scene
 
 Scene = Gaussians[torch.Tensor]
 #: GSSTREAM_TEST_EXAMPLES=1000 makes a job of the matrix: at least so many examples for every property.
@@ -107,7 +107,7 @@ def dictated(magnitudes: Any) -> Dictated:
     """One camera that feels gradients of these lengths [N], along x, in pixels; float32."""
     lengths = torch.as_tensor(magnitudes, dtype=torch.float32).reshape(-1)
     n = len(lengths)
-    base = make_world("dictated", scene(torch.zeros(n, 3)), rig(1))
+    base = make_case("dictated", scene(torch.zeros(n, 3)), rig(1))
     facts = {field.name: getattr(base, field.name) for field in dataclasses.fields(base)}
     gradient = torch.stack([lengths, torch.zeros(n)], 1)[None]
     return Dictated(**facts, gradient=gradient, visible=torch.ones(1, n, dtype=torch.bool))

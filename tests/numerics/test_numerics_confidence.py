@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from numeric_scenes import dictated, some
 
 from gsstream.core.errors import ShapeError
-from gsstream.testing.cases import world
+from gsstream.testing.cases import get_case
 
 LIMIT = ViewSpaceGradient.Config().limit
 NORMALISATIONS = {
@@ -114,7 +114,7 @@ def test_parts_that_count_in_noise_stay_finite_in_any_unit(part: NoiseNormalised
 
 @pytest.mark.parametrize("sigma", [0.0, 1e-30, 1e3])
 def test_a_camera_without_noise_and_one_of_noise_alone(sigma: float) -> None:
-    case = replace(world("line"), sigma=sigma)
+    case = replace(get_case("line"), sigma=sigma)
     for part in (NoiseNormalised(), ViewSpaceGradient(ViewSpaceGradient.Config(normalisation="noise"))):
         logits = part.estimate(case)
         assert bool(torch.isfinite(logits).all())
@@ -123,7 +123,7 @@ def test_a_camera_without_noise_and_one_of_noise_alone(sigma: float) -> None:
 
 
 def test_a_black_and_a_white_frame() -> None:
-    case = world("line")
+    case = get_case("line")
     for level in (0.0, 1.0):
         flash = replace(case, now=tuple(torch.full_like(image, level) for image in case.now))
         for part in (ViewSpaceGradient(), NoiseNormalised(), ErrorAware()):

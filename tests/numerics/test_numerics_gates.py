@@ -7,12 +7,12 @@ import math
 import pytest
 import torch
 from gsstream_binary_ste.binary import BinarySteGate
-from gsstream_s2gs.gumbel_sigmoid import GumbelSigmoid, gumbel, logistic, slope
+from gsstream_s2gs.gumbel_sigmoid import GumbelSigmoid, gumbel, logistic, sigmoid_derivative
 from hypothesis import given
 from hypothesis import strategies as st
 from numeric_scenes import some
 
-from gsstream.engine.step.dead_gates import count_dead
+from gsstream.engine.step.dead_gates import count_dead_gates
 from gsstream.parts.gate.always_open import AlwaysOpen
 
 EXTREMES = torch.tensor([-1e4, -100.0, -17.5, -6.9, -1e-30, 0.0, 1e-30, 6.9, 17.5, 100.0, 1e4])
@@ -80,7 +80,7 @@ def test_an_open_gate_feels_the_images_as_a_closed_one_does(part: GumbelSigmoid)
 @some(60)
 def test_the_slope_is_even_and_never_dies_in_range(x: float) -> None:
     at = torch.tensor([x, -x])
-    values = slope(at)
+    values = sigmoid_derivative(at)
     assert values[0] == values[1]
     assert float(values[0]) > 0
     assert float(values[0]) == pytest.approx(1 / (2 + 2 * math.cosh(x)), rel=1e-4)
@@ -111,15 +111,15 @@ def test_calibration_within_four_sigma_at_the_limits_of_the_settings(levels: int
 def test_dead_gates_are_counted_and_there_are_none_by_default() -> None:
     spread = torch.linspace(-50, 50, 101)
     default = sampler()
-    assert count_dead(default, default.init(spread)) == 0
+    assert count_dead_gates(default, default.init(spread)) == 0
     # With a bound of 50 and a cold gate the far logits are out of reach of images and price: float32 spacing at 1.
     cold = sampler(logit_bound=50.0, temperature=0.01)
     probability = 1 / (2 + 2 * torch.cosh(spread.double() - 0.01 * math.log(0.05 / 0.95)))
     image = 1 / (0.01 * (2 + 2 * torch.cosh(spread.double() / 0.01)))
     expected = int(((probability < 2.0**-24) & (image < 2.0**-24)).sum())
-    assert count_dead(cold, cold.init(spread)) == expected > 50
-    assert count_dead(AlwaysOpen(), spread) == 0
-    assert count_dead(default, torch.zeros(0)) == 0
+    assert count_dead_gates(cold, cold.init(spread)) == expected > 50
+    assert count_dead_gates(AlwaysOpen(), spread) == 0
+    assert count_dead_gates(default, torch.zeros(0)) == 0
 
 
 def test_double_precision_agrees_with_single() -> None:

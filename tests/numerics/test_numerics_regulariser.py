@@ -14,7 +14,7 @@ from numeric_scenes import some
 from gsstream.core.errors import ComponentError
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.engine.assembly.checks import Checks, Look
-from gsstream.engine.assembly.where import Where
+from gsstream.engine.assembly.call_location import Where
 
 
 def flat(nodes: int, rows: int) -> Hierarchy:

@@ -23,7 +23,7 @@ from gsstream.packet import decode_delta, encode_delta, quantise_key
 from gsstream.packet.grids import KEY_BITS, MAX_CODE, from_codes, to_codes
 from gsstream.packet.symbols import MAX_BINS, decode_symbols, encode_symbols
 from gsstream.parts.update.additive import Additive, DirectCode
-from gsstream.parts.update.base import MAX_SYMBOL, symbols
+from gsstream.parts.update.base import MAX_SYMBOL, quantise_latents
 
 
 def layout(nodes: int = 6, rows: int = 2) -> Layout:
@@ -65,7 +65,7 @@ def test_latents_that_have_no_integer_are_refused(rule: Additive, bad: float) ->
     latents = {"scales": torch.zeros(4, 3)}
     latents["scales"][2, 1] = bad
     with pytest.raises(ShapeError, match=r"latents of scales: .* row 2, channel 1 \(1 of 12 values\)"):
-        symbols(rule.codes(), latents)
+        quantise_latents(rule.codes(), latents)
 
 
 @given(st.integers(-MAX_SYMBOL, MAX_SYMBOL), st.sampled_from([0.01, 0.02, 0.1, 0.25, 1.0]))

@@ -20,13 +20,13 @@ from numeric_scenes import some
 
 from gsstream.core.errors import ComponentError, ShapeError
 from gsstream.core.frame import Frame
-from gsstream.engine.step.active.change import detect_change
+from gsstream.engine.step.active.change import detect_changed_tiles
 from gsstream.engine.step.optimise import _FrameRun
 from gsstream.input.recordings.open import open_source
 from gsstream.metrics import psnr
 from gsstream.parts.optimiser.adam import ReferenceAdam
 from gsstream.parts.optimiser.base import MAX_GRADIENT, AdamState, RowOptimiser
-from gsstream.testing.stepper.checks import SOURCE, MethodUnderTest
+from gsstream.testing.streaming_method.checks import SOURCE, MethodUnderTest
 
 
 @functools.cache
@@ -140,10 +140,10 @@ def test_a_change_of_the_whole_picture_is_seen(flash: str, threshold: float) -> 
     """The spread of the differences is taken for noise; when everything changes, the change hid itself, and the frame
     was sent as "nothing changed"."""
     before, after = textured(0), textured(1)
-    change = detect_change(before, shown(after, 1, FLASHES[flash]), threshold)
+    change = detect_changed_tiles(before, shown(after, 1, FLASHES[flash]), threshold)
     assert change is not None
     assert change.share > 0.3
-    still = detect_change(before, after, threshold)
+    still = detect_changed_tiles(before, after, threshold)
     assert still is not None
     assert still.share < 0.05, "noise alone is still no change"
 
@@ -160,7 +160,7 @@ def test_a_slow_change_of_the_light_is_no_noise(gain: float) -> None:
         draw = np.random.default_rng(index).normal(0, 0.006, frame.images.shape)
         return shown(frame, index, lambda images: gain * lit + draw)
 
-    change, still = (detect_change(exposed(0, 1.0), exposed(1, g), 6.0) for g in (gain, 1.0))
+    change, still = (detect_changed_tiles(exposed(0, 1.0), exposed(1, g), 6.0) for g in (gain, 1.0))
     assert change is not None
     assert change.share > 0.5
     assert still is not None

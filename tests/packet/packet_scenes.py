@@ -9,7 +9,7 @@ import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.changes import (
-    Births,
+    AddedGaussians,
     Delta,
     Field,
     FieldShape,
@@ -92,11 +92,11 @@ def make_delta(
     return Delta((Residual(gates.astype(np.uint8), levels, symbols, dict.fromkeys(widths, 0.01), decoders),))
 
 
-def make_births(rng: np.random.Generator, layout: Layout, number: int, new: int, sh_rest: int = 3) -> Births:
+def make_births(rng: np.random.Generator, layout: Layout, number: int, new: int, sh_rest: int = 3) -> AddedGaussians:
     nodes = len(layout.node_counts)
     parents = nodes + np.arange(new) - rng.integers(0, 3, new).clip(0, nodes)
     where = np.sort(rng.integers(0, nodes + new, number))
-    return Births(make_scene(rng, number, sh_rest), where, rng.integers(0, 3, number).astype(np.uint8), parents)
+    return AddedGaussians(make_scene(rng, number, sh_rest), where, rng.integers(0, 3, number).astype(np.uint8), parents)
 
 
 def make_edit(rng: np.random.Generator, state: PlayerState, births: int = 3, deaths: float = 0.2) -> Delta:

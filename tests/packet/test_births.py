@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from packet_scenes import decode_all, make_births, make_edit, make_key, make_packets, make_scene, same_bits
 
-from gsstream.core.changes import Births, Delta, Layout, Residual, Rows, apply_delta, in_nodes, own_nodes, row_gates
+from gsstream.core.changes import AddedGaussians, Delta, Layout, Residual, Rows, apply_delta, add_to_nodes, add_as_nodes, row_gates
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.evaluation.stream_stats import stream_stats
 from gsstream.packet import (
@@ -21,13 +21,13 @@ from gsstream.packet import (
     encode_key,
     quantise_key,
 )
-from gsstream.packet.changes.rows import most_births
+from gsstream.packet.changes.rows import max_added_in
 
 SEEDS = st.integers(0, 2**32 - 1)
 NONE = np.zeros(0, np.int64)
 
 
-def closed(births: Births | None = None, deaths=NONE) -> Delta:
+def closed(births: AddedGaussians | None = None, deaths=NONE) -> Delta:
     return Delta().with_rows(Rows(births, deaths))
 
 
@@ -95,7 +95,7 @@ def test_births_and_deaths_alone_are_a_packet():
     state = first_state(np.random.default_rng(1))
     for delta in (
         closed(deaths=np.array([3])),
-        closed(in_nodes(make_scene(np.random.default_rng(2), 2), [4, 1], [0, 1])),
+        closed(add_to_nodes(make_scene(np.random.default_rng(2), 2), [4, 1], [0, 1])),
     ):
         assert not delta.is_empty
         after = decode_packet(state, encode_delta(delta, state.layout, {}, frame=1).data)
@@ -108,7 +108,7 @@ def test_everything_may_leave_and_something_come_again():
     state = decode_packet(state, encode_delta(nothing, state.layout, {}, frame=1).data)
     assert len(state.gaussians) == 0
     assert len(state.layout.node_counts) == 12
-    born = own_nodes(make_scene(np.random.default_rng(4), 5), np.zeros(5), 12)
+    born = add_as_nodes(make_scene(np.random.default_rng(4), 5), np.zeros(5), 12)
     state = decode_packet(state, encode_delta(closed(born), state.layout, {}, frame=2).data)
     assert same_bits(state.gaussians, quantise_key(born.gaussians))
     assert state.layout.node_counts.tolist() == [0] * 12 + [1] * 5
@@ -128,7 +128,7 @@ def _unfit():
     yield state, None, np.array([4, 4]), "deaths"
     yield state, None, np.array([5, 4]), "deaths"
     yield state, None, np.array([40]), "deaths"
-    yield state, Births(births.gaussians.rows(NONE), NONE, NONE.astype(np.uint8), NONE), NONE, "at least 1"
+    yield state, AddedGaussians(births.gaussians.rows(NONE), NONE, NONE.astype(np.uint8), NONE), NONE, "at least 1"
     bad = change(births.gaussians, means=np.full((4, 3), np.nan, np.float32))
     yield state, change(births, gaussians=bad), NONE, "finite"
 
@@ -152,7 +152,7 @@ def test_births_of_another_degree_are_refused_with_the_packets_offset():
 def test_births_are_refused_once_most_of_them_are_equal():
     rng = np.random.default_rng(7)
     state = first_state(rng)
-    many = in_nodes(make_scene(rng, 1).rows(np.zeros(200_000, np.int64)), np.zeros(200_000), np.zeros(200_000))
+    many = add_to_nodes(make_scene(rng, 1).rows(np.zeros(200_000, np.int64)), np.zeros(200_000), np.zeros(200_000))
     with pytest.raises(ShapeError, match="Gaussians that differ"):
         encode_delta(closed(many), state.layout, {}, frame=1)
 
@@ -167,13 +167,13 @@ def test_a_scene_cannot_grow_beyond_the_limit(monkeypatch):
     monkeypatch.setattr("gsstream.packet.changes.rows.MAX_GAUSSIANS", 44)
     assert len(decode_delta(packet.data, state.scene, {}).births) == 4
     monkeypatch.undo()
-    assert most_births(10) == 640
+    assert max_added_in(10) == 640
 
 
 def test_gates_are_shown_on_the_rows_they_moved():
     state = first_state(np.random.default_rng(11), 6, 2)
     layout = Layout(np.int32([4, 2]), state.layout.unit_of, state.layout.units)
-    born = in_nodes(make_scene(np.random.default_rng(12), 1), [0], [0])
+    born = add_to_nodes(make_scene(np.random.default_rng(12), 1), [0], [0])
     delta = Delta((Residual(np.uint8([0, 2]), 4), Rows(born, np.array([0, 5]))))
     assert row_gates(layout, delta).tolist() == [0, 0, 0, 1, 0.5]
 

@@ -15,7 +15,7 @@ from gsstream.packet import StreamReader
 from gsstream.packet.base import PACKET_HEADER
 from gsstream.player.export import export
 from gsstream.player.play import play
-from gsstream.player.playback import Playback, UnfinishedStreamWarning
+from gsstream.player.playback import Playback, TruncatedStreamWarning
 
 BAD = 3
 
@@ -108,7 +108,7 @@ def test_an_unfinished_tail_is_a_warning_and_no_error(tmp_path, capsys) -> None:
     assert f"20 bytes from byte {at}" in capsys.readouterr().err
     assert len(list((tmp_path / "p").iterdir())) == 4
     with warnings.catch_warnings(), Playback(path) as playback:
-        warnings.simplefilter("error", UnfinishedStreamWarning)
+        warnings.simplefilter("error", TruncatedStreamWarning)
         assert playback.sound(0, 3) == (range(3), None)
-        with pytest.raises(UnfinishedStreamWarning):
+        with pytest.raises(TruncatedStreamWarning):
             playback.sound()

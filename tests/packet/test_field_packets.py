@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from packet_scenes import begin, decode_all, follow, make_delta, make_field, make_field_packets, make_motion
 
 from gsstream.core.changes import Delta, FieldShape, Rows, Scene, apply_delta, apply_field, apply_motion, field_rows
-from gsstream.core.changes.hashgrid import evaluated
+from gsstream.core.changes.hashgrid import evaluate_network
 from gsstream.core.errors import ShapeError
 from gsstream.packet import decode_delta, encode_delta
 
@@ -93,7 +93,7 @@ def test_sums_are_exact_at_the_limits_of_the_format(seed):
     """The network by matrices of int64, which no library of linear algebra touches, agrees in every bit."""
     shape, unit, entries, weights = largest(None if seed is None else np.random.default_rng(seed))
     touched = shape.touched(unit)
-    got = evaluated(shape, unit, touched, entries, weights)
+    got = evaluate_network(shape, unit, touched, entries, weights)
     # Inputs as the look-up makes them: the network whose layers are one is asked for them, number by number.
     values = np.empty((len(unit), 128), np.int64)
     for level, table in enumerate(entries):
@@ -111,7 +111,7 @@ def test_sums_are_exact_at_the_limits_of_the_format(seed):
             values = np.clip((values + (1 << 13)) >> 14, 0, (1 << 26) - 1)
     assert np.array_equal(got * 2.0**34, values)
     for some in (slice(0, 1), slice(0, 7), slice(3, 300)):  # other shapes, other kernels of the library
-        assert evaluated(shape, unit[some], touched, entries, weights).tobytes() == got[some].tobytes()
+        assert evaluate_network(shape, unit[some], touched, entries, weights).tobytes() == got[some].tobytes()
 
 
 def test_blocks_of_rows_do_not_show(monkeypatch):

@@ -19,7 +19,7 @@ def far(state: PlayerState, *, predicted: bool = False) -> Motion:
     motion = make_motion(np.random.default_rng(0), state.scene, share=1.0, predicted=predicted)
     symbols = np.zeros_like(motion.symbols)
     symbols[:, :3] = 2**30
-    return dataclasses.replace(motion, symbols=symbols, shift_step=float(np.float32(9e8)))
+    return dataclasses.replace(motion, symbols=symbols, translation_step=float(np.float32(9e8)))
 
 
 @pytest.mark.filterwarnings("error")
@@ -60,8 +60,8 @@ def test_an_encoder_refuses_motions_that_are_none():
     state, delta = moving_state()
     motion, change = delta.motions[0], dataclasses.replace
     wrong = [
-        (change(motion, cell=0.1), "cell: expected a float32"), (change(motion, turn_step=0.1), "turn_step"),
-        (change(motion, shift_step=0.0), "shift_step"), (change(motion, shades=17), "shades"),
+        (change(motion, cell=0.1), "cell: expected a float32"), (change(motion, rotation_step=0.1), "rotation_step"),
+        (change(motion, translation_step=0.0), "translation_step"), (change(motion, shades=17), "shades"),
         (change(motion, symbols=motion.symbols.astype(np.int64)), "int32"),
         (change(motion, symbols=motion.symbols[1:]), "symbols: expected"),
         (change(motion, symbols=motion.symbols[:, :5]), "symbols: expected"),
@@ -82,7 +82,7 @@ def test_the_limit_of_a_correction_is_that_of_its_own_step():
     motion = make_motion(np.random.default_rng(0), state.scene, share=1.0)
     symbols = np.zeros_like(motion.symbols)
     symbols[:, 0], symbols[:, 3] = 2**31 - 1, 1
-    motion = dataclasses.replace(motion, symbols=symbols, turn_step=float(np.float32(9e8)))
+    motion = dataclasses.replace(motion, symbols=symbols, rotation_step=float(np.float32(9e8)))
     follow(state, Delta((motion,)))
 
 

@@ -35,7 +35,7 @@ from gsstream.core.changes import (
     apply_motion,
     apply_residual,
     gather_rows,
-    own_nodes,
+    add_as_nodes,
     sent_rows,
 )
 from gsstream.evaluation.stream_stats import stream_stats
@@ -69,7 +69,7 @@ def random_frame(rng: np.random.Generator, state: PlayerState, reach: float) -> 
             moving = last.moving * (rng.random(len(last.moving)) < 0.5).astype(np.uint8)
             symbols = rng.integers(-9, 10, (int(moving.sum()), 6)).astype(np.int32)
             motion = dataclasses.replace(last, moving=moving, symbols=symbols, regroup=False)
-        motion = dataclasses.replace(motion, turn_step=float(np.float32(rng.choice([0.01, 0.3, 40.0]))))
+        motion = dataclasses.replace(motion, rotation_step=float(np.float32(rng.choice([0.01, 0.3, 40.0]))))
         scene, _ = apply_motion(scene, motion)
         motions.append(motion)
     rest: tuple[Residual | Rows, ...] = ()
@@ -100,7 +100,7 @@ def oracle_step(world: World, state: PlayerState, after: PlayerState) -> None:
         world.sh0 = changed.sh0[:, 0].tolist()
         touched |= set(sent_rows(state.layout, after.delta.residual.gates).tolist())
     world.displaced(means, quats, touched)
-    if after.delta.edits_rows:
+    if after.delta.has_row_edit:
         source = gather_rows(state.layout.node_of, after.delta.births, after.delta.deaths).tolist()
         tables = [world.means, world.quats, world.sh0]
         if after.delta.births is not None:
@@ -166,7 +166,7 @@ def test_motions_round_trip(seed, number, motions, predicted, regroup):
     found = decode_delta(packet.data, state.scene, {})
     assert len(found.motions) == motions
     for sent, got in zip(delta.motions, found.motions, strict=True):
-        for name in ("cell", "shades", "shift_step", "turn_step", "predicted", "regroup"):
+        for name in ("cell", "shades", "translation_step", "rotation_step", "predicted", "regroup"):
             assert getattr(got, name) == getattr(sent, name), name
         assert got.moving.tolist() == sent.moving.tolist()
         assert got.symbols.dtype == np.int32
@@ -266,7 +266,7 @@ def pinned_stream() -> dict[str, PlayerState]:
     world.move(first)
     world.form_groups(1.0, 1, False)
     add("two", first, motion(1.0, 1, world.count, 2))
-    born = own_nodes(scene.rows(np.array([0, 5])), np.zeros(2), 6)
+    born = add_as_nodes(scene.rows(np.array([0, 5])), np.zeros(2), 6)
     add("rows", motion(1.0, 1, state.scene.groups.count, 2), Rows(born, np.array([0, 7, 23])))
     add("again", motion(1.0, 1, state.scene.groups.count, 1))
     return states
@@ -292,7 +292,7 @@ def test_groups_of_a_scene_without_rows_are_forgotten():
     for number in (0, 5):
         state = begin(rng, number, 2)
         motion = make_motion(rng, state.scene)
-        rows = Rows(own_nodes(make_scene(rng, 3), np.zeros(3), 2), np.arange(number))
+        rows = Rows(add_as_nodes(make_scene(rng, 3), np.zeros(3), 2), np.arange(number))
         state = follow(state, Delta((motion, rows)))
         assert state.scene.groups is None
         assert len(state.gaussians) == 3

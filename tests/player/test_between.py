@@ -11,7 +11,7 @@ from test_player import NUMPY, make_scene, make_stream
 from gsstream.core.changes import Delta, Layout, Residual, Rows, Scene, apply_delta
 from gsstream.core.errors import InputError
 from gsstream.packet import PlayerState
-from gsstream.player.between import Moments, between, moments
+from gsstream.player.interpolation import Moments, interpolate, frame_times
 from gsstream.player.play import play
 from gsstream.player.playback import Playback
 
@@ -36,7 +36,7 @@ def rotation(quats: np.ndarray) -> Rotation:
 def test_rows_go_straight_and_turn_evenly(share: float) -> None:
     """Turns against scipy's spherical interpolation."""
     before, after = two_frames()
-    scene = between(before, after, share)
+    scene = interpolate(before, after, share)
     expected = (1 - share) * before.gaussians.means + share * after.gaussians.means
     np.testing.assert_allclose(scene.means, expected, atol=1e-6)
     for row in range(20):
@@ -53,7 +53,7 @@ def test_rows_go_straight_and_turn_evenly(share: float) -> None:
 
 def test_rows_are_found_again_when_others_leave() -> None:
     before, after = two_frames(Rows(None, np.array([0, 3, 8])))
-    scene = between(before, after, 0.5)
+    scene = interpolate(before, after, 0.5)
     assert len(scene) == 20, "who leaves is there until the next frame"
     here = {name: row for row, name in enumerate(after.gaussians.opacities)}
     for row, name in enumerate(before.gaussians.opacities):
@@ -65,9 +65,9 @@ def test_rows_are_found_again_when_others_leave() -> None:
 
 def test_before_a_key_packet_and_at_a_frame_nothing_is_on_its_way() -> None:
     before, after = two_frames()
-    assert between(before, after, 0.0) is before.gaussians
+    assert interpolate(before, after, 0.0) is before.gaussians
     key = PlayerState(4, Scene(after.gaussians, after.layout), None)
-    assert between(before, key, 0.5) is before.gaussians
+    assert interpolate(before, key, 0.5) is before.gaussians
 
 
 def test_twice_the_pictures_show_the_frames_and_moments_between_them(tmp_path) -> None:
@@ -97,9 +97,9 @@ def test_moments_come_in_any_order(tmp_path) -> None:
 
 
 def test_times_keep_the_speed() -> None:
-    assert moments(range(2, 5), 30, 60) == [2, 2.5, 3, 3.5, 4]
-    assert moments(range(0, 4), 30, 20) == [0, 1.5, 3]
-    assert moments(range(7, 8), 30, 60) == [7]
-    times = moments(range(0, 91), 30, 29.97)
+    assert frame_times(range(2, 5), 30, 60) == [2, 2.5, 3, 3.5, 4]
+    assert frame_times(range(0, 4), 30, 20) == [0, 1.5, 3]
+    assert frame_times(range(7, 8), 30, 60) == [7]
+    times = frame_times(range(0, 91), 30, 29.97)
     assert times[-1] <= 90
     assert times[1] == pytest.approx(30 / 29.97)

@@ -15,7 +15,7 @@ from gsstream.core.errors import InputError, OutputError, PluginUnavailable, Unk
 from gsstream.core.world import World
 from gsstream.player.camera_file import read_path
 from gsstream.player.export import export
-from gsstream.player.paths import LEAST_SWING, camera_path, resized
+from gsstream.player.paths import MIN_SWING, camera_path, resized
 from gsstream.player.play import play
 from gsstream.player.render import named_renderer
 
@@ -52,7 +52,7 @@ def test_an_orbit_of_one_camera_swings_a_little() -> None:
     spread = np.ptp(np.unwrap(np.arctan2(*(path.centers - path.centers.mean(0))[:, :2].T)))
     assert np.linalg.norm(path.centers - path.centers[0], axis=1).max() > 0
     assert np.isfinite(spread)
-    assert LEAST_SWING < 0.2
+    assert MIN_SWING < 0.2
 
 
 @pytest.mark.parametrize("size", [(142, 90), (200, 45), (30, 90), (1, 1)])

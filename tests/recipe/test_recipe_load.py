@@ -132,7 +132,7 @@ def test_messages(lab) -> None:
     assert lab.refuse(text) == (
         "2 problems in the recipe:\n"
         "  run.yaml:5:1: unknown key 'strem'; did you mean 'stream'?\n"
-        "  run.yaml:9:3: unknown key 'codec.key_evry'; did you mean 'key_every'?"
+        "  run.yaml:9:3: unknown key 'codec.key_evry'; did you mean 'key_interval'?"
     )
     assert lab.refuse("gate: {temperature: 1}") == (
         "run.yaml:1:8: unknown key 'gate.temperature'; a part's own settings go under 'gate.params'"

@@ -37,7 +37,7 @@ def test_slope_and_ends():
 def test_a_small_run_does_not_drift(tmp_path, capsys):
     source = "synthetic:frames=3&views=3&width=48&height=36&supersample=1"
     command = ["--source", source, "--frames", "6", "--out", str(tmp_path), "--set", "first_frame.max_iterations=20",
-               "--set", "stream.epochs=2", "--set", "codec.key_every=4"]  # fmt: skip
+               "--set", "stream.epochs=2", "--set", "codec.key_interval=4"]  # fmt: skip
     assert main(command) == 0
     found = json.loads((tmp_path / "drift.json").read_text())
     assert json.loads(capsys.readouterr().out) == found["summary"]

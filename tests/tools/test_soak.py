@@ -33,7 +33,7 @@ def test_cases_repeat_and_cover_what_there_is() -> None:
     assert set(SOMETIMES) <= keys
     for slot, name in [("gate", "binary-ste"), ("propagation", "ft-pruning"), ("update", "latent")]:
         assert any((f"{slot}.name", name) in case.settings for case in cases)
-    assert {"gate.params.levels", "structure.params.root_exponent", "stepper.params.gate.l0"} <= keys
+    assert {"gate.params.levels", "structure.params.root_exponent", "streaming_method.params.gate.l0"} <= keys
 
 
 def test_drawn_settings_lie_in_their_ranges() -> None:

@@ -135,11 +135,11 @@ EVENT = st.sampled_from(["key", *["delta"] * 3, *["take"] * 3, "new", "damage"])
 
 
 @settings(max_examples=60, deadline=None)
-@given(events=st.lists(EVENT, max_size=80), most_behind=st.integers(1, 5))
-def test_no_viewer_ever_gets_a_delta_alone(tmp_path_factory, events, most_behind):
+@given(events=st.lists(EVENT, max_size=80), max_lag=st.integers(1, 5))
+def test_no_viewer_ever_gets_a_delta_alone(tmp_path_factory, events, max_lag):
     path = tmp_path_factory.mktemp("s") / "s.gss"
     follower = Follower(path)
-    cursor = Cursor(follower, most_behind=most_behind)
+    cursor = Cursor(follower, max_lag=max_lag)
     held, frame, restart = None, 0, True
 
     def take() -> bool:

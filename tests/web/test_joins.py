@@ -13,10 +13,10 @@ import pytest
 from moving_scenes import make_gaussians, moving_packets
 from node_runs import HERE, NODE, needs_node
 
-from gsstream.core.changes import Births, Delta, Motion, Rows, groups_for
+from gsstream.core.changes import AddedGaussians, Delta, Motion, Rows, groups_for
 from gsstream.core.errors import PacketError
 from gsstream.packet import PlayerState, decode_packet, encode_delta
-from gsstream.serve.joins import decode_join, encode_join, follow
+from gsstream.serve.joins import decode_join, encode_join, track_rows
 
 
 def digest(state: PlayerState) -> str:
@@ -29,7 +29,7 @@ def joins_of(packets):
     source, states, joins = np.arange(len(key.gaussians)), [key], []
     for packet in packets[1:]:
         state = decode_packet(state, packet.data)
-        source = follow(source, state)
+        source = track_rows(source, state)
         joins.append(encode_join(key, state, source))
         states.append(state)
     return packets, states, joins
@@ -96,7 +96,7 @@ def test_a_scene_without_an_old_row_forgets_its_groups(tmp_path):
 
     nodes = len(state.layout.node_counts)
     where = np.sort(rng.integers(0, nodes, 9))
-    born = Births(make_gaussians(rng, 9, 3), where, np.zeros(9, np.uint8), np.zeros(0, np.int64))
+    born = AddedGaussians(make_gaussians(rng, 9, 3), where, np.zeros(9, np.uint8), np.zeros(0, np.int64))
     for change in (motion, lambda s: Rows(born, np.arange(len(s.gaussians))), motion):
         packet = encode_delta(Delta((change(state),)), state.layout, state.decoders, frame=state.frame + 1)
         packets.append(packet)

@@ -183,7 +183,7 @@ def test_the_end_and_silence_are_told(page, packets, tmp_path):
 def test_what_is_wrong_is_said_in_one_sentence(page, packets, tmp_path, case):
     file = tmp_path / "s.gss"
     Growing(file).write(packets[:3])
-    options = {"token": "secret"} if "token" in case else {"most_viewers": 0} if case == "viewers" else {}
+    options = {"token": "secret"} if "token" in case else {"max_viewers": 0} if case == "viewers" else {}
     expected = {
         "no stream": "ot a gsstream file", "newer": "cannot be read",
         "token": "needs a token", "wrong token": "needs a token",

@@ -197,7 +197,7 @@ def test_a_damaged_packet_is_left_out_until_the_next_key(tmp_path, packets):
 
 def test_no_more_viewers_than_allowed_and_a_place_becomes_free(tmp_path, packets):
     Growing(tmp_path / "s.gss").write(packets[:3])
-    with Server(tmp_path / "s.gss", live=True, port=0, most_viewers=2) as server, contextlib.ExitStack() as stack:
+    with Server(tmp_path / "s.gss", live=True, port=0, max_viewers=2) as server, contextlib.ExitStack() as stack:
         first, second = (stack.enter_context(live_socket(server.url)) for _ in range(2))
         packets_from(first, until=2)
         packets_from(second, until=2)

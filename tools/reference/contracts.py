@@ -47,7 +47,7 @@ def checks() -> str:
 #: What a reader may miss among the checks.
 ELSEWHERE = {
     "a structure's time grows with N, not faster": "no check judges by a clock, and shared machines have poor ones",
-    "memory returns after an estimate": "`check_confidence_leaves_no_trace` refuses what would hold it, a graph",
+    "memory returns after an estimate": "`check_confidence_no_grad_left` refuses what would hold it, a graph",
     "outputs stay on a GPU": "checks run on the CPU, where every result can be compared bit by bit; a GPU renderer "
     "brings its own suite (`plugins/gsplat_render/tests`)",
     "a gate's noise at the ends of the generator's range": "a generator cannot be made to return them; 65,536 draws "

@@ -20,7 +20,7 @@ from pydantic.fields import FieldInfo
 from gsstream.core.errors import PluginUnavailable
 from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.core.rng import Rng
-from gsstream.engine.assembly.heeded import PART_SECTIONS, SESSION_KEYS
+from gsstream.engine.assembly.recipe_keys import PART_SECTIONS, SESSION_KEYS
 from gsstream.plugins.catalog import Catalog
 
 Generator = np.random.Generator
@@ -90,12 +90,12 @@ SOMETIMES: Mapping[str, Draw] = MappingProxyType({
     "first_frame.lr_means": _of(0.0, 1e-2),
     "first_frame.exposure": _of(True), "stream.active_threshold": _of(0.0, 0.05, 0.5, 0.99, 1.0),
     "stream.change_threshold": _of(0.0, 1.0, 6.0, 20.0, 100.0),
-    "stream.release_closed": _of(False, True),
-    "stream.rate_weight": _of(0.0, 1e-5, 3e-4, 1e-2, 1.0), "stream.on_error": _of("raise", "repeat"),
+    "stream.freeze_closed": _of(False, True),
+    "stream.rd_lambda": _of(0.0, 1e-5, 3e-4, 1e-2, 1.0), "stream.on_error": _of("raise", "repeat"),
     "stream.progressive": _of(False, True),
     "stream.lr_final_factor": _of(1.0, 0.1, 1e-6),
     "loss.backend": _of("auto", "reference"),
-    "codec.key_every": _of(0, 1, 2, 3),
+    "codec.key_interval": _of(0, 1, 2, 3),
     "data.leak": _of("none", "points", "training"), "data.images": _of("float16", "uint8"),
 })  # fmt: skip
 #: Drawn with the others where the method is made of parts.
@@ -128,12 +128,12 @@ def draw_case(seed: int, index: int, catalog: Catalog) -> Case:
         settings["data.train_views"] = int(rng.integers(2, views))
     if width * height <= REFERENCE_PIXELS and rng.random() < 0.2:
         settings["renderer"] = "reference"
-    stepper = stepper_of(method, catalog)
-    if stepper is not None:
-        heeds = getattr(catalog.resolve("stepper", stepper), "heeds", ())
-        read = (*heeds, *SESSION_KEYS)
+    streaming_method = stepper_of(method, catalog)
+    if streaming_method is not None:
+        recipe_keys = getattr(catalog.resolve("streaming_method", streaming_method), "recipe_keys", ())
+        read = (*recipe_keys, *SESSION_KEYS)
         settings = {k: v for k, v in settings.items() if k in read or k.partition(".")[0] not in PART_SECTIONS}
-        settings |= dict(_settings_of(catalog, "stepper", stepper, rng, share))
+        settings |= dict(_settings_of(catalog, "streaming_method", streaming_method, rng, share))
     else:
         settings |= {key: draw(rng) for key, draw in OF_PARTS.items() if rng.random() < share}
         settings |= _parts(catalog, rng, share)
@@ -141,10 +141,10 @@ def draw_case(seed: int, index: int, catalog: Catalog) -> Case:
 
 
 def stepper_of(method: str, catalog: Catalog) -> str | None:
-    """The stepper behind a method's name; None where it is made of parts."""
+    """The streaming_method behind a method's name; None where it is made of parts."""
     from gsstream.recipe.load import resolve_recipe
 
-    name = resolve_recipe(method, catalog.recipe_path).recipe.stepper.name
+    name = resolve_recipe(method, catalog.recipe_path).recipe.streaming_method.name
     return None if name == "parts" else name
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from gsstream.core.errors import ComponentError, InputError, PluginUnavailable, ShapeError
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.engine.method.repeating import LeftOutWarning, RepeatedFrameWarning
+from gsstream.engine.method.repeating import SkippedWorkWarning, RepeatedFrameWarning
 from gsstream.engine.run.recording import open_recording
 from gsstream.engine.run.session import METRICS, STREAM, RunListener, run
 from gsstream.method.base import Step
@@ -93,10 +93,10 @@ def _encode_and_check(case: Case, parts: Assembly, catalog: Catalog, out: Path, 
     source = open_recording(case.source, parts.recipe, catalog)
     try:
         with warnings.catch_warnings():
-            for failed in (RepeatedFrameWarning, LeftOutWarning):
+            for failed in (RepeatedFrameWarning, SkippedWorkWarning):
                 warnings.simplefilter("error", failed)
             run(parts, source, out, quiet=True, listener=Witness())
-    except (RepeatedFrameWarning, LeftOutWarning) as error:
+    except (RepeatedFrameWarning, SkippedWorkWarning) as error:
         raise ComponentError(
             str(error), slot="any", part="any", distribution="any", frame=len(digests), iteration=None
         ) from error

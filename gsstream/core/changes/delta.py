@@ -11,10 +11,10 @@ from typing import TypeAlias
 import numpy as np
 
 from gsstream.core.changes.field import Field, apply_field
-from gsstream.core.changes.history import displacement
-from gsstream.core.changes.motion import Motion, apply_motions, either
+from gsstream.core.changes.history import displacement_between
+from gsstream.core.changes.motion import Motion, apply_motions, union_rows
 from gsstream.core.changes.residual import Residual, apply_residual, sent_rows
-from gsstream.core.changes.rows import Births, Rows, apply_rows, gather_rows, join_rows
+from gsstream.core.changes.rows import AddedGaussians, Rows, apply_row_edit, gather_rows, join_rows
 from gsstream.core.changes.scene import Layout, Scene
 from gsstream.core.errors import ShapeError
 from gsstream.core.shapes import FloatArray, IntArray
@@ -62,7 +62,7 @@ class Delta:
         return next((change for change in self.changes if isinstance(change, Rows)), None)
 
     @property
-    def births(self) -> Births | None:
+    def births(self) -> AddedGaussians | None:
         """Gaussians that are added, or None."""
         return None if self.rows is None else self.rows.births
 
@@ -77,7 +77,7 @@ class Delta:
         return all(change.is_empty for change in self.changes)
 
     @property
-    def edits_rows(self) -> bool:
+    def has_row_edit(self) -> bool:
         """Whether Gaussians are added or removed."""
         return self.rows is not None and not self.rows.is_empty
 
@@ -107,12 +107,12 @@ def apply_delta(scene: Scene, delta: Delta) -> Scene:
     after, touched = apply_motions(scene, delta.motions)
     if delta.field is not None:
         after, rows = apply_field(after, delta.field)
-        touched = either(len(after.gaussians), touched, rows)
+        touched = union_rows(len(after.gaussians), touched, rows)
     if delta.residual is not None:
         after = replace(after, gaussians=apply_residual(after.gaussians, after.layout, delta.residual))
-        touched = either(len(after.gaussians), touched, sent_rows(after.layout, delta.residual.gates))
-    after = replace(after, moved=displacement(scene.gaussians, after.gaussians, touched))
-    return after if delta.rows is None else apply_rows(after, delta.rows)
+        touched = union_rows(len(after.gaussians), touched, sent_rows(after.layout, delta.residual.gates))
+    after = replace(after, moved=displacement_between(scene.gaussians, after.gaussians, touched))
+    return after if delta.rows is None else apply_row_edit(after, delta.rows)
 
 
 def row_gates(layout: Layout, delta: Delta) -> FloatArray:
@@ -125,7 +125,7 @@ def row_gates(layout: Layout, delta: Delta) -> FloatArray:
         gates = np.zeros(len(layout.unit_of), np.float32)
     else:
         gates = np.repeat(residual.gates, layout.node_counts).astype(np.float32) / np.float32(residual.num_levels)
-    if not delta.edits_rows:
+    if not delta.has_row_edit:
         return np.asarray(gates)
     born = None if delta.births is None else np.ones(len(delta.births), np.float32)
     return join_rows(gates, born, gather_rows(layout.node_of, delta.births, delta.deaths))

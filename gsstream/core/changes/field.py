@@ -11,18 +11,18 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gsstream.core.changes.hashgrid import ENTRY_RANGE, WEIGHT_RANGE, FieldShape, evaluated
-from gsstream.core.changes.motion import columns, multiply, quats_of
+from gsstream.core.changes.hashgrid import ENTRY_RANGE, WEIGHT_RANGE, FieldShape, evaluate_network
+from gsstream.core.changes.motion import columns, quat_multiply, rodrigues_to_quat
 from gsstream.core.changes.scene import Scene
 from gsstream.core.errors import ShapeError
 from gsstream.core.shapes import FloatArray, IntArray
 
 #: Multiplications that one field may take, rows times the network: some seconds of a processor.
-MAX_EFFORT = 1 << 35
+MAX_FLOPS = 1 << 35
 #: Symbols times their step stay below this, in units; with what learning starts from, below the range of weights.
 MAX_ENTRY_STEP, MAX_WEIGHT_STEP = 1 << ENTRY_RANGE - 1, 1 << WEIGHT_RANGE - 1
 #: The real part of a quaternion stays above this, so that a turn is one.
-LEAST_REAL = 0.1
+MIN_REAL = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,15 +70,15 @@ def field_rows(scene: Scene, shape: FieldShape, marks: IntArray | None) -> tuple
     able = np.arange(number) if marks is None else np.flatnonzero(marks)
     unit = shape.unit(scene.gaussians.means.take(able, 0))
     inside = np.flatnonzero(((unit >= 0) & (unit <= 1)).all(1))
-    if len(inside) * shape.effort > MAX_EFFORT:
+    if len(inside) * shape.effort > MAX_FLOPS:
         raise ShapeError(
-            f"field: {len(inside)} Gaussians by {shape.effort} multiplications are more than {MAX_EFFORT}; expected a "
+            f"field: {len(inside)} Gaussians by {shape.effort} multiplications are more than {MAX_FLOPS}; expected a "
             "smaller network or fewer Gaussians"
         )
     return able.take(inside), unit.take(inside, 0)
 
 
-def misfit(change: Field, touched: list[IntArray]) -> str | None:
+def mismatch(change: Field, touched: list[IntArray]) -> str | None:
     """Say why the symbols of a field cannot be; None when they can.
 
     Arguments:
@@ -114,7 +114,7 @@ def apply_field(scene: Scene, change: Field) -> tuple[Scene, IntArray]:
     shape = change.shape
     rows, unit = field_rows(scene, shape, change.marks)
     touched = shape.touched(unit)
-    problem = misfit(change, touched)
+    problem = mismatch(change, touched)
     if problem:
         raise ShapeError(f"field: {problem}")
     if not len(rows):
@@ -127,12 +127,12 @@ def apply_field(scene: Scene, change: Field) -> tuple[Scene, IntArray]:
         start + symbols.astype(np.int64) * change.weight_step
         for start, symbols in zip(shape.start_weights(), change.weights, strict=True)
     ]
-    said = evaluated(shape, unit, touched, entries, weights)
+    said = evaluate_network(shape, unit, touched, entries, weights)
     gaussians = scene.gaussians
     # By the limits of weights and reach no shift is above 10^15, so what is finite stays so.
     there = gaussians.means.take(rows, 0).astype(np.float64) + said[:, :3] * shape.reach
-    turn = said[:, 4:] / np.maximum(1.0 + said[:, 3:4], LEAST_REAL)
+    turn = said[:, 4:] / np.maximum(1.0 + said[:, 3:4], MIN_REAL)
     means, quats = gaussians.means.copy(), gaussians.quats.copy()
     means[rows] = there.astype(np.float32)
-    quats[rows] = multiply(quats_of(turn), columns(gaussians.quats, rows).T).astype(np.float32)
+    quats[rows] = quat_multiply(rodrigues_to_quat(turn), columns(gaussians.quats, rows).T).astype(np.float32)
     return replace(scene, gaussians=replace(gaussians, means=means, quats=quats)), rows

@@ -171,7 +171,7 @@ class FieldShape:
 BLOCK = 1 << 13
 
 
-def evaluated(
+def evaluate_network(
     shape: FieldShape, unit: FloatArray, touched: list[IntArray], entries: list[IntArray], weights: list[IntArray]
 ) -> FloatArray:
     """Return what the network says of places: [A, 7] float64, multiples of 2^-34.

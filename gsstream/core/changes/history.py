@@ -31,7 +31,7 @@ class Displacement:
         return Displacement(kept, self.shift[place], self.turn[place])
 
 
-def displacement(
+def displacement_between(
     before: Gaussians[FloatArray], after: Gaussians[FloatArray], rows: IntArray
 ) -> Displacement | None:
     """Measure how far a frame moved and turned rows; None when nothing moved.
@@ -43,13 +43,13 @@ def displacement(
     """
     with np.errstate(over="ignore"):  # beyond float32 it is infinite; a motion predicted from that is refused
         shift = after.means.take(rows, 0) - before.means.take(rows, 0)
-    turn = turn_between(before.quats.take(rows, 0), after.quats.take(rows, 0))
+    turn = rotation_between(before.quats.take(rows, 0), after.quats.take(rows, 0))
     # Number by number: any(1) over rows of three takes six times as long.
     some = np.flatnonzero(np.logical_or.reduce([column != 0 for column in (*shift.T, *turn.T)]))
     return Displacement(rows.take(some), shift.take(some, 0), turn.take(some, 0)) if len(some) else None
 
 
-def turn_between(before: FloatArray, after: FloatArray) -> FloatArray:
+def rotation_between(before: FloatArray, after: FloatArray) -> FloatArray:
     """Return the rotation [A, 3] that leads from one row of quaternions [A, 4] to the other: axis * tan(angle / 2).
 
     float64, each sum from left to right, rounded to float32 at the end. A turn of more than 120 degrees counts as none:

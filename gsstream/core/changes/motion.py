@@ -21,9 +21,9 @@ from gsstream.core.shapes import FloatArray, IntArray
 
 #: Cells are counted from -HALF_GRID to HALF_GRID - 1 along each axis; what lies beyond belongs to the outermost one.
 HALF_GRID = 1 << 15
-MAX_SHADES = 16
+MAX_BRIGHTNESS_BINS = 16
 #: Cells per row up to which groups are numbered by a table of all cells around the rows.
-MOST_CELLS = 64
+MAX_CELLS_PER_ROW = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +63,8 @@ class Motion:
         cell, shades: what makes a group (:class:`Groups`); ``cell`` is a float32 above 0.
         moving: [G] uint8, 1 for the K groups that move.
         symbols: [K, 6] int32 corrections of the prediction: shift x, y, z and turn x, y, z.
-        shift_step: scene units per symbol of the shift.
-        turn_step: tan(angle / 2) per symbol of the turn.
+        translation_step: scene units per symbol of the shift.
+        rotation_step: tan(angle / 2) per symbol of the turn.
         predicted: whether a group starts from the mean displacement of its rows in the last frame, else from rest.
         regroup: whether the groups are formed anew from where rows are now, even if they are known.
     """
@@ -73,8 +73,8 @@ class Motion:
     shades: int
     moving: IntArray
     symbols: IntArray = field(repr=False)
-    shift_step: float = 1.0
-    turn_step: float = 1.0
+    translation_step: float = 1.0
+    rotation_step: float = 1.0
     predicted: bool = True
     regroup: bool = False
 
@@ -84,7 +84,7 @@ class Motion:
         return not bool(np.any(self.moving))
 
 
-class Moves(NamedTuple):
+class GroupTransforms(NamedTuple):
     """The rows of moving groups, and the transform of each group: x' = R (x - centre) + centre + shift.
 
     ``rows`` [A] ascending, ``place`` [A] which of the K moving groups each is in, ``centre``, ``shift``, ``turn``
@@ -120,7 +120,7 @@ def groups_for(scene: Scene, cell: float, shades: int, regroup: bool = False) ->
     red, green, blue = scene.gaussians.sh0[:, 0].astype(np.float64).T
     bright = 0.5 + SH0 * (0.25 * red + 0.5 * green + 0.25 * blue)
     shade = np.clip(np.floor(bright * shades), 0, shades - 1).astype(np.int64)
-    group_of, count = _numbered((x, y, z, shade), (2 * HALF_GRID, 2 * HALF_GRID, 2 * HALF_GRID, MAX_SHADES))
+    group_of, count = _numbered((x, y, z, shade), (2 * HALF_GRID, 2 * HALF_GRID, 2 * HALF_GRID, MAX_BRIGHTNESS_BINS))
     return Groups(cell, shades, group_of, count)
 
 
@@ -134,7 +134,7 @@ def _numbered(digits: Sequence[IntArray], bases: Sequence[int]) -> tuple[IntArra
         return np.zeros(0, np.int32), 0
     low = [int(digit.min()) for digit in digits]
     spans = [int(digit.max()) - least + 1 for digit, least in zip(digits, low, strict=True)]
-    small = math.prod(spans) <= MOST_CELLS * len(digits[0])
+    small = math.prod(spans) <= MAX_CELLS_PER_ROW * len(digits[0])
     key = np.zeros(len(digits[0]), np.int64)
     for digit, least, span, base in zip(digits, low, spans, bases, strict=True):
         key = key * (span if small else base) + (digit - least if small else digit)
@@ -150,7 +150,7 @@ def _numbered(digits: Sequence[IntArray], bases: Sequence[int]) -> tuple[IntArra
     return rank[key], len(names)
 
 
-def moves_of(scene: Scene, groups: Groups, moving: IntArray, predicted: bool) -> Moves:
+def predict_transforms(scene: Scene, groups: Groups, moving: IntArray, predicted: bool) -> GroupTransforms:
     """Return the moving rows and the predicted transform of their groups, before any correction.
 
     Means over rows are float64 sums in the order of rows, divided by their number.
@@ -176,7 +176,7 @@ def moves_of(scene: Scene, groups: Groups, moving: IntArray, predicted: bool) ->
         past = past.take(here)
         shift = _means(scene.moved.shift.take(here, 0), past, len(which))
         turn = _means(scene.moved.turn.take(here, 0), past, len(which))
-    return Moves(rows, place, centre, shift, turn)
+    return GroupTransforms(rows, place, centre, shift, turn)
 
 
 def apply_motion(scene: Scene, motion: Motion) -> tuple[Scene, IntArray]:
@@ -193,15 +193,15 @@ def apply_motion(scene: Scene, motion: Motion) -> tuple[Scene, IntArray]:
             f"motion: expected a mark for each of {groups.count} groups, got shape {list(motion.moving.shape)}; "
             "the packet belongs to another scene"
         )
-    moves = moves_of(scene, groups, motion.moving, motion.predicted)
+    moves = predict_transforms(scene, groups, motion.moving, motion.predicted)
     if motion.symbols.shape != (len(moves.centre), 6):
         raise ShapeError(
             f"motion: expected 6 symbols for each of {len(moves.centre)} moving groups, got shape "
             f"{list(motion.symbols.shape)}"
         )
-    shift = moves.shift + motion.symbols[:, :3].astype(np.float64) * float(motion.shift_step)
-    turn = moves.turn + motion.symbols[:, 3:].astype(np.float64) * float(motion.turn_step)
-    gaussians = transformed(scene.gaussians, moves._replace(shift=shift, turn=turn))
+    shift = moves.shift + motion.symbols[:, :3].astype(np.float64) * float(motion.translation_step)
+    turn = moves.turn + motion.symbols[:, 3:].astype(np.float64) * float(motion.rotation_step)
+    gaussians = transform_groups(scene.gaussians, moves._replace(shift=shift, turn=turn))
     return replace(scene, gaussians=gaussians, groups=groups), moves.rows
 
 
@@ -213,11 +213,11 @@ def apply_motions(scene: Scene, motions: Sequence[Motion]) -> tuple[Scene, IntAr
     touched: IntArray = np.zeros(0, np.int64)
     for motion in motions:
         scene, rows = apply_motion(scene, motion)
-        touched = either(len(scene.gaussians), touched, rows)
+        touched = union_rows(len(scene.gaussians), touched, rows)
     return scene, touched
 
 
-def either(number: int, *rows: IntArray) -> IntArray:
+def union_rows(number: int, *rows: IntArray) -> IntArray:
     """Return the rows, ascending, that are in any of these lists of rows below ``number``."""
     marks = np.zeros(number, bool)
     for some in rows:
@@ -225,14 +225,14 @@ def either(number: int, *rows: IntArray) -> IntArray:
     return np.flatnonzero(marks)
 
 
-def transformed(gaussians: Gaussians[FloatArray], moves: Moves) -> Gaussians[FloatArray]:
+def transform_groups(gaussians: Gaussians[FloatArray], moves: GroupTransforms) -> Gaussians[FloatArray]:
     """Return the Gaussians with the rows of moving groups transformed. Raises ShapeError beyond float32."""
     if len(moves.rows) == 0:
         return gaussians
     rows, place = moves.rows, moves.place
-    quats = quats_of(moves.turn)
+    quats = rodrigues_to_quat(moves.turn)
     # Column by column: a player does this in every frame, and columns that lie together take half the time.
-    groups = np.concatenate([matrices_of(quats).reshape(-1, 9), moves.centre, moves.shift, quats], 1)
+    groups = np.concatenate([quat_to_rotmat(quats).reshape(-1, 9), moves.centre, moves.shift, quats], 1)
     of = np.ascontiguousarray(groups.T).take(place, 1, mode="clip")
     matrix, centre, shift, turn = of[:9].reshape(3, 3, -1), of[9:12], of[12:15], of[15:]
     x, y, z = columns(gaussians.means, rows) - centre
@@ -245,7 +245,7 @@ def transformed(gaussians: Gaussians[FloatArray], moves: Moves) -> Gaussians[Flo
         raise ShapeError("motion: it leads to positions beyond the range of float32")
     means, turns = gaussians.means.copy(), gaussians.quats.copy()
     means[rows] = rounded.T
-    turns[rows] = multiply(turn.T, columns(gaussians.quats, rows).T).astype(np.float32)
+    turns[rows] = quat_multiply(turn.T, columns(gaussians.quats, rows).T).astype(np.float32)
     return replace(gaussians, means=means, quats=turns)
 
 
@@ -254,14 +254,14 @@ def columns(values: FloatArray, rows: IntArray) -> FloatArray:
     return values.take(rows, 0).T.astype(np.float64, order="C")
 
 
-def quats_of(turn: FloatArray) -> FloatArray:
+def rodrigues_to_quat(turn: FloatArray) -> FloatArray:
     """Return unit quaternions [K, 4] wxyz, float64, of rotations [K, 3] given as axis * tan(angle / 2)."""
     x, y, z = turn.T
     scale = 1.0 / np.sqrt(1.0 + x * x + y * y + z * z)
     return np.stack([scale, x * scale, y * scale, z * scale], 1)
 
 
-def matrices_of(quats: FloatArray) -> FloatArray:
+def quat_to_rotmat(quats: FloatArray) -> FloatArray:
     """Return rotation matrices [K, 3, 3] of unit quaternions [K, 4] wxyz."""
     w, x, y, z = quats.T
     rows = [
@@ -272,7 +272,7 @@ def matrices_of(quats: FloatArray) -> FloatArray:
     return np.stack([np.stack(row, 1) for row in rows], 1)
 
 
-def multiply(a: FloatArray, b: FloatArray) -> FloatArray:
+def quat_multiply(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the quaternion products a b [A, 4] wxyz: first the rotation b, then a."""
     w0, x0, y0, z0 = a.T
     w1, x1, y1, z1 = b.T

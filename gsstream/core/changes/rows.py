@@ -21,7 +21,7 @@ Table = TypeVar("Table", FloatArray, IntArray)
 
 
 @dataclass(frozen=True, slots=True)
-class Births:
+class AddedGaussians:
     """B Gaussians that one frame adds, and K nodes that come with them.
 
     Arguments:
@@ -49,7 +49,7 @@ class Rows:
         deaths: [D] int64 rows removed (of the scene before the births), ascending.
     """
 
-    births: Births | None = None
+    births: AddedGaussians | None = None
     deaths: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
@@ -58,31 +58,31 @@ class Rows:
         return self.births is None and len(self.deaths) == 0
 
 
-def apply_rows(scene: Scene, rows: Rows) -> Scene:
+def apply_row_edit(scene: Scene, rows: Rows) -> Scene:
     """Return the scene without the rows that leave and with those that join. Raises ShapeError when they do not fit.
 
     A birth belongs to the group of the row stored before it, so that it moves with its neighbours.
     """
     layout, born = scene.layout, rows.births
-    check_deaths(rows.deaths, len(layout.unit_of))
+    check_removed(rows.deaths, len(layout.unit_of))
     if rows.is_empty:
         return scene
     if born is not None:
         widths = [(name, int(np.prod(value.shape[1:]))) for name, value in scene.gaussians.items()]
-        check_births(born, len(layout.node_counts), len(layout.units), widths)
+        check_added(born, len(layout.node_counts), len(layout.units), widths)
     source = gather_rows(layout.node_of, born, rows.deaths)
     gaussians = Gaussians(**{
         name: join_rows(value, None if born is None else getattr(born.gaussians, name), source)
         for name, value in scene.gaussians.items()
     })
     units = join_rows(layout.unit_of, None if born is None else born.unit_of, source).astype(np.uint8)
-    counts = next_counts(layout.node_counts, layout.node_of, born, rows.deaths)
+    counts = edited_counts(layout.node_counts, layout.node_of, born, rows.deaths)
     moved = None if scene.moved is None else scene.moved.gathered(source)
     groups = None if scene.groups is None else scene.groups.gathered(source)
     return Scene(gaussians, Layout(counts, units, layout.units), moved, groups)
 
 
-def own_nodes(gaussians: Gaussians[FloatArray], unit_of: IntArray, num_nodes: int) -> Births:
+def add_as_nodes(gaussians: Gaussians[FloatArray], unit_of: IntArray, num_nodes: int) -> AddedGaussians:
     """Return births that each bring a root node of their own, so that they share a gate with nobody.
 
     Arguments:
@@ -91,10 +91,10 @@ def own_nodes(gaussians: Gaussians[FloatArray], unit_of: IntArray, num_nodes: in
         num_nodes: M, nodes before the births.
     """
     nodes = num_nodes + np.arange(len(gaussians), dtype=np.int64)
-    return Births(gaussians, nodes, np.asarray(unit_of, np.uint8), nodes)
+    return AddedGaussians(gaussians, nodes, np.asarray(unit_of, np.uint8), nodes)
 
 
-def in_nodes(gaussians: Gaussians[FloatArray], nodes: IntArray, unit_of: IntArray) -> Births:
+def add_to_nodes(gaussians: Gaussians[FloatArray], nodes: IntArray, unit_of: IntArray) -> AddedGaussians:
     """Return births into existing nodes; a copy stays in the node of what it was copied from.
 
     Arguments:
@@ -104,10 +104,10 @@ def in_nodes(gaussians: Gaussians[FloatArray], nodes: IntArray, unit_of: IntArra
     """
     order = np.argsort(nodes, kind="stable")
     units = np.asarray(unit_of, np.uint8)[order]
-    return Births(gaussians.rows(order), np.asarray(nodes, np.int64)[order], units, np.zeros(0, np.int64))
+    return AddedGaussians(gaussians.rows(order), np.asarray(nodes, np.int64)[order], units, np.zeros(0, np.int64))
 
 
-def gather_rows(node_of: IntArray, births: Births | None, deaths: IntArray) -> IntArray:
+def gather_rows(node_of: IntArray, births: AddedGaussians | None, deaths: IntArray) -> IntArray:
     """Return [N'] int64: which row each row of the scene afterwards was before; N + j is birth j.
 
     Arguments:
@@ -122,7 +122,7 @@ def gather_rows(node_of: IntArray, births: Births | None, deaths: IntArray) -> I
     return np.asarray(np.insert(kept, places, len(node_of) + np.arange(len(births))))
 
 
-def next_counts(node_counts: IntArray, node_of: IntArray, births: Births | None, deaths: IntArray) -> IntArray:
+def edited_counts(node_counts: IntArray, node_of: IntArray, births: AddedGaussians | None, deaths: IntArray) -> IntArray:
     """Return [M + K] int32: Gaussians of each node after births and deaths.
 
     Arguments:
@@ -150,7 +150,7 @@ def join_rows(old: Table, born: Table | None, source: IntArray) -> Table:
     return joined
 
 
-def check_births(births: Births, num_nodes: int, num_units: int, shapes: Sequence[tuple[str, int]]) -> None:
+def check_added(births: AddedGaussians, num_nodes: int, num_units: int, shapes: Sequence[tuple[str, int]]) -> None:
     """Raise ShapeError unless the births fit a scene of M nodes and H units.
 
     Arguments:
@@ -179,7 +179,7 @@ def check_births(births: Births, num_nodes: int, num_units: int, shapes: Sequenc
             raise ShapeError(f"births: expected {width} values of {name} like the scene, got {got}")
 
 
-def check_deaths(deaths: IntArray, number: int) -> None:
+def check_removed(deaths: IntArray, number: int) -> None:
     """Raise ShapeError unless ``deaths`` are rows of N Gaussians, ascending, none twice."""
     if len(deaths) and (int(deaths[0]) < 0 or int(deaths[-1]) >= number or np.any(np.diff(deaths) <= 0)):
         raise ShapeError(f"deaths: expected rows from 0 to {number - 1}, ascending and none twice")

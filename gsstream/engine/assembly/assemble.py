@@ -12,11 +12,11 @@ from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
 from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.core.needs import install_renderer
 from gsstream.core.part import Part, unwrapped
-from gsstream.engine.assembly.checks import Checks, wanted_checks
+from gsstream.engine.assembly.checks import Checks, requested_checks
 from gsstream.engine.assembly.guard import guard
-from gsstream.engine.assembly.heeded import unheeded
+from gsstream.engine.assembly.recipe_keys import unused_keys
 from gsstream.engine.assembly.title import title
-from gsstream.engine.assembly.where import Where
+from gsstream.engine.assembly.call_location import Where
 from gsstream.method.base import StreamingMethod
 from gsstream.parts.confidence.base import ConfidenceEstimator
 from gsstream.parts.gate.base import GateSampler
@@ -35,7 +35,7 @@ from gsstream.recipe.document import KeyPath, Origin
 from gsstream.recipe.load import ResolvedRecipe
 from gsstream.recipe.model import ComponentRef, Recipe
 
-SLOTS = (*METHOD_SLOTS, "stepper", "renderer")
+SLOTS = (*METHOD_SLOTS, "streaming_method", "renderer")
 #: Everything that is called behind a guard.
 GUARDED = (*SLOTS, "loss", "optimiser")
 #: What "auto" tries, fastest first, before it falls back to the reference.
@@ -54,7 +54,7 @@ class Assembly:
 
     Arguments:
         recipe: the recipe with every part's parameters written out and the renderer that was chosen.
-        stepper: what goes from frame to frame: the parts above, or a method that is built otherwise.
+        streaming_method: what goes from frame to frame: the parts above, or a method that is built otherwise.
         origins: path -> origin of every value that is not a default (for ``recipe.save.save_resolved``).
         distributions: installed distributions that the parts come from.
         checks: how closely the run looks at what parts return; nothing that is sent depends on it.
@@ -73,7 +73,7 @@ class Assembly:
     update: UpdateRule
     growth: Growth
     regularizer: Regularizer
-    stepper: StreamingMethod[Any]
+    streaming_method: StreamingMethod[Any]
     renderer: Renderer
     loss: Loss
     optimiser: RowOptimiser
@@ -111,7 +111,7 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
         RecipeError: parameters that a part does not know or refuses, unknown parts; all of them together.
         PluginUnavailable: a part's plugin is in quarantine or the part is not what it claims to be.
     """
-    level = wanted_checks(checks)
+    level = requested_checks(checks)
     if isinstance(resolved, Recipe):
         resolved = ResolvedRecipe(resolved, {})
     problems: list[str] = []
@@ -129,9 +129,9 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
             parts[slot] = built
             refs[slot] = ComponentRef(name=ref.name, params=built.config.model_dump(mode="json"))
     loss = _loss(resolved, catalog, problems)
-    if "stepper" in parts:
-        paths = list(unheeded(resolved.recipe.model_copy(update=refs), parts["stepper"], parts))
-        problems += _unread(paths, resolved)
+    if "streaming_method" in parts:
+        paths = list(unused_keys(resolved.recipe.model_copy(update=refs), parts["streaming_method"], parts))
+        problems += _unused_key_messages(paths, resolved)
     join_problems(problems)
     parts["loss"] = loss
     parts["optimiser"] = _optimiser(catalog)
@@ -143,18 +143,18 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
     )  # fmt: skip
 
 
-def _unread(paths: list[KeyPath], resolved: ResolvedRecipe) -> list[str]:
-    """What to say about keys that the stepper does not read: each, or in one line where it is the whole method's."""
-    name, base = resolved.recipe.stepper.name, resolved.recipe.method
+def _unused_key_messages(paths: list[KeyPath], resolved: ResolvedRecipe) -> list[str]:
+    """What to say about keys that the streaming_method does not read: each, or in one line where it is the whole method's."""
+    name, base = resolved.recipe.streaming_method.name, resolved.recipe.method
     from_base = [path for path in paths if resolved.near(path).label == f"method {base}"]
     if len(from_base) > 2:
-        where = resolved.near(("stepper", "name")).where
+        where = resolved.near(("streaming_method", "name")).where
         some = ", ".join(".".join(path) for path in from_base[:3])
         return [
-            f"{where}: the stepper {name!r} reads none of {len(from_base)} settings that the method {base!r} brings "
-            f"({some}, ...); put it in place of another method: --method dense --set stepper={name}"
+            f"{where}: the streaming_method {name!r} reads none of {len(from_base)} settings that the method {base!r} brings "
+            f"({some}, ...); put it in place of another method: --method dense --set streaming_method={name}"
         ]
-    hint = f"the stepper {name!r} does not read it; its own settings: gsstream plugins stepper/{name}"
+    hint = f"the streaming_method {name!r} does not read it; its own settings: gsstream plugins streaming_method/{name}"
     return [f"{resolved.near(path).where}: {'.'.join(path)}: {hint}" for path in paths]
 
 

@@ -14,7 +14,7 @@ import torch
 
 from gsstream.core.errors import InputError
 from gsstream.engine.assembly.fault import fault
-from gsstream.engine.assembly.where import Where
+from gsstream.engine.assembly.call_location import Where
 
 VARIABLE = "GSSTREAM_CHECKS"
 UNIT = (0.0, 1.0)
@@ -34,7 +34,7 @@ class Checks(StrEnum):
     STEP = "step"
 
 
-def wanted_checks(given: str | None = None) -> Checks:
+def requested_checks(given: str | None = None) -> Checks:
     """Return the level asked for: ``given``, else that of the environment, else "frame".
 
     Raises InputError for anything but the three levels.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.metadata import entry_points, packages_distributions
 
 from gsstream.core.errors import ComponentError
-from gsstream.engine.assembly.where import Where
+from gsstream.engine.assembly.call_location import Where
 from gsstream.spec import ENTRY_POINT_GROUP
 
 

@@ -14,8 +14,8 @@ from gsstream.core.errors import GsstreamError, InputError, ShapeError
 from gsstream.core.part import unwrapped
 from gsstream.engine.assembly.checks import Checks, Look
 from gsstream.engine.assembly.fault import fault
-from gsstream.engine.assembly.looks import LOOKS
-from gsstream.engine.assembly.where import Where
+from gsstream.engine.assembly.output_checks import OUTPUT_CHECKS
+from gsstream.engine.assembly.call_location import Where
 from gsstream.parts.optimiser.base import RowOptimiser
 from gsstream.parts.optimiser.residual import ResidualOptimiser
 from gsstream.parts.render.base import RenderSession
@@ -34,7 +34,7 @@ BODIES: Mapping[tuple[str, str], Callable[..., Any]] = {
 
 
 @contextmanager
-def blaming(slot: str, part: object, where: Where) -> Iterator[None]:
+def error_context(slot: str, part: object, where: Where) -> Iterator[None]:
     """Turn what a part raises into a ComponentError with slot, part, distribution, frame and iteration.
 
     A ShapeError is turned, too: it says that this part refuses what another part gave it. Of a renderer so is every
@@ -68,7 +68,7 @@ def _line_of(error: Exception, part: object) -> str:
 class Guarded:
     """Calls a part and stands in its place: attributes that are no functions are the part's own.
 
-    What its functions raise passes :func:`blaming`; what they return is looked at (``engine.assembly.looks``).
+    What its functions raise passes :func:`error_context`; what they return is looked at (``engine.assembly.output_checks``).
     """
 
     def __init__(self, slot: str, part: object, where: Where, level: Checks, kind: str = "") -> None:
@@ -113,18 +113,18 @@ class Guarded:
         except Exception as error:
             if isinstance(error, AttributeError) and getattr_static(self._subject, name, None) is None:
                 raise  # the part has none, which whoever asks may want to know
-            with blaming(self._slot, self._part, self._where):
+            with error_context(self._slot, self._part, self._where):
                 raise
 
     def _guarding(self, name: str, method: Callable[..., Any]) -> Callable[..., Any]:
         # Nothing here may hold ``self``, which holds what is returned: a session has to go when its owner lets go of
         # it, not when the garbage collector comes by. It has the memory of a render for every camera.
         slot, part, where, level, kind = self._slot, self._part, self._where, self._level, self._kind
-        look = LOOKS.get((kind, name))
+        look = OUTPUT_CHECKS.get((kind, name))
         looking = Look(level, slot, part, where)
 
         def call(*args: Any, **kwargs: Any) -> Any:
-            with blaming(slot, part, where):
+            with error_context(slot, part, where):
                 result = method(*args, **kwargs)
                 if name == "propose":
                     where.pause()  # what the part fitted is over: what is wrong with the result is of no iteration

@@ -32,9 +32,9 @@ def title(recipe: Recipe, catalog: Catalog) -> str:
     except GsstreamError:
         return recipe.method
     name, changes = recipe.method, list(_changes(recipe, base, catalog))
-    if recipe.stepper.name not in (base.stepper.name, "parts"):
-        name = recipe.stepper.name
-        changes = [change for change in changes if not change.startswith("stepper=")]
+    if recipe.streaming_method.name not in (base.streaming_method.name, "parts"):
+        name = recipe.streaming_method.name
+        changes = [change for change in changes if not change.startswith("streaming_method=")]
     if not changes:
         return name
     more = f" and {len(changes) - SHOWN} more" if len(changes) > SHOWN else ""

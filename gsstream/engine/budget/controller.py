@@ -12,9 +12,9 @@ from typing import Any
 
 from gsstream.core.log import FrameLog
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.budget.pace import Allowance
-from gsstream.engine.budget.plan import WINDOW, Past, past_of, plan
-from gsstream.engine.budget.spent import spent
+from gsstream.engine.budget.epoch_scheduler import Allowance
+from gsstream.engine.budget.plan import WINDOW, Past, read_past_frame, plan
+from gsstream.engine.budget.usage import spent
 from gsstream.method.base import Step
 from gsstream.method.tools import FrameBudget
 from gsstream.metrics import peak_memory_mb
@@ -50,7 +50,7 @@ class Controller:
         if not numbers.get("iterations"):
             return
         used = numbers.get("budget") or {
-            "rate_weight": budget.plan.rate_weight, "estimate": 0.0, "stopped_by_clock": False,
+            "rd_lambda": budget.plan.rd_lambda, "estimate": 0.0, "stopped_by_clock": False,
             "untrimmed": len(step.packet.data), "dropped": {},
             "before": log.seconds("change", "motion", "confidence"),
             "optimise": log.seconds("optimise"),
@@ -92,18 +92,18 @@ class Controller:
             size = sum(metrics["bytes"].values())
             seconds = metrics["seconds"].get("key", metrics["seconds"].get("code", 0.0))
             self._key = size / metrics["num_gaussians"], seconds / metrics["num_gaussians"]
-        past = past_of(metrics)
+        past = read_past_frame(metrics)
         if past is not None:
             self._history = (*self._history, past)[-WINDOW:]
 
 
-def planned(parts: Assembly, budget: FrameBudget) -> Assembly:
+def apply_plan(parts: Assembly, budget: FrameBudget) -> Assembly:
     """Return the parts with the recipe of one frame: the plan's epochs, threshold and weight."""
     assert isinstance(budget, Allowance)
     frame_plan = budget.plan
     changes = {
         "epochs": frame_plan.epochs, "change_threshold": frame_plan.change_threshold,
-        "rate_weight": frame_plan.rate_weight,
+        "rd_lambda": frame_plan.rd_lambda,
     }  # fmt: skip
     recipe = parts.recipe
     return replace(parts, recipe=recipe.model_copy(update={"stream": recipe.stream.model_copy(update=changes)}))

@@ -22,15 +22,15 @@ BYTES_PER_GAUSSIAN = 1_700
 #: Share of the memory beside the images that Gaussians get; caches get the rest (250 bytes per camera and Gaussian).
 FOR_GAUSSIANS = 0.6
 #: With fewer Gaussians than this a scene is not worth encoding.
-LEAST_GAUSSIANS = 1_000
+MIN_GAUSSIANS = 1_000
 
 
-def memory_floor(info: SourceInfo) -> int:
+def min_memory(info: SourceInfo) -> int:
     """Return how many bytes a run of this recording needs with the least number of Gaussians."""
-    return _fixed(info) + round(LEAST_GAUSSIANS * BYTES_PER_GAUSSIAN / FOR_GAUSSIANS)
+    return _fixed(info) + round(MIN_GAUSSIANS * BYTES_PER_GAUSSIAN / FOR_GAUSSIANS)
 
 
-def within_memory(parts: Assembly, info: SourceInfo) -> Assembly:
+def limit_memory(parts: Assembly, info: SourceInfo) -> Assembly:
     """Return the parts with limits on Gaussians and caches that the budget of memory can hold.
 
     These are ``first_frame.max_gaussians`` and the renderer's ``cache_mb``.
@@ -40,12 +40,12 @@ def within_memory(parts: Assembly, info: SourceInfo) -> Assembly:
     memory = parts.recipe.budget.memory
     if memory is None:
         return parts
-    if memory < memory_floor(info):
+    if memory < min_memory(info):
         raise InputError(
             f"budget.memory: {memory / 1e6:.0f} MB, but a run of this recording needs at least "
-            f"{memory_floor(info) / 1e6:.0f} MB ({PROCESS / 1e6:.0f} MB for the process, the rest for "
+            f"{min_memory(info) / 1e6:.0f} MB ({PROCESS / 1e6:.0f} MB for the process, the rest for "
             f"{len(info.train)} training cameras of {info.train.width} x {info.train.height} pixels and "
-            f"{LEAST_GAUSSIANS} Gaussians); give more, or lower --scale"
+            f"{MIN_GAUSSIANS} Gaussians); give more, or lower --scale"
         )
     free, first = memory - _fixed(info), parts.recipe.first_frame
     most = min(first.max_gaussians, round(FOR_GAUSSIANS * free) // BYTES_PER_GAUSSIAN)

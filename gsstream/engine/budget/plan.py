@@ -21,7 +21,7 @@ WINDOW = 5
 TIME_MARGIN = 0.93
 #: Below this share of a size budget the weight falls; above this multiple it rises. In between the packet is trimmed:
 #: that takes 43 % of the bytes for less than any weight does (docs/results/trade.md).
-SIZE_AIM, MOST_TRIMMED = 0.94, 2.0
+SIZE_TARGET, MAX_TRIMMED = 0.94, 2.0
 #: Largest share of the time that is kept for the phases after the passes, while no frame has shown what they cost.
 UNKNOWN_RESERVE = 0.2
 #: Share of a pass's time that does not depend on the number of candidates.
@@ -29,13 +29,13 @@ FIXED_SHARE = 0.3
 #: Most passes over the cameras that a budget of time spends on one frame, where the recipe has fewer.
 MOST_EPOCHS = 30
 #: When fewer passes than this fit, it is better to have fewer candidates and more passes.
-LEAST_EPOCHS = 4
+MIN_EPOCHS = 4
 #: Weights of the rate that the controller may use; recipes ship 3e-4, which halves the bytes (docs/results/trade.md).
-LEAST_WEIGHT, MOST_WEIGHT = 3e-5, 3e-2
+MIN_WEIGHT, MAX_WEIGHT = 3e-5, 3e-2
 #: Steps get at most this much coarser.
-MOST_STEP_SCALE = 4.0
+MAX_STEP_SCALE = 4.0
 #: Thresholds of change rise at most to this many times the recipe's, from this one where the recipe has none.
-MOST_THRESHOLD, FIRST_THRESHOLD = 4.0, 3.0
+MAX_THRESHOLD, FIRST_THRESHOLD = 4.0, 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class Past:
     size: int
 
 
-def past_of(metrics: Mapping[str, Any]) -> Past | None:
+def read_past_frame(metrics: Mapping[str, Any]) -> Past | None:
     """Return a line of ``metrics.jsonl`` as the planner sees it; None for frames that were not optimised."""
     spent = metrics.get("budget", {}).get("spent")
     if spent is None:
@@ -73,7 +73,7 @@ def past_of(metrics: Mapping[str, Any]) -> Past | None:
         candidates=int(metrics.get("candidate_gaussians", metrics["num_gaussians"])),
         before=float(spent["before"]), optimise=float(spent["optimise"]),
         after=float(spent["seconds"]) - float(spent["before"]) - float(spent["optimise"]),
-        weight=float(spent["rate_weight"]), step_scale=float(spent["step_scale"]),
+        weight=float(spent["rd_lambda"]), step_scale=float(spent["step_scale"]),
         threshold=float(spent["change_threshold"]), estimate=float(spent["estimate"]),
         untrimmed=int(spent["untrimmed"]), size=sum(metrics["bytes"].values()),
     )  # fmt: skip
@@ -85,8 +85,8 @@ class FramePlan:
 
     Arguments:
         epochs: passes over the cameras; with a time budget a prediction, corrected after every pass.
-        rate_weight: at the start; moved after every pass where a size is to be met.
-        most_epochs: passes that are not exceeded however much time is left.
+        rd_lambda: at the start; moved after every pass where a size is to be met.
+        max_epochs: passes that are not exceeded however much time is left.
         step_scale: factor on all quantisation steps, >= 1.
         max_bytes: the size that must not be exceeded, or None. correction: real bytes per estimated byte.
         seconds: what may be planned with from the start of the frame, or None.
@@ -97,8 +97,8 @@ class FramePlan:
 
     epochs: int
     change_threshold: float
-    rate_weight: float
-    most_epochs: int = 0
+    rd_lambda: float
+    max_epochs: int = 0
     step_scale: float = 1.0
     max_bytes: int | None = None
     correction: float = 1.0
@@ -119,7 +119,7 @@ def plan(budget: Budget, stream: Stream, history: Sequence[Past]) -> FramePlan:
         history: earlier frames that were optimised, oldest first.
     """
     recent = history[-WINDOW:]
-    each, (before, after) = seconds_per_epoch(recent), _around(recent)
+    each, (before, after) = seconds_per_epoch(recent), _other_seconds(recent)
     epochs = _epochs(budget, stream, each, before + after)
     size = budget.size
     held = size is not None
@@ -129,8 +129,8 @@ def plan(budget: Budget, stream: Stream, history: Sequence[Past]) -> FramePlan:
     return FramePlan(
         epochs=epochs,
         change_threshold=_threshold(budget, stream, recent),
-        rate_weight=_weight(budget, stream, recent) if held else stream.rate_weight,
-        most_epochs=max(stream.epochs, MOST_EPOCHS),
+        rd_lambda=_weight(budget, stream, recent) if held else stream.rd_lambda,
+        max_epochs=max(stream.epochs, MOST_EPOCHS),
         step_scale=_step_scale(recent) if held else 1.0,
         max_bytes=size,
         correction=_correction(recent),
@@ -149,7 +149,7 @@ def seconds_per_epoch(history: Sequence[Past]) -> float | None:
     return median(known) if known else None
 
 
-def epochs_within(seconds: float, each: float, most: int) -> int:
+def epochs_in(seconds: float, each: float, most: int) -> int:
     """Return how many passes fit into a time, at least 1.
 
     Arguments:
@@ -162,7 +162,7 @@ def epochs_within(seconds: float, each: float, most: int) -> int:
     return max(1, min(most, math.floor(min(seconds / each, most) + 1e-9)))
 
 
-def each_with(each: float, then: int, now: int) -> float:
+def scale_epoch_seconds(each: float, then: int, now: int) -> float:
     """Return the seconds of a pass with another number of candidates; a part of it does not scale.
 
     Arguments:
@@ -178,10 +178,10 @@ def _epochs(budget: Budget, stream: Stream, each: float | None, around: float) -
     if budget.time is None:
         return stream.epochs
     most = max(stream.epochs, MOST_EPOCHS)
-    return most if each is None else epochs_within(TIME_MARGIN * budget.time - around, each, most)
+    return most if each is None else epochs_in(TIME_MARGIN * budget.time - around, each, most)
 
 
-def _around(recent: Sequence[Past]) -> tuple[float, float]:
+def _other_seconds(recent: Sequence[Past]) -> tuple[float, float]:
     """Seconds before and after the passes."""
     if not recent:
         return 0.0, 0.0
@@ -199,11 +199,11 @@ def _threshold(budget: Budget, stream: Stream, recent: Sequence[Past]) -> float:
     usual = stream.change_threshold
     if budget.time is None or not recent:
         return usual
-    last, most = recent[-1], MOST_THRESHOLD * (usual or FIRST_THRESHOLD)
-    few = min(LEAST_EPOCHS, stream.epochs)
+    last, most = recent[-1], MAX_THRESHOLD * (usual or FIRST_THRESHOLD)
+    few = min(MIN_EPOCHS, stream.epochs)
     if len(recent) > 1 and max(last.epochs, recent[-2].epochs) < few:
         return min(1.5 * last.threshold if last.threshold else FIRST_THRESHOLD, most)
-    if last.epochs >= 2 * LEAST_EPOCHS and last.threshold > usual:
+    if last.epochs >= 2 * MIN_EPOCHS and last.threshold > usual:
         lower = last.threshold / 1.25
         return lower if lower > max(usual, 0.7 * FIRST_THRESHOLD) else usual
     return last.threshold
@@ -215,11 +215,11 @@ def _weight(budget: Budget, stream: Stream, recent: Sequence[Past]) -> float:
     Never more: a residual that is taxed from the first pass on does not grow to what it should be. To let it grow and
     to trim the packet is better by far at equal bytes (docs/results/trade.md).
     """
-    start = stream.rate_weight or LEAST_WEIGHT
+    start = stream.rd_lambda or MIN_WEIGHT
     if recent and budget.size is not None:
-        missed = recent[-1].untrimmed / (SIZE_AIM * budget.size)
+        missed = recent[-1].untrimmed / (SIZE_TARGET * budget.size)
         start = min(start, recent[-1].weight * min(max(missed**1.5, 0.5), 2.0))
-    return min(max(start, LEAST_WEIGHT), MOST_WEIGHT)
+    return min(max(start, MIN_WEIGHT), MAX_WEIGHT)
 
 
 def _step_scale(recent: Sequence[Past]) -> float:
@@ -227,9 +227,9 @@ def _step_scale(recent: Sequence[Past]) -> float:
     if not recent:
         return 1.0
     last = recent[-1]
-    if last.weight >= 0.5 * MOST_WEIGHT and last.untrimmed > last.size:
-        return min(2 ** 0.5 * last.step_scale, MOST_STEP_SCALE)
-    return max(1.0, last.step_scale / 2 ** 0.5) if last.weight < 0.1 * MOST_WEIGHT else last.step_scale
+    if last.weight >= 0.5 * MAX_WEIGHT and last.untrimmed > last.size:
+        return min(2 ** 0.5 * last.step_scale, MAX_STEP_SCALE)
+    return max(1.0, last.step_scale / 2 ** 0.5) if last.weight < 0.1 * MAX_WEIGHT else last.step_scale
 
 
 def _correction(recent: Sequence[Past]) -> float:

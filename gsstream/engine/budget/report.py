@@ -41,7 +41,7 @@ def budget_lines(lines: Sequence[Mapping[str, Any]]) -> list[str]:
         text = f"budget {name} {quantity(name, limit)}: {inside} of {len(of)} frames inside; "
         text += f"median {quantity(name, median(actual))}, most {quantity(name, max(actual))}"
         out.append(text if name == "memory" else f"{text}; it bound {bound} frames")
-    out += _given_up(held)
+    out += _reductions(held)
     broken = [f"  frame {line['frame']}: {', '.join(violations(line))}" for line in held if line["budget"]["violated"]]
     if broken:
         out += ["outside the budget:", *broken[:LISTED]]
@@ -53,14 +53,14 @@ def budget_lines(lines: Sequence[Mapping[str, Any]]) -> list[str]:
     return out
 
 
-def _given_up(held: Sequence[Mapping[str, Any]]) -> list[str]:
+def _reductions(held: Sequence[Mapping[str, Any]]) -> list[str]:
     """What the frames gave up, by kind: in how many of them, and the median of how much."""
     found: dict[str, list[float]] = {}
     for line in held:
         for name, value in line["budget"].get("given_up", {}).items():
             found.setdefault(name, []).append(value[1] if isinstance(value, list) else value)
     words = {
-        "rate_weight": "rate weight raised to {:.1e}", "step_scale": "steps {:.1f} times coarser",
+        "rd_lambda": "rate weight raised to {:.1e}", "step_scale": "steps {:.1f} times coarser",
         "symbols": "{:.0f} symbols trimmed", "gates": "{:.0f} gates closed", "births": "{:.0f} births dropped",
         "epochs": "{:.1f} passes less than the recipe's", "change_threshold": "change threshold raised to {:.1f}",
     }  # fmt: skip

@@ -25,7 +25,7 @@ _BISECTIONS, _GATE_BITS = 24, 3.0
 
 
 @dataclass(frozen=True)
-class Fitted:
+class TrimmedDelta:
     """A packet that fits, and what it gave up.
 
     Arguments:
@@ -41,10 +41,10 @@ class Fitted:
     births: int = 0
 
 
-def fit(
+def trim_to_size(
     delta: Delta, packet: EncodedPacket, curvature: Mapping[str, FloatArray], layout: Layout,
     encode: Callable[[Delta], EncodedPacket], max_bytes: int,
-) -> Fitted:  # fmt: skip
+) -> TrimmedDelta:  # fmt: skip
     """Return the delta, with as little given up as makes its packet fit; unchanged when it fits already.
 
     Arguments:
@@ -59,18 +59,18 @@ def fit(
     """
     untrimmed = len(packet.data)
     if untrimmed <= max_bytes:
-        return Fitted(delta, packet, untrimmed)
+        return TrimmedDelta(delta, packet, untrimmed)
     able = delta.residual is not None and delta.residual.symbols
     found = _trimmed(delta, packet, curvature, layout, encode, max_bytes) if able else None
-    if found is None and delta.edits_rows:
+    if found is None and delta.has_row_edit:
         # Births cost most per row, so they are given up first: without them the rest may fit.
         rest = delta.with_rows(None)
-        plain = fit(rest, encode(rest), curvature, layout, encode, max_bytes)
+        plain = trim_to_size(rest, encode(rest), curvature, layout, encode, max_bytes)
         return replace(plain, untrimmed=untrimmed, births=0 if delta.births is None else len(delta.births))
     if found is None:
         found = Delta(), encode(Delta())
     assert len(found[1].data) <= max_bytes, "an empty packet is above the budget"
-    return Fitted(*found, untrimmed, _changed(delta, found[0], layout), _open(delta) - _open(found[0]))
+    return TrimmedDelta(*found, untrimmed, _changed(delta, found[0], layout), _open(delta) - _open(found[0]))
 
 
 def _trimmed(
@@ -145,9 +145,9 @@ class _Table:
             low, high = (low, middle) if self._choose(middle)[2] <= bits else (middle, high)
         return self._residual(*self._choose(high)[:2])
 
-    def _choose(self, price: float) -> tuple[IntArray, BoolArray, float]:
+    def _choose(self, rd_lambda: float) -> tuple[IntArray, BoolArray, float]:
         """(symbols [K], open [G] of the gates, bits) at a price of loss per bit."""
-        costs = self.losses + price * self.lengths
+        costs = self.losses + rd_lambda * self.lengths
         nearer = costs[1] < costs[0]
         zero = costs[2] < np.where(nearer, costs[1], costs[0])  # of equal costs the first, as argmin would have it
 
@@ -155,7 +155,7 @@ class _Table:
             return np.where(zero, of[2], np.where(nearer, of[1], of[0]))
 
         length = self._by_gate(chosen(self.lengths)) + self.fixed
-        opened = self.closed > self._by_gate(chosen(self.losses)) + price * length
+        opened = self.closed > self._by_gate(chosen(self.losses)) + rd_lambda * length
         return chosen(self.values), opened, float(length[opened].sum())
 
     def _by_gate(self, values: FloatArray) -> FloatArray:

@@ -67,11 +67,11 @@ def grow_and_prune(
     kept = keep.nonzero()[:, 0]
     source = torch.cat([kept, hot])
     fresh = torch.cat([split[kept], torch.ones(len(hot), dtype=torch.bool)])
-    values = dict(children(gaussians, source, split[source], generator).items())
+    values = dict(split_or_clone(gaussians, source, split[source], generator).items())
     return TopologyEdit(source, fresh), values
 
 
-def children(
+def split_or_clone(
     gaussians: Gaussians[torch.Tensor], parents: torch.Tensor, halves: torch.Tensor, generator: torch.Generator
 ) -> Gaussians[torch.Tensor]:
     """Return copies of Gaussians, those that are halves of a split drawn from their parent and made smaller (3DGS).

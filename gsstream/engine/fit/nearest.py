@@ -24,7 +24,7 @@ def neighbour_distance(positions: torch.Tensor) -> torch.Tensor:
     count = len(positions)
     if count < 2:
         return torch.full((count,), ALONE)
-    distances, _ = nearest_among(positions.numpy(), positions.numpy(), min(4, count))
+    distances, _ = k_nearest(positions.numpy(), positions.numpy(), min(4, count))
     # The nearest is the point itself, or one at the same place.
     return torch.from_numpy(np.sqrt(np.square(distances[:, 1:]).mean(1)).astype(np.float32))
 
@@ -33,11 +33,11 @@ def nearest_rows(points: FloatArray, means: FloatArray) -> tuple[FloatArray, Int
     """Return [B] the distance of each point to the nearest of ``means``, and its row; infinitely far without any."""
     if not len(means):
         return np.full(len(points), np.inf), np.zeros(len(points), np.int64)
-    distances, rows = nearest_among(points, means, 1)
+    distances, rows = k_nearest(points, means, 1)
     return distances[:, 0], rows[:, 0]
 
 
-def nearest_among(points: FloatArray, among: FloatArray, k: int) -> tuple[FloatArray, IntArray]:
+def k_nearest(points: FloatArray, among: FloatArray, k: int) -> tuple[FloatArray, IntArray]:
     """Return the distances [B, k] of points to the ``k`` nearest of ``among``, nearest first, and their rows [B, k].
 
     Arguments:

@@ -27,15 +27,15 @@ def nearest_axes(gaussians: Gaussians[torch.Tensor]) -> Gaussians[torch.Tensor]:
     quats = gaussians.quats.double()
     quats = quats / quats.norm(dim=1, keepdim=True)
     # [N, 24]: first component of the product of each quaternion with each of the rotations.
-    first = quats @ conjugates(_TURNS).T
+    first = quats @ quat_conjugate(_ROTATIONS).T
     turn = first.abs().argmax(1)
-    turned = quat_products(quats, _TURNS[turn])
+    turned = quat_multiply_torch(quats, _ROTATIONS[turn])
     turned = turned * turned[:, :1].sign()
     scales = gaussians.scales.gather(1, _PLACES[turn])
     return replace(gaussians, quats=turned.to(gaussians.quats.dtype), scales=scales)
 
 
-def _turns() -> torch.Tensor:
+def _rotations() -> torch.Tensor:
     """[24, 4] unit quaternions of the rotations that take axes to axes, one of each pair of opposite signs."""
     units = torch.eye(4).tolist()
     halves = [[0.5, *(0.5 * s for s in signs)] for signs in itertools.product((1, -1), repeat=3)]
@@ -48,7 +48,7 @@ def _turns() -> torch.Tensor:
     return torch.tensor([*units, *halves, *edges], dtype=torch.float64)
 
 
-def quat_products(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+def quat_multiply_torch(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Return the Hamilton products [n, 4] of quaternions, wxyz.
 
     Arguments:
@@ -58,11 +58,11 @@ def quat_products(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return torch.cat([w * x - (v * u).sum(1, keepdim=True), w * u + x * v + torch.linalg.cross(v, u)], 1)
 
 
-def conjugates(quats: torch.Tensor) -> torch.Tensor:
+def quat_conjugate(quats: torch.Tensor) -> torch.Tensor:
     """Return the conjugates [n, 4] of quaternions [n, 4], wxyz: of unit ones the turns back."""
     return quats * torch.tensor([1.0, -1.0, -1.0, -1.0])
 
 
-_TURNS = _turns()
+_ROTATIONS = _rotations()
 #: [24, 3]: the axis whose scale comes to each place.
-_PLACES = rotation_matrices(_TURNS).abs().argmax(1)
+_PLACES = rotation_matrices(_ROTATIONS).abs().argmax(1)

@@ -18,9 +18,9 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.assembly.guard import blaming
-from gsstream.engine.frame0.cheaper import cheaper_rows
-from gsstream.engine.frame0.first_seen import first_rows
+from gsstream.engine.assembly.guard import error_context
+from gsstream.engine.frame0.rd_quantise import rd_quantise
+from gsstream.engine.frame0.first_layer import first_layer_mask
 from gsstream.engine.frame0.optimise import initial_gaussians, optimise_first_frame, sort_by_node
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.input.seeds.thinning import thin_points
@@ -38,17 +38,17 @@ def begin(parts: Assembly, frame: Frame, tools: Tools) -> Step:
     check_cameras(frame.cameras, 1, "a frame")
     log, rng = tools.log, tools.rng
     with log.phase("seed"):
-        anchors = seeded(parts, tools.points(frame), frame)
+        anchors = seed_anchors(parts, tools.points(frame), frame)
     with log.phase("optimise"):
         start = initial_gaussians(anchors, parts.recipe.first_frame)
         found = optimise_first_frame(start, anchors.levels, frame, parts, rng, tools.progress)
     with log.phase("code"):
         # Positions are float32 in the packet too, so the hierarchy of the decoded scene is the one built here.
-        cheaper = cheaper_rows(parts, found.gaussians, frame, found.exposure, rng)
+        cheaper = rd_quantise(parts, found.gaussians, frame, found.exposure, rng)
         decoded = quantise_key(cheaper.map(lambda t: t.numpy())).map(torch.from_numpy)
-        hierarchy, levels, decoded = arrange(parts, decoded, found.levels, anchors)
+        hierarchy, levels, decoded = sort_into_nodes(parts, decoded, found.levels, anchors)
         layout = make_layout(hierarchy, levels, anchors)
-        first = first_rows(parts, decoded, frame, found.exposure, rng)
+        first = first_layer_mask(parts, decoded, frame, found.exposure, rng)
         state, packet = key_state(
             parts, decoded, layout, hierarchy, frame, tools.meta(frame), found.exposure, anchors.origin, rng, first
         )
@@ -56,7 +56,7 @@ def begin(parts: Assembly, frame: Frame, tools: Tools) -> Step:
     return Step(state, packet, "key")
 
 
-def seeded(parts: Assembly, points: PointCloud, frame: Frame) -> Anchors:
+def seed_anchors(parts: Assembly, points: PointCloud, frame: Frame) -> Anchors:
     """Return anchors, at most as many as frame 0 may have Gaussians.
 
     A structure places one or more for each point, so where there are too many it is given fewer points.
@@ -107,7 +107,7 @@ def decoded_anchors(player: PlayerState) -> Anchors:
     )
 
 
-def arrange(
+def sort_into_nodes(
     parts: Assembly, gaussians: Gaussians[torch.Tensor], levels: torch.Tensor, anchors: Anchors
 ) -> tuple[Hierarchy, torch.Tensor, Gaussians[torch.Tensor]]:
     """Group the Gaussians and store them node by node: (hierarchy, levels, Gaussians), all in the new order.
@@ -119,7 +119,7 @@ def arrange(
         anchors: what the structure laid.
     """
     hierarchy = parts.structure.build(gaussians, anchors)
-    with blaming("structure", parts.part("structure"), parts.where):
+    with error_context("structure", parts.part("structure"), parts.where):
         hierarchy.validate()
     edit = sort_by_node(hierarchy.node_of)
     return hierarchy.rows(edit.source), levels[edit.source], gaussians.rows(edit.source)

@@ -25,8 +25,8 @@ from gsstream.engine.fit.densify import DensifyStatistics, grow_and_prune
 from gsstream.engine.fit.exposure import ExposureFit
 from gsstream.engine.fit.nearest import neighbour_distance
 from gsstream.engine.fit.photometric import PhotometricLoss
-from gsstream.engine.frame0.probes import TrainingViews
-from gsstream.engine.frame0.removal import not_missed
+from gsstream.engine.frame0.hutchinson import TrainingViews
+from gsstream.engine.frame0.prune import prune_by_error
 from gsstream.parts.optimiser.row_parameters import RowParameters
 from gsstream.parts.render.activations import logit, rgb_to_sh0
 from gsstream.parts.render.exposure import Exposure
@@ -39,7 +39,7 @@ Progress = Callable[[int, int, float, int], None]
 
 
 @dataclass(frozen=True)
-class Reconstructed:
+class Reconstruction:
     """Optimised frame 0. ``levels`` [N] is aligned with the Gaussians."""
 
     gaussians: Gaussians[torch.Tensor]
@@ -66,7 +66,7 @@ def initial_gaussians(anchors: Anchors, settings: FirstFrame) -> Gaussians[torch
     )
 
 
-def first_rates(settings: FirstFrame, extent: float) -> dict[str, float]:
+def first_frame_lrs(settings: FirstFrame, extent: float) -> dict[str, float]:
     """Return the learning rate of every attribute at the start of frame 0.
 
     Arguments:
@@ -85,7 +85,7 @@ def optimise_first_frame(
     parts: Assembly,
     rng: Rng,
     progress: Progress,
-) -> Reconstructed:
+) -> Reconstruction:
     """Fit frame 0 on its training images.
 
     Arguments:
@@ -110,7 +110,7 @@ def optimise_first_frame(
     look = Look(parts.checks, "first frame", run.table, parts.where)
     for name, values in found.items():
         look.values(f"{name} after the last iteration ({VARIABLE}=step finds the first)", values)
-    return Reconstructed(found, run.levels, exposure, run.iterations)
+    return Reconstruction(found, run.levels, exposure, run.iterations)
 
 
 class FirstFrameRun:
@@ -135,7 +135,7 @@ class FirstFrameRun:
         self.views = len(frame.cameras)
         self.extent = frame.cameras.extent
         self.iterations, self.generator = iterations, generator
-        self.table = RowParameters(dict(start.items()), first_rates(self.settings, self.extent), parts.optimiser)
+        self.table = RowParameters(dict(start.items()), first_frame_lrs(self.settings, self.extent), parts.optimiser)
         self.photometric = PhotometricLoss(parts.loss, schedule.DSSIM, frame.images, None)
         #: Colour maps that are fitted along; None: those of the photometric loss stay.
         self.exposure: ExposureFit | None = None
@@ -157,7 +157,7 @@ class FirstFrameRun:
         found = self._loss_and_grad(view, rows, densify)
         fraction = iteration / self.iterations
         self.table.set_lr("means", self.extent * _log_linear(s.lr_means, s.lr_means_final, fraction))
-        self.table.step(self._penalised(found.grad))
+        self.table.step(self._with_penalty_grad(found.grad))
         if found.means2d is not None:
             size = torch.tensor([self.frame.cameras.width / 2, self.frame.cameras.height / 2])
             self.statistics = self.statistics.add(found.means2d * size)
@@ -191,7 +191,7 @@ class FirstFrameRun:
                 self.exposure = self.exposure.centered()
         return found
 
-    def _penalised(self, gradients: Gaussians[torch.Tensor]) -> dict[str, torch.Tensor]:
+    def _with_penalty_grad(self, gradients: Gaussians[torch.Tensor]) -> dict[str, torch.Tensor]:
         """Gradients with those of the mean opacity and the mean scale, which need no graph."""
         count = max(1, len(self.levels))
         p = self.table["opacities"].detach().sigmoid()
@@ -212,7 +212,7 @@ class FirstFrameRun:
         gaussians = self.gaussians().map(torch.Tensor.detach)
         exposure = self.exposure.exposure if self.exposure else self.photometric.exposure
         views = TrainingViews(self.renderer, self.frame, exposure, self.recipe.background)
-        rows = not_missed(views, gaussians, self.generator, self.settings.prune_error)
+        rows = prune_by_error(views, gaussians, self.generator, self.settings.prune_error)
         self.table.select_rows(rows)
         self.levels, self.came_from = self.levels[rows], self.came_from[rows]
         self.statistics = DensifyStatistics.zeros(len(rows))

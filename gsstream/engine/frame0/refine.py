@@ -21,7 +21,7 @@ from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.densify import DensifyStatistics
-from gsstream.engine.frame0.axes import conjugates, quat_products
+from gsstream.engine.frame0.axes import quat_conjugate, quat_multiply_torch
 from gsstream.engine.frame0.optimise import FirstFrameRun
 from gsstream.engine.state.refinement import Refinement
 from gsstream.engine.state.stream_state import Step, StreamState
@@ -35,7 +35,7 @@ from gsstream.recipe.model import Stream
 SHOWN = "shown"
 
 
-def refined(parts: Assembly, state: StreamState, step: Step, frame: Frame, tools: Tools) -> Step:
+def refine_first_frame(parts: Assembly, state: StreamState, step: Step, frame: Frame, tools: Tools) -> Step:
     """Return a step whose state has the refinement after this frame; as it is where the recipe asks for none.
 
     ``state`` is that before the frame. A frame that is skipped only moves what is refined.
@@ -43,13 +43,13 @@ def refined(parts: Assembly, state: StreamState, step: Step, frame: Frame, tools
     if not is_refining(parts.recipe.stream, state):
         return step
     with tools.log.phase("refine"):
-        after, before = step.state, state.refinement or begun(state.player)
-        found = advanced(parts, before, state.player, after.player, frame, state.exposure, tools.rng)
+        after, before = step.state, state.refinement or start_refinement(state.player)
+        found = advance_refinement(parts, before, state.player, after.player, frame, state.exposure, tools.rng)
     tools.log.set(refine_iterations=found.iterations - before.iterations)
     return replace(step, state=replace(after, refinement=found))
 
 
-def follows_packet(stream: Stream, state: StreamState, frame: Frame) -> bool:
+def runs_after_packet(stream: Stream, state: StreamState, frame: Frame) -> bool:
     """Say whether what a frame gives to the refinement can be made after its packet: its last iterations cannot.
 
     Arguments:
@@ -78,7 +78,7 @@ def _iterations(stream: Stream) -> int:
     return stream.refine_frames * stream.refine_iterations
 
 
-def begun(player: PlayerState) -> Refinement:
+def start_refinement(player: PlayerState) -> Refinement:
     """Return the refinement of a first frame, before its first iteration.
 
     Arguments:
@@ -90,7 +90,7 @@ def begun(player: PlayerState) -> Refinement:
     return Refinement(gaussians, levels, torch.arange(count), {}, DensifyStatistics.zeros(count), 0)
 
 
-def advanced(
+def advance_refinement(
     parts: Assembly, refinement: Refinement, before: PlayerState, after: PlayerState, frame: Frame,
     exposure: Exposure | None, rng: Rng,
 ) -> Refinement:  # fmt: skip
@@ -104,7 +104,7 @@ def advanced(
         exposure: colour maps of the cameras, or None.
         rng: random streams by name and frame.
     """
-    start, stream = carried(refinement, before, after), parts.recipe.stream
+    start, stream = track_motion(refinement, before, after), parts.recipe.stream
     if frame.effort == 0 or is_refined(stream, start):
         return start
     generator = rng.stream("refine", frame.index)
@@ -120,14 +120,14 @@ def advanced(
     return Refinement(found, run.levels, start.ancestors[run.came_from], moments, run.statistics, last)
 
 
-def carried(refinement: Refinement, before: PlayerState, after: PlayerState) -> Refinement:
+def track_motion(refinement: Refinement, before: PlayerState, after: PlayerState) -> Refinement:
     """Return the refinement with every Gaussian moved and turned as the one it came from was.
 
     Arguments:
         refinement: after the frame before.
         before: what players had then. after: what they have now.
     """
-    row_now = _rows_now(before, after)
+    row_now = _current_rows(before, after)
     ancestors = refinement.ancestors
     alive = ancestors >= 0
     now = torch.where(alive, row_now[ancestors.clamp_min(0)], -1)
@@ -145,7 +145,7 @@ def carried(refinement: Refinement, before: PlayerState, after: PlayerState) -> 
     means, quats = g.means.clone(), g.quats.clone()
     offset = (turn @ (g.means[rows] - was[0][old])[..., None])[..., 0]
     means[rows] = new[0][there] + offset
-    quats[rows] = quat_products(quat_products(new[1][there], conjugates(was[1][old])), g.quats[rows])
+    quats[rows] = quat_multiply_torch(quat_multiply_torch(new[1][there], quat_conjugate(was[1][old])), g.quats[rows])
     return replace(refinement, gaussians=replace(g, means=means, quats=quats), ancestors=now)
 
 
@@ -154,11 +154,11 @@ def _poses(gaussians: Gaussians[FloatArray]) -> tuple[torch.Tensor, torch.Tensor
     return torch.from_numpy(gaussians.means), quats / quats.norm(dim=1, keepdim=True).clamp_min(1e-12)
 
 
-def _rows_now(before: PlayerState, after: PlayerState) -> torch.Tensor:
+def _current_rows(before: PlayerState, after: PlayerState) -> torch.Tensor:
     """[N] int64: where each row of the players' scene is after a frame; -1 for one that has left."""
     count = len(before.gaussians)
     delta = after.delta
-    if delta is None or not delta.edits_rows:
+    if delta is None or not delta.has_row_edit:
         return torch.arange(count)
     source = gather_rows(before.layout.node_of, delta.births, delta.deaths)
     out = torch.full((count,), -1)

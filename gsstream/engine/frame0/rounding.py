@@ -21,7 +21,7 @@ UNUSED = 0.05
 _Near = Callable[[IntArray], IntArray]
 
 
-def codes_towards_zero(exact: FloatArray, felt: FloatArray, weight: float) -> IntArray:
+def rd_codes_to_zero(exact: FloatArray, sensitivity: FloatArray, weight: float) -> IntArray:
     """Return the codes [N, width] int32 with the least ``felt (code - exact)^2 + weight bits``, column by column.
 
     Of each value: the nearest code, its two neighbours towards zero, and zero, for what may as well not be there. The
@@ -33,16 +33,16 @@ def codes_towards_zero(exact: FloatArray, felt: FloatArray, weight: float) -> In
         weight: squared error that a bit must save, at least 0.
     """
 
-    def near(nearest: IntArray) -> IntArray:
+    def candidate_codes(nearest: IntArray) -> IntArray:
         towards = np.sign(nearest)
         # A code of 1 has no neighbour two towards zero on its side of it.
         second = np.where(np.abs(nearest) > 1, nearest - 2 * towards, 0)
         return np.stack([nearest, nearest - towards, second, np.zeros_like(nearest)])
 
-    return _by_column(exact, felt, weight, near)
+    return _by_column(exact, sensitivity, weight, candidate_codes)
 
 
-def codes_nearby(exact: FloatArray, felt: FloatArray, weight: float, reach: int) -> IntArray:
+def rd_codes_nearby(exact: FloatArray, sensitivity: FloatArray, weight: float, reach: int) -> IntArray:
     """Return the same among all codes within ``reach`` of the nearest one, for what must stay about what it is.
 
     Arguments:
@@ -54,22 +54,22 @@ def codes_nearby(exact: FloatArray, felt: FloatArray, weight: float, reach: int)
     # The nearest one first, then by distance: of equally good ones the nearer is taken.
     offsets = sorted(range(-reach, reach + 1), key=lambda offset: (abs(offset), offset))
 
-    def near(nearest: IntArray) -> IntArray:
+    def candidate_codes(nearest: IntArray) -> IntArray:
         return np.stack([nearest + np.int32(offset) for offset in offsets])
 
-    return _by_column(exact, felt, weight, near)
+    return _by_column(exact, sensitivity, weight, candidate_codes)
 
 
-def _by_column(exact: FloatArray, felt: FloatArray, weight: float, near: _Near) -> IntArray:
+def _by_column(exact: FloatArray, sensitivity: FloatArray, weight: float, candidate_codes: _Near) -> IntArray:
     nearest = np.rint(exact).astype(np.int32)
     if weight == 0 or nearest.size == 0:
         return nearest
-    columns = zip(exact.T, nearest.T, felt.T, strict=True)
-    return np.stack([_column(values, codes, near(codes), slopes, weight) for values, codes, slopes in columns], 1)
+    columns = zip(exact.T, nearest.T, sensitivity.T, strict=True)
+    return np.stack([_column(values, codes, candidate_codes(codes), sensitivities, weight) for values, codes, sensitivities in columns], 1)
 
 
-def _column(exact: FloatArray, nearest: IntArray, candidates: IntArray, felt: FloatArray, weight: float) -> IntArray:
-    error = felt * (candidates - exact) ** 2
+def _column(exact: FloatArray, nearest: IntArray, candidates: IntArray, sensitivity: FloatArray, weight: float) -> IntArray:
+    error = sensitivity * (candidates - exact) ** 2
     low = int(candidates.min())
     chosen = nearest
     for _ in range(ROUNDS):

@@ -14,9 +14,9 @@ from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.frame0.begin import arrange, decoded_anchors, key_state, make_layout
-from gsstream.engine.frame0.cheaper import cheaper_rows
-from gsstream.engine.frame0.first_seen import first_rows
+from gsstream.engine.frame0.begin import sort_into_nodes, decoded_anchors, key_state, make_layout
+from gsstream.engine.frame0.rd_quantise import rd_quantise
+from gsstream.engine.frame0.first_layer import first_layer_mask
 from gsstream.engine.frame0.refine import SHOWN, is_refined
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.method.tools import Tools
@@ -26,7 +26,7 @@ from gsstream.packet import StreamMeta, quantise_key
 REFINED = "refined"
 
 
-def refresh(parts: Assembly, step: Step, frame: Frame, tools: Tools) -> Step:
+def key_packet_if_due(parts: Assembly, step: Step, frame: Frame, tools: Tools) -> Step:
     """Return ``step``, or when the recipe asks for a key packet at this frame, the step that writes one instead of it.
 
     A key packet that the budget refuses, or whose frame is skipped, stays due: the next frame tries again. Pure, like a
@@ -46,7 +46,7 @@ def refresh(parts: Assembly, step: Step, frame: Frame, tools: Tools) -> Step:
     if refused is not None:
         return _postponed(step, reason, refused, tools)
     # A refined scene was fitted to the pictures of this frame; another may show older ones.
-    made, shown = (refined_key, frame) if reason == REFINED else (decoded_again, state.previous)
+    made, shown = (refined_key_step, frame) if reason == REFINED else (reencode_as_key, state.previous)
     with tools.log.phase("key"):
         after = made(parts, state, frame, tools.meta(frame), tools.rng)
     max_bytes = None if tools.budget is None else tools.budget.max_bytes
@@ -61,7 +61,7 @@ def _due(parts: Assembly, step: Step) -> str | None:
 
     It is not asked of frames whose iterations of a refinement follow their packets (``engine.method.parts``).
     """
-    every, state = parts.recipe.codec.key_every, step.state
+    every, state = parts.recipe.codec.key_interval, step.state
     if step.status == "key":
         return None
     if state.refinement is not None:  # a periodic one would end the refinement: it waits for the refined one
@@ -74,7 +74,7 @@ def _postponed(step: Step, reason: str, refused: str, tools: Tools) -> Step:
     return step
 
 
-def refined_key(parts: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
+def refined_key_step(parts: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
     """Return the refined first frame, as it is now, as a key packet, and the state that follows from its bytes.
 
     Arguments:
@@ -86,12 +86,12 @@ def refined_key(parts: Assembly, state: StreamState, frame: Frame, meta: StreamM
     """
     found = state.refinement
     assert found is not None
-    cheaper = cheaper_rows(parts, found.gaussians, frame, state.exposure, rng)
+    cheaper = rd_quantise(parts, found.gaussians, frame, state.exposure, rng)
     gaussians = quantise_key(cheaper.map(lambda t: t.numpy())).map(torch.from_numpy)
-    return _keyed(parts, state, gaussians, found.levels, frame, frame.index, meta, rng, layered=True)
+    return _key_step(parts, state, gaussians, found.levels, frame, frame.index, meta, rng, layered=True)
 
 
-def decoded_again(parts: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
+def reencode_as_key(parts: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
     """Return the current decoded scene as a key packet, and the state that follows from its bytes.
 
     Arguments:
@@ -103,10 +103,10 @@ def decoded_again(parts: Assembly, state: StreamState, frame: Frame, meta: Strea
     """
     gaussians = quantise_key(state.player.gaussians).map(torch.from_numpy)
     levels = decoded_anchors(state.player).levels
-    return _keyed(parts, state, gaussians, levels, frame, state.previous.index, meta, rng)
+    return _key_step(parts, state, gaussians, levels, frame, state.previous.index, meta, rng)
 
 
-def _keyed(
+def _key_step(
     parts: Assembly, state: StreamState, gaussians: Gaussians[torch.Tensor], levels: torch.Tensor, frame: Frame,
     shown: int, meta: StreamMeta, rng: Rng, *, layered: bool = False,
 ) -> Step:  # fmt: skip
@@ -115,11 +115,11 @@ def _keyed(
     A periodic one has no layers: whoever plays on needs none, and to find them would cost the frame time.
     """
     anchors = decoded_anchors(state.player)
-    hierarchy, levels, gaussians = arrange(parts, gaussians, levels, anchors)
+    hierarchy, levels, gaussians = sort_into_nodes(parts, gaussians, levels, anchors)
     layout = make_layout(hierarchy, levels, anchors)
     # A resumed run must compare the next frame with the picture this scene shows, which may be an older one.
     meta = replace(meta, extra={**meta.extra, SHOWN: shown})
-    first = first_rows(parts, gaussians, frame, state.exposure, rng) if layered else None
+    first = first_layer_mask(parts, gaussians, frame, state.exposure, rng) if layered else None
     after, packet = key_state(
         parts, gaussians, layout, hierarchy, frame, meta, state.exposure, anchors.origin, rng, first
     )

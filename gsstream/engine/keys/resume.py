@@ -14,8 +14,8 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import decoded_anchors, exposure_from_meta
-from gsstream.engine.frame0.refine import SHOWN, advanced, begun, is_refining
-from gsstream.engine.state.follow import follow
+from gsstream.engine.frame0.refine import SHOWN, advance_refinement, start_refinement, is_refining
+from gsstream.engine.state.next_state import next_state
 from gsstream.engine.state.refinement import Refinement
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.input.recordings.base import SourceInfo
@@ -35,7 +35,7 @@ class Ended(NamedTuple):
     key_frame: int
 
 
-def ended(path: Path, last: int | None = None) -> Ended:
+def read_end(path: Path, last: int | None = None) -> Ended:
     """Decode a stream to its last sound packet.
 
     Arguments:
@@ -45,7 +45,7 @@ def ended(path: Path, last: int | None = None) -> Ended:
     """
     player: PlayerState | None = None
     shown = key = 0
-    for player, kind in _played(path, last):
+    for player, kind in _decoded_states(path, last):
         if kind == PacketKind.KEY:
             key = player.frame
             # A key packet says which picture its scene shows: it may stand for an older one.
@@ -57,14 +57,14 @@ def ended(path: Path, last: int | None = None) -> Ended:
     return Ended(player, shown, key)
 
 
-def since_key(path: Path, end: Ended) -> Iterator[PlayerState]:
+def states_since_key(path: Path, end: Ended) -> Iterator[PlayerState]:
     """Yield what players have after every packet from the last key packet to the end."""
-    for player, _ in _played(path, end.player.frame):
+    for player, _ in _decoded_states(path, end.player.frame):
         if player.frame >= end.key_frame:
             yield player
 
 
-def _played(path: Path, last: int | None) -> Iterator[tuple[PlayerState, PacketKind]]:
+def _decoded_states(path: Path, last: int | None) -> Iterator[tuple[PlayerState, PacketKind]]:
     """States and kinds of packets up to ``last`` or the first that is not sound."""
     player: PlayerState | None = None
     with StreamReader(path) as reader:
@@ -111,7 +111,7 @@ def state_after(parts: Assembly, states: Iterable[PlayerState], rng: Rng) -> Str
     """
     state: StreamState | None = None
     for player in states:
-        state = key_state_from_player(parts, player, rng) if state is None else follow(state, player)
+        state = key_state_from_player(parts, player, rng) if state is None else next_state(state, player)
     assert state is not None, "a stream without a key packet"
     return state
 
@@ -131,10 +131,10 @@ def refinement_after(parts: Assembly, state: StreamState, tools: Tools) -> Refin
     before = state.player
     for player in tools.since_key():
         if found is None:
-            found = begun(player)
+            found = start_refinement(player)
         else:
             frame = tools.recorded(player.frame)
-            found = advanced(parts, found, before, player, frame, state.exposure, tools.rng)
+            found = advance_refinement(parts, found, before, player, frame, state.exposure, tools.rng)
         before = player
     return found
 
@@ -166,7 +166,7 @@ def rebuild_hierarchy(parts: Assembly, player: PlayerState) -> Hierarchy:
 
 def _check_recipe(parts: Assembly, meta: StreamMeta) -> None:
     old, new = dict(meta.recipe), parts.recipe.model_dump(mode="json")
-    changed = sorted(key for key in new if key != "frames" and _deciding(key, old.get(key)) != _deciding(key, new[key]))
+    changed = sorted(key for key in new if key != "frames" and _deciding_keys(key, old.get(key)) != _deciding_keys(key, new[key]))
     if changed:
         raise OutputError(
             f"the stream was written with another recipe: {', '.join(changed)} differ; resume with the same recipe "
@@ -174,7 +174,7 @@ def _check_recipe(parts: Assembly, meta: StreamMeta) -> None:
         )
 
 
-def _deciding(section: str, values: Any) -> Any:
+def _deciding_keys(section: str, values: Any) -> Any:
     """A section of a recipe without what only decides where a run ends, and not what the packets before hold.
 
     So may the number of frames, which grows, and what is done about pictures that cannot be read and parts that fail.

@@ -12,14 +12,14 @@ from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.assembly.fault import fault
-from gsstream.engine.assembly.guard import blaming
+from gsstream.engine.assembly.guard import error_context
 from gsstream.engine.frame0.begin import check_cameras
 from gsstream.engine.step.metrics import log_packet
 from gsstream.method.base import Step, StreamingMethod
 from gsstream.method.tools import Tools
 from gsstream.packet import PlayerState, decode_packet
 
-SLOT = "stepper"
+SLOT = "streaming_method"
 
 
 class Checked(StreamingMethod[Any]):
@@ -43,8 +43,8 @@ class Checked(StreamingMethod[Any]):
 
     def begin(self, frame: Frame, tools: Tools) -> Step[Any]:
         recipe, method = self._parts.recipe, self._method
-        name = recipe.stepper.name if recipe.stepper.name != "parts" else recipe.method
-        check_cameras(frame.cameras, method.least_cameras, f"the method {name!r}")
+        name = recipe.streaming_method.name if recipe.streaming_method.name != "parts" else recipe.method
+        check_cameras(frame.cameras, method.min_cameras, f"the method {name!r}")
         with self._blaming(frame):
             step = method.begin(frame, tools)
         return self._compared(None, step, frame, tools)
@@ -74,12 +74,12 @@ class Checked(StreamingMethod[Any]):
         return found
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> Any:
-        with blaming(SLOT, self._method, self._parts.where):
+        with error_context(SLOT, self._method, self._parts.where):
             return self._method.resume(player, shown, tools)
 
     def _blaming(self, frame: Frame) -> Any:
         self._parts.where.enter(frame.index)
-        return blaming(SLOT, self._method, self._parts.where)
+        return error_context(SLOT, self._method, self._parts.where)
 
     def _fault(self, message: str) -> ComponentError:
         return fault(message, SLOT, self._method, self._parts.where)

@@ -8,11 +8,11 @@ from typing import Any, ClassVar, final
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.budget.controller import planned
+from gsstream.engine.budget.controller import apply_plan
 from gsstream.engine.frame0.begin import begin
-from gsstream.engine.frame0.refine import follows_packet, refined
-from gsstream.engine.frame0.taken import begin_from
-from gsstream.engine.keys.keyframes import refresh
+from gsstream.engine.frame0.refine import runs_after_packet, refine_first_frame
+from gsstream.engine.frame0.reuse import reuse_first_frame
+from gsstream.engine.keys.keyframes import key_packet_if_due
 from gsstream.engine.keys.resume import refinement_after, state_after
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.frame_step import frame_step
@@ -26,7 +26,7 @@ class PartsMethod(StreamingMethod[StreamState]):
     """Runs the slots of the recipe: structure, confidence, propagation, gate, motion, update, growth, regularizer."""
 
     source: ClassVar[str] = "gsstream"
-    heeds: ClassVar[tuple[str, ...]] = ("*",)
+    recipe_keys: ClassVar[tuple[str, ...]] = ("*",)
 
     _slots: Assembly | None
 
@@ -46,20 +46,20 @@ class PartsMethod(StreamingMethod[StreamState]):
         return self._slots
 
     def begin(self, frame: Frame, tools: Tools) -> Step:
-        make = begin if tools.first is None else begin_from
+        make = begin if tools.first is None else reuse_first_frame
         return make(self.slots, frame, tools)
 
     def step(self, state: StreamState, frame: Frame, tools: Tools) -> Step:
-        parts = self.slots if tools.budget is None else planned(self.slots, tools.budget)
+        parts = self.slots if tools.budget is None else apply_plan(self.slots, tools.budget)
         step = frame_step(parts, state, frame, tools)
-        if follows_packet(parts.recipe.stream, state, frame):
+        if runs_after_packet(parts.recipe.stream, state, frame):
             return step  # no key packet is due before the last iteration of the refinement
-        return refresh(self.slots, refined(self.slots, state, step, frame, tools), frame, tools)
+        return key_packet_if_due(self.slots, refine_first_frame(self.slots, state, step, frame, tools), frame, tools)
 
     def follow_up(self, state: StreamState, step: Step, frame: Frame, tools: Tools) -> Step:
-        if not follows_packet(self.slots.recipe.stream, state, frame):
+        if not runs_after_packet(self.slots.recipe.stream, state, frame):
             return step
-        return refined(self.slots, state, step, frame, tools)
+        return refine_first_frame(self.slots, state, step, frame, tools)
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> StreamState:
         state = replace(state_after(self.slots, tools.since_key(), tools.rng), previous=shown)

@@ -17,7 +17,7 @@ class RepeatedFrameWarning(UserWarning):
     """A part failed, and its frame was sent as "nothing changed"."""
 
 
-class LeftOutWarning(UserWarning):
+class SkippedWorkWarning(UserWarning):
     """A part failed in work that follows a frame's packet, which is sound and out; the work was left out."""
 
 
@@ -64,7 +64,7 @@ class Repeating(StreamingMethod[Any]):
             found = self._method.follow_up(state, step, replace(frame, effort=0.0), tools)
             warnings.warn(
                 f"frame {frame.index}: its packet is sound, but the work that follows it failed and is left out: "
-                f"{error}", LeftOutWarning, stacklevel=2
+                f"{error}", SkippedWorkWarning, stacklevel=2
             )  # fmt: skip
             return found
 

@@ -15,7 +15,7 @@ from gsstream.method.base import StreamingMethod
 
 def wrapped(parts: Assembly, controller: Controller) -> StreamingMethod[Any]:
     """Return the method of a recipe behind what its recipe asks for; each wrapper is a method itself."""
-    own = parts.part("stepper")
+    own = parts.part("streaming_method")
     method: StreamingMethod[Any] = own.with_slots(parts) if isinstance(own, PartsMethod) else own  # type: ignore[assignment]
     method = Checked(method, parts)
     if controller.budget.limits_anything:

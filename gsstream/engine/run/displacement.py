@@ -21,12 +21,12 @@ def displacement_pixels(player: PlayerState, cameras: Cameras) -> dict[str, floa
     if moved is None:
         return {"median": 0.0, "max": 0.0}
     after = player.gaussians.means[moved.rows]
-    ways = screen_ways(after - moved.shift, after, cameras)
+    ways = screen_displacement(after - moved.shift, after, cameras)
     ways = ways[np.isfinite(ways)]
     return {"median": float(np.median(ways)), "max": float(ways.max())} if len(ways) else {"median": 0.0, "max": 0.0}
 
 
-def screen_ways(before: FloatArray, after: FloatArray, cameras: Cameras) -> FloatArray:
+def screen_displacement(before: FloatArray, after: FloatArray, cameras: Cameras) -> FloatArray:
     """Return [P] the distance on the screen between two places of each point, pixels, mean over the cameras.
 
     A camera counts that has both places in its picture; nan where none has.

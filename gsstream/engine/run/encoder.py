@@ -13,14 +13,14 @@ from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.log import FrameLog
 from gsstream.core.rng import Rng
-from gsstream.core.world import snapped
+from gsstream.core.world import snap_cameras
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.controller import Controller
-from gsstream.engine.frame0.carried import in_world
+from gsstream.engine.frame0.reproject import to_stream_coordinates
 from gsstream.engine.frame0.optimise import Progress
 from gsstream.engine.frame0.points import gather_points
-from gsstream.engine.frame0.taken import cloud_of
-from gsstream.engine.keys.resume import check_stream, ended, since_key
+from gsstream.engine.frame0.reuse import point_cloud_of
+from gsstream.engine.keys.resume import check_stream, read_end, states_since_key
 from gsstream.engine.method.wrapped import wrapped
 from gsstream.engine.run.threads import one_torch_thread
 from gsstream.engine.step.tools import RunTools
@@ -35,7 +35,7 @@ Seeds = Callable[[Frame], PointCloud]
 
 
 @dataclass(frozen=True)
-class Listeners:
+class Callbacks:
     """Functions that an encoder calls while it works.
 
     Arguments:
@@ -66,7 +66,7 @@ class Encoder:
 
     def __init__(
         self, parts: Assembly, info: SourceInfo, seeds: Seeds | None = None, *, first_frame: PlayerState | None = None,
-        listeners: Listeners | None = None, place: bool = False,
+        listeners: Callbacks | None = None, place: bool = False,
     ) -> None:  # fmt: skip
         held = sized(parts.recipe.budget, info.fps)
         self.controller = Controller(held, parts.recipe.stream)
@@ -76,8 +76,8 @@ class Encoder:
         self.near = parts.recipe.near * info.train.extent
         #: State after the last frame; None before frame 0.
         self.state: Any = None
-        self._first = None if first_frame is None else in_world(first_frame, info.world)
-        self._seeds, self._listeners = seeds or self._swept, listeners or Listeners()
+        self._first = None if first_frame is None else to_stream_coordinates(first_frame, info.world)
+        self._seeds, self._listeners = seeds or self._swept, listeners or Callbacks()
 
     @property
     def parts(self) -> Assembly:
@@ -101,7 +101,7 @@ class Encoder:
                 follows a packet, that packet has been handed out; the same frame gives it again.
         """
         frame.validate()
-        frame = self.at_near(frame)
+        frame = self.with_near_plane(frame)
         log, worked = FrameLog(), time.process_time()
         tools = self._tools(log=log)
         with one_torch_thread():
@@ -132,20 +132,20 @@ class Encoder:
         # Checked before the replay, which with the parts of another recipe would fail with a less helpful message.
         if not check_stream(self.parts, stream, self.info) or (last is not None and last < 0):
             return None
-        end = ended(stream, last)
+        end = read_end(stream, last)
         # The title is what the stream says: equal recipes may be called otherwise by another version.
         self.parts = replace(self.parts, title=end.player.meta.title)
         tools = self._tools(
-            replay=lambda: since_key(stream, end), recorded=lambda index: self.at_near(image(index))
+            replay=lambda: states_since_key(stream, end), recorded=lambda index: self.with_near_plane(image(index))
         )
         self.parts.where.enter(end.player.frame)
         with one_torch_thread():
-            self.state = self.method.resume(end.player, self.at_near(image(end.shown)), tools)
+            self.state = self.method.resume(end.player, self.with_near_plane(image(end.shown)), tools)
         return end.player.frame
 
-    def at_near(self, frame: Frame) -> Frame:
+    def with_near_plane(self, frame: Frame) -> Frame:
         """Return the frame with the near plane that the recipe gives this rig, in the stream's coordinates."""
-        cameras = snapped(self.info.world.cameras_back(frame.cameras)) if self._place else frame.cameras
+        cameras = snap_cameras(self.info.world.inverse_cameras(frame.cameras)) if self._place else frame.cameras
         return replace(frame, cameras=replace(cameras, near=self.near))
 
     def _begin(self, frame: Frame, tools: RunTools) -> Step[Any]:
@@ -165,7 +165,7 @@ class Encoder:
 
     def _points(self, frame: Frame) -> PointCloud:
         """What frame 0 starts from: seeds, or the centres of the Gaussians that are taken over."""
-        return self._seeds(frame) if self._first is None else cloud_of(self._first)
+        return self._seeds(frame) if self._first is None else point_cloud_of(self._first)
 
     def _swept(self, frame: Frame) -> PointCloud:
         return gather_points(lambda _: None, frame, self.parts.recipe.first_frame, self.rng)

@@ -49,7 +49,7 @@ def _policy(frame: Frame) -> str | None:
     return "hurried" if frame.effort < 1 else "held" if absent else None
 
 
-def late_words(metrics: Mapping[str, Any]) -> list[str]:
+def latency_words(metrics: Mapping[str, Any]) -> list[str]:
     """Return what a frame's line says of its latency; empty for a recording that is not live."""
     live = metrics.get("live")
     if live is None:
@@ -59,7 +59,7 @@ def late_words(metrics: Mapping[str, Any]) -> list[str]:
     return words if live["policy"] is None else [*words, _WORDS[live["policy"]]]
 
 
-def live_lines(lines: Sequence[Mapping[str, Any]]) -> list[str]:
+def latency_lines(lines: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return what the summary of a run says of its latency; empty for a recording that was not live.
 
     A dropped frame has a latency in its metrics, but it shows nothing new: median and worst are of the others.

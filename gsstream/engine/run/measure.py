@@ -16,9 +16,9 @@ from gsstream.metrics import changed_mask, moving_mask, noise_sigma, psnr, ssim
 from gsstream.parts.render.base import Renderer
 
 #: Held-out PSNR of frame 0 below which training views are looked at, and how far it may lie below theirs, dB.
-DOUBTFUL, FAR_BELOW = 20.0, 4.0
+LOW_PSNR_DB, MAX_DROP_DB = 20.0, 4.0
 #: Training views that are looked at.
-LOOKED_AT = 4
+MAX_TRAIN_VIEWS = 4
 
 
 class HeldOut:
@@ -61,12 +61,12 @@ class HeldOut:
         Returns one line for a person; empty where there is nothing to say.
         """
         held_out = [value for value in measured.values() if value is not None]
-        if not held_out or float(np.mean(held_out)) >= DOUBTFUL:
+        if not held_out or float(np.mean(held_out)) >= LOW_PSNR_DB:
             return ""
-        views = np.unique(np.linspace(0, len(train.cameras) - 1, LOOKED_AT).round().astype(int))
+        views = np.unique(np.linspace(0, len(train.cameras) - 1, MAX_TRAIN_VIEWS).round().astype(int))
         seen = float(np.mean([psnr(self.render(state, train, int(view)), train.images[view]) for view in views]))
         below = seen - float(np.mean(held_out))
-        if below < FAR_BELOW:
+        if below < MAX_DROP_DB:
             return ""
         return (
             f"held-out cameras show {np.mean(held_out):.1f} dB of frame 0, training cameras {seen:.1f} dB: poses, "

@@ -62,7 +62,7 @@ def run_lock(out: Path, what: str = "run") -> Iterator[None]:
             raise OutputError(
                 f"another {what} works in {out}{_holder(file)}: wait for it, end it, or choose another --out"
             ) from error
-        if not _is_still(path, file):
+        if not _is_same_file(path, file):
             raise OutputError(f"another {what} has just ended in {out}; try again")
         file.truncate(0)
         json.dump({"pid": os.getpid(), "host": socket.gethostname(), "since": time.strftime("%F %T")}, file)
@@ -80,7 +80,7 @@ def _opened(path: Path) -> TextIOWrapper:
         raise OutputError(f"the output folder {path.parent} cannot be used: {error}") from error
 
 
-def _is_still(path: Path, file: TextIOWrapper) -> bool:
+def _is_same_file(path: Path, file: TextIOWrapper) -> bool:
     """Whether the file that was locked is the one of that name: its holder removes it when it is done."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), path.stat())

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from gsstream.engine.budget.report import violations
-from gsstream.engine.run.live import late_words
+from gsstream.engine.run.live import latency_words
 
 #: Seconds between plain lines, and those after which the pace of frame 0 is known.
 _EVERY = 10
@@ -127,7 +127,7 @@ def frame_line(metrics: Mapping[str, Any], total: int | None) -> str:
     parts.append(f"{sum(metrics['seconds'].values()):.2f} s")
     if metrics["num_gaussians"]:
         parts.append(f"{100 * metrics['active_gaussians'] / metrics['num_gaussians']:.1f} % active")
-    parts += late_words(metrics)
+    parts += latency_words(metrics)
     parts += [f"OVER BUDGET: {text}" for text in violations(metrics)]
     last = "" if total is None else f"/{total - 1}"
     return f"frame {metrics['frame']}{last}: " + ", ".join(parts)

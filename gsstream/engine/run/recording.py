@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from gsstream.core.errors import GsstreamError, PacketError, PluginUnavailable, RecipeError
 from gsstream.input.recordings.base import FrameSource
-from gsstream.input.recordings.canonical import CanonicalSource, world_of
+from gsstream.input.recordings.canonical import CanonicalSource, recording_similarity
 from gsstream.input.recordings.open import open_source
 from gsstream.input.recordings.options import DataOptions
 from gsstream.input.recordings.transformed import transformed
@@ -59,7 +59,7 @@ def reopen_recording(uri: str, recipe: Mapping[str, Any], catalog: Catalog) -> F
 def _open(uri: str, scale: float, data: DataOptions, catalog: Catalog) -> FrameSource:
     source = _open_plain(uri, scale, catalog)
     try:
-        return CanonicalSource(transformed(source, data), world_of(source))
+        return CanonicalSource(transformed(source, data), recording_similarity(source))
     except BaseException:
         source.close()
         raise

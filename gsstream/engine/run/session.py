@@ -15,15 +15,15 @@ from typing import Any
 
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.budget.memory import within_memory
+from gsstream.engine.budget.memory import limit_memory
 from gsstream.engine.frame0.points import gather_points, with_test_views
 from gsstream.engine.run.displacement import displacement_pixels
-from gsstream.engine.run.encoder import Encoder, Listeners
+from gsstream.engine.run.encoder import Encoder, Callbacks
 from gsstream.engine.run.live import live_metrics
 from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.run.metrics_log import append_metrics, last_written, trim_metrics
 from gsstream.engine.run.progress import RunProgress
-from gsstream.input.recordings.base import FrameSource, GrowingSource, HurriedSource, SourceInfo
+from gsstream.input.recordings.base import FrameSource, LiveSource, AdaptiveSource, SourceInfo
 from gsstream.input.recordings.prefetch import Prefetcher
 from gsstream.method.base import Step
 from gsstream.packet import EncodedPacket, PlayerState, StreamReader, StreamWriter
@@ -77,7 +77,7 @@ def run(
             reconstructed again.
         listener: told of every frame before and after it is encoded.
     """
-    parts = within_memory(parts, source.info)
+    parts = limit_memory(parts, source.info)
     doing = _Run(parts, source, out, quiet, measure, first_frame, listener or RunListener())
     return doing.encode(resume)
 
@@ -93,7 +93,7 @@ class _Run:
         self.total = _num_frames(source.info, parts.recipe.frames)
         self.held_out = HeldOut(parts.renderer, parts.recipe.background) if measure else None
         self.progress = RunProgress(self.total, quiet)
-        listeners = Listeners(packet=self._write, progress=self.progress.first_frame)
+        listeners = Callbacks(packet=self._write, progress=self.progress.first_frame)
         self.encoder = Encoder(parts, source.info, self._seeds, first_frame=first_frame, listeners=listeners)
         self.writer: StreamWriter
         #: When the last packet was complete in the file, seconds since 1970.
@@ -105,7 +105,7 @@ class _Run:
         if last is None:
             save_resolved(self.out / RECIPE, self.encoder.parts.resolved)
         if done > 0:
-            self._remember(done)
+            self._restore_metrics(done)
         indices = itertools.count(done) if self.total is None else range(done, self.total)
         recipe = self.encoder.parts.recipe
         with (
@@ -118,7 +118,7 @@ class _Run:
         ):
             self.writer = writer
             for train, test, waited in _timed(frames):
-                self._advance(_as_late(train, self.source), test, waited)
+                self._advance(_with_current_epoch_scale(train, self.source), test, waited)
                 done = train.index + 1
                 if stop.is_set():
                     break
@@ -134,9 +134,9 @@ class _Run:
         # Who is behind does not spend time on the quality of what he drops: ``evaluate`` measures it.
         dropped = metrics["live"] is not None and metrics["live"]["policy"] == "dropped"
         if self.held_out and len(test.cameras) and not dropped:
-            metrics |= self.held_out.measure(step.state, self.encoder.at_near(test))
+            metrics |= self.held_out.measure(step.state, self.encoder.with_near_plane(test))
             if train.index == 0:
-                doubt = self.held_out.doubt(step.state, self.encoder.at_near(train), metrics["psnr"])
+                doubt = self.held_out.doubt(step.state, self.encoder.with_near_plane(train), metrics["psnr"])
                 if doubt:
                     warnings.warn(f"{doubt}: see 'gsstream scene validate {self.source.info.uri}'", stacklevel=2)
         append_metrics(self.out / METRICS, metrics)
@@ -161,20 +161,20 @@ class _Run:
         wanted = last_written(log) if planned or log.exists() else None
         last = self.encoder.resume(stream, lambda index: self.source.frame(index, "train"), wanted)
         if wanted is not None:
-            _say_what_is_lost(stream, -1 if last is None else last)
+            _warn_lost_lines(stream, -1 if last is None else last)
         self.encoder.controller.remember(trim_metrics(log, -1 if last is None else last))
         if last is None and wanted is not None:
             stream.unlink()  # it may hold sound packets of frames that are made again
         return last
 
-    def _remember(self, done: int) -> None:
+    def _restore_metrics(self, done: int) -> None:
         """What the frames before ``done``, which are not made here, say about noise and about what moves."""
         if self.held_out and len(self.source.info.test):
             second = self.source.frame(1, "test") if done > 1 else None
             self.held_out.remember(self.source.frame(0, "test"), second)
 
 
-def _say_what_is_lost(stream: Path, last: int) -> None:
+def _warn_lost_lines(stream: Path, last: int) -> None:
     """Warn of packets whose lines a kill has lost: they are made again, and it may be for hours."""
     if stream.stat().st_size < FILE_HEADER.size:
         return
@@ -193,9 +193,9 @@ def _num_frames(info: SourceInfo, wanted: int | None) -> int | None:
     return min((number for number in (info.num_frames, wanted) if number is not None), default=None)
 
 
-def _as_late(frame: Frame, source: FrameSource) -> Frame:
+def _with_current_epoch_scale(frame: Frame, source: FrameSource) -> Frame:
     """The frame with what it is worth now: it was read ahead, and the run may have fallen behind since."""
-    if frame.arrival is None or not isinstance(source, HurriedSource):
+    if frame.arrival is None or not isinstance(source, AdaptiveSource):
         return frame
     return replace(frame, effort=min(frame.effort, source.effort(frame.index)))
 
@@ -223,7 +223,7 @@ def _stop_on_interrupt(say: Callable[[str], None], source: FrameSource) -> Itera
         if stop.is_set():
             raise KeyboardInterrupt
         stop.set()
-        if isinstance(source, GrowingSource):
+        if isinstance(source, LiveSource):
             source.interrupt()  # the frame in flight may be one that nobody has captured yet
         say("stopping after this frame; interrupt again to stop at once")
 

@@ -15,8 +15,8 @@ from gsstream.core.storage import unpacked
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.photometric import PhotometricLoss, render_exposed
 from gsstream.engine.fit.schedule import DSSIM
-from gsstream.engine.step.active.candidates import VoteBook, changed_rows
-from gsstream.engine.step.active.change import MOST_PIXEL_SIGMA, Change
+from gsstream.engine.step.active.candidates import VoteCache, changed_rows
+from gsstream.engine.step.active.change import MAX_PIXEL_SIGMA, Change
 from gsstream.engine.step.active.tiles import changed_tile_weights
 from gsstream.metrics.noise import noise_sigma
 from gsstream.parts.optimiser.base import RowOptimiser
@@ -26,8 +26,8 @@ from gsstream.parts.render.target import ViewTarget
 from gsstream.parts.render.wrt import G, LossAndGrad, Wrt
 
 
-class FrameView:
-    """One frame over a decoded scene (implements ``render.work.FrameWork`` and ``method.tools.FrameTools``).
+class EngineContext:
+    """One frame over a decoded scene (implements ``render.work.FitContext`` and ``method.tools.FrameTools``).
 
     Images are as recorded; gradients are pulled through the camera's colour map, so that parts need not know it.
 
@@ -43,14 +43,14 @@ class FrameView:
     def __init__(
         self, parts: Assembly, gaussians: Gaussians[torch.Tensor], hierarchy: Hierarchy, frame: Frame, previous: Frame,
         exposure: Exposure | None, change: Change | None = None, session: RenderSession | None = None,
-        photometric: PhotometricLoss | None = None, votes: VoteBook | None = None,
+        photometric: PhotometricLoss | None = None, votes: VoteCache | None = None,
     ) -> None:  # fmt: skip
         self._parts, self._gaussians, self._hierarchy = parts, gaussians, hierarchy
         self._frame, self._previous, self._change = frame, previous, change
         self._background = parts.recipe.background
         self.photometric = photometric or PhotometricLoss(parts.loss, DSSIM, frame.images, exposure)
         self._session = session
-        self._votes = votes or (None if change is None else VoteBook(change, frame.cameras))
+        self._votes = votes or (None if change is None else VoteCache(change, frame.cameras))
 
     @property
     def session(self) -> RenderSession:
@@ -100,17 +100,17 @@ class FrameView:
         return render_exposed(renderer, gaussians, self.cameras, view, self._background, exposure)
 
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
-        if self._stands_still(view):
+        if self._is_static(view):
             number = len(self._gaussians)
             return ScreenGradient(torch.zeros(number, 2), torch.zeros(number, dtype=torch.bool))
         return self.session.screen_gradient(view, self._upstream(view, image_gradient))
 
     def screen_gradient_rows(self, view: int, image_gradient: torch.Tensor) -> RowGradient:
-        if self._stands_still(view):
+        if self._is_static(view):
             return RowGradient(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 2))
         return self.session.screen_gradient_rows(view, self._upstream(view, image_gradient))
 
-    def _stands_still(self, view: int) -> bool:
+    def _is_static(self, view: int) -> bool:
         return self._change is not None and not bool(self._change.tiles[view].any())
 
     def _upstream(self, view: int, image_gradient: torch.Tensor) -> torch.Tensor:
@@ -126,15 +126,15 @@ class FrameView:
         # Where everything moves, the estimate measures the motion instead of the noise, so it is bounded; see
         # MOST_SIGMA.
         measured = noise_sigma(unpacked(self._previous.images[view]), self._frame.images[view])
-        return min(measured, MOST_PIXEL_SIGMA)
+        return min(measured, MAX_PIXEL_SIGMA)
 
     @property
     def optimiser(self) -> RowOptimiser:
         return self._parts.optimiser
 
-    def changed_rows(self, least_votes: float) -> torch.Tensor:
+    def changed_rows(self, min_votes: float) -> torch.Tensor:
         return changed_rows(
-            self._change, self._gaussians.means, self.cameras, self.session, least_votes, self._votes
+            self._change, self._gaussians.means, self.cameras, self.session, min_votes, self._votes
         )
 
     def narrow(self, rows: torch.Tensor) -> None:
@@ -148,8 +148,8 @@ class FrameView:
     def view_target(self, view: int, tile_weights: torch.Tensor | None = None) -> ViewTarget:
         return self.photometric.view_target(view, tile_weights)
 
-    def on(self, gaussians: Gaussians[torch.Tensor], session: RenderSession | None = None) -> FrameView:
-        return FrameView(
+    def on(self, gaussians: Gaussians[torch.Tensor], session: RenderSession | None = None) -> EngineContext:
+        return EngineContext(
             self._parts, gaussians, self._hierarchy, self._frame, self._previous, self.photometric.exposure,
             self._change, session, self.photometric, self._votes,
         )  # fmt: skip

@@ -10,7 +10,7 @@ from gsstream.parts.gate.base import GateSampler
 RESOLUTION = 2.0**-24
 
 
-def count_dead(gate: GateSampler, logits: torch.Tensor) -> int:
+def count_dead_gates(gate: GateSampler, logits: torch.Tensor) -> int:
     """Count the gates with these logits [M] that neither the images nor the price can move.
 
     Dead: the derivatives by the logit both of the deterministic gate (through which the images act) and of the open
@@ -19,8 +19,8 @@ def count_dead(gate: GateSampler, logits: torch.Tensor) -> int:
     """
     leaf = logits.detach().clone().requires_grad_()
     with torch.enable_grad():
-        felt = [value for value in (gate.sample(leaf, None), gate.open_probability(leaf)) if value.requires_grad]
-        slopes = [torch.autograd.grad(value.sum(), leaf)[0].abs() for value in felt]
-    if not slopes:
+        outputs = [value for value in (gate.sample(leaf, None), gate.open_probability(leaf)) if value.requires_grad]
+        grads = [torch.autograd.grad(value.sum(), leaf)[0].abs() for value in outputs]
+    if not grads:
         return 0
-    return int((torch.stack(slopes).amax(0) < RESOLUTION).sum())
+    return int((torch.stack(grads).amax(0) < RESOLUTION).sum())

@@ -12,19 +12,19 @@ from gsstream.core.frame import Frame
 from gsstream.core.log import FrameLog
 from gsstream.core.storage import packed
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.budget.pace import Allowance, EpochScheduler, scheduled
-from gsstream.engine.budget.spent import usage
-from gsstream.engine.state.follow import follow
+from gsstream.engine.budget.epoch_scheduler import Allowance, EpochScheduler, scheduled
+from gsstream.engine.budget.usage import usage
+from gsstream.engine.state.next_state import next_state
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.active.candidates import CHANGE_VOTES, candidates
-from gsstream.engine.step.active.change import detect_change
+from gsstream.engine.step.active.change import detect_changed_tiles
 from gsstream.engine.step.active.tiles import tile_weights
 from gsstream.engine.step.encode import encode_frame
-from gsstream.engine.step.growth import grown
-from gsstream.engine.step.harden import harden
-from gsstream.engine.step.keep import kept_session
+from gsstream.engine.step.growth import with_growth
+from gsstream.engine.step.quantise import quantise_residual
+from gsstream.engine.step.commit import commit_session
 from gsstream.engine.step.metrics import log_packet, step_numbers
-from gsstream.engine.step.motion import moved
+from gsstream.engine.step.motion import propose_motion
 from gsstream.engine.step.optimise import optimise
 from gsstream.engine.step.problem import Problem
 from gsstream.method.tools import Tools
@@ -41,13 +41,13 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) 
     assert allowance is None or isinstance(allowance, Allowance)
     parts.where.enter(frame.index)
     if frame.effort == 0:  # its pictures count for nothing: a source that is behind has not even read them
-        return still(state, frame, log)
+        return empty_step(state, frame, log)
     with log.phase("change"):
-        change = detect_change(state.previous, frame, stream.change_threshold)
+        change = detect_changed_tiles(state.previous, frame, stream.change_threshold)
     if change is not None and change.share == 0:
-        return still(state, frame, log)
+        return empty_step(state, frame, log)
     with log.phase("motion"):
-        motions, scene, view = moved(parts, state, frame, change, rng, allowance)
+        motions, scene, view = propose_motion(parts, state, frame, change, rng, allowance)
     with log.phase("confidence"):
         confidence = parts.propagation.propagate(parts.confidence.estimate(view), state.hierarchy)
         logits = parts.gate.init(confidence)
@@ -59,15 +59,15 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) 
         problem = Problem(
             scene.layout, state.hierarchy, rows, view.gaussians.rows(rows), logits, state.decoders,
             view.session_for(rows), lambda index: view.view_target(
-                index, tile_weights(change, index, stream.quiet_tiles, generator)
+                index, tile_weights(change, index, stream.static_tile_share, generator)
             ), views, frame.cameras.width * frame.cameras.height, generator,
             1.0 if allowance is None else allowance.plan.step_scale,
         )  # fmt: skip
         schedule = scheduled(stream, frame, allowance)
         solution = optimise(parts, problem, schedule)
-        residual = harden(parts, problem, solution)
+        residual = quantise_residual(parts, problem, solution)
     with log.phase("growth"):
-        delta = grown(parts, state, Delta(motions).with_residual(residual), view, rng)
+        delta = with_growth(parts, state, Delta(motions).with_residual(residual), view, rng)
     with log.phase("code"):
         most = None if allowance is None else allowance.plan.max_bytes
         fitted = encode_frame(delta, state.player, frame.index, solution, parts.recipe.codec.trim, most)
@@ -77,8 +77,8 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) 
         # that a change too slow to see from frame to frame adds up until it is seen.
         unchanged = fitted.delta.is_empty
         shown = state.previous if unchanged else replace(frame, images=packed(frame.images, parts.recipe.data.images))
-        session = kept_session(view, scene, fitted.delta, player)
-        after = follow(replace(state, previous=shown, session=session), player)
+        session = commit_session(view, scene, fitted.delta, player)
+        after = next_state(replace(state, previous=shown, session=session), player)
     log_packet(log, player, fitted.packet)
     log.set(changed_tiles=1.0 if change is None else change.share, **step_numbers(solution, len(rows), session))
     if isinstance(schedule, EpochScheduler) and len(rows):
@@ -86,7 +86,7 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) 
     return Step(after, replace(fitted.packet, decoded=player), "empty" if unchanged else "delta")
 
 
-def still(state: StreamState, frame: Frame, log: FrameLog) -> Step:
+def empty_step(state: StreamState, frame: Frame, log: FrameLog) -> Step:
     """Return the step of a frame in which no tile of any view changed, or that is skipped: an empty packet."""
     with log.phase("code"):
         packet = encode_empty(frame=frame.index)

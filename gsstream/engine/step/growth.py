@@ -5,13 +5,13 @@ from __future__ import annotations
 from gsstream.core.changes import Delta, apply_delta
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.assembly.guard import blaming
+from gsstream.engine.assembly.guard import error_context
 from gsstream.engine.state.stream_state import StreamState
-from gsstream.engine.step.context import FrameView
+from gsstream.engine.step.context import EngineContext
 from gsstream.parts.growth.none import NoGrowth
 
 
-def grown(parts: Assembly, state: StreamState, delta: Delta, view: FrameView, rng: Rng) -> Delta:
+def with_growth(parts: Assembly, state: StreamState, delta: Delta, view: EngineContext, rng: Rng) -> Delta:
     """Return the delta with the rows that leave and those that join.
 
     Arguments:
@@ -27,7 +27,7 @@ def grown(parts: Assembly, state: StreamState, delta: Delta, view: FrameView, rn
         return delta  # nobody looks at the scene after the residual, so it need not be made
     after = apply_delta(state.player.scene, delta)
     rows = parts.growth.propose(after, view, rng)
-    with blaming("growth", parts.part("growth"), parts.where):
+    with error_context("growth", parts.part("growth"), parts.where):
         if rows is not None:
             apply_delta(after, Delta((rows,)))
     return delta.with_rows(rows)

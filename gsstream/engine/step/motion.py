@@ -11,15 +11,15 @@ from gsstream.core.changes.motion import apply_motions
 from gsstream.core.frame import Frame
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.assembly.guard import blaming
-from gsstream.engine.budget.pace import Allowance
+from gsstream.engine.assembly.guard import error_context
+from gsstream.engine.budget.epoch_scheduler import Allowance
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.active.change import Change
-from gsstream.engine.step.context import FrameView
+from gsstream.engine.step.context import EngineContext
 from gsstream.packet.changes.motion import encode_motions
 
 #: Largest share of the bytes a frame may take that its motions may take.
-MOST_OF_SIZE = 0.5
+MAX_SIZE_SHARE = 0.5
 
 
 class Moved(NamedTuple):
@@ -27,10 +27,10 @@ class Moved(NamedTuple):
 
     motions: tuple[Motion, ...]
     scene: Scene
-    view: FrameView
+    view: EngineContext
 
 
-def moved(
+def propose_motion(
     parts: Assembly, state: StreamState, frame: Frame, change: Change | None, rng: Rng,
     allowance: Allowance | None = None,
 ) -> Moved:  # fmt: skip
@@ -48,16 +48,16 @@ def moved(
     Raises ComponentError when the part fails, or proposes motions that do not fit the scene or cannot be sent.
     """
     scene = state.player.scene
-    view = FrameView(
+    view = EngineContext(
         parts, state.gaussians, state.hierarchy, frame, state.previous, state.exposure, change, state.session,
     )  # fmt: skip
     motions = tuple(motion for motion in parts.motion.propose(scene, view, rng) if not motion.is_empty)
     if not motions:
         return Moved((), scene, view)
-    with blaming("motion", parts.part("motion"), parts.where):
+    with error_context("motion", parts.part("motion"), parts.where):
         sections = encode_motions(motions)  # what cannot be sent is refused before anything is learned on it
         most = None if allowance is None else allowance.plan.max_bytes
-        if most is not None and sum(len(data) for _, data in sections) > MOST_OF_SIZE * most:
+        if most is not None and sum(len(data) for _, data in sections) > MAX_SIZE_SHARE * most:
             return Moved((), scene, view)
         scene, touched = apply_motions(scene, motions)
     gaussians = scene.gaussians.map(torch.from_numpy)

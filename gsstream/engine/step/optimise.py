@@ -12,21 +12,21 @@ from functools import partial
 import torch
 
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.budget.pace import estimated_bytes
+from gsstream.engine.budget.epoch_scheduler import estimated_bytes
 from gsstream.engine.budget.schedule import Schedule
 from gsstream.engine.fit.gates import TrainedGates
 from gsstream.engine.fit.schedule import GATE_LR
-from gsstream.engine.step.active.candidates import released
-from gsstream.engine.step.dead_gates import count_dead
+from gsstream.engine.step.active.candidates import keep_mask
+from gsstream.engine.step.dead_gates import count_dead_gates
 from gsstream.engine.step.levels import current_level, level_schedule
 from gsstream.engine.step.lr_factor import lr_factor
 from gsstream.engine.step.problem import Problem, Solution
 from gsstream.parts.optimiser.residual import Iteration, ResidualEpoch
-from gsstream.parts.update.base import coarser, init_latents
-from gsstream.parts.update.joint import joint_code
+from gsstream.parts.update.base import scale_steps, init_latents
+from gsstream.parts.update.joint import joint_layout
 
 #: Rows leave only when at least a tenth of them can: each time, every view has to be frozen anew.
-WORTH_LEAVING = 0.9
+MAX_RETAINED_SHARE = 0.9
 
 
 def optimise(parts: Assembly, problem: Problem, schedule: Schedule) -> Solution:
@@ -48,7 +48,7 @@ def optimise(parts: Assembly, problem: Problem, schedule: Schedule) -> Solution:
                 return fit.solution(losses, done * views + len(losses))
         done += 1
         schedule.end_epoch(done)
-        if parts.recipe.stream.release_closed and done < schedule.epochs:
+        if parts.recipe.stream.freeze_closed and done < schedule.epochs:
             fit.release(done / schedule.epochs)
             if len(fit.rows) == 0:
                 break
@@ -66,7 +66,7 @@ class _Fit:
         self.stages = level_schedule(parts.recipe.stream, layout.unit_of)
         latents = init_latents(parts.update, problem.base)
         self.decoders = {name: problem.decoders[name] for name in latents if name in problem.decoders}
-        self.code = joint_code(coarser(parts.update.codes(), problem.step_scale), latents, self.decoders, problem.base)
+        self.code = joint_layout(scale_steps(parts.update.codes(), problem.step_scale), latents, self.decoders, problem.base)
         units, matrix = torch.from_numpy(layout.units_of(index)), self.code.join_decoders(self.decoders)
         self.residual = parts.optimiser.residual_optimiser(self.code, problem.base, units, matrix)
         self.gates = TrainedGates(
@@ -90,8 +90,8 @@ class _Fit:
 
     def release(self, fraction: float) -> None:
         """Let go of the rows whose gate has closed: they no longer cost anything in this frame."""
-        keep = released(self.gates.final(), self.parts.gate.num_levels, self.gates.hierarchy, self.frozen(fraction))
-        if int(keep.sum()) > WORTH_LEAVING * len(keep):
+        keep = keep_mask(self.gates.final(), self.parts.gate.num_levels, self.gates.hierarchy, self.frozen(fraction))
+        if int(keep.sum()) > MAX_RETAINED_SHARE * len(keep):
             return
         rows = keep.nonzero()[:, 0]
         self.gates.select_rows(rows)
@@ -107,7 +107,7 @@ class _Fit:
 
     def solution(self, losses: Sequence[torch.Tensor], iterations: int) -> Solution:
         """What was found after so many iterations, and the mean of these losses."""
-        dead = count_dead(self.parts.gate, self.gates.logits)
+        dead = count_dead_gates(self.parts.gate, self.gates.logits)
         self.parts.where.pause()
         self.schedule.finish()
         return Solution(

@@ -57,7 +57,7 @@ class Solution:
         loss: mean over the last pass, of the tiles that took part.
         iterations: views rendered.
         curvature: attribute -> [A, L], mean squared gradient of the latents: what a latent is worth, up to a factor.
-        dead_gates: gates of rows that stayed which ended where nothing moves them (:func:`count_dead`).
+        dead_gates: gates of rows that stayed which ended where nothing moves them (:func:`count_dead_gates`).
     """
 
     rows: torch.Tensor

@@ -13,11 +13,11 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.log import FrameLog
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.budget.pace import Allowance
+from gsstream.engine.budget.epoch_scheduler import Allowance
 from gsstream.engine.frame0.begin import begin, exposure_from_meta
 from gsstream.engine.frame0.optimise import Progress
-from gsstream.engine.frame0.taken import begin_from
-from gsstream.engine.step.context import FrameView
+from gsstream.engine.frame0.reuse import reuse_first_frame
+from gsstream.engine.step.context import EngineContext
 from gsstream.method.tools import FirstFrame
 from gsstream.packet import PlayerState, StreamMeta
 from gsstream.parts.render.base import Renderer
@@ -73,12 +73,12 @@ class RunTools:
         return self.replay()
 
     def first_frame(self, frame: Frame) -> FirstFrame:
-        make = begin if self.first is None else begin_from
+        make = begin if self.first is None else reuse_first_frame
         player = make(self.parts, frame, self).state.player
         return FirstFrame(player.gaussians, player.layout, player.meta)
 
-    def open(self, player: PlayerState, previous: Frame, frame: Frame) -> FrameView:
+    def open(self, player: PlayerState, previous: Frame, frame: Frame) -> EngineContext:
         roots = torch.arange(len(player.layout.node_counts))
         forest = Hierarchy(torch.from_numpy(player.layout.node_of), roots, torch.zeros_like(roots))
         gaussians, exposure = player.gaussians.map(torch.from_numpy), exposure_from_meta(player.meta)
-        return FrameView(self.parts, gaussians, forest, frame, previous, exposure)
+        return EngineContext(self.parts, gaussians, forest, frame, previous, exposure)

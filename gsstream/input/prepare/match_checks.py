@@ -14,9 +14,9 @@ from gsstream.input.seeds.matching import PairMatches
 
 #: Median distance to the epipolar line above which a camera is wrong, as a share of the image width (2 px of 640).
 TOLERANCE = 2 / 640
-LEAST_MATCHES = 30
+MIN_MATCHES = 30
 #: Share of a camera's matches in pairs that contradict the poses, above which the camera is to blame.
-MOST_WRONG = 0.65
+MAX_WRONG = 0.65
 
 Repair = Callable[[FloatArray], FloatArray]
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -38,14 +38,14 @@ def check_matches(cameras: Cameras, pairs: list[PairMatches], *, rig_only: bool 
         pairs: verified matches of a pose-free geometry; pairs with fewer than 30 matches are not counted.
         rig_only: only say what is wrong with the rig as a whole.
     """
-    pairs = [pair for pair in pairs if len(pair.first) >= LEAST_MATCHES]
+    pairs = [pair for pair in pairs if len(pair.first) >= MIN_MATCHES]
     limit = max(1.0, TOLERANCE * cameras.width)
     if len(pairs) < 2:
         return [note("epipolar", (
             f"the pictures of frame 0 share too few features to check the calibration ({len(pairs)} pairs of cameras "
-            f"with at least {LEAST_MATCHES} matches); look at the first frame of a run instead"
+            f"with at least {MIN_MATCHES} matches); look at the first frame of a run instead"
         ))]  # fmt: skip
-    bad = _accused(cameras, pairs, limit)
+    bad = _suspect_cameras(cameras, pairs, limit)
     involved = {camera for pair in pairs for camera in pair.cameras}
     if not bad:
         return []
@@ -56,7 +56,7 @@ def check_matches(cameras: Cameras, pairs: list[PairMatches], *, rig_only: bool 
     return _swapped(cameras, pairs, bad, limit) or _each(cameras, pairs, bad, limit)
 
 
-def _accused(cameras: Cameras, pairs: list[PairMatches], limit: float) -> list[int]:
+def _suspect_cameras(cameras: Cameras, pairs: list[PairMatches], limit: float) -> list[int]:
     """Cameras most of whose matches, in at least two pairs, contradict the poses; the worst first.
 
     Matches count, not pairs: wide pairs with few matches often agree on a geometry that is none (repeated texture, one
@@ -73,7 +73,7 @@ def _accused(cameras: Cameras, pairs: list[PairMatches], limit: float) -> list[i
                 count[camera] += 1
         share = np.where(count >= 2, against / np.maximum(total, 1), 0)
         worst = int(share.argmax())
-        if share[worst] <= MOST_WRONG:
+        if share[worst] <= MAX_WRONG:
             break
         accused.append(worst)
         left = [k for k in left if worst not in pairs[k].cameras]
@@ -125,7 +125,7 @@ def _swapped(cameras: Cameras, pairs: list[PairMatches], bad: list[int], limit: 
             order = list(range(len(cameras)))
             order[a], order[b] = b, a
             moved = replace(cameras, viewmats=cameras.viewmats[order], Ks=cameras.Ks[order])
-            if a < b and not {a, b} & set(_accused(moved, pairs, limit)):
+            if a < b and not {a, b} & set(_suspect_cameras(moved, pairs, limit)):
                 return [error("epipolar", (
                     f"cameras {cameras.ids[a]!r} and {cameras.ids[b]!r} are swapped: the pictures fit with each "
                     "other's pose; exchange their images or their calibration"

@@ -18,7 +18,7 @@ from gsstream.input.prepare.findings import Finding, error
 from gsstream.input.prepare.match_checks import REPAIRS
 from gsstream.input.prepare.rig_checks import check_axes, check_intrinsics, check_overlap, check_placement
 from gsstream.input.recordings.base import FrameSource
-from gsstream.input.recordings.canonical import as_filed
+from gsstream.input.recordings.canonical import to_file_coordinates
 from gsstream.input.seeds.sweep import SweepSettings, agreement
 
 #: Width of the pictures that are swept, and how many of them are.
@@ -41,7 +41,7 @@ def first_look(source: FrameSource) -> list[Finding]:
 
     Raises SourceError when frame 0 cannot be read.
     """
-    source = as_filed(source)
+    source = to_file_coordinates(source)
     train = source.info.train
     found = [*check_intrinsics(train), *check_placement(train, len(train), None), *check_axes(train)]
     if found:

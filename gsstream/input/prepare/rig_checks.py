@@ -12,7 +12,7 @@ from gsstream.input.prepare.findings import Finding, error, warning
 from gsstream.input.seeds.geometry import depth_range, focus_point, visible_views
 
 FAR = 30.0
-LEAST_OVERLAP = 0.05
+MIN_OVERLAP = 0.05
 
 
 def check_intrinsics(cameras: Cameras) -> list[Finding]:
@@ -121,7 +121,7 @@ def check_overlap(cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
         others = [j for j in range(len(cameras)) if j != i]
         seen = visible_views(_view_points(cameras, i), cameras)[:, others]
         share = float(seen.any(1).mean())
-        if share < LEAST_OVERLAP:
+        if share < MIN_OVERLAP:
             found.append(error("overlap", (
                 f"camera {name!r} shares its view with no other training camera ({100 * share:.0f} % of it); check its "
                 "pose, or take it out"

@@ -24,7 +24,7 @@ GRID = 36
 #: Largest offset of a clock that is searched for, frames.
 REACH = 3
 AGREE, MARGIN = 0.45, 0.15
-LEAST_VOXELS = 40
+MIN_VOXELS = 40
 VOTES = 0.75
 
 
@@ -146,7 +146,7 @@ def _scores(hull: BoolArray, motion: _Motion, c: int) -> FloatArray:
     mine, frames = motion.at(c, c), len(hull)
     # Every offset is judged by the same frames.
     core = hull[REACH : frames - REACH] & motion.seen[None, :, c]
-    if int(core.sum()) < LEAST_VOXELS:
+    if int(core.sum()) < MIN_VOXELS:
         return np.full(2 * REACH + 1, -1.0)
     return np.array([float(mine[o : o + len(core)][core].mean()) for o in range(2 * REACH + 1)])
 
@@ -164,7 +164,7 @@ def _swapped(
             fits = []
             for camera, pose in ((a, b), (b, a)):
                 where = hull & motion.seen[None, :, pose]
-                fits.append(float(motion.at(camera, pose)[where].mean()) if int(where.sum()) >= LEAST_VOXELS else 0.0)
+                fits.append(float(motion.at(camera, pose)[where].mean()) if int(where.sum()) >= MIN_VOXELS else 0.0)
             if min(fits) > AGREE + MARGIN:
                 found.append(error("sync", (
                     f"cameras {cameras.ids[a]!r} and {cameras.ids[b]!r} are swapped: each sees what moves where the "

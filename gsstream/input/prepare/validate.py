@@ -23,7 +23,7 @@ from gsstream.input.prepare.pose_checks import check_poses
 from gsstream.input.prepare.rig_checks import check_axes, check_intrinsics, check_overlap, check_placement
 from gsstream.input.prepare.sync_checks import check_sync
 from gsstream.input.recordings.base import FilesMissing, FrameSource
-from gsstream.input.recordings.canonical import as_filed
+from gsstream.input.recordings.canonical import to_file_coordinates
 from gsstream.input.seeds.matching import match_images
 
 #: Width of the pictures that are compared over time, and of those whose features are matched.
@@ -75,7 +75,7 @@ def rig_of(source: FrameSource) -> Cameras:
 
 
 def _stages(source: FrameSource, open_scene: Open, frames: int, features: bool) -> Iterator[list[Finding]]:
-    source = as_filed(source)
+    source = to_file_coordinates(source)
     rig, train = rig_of(source), source.info.train
     yield check_intrinsics(rig)
     try:
@@ -110,7 +110,7 @@ def _thumbnails(source: FrameSource, open_scene: Open, rig: Cameras, frames: int
     small = open_scene(min(1.0, SMALL / rig.width))
     try:
         known = source.info.num_frames
-        return read_thumbnails(as_filed(small), rig, frames if known is None else min(frames, known))
+        return read_thumbnails(to_file_coordinates(small), rig, frames if known is None else min(frames, known))
     finally:
         small.close()
 

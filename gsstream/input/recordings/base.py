@@ -89,7 +89,7 @@ def check_index(info: SourceInfo, index: int) -> None:
 
 
 @runtime_checkable
-class GrowingSource(FrameSource, Protocol):
+class LiveSource(FrameSource, Protocol):
     """A recording that is still being written: ``frame`` waits, and raises EndOfRecording after the last one."""
 
     def interrupt(self) -> None:
@@ -97,7 +97,7 @@ class GrowingSource(FrameSource, Protocol):
 
 
 @runtime_checkable
-class HurriedSource(GrowingSource, Protocol):
+class AdaptiveSource(LiveSource, Protocol):
     """A growing recording that may ask for less work on a frame when the run has fallen behind."""
 
     def effort(self, index: int) -> float:

@@ -9,14 +9,14 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import Frame, PointCloud
-from gsstream.core.world import World, own_world, snapped
-from gsstream.input.recordings.base import FrameSource, GrowingSource, HurriedSource, PointKind, SourceInfo, Split
+from gsstream.core.world import World, rig_similarity, snap_cameras
+from gsstream.input.recordings.base import FrameSource, LiveSource, AdaptiveSource, PointKind, SourceInfo, Split
 
 #: Points farther from the rig than this many of its extents leave the range in which positions can be coded.
 FARTHEST = 1e12
 
 
-def world_of(source: FrameSource) -> World:
+def recording_similarity(source: FrameSource) -> World:
     """Return the world that a recording's cameras define, training and test cameras together.
 
     So it does not depend on the split.
@@ -31,10 +31,10 @@ def world_of(source: FrameSource) -> World:
         viewmats=np.concatenate([train.viewmats, test.viewmats]),
         Ks=np.concatenate([train.Ks, test.Ks]),
     )
-    return own_world(rig, source.points)
+    return rig_similarity(rig, source.points)
 
 
-def as_filed(source: FrameSource) -> FrameSource:
+def to_file_coordinates(source: FrameSource) -> FrameSource:
     """Return a recording in the coordinates of its files, for checks of what the files say.
 
     Poses that were written the wrong way round are mended by inverting them in those coordinates, and in no others.
@@ -52,7 +52,7 @@ class CanonicalSource:
 
     Arguments:
         source: an open recording, in the coordinates of its files.
-        world: :func:`world_of` it, or of the recording that it shows a part of.
+        world: :func:`recording_similarity` it, or of the recording that it shows a part of.
     """
 
     def __init__(self, source: FrameSource, world: World) -> None:
@@ -80,7 +80,7 @@ class CanonicalSource:
         cloud = self._source.points(kind)
         if cloud is None:
             return None
-        xyz = self._world.points_back(cloud.xyz)
+        xyz = self._world.inverse_points(cloud.xyz)
         if len(xyz) and not float(np.abs(xyz).max()) < FARTHEST:
             raise SourceError(
                 f"points of {self._info.name!r} ({cloud.origin}): expected positions within {FARTHEST:g} times the "
@@ -90,16 +90,16 @@ class CanonicalSource:
 
     def interrupt(self) -> None:
         """End the waits of an inner source that grows; others never wait."""
-        if isinstance(self._source, GrowingSource):
+        if isinstance(self._source, LiveSource):
             self._source.interrupt()
 
     def effort(self, index: int) -> float:
         """Return what a frame of an inner source that grows is worth now; 1 of any other."""
-        return self._source.effort(index) if isinstance(self._source, HurriedSource) else 1.0
+        return self._source.effort(index) if isinstance(self._source, AdaptiveSource) else 1.0
 
     def close(self) -> None:
         """Close the inner source."""
         self._source.close()
 
     def _placed(self, rig: Cameras) -> Cameras:
-        return snapped(self._world.cameras_back(rig))
+        return snap_cameras(self._world.inverse_cameras(rig))

@@ -96,7 +96,7 @@ def _size_of(path: Path) -> tuple[int, int]:
         ) from error
 
 
-def natural(path: Path) -> list[tuple[int, str]]:
+def natural_sort_key(path: Path) -> list[tuple[int, str]]:
     """Sort key: cam_2 before cam_10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name) if part]
 
@@ -105,7 +105,7 @@ def images_in(folder: Path) -> list[Path]:
     """Return the image files of a folder, in natural order; empty when there is no such folder."""
     if not folder.is_dir():
         return []
-    return sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=natural)
+    return sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=natural_sort_key)
 
 
 def folder_clip(folder: Path) -> ImageClip:

@@ -85,7 +85,7 @@ def _decode(path: Path) -> tuple[np.ndarray[Any, Any], float]:
             return _decode_rgb16(path), 65535.0
         with Image.open(path, formats=PICTURE_FORMATS) as image:
             image.load()
-            _say_if_turned(image)
+            _warn_if_rotated(image)
             return _to_rgb(path, image)
     except FileNotFoundError as error:
         raise SourceError(f"{path}: the image is missing; every declared frame must exist ({_READABLE})") from error
@@ -97,7 +97,7 @@ def _decode(path: Path) -> tuple[np.ndarray[Any, Any], float]:
         ) from error
 
 
-def _say_if_turned(image: Image.Image) -> None:
+def _warn_if_rotated(image: Image.Image) -> None:
     """Warn, once for a recording, of pictures that viewers turn and this reader does not: the poses decide."""
     turned = image.getexif().get(_ORIENTATION, _UPRIGHT) if "exif" in image.info else _UPRIGHT
     if turned != _UPRIGHT:

@@ -9,8 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from gsstream.core.storage import Storage
 
 Leak = Literal["none", "points", "training"]
-LostAs = Literal["hold", "black"]
-JudgedBy = Literal["reporting", "tuning"]
+LostImage = Literal["hold", "black"]
+SplitName = Literal["reporting", "tuning"]
 BadImage = Literal["stop", "repeat", "drop"]
 
 
@@ -37,7 +37,7 @@ class Disturbances(BaseModel):
     lost_share: float = Field(
         default=0.0, ge=0, lt=1, description="each training image after frame 0 is lost with this probability"
     )
-    lost_as: LostAs = Field(
+    lost_as: LostImage = Field(
         default="hold", description="a lost image is: hold: the camera's last one; black: a black one"
     )
     time_offset: tuple[str, ...] = Field(
@@ -54,7 +54,7 @@ class DataOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
-    split: JudgedBy = Field(
+    split: SplitName = Field(
         default="reporting",
         description="which cameras judge. reporting: the test cameras, for results; tuning: the test cameras are taken "
         "away altogether and about one in six training cameras judges instead, for choosing settings",

@@ -12,8 +12,8 @@ from types import TracebackType
 from gsstream.core.errors import EndOfRecording, GsstreamError, InputError, SourceError
 from gsstream.core.frame import Frame
 from gsstream.core.storage import Storage, packed, unpacked
-from gsstream.input.recordings.base import FrameSource, GrowingSource
-from gsstream.input.recordings.canonical import as_filed
+from gsstream.input.recordings.base import FrameSource, LiveSource
+from gsstream.input.recordings.canonical import to_file_coordinates
 
 FramePair = tuple[Frame, Frame]
 
@@ -86,7 +86,7 @@ class Prefetcher:
             future.cancel()
         self._pending.clear()
         self._todo = iter(())
-        if isinstance(self._source, GrowingSource):
+        if isinstance(self._source, LiveSource):
             self._source.interrupt()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
@@ -105,6 +105,6 @@ def _read_pair(source: FrameSource, index: int, storage: Storage) -> tuple[Frame
     except GsstreamError:
         raise
     except Exception as error:  # a source may be a plugin's: its failure is reported with its name
-        name = type(as_filed(source)).__name__
+        name = type(to_file_coordinates(source)).__name__
         raise SourceError(f"{name} could not read frame {index}: {type(error).__name__}: {error}") from error
     return pair, time.perf_counter() - start

@@ -17,8 +17,8 @@ from gsstream.core.storage import rounded
 from gsstream.input.recordings.base import (
     AttributedPoints,
     FrameSource,
-    GrowingSource,
-    HurriedSource,
+    LiveSource,
+    AdaptiveSource,
     PointKind,
     SingleImages,
     SourceInfo,
@@ -100,7 +100,7 @@ class TransformedSource:
         cameras = self._info.train if split == "train" else self._info.test
         images: FloatArray = np.empty((len(cameras), cameras.height, cameras.width, 3), np.float32)
         cache: dict[tuple[int, Split], Frame] = {}
-        if isinstance(self._source, GrowingSource):
+        if isinstance(self._source, LiveSource):
             # Its frames say how much they are worth, and which test cameras are there: both are read first.
             cache = {(self._start + index, home): self._source.frame(self._start + index, home) for home in SPLITS}
             there = {name for frame in cache.values() for name in frame.cameras.ids}
@@ -109,7 +109,7 @@ class TransformedSource:
         effort = min((frame.effort for frame in cache.values()), default=1.0)
         bad = False
         for row, name in enumerate(cameras.ids):
-            shown = self._last_shown(name, index) if split == "train" else index
+            shown = self._delivered_frame(name, index) if split == "train" else index
             if shown is not None:
                 images[row], read = self._whole(name, shown, split, cache)
                 bad |= read != shown
@@ -155,18 +155,18 @@ class TransformedSource:
 
     def interrupt(self) -> None:
         """End the waits of an inner source that grows; others never wait."""
-        if isinstance(self._source, GrowingSource):
+        if isinstance(self._source, LiveSource):
             self._source.interrupt()
 
     def effort(self, index: int) -> float:
         """Return what a frame of an inner source that grows is worth now; 1 of any other."""
-        return self._source.effort(self._start + index) if isinstance(self._source, HurriedSource) else 1.0
+        return self._source.effort(self._start + index) if isinstance(self._source, AdaptiveSource) else 1.0
 
     def close(self) -> None:
         """Close the inner source."""
         self._source.close()
 
-    def _last_shown(self, name: str, index: int) -> int | None:
+    def _delivered_frame(self, name: str, index: int) -> int | None:
         """The frame whose image this camera delivers at ``index``; None: a black one."""
         while is_lost(self._disturbances, self._losses, name, index, self._rng):
             if self._disturbances.lost_as == "black":

@@ -99,7 +99,7 @@ def choose_split(options: DataOptions, train: Cameras, test: Cameras) -> ChosenS
 
 
 #: One training camera in so many judges in the tuning split, rounded to the nearest number, and at least one.
-TRAINING_TO_JUDGES = 6
+TRAINING_PER_HELD_OUT = 6
 
 
 def _for_tuning(
@@ -115,9 +115,9 @@ def _for_tuning(
         raise SourceError(
             f"data.split: the tuning split needs two training cameras, one of which judges; got {len(trains)}"
         )
-    count = max(1, (len(trains) + TRAINING_TO_JUDGES // 2) // TRAINING_TO_JUDGES)
-    judges = [trains[i] for i in _medoids(centers, count)]
-    return ChosenSplit(tuple(i for i in trains if i not in judges), tuple(judges), tests)
+    count = max(1, (len(trains) + TRAINING_PER_HELD_OUT // 2) // TRAINING_PER_HELD_OUT)
+    held_out = [trains[i] for i in _medoids(centers, count)]
+    return ChosenSplit(tuple(i for i in trains if i not in held_out), tuple(held_out), tests)
 
 
 def _medoids(centers: FloatArray, count: int) -> list[int]:

@@ -178,7 +178,7 @@ class WatchSource:
         if waiting <= self._options.queue:
             return 1.0
         if self._options.behind == "hurry":
-            return max(self._options.least_effort, self._options.queue / waiting)
+            return max(self._options.min_epoch_scale, self._options.queue / waiting)
         self._skip_to = self._newest
         return 0.0
 

@@ -28,7 +28,7 @@ class WatchOptions(BaseModel):
         "drop: skip to the newest, skipped frames become empty packets; hurry: fewer epochs, in proportion",
     )
     queue: int = Field(default=4, ge=1, le=100_000, description="complete frames that may wait before 'behind' acts")
-    least_effort: float = Field(default=0.2, gt=0, le=1, description="smallest share of the epochs (behind=hurry)")
+    min_epoch_scale: float = Field(default=0.2, gt=0, le=1, description="smallest share of the epochs (behind=hurry)")
     missing: Literal["wait", "hold", "drop"] = Field(
         default="wait",
         description="a camera whose image does not come: wait: until 'timeout', then the stream ends; "

@@ -9,7 +9,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.projection import inside, project, unproject
 from gsstream.core.shapes import BoolArray, FloatArray, IntArray
-from gsstream.input.seeds.geometry import pixel_centres
+from gsstream.input.seeds.geometry import pixel_centers
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ def world_points(depths: FloatArray, cameras: Cameras, view: int) -> FloatArray:
         cameras: the C cameras.
         view: index of one of them.
     """
-    return unproject(pixel_centres(cameras.width, cameras.height), depths[view].reshape(-1), cameras, view)
+    return unproject(pixel_centers(cameras.width, cameras.height), depths[view].reshape(-1), cameras, view)
 
 
 def interpolate_depths(depths: FloatArray, known: BoolArray, iterations: int = 300) -> FloatArray:

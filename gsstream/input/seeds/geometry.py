@@ -26,7 +26,7 @@ def visible_views(points: FloatArray, cameras: Cameras) -> BoolArray:
     return visible
 
 
-def pixel_centres(width: int, height: int) -> FloatArray:
+def pixel_centers(width: int, height: int) -> FloatArray:
     """Return [height * width, 2] centres of all pixels, row by row."""
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return np.stack([x.ravel(), y.ravel()], axis=1)

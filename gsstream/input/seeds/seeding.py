@@ -44,7 +44,7 @@ def photo_consistent_seeds(
     *,
     settings: SweepSettings | None = None,
     tolerance: float = 0.015,
-    least_support: int = 2,
+    min_support: int = 2,
     dominance: float = 1.0,
 ) -> PhotoSeeds:
     """Find points that several views agree on: plane sweep, cross-view check, bridging of plain surfaces, thinning.
@@ -55,7 +55,7 @@ def photo_consistent_seeds(
         cameras: C >= 3 training cameras of that size.
         count: at most this many seeds.
         tolerance: relative depth difference that still counts as agreement.
-        least_support: other views that must agree.
+        min_support: other views that must agree.
         dominance: supporters needed per view that sees through the point (twice as many for bridged pixels).
 
     Raises InputError for fewer than three cameras and when no two views agree anywhere.
@@ -68,7 +68,7 @@ def photo_consistent_seeds(
             f"and count {count}; give the recording points, or use structure from motion"
         )
     depths = sweep_depths(images, cameras, SweepSettings() if settings is None else settings)
-    sure = agreement(depths, cameras, tolerance).accepted(least_support, dominance)
+    sure = agreement(depths, cameras, tolerance).accepted(min_support, dominance)
     if not sure.any():
         raise InputError(
             "photo-consistent seeds: no two views agree on any surface; check that the poses are world-to-camera with "
@@ -79,7 +79,7 @@ def photo_consistent_seeds(
     verdict = agreement(depths, cameras, tolerance)
     # The depth of an interpolated pixel was not matched, so twice as many views must support it.
     accepted = np.where(
-        sure, verdict.accepted(least_support, dominance), verdict.accepted(least_support, 2 * dominance)
+        sure, verdict.accepted(min_support, dominance), verdict.accepted(min_support, 2 * dominance)
     )
     confidence = verdict.support / np.maximum(verdict.support + verdict.violation, 1)
     xyz = np.concatenate([world_points(depths, cameras, i)[accepted[i].reshape(-1)] for i in range(len(cameras))])

@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from gsstream.core.cameras import Cameras
 from gsstream.core.shapes import FloatArray, check_shape
 from gsstream.input.seeds.aggregate import aggregate, best_plane
-from gsstream.input.seeds.geometry import depth_range, neighbour_views, pixel_centres
+from gsstream.input.seeds.geometry import depth_range, neighbour_views, pixel_centers
 from gsstream.input.seeds.window import window_mean
 
 _GREY = np.array([0.299, 0.587, 0.114], np.float32)
@@ -143,7 +143,7 @@ def _plane_map(cameras: Cameras, view: int, partner: int) -> tuple[torch.Tensor,
     relative = cameras.viewmats[partner] @ np.linalg.inv(cameras.viewmats[view])
     to_unit = np.array([[2 / cameras.width, 0, -1], [0, 2 / cameras.height, -1], [0, 0, 1.0]])
     camera = to_unit @ cameras.Ks[partner]
-    uv = pixel_centres(cameras.width, cameras.height)
+    uv = pixel_centers(cameras.width, cameras.height)
     rays = np.linalg.inv(cameras.Ks[view]) @ np.concatenate([uv, np.ones((len(uv), 1))], axis=1).T
     rotation = (camera @ relative[:3, :3] @ rays).astype(np.float32)
     return torch.from_numpy(rotation), torch.from_numpy((camera @ relative[:3, 3]).astype(np.float32))

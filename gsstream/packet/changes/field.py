@@ -8,11 +8,11 @@ import struct
 import numpy as np
 
 from gsstream.core.changes import Field, FieldShape, Motion, Scene, field_rows
-from gsstream.core.changes.field import MAX_ENTRY_STEP, MAX_WEIGHT_STEP, misfit
+from gsstream.core.changes.field import MAX_ENTRY_STEP, MAX_WEIGHT_STEP, mismatch
 from gsstream.core.changes.motion import apply_motions
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.shapes import IntArray
-from gsstream.packet.base import Section, located
+from gsstream.packet.base import Section, add_offset
 from gsstream.packet.bits import pack_blobs, unpack_blobs
 from gsstream.packet.gates import decode_gates, encode_gates
 from gsstream.packet.symbols import decode_symbols, encode_symbols
@@ -51,7 +51,7 @@ def decode_field(section: Section, scene: Scene, motions: tuple[Motion, ...]) ->
         scene: that of the frame before.
         motions: of the same packet; which entries a field is sent of depends on where they lead.
     """
-    with located(section.offset):
+    with add_offset(section.offset):
         try:
             return _decode(section.data, apply_motions(scene, motions)[0])
         except ShapeError as error:
@@ -87,7 +87,7 @@ def _decode(data: bytes, scene: Scene) -> Field:
     sizes += list(itertools.pairwise(shape.widths))
     tables = tuple(decode_symbols(blob, *size) for blob, size in zip(blobs[1:], sizes, strict=True))
     change = Field(shape, marks, tables[:levels], tables[levels:], entry_step, weight_step)
-    problem = misfit(change, touched)
+    problem = mismatch(change, touched)
     if problem:
         raise PacketError(f"field: {problem}")
     return change

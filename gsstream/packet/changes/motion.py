@@ -8,9 +8,9 @@ import struct
 import numpy as np
 
 from gsstream.core.changes import Groups, Motion, Scene, apply_motion, groups_for
-from gsstream.core.changes.motion import MAX_SHADES
+from gsstream.core.changes.motion import MAX_BRIGHTNESS_BINS
 from gsstream.core.errors import PacketError, ShapeError
-from gsstream.packet.base import Section, located
+from gsstream.packet.base import Section, add_offset
 from gsstream.packet.bits import pack_blobs, unpack_blobs
 from gsstream.packet.gates import decode_gates, encode_gates
 from gsstream.packet.symbols import decode_symbols, encode_symbols
@@ -20,7 +20,7 @@ _PREDICTED, _REGROUP = 1, 2
 #: Most motions of one frame: the levels of a hierarchy of groups.
 MAX_MOTIONS = 8
 #: Corrections beyond this are refused: they could not be added to a float32 scene.
-_MAX_SHIFT = 1e18
+_MAX_TRANSLATION = 1e18
 
 
 def encode_motions(motions: tuple[Motion, ...]) -> list[tuple[str, bytes]]:
@@ -34,7 +34,7 @@ def encode_motions(motions: tuple[Motion, ...]) -> list[tuple[str, bytes]]:
 
 def decode_motions(section: Section, scene: Scene) -> tuple[Motion, ...]:
     """Return the motions of a frame. Their groups depend on the scene, which each of them moves. Raises PacketError."""
-    with located(section.offset):
+    with add_offset(section.offset):
         number = section.data[0] if section.data else 0
         if not 1 <= number <= MAX_MOTIONS:
             raise PacketError(f"motion: expected 1 to {MAX_MOTIONS} motions, got {number}")
@@ -57,21 +57,21 @@ def _encode(motion: Motion) -> bytes:
         problem = f"symbols: expected [{int(np.count_nonzero(moving))}, 6], got {list(motion.symbols.shape)}"
     if problem is None and motion.symbols.dtype != np.int32:
         problem = f"symbols: expected int32, got {motion.symbols.dtype}"
-    problem = problem or _too_far(motion)
+    problem = problem or _exceeds_range(motion)
     if problem:
         raise ShapeError(f"motion: {problem}")
     flags = _PREDICTED * motion.predicted | _REGROUP * motion.regroup
-    head = _MOTION.pack(flags, motion.shades, motion.cell, motion.shift_step, motion.turn_step)
+    head = _MOTION.pack(flags, motion.shades, motion.cell, motion.translation_step, motion.rotation_step)
     return head + pack_blobs([encode_gates(moving.astype(np.uint8), 1), encode_symbols(motion.symbols)])
 
 
 def _decode(data: bytes, scene: Scene) -> Motion:
     if len(data) < _MOTION.size:
         raise PacketError("motion cut short")
-    flags, shades, cell, shift_step, turn_step = _MOTION.unpack_from(data)
+    flags, shades, cell, translation_step, rotation_step = _MOTION.unpack_from(data)
     if flags & ~(_PREDICTED | _REGROUP):
         raise PacketError(f"motion: unknown flags {flags}; upgrade gsstream")
-    none = Motion(cell, shades, np.zeros(0, np.uint8), np.zeros((0, 6), np.int32), shift_step, turn_step)
+    none = Motion(cell, shades, np.zeros(0, np.uint8), np.zeros((0, 6), np.int32), translation_step, rotation_step)
     problem = _misfit(none)
     if problem:
         raise PacketError(f"motion: {problem}")
@@ -82,8 +82,8 @@ def _decode(data: bytes, scene: Scene) -> Motion:
     if levels != 1:
         raise PacketError("motion: groups move or stand still, there are no levels")
     symbols = decode_symbols(table, int(np.count_nonzero(moving)), 6)
-    motion = Motion(cell, shades, moving, symbols, shift_step, turn_step, bool(flags & _PREDICTED), regroup)
-    problem = _too_far(motion)
+    motion = Motion(cell, shades, moving, symbols, translation_step, rotation_step, bool(flags & _PREDICTED), regroup)
+    problem = _exceeds_range(motion)
     if problem:
         raise PacketError(f"motion: {problem}")
     return motion
@@ -91,19 +91,19 @@ def _decode(data: bytes, scene: Scene) -> Motion:
 
 def _misfit(motion: Motion) -> str | None:
     """Why a motion cannot be; None when its settings can."""
-    for name in ("cell", "shift_step", "turn_step"):
+    for name in ("cell", "translation_step", "rotation_step"):
         value = float(getattr(motion, name))
         if not 0 < value < 1e9 or value != float(np.float32(value)):
             return f"{name}: expected a float32 above 0 and below 1e9, got {value!r}"
-    if not 1 <= motion.shades <= MAX_SHADES or not math.isfinite(motion.cell):
-        return f"shades: expected 1 to {MAX_SHADES}, got {motion.shades}"
+    if not 1 <= motion.shades <= MAX_BRIGHTNESS_BINS or not math.isfinite(motion.cell):
+        return f"shades: expected 1 to {MAX_BRIGHTNESS_BINS}, got {motion.shades}"
     return None
 
 
-def _too_far(motion: Motion) -> str | None:
+def _exceeds_range(motion: Motion) -> str | None:
     """Why the corrections of a motion cannot be; None when they can."""
     if motion.symbols.size == 0:
         return None
     sizes = np.abs(motion.symbols.astype(np.float64)).max(0)
-    largest = max(float(sizes[:3].max()) * motion.shift_step, float(sizes[3:].max()) * motion.turn_step)
-    return f"a correction of {largest:g} cannot be, expected at most {_MAX_SHIFT:g}" if largest > _MAX_SHIFT else None
+    largest = max(float(sizes[:3].max()) * motion.translation_step, float(sizes[3:].max()) * motion.rotation_step)
+    return f"a correction of {largest:g} cannot be, expected at most {_MAX_TRANSLATION:g}" if largest > _MAX_TRANSLATION else None

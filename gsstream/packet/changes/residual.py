@@ -15,7 +15,7 @@ from gsstream.packet.base import (
     MAX_CHANNELS,
     WIDTHS,
     Section,
-    located,
+    add_offset,
 )  # fmt: skip
 from gsstream.packet.gates import decode_gates, encode_gates
 from gsstream.packet.pattern import decode_pattern, encode_pattern, pattern_of, spread
@@ -89,23 +89,23 @@ def decode_residual(
         if strange:
             raise PacketError(f"delta packet: section {strange[0]} without gates", sections[strange[0]].offset)
         return None
-    with located(sections["gates"].offset):
+    with add_offset(sections["gates"].offset):
         gates, num_levels = decode_gates(sections["gates"].data, len(layout.node_counts))
     rows = int(np.asarray(layout.node_counts)[gates != 0].sum())
     known = dict(previous_decoders)
     sent: dict[str, FloatArray] = {}
     if "decoders" in sections:
-        with located(sections["decoders"].offset):
+        with add_offset(sections["decoders"].offset):
             sent = _decode_decoders(sections["decoders"])
     known.update(sent)
     symbols, steps, decoders = {}, {}, {}
     names = [name for name in ATTRIBUTES if name in sections]
     pattern = None
     if "pattern" in sections:
-        with located(sections["pattern"].offset):
+        with add_offset(sections["pattern"].offset):
             pattern = decode_pattern(sections["pattern"].data, rows, len(names))
     for bit, name in enumerate(names):
-        with located(sections[name].offset):
+        with add_offset(sections[name].offset):
             number = rows if pattern is None else int(np.count_nonzero(pattern >> bit & 1))
             table, steps[name], mode = _decode_attribute(name, sections[name].data, number, known)
             symbols[name] = table if pattern is None else spread(table, pattern, bit)

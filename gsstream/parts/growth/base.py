@@ -7,14 +7,14 @@ from abc import abstractmethod
 from gsstream.core.changes import Rows, Scene
 from gsstream.core.part import Part
 from gsstream.core.rng import Rng
-from gsstream.parts.render.work import FrameWork
+from gsstream.parts.render.work import FitContext
 
 
 class Growth(Part):
     """Proposes births and deaths, which travel in the packet of the frame that they belong to."""
 
     @abstractmethod
-    def propose(self, after: Scene, work: FrameWork, rng: Rng) -> Rows | None:
+    def propose(self, after: Scene, work: FitContext, rng: Rng) -> Rows | None:
         """Return the rows that leave and those that join; None for neither.
 
         Arguments:

@@ -7,41 +7,41 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from gsstream.core.changes import Rows, Scene, own_nodes
+from gsstream.core.changes import Rows, Scene, add_as_nodes
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import IntArray
-from gsstream.parts.growth.fitting import fitted_births, joined
-from gsstream.parts.render.work import FrameWork
+from gsstream.parts.growth.fitting import fit_added, concat_gaussians
+from gsstream.parts.render.work import FitContext
 
 #: (frame as a scene shows it, rows [P] that are pulled, the largest first) -> those that may be copied, in that order.
-Admitted = Callable[[FrameWork, torch.Tensor], torch.Tensor]
+CopyFilter = Callable[[FitContext, torch.Tensor], torch.Tensor]
 
 
-def replaced_by_copies(
-    scene: Scene, deaths: IntArray, work: FrameWork, epochs: int, rng: Rng, *, gradient: float, most: int, rounds: int,
-    prune_opacity: float, admitted: Admitted | None = None,
+def replace_with_copies(
+    scene: Scene, deaths: IntArray, work: FitContext, epochs: int, rng: Rng, *, gradient: float, most: int, rounds: int,
+    prune_opacity: float, admitted: CopyFilter | None = None,
 ) -> Rows:  # fmt: skip
     """Return the change of rows in which some leave and the frame's copies are born, each a node of its own.
 
     Arguments:
         scene: N rows, after the frame's motions.
         deaths: [D] int64 rows that leave, ascending.
-        work, epochs, rng, gradient, most, rounds, prune_opacity, admitted: as for :func:`fitted_copies`.
+        work, epochs, rng, gradient, most, rounds, prune_opacity, admitted: as for :func:`fit_copies`.
     """
     kept = scene.gaussians.rows(np.delete(np.arange(len(scene.gaussians)), deaths)).map(torch.from_numpy)
-    born = fitted_copies(
+    born = fit_copies(
         kept, work, epochs, rng, gradient=gradient, most=most, rounds=rounds, prune_opacity=prune_opacity,
         admitted=admitted,
     ).map(lambda value: value.numpy())
     if not len(born):
         return Rows(deaths=deaths)
-    return Rows(own_nodes(born, np.zeros(len(born), np.uint8), len(scene.layout.node_counts)), deaths)
+    return Rows(add_as_nodes(born, np.zeros(len(born), np.uint8), len(scene.layout.node_counts)), deaths)
 
 
-def fitted_copies(
-    scene: Gaussians[torch.Tensor], work: FrameWork, epochs: int, rng: Rng, *, gradient: float, most: int, rounds: int,
-    prune_opacity: float, admitted: Admitted | None = None,
+def fit_copies(
+    scene: Gaussians[torch.Tensor], work: FitContext, epochs: int, rng: Rng, *, gradient: float, most: int, rounds: int,
+    prune_opacity: float, admitted: CopyFilter | None = None,
 ) -> Gaussians[torch.Tensor]:  # fmt: skip
     """Return the Gaussians that a frame adds to a scene, raw values.
 
@@ -50,7 +50,7 @@ def fitted_copies(
         work: the frame.
         epochs: passes over the training cameras, spread over the rounds.
         rng: random streams by name and frame.
-        gradient: as for :func:`pulled_rows`.
+        gradient: as for :func:`high_gradient_rows`.
         most: Gaussians that are added at most.
         rounds: times that the scene is searched for places.
         prune_opacity: opacity below which an added Gaussian is given up, 0 to 1.
@@ -63,24 +63,24 @@ def fitted_copies(
         room = most - len(born)
         if not passes or (room <= 0 and not len(born)):
             continue
-        copies = _copies(work.on(joined(scene, born) if len(born) else scene), gradient, max(0, room), admitted)
-        born = joined(born, copies) if len(born) else copies
+        copies = _copies(work.on(concat_gaussians(scene, born) if len(born) else scene), gradient, max(0, room), admitted)
+        born = concat_gaussians(born, copies) if len(born) else copies
         if not len(born):
             continue
-        born = fitted_births(scene, born, work, views, passes, rng)
+        born = fit_added(scene, born, work, views, passes, rng)
         born = born.rows(born.opacities.sigmoid() >= prune_opacity)
     return born
 
 
-def _copies(work: FrameWork, gradient: float, room: int, admitted: Admitted | None) -> Gaussians[torch.Tensor]:
+def _copies(work: FitContext, gradient: float, room: int, admitted: CopyFilter | None) -> Gaussians[torch.Tensor]:
     """Copies of at most ``room`` Gaussians. What is rendered for it, a render for every camera, goes with the call."""
-    places = pulled_rows(work, gradient)
+    places = high_gradient_rows(work, gradient)
     if admitted is not None:
         places = admitted(work, places)
     return work.gaussians.rows(places[:room].sort().values)
 
 
-def pulled_rows(work: FrameWork, gradient: float) -> torch.Tensor:
+def high_gradient_rows(work: FitContext, gradient: float) -> torch.Tensor:
     """Return the rows [P] whose mean screen gradient exceeds a bound, the largest first.
 
     The gradient is that of the mean absolute difference between what a view shows and what its camera recorded; the
@@ -96,6 +96,6 @@ def pulled_rows(work: FrameWork, gradient: float) -> torch.Tensor:
         difference = work.previous_render(view) - work.image(view)
         norm = (work.screen_gradient(view, difference.sign() / difference.numel()).gradient * half).norm(dim=1)
         total, count = total + norm, count + (norm > 0)
-    pull = total / count.clamp_min(1)
-    hot = (pull > gradient).nonzero()[:, 0]
-    return hot[torch.argsort(pull[hot], descending=True, stable=True)]
+    grad_norm = total / count.clamp_min(1)
+    hot = (grad_norm > gradient).nonzero()[:, 0]
+    return hot[torch.argsort(grad_norm[hot], descending=True, stable=True)]

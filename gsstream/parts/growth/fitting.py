@@ -11,7 +11,7 @@ import torch
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
-from gsstream.parts.render.work import FrameWork
+from gsstream.parts.render.work import FitContext
 from gsstream.parts.render.wrt import WrtRows
 
 Array = TypeVar("Array", torch.Tensor, FloatArray)
@@ -20,7 +20,7 @@ RATES = {"means": 0.1, "quats": 1e-2, "scales": 0.02, "opacities": 0.1, "sh0": 0
 BETAS, EPSILON = (0.9, 0.99), 1e-15
 
 
-def joined(scene: Gaussians[Array], born: Gaussians[Array]) -> Gaussians[Array]:
+def concat_gaussians(scene: Gaussians[Array], born: Gaussians[Array]) -> Gaussians[Array]:
     """Return the rows of both, those of ``born`` behind those of ``scene``."""
     values = {}
     for name, value in scene.items():
@@ -29,8 +29,8 @@ def joined(scene: Gaussians[Array], born: Gaussians[Array]) -> Gaussians[Array]:
     return cast("Gaussians[Array]", Gaussians(**values))
 
 
-def fitted_births(
-    scene: Gaussians[torch.Tensor], born: Gaussians[torch.Tensor], work: FrameWork, views: Sequence[int], epochs: int,
+def fit_added(
+    scene: Gaussians[torch.Tensor], born: Gaussians[torch.Tensor], work: FitContext, views: Sequence[int], epochs: int,
     rng: Rng,
 ) -> Gaussians[torch.Tensor]:  # fmt: skip
     """Return the newborn, optimised in these views while the scene holds still.
@@ -43,7 +43,7 @@ def fitted_births(
         epochs: passes over them.
         rng: of the order of views.
     """
-    inner = work.on(joined(scene, born))
+    inner = work.on(concat_gaussians(scene, born))
     inner.narrow(torch.arange(len(scene), len(scene) + len(born)))
     values = {name: value.clone() for name, value in born.items()}
     first = {name: torch.zeros_like(value) for name, value in values.items()}

@@ -7,7 +7,7 @@ from typing import ClassVar, final
 from gsstream.core.changes import Rows, Scene
 from gsstream.core.rng import Rng
 from gsstream.parts.growth.base import Growth
-from gsstream.parts.render.work import FrameWork
+from gsstream.parts.render.work import FitContext
 
 
 @final
@@ -16,5 +16,5 @@ class NoGrowth(Growth):
 
     source: ClassVar[str] = "gsstream"
 
-    def propose(self, after: Scene, work: FrameWork, rng: Rng) -> Rows | None:
+    def propose(self, after: Scene, work: FitContext, rng: Rng) -> Rows | None:
         return None

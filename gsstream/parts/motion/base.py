@@ -7,7 +7,7 @@ from abc import abstractmethod
 from gsstream.core.changes import Motion, Scene
 from gsstream.core.part import Part
 from gsstream.core.rng import Rng
-from gsstream.parts.render.work import FrameWork
+from gsstream.parts.render.work import FitContext
 
 
 class MotionPart(Part):
@@ -19,7 +19,7 @@ class MotionPart(Part):
     """
 
     @abstractmethod
-    def propose(self, scene: Scene, work: FrameWork, rng: Rng) -> tuple[Motion, ...]:
+    def propose(self, scene: Scene, work: FitContext, rng: Rng) -> tuple[Motion, ...]:
         """Return the motions of this frame, in the order in which they apply; none leaves the scene where it is.
 
         Arguments:

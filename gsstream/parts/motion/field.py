@@ -6,10 +6,10 @@ import numpy as np
 
 from gsstream.core.changes import Motion, Scene, groups_for
 from gsstream.core.shapes import FloatArray, IntArray
-from gsstream.parts.motion.groups import groups_within
+from gsstream.parts.motion.groups import groups_of_rows
 
 
-def said_by_cells(
+def approximate_by_cells(
     scene: Scene, rows: IntArray, shift: FloatArray, turn: FloatArray, side: float, step: float
 ) -> Motion | None:
     """Return the rigid motions of small cells that come nearest to a field; None where no cell moves.
@@ -27,7 +27,7 @@ def said_by_cells(
     groups = groups_for(scene, side, 1, regroup=True)
     place = groups.group_of[rows]
     hits = np.bincount(place, minlength=groups.count)
-    able = np.flatnonzero(groups_within(groups, rows))
+    able = np.flatnonzero(groups_of_rows(groups, rows))
     values: FloatArray = np.concatenate([shift, turn], 1).astype(np.float64)
     means = np.stack([np.bincount(place, values[:, i], groups.count) / np.maximum(hits, 1) for i in range(6)], 1)
     # Half a cell from its centre, a turn of one step moves a Gaussian by a step, too.

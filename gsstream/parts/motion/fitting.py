@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from gsstream.core.changes import Scene
-from gsstream.core.changes.motion import Moves
+from gsstream.core.changes.motion import GroupTransforms
 from gsstream.core.shapes import FloatArray
-from gsstream.parts.render.work import FrameWork
+from gsstream.parts.render.work import FitContext
 from gsstream.parts.render.wrt import WrtTransforms
 
 BETAS, EPSILON = (0.9, 0.99), 1e-12
@@ -19,7 +19,7 @@ BETAS, EPSILON = (0.9, 0.99), 1e-12
 Measure = Callable[[FloatArray], FloatArray]
 
 
-class Descent:
+class GroupAdam:
     """Descends along slopes with Adam's moments, in steps of given length.
 
     Arguments:
@@ -31,18 +31,18 @@ class Descent:
         self.values, self._measure = values, measure
         self._first, self._second, self._steps = np.zeros_like(values), np.zeros_like(values), 0
 
-    def step(self, slope: FloatArray, rate: float) -> None:
+    def step(self, grad: FloatArray, rate: float) -> None:
         """Replace ``values``: one step of length ``rate`` against a slope [K, 6]."""
         self._steps += 1
-        self._first = BETAS[0] * self._first + (1 - BETAS[0]) * slope
-        self._second = BETAS[1] * self._second + (1 - BETAS[1]) * slope**2
+        self._first = BETAS[0] * self._first + (1 - BETAS[0]) * grad
+        self._second = BETAS[1] * self._second + (1 - BETAS[1]) * grad**2
         scale = np.sqrt(self._measure(self._second) / (1 - BETAS[1] ** self._steps)) + EPSILON
         self.values = self.values - rate * (self._first / (1 - BETAS[0] ** self._steps)) / scale
 
 
-def fitted_moves(
-    scene: Scene, work: FrameWork, start: Moves, unit: FloatArray, rates: Sequence[float], order: np.random.Generator,
-    measure: Measure, pull: float = 0.0, tiles: Literal["all", "changed"] = "all",
+def fit_transforms_adam(
+    scene: Scene, work: FitContext, start: GroupTransforms, unit: FloatArray, rates: Sequence[float], order: np.random.Generator,
+    measure: Measure, l1_weight: float = 0.0, tiles: Literal["all", "changed"] = "all",
 ) -> FloatArray:  # fmt: skip
     """Return the shifts and turns [K, 6] of groups that explain the images best.
 
@@ -61,26 +61,26 @@ def fitted_moves(
     work.narrow(torch.from_numpy(start.rows))
     base = scene.gaussians.rows(start.rows).map(torch.from_numpy)
     local = start._replace(rows=np.arange(len(start.rows)))
-    descent = Descent(np.concatenate([start.shift, start.turn], 1) / unit, measure)
+    descent = GroupAdam(np.concatenate([start.shift, start.turn], 1) / unit, measure)
     for step, rate in enumerate(rates):
         if step % views == 0:
             sequence = order.permutation(views)
         values = descent.values
         moves = local._replace(shift=values[:, :3] * unit[:3], turn=values[:, 3:] * unit[3:])
         found = work.loss_and_grad(int(sequence[step % views]), WrtTransforms(base, moves), tiles)
-        slope = found.grad.numpy() * unit
-        if pull:
-            slope = slope + pull * np.sign(values) / values.size
-        descent.step(slope, rate)
+        grad = found.grad.numpy() * unit
+        if l1_weight:
+            grad = grad + l1_weight * np.sign(values) / values.size
+        descent.step(grad, rate)
     return np.asarray(descent.values * unit)
 
 
-def each_alone(second: FloatArray) -> FloatArray:
+def elementwise(second: FloatArray) -> FloatArray:
     """Return the squared slopes as they are: every number is measured by itself, as Adam does."""
     return second
 
 
-def felt_most(second: FloatArray) -> FloatArray:
+def groupwise_max(second: FloatArray) -> FloatArray:
     """Return the squared slope [K, 1] that all six numbers of a group are measured by: that of the one felt most.
 
     With a measure of its own every number would make steps of full size, those that the images say nothing about too

@@ -8,7 +8,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.changes import Groups, Scene, groups_for
 from gsstream.core.median import median
 from gsstream.core.shapes import FloatArray, IntArray
-from gsstream.parts.render.work import FrameWork
+from gsstream.parts.render.work import FitContext
 
 
 def pixel_size(means: FloatArray, cameras: Cameras) -> float:
@@ -45,7 +45,7 @@ def known_groups(scene: Scene, cameras: Cameras, pixels: float, shades: int) -> 
     return groups_for(scene, cell, shades)
 
 
-def changed_groups(groups: Groups, work: FrameWork, votes: float, share: float) -> IntArray:
+def changed_groups(groups: Groups, work: FitContext, votes: float, share: float) -> IntArray:
     """Return [G] bool: groups of which at least this share of the rows lie in what changed.
 
     Arguments:
@@ -59,7 +59,7 @@ def changed_groups(groups: Groups, work: FrameWork, votes: float, share: float) 
     return np.asarray((total > 0) & (hit > 0) & (hit >= share * total))
 
 
-def groups_within(groups: Groups, rows: IntArray) -> IntArray:
+def groups_of_rows(groups: Groups, rows: IntArray) -> IntArray:
     """Return [G] bool: groups of which at least half of the rows, and at least one, are among ``rows`` [A]."""
     total = np.bincount(groups.group_of, minlength=groups.count)
     hit = np.bincount(groups.group_of[rows], minlength=groups.count)

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 
 from gsstream.core.changes import Scene
-from gsstream.core.changes.motion import Moves
+from gsstream.core.changes.motion import GroupTransforms
 from gsstream.core.shapes import FloatArray
-from gsstream.parts.render.work import FrameWork
+from gsstream.parts.render.work import FitContext
 from gsstream.parts.render.wrt import WrtTransforms
 
 
@@ -28,7 +28,7 @@ class Damping(NamedTuple):
     longest: float
 
 
-class NewtonDescent:
+class DampedNewton:
     """Descends along slopes of one view after another, each divided by the curvature of all views seen so far.
 
     Recursive least squares: after a pass every view has had its say with equal weight, and what a later one adds is
@@ -43,7 +43,7 @@ class NewtonDescent:
         self.values, self._damping = values, damping
         self._total, self._measured, self._seen = np.zeros((len(values), 6, 6)), 0, 0
 
-    def step(self, slope: FloatArray, curvature: FloatArray | None = None) -> None:
+    def step(self, grad: FloatArray, curvature: FloatArray | None = None) -> None:
         """Replace ``values``: one step against a view's slope [K, 6].
 
         Arguments:
@@ -57,13 +57,13 @@ class NewtonDescent:
         matrix = self._total * (self._seen / self._measured)
         mean = np.trace(matrix, axis1=1, axis2=2) / 6
         added = self._damping.share * np.maximum(mean, mean.mean()) + self._damping.hold
-        step = np.linalg.solve(matrix + added[:, None, None] * np.eye(6), slope[..., None])[..., 0]
+        step = np.linalg.solve(matrix + added[:, None, None] * np.eye(6), grad[..., None])[..., 0]
         longest = np.abs(step).max(1, keepdims=True)
         self.values = self.values - step * np.minimum(1.0, self._damping.longest / np.maximum(longest, 1e-12))
 
 
-def newton_moves(
-    scene: Scene, work: FrameWork, start: Moves, unit: FloatArray, iterations: int, order: np.random.Generator,
+def fit_transforms_newton(
+    scene: Scene, work: FitContext, start: GroupTransforms, unit: FloatArray, iterations: int, order: np.random.Generator,
     damping: Damping, tiles: Literal["all", "changed"] = "all",
 ) -> FloatArray:  # fmt: skip
     """Return the shifts and turns [K, 6] of groups that explain the images best.
@@ -82,7 +82,7 @@ def newton_moves(
     work.narrow(torch.from_numpy(start.rows))
     base = scene.gaussians.rows(start.rows).map(torch.from_numpy)
     local = start._replace(rows=np.arange(len(start.rows)))
-    descent = NewtonDescent(np.concatenate([start.shift, start.turn], 1) / unit, damping)
+    descent = DampedNewton(np.concatenate([start.shift, start.turn], 1) / unit, damping)
     for step in range(iterations):
         if step % views == 0:
             sequence = order.permutation(views)

@@ -8,14 +8,14 @@ import numpy as np
 from pydantic import Field
 
 from gsstream.core.changes import Motion, Scene
-from gsstream.core.changes.motion import Moves, moves_of
+from gsstream.core.changes.motion import GroupTransforms, predict_transforms
 from gsstream.core.part import PartConfig
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.parts.motion.base import MotionPart
 from gsstream.parts.motion.groups import changed_groups, known_groups
-from gsstream.parts.motion.newton import Damping, newton_moves
-from gsstream.parts.render.work import FrameWork
+from gsstream.parts.motion.newton import Damping, fit_transforms_newton
+from gsstream.parts.render.work import FitContext
 
 
 class Units(NamedTuple):
@@ -66,7 +66,7 @@ class Rigid(MotionPart):
 
     source: ClassVar[str] = "gsstream; groups of one rigid motion as in HiCoM"
 
-    def propose(self, scene: Scene, work: FrameWork, rng: Rng) -> tuple[Motion, ...]:
+    def propose(self, scene: Scene, work: FitContext, rng: Rng) -> tuple[Motion, ...]:
         config = self.config
         groups = known_groups(scene, work.cameras, config.pixels, config.shades)
         able = changed_groups(groups, work, config.votes, config.share)
@@ -76,7 +76,7 @@ class Rigid(MotionPart):
         pixel = groups.cell / config.pixels
         # Half a cell from the centre, an angle a moves a point by a * cell / 2 = tan(a / 2) * cell.
         units = Units(pixel, pixel / groups.cell)
-        start = moves_of(scene, groups, able.astype(np.uint8), predicted=True)
+        start = predict_transforms(scene, groups, able.astype(np.uint8), predicted=True)
         found = self._fitted(scene, work, start, units, rng)
         steps = np.float32(config.step * units.shift), np.float32(config.step * units.turn)
         step = np.array([float(steps[0])] * 3 + [float(steps[1])] * 3)
@@ -88,11 +88,11 @@ class Rigid(MotionPart):
         moving[np.flatnonzero(able)[kept]] = 1
         return (Motion(groups.cell, groups.shades, moving, symbols[kept], float(steps[0]), float(steps[1])),)
 
-    def _fitted(self, scene: Scene, work: FrameWork, start: Moves, units: Units, rng: Rng) -> FloatArray:
+    def _fitted(self, scene: Scene, work: FitContext, start: GroupTransforms, units: Units, rng: Rng) -> FloatArray:
         """[K, 6] shift and turn of the groups that explain the images best."""
         config = self.config
         total = max(1, round(config.epochs * len(work.cameras) * work.effort))
         damping = Damping(config.damping, config.hold, config.longest)
         order = rng.numpy("motion", work.index)
         tiles: Literal["all", "changed"] = "all" if config.everywhere else "changed"
-        return newton_moves(scene, work, start, units.row, total, order, damping, tiles)
+        return fit_transforms_newton(scene, work, start, units.row, total, order, damping, tiles)

@@ -8,13 +8,13 @@ import numpy as np
 import torch
 
 from gsstream.core.changes import Scene
-from gsstream.core.changes.motion import Moves
+from gsstream.core.changes.motion import GroupTransforms
 from gsstream.core.shapes import FloatArray, IntArray
-from gsstream.parts.render.work import FrameWork
+from gsstream.parts.render.work import FitContext
 from gsstream.parts.render.wrt import WrtTransforms
 
 
-def gains(scene: Scene, work: FrameWork, moves: Moves, views: Sequence[int] | IntArray) -> FloatArray:
+def loss_change(scene: Scene, work: FitContext, moves: GroupTransforms, views: Sequence[int] | IntArray) -> FloatArray:
     """Return the change [K] of the loss, summed over views, that each group's move brings about; below 0 it helps.
 
     It is the slope of the loss half-way, along the move: for a loss that is quadratic between the two ends it is their
@@ -30,11 +30,11 @@ def gains(scene: Scene, work: FrameWork, moves: Moves, views: Sequence[int] | In
     base = scene.gaussians.rows(moves.rows).map(torch.from_numpy)
     half = moves._replace(rows=np.arange(len(moves.rows)), shift=moves.shift / 2, turn=moves.turn / 2)
     grads = (work.loss_and_grad(view, WrtTransforms(base, half)).grad.numpy() for view in views)
-    slope = sum(grads, np.zeros((len(moves.centre), 6)))
-    return np.asarray((slope * np.concatenate([moves.shift, moves.turn], 1)).sum(1))
+    grad = sum(grads, np.zeros((len(moves.centre), 6)))
+    return np.asarray((grad * np.concatenate([moves.shift, moves.turn], 1)).sum(1))
 
 
-def some_views(number: int, share: float, frame: int) -> IntArray:
+def rotating_views(number: int, share: float, frame: int) -> IntArray:
     """Return the views that take their turn in a frame: a share of all, evenly spread, others in the next frame.
 
     Arguments:

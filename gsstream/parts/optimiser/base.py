@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import torch
 
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.joint import JointCode
+from gsstream.core.joint import JointLayout
 from gsstream.core.part import Part
 from gsstream.parts.optimiser.joint import JointResidualOptimiser
 from gsstream.parts.optimiser.residual import ResidualOptimiser
@@ -46,7 +46,7 @@ class RowOptimiser(Part):
         """
 
     def residual_optimiser(
-        self, code: JointCode, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor
+        self, code: JointLayout, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor
     ) -> ResidualOptimiser:
         """Return the optimiser of a frame's residual, from zero latents on. By default it is made of :meth:`step`.
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple, final
 import torch
 
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.joint import JointCode
+from gsstream.core.joint import JointLayout
 from gsstream.parts.optimiser.rate import rate_gradient
 from gsstream.parts.optimiser.residual import ResidualOptimiser
 from gsstream.parts.optimiser.row_parameters import RowParameters
@@ -21,37 +21,37 @@ if TYPE_CHECKING:
     from gsstream.parts.optimiser.base import RowOptimiser
 
 
-def join_features(code: JointCode, rows: Gaussians[torch.Tensor]) -> torch.Tensor:
+def join_features(code: JointLayout, rows: Gaussians[torch.Tensor]) -> torch.Tensor:
     """Return [A, D]: the attributes that may change, side by side."""
     # The width is given explicitly, because with no rows left reshape could not infer it from -1.
     parts = [getattr(rows, name).reshape(len(rows), at.stop - at.start) for name, at in code.feature.items()]
     return torch.cat(parts, 1) if parts else torch.zeros(len(rows), 0)
 
 
-class JointChange(NamedTuple):
+class JointResidual(NamedTuple):
     """Quantised latents [A, L] and the ungated change of the features [A, D] (positions in scene units)."""
 
     latents: torch.Tensor
     decoded: torch.Tensor
 
 
-def decode_joint(code: JointCode, latents: torch.Tensor, matrix: torch.Tensor, units: torch.Tensor) -> JointChange:
+def decode_joint(code: JointLayout, latents: torch.Tensor, matrix: torch.Tensor, units: torch.Tensor) -> JointResidual:
     """Return the latents [A, L] as the decoder will have them, and what they decode to.
 
     Arguments:
         code: columns of the attributes.
         latents: [A, L].
-        matrix: [L, D] of :meth:`JointCode.join_decoders`. units: [A] cell of each anchor, scene units.
+        matrix: [L, D] of :meth:`JointLayout.join_decoders`. units: [A] cell of each anchor, scene units.
     """
     quantised = torch.round(latents / code.steps).mul_(code.steps)
     decoded = quantised @ matrix
     if "means" in code.feature:
         decoded[:, code.feature["means"]] *= units[:, None]
-    return JointChange(quantised, decoded)
+    return JointResidual(quantised, decoded)
 
 
 def add_joint(
-    code: JointCode, base: Gaussians[torch.Tensor], features: torch.Tensor, change: JointChange, gates: torch.Tensor
+    code: JointLayout, base: Gaussians[torch.Tensor], features: torch.Tensor, change: JointResidual, gates: torch.Tensor
 ) -> Gaussians[torch.Tensor]:
     """Return a_t = a_{t-1} + g * change.
 
@@ -78,7 +78,7 @@ class JointGrad(NamedTuple):
 
 
 def joint_vjp(
-    code: JointCode, upstream: torch.Tensor, change: JointChange, matrix: torch.Tensor, gates: torch.Tensor,
+    code: JointLayout, upstream: torch.Tensor, change: JointResidual, matrix: torch.Tensor, gates: torch.Tensor,
     units: torch.Tensor,
 ) -> JointGrad:  # fmt: skip
     """Return the gradient of the map from latents, decoders and gates to features.
@@ -105,7 +105,7 @@ class JointResidualOptimiser(ResidualOptimiser):
     """Calls the functions above, the rate's gradient and the optimiser's ``step``: the truth for faster ones."""
 
     def __init__(
-        self, code: JointCode, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor,
+        self, code: JointLayout, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor,
         optimiser: RowOptimiser,
     ) -> None:  # fmt: skip
         self._code, self._base, self._units = code, base, units

@@ -56,8 +56,8 @@ def laplace_gradient(latents: torch.Tensor, step: float | torch.Tensor, spread: 
     grown = (magnitude.clamp_max(0.5) / spread).exp_()
     shrunk = grown.reciprocal()
     inside = (grown - shrunk).mul_(tail).div_(2 - (grown + shrunk).mul_(tail))
-    slope = torch.where(magnitude < 0.5, inside, torch.ones((), dtype=u.dtype))
-    return slope.mul_(u.sign_()).div_(spread * step * _LN2)
+    derivative = torch.where(magnitude < 0.5, inside, torch.ones((), dtype=u.dtype))
+    return derivative.mul_(u.sign_()).div_(spread * step * _LN2)
 
 
 def rate_gradient(latents: torch.Tensor, steps: torch.Tensor, gates: torch.Tensor, weight: float) -> torch.Tensor:

@@ -8,12 +8,12 @@ from dataclasses import replace
 import torch
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.changes.motion import Moves
+from gsstream.core.changes.motion import GroupTransforms
 from gsstream.core.context import RowGradient, ScreenGradient
 from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.parts.render.backward import backward, gradient_of
 from gsstream.parts.render.output import TILE, RenderCache, RenderOutput
-from gsstream.parts.render.structure import weighed_structure
+from gsstream.parts.render.structure import weighted_structure_tensor
 from gsstream.parts.render.target import ViewTarget
 from gsstream.parts.render.transforms import curvature_of
 from gsstream.parts.render.wrt import G, LossAndGrad, Wrt, WrtTransforms
@@ -69,9 +69,9 @@ class RenderSession(ABC):
         For a renderer whose work follows the pixels at which the image's gradient is not zero; it may also name rows
         that these pixels do not reach.
         """
-        pulled = self.screen_gradient(view, image_gradient)
-        rows = pulled.visible.nonzero()[:, 0]
-        return RowGradient(rows, pulled.gradient[rows])
+        found = self.screen_gradient(view, image_gradient)
+        rows = found.visible.nonzero()[:, 0]
+        return RowGradient(rows, found.gradient[rows])
 
     @abstractmethod
     def visible(self, view: int, tiles: torch.Tensor) -> torch.Tensor:
@@ -192,7 +192,7 @@ def _compared(
 
 
 def _curvature(
-    session: RenderSession, view: int, target: ViewTarget, transforms: Moves, leaves: Gaussians[torch.Tensor],
+    session: RenderSession, view: int, target: ViewTarget, transforms: GroupTransforms, leaves: Gaussians[torch.Tensor],
     wanted: torch.Tensor | None,
 ) -> torch.Tensor:  # fmt: skip
     """[K, 6, 6] of Gauss-Newton, from the share that each row has of a pixel's light."""
@@ -201,6 +201,6 @@ def _curvature(
     image = session.render(view, replace(rows, sh0=colour), tile_mask=wanted).image
     recorded = target.exposure.apply(image.detach()) if target.exposure else image.detach()
     # The gradient of a pixel by a colour is the share that its Gaussian has of the pixel's light.
-    backward([image], [weighed_structure(recorded, target.image)])
+    backward([image], [weighted_structure_tensor(recorded, target.image)])
     structure = gradient_of(colour)[:, 0].numpy() / SH0
     return torch.from_numpy(curvature_of(rows.means.numpy(), transforms, session.cameras, view, structure))

@@ -6,12 +6,12 @@ import numpy as np
 import torch
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.changes.motion import Moves
+from gsstream.core.changes.motion import GroupTransforms
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
 
 
-def transform_vjp(leaves: Gaussians[torch.Tensor], moves: Moves) -> FloatArray:
+def transform_vjp(leaves: Gaussians[torch.Tensor], moves: GroupTransforms) -> FloatArray:
     """Return the gradient [K, 6] by shift and turn of the groups, from that of the rows that they have moved.
 
     Arguments:
@@ -36,7 +36,7 @@ def transform_vjp(leaves: Gaussians[torch.Tensor], moves: Moves) -> FloatArray:
 
 
 def curvature_of(
-    means: FloatArray, moves: Moves, cameras: Cameras, view: int, structure: FloatArray
+    means: FloatArray, moves: GroupTransforms, cameras: Cameras, view: int, structure: FloatArray
 ) -> FloatArray:
     """Return the curvature [K, 6, 6] of a view's loss by shift and turn of groups of rows.
 
@@ -62,12 +62,12 @@ def curvature_of(
     return out / (3 * cameras.height * cameras.width)
 
 
-def _on_screen(means: FloatArray, moves: Moves, cameras: Cameras, view: int) -> FloatArray:
+def _on_screen(means: FloatArray, moves: GroupTransforms, cameras: Cameras, view: int) -> FloatArray:
     """[A, 2, 6] derivative of each row's place on the screen, pixels, by shift and turn of its group."""
     rotation, focal = cameras.viewmats[view, :3, :3], np.diag(cameras.Ks[view])[:2]
     seen = means @ rotation.T + cameras.viewmats[view, :3, 3]
     depth = np.maximum(seen[:, 2], cameras.near)
-    slopes = (seen[:, :2] / depth[:, None])[..., None]
-    shift = (focal / depth[:, None])[..., None] * (rotation[:2] - slopes * rotation[2])
+    tangents = (seen[:, :2] / depth[:, None])[..., None]
+    shift = (focal / depth[:, None])[..., None] * (rotation[:2] - tangents * rotation[2])
     arm = means - (moves.centre + moves.shift)[moves.place]
     return np.concatenate([shift, 2 * np.cross(arm[:, None], shift)], -1)

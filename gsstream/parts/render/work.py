@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from gsstream.parts.render.wrt import G, LossAndGrad, Wrt
 
 
-class FrameWork(FrameContext, Protocol):
+class FitContext(FrameContext, Protocol):
     """A frame that a part works on: it renders with some rows moving, and is told how well that explains the images.
 
     Colour maps of the cameras are applied and pulled through where they belong; a part need not know them.
@@ -27,11 +27,11 @@ class FrameWork(FrameContext, Protocol):
     def optimiser(self) -> Any:
         """The optimiser of the run (``gsstream.api.RowOptimiser``), for rows that a part fits on its own."""
 
-    def changed_rows(self, least_votes: float) -> torch.Tensor:
+    def changed_rows(self, min_votes: float) -> torch.Tensor:
         """Return [N] bool: Gaussians that are seen in a tile that changed.
 
         Arguments:
-            least_votes: least share, 0 to 1, of the views a Gaussian projects into in which it must lie in or beside a
+            min_votes: least share, 0 to 1, of the views a Gaussian projects into in which it must lie in or beside a
                 changed tile. Where change is not detected, all Gaussians count.
         """
 
@@ -54,5 +54,5 @@ class FrameWork(FrameContext, Protocol):
     def shown(self, gaussians: Gaussians[torch.Tensor], view: int) -> torch.Tensor:
         """Return [H, W, 3]: a scene as the camera of this view would record it, without a graph."""
 
-    def on(self, gaussians: Gaussians[torch.Tensor]) -> FrameWork:
+    def on(self, gaussians: Gaussians[torch.Tensor]) -> FitContext:
         """Return the same frame, to be worked on from another scene."""

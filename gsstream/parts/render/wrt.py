@@ -8,7 +8,7 @@ from typing import Generic, TypeVar, final
 
 import torch
 
-from gsstream.core.changes.motion import Moves, transformed
+from gsstream.core.changes.motion import GroupTransforms, transform_groups
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
 from gsstream.parts.render.backward import gradient_of
@@ -68,12 +68,12 @@ class WrtTransforms(Wrt[torch.Tensor]):
     """
 
     base: Gaussians[torch.Tensor]
-    transforms: Moves
+    transforms: GroupTransforms
     curvature: bool = False
 
     def placed(self) -> Gaussians[torch.Tensor]:
         """Return the rows after they moved, with the decoder's bits."""
-        return transformed(self.base.map(_array), self.transforms).map(torch.from_numpy)
+        return transform_groups(self.base.map(_array), self.transforms).map(torch.from_numpy)
 
     def grad(self, leaves: Gaussians[torch.Tensor]) -> torch.Tensor:
         return torch.from_numpy(transform_vjp(leaves, self.transforms))

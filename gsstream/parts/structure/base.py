@@ -41,12 +41,12 @@ class StructureTraits(Traits):
     Arguments:
         idempotent: building again from the same Gaussians, also stored node by node, gives the same forest.
         local: the members of a node lie within one root cell of each other, along every axis.
-        lays_grid: its groups follow a grid that it lays when it seeds; False: any grid serves it, as units of position.
+        has_grid: its groups follow a grid that it lays when it seeds; False: any grid serves it, as units of position.
     """
 
     idempotent: bool = False
     local: bool = False
-    lays_grid: bool = True
+    has_grid: bool = True
 
 
 class Structure(Part):

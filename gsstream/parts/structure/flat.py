@@ -28,7 +28,7 @@ class Flat(Structure):
             description="position residuals are measured in (scene diameter / resolution); 1 to 65536",
         )  # fmt: skip
 
-    traits = StructureTraits(idempotent=True, local=True, lays_grid=False)
+    traits = StructureTraits(idempotent=True, local=True, has_grid=False)
 
     def seed(self, points: PointCloud, cameras: Cameras) -> Anchors:
         if len(points) == 0:

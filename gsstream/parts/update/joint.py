@@ -12,14 +12,14 @@ from collections.abc import Mapping
 import torch
 
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.joint import JointCode as JointCode
+from gsstream.core.joint import JointLayout as JointLayout
 from gsstream.parts.update.base import AttributeCode
 
 
-def joint_code(
+def joint_layout(
     codes: Mapping[str, AttributeCode], latents: Mapping[str, torch.Tensor], decoders: Mapping[str, torch.Tensor],
     base: Gaussians[torch.Tensor],
-) -> JointCode:  # fmt: skip
+) -> JointLayout:  # fmt: skip
     """Return the columns that attributes have in one table, in the order of ``latents``.
 
     Arguments:
@@ -43,7 +43,7 @@ def joint_code(
     for name in decoders:
         trained[latent[name], feature[name]] = 1
     rates = torch.tensor(decoder_lrs, dtype=kind)[:, None]
-    return JointCode(
+    return JointLayout(
         latent, feature, torch.tensor(steps, dtype=kind), torch.tensor(lrs, dtype=kind), rates, trained
     )
 

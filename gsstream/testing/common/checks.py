@@ -22,11 +22,11 @@ from gsstream.core.errors import InputError
 from gsstream.core.kinds import CONTRACTS
 from gsstream.core.part import Part
 from gsstream.parts.gate.base import GateSampler
-from gsstream.testing.cases import EXTREMES, World, fingerprint, world
+from gsstream.testing.cases import EXTREMES, World, fingerprint, get_case
 from gsstream.testing.compare import ROUNDING, all_equal, finite
 from gsstream.testing.drive import behaviour_of, draw, outputs
 from gsstream.testing.recording import SourceUnderTest
-from gsstream.testing.registry import BEHAVED, LEAST_REASON, Skip, check, checks_for, kind_of
+from gsstream.testing.registry import BEHAVED, MIN_REASON, Skip, check, checks_for, kind_of
 
 ALL = tuple(CONTRACTS)
 
@@ -94,8 +94,8 @@ def check_denials(part: Part) -> None:
     made = {entry.name for entry in checks_for(kind_of(part))}
     for name, reason in part.denials().items():
         assert name in made, f"denied: no check named {name!r} is made on a {kind_of(part)}"
-        assert isinstance(reason, str) and len(reason.strip()) >= LEAST_REASON, (
-            f"denied[{name!r}]: expected a reason of at least {LEAST_REASON} characters, got {reason!r}"
+        assert isinstance(reason, str) and len(reason.strip()) >= MIN_REASON, (
+            f"denied[{name!r}]: expected a reason of at least {MIN_REASON} characters, got {reason!r}"
         )
 
 
@@ -137,7 +137,7 @@ def _imports_torch(module: str, path: str) -> str:
 @check("common", kinds=BEHAVED)
 def check_pure(part: Part) -> None:
     """The same inputs give the same bits twice; inputs are left as they were; no .grad is left behind."""
-    case = world("moving")
+    case = get_case("moving")
     before = fingerprint(case)
     first = outputs(part, case)
     assert fingerprint(case) == before, f"{type(part).__name__} changed its inputs"
@@ -150,7 +150,7 @@ def check_pure(part: Part) -> None:
 def check_rng_isolated(part: Part) -> None:
     """The global generators of torch, numpy and python are untouched; a generator's seed alone decides the noise."""
     state = torch.get_rng_state(), np.random.get_state()[1].copy(), random.getstate()  # type: ignore[index]
-    outputs(part, world("moving"))
+    outputs(part, get_case("moving"))
     changed = [
         name
         for name, same in (
@@ -171,7 +171,7 @@ def check_rng_isolated(part: Part) -> None:
 @check("common", kinds=BEHAVED)
 def check_dtype_and_device(part: Part) -> None:
     """Outputs stay float32, or float64 where logits are an input of that type, and on the input's device."""
-    for case in (world("cloud"), world("cloud").double()):
+    for case in (get_case("cloud"), get_case("cloud").double()):
         for name, value in outputs(part, case).items():
             assert value.device == case.logits.device, f"{name}: expected {case.logits.device}, got {value.device}"
             if value.dtype.is_floating_point:
@@ -184,7 +184,7 @@ def check_extremes(part: Part) -> None:
     """Worlds of no, one, identical, collinear, far, tiny, vast, thin and unseen Gaussians work; nothing is NaN."""
     for name in EXTREMES:
         try:
-            found = outputs(part, world(name))
+            found = outputs(part, get_case(name))
         except Exception as error:
             raise AssertionError(f"world {name!r}: raised {type(error).__name__}: {error}") from error
         for output, value in found.items():
@@ -218,14 +218,14 @@ def _same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bo
 
 def _poisoned(part: Part, value: float) -> tuple[World, str]:
     """The cloud with one value of what the part reads replaced, and which."""
-    case = world("cloud")
+    case = get_case("cloud")
     return case, behaviour_of(part).poison(case, value)
 
 
 @check("common", kinds=BEHAVED)
 def check_permutation(part: Part) -> None:
     """Permuting the Gaussians permutes what there is per Gaussian and changes nothing else."""
-    case = world("cloud")
+    case = get_case("cloud")
     order = torch.randperm(len(case.logits), generator=torch.Generator().manual_seed(3))
     first, second = outputs(part, case), outputs(part, case.permuted(order))
     behaviour = behaviour_of(part)

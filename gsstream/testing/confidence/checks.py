@@ -8,7 +8,7 @@ from itertools import pairwise
 import torch
 
 from gsstream.parts.confidence.base import ConfidenceEstimator
-from gsstream.testing.cases import world
+from gsstream.testing.cases import get_case
 from gsstream.testing.compare import at_most, equal, finite
 from gsstream.testing.registry import check
 
@@ -19,7 +19,7 @@ ENOUGH_AUC = 0.9
 def check_confidence_range(part: ConfidenceEstimator) -> None:
     """[N] finite float32 logits, on every world."""
     for name in ("one", "line", "cloud", "far", "tiny", "vast", "thin", "unseen", "one camera"):
-        case = world(name)
+        case = get_case(name)
         got = part.estimate(case)
         n = len(case.gaussians)
         assert tuple(got.shape) == (n,), f"world {name!r}: expected shape [{n}], got {list(got.shape)}"
@@ -30,7 +30,7 @@ def check_confidence_range(part: ConfidenceEstimator) -> None:
 @check("confidence")
 def check_confidence_static_frame(part: ConfidenceEstimator) -> None:
     """Identical consecutive frames: finite, and at most the declared floor."""
-    got = part.estimate(world("static"))
+    got = part.estimate(get_case("static"))
     finite("a frame in which nothing changed", got)
     at_most("a frame in which nothing changed", got, part.claims().floor, 1e-5, "float32 of the declared floor")
 
@@ -38,7 +38,7 @@ def check_confidence_static_frame(part: ConfidenceEstimator) -> None:
 @check("confidence")
 def check_confidence_unseen(part: ConfidenceEstimator) -> None:
     """Gaussians that no camera sees get a defined value, at most the declared floor."""
-    case = world("unseen")
+    case = get_case("unseen")
     hidden = case.gaussians.means[:, 1] > 5
     got = part.estimate(case)[hidden]
     finite("Gaussians nobody sees", got)
@@ -48,7 +48,7 @@ def check_confidence_unseen(part: ConfidenceEstimator) -> None:
 @check("confidence")
 def check_confidence_view_order(part: ConfidenceEstimator) -> None:
     """Shuffling the cameras changes nothing."""
-    case = world("cloud")
+    case = get_case("cloud")
     equal(
         "shuffled cameras", part.estimate(case.views([2, 0, 1])), part.estimate(case), 1e-4,
         "sums over views in another order, amplified by a division by their spread",
@@ -58,7 +58,7 @@ def check_confidence_view_order(part: ConfidenceEstimator) -> None:
 @check("confidence", trait="finds_motion")
 def check_confidence_finds_motion(part: ConfidenceEstimator) -> None:
     """What moved outranks what did not: area under the ROC curve at least 0.9. A check of usefulness."""
-    case = world("moving")
+    case = get_case("moving")
     got = part.estimate(case)
     moved, still = got[case.moved], got[~case.moved]
     pairs = (moved[:, None] > still[None]).float() + 0.5 * (moved[:, None] == still[None]).float()
@@ -69,7 +69,7 @@ def check_confidence_finds_motion(part: ConfidenceEstimator) -> None:
 @check("confidence", trait="monotone_in_change")
 def check_confidence_monotone_in_change(part: ConfidenceEstimator) -> None:
     """Blending the change in (0, 1/4, 1/2, 1): the mean logit of what moved does not fall."""
-    case = world("moving")
+    case = get_case("moving")
     means = [float(part.estimate(case.blended(share))[case.moved].mean()) for share in (0.0, 0.25, 0.5, 1.0)]
     slack = 1e-3 * (1 + max(abs(value) for value in means))
     falls = [b - a for a, b in pairwise(means) if b < a - slack]
@@ -77,9 +77,9 @@ def check_confidence_monotone_in_change(part: ConfidenceEstimator) -> None:
 
 
 @check("confidence")
-def check_confidence_leaves_no_trace(part: ConfidenceEstimator) -> None:
+def check_confidence_no_grad_left(part: ConfidenceEstimator) -> None:
     """Parameters keep requires_grad and .grad; the result carries no graph."""
-    case = world("cloud")
+    case = get_case("cloud")
     case = replace(case, gaussians=case.gaussians.map(lambda t: t.clone().requires_grad_(True)))
     got = part.estimate(case)
     assert not got.requires_grad and got.grad_fn is None, "the result carries a graph: memory grows with every frame"
@@ -91,7 +91,7 @@ def check_confidence_leaves_no_trace(part: ConfidenceEstimator) -> None:
 @check("confidence")
 def check_confidence_no_cameras(part: ConfidenceEstimator) -> None:
     """Without a camera nobody sees anything: at most the declared floor."""
-    got = part.estimate(world("cloud").views([]))
+    got = part.estimate(get_case("cloud").views([]))
     finite("no cameras", got)
     at_most("no cameras", got, part.claims().floor, 1e-5, "float32 of the declared floor")
 
@@ -99,7 +99,7 @@ def check_confidence_no_cameras(part: ConfidenceEstimator) -> None:
 @check("confidence")
 def check_confidence_extreme_images(part: ConfidenceEstimator) -> None:
     """A cut from black to white and a change of one part in 1e6 stay finite."""
-    case = world("cloud")
+    case = get_case("cloud")
     black, white = (tuple(torch.full_like(i, value) for i in case.now) for value in (0.0, 1.0))
     finite("black to white", part.estimate(replace(case, before=black, now=white)))
     finite("a change of 1e-6", part.estimate(case.blended(1e-6)))
@@ -112,7 +112,7 @@ EXPOSURE = 0.02
 @check("confidence", trait="brightness")
 def check_confidence_brightness(part: ConfidenceEstimator) -> None:
     """When a still scene becomes brighter as a whole, the mean logit stays within the declared bound."""
-    case = world("static")
+    case = get_case("static")
     brighter = tuple((image + EXPOSURE).clamp(max=1.0) for image in case.before)
     got = part.estimate(replace(case, now=brighter)).double().mean()
     finite("brighter by a fiftieth", got)

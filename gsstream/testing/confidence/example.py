@@ -31,15 +31,15 @@ class ExampleConfidence(ConfidenceEstimator):
         return replace(self.traits, floor=self.config.floor, brightness=0.0)
 
     def estimate(self, context: FrameContext) -> torch.Tensor:
-        pull = torch.zeros(len(context.gaussians), dtype=torch.float64)
+        change = torch.zeros(len(context.gaussians), dtype=torch.float64)
         for view in range(len(context.cameras)):
             change = context.previous_image(view) - context.image(view)
             check_finite(f"change of view {view}", change)
             gradient, visible = context.screen_gradient(view, change)
-            pull += gradient.double().norm(dim=1) * visible
-        logits = torch.full_like(pull, self.config.floor)
-        pulled = pull > 0
-        if bool(pulled.any()):
-            share = pull[pulled] / pull.max()
-            logits[pulled] = (self.config.gain * (share - 0.5)).clamp_min(self.config.floor)
+            change += gradient.double().norm(dim=1) * visible
+        logits = torch.full_like(change, self.config.floor)
+        changed = change > 0
+        if bool(changed.any()):
+            share = change[changed] / change.max()
+            logits[changed] = (self.config.gain * (share - 0.5)).clamp_min(self.config.floor)
         return logits.float()

@@ -7,7 +7,7 @@ from itertools import pairwise
 import torch
 
 from gsstream.parts.gate.base import AnalyticGate, GateSampler
-from gsstream.testing.cases import world
+from gsstream.testing.cases import get_case
 from gsstream.testing.compare import ROUNDING, all_equal, at_most, equal, finite
 from gsstream.testing.drive import draw
 from gsstream.testing.registry import check
@@ -65,7 +65,7 @@ def check_gate_calibration(part: GateSampler) -> None:
 
 
 @check("gate", trait="stochastic")
-def check_gate_really_stochastic(part: GateSampler) -> None:
+def check_gate_stochastic(part: GateSampler) -> None:
     """With noise, gates vary from draw to draw."""
     logits = part.init(torch.zeros(256))
     first, second = (part.sample(logits, draw(part, 256, seed)) for seed in (1, 2))
@@ -152,7 +152,7 @@ def check_gate_deterministic_is_final(part: GateSampler) -> None:
 
 
 @check("gate")
-def check_gate_bound(part: GateSampler) -> None:
+def check_gate_clamp(part: GateSampler) -> None:
     """Bounds are a projection: bounding twice is bounding once, and a fresh logits is within them."""
     fresh = part.init(_spread() * 10)
     equal("bound(init(z))", part.bound(fresh), fresh)
@@ -164,7 +164,7 @@ def check_gate_bound(part: GateSampler) -> None:
 @check("gate")
 def check_gate_state_resume(part: GateSampler) -> None:
     """The logits are all there is: one plain float32 tensor per node, and a copy of it gives the same gates."""
-    start = world("cloud").logits
+    start = get_case("cloud").logits
     logits = part.init(start)
     assert type(logits) is torch.Tensor, f"init(): expected a plain torch.Tensor, got {type(logits).__name__}"
     got = tuple(logits.shape)

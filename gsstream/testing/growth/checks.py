@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsstream.core.changes import Rows, apply_rows
+from gsstream.core.changes import Rows, apply_row_edit
 from gsstream.packet.changes.rows import encode_rows_change
 from gsstream.parts.growth.base import Growth
 from gsstream.testing.cases import fingerprint
 from gsstream.testing.registry import check
-from gsstream.testing.working import at_work, check_closed_loop
+from gsstream.testing.working import fit_fixture, check_closed_loop
 
 
 def _proposed(part: Growth, *, changed: bool = True) -> Rows | None:
-    case = at_work(changed=changed)
+    case = fit_fixture(changed=changed)
     rows = part.propose(case.scene, case.work, case.rng)
     assert rows is None or isinstance(rows, Rows), f"propose(): expected Rows or None, got {type(rows).__name__}"
     return rows
@@ -22,11 +22,11 @@ def _proposed(part: Growth, *, changed: bool = True) -> Rows | None:
 @check("growth")
 def check_growth_fits(part: Growth) -> None:
     """What is proposed can be written and applied: rows that exist leave, those that join have a node and a unit."""
-    scene, rows = at_work().scene, _proposed(part)
+    scene, rows = fit_fixture().scene, _proposed(part)
     if rows is None:
         return
     encode_rows_change(rows, scene.layout)
-    after = apply_rows(scene, rows)
+    after = apply_row_edit(scene, rows)
     born = 0 if rows.births is None else len(rows.births)
     wanted = len(scene.gaussians) - len(rows.deaths) + born
     assert len(after.gaussians) == wanted, f"expected {wanted} Gaussians afterwards, got {len(after.gaussians)}"
@@ -38,7 +38,7 @@ def check_growth_fits(part: Growth) -> None:
 @check("growth")
 def check_growth_pure(part: Growth) -> None:
     """The scene stays as it was, and the same frame gives the same rows again."""
-    case = at_work()
+    case = fit_fixture()
     before = fingerprint((case.scene.gaussians, case.scene.layout))
     first = part.propose(case.scene, case.work, case.rng)
     assert fingerprint((case.scene.gaussians, case.scene.layout)) == before, "the scene was changed"

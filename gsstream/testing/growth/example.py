@@ -8,7 +8,7 @@ from typing import final
 import numpy as np
 from pydantic import Field
 
-from gsstream.api import FrameWork, Growth, PartConfig, Rng, Rows, Scene
+from gsstream.api import FitContext, Growth, PartConfig, Rng, Rows, Scene
 
 
 @final
@@ -23,7 +23,7 @@ class ExampleGrowth(Growth):
             default=0.01, gt=0, le=0.5, description="largest share of the Gaussians that leaves in one frame, to 0.5"
         )
 
-    def propose(self, after: Scene, work: FrameWork, rng: Rng) -> Rows | None:
+    def propose(self, after: Scene, work: FitContext, rng: Rng) -> Rows | None:
         # Scenes hold raw values: an opacity is the sigmoid of what is stored.
         opacities, least = after.gaussians.opacities, math.log(self.config.opacity / (1 - self.config.opacity))
         faint = np.flatnonzero(opacities < least)

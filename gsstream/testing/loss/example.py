@@ -46,14 +46,14 @@ class ExampleLoss(Loss):
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         leaf = image.detach().requires_grad_()
-        judged = inside = torch.ones_like(image[..., :1])
+        counted = inside = torch.ones_like(image[..., :1])
         if tile_mask is not None:
             # Windows of the tiles beside see what changed; their own gradient belongs to whoever drew them.
             beside = max_pool2d(tile_mask[None].to(image.dtype), 3, 1, 1)[0]
-            judged, inside = (pixels(mask, image) for mask in (beside, tile_mask.to(image.dtype)))
+            counted, inside = (pixels(mask, image) for mask in (beside, tile_mask.to(image.dtype)))
         with torch.enable_grad():
             per_pixel = (1 - dssim) * (leaf - prepared).abs() + dssim * (1 - similarity(leaf, prepared))
-            value = (per_pixel * judged).mean()
+            value = (per_pixel * counted).mean()
             (gradient,) = torch.autograd.grad(value, leaf)
         return value.detach().double(), gradient * inside
 

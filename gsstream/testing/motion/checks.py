@@ -10,11 +10,11 @@ from gsstream.packet.changes.motion import decode_motions, encode_motions
 from gsstream.parts.motion.base import MotionPart
 from gsstream.testing.cases import fingerprint
 from gsstream.testing.registry import check
-from gsstream.testing.working import at_work, check_closed_loop
+from gsstream.testing.working import fit_fixture, check_closed_loop
 
 
 def _proposed(part: MotionPart, *, changed: bool = True) -> tuple[Motion, ...]:
-    case = at_work(changed=changed)
+    case = fit_fixture(changed=changed)
     motions = part.propose(case.scene, case.work, case.rng)
     assert isinstance(motions, tuple), f"propose(): expected a tuple of Motion, got {type(motions).__name__}"
     for motion in motions:
@@ -25,7 +25,7 @@ def _proposed(part: MotionPart, *, changed: bool = True) -> tuple[Motion, ...]:
 @check("motion")
 def check_motion_fits(part: MotionPart) -> None:
     """What is proposed fits the scene, leads to finite values, and is the same motion when a player has read it."""
-    scene, motions = at_work().scene, tuple(motion for motion in _proposed(part) if not motion.is_empty)
+    scene, motions = fit_fixture().scene, tuple(motion for motion in _proposed(part) if not motion.is_empty)
     sent = encode_motions(motions)
     got = decode_motions(Section(sent[0][1], 0), scene) if sent else ()
     for motion, read in zip(motions, got, strict=True):
@@ -39,7 +39,7 @@ def check_motion_fits(part: MotionPart) -> None:
 @check("motion")
 def check_motion_pure(part: MotionPart) -> None:
     """The scene stays as it was, and the same frame gives the same motions again."""
-    case = at_work()
+    case = fit_fixture()
     before = fingerprint((case.scene.gaussians, case.scene.layout, case.scene.moved))
     first = part.propose(case.scene, case.work, case.rng)
     assert fingerprint((case.scene.gaussians, case.scene.layout, case.scene.moved)) == before, "the scene was changed"
@@ -47,7 +47,7 @@ def check_motion_pure(part: MotionPart) -> None:
 
 
 @check("motion")
-def check_motion_rests(part: MotionPart) -> None:
+def check_motion_static_frame(part: MotionPart) -> None:
     """Where no tile of any view changed, no group moves: a velocity dies when its body stops."""
     for motion in _proposed(part, changed=False):
         moving = int(np.count_nonzero(motion.moving))

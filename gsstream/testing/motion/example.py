@@ -7,7 +7,7 @@ from typing import final
 import numpy as np
 from pydantic import Field
 
-from gsstream.api import FrameWork, Motion, MotionPart, PartConfig, Rng, Scene, groups_for
+from gsstream.api import FitContext, Motion, MotionPart, PartConfig, Rng, Scene, groups_for
 
 
 @final
@@ -25,7 +25,7 @@ class ExampleMotion(MotionPart):
             default=0.5, ge=0, le=1, description="share of its views in which a Gaussian must lie in changed tiles"
         )
 
-    def propose(self, scene: Scene, work: FrameWork, rng: Rng) -> tuple[Motion, ...]:
+    def propose(self, scene: Scene, work: FitContext, rng: Rng) -> tuple[Motion, ...]:
         if scene.moved is None:
             return ()
         # A packet holds the cell in single precision, and both ends must form the same groups.

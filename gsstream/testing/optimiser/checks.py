@@ -6,7 +6,7 @@ import torch
 
 from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.joint import JointCode
+from gsstream.core.joint import JointLayout
 from gsstream.engine.fit.gates import TrainedGates
 from gsstream.parts.loss.photometric import ReferenceLoss
 from gsstream.parts.optimiser.base import ADAM_BETAS, ADAM_EPS, AdamState, RowOptimiser
@@ -14,8 +14,8 @@ from gsstream.parts.optimiser.joint import JointResidualOptimiser
 from gsstream.parts.optimiser.residual import Iteration, ResidualEpoch, ResidualOptimiser
 from gsstream.parts.render.target import ViewTarget
 from gsstream.parts.update.base import AttributeCode
-from gsstream.parts.update.joint import joint_code
-from gsstream.testing.cases import BLACK, RENDERER, world
+from gsstream.parts.update.joint import joint_layout
+from gsstream.testing.cases import BLACK, RENDERER, get_case
 from gsstream.testing.compare import equal
 from gsstream.testing.gate.example import ExampleGate
 from gsstream.testing.registry import check
@@ -86,7 +86,7 @@ def check_optimiser_refuses(part: RowOptimiser) -> None:
         raise AssertionError(f"a gradient of shape {list(wrong.shape)}, first value {wrong.flatten()[0]}, was accepted")
 
 
-def _residual_case() -> tuple[JointCode, Gaussians[torch.Tensor], torch.Tensor, torch.Tensor]:
+def _residual_case() -> tuple[JointLayout, Gaussians[torch.Tensor], torch.Tensor, torch.Tensor]:
     """300 rows of which positions change directly, in units, and sizes and colours through decoders."""
     g = torch.Generator().manual_seed(7)
     shapes = (3,), (4,), (3,), (), (1, 3), (3, 3)
@@ -99,7 +99,7 @@ def _residual_case() -> tuple[JointCode, Gaussians[torch.Tensor], torch.Tensor, 
     latents = {name: torch.zeros(300, code.latent or (3 if name == "means" else 1)) for name, code in codes.items()}
     widths = {"scales": 3, "sh0": 3, "shN": 9}
     decoders = {name: 0.1 * torch.randn(codes[name].latent, width, generator=g) for name, width in widths.items()}
-    code = joint_code(codes, latents, decoders, base)
+    code = joint_layout(codes, latents, decoders, base)
     return code, base, 0.1 + torch.rand(300, generator=g), code.join_decoders(decoders)
 
 
@@ -139,13 +139,13 @@ def check_residual_optimiser_run(part: RowOptimiser) -> None:
     """Six iterations of ``run`` find what its default body finds: residual, decoders, gates and losses."""
     found = []
     for body in (None, ResidualOptimiser.run):
-        case = world("cloud")
+        case = get_case("cloud")
         active, loss = torch.arange(0, len(case.gaussians), 3), ReferenceLoss()
         session = RENDERER.open(case.gaussians, active, case.cameras, BLACK)
         base, views = case.gaussians.rows(active), len(case.cameras)
         latents = {"means": torch.zeros(len(active), 3), "sh0": torch.zeros(len(active), 3)}
         codes = {"means": AttributeCode(0.05, 0.02), "sh0": AttributeCode(0.1, 0.05)}
-        code = joint_code(codes, latents, {}, base)
+        code = joint_layout(codes, latents, {}, base)
         subject = part.residual_optimiser(code, base, torch.full((len(active),), 0.2), code.join_decoders({}))
         gates = TrainedGates(
             ExampleGate(), ExampleRegularizer(), part, 0.05, torch.ones(case.hierarchy.num_nodes), case.hierarchy,

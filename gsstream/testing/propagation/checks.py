@@ -8,7 +8,7 @@ import torch
 
 from gsstream.core.hierarchy import Hierarchy, tree_roots
 from gsstream.parts.propagation.base import Propagation
-from gsstream.testing.cases import World, flat, world
+from gsstream.testing.cases import World, flat, get_case
 from gsstream.testing.compare import ROUNDING, at_most, equal, finite
 from gsstream.testing.registry import check
 
@@ -30,7 +30,7 @@ def _owners(hierarchy: Hierarchy) -> torch.Tensor:
 def check_propagation_range(part: Propagation) -> None:
     """[M] finite logits, none above the largest that came in, also at +-1e4."""
     for name in WORLDS:
-        case = world(name)
+        case = get_case(name)
         got = _spread(part, case)
         m = case.hierarchy.num_nodes
         assert tuple(got.shape) == (m,), f"world {name!r}: expected shape [{m}], got {list(got.shape)}"
@@ -42,7 +42,7 @@ def check_propagation_range(part: Propagation) -> None:
 @check("propagation", trait="normalised")
 def check_propagation_normalised(part: Propagation) -> None:
     """A constant stays that constant at every node with members."""
-    case = world("cloud")
+    case = get_case("cloud")
     for constant in (-3.0, 0.0, 2.5):
         got = _spread(part, case, torch.full_like(case.logits, constant))[_owners(case.hierarchy)]
         equal(f"constant {constant}", got, torch.full_like(got, constant), 1e-5, ROUNDING)
@@ -51,14 +51,14 @@ def check_propagation_normalised(part: Propagation) -> None:
 @check("propagation", trait="normalised")
 def check_propagation_flat_identity(part: Propagation) -> None:
     """On the flat structure nothing changes."""
-    case = replace(world("cloud"), hierarchy=flat(len(world("cloud").logits)))
+    case = replace(get_case("cloud"), hierarchy=flat(len(get_case("cloud").logits)))
     equal("flat structure", _spread(part, case), case.logits, 1e-6, ROUNDING)
 
 
 @check("propagation")
 def check_propagation_relabelling(part: Propagation) -> None:
     """Renaming the nodes renames the result."""
-    case = world("cloud")
+    case = get_case("cloud")
     new = torch.randperm(case.hierarchy.num_nodes, generator=torch.Generator().manual_seed(4))
     old = torch.argsort(new)
     old_forest = case.hierarchy
@@ -70,7 +70,7 @@ def check_propagation_relabelling(part: Propagation) -> None:
 @check("propagation")
 def check_propagation_monotone(part: Propagation) -> None:
     """Raising confidences lowers no node."""
-    case = world("cloud")
+    case = get_case("cloud")
     g = torch.Generator().manual_seed(8)
     for _ in range(4):
         some = torch.arange(len(case.logits)) % 5 == 0
@@ -82,7 +82,7 @@ def check_propagation_monotone(part: Propagation) -> None:
 def check_propagation_conservative(part: Propagation) -> None:
     """No suspect is lost: a node is at least as suspect as each of its members."""
     for name in ("cloud", "huge logits"):
-        case = world(name)
+        case = get_case(name)
         held = _spread(part, case)[case.hierarchy.node_of]
         at_most(f"world {name!r}: members against their nodes", case.logits, held, 1e-5, ROUNDING)
 
@@ -90,7 +90,7 @@ def check_propagation_conservative(part: Propagation) -> None:
 @check("propagation")
 def check_propagation_tree_local(part: Propagation) -> None:
     """Changing one tree leaves the others as they were, bit by bit."""
-    case = world("cloud")
+    case = get_case("cloud")
     root = tree_roots(case.hierarchy.parent)
     first = root[case.hierarchy.node_of[0]]
     changed = case.logits + 3.0 * (root[case.hierarchy.node_of] == first)
@@ -102,7 +102,7 @@ def check_propagation_tree_local(part: Propagation) -> None:
 @check("propagation", trait="idempotent")
 def check_propagation_idempotent(part: Propagation) -> None:
     """Giving the result back to the members and propagating again changes no node with members."""
-    case = world("cloud")
+    case = get_case("cloud")
     once = _spread(part, case)
     twice = _spread(part, case, once[case.hierarchy.node_of])
     owners = _owners(case.hierarchy)
@@ -112,7 +112,7 @@ def check_propagation_idempotent(part: Propagation) -> None:
 @check("propagation", trait="parent_bound")
 def check_propagation_parent_bound(part: Propagation) -> None:
     """A parent is at least as suspect as each of its children."""
-    case = world("cloud")
+    case = get_case("cloud")
     got = _spread(part, case)
     at_most("children against their parents", got, got[case.hierarchy.parent], 1e-5, ROUNDING)
 
@@ -121,7 +121,7 @@ def check_propagation_parent_bound(part: Propagation) -> None:
 def check_propagation_gradient(part: Propagation) -> None:
     """Agrees with finite differences in double precision away from ties; at ties the gradient is finite."""
     n = 24
-    case = world("huge logits")
+    case = get_case("huge logits")
     distinct = torch.linspace(-4, 4, n, dtype=torch.float64)[torch.arange(n) * 7 % n].clone().requires_grad_(True)
     torch.autograd.gradcheck(lambda z: part.propagate(z, case.hierarchy), (distinct,), eps=1e-6, atol=1e-5)
     tied = torch.zeros(n, dtype=torch.float64, requires_grad=True)

@@ -10,7 +10,7 @@ import torch
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.shapes import check_shape
 from gsstream.parts.regularizer.base import AnalyticPenalty, Regularizer
-from gsstream.testing.cases import World, forest, world
+from gsstream.testing.cases import World, forest, get_case
 from gsstream.testing.compare import ROUNDING, at_most, equal, finite
 from gsstream.testing.registry import check
 
@@ -39,7 +39,7 @@ def _total(terms: Mapping[str, torch.Tensor]) -> torch.Tensor:
 @check("regularizer")
 def check_regularizer_scalar(part: Regularizer) -> None:
     """Each term is a finite scalar >= 0 in the input's dtype."""
-    for case in (world("cloud"), world("cloud").double()):
+    for case in (get_case("cloud"), get_case("cloud").double()):
         for name, value in _terms(part, case).items():
             check_shape(f"term {name!r}", value, ())
             finite(f"term {name!r}", value)
@@ -49,14 +49,14 @@ def check_regularizer_scalar(part: Regularizer) -> None:
 @check("regularizer")
 def check_regularizer_terms(part: Regularizer) -> None:
     """The names of the terms do not depend on the input, so that logs line up."""
-    names = {name: list(_terms(part, world(name))) for name in ("one", "two identical", "cloud")}
+    names = {name: list(_terms(part, get_case(name))) for name in ("one", "two identical", "cloud")}
     assert len({tuple(found) for found in names.values()}) == 1, f"terms differ from input to input: {names}"
 
 
 @check("regularizer")
 def check_regularizer_zero_at_rest(part: Regularizer) -> None:
     """All closed and no residual costs exactly 0."""
-    case = world("cloud")
+    case = get_case("cloud")
     rest = _total(_terms(part, case, torch.zeros(case.hierarchy.num_nodes), torch.zeros_like(case.residual)))
     equal("penalty at rest", rest, torch.zeros_like(rest))
 
@@ -64,7 +64,7 @@ def check_regularizer_zero_at_rest(part: Regularizer) -> None:
 @check("regularizer")
 def check_regularizer_monotone(part: Regularizer) -> None:
     """Raising an open probability or enlarging a residual does not lower the total."""
-    case = world("cloud")
+    case = get_case("cloud")
     before = _total(_terms(part, case))
     for node in range(0, case.hierarchy.num_nodes, 4):
         opened = _opened(case)
@@ -81,7 +81,7 @@ def check_regularizer_monotone(part: Regularizer) -> None:
 def check_regularizer_linear_in_weight(part: Regularizer) -> None:
     """Doubling the claimed weights doubles the total; zero weights give exactly 0 and no gradient."""
     weights = part.claims().weights
-    case = world("cloud")
+    case = get_case("cloud")
 
     def scaled(factor: float) -> Regularizer:
         values: dict[str, Any] = {name: factor * getattr(part.config, name) for name in weights}
@@ -100,7 +100,7 @@ def check_regularizer_linear_in_weight(part: Regularizer) -> None:
 @check("regularizer")
 def check_regularizer_gradient(part: Regularizer) -> None:
     """Agrees with finite differences in double precision; finite where nothing moves and all is closed."""
-    case = world("two identical").double()
+    case = get_case("two identical").double()
     inputs = (torch.tensor([0.3, 0.7], dtype=torch.float64, requires_grad=True), case.residual.requires_grad_(True))
     if not _total(part.penalty(*inputs, case.hierarchy, 2)).requires_grad:
         return  # it costs nothing, whatever the input
@@ -115,7 +115,7 @@ def check_regularizer_gradient(part: Regularizer) -> None:
 @check("regularizer")
 def check_regularizer_reduction(part: Regularizer) -> None:
     """A scene beside its own copy costs the same (reduction "mean") or twice as much ("sum"), and so do many copies."""
-    case = world("cloud")
+    case = get_case("cloud")
     once, m = _total(_terms(part, case)), case.hierarchy.num_nodes
     half = forest(len(case.logits))
     both = Hierarchy(*(torch.cat([a, a + step]) for a, step in ((half.node_of, m), (half.parent, m), (half.level, 0))))
@@ -131,7 +131,7 @@ def check_regularizer_reduction(part: Regularizer) -> None:
 @check("regularizer")
 def check_regularizer_closed_rows(part: Regularizer) -> None:
     """Rows that are left out because their gates are closed cost what they cost when they were kept: nothing."""
-    case = world("cloud")
+    case = get_case("cloud")
     opened = _opened(case)
     closed = torch.arange(case.hierarchy.num_nodes) % 2 == 0
     opened[closed] = 0.0
@@ -144,19 +144,19 @@ def check_regularizer_closed_rows(part: Regularizer) -> None:
 @check("regularizer")
 def check_regularizer_empty(part: Regularizer) -> None:
     """No active rows cost exactly 0."""
-    case = world("empty")
+    case = get_case("empty")
     total = _total(_terms(part, case))
     equal("no Gaussians", total, torch.zeros_like(total))
-    scene = world("cloud")
+    scene = get_case("cloud")
     none_active = part.penalty(_opened(scene), scene.residual[:0], scene.hierarchy.rows(slice(0, 0)), len(scene.logits))
     total = _total(none_active)
     equal("no active rows", total, torch.zeros_like(total))
 
 
 @check("regularizer", trait="gate_terms")
-def check_regularizer_uses_what_it_says(part: Regularizer) -> None:
+def check_regularizer_reads_weights(part: Regularizer) -> None:
     """Terms said to price gates alone (gate_terms) do not depend on the residual."""
-    case = world("cloud")
+    case = get_case("cloud")
     still, moving = (_terms(part, case, None, factor * case.residual) for factor in (0.0, 1.0))
     for name in part.claims().gate_terms:
         assert name in moving, f"RegularizerTraits.gate_terms names {name!r}; the terms are {', '.join(moving)}"
@@ -169,7 +169,7 @@ def check_regularizer_form(part: Regularizer) -> None:
     form = part.form()
     if not isinstance(form, AnalyticPenalty):
         return
-    case = world("cloud")
+    case = get_case("cloud")
     hierarchy, count = case.hierarchy, 3 * len(case.residual)
     probability = torch.linspace(0.01, 0.99, hierarchy.num_nodes).requires_grad_()
     residual = case.residual.clone().requires_grad_()

@@ -10,7 +10,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.parts.render.backward import gradient_of
 from gsstream.parts.render.base import TILE, Renderer, RenderOutput
 from gsstream.parts.render.reference import ALPHA_CUT, project
-from gsstream.testing.cases import BLACK, RENDERER, SIZE, Scene, fingerprint, world
+from gsstream.testing.cases import BLACK, RENDERER, SIZE, Scene, fingerprint, get_case
 from gsstream.testing.compare import EXACT, at_most, equal, finite, gradients_equal, relative
 from gsstream.testing.registry import check
 from gsstream.testing.renderer import loss_and_grad as loss_and_grad  # its checks register themselves
@@ -41,7 +41,7 @@ def _next(scene: Scene, rows: torch.Tensor) -> Scene:
 def check_renderer_range(part: Renderer) -> None:
     """[H, W, 3] and [H, W], finite; a pixel lies between 0 and the brightest colour; nothing drawn is background."""
     for name in WORLDS:
-        case = world(name)
+        case = get_case(name)
         got = _draw(part, case.gaussians, case.cameras)
         shapes = (tuple(got.image.shape), tuple(got.alpha.shape))
         assert shapes == ((SIZE, SIZE, 3), (SIZE, SIZE)), f"world {name!r}: expected [{SIZE}, {SIZE}, 3], got {shapes}"
@@ -56,7 +56,7 @@ def check_renderer_range(part: Renderer) -> None:
         at_most(f"world {name!r}: image below 0", -dark, 0.0, 1e-5, why)
         at_most(f"world {name!r}: alpha", got.alpha, 1.0, 1e-5, "1 - transmittance")
         at_most(f"world {name!r}: alpha below 0", -got.alpha, 0.0, 1e-5, "1 - transmittance")
-    nothing = _draw(part, world("empty").gaussians, world("empty").cameras).image
+    nothing = _draw(part, get_case("empty").gaussians, get_case("empty").cameras).image
     equal("no Gaussians", nothing, torch.tensor(GREY).expand(SIZE, SIZE, 3), 1e-6, "the background alone")
 
 
@@ -64,7 +64,7 @@ def check_renderer_range(part: Renderer) -> None:
 def check_renderer_reference(part: Renderer) -> None:
     """Image and alpha are those of the reference renderer, from every camera."""
     for name in ("line", "cloud", "thin", "unseen"):
-        case = world(name)
+        case = get_case(name)
         for view in range(len(case.cameras)):
             got, want = (_draw(each, case.gaussians, case.cameras, view) for each in (part, RENDERER))
             for what, a, b in (("image", got.image, want.image), ("alpha", got.alpha, want.alpha)):
@@ -76,7 +76,7 @@ def check_renderer_reference(part: Renderer) -> None:
 @check("renderer")
 def check_renderer_gradient(part: Renderer) -> None:
     """The gradient of every attribute is that of the reference renderer, from every camera."""
-    case = world("cloud")
+    case = get_case("cloud")
     weights = torch.randn(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(8))
     for view in range(len(case.cameras)):
         got, want = (case.gaussians.map(lambda v: v.clone().requires_grad_()) for _ in range(2))
@@ -90,7 +90,7 @@ def check_renderer_gradient(part: Renderer) -> None:
 @check("renderer")
 def check_renderer_repeatable(part: Renderer) -> None:
     """The same scene gives the same image, bit for bit; scene and cameras come out as they went in."""
-    case = world("cloud")
+    case = get_case("cloud")
     scene = replace(case.gaussians, opacities=case.gaussians.opacities.clone())
     scene.opacities[::3] = 9.0  # nearly opaque
     before = fingerprint((scene, case.cameras))
@@ -103,7 +103,7 @@ def check_renderer_repeatable(part: Renderer) -> None:
 @check("renderer")
 def check_renderer_screen_gradient(part: Renderer) -> None:
     """Agrees with finite differences of the reference, in pixels; who is not in view has none and is not visible."""
-    case = world("line")
+    case = get_case("line")
     weights = torch.randn(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(6))
     got = part.screen_gradient(case.gaussians, case.cameras, 1, weights)
     picked = torch.arange(0, len(case.gaussians), 3)
@@ -119,7 +119,7 @@ def check_renderer_screen_gradient(part: Renderer) -> None:
             want[place, axis] = (ends[0] - ends[1]) / (2 * eps)
     relative("gradient of the 2-D means", got.gradient[picked], want.float(), 5e-3, SUMS, floor=0.1)
 
-    case = world("unseen")
+    case = get_case("unseen")
     got = part.screen_gradient(case.gaussians, case.cameras, 0, weights)
     hidden = case.gaussians.means[:, 1] > 10
     assert not bool(got.visible[hidden].any()), "Gaussians far outside the image are called visible"
@@ -134,14 +134,14 @@ def check_renderer_screen_gradient(part: Renderer) -> None:
 
 
 @check("renderer")
-def check_renderer_visible(part: Renderer) -> None:
+def check_renderer_contributing(part: Renderer) -> None:
     """Who has a gradient in marked tiles is visible in them, and the footprint of who is visible meets one of them."""
     weights = torch.randn(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(7))
     count = -(-SIZE // TILE)
     first, last = (torch.arange(count * count).reshape(count, count) == place for place in (0, count * count - 1))
     masks = (first, last, first | True)
     for name in ("empty", "line", "cloud", "unseen"):
-        case = world(name)
+        case = get_case(name)
         session = part.open(case.gaussians, None, case.cameras, GREY)
         for view in range(len(case.cameras)):
             for mask in masks:
@@ -162,8 +162,8 @@ def check_renderer_visible(part: Renderer) -> None:
         equal(f"world {name!r}: visible in the narrowed session", got, want)
         for tiles in ([last] * len(case.cameras), [last, first], [last & False] * len(case.cameras)):
             asked = torch.stack([*tiles, *[first & False] * (len(case.cameras) - len(tiles))])[: len(case.cameras)]
-            each_alone = torch.stack([fresh.visible(view, asked[view]) for view in range(len(asked))]).any(0)
-            equal(f"world {name!r}: visible anywhere", session.visible_anywhere(asked), each_alone)
+            elementwise = torch.stack([fresh.visible(view, asked[view]) for view in range(len(asked))]).any(0)
+            equal(f"world {name!r}: visible anywhere", session.visible_anywhere(asked), elementwise)
 
 
 def _reached(scene: Scene, cameras: Cameras, view: int, mask: torch.Tensor) -> torch.Tensor:
@@ -182,7 +182,7 @@ def _reached(scene: Scene, cameras: Cameras, view: int, mask: torch.Tensor) -> t
 @check("renderer")
 def check_renderer_session(part: Renderer) -> None:
     """A session whose active rows changed shows what a fresh render of the whole shows, with the same gradients."""
-    case = world("cloud")
+    case = get_case("cloud")
     active = torch.arange(0, len(case.gaussians), 9)
     changed = _next(case.gaussians, active)
     weights = torch.randn(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(2))
@@ -207,7 +207,7 @@ def check_renderer_session(part: Renderer) -> None:
 @check("renderer")
 def check_renderer_commit(part: Renderer) -> None:
     """After ``commit`` a session is, bit for bit, one opened anew with the next scene."""
-    case = world("cloud")
+    case = get_case("cloud")
     active = torch.arange(0, len(case.gaussians), 9)
     later = _next(case.gaussians, active)
     session = part.open(case.gaussians, None, case.cameras, GREY)

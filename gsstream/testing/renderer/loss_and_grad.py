@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsstream.core.changes.motion import Moves
+from gsstream.core.changes.motion import GroupTransforms
 from gsstream.core.errors import ComponentError, ShapeError
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.parts.loss.base import Loss
@@ -19,7 +19,7 @@ from gsstream.parts.render.exposure import CameraExposure
 from gsstream.parts.render.target import ViewTarget
 from gsstream.parts.render.wrt import LossAndGrad, Wrt, WrtRows, WrtScene, WrtTransforms
 from gsstream.plugins.catalog import load_catalog
-from gsstream.testing.cases import SIZE, Scene, fingerprint, world
+from gsstream.testing.cases import SIZE, Scene, fingerprint, get_case
 from gsstream.testing.compare import EXACT, at_most, equal, gradients_equal, relative
 from gsstream.testing.registry import check
 
@@ -66,7 +66,7 @@ def cases() -> Iterator[tuple[str, int, ViewTarget]]:
 
 def narrowed(part: Renderer) -> tuple[RenderSession, Scene]:
     """Return a narrowed session, and other values of its rows."""
-    case = world("cloud")
+    case = get_case("cloud")
     active = torch.arange(0, len(case.gaussians), 9)
     session = part.open(case.gaussians, None, case.cameras, GREY)
     session.narrow(active)
@@ -74,11 +74,11 @@ def narrowed(part: Renderer) -> tuple[RenderSession, Scene]:
     return session, case.gaussians.rows(active).map(lambda v: v + 0.02 * torch.randn(v.shape, generator=g))
 
 
-def transforms(count: int) -> Moves:
+def transforms(count: int) -> GroupTransforms:
     """Return small transforms of three groups of so many rows."""
     rng = np.random.default_rng(5)
     parts = (0.02 * rng.standard_normal((3, 3)) for _ in range(3))
-    return Moves(np.arange(count), np.arange(count) % 3, *parts)
+    return GroupTransforms(np.arange(count), np.arange(count) % 3, *parts)
 
 
 def compare(what: str, got: LossAndGrad[Any], want: LossAndGrad[Any], tolerance: float) -> None:
@@ -117,7 +117,7 @@ def check_renderer_loss_and_grad(part: Renderer) -> None:
 @check("renderer")
 def check_renderer_loss_and_grad_scene(part: Renderer) -> None:
     """A wide session's own ``loss_and_grad`` gives what the default body gives by a whole scene."""
-    case = world("cloud")
+    case = get_case("cloud")
     session = part.open(case.gaussians, None, case.cameras, GREY)
     if type(session).loss_and_grad is RenderSession.loss_and_grad:
         return
@@ -156,7 +156,7 @@ def check_renderer_grad(part: Renderer) -> None:
 @check("renderer")
 def check_renderer_grad_unseen(part: Renderer) -> None:
     """Rows that are not in view have a gradient of exactly 0, alone and as a whole scene."""
-    case = world("unseen")
+    case = get_case("unseen")
     loss = ReferenceLoss()
     target = ViewTarget(loss, loss.prepare(IMAGE), 0.2, IMAGE)
     hidden = (case.gaussians.means[:, 1] > 10).nonzero()[:, 0]

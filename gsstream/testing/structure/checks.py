@@ -11,7 +11,7 @@ from gsstream.core.errors import InputError
 from gsstream.core.frame import PointCloud
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.parts.structure.base import Structure
-from gsstream.testing.cases import World, world
+from gsstream.testing.cases import World, get_case
 from gsstream.testing.compare import finite
 from gsstream.testing.registry import check
 
@@ -32,7 +32,7 @@ def _built(part: Structure, case: World) -> Hierarchy:
 def check_structure_partition(part: Structure) -> None:
     """Every Gaussian has a node, int64 in [0, M); every node has a member or a child."""
     for name in WORLDS:
-        case = world(name)
+        case = get_case(name)
         forest = _built(part, case)
         n, m = len(case.gaussians), forest.num_nodes
         dtype = forest.node_of.dtype
@@ -51,7 +51,7 @@ def check_structure_partition(part: Structure) -> None:
 def check_structure_forest(part: Structure) -> None:
     """A root is its own parent; following parents ends at a root within max(level) steps."""
     for name in WORLDS:
-        forest = _built(part, world(name))
+        forest = _built(part, get_case(name))
         m = forest.num_nodes
         forest_parent = forest.parent
         low, high = int(forest_parent.min()), int(forest_parent.max())
@@ -74,7 +74,7 @@ def check_structure_forest(part: Structure) -> None:
 @check("structure")
 def check_structure_label_free(part: Structure) -> None:
     """Permuting the Gaussians gives the same groups, whatever the nodes are called."""
-    case = world("cloud")
+    case = get_case("cloud")
     order = torch.randperm(len(case.gaussians), generator=torch.Generator().manual_seed(5))
     first = canonical(_built(part, case).node_of[order])
     second = canonical(_built(part, case.permuted(order)).node_of)
@@ -86,7 +86,7 @@ def check_structure_label_free(part: Structure) -> None:
 def check_structure_locality(part: Structure) -> None:
     """Two members of one node are within one root cell of each other along every axis."""
     for name in ("line", "cloud", "unseen"):
-        case = world(name)
+        case = get_case(name)
         forest, cell = _built(part, case), float(case.anchors.cell_sizes[0])
         for node in range(forest.num_nodes):
             members = case.gaussians.means[forest.node_of == node]
@@ -102,7 +102,7 @@ def check_structure_locality(part: Structure) -> None:
 @check("structure", trait="idempotent")
 def check_structure_idempotent(part: Structure) -> None:
     """Building again from the same Gaussians, also stored node by node, gives the same forest."""
-    case = world("cloud")
+    case = get_case("cloud")
     forest = _built(part, case)
     order = torch.argsort(forest.node_of, stable=True)
     again = _built(part, case.permuted(order))
@@ -115,7 +115,7 @@ def check_structure_idempotent(part: Structure) -> None:
 def check_structure_degenerate(part: Structure) -> None:
     """Coincident, collapsed and far clouds: a valid forest, at most N nodes per level, M = 0 for N = 0."""
     for name in ("coincident", "empty", "far", "tiny", "vast", "thin", "two identical"):
-        case = world(name)
+        case = get_case(name)
         forest = _built(part, case)
         forest.validate()
         deepest = int(forest.level.max()) + 1 if forest.num_nodes else 1
@@ -126,7 +126,7 @@ def check_structure_degenerate(part: Structure) -> None:
 @check("structure")
 def check_structure_no_gradient(part: Structure) -> None:
     """Nothing it returns carries a gradient."""
-    case = world("cloud")
+    case = get_case("cloud")
     case = replace(case, gaussians=case.gaussians.map(lambda t: t.clone().requires_grad_(True)))
     forest = _built(part, case)
     carried = [name for name in ("node_of", "parent", "level") if getattr(forest, name).requires_grad]
@@ -139,7 +139,7 @@ def check_structure_no_gradient(part: Structure) -> None:
 def check_structure_seed(part: Structure) -> None:
     """Anchors are finite, levels index cell sizes, cells are positive and never grow; no points raise InputError."""
     for name in (*WORLDS, "coincident"):
-        case = world(name)
+        case = get_case(name)
         anchors = part.seed(case.points, case.cameras)
         n, levels, sizes = len(anchors.positions), len(anchors.cell_sizes), anchors.cell_sizes
         shapes = tuple(anchors.positions.shape), tuple(anchors.colors.shape)
@@ -153,7 +153,7 @@ def check_structure_seed(part: Structure) -> None:
         assert bool((sizes.diff() <= 0).all()), f"world {name!r}: cell_sizes grow: {sizes.tolist()}"
     nothing = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), "nothing")
     try:
-        part.seed(nothing, world("cloud").cameras)
+        part.seed(nothing, get_case("cloud").cameras)
     except InputError:
         return
     raise AssertionError("no points were accepted; expected InputError saying what to do")
@@ -162,7 +162,7 @@ def check_structure_seed(part: Structure) -> None:
 @check("structure", trait="local")
 def check_structure_translation(part: Structure) -> None:
     """Moved by whole root cells, along any axis, the Gaussians are grouped as before."""
-    case = world("cloud")
+    case = get_case("cloud")
     # Binary fractions: moving by a cell is exact, so nothing may fall on the other side of a border.
     means = torch.round(case.gaussians.means * 1024) / 1024
     anchors = replace(case.anchors, cell_sizes=torch.tensor([0.5, 0.25]), origin=torch.tensor([-2.0, -2.0, -2.0]))

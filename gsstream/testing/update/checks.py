@@ -12,9 +12,9 @@ from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.packet import quantise_decoders
 from gsstream.packet.base import MAX_CHANNELS
 from gsstream.parts.optimiser.joint import add_joint, decode_joint, join_features
-from gsstream.parts.update.base import UpdateRule, init_latents, symbols
-from gsstream.parts.update.joint import joint_code
-from gsstream.testing.cases import fingerprint, world
+from gsstream.parts.update.base import UpdateRule, init_latents, quantise_latents
+from gsstream.parts.update.joint import joint_layout
+from gsstream.testing.cases import fingerprint, get_case
 from gsstream.testing.compare import equal
 from gsstream.testing.registry import check
 
@@ -22,7 +22,7 @@ LEVELS = 4
 
 
 def _decoders(part: UpdateRule, seed: int = 3) -> dict[str, torch.Tensor]:
-    return part.init_decoders(world("cloud").gaussians, torch.Generator().manual_seed(seed))
+    return part.init_decoders(get_case("cloud").gaussians, torch.Generator().manual_seed(seed))
 
 
 @check("update")
@@ -43,7 +43,7 @@ def check_update_codes(part: UpdateRule) -> None:
 @check("update")
 def check_update_decoders(part: UpdateRule) -> None:
     """Decoders are [L, D] float32 of the attributes that have latents, drawn from the generator alone."""
-    case, codes = world("cloud"), part.codes()
+    case, codes = get_case("cloud"), part.codes()
     decoders = _decoders(part)
     for name, code in codes.items():
         width = int(getattr(case.gaussians, name)[0].numel())
@@ -62,7 +62,7 @@ def check_update_decoders(part: UpdateRule) -> None:
 @check("update")
 def check_update_closed_loop(part: UpdateRule) -> None:
     """What training renders is what a player computes from the integers, to the last bits of float32."""
-    case = world("cloud")
+    case = get_case("cloud")
     before = fingerprint(case.gaussians)
     n = len(case.gaussians)
     layout = Layout(np.ones(n, np.int32), np.zeros(n, np.uint8), np.array([0.25], np.float32))
@@ -76,13 +76,13 @@ def check_update_closed_loop(part: UpdateRule) -> None:
         name: codes[name].step * 3 * torch.randn(value.shape, generator=g)
         for name, value in init_latents(part, case.gaussians).items()
     }
-    code = joint_code(codes, latents, decoders, case.gaussians)
+    code = joint_layout(codes, latents, decoders, case.gaussians)
     table = torch.cat(list(latents.values()), 1) if latents else torch.zeros(n, 0)
     change = decode_joint(code, table, code.join_decoders(decoders), torch.full((n,), 0.25))
     features = join_features(code, case.gaussians)
     trained = add_joint(code, case.gaussians, features, change, level / LEVELS)
     rows = sent_rows(layout, level.numpy())
-    integers: Mapping[str, torch.Tensor] = symbols(codes, latents)
+    integers: Mapping[str, torch.Tensor] = quantise_latents(codes, latents)
     residual = Residual(
         level.numpy().astype(np.uint8), LEVELS, {name: value.numpy()[rows] for name, value in integers.items()},
         {name: codes[name].step for name in integers}, sent,

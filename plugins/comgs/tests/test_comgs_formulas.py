@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import torch
 from gsstream_comgs.correction import corrected
-from gsstream_comgs.influence import Field, KeyPoints, field_of, matrices, moved_by, weights_of
+from gsstream_comgs.influence import Field, KeyPoints, field_of, matrices, apply_motion_field, weights_of
 from gsstream_comgs.settings import CorrectionSettings
 from scipy.spatial.transform import Rotation
 
 from gsstream.api import Gaussians, Layout, LossAndGrad, Scene, Wrt, apply_motion
-from gsstream.blocks import said_by_cells
+from gsstream.blocks import approximate_by_cells
 
 RNG = np.random.default_rng(0)
 
@@ -66,7 +66,7 @@ def test_the_field_is_the_weighted_sum_of_rigid_motions() -> None:
 def test_gaussians_turn_with_the_field() -> None:
     scene = scene_of(RNG.normal(size=(5, 3))).gaussians.map(torch.from_numpy)
     turn = torch.from_numpy(RNG.normal(0, 0.3, (5, 3)).astype(np.float32))
-    after = moved_by(scene, Field(torch.zeros(5, 3), turn))
+    after = apply_motion_field(scene, Field(torch.zeros(5, 3), turn))
     for i in range(5):
         before = Rotation.from_quat(np.roll(scene.quats[i].numpy(), -1)).as_matrix()
         expected = turned(turn[i].numpy()).as_matrix() @ before
@@ -76,7 +76,7 @@ def test_gaussians_turn_with_the_field() -> None:
 def test_cells_say_a_field_that_is_the_same_everywhere_to_half_a_step() -> None:
     scene, rows = scene_of(RNG.uniform(-1, 1, (200, 3))), np.arange(200)
     shift = np.tile([0.33, -0.21, 0.05], (200, 1))
-    motion = said_by_cells(scene, rows, shift, np.zeros((200, 3)), 0.5, 0.02)
+    motion = approximate_by_cells(scene, rows, shift, np.zeros((200, 3)), 0.5, 0.02)
     assert motion is not None
     after, touched = apply_motion(scene, motion)
     assert len(touched) == 200
@@ -86,11 +86,11 @@ def test_cells_say_a_field_that_is_the_same_everywhere_to_half_a_step() -> None:
 def test_cells_of_which_most_may_not_move_stay() -> None:
     scene = scene_of(np.array([[0.1, 0.1, 0.1], [0.2, 0.1, 0.1], [0.3, 0.1, 0.1], [5.1, 0.1, 0.1]]))
     rest = np.zeros((1, 3))
-    motion = said_by_cells(scene, np.array([0, 3]), np.ones((2, 3)), np.zeros((2, 3)), 1.0, 0.1)
+    motion = approximate_by_cells(scene, np.array([0, 3]), np.ones((2, 3)), np.zeros((2, 3)), 1.0, 0.1)
     assert motion is not None
     assert apply_motion(scene, motion)[1].tolist() == [3]
-    assert said_by_cells(scene, np.array([0]), rest + 1, rest, 1.0, 0.1) is None
-    assert said_by_cells(scene, np.array([3]), rest, rest, 1.0, 0.1) is None
+    assert approximate_by_cells(scene, np.array([0]), rest + 1, rest, 1.0, 0.1) is None
+    assert approximate_by_cells(scene, np.array([3]), rest, rest, 1.0, 0.1) is None
 
 
 class Wrong:

@@ -187,4 +187,4 @@ def test_updates_of_few_blocks_leave_what_a_forward_of_the_scene_leaves(isa: str
         assert equal_bits(picture, fresh.forward(splats))
         v_image = upstream(step)[0]
         assert equal_bits(subject.backward_cached(splats, v_image), fresh.backward_cached(splats, v_image))
-        assert np.array_equal(subject.drawn_in_cache(None), fresh.drawn_in_cache(None))
+        assert np.array_equal(subject.contributing_in_cache(None), fresh.contributing_in_cache(None))

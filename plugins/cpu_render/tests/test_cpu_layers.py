@@ -228,7 +228,7 @@ def test_layers_count_as_memory() -> None:
     native = session._view(0).rasterizer._native
     pulled(session, 0, whole.rows(active), comparison())
     layered = native.memory_bytes()
-    native.shed_scratch()
+    native.free_scratch()
     pixels = 6 * 32 * 16 * 7 * 4  # tiles of the picture, their pixels, transmittance and two colours
     assert layered - native.memory_bytes() > pixels
     session.narrow(active)

@@ -11,8 +11,8 @@ from gsstream_cpu_render.renderer import CpuRenderer
 from test_cpu_fit import BACKGROUND, comparison, some_tiles
 from test_cpu_renderer import rig, scene
 
-from gsstream.api import Gaussians, LossAndGrad, Moves, RenderSession, ShapeError, ViewTarget, WrtRows, WrtTransforms
-from gsstream.core.changes.motion import transformed
+from gsstream.api import Gaussians, LossAndGrad, GroupTransforms, RenderSession, ShapeError, ViewTarget, WrtRows, WrtTransforms
+from gsstream.core.changes.motion import transform_groups
 from gsstream.parts.loss.photometric import ReferenceLoss
 from gsstream.parts.render.transforms import transform_vjp
 
@@ -24,23 +24,23 @@ def opened() -> tuple[RenderSession, Gaussians[torch.Tensor]]:
     return CpuRenderer().open(whole, ROWS, rig(), BACKGROUND), whole.rows(ROWS)
 
 
-def moves(seed: int = 5, groups: int = 3, size: float = 0.3) -> Moves:
+def moves(seed: int = 5, groups: int = 3, size: float = 0.3) -> GroupTransforms:
     """Groups of which the last one has no row."""
     rng = np.random.default_rng(seed)
     place = np.arange(len(ROWS)) % (groups - 1)
     values = (size * rng.standard_normal((groups, 3)) for _ in range(3))
-    return Moves(np.arange(len(ROWS)), place, *values)
+    return GroupTransforms(np.arange(len(ROWS)), place, *values)
 
 
-def fused(given: Moves, wanted: ViewTarget, curvature: bool = False) -> LossAndGrad[torch.Tensor]:
+def fused(given: GroupTransforms, wanted: ViewTarget, curvature: bool = False) -> LossAndGrad[torch.Tensor]:
     session, rows = opened()
     return session.loss_and_grad(1, wanted, WrtTransforms(rows, given, curvature))
 
 
-def by_rows(given: Moves, wanted: ViewTarget) -> tuple[torch.Tensor, np.ndarray]:
+def by_rows(given: GroupTransforms, wanted: ViewTarget) -> tuple[torch.Tensor, np.ndarray]:
     """Loss and gradient of the rows after they moved, passed on to their transforms."""
     session, rows = opened()
-    there = transformed(rows.map(torch.Tensor.numpy), given)
+    there = transform_groups(rows.map(torch.Tensor.numpy), given)
     leaves = there.map(lambda value: torch.from_numpy(value.copy()).requires_grad_())
     found = session.loss_and_grad(1, wanted, WrtRows(leaves))
     for (_, leaf), (_, gradient) in zip(leaves.items(), found.grad.items(), strict=True):

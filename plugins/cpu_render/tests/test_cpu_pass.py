@@ -39,7 +39,7 @@ CASES = {
     "a sum instead of a mean": ("s2gs-edge", ("regularizer.reduction=sum", "regularizer.lambda1=1e-4")),
     "gates that are always open": ("dense", ()),
     "rates that fall": ("dense", ("stream.lr_final_factor=0.1",)),
-    "tiles that are drawn": ("s2gs-edge", ("stream.quiet_tiles=0.3",)),
+    "tiles that are drawn": ("s2gs-edge", ("stream.static_tile_share=0.3",)),
     "colour maps of cameras": ("s2gs-edge", ("first_frame.exposure=true",)),
     "residuals without decoders": ("s2gs-edge", ("update=additive",)),
 }
@@ -75,7 +75,7 @@ def solved(parts: Assembly, problem: Problem) -> Solution:
     problem.session.narrow(problem.rows)
     problem.generator.manual_seed(7)
     stream = parts.recipe.stream
-    return optimise(parts, problem, Schedule(stream.epochs, stream.rate_weight))
+    return optimise(parts, problem, Schedule(stream.epochs, stream.rd_lambda))
 
 
 def one_by_one(parts: Assembly, problem: Problem) -> Solution:

@@ -114,7 +114,7 @@ def test_rows_that_a_gradient_reaches_are_those_of_the_whole(share: float) -> No
     subject, splats = rasterizer(), random_splats(300, 6, 4)
     subject.forward(splats)
     v_image = upstream(6)[0] * (np.random.default_rng(6).random((HEIGHT, WIDTH, 1)) < share).astype(np.float32)
-    rows, gradient = subject.pull_cached(splats, v_image)
+    rows, gradient = subject.backward_cached_rows(splats, v_image)
     whole = subject.backward_cached(splats, v_image)[0]
     assert np.all(np.diff(rows) > 0)
     assert np.array_equal(gradient, whole[rows])

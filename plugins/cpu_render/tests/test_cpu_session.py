@@ -7,7 +7,7 @@ import pytest
 import torch
 from cpu_scenes import BACKGROUND, HEIGHT, WIDTH
 from gsstream_cpu_render.arrays import SplatArrays
-from gsstream_cpu_render.pool import lease, release_idle_memory
+from gsstream_cpu_render.pool import acquire_rasterizer, release_idle_memory
 from gsstream_cpu_render.renderer import CpuRenderer
 from test_cpu_renderer import N, grads, leaves, pull, replaced, rig, scene, upstream
 
@@ -38,7 +38,7 @@ def sparse_upstream(seed: int) -> torch.Tensor:
 
 def full_screen_gradient(whole: Scene, view: int, v_image: torch.Tensor) -> ScreenGradient:
     """By the full pass, which renders everything and differentiates everything."""
-    held = lease(rig(), view, BACKGROUND)
+    held = acquire_rasterizer(rig(), view, BACKGROUND)
     rasterizer = held.rasterizer
     rasterizer.forward(SplatArrays(*(value.numpy() for _, value in whole.items())))
     visible = torch.zeros(N, dtype=torch.bool)
@@ -176,7 +176,7 @@ def test_what_fits_does_not_depend_on_what_the_process_did_before() -> None:
 
     release_idle_memory()
     before = kept()
-    large = lease(rig(), 0, BACKGROUND)
+    large = acquire_rasterizer(rig(), 0, BACKGROUND)
     many = scene(5).rows(torch.arange(N).repeat(200))
     large.rasterizer.forward(SplatArrays(*(value.numpy() for _, value in many.items())))
     del large

@@ -31,25 +31,25 @@ CALLS: dict[str, Callable[[NumpyRasterizer], object]] = {
     "backward_active": lambda r: r.backward_active(V_IMAGE),
     "update": lambda r: r.update(IDS, rows_of(SPLATS, IDS), *picture()),
     "backward_cached": lambda r: r.backward_cached(SPLATS, V_IMAGE),
-    "drawn_in_cache": lambda r: r.drawn_in_cache(None),
+    "contributing_in_cache": lambda r: r.contributing_in_cache(None),
     "forward_cached": lambda r: r.forward_cached(),
     "forget": lambda r: r.forget(),
-    "shed_scratch": lambda r: r.shed_scratch(),
+    "free_scratch": lambda r: r.free_scratch(),
 }
-ANY = {"forward", "forget", "shed_scratch"}
-CACHED = ANY | {"freeze", "update", "backward_cached", "drawn_in_cache", "forward_cached"}
+ANY = {"forward", "forget", "free_scratch"}
+CACHED = ANY | {"freeze", "update", "backward_cached", "contributing_in_cache", "forward_cached"}
 #: State: the calls that lead to it, and those it takes.
 STATES = {
     "cached": (["forward", "forward_cached"], CACHED),
     "cached by an update": (["forward", "freeze", "forward_active", "update"], CACHED),
-    "cached, scratch shed": (["forward", "freeze", "shed_scratch"], CACHED),
+    "cached, scratch shed": (["forward", "freeze", "free_scratch"], CACHED),
     "passed": (["forward"], CACHED | {"backward"}),
-    "passed, looked at": (["forward", "backward", "drawn_in_cache", "backward_cached"], CACHED | {"backward"}),
+    "passed, looked at": (["forward", "backward", "contributing_in_cache", "backward_cached"], CACHED | {"backward"}),
     "frozen": (["forward", "freeze"], CACHED | {"forward_active"}),
     "frozen, pass forgotten": (["forward", "freeze", "forward_active", "forward_cached"], CACHED | {"forward_active"}),
     "active_passed": (["forward", "freeze", "forward_active"], CACHED | {"forward_active", "backward_active"}),
     "active_passed, looked at": (
-        ["forward", "freeze", "forward_active", "backward_active", "drawn_in_cache", "backward_cached"],
+        ["forward", "freeze", "forward_active", "backward_active", "contributing_in_cache", "backward_cached"],
         CACHED | {"forward_active", "backward_active"},
     ),
 }  # fmt: skip
@@ -69,7 +69,7 @@ def test_a_state_takes_these_calls_and_no_others(state: str, call: str) -> None:
     with pytest.raises(InputError, match=f"{call}: {MESSAGES.get(call, FORWARD)}"):
         CALLS[call](subject)
     # A refusal changes nothing: what the state takes it still takes.
-    for other in sorted(taken - {"forward", "update", "freeze", "forget", "shed_scratch", "forward_cached"}):
+    for other in sorted(taken - {"forward", "update", "freeze", "forget", "free_scratch", "forward_cached"}):
         CALLS[other](subject)
 
 

@@ -185,13 +185,13 @@ def test_the_rasteriser_refuses_tiles_that_it_did_not_draw() -> None:
     rasterizer = NumpyRasterizer(*camera(*EVEN), *EVEN)
     everything = np.ones((3, 5), np.bool_)
     with pytest.raises(InputError, match="expected a forward pass of the whole scene before"):
-        rasterizer.drawn_in_cache(everything)
+        rasterizer.contributing_in_cache(everything)
     part = everything.copy()
     part[1] = False
     rasterizer.forward(random_splats(N, 0, 4), tile_mask=part)
-    assert rasterizer.drawn_in_cache(part).any()
+    assert rasterizer.contributing_in_cache(part).any()
     with pytest.raises(InputError, match="did not cover"):
-        rasterizer.drawn_in_cache(everything)
+        rasterizer.contributing_in_cache(everything)
 
 
 @pytest.mark.parametrize("megabytes", [None, 0.0, 0.05])

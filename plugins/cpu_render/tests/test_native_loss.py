@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from gsstream_cpu_render.loss import PhotometricTarget, photometric_loss, tile_shape
+from gsstream_cpu_render.loss import PreparedImage, photometric_loss, tile_shape
 from gsstream_cpu_render.threads import set_num_threads
 from numpy.typing import NDArray
 
@@ -94,7 +94,7 @@ def test_value_and_gradient_equal_float64(size: tuple[int, int], pair: Callable[
     image, target = pair(np.random.default_rng(1), *size)
     for weight in (0.0, 0.2, 1.0):
         value, gradient = oracle(image, target, weight)
-        for goal in (target, PhotometricTarget(target)):
+        for goal in (target, PreparedImage(target)):
             result = photometric_loss(image, goal, dssim_weight=weight)
             assert result.value == pytest.approx(value, abs=1e-6)
             # Between flat images of unequal brightness two terms of size w |G - I| / C2 cancel: the worst case.
@@ -129,7 +129,7 @@ def test_masked_sum_and_gradients(seed: int) -> None:
     mask = rng.random(tile_shape(height, width)) < rng.choice([0.05, 0.3, 0.7])
     value, gradient = oracle(image, target, 0.2, mask)
     inside = pixels_of(mask, height, width)
-    for goal, chosen in ((target, mask), (PhotometricTarget(target), mask.astype(np.uint8))):
+    for goal, chosen in ((target, mask), (PreparedImage(target), mask.astype(np.uint8))):
         result = photometric_loss(image, goal, tile_mask=chosen)
         assert result.value == pytest.approx(value, abs=1e-6)
         assert_gradient(result.gradient, gradient * inside)
@@ -161,7 +161,7 @@ def test_empty_mask_costs_nothing() -> None:
 
 def test_equal_images_have_exactly_no_loss_and_no_gradient(isa: str) -> None:
     _, image = near_pair(np.random.default_rng(9), 70, 90)
-    result = photometric_loss(image, PhotometricTarget(image))
+    result = photometric_loss(image, PreparedImage(image))
     assert result.value == 0.0
     assert result.gradient is not None
     assert not result.gradient.any()
@@ -189,7 +189,7 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
     for threads in (1, 2, 3, 7):
         set_num_threads(threads)
         for chosen in (None, mask):
-            r = photometric_loss(image, PhotometricTarget(target), tile_mask=chosen)
+            r = photometric_loss(image, PreparedImage(target), tile_mask=chosen)
             assert r.gradient is not None
             seen.append((r.value, r.gradient.tobytes()))
     assert seen[0::2] == seen[:1] * 4
@@ -269,7 +269,7 @@ def test_wrong_weight_is_refused(weight: float) -> None:
 def test_non_finite_pixels_are_named(value: float) -> None:
     bad = GOOD.copy()
     bad[19, 39, 2] = value
-    for call in (_wrong(image=bad), _wrong(target=bad), lambda: PhotometricTarget(bad)):
+    for call in (_wrong(image=bad), _wrong(target=bad), lambda: PreparedImage(bad)):
         with pytest.raises(ShapeError, match=r"index \[19, 39, 2\]"):
             call()
 
@@ -281,7 +281,7 @@ def test_around_gives_the_dense_gradient_in_masked_tiles(seed: int) -> None:
     image, target = near_pair(rng, height, width)
     mask = rng.random(tile_shape(height, width)) < rng.choice([0.05, 0.3])
     dense = photometric_loss(image, target)
-    part = photometric_loss(image, PhotometricTarget(target), tile_mask=mask, around=True)
+    part = photometric_loss(image, PreparedImage(target), tile_mask=mask, around=True)
     inside = np.broadcast_to(pixels_of(mask, height, width) != 0, image.shape)
     assert dense.gradient is not None
     assert part.gradient is not None

@@ -12,8 +12,8 @@ from gsstream_hicom.motion import cell_sides, fitted_motions
 from gsstream_hicom.settings import BirthSettings, HiCoMConfig, MotionSettings
 
 from gsstream.api import Cameras, Displacement, Gaussians, Layout, LossAndGrad, Scene, Wrt, apply_motion
-from gsstream.blocks import pulled_rows
-from gsstream.testing.stepping import MethodUnderTest
+from gsstream.blocks import high_gradient_rows
+from gsstream.testing.method_driver import MethodUnderTest
 
 RNG = np.random.default_rng(0)
 RIG = Cameras(
@@ -140,6 +140,6 @@ class Shown:
 
 
 def test_copies_are_made_where_the_gradient_in_half_widths_exceeds_the_bound() -> None:
-    assert pulled_rows(Shown(), 0.01).tolist() == [1, 0], "0.16 and 0.012; the largest first"
-    assert pulled_rows(Shown(), 0.1).tolist() == [1]
-    assert pulled_rows(Shown(), 0.2).tolist() == []
+    assert high_gradient_rows(Shown(), 0.01).tolist() == [1, 0], "0.16 and 0.012; the largest first"
+    assert high_gradient_rows(Shown(), 0.1).tolist() == [1]
+    assert high_gradient_rows(Shown(), 0.2).tolist() == []

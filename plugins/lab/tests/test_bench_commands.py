@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from gsstream_lab.bench.native import LOOKS, find_native, measure_peaks
+from gsstream_lab.bench.native import OUTPUT_CHECKS, find_native, measure_peaks
 
 from gsstream.cli.main import run_command
 
 RENDER_KEYS = {
     "renderer", "level", "gaussians", "width", "height", "share", "tiles", "path", "rows", "drawn", "live_pairs",
-    "pixels", "floats", "threads", "forward_ms", "backward_ms", "total_ms", "statistics", "floor_ms", "ratio",
+    "pixels", "floats", "threads", "forward_ms", "backward_ms", "total_ms", "statistics", "roofline_ms", "ratio",
     "ratio_cpu",
 }  # fmt: skip
 FRAME_KEYS = {
@@ -38,7 +38,7 @@ def test_render_without_compiled_renderers(
     assert [case["renderer"] for case in data["cases"]] == ["reference"]
     (case,) = data["cases"]
     assert set(case) == RENDER_KEYS
-    assert (case["floor_ms"], case["ratio"], data["peaks"]) == (None, None, [])
+    assert (case["roofline_ms"], case["ratio"], data["peaks"]) == (None, None, [])
     assert case["live_pairs"] == data["scenes"][0]["live_pairs"] > 0
     assert [skipped["renderer"] for skipped in data["skipped"]] == ["missing"]
     assert "missing" in data["skipped"][0]["why"]
@@ -63,7 +63,7 @@ def test_render_with_the_cpu_renderer(tmp_path: Path) -> None:
     for case in data["cases"]:
         assert set(case) == RENDER_KEYS
         assert 0 < case["total_ms"]["min"] <= case["total_ms"]["median"]
-        assert case["ratio"] == pytest.approx(case["total_ms"]["min"] / case["floor_ms"], rel=0.05)
+        assert case["ratio"] == pytest.approx(case["total_ms"]["min"] / case["roofline_ms"], rel=0.05)
         assert (case["statistics"] is None) == (case["level"] == "part")
         if case["share"] < 1:
             assert case["live_pairs"] < whole["live_pairs"]
@@ -84,8 +84,8 @@ def test_the_reference_renderer_is_left_out_where_it_would_take_minutes(tmp_path
 
 def test_peaks_keep_the_better_of_two_measurements() -> None:
     class Machine:
-        flops = iter([*[4.0] * 7, 10.0, *[5.0] * (LOOKS - 8), *[9.0] * LOOKS])
-        bytes_ = iter([*[0.5] * (LOOKS // 4 - 1), 1.0, 3.0, *[2.0] * (LOOKS // 4 - 1)])
+        flops = iter([*[4.0] * 7, 10.0, *[5.0] * (OUTPUT_CHECKS - 8), *[9.0] * OUTPUT_CHECKS])
+        bytes_ = iter([*[0.5] * (OUTPUT_CHECKS // 4 - 1), 1.0, 3.0, *[2.0] * (OUTPUT_CHECKS // 4 - 1)])
 
         def fma_peak(self, threads: int, seconds: float) -> float:
             return next(self.flops)

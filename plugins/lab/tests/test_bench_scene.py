@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from gsstream_lab.bench.floor import (
+from gsstream_lab.bench.roofline import (
     FLOPS_PER_PAIR,
     FLOPS_PER_VISIBLE,
     Peak,
     central_tiles,
-    floor_ms,
+    roofline_ms,
     footprints,
     live_pairs,
     pixels_of,
@@ -156,10 +156,10 @@ def test_rows_that_move_have_their_centre_in_the_tiles() -> None:
 
 def test_the_floor_is_counted_work_over_peaks() -> None:
     peak = Peak(1, gflops=2.0, gbytes_per_second=4.0)
-    forward, backward = floor_ms(peak, pairs=10**6, visible=0, rows=0, pixels=0, floats=38)
+    forward, backward = roofline_ms(peak, pairs=10**6, visible=0, rows=0, pixels=0, floats=38)
     assert forward == pytest.approx(FLOPS_PER_PAIR[0] * 1e6 / 2e9 * 1e3)
     assert backward == pytest.approx(FLOPS_PER_PAIR[1] * 1e6 / 2e9 * 1e3)
-    forward, backward = floor_ms(peak, pairs=0, visible=1000, rows=10**6, pixels=10**6, floats=38)
+    forward, backward = roofline_ms(peak, pairs=0, visible=1000, rows=10**6, pixels=10**6, floats=38)
     assert forward == pytest.approx(FLOPS_PER_VISIBLE[0] * 1e3 / 2e9 * 1e3 + (38 + 4) * 4e6 / 4e9 * 1e3)
     assert backward == pytest.approx(FLOPS_PER_VISIBLE[1] * 1e3 / 2e9 * 1e3 + (2 * 38 + 4) * 4e6 / 4e9 * 1e3)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from flow_runs import encode, metrics
-from gsstream_lab.gap.measure import Gap, GapView, usual_frames
+from gsstream_lab.gap.measure import Gap, GapView, default_frames
 
 from gsstream.cli.main import run_command
 from gsstream.input.recordings.open import open_source
@@ -98,9 +98,9 @@ def test_mistakes_are_explained(
 
 
 def test_the_usual_frames_are_a_third_two_thirds_and_the_last() -> None:
-    assert usual_frames(range(90)) == [30, 59, 89]
-    assert usual_frames(range(5, 7)) == [5, 6]
-    assert usual_frames(range(1)) == [0]
+    assert default_frames(range(90)) == [30, 59, 89]
+    assert default_frames(range(5, 7)) == [5, 6]
+    assert default_frames(range(1)) == [0]
 
 
 def test_means_are_over_cameras_first_and_leave_out_what_is_not_defined() -> None:

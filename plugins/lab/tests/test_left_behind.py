@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gsstream_lab.left_behind import LeftBehind
 
-from gsstream.engine.run.displacement import displacement_pixels, screen_ways
+from gsstream.engine.run.displacement import displacement_pixels, screen_displacement
 from gsstream.input.recordings.open import open_source
 
 WORLD = "synthetic:scene=stop&event=90&frames=20&views=5&width=96&height=72&supersample=1&shadows=0"
@@ -42,9 +42,9 @@ def test_ways_are_those_of_the_projections(source) -> None:
             uv.append((pixel[:2] / pixel[2]).T)
         inside = [((p >= 0) & (p < (96, 72))).all(1) for p in uv]
         expected.append(np.where(inside[0] & inside[1], np.linalg.norm(uv[1] - uv[0], axis=1), np.nan))
-    np.testing.assert_allclose(screen_ways(before, after, rig), np.nanmean(expected, axis=0), rtol=1e-6)
+    np.testing.assert_allclose(screen_displacement(before, after, rig), np.nanmean(expected, axis=0), rtol=1e-6)
     behind = np.array([[50.0, 0, 1]])
-    assert np.isnan(screen_ways(behind, behind, rig)).all(), "no camera sees it"
+    assert np.isnan(screen_displacement(behind, behind, rig)).all(), "no camera sees it"
     moved = SimpleNamespace(rows=np.arange(40), shift=(after - before).astype(np.float32))
     state = player(after)
     state.scene.moved = moved
@@ -85,7 +85,7 @@ def test_rows_are_followed_through_births_and_deaths_and_faint_ones_are_not_coun
         def __len__(self) -> int:
             return 2
 
-    state.delta = SimpleNamespace(edits_rows=True, births=Born(), deaths=np.array([0, 1, 2]))
+    state.delta = SimpleNamespace(has_row_edit=True, births=Born(), deaths=np.array([0, 1, 2]))
     # Row by row its own node, so that births of node 0 stand first.
     state.before = SimpleNamespace(node_of=np.arange(len(start)))
     assert found.after(state, source.frame(AT), False) == {"body": 37, "outside": 0, "unmoved": 0}

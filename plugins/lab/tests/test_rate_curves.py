@@ -49,7 +49,7 @@ def test_what_cannot_be_compared_is_nan(other: list[tuple[float, float]]) -> Non
 def cells_of(variant: str, factor: float, weights=(1, 2, 3)):
     qualities = {1: (32.0, 40.0), 2: (31.0, 15.0), 3: (30.0, 5.0)}
     return [
-        ("a", variant, {"stream.rate_weight": w}, 0, qualities[w][0], factor * qualities[w][1], 1.0) for w in weights
+        ("a", variant, {"stream.rd_lambda": w}, 0, qualities[w][0], factor * qualities[w][1], 1.0) for w in weights
     ]
 
 
@@ -61,12 +61,12 @@ def test_the_report_has_a_table_and_a_picture_of_each_axis(tmp_path: Path) -> No
     assert [(curve.name, len(curve.groups)) for curve in curves] == [("gates", 3), ("groups", 3)]
     blocks = build_report(data, {})
     (table,) = [block for block in blocks if isinstance(block, Table) and block.caption.startswith("Curves over")]
-    assert table.caption == "Curves over stream.rate_weight, against gates"
+    assert table.caption == "Curves over stream.rd_lambda, against gates"
     gates, groups = table.rows[1:]
     assert gates[:5] == ["gates", "1 to 3", "40.0 to 5.0", "33.00 to 31.00", "-"]
     assert groups[:5] == ["groups", "1 to 3", "20.0 to 2.5", "33.00 to 31.00", "-50 %"]
     (picture,) = [block for block in blocks if isinstance(block, Picture) and "curves" in block.name]
-    assert picture.name == "a-rate_weight-curves.png"
+    assert picture.name == "a-rd_lambda-curves.png"
     assert picture.data.startswith(b"\x89PNG")
 
 
@@ -76,9 +76,9 @@ def test_a_single_family_makes_no_curves(tmp_path: Path) -> None:
 
 
 def test_points_that_cost_more_for_no_more_quality_are_left_out(tmp_path: Path) -> None:
-    beaten = ("a", "gates", {"stream.rate_weight": 4}, 0, 30.5, 20.0, 1.0)
+    beaten = ("a", "gates", {"stream.rd_lambda": 4}, 0, 30.5, 20.0, 1.0)
     cells = [*cells_of("gates", 1.0), beaten, *cells_of("other", 2.0)]
     data = read_sweep_data(make_table(tmp_path / "swept", cells))
-    gates = curves_over(data.of("a"))["stream.rate_weight"][0]
+    gates = curves_over(data.of("a"))["stream.rd_lambda"][0]
     assert len(gates.groups) == 4
     assert gates.points("psnr") == [(5.0, 31.0), (15.0, 32.0), (40.0, 33.0)]

@@ -65,16 +65,16 @@ def test_settings_win_in_the_documented_order(plan_of, tmp_path):
     (tmp_path / "s.yaml").write_text("near: 0.3\nfirst_frame: {lr_factor: 0.3, exposure: true}\n")
     text = (
         "name: o\nscenes: [{name: a, uri: demo, recipe: s.yaml, "
-        "set: {first_frame.lr_factor: 0.4, stream.rate_weight: 0.4}}]\n"
-        "set: {first_frame.lr_factor: 0.35, stream.rate_weight: 0.35, codec.trim: 0.35}\n"
-        "variants: [{name: v, recipe: v.yaml, set: {stream.rate_weight: 0.5}}]\naxes: {codec.trim: [0.6]}\n"
+        "set: {first_frame.lr_factor: 0.4, stream.rd_lambda: 0.4}}]\n"
+        "set: {first_frame.lr_factor: 0.35, stream.rd_lambda: 0.35, codec.trim: 0.35}\n"
+        "variants: [{name: v, recipe: v.yaml, set: {stream.rd_lambda: 0.5}}]\naxes: {codec.trim: [0.6]}\n"
     )
     recipe = plan_of(text).points[0].resolved.recipe
     assert (recipe.stream.epochs, recipe.near, recipe.first_frame.lr_factor) == (2, 0.3, 0.4)
-    assert (recipe.stream.rate_weight, recipe.codec.trim) == (0.5, 0.6)
+    assert (recipe.stream.rd_lambda, recipe.codec.trim) == (0.5, 0.6)
     assert (recipe.seed, recipe.first_frame.exposure) == (0, True)
     origins = plan_of(text).points[0].resolved
-    assert origins.origin(("stream", "rate_weight")).label == "sweep, variant v: set"
+    assert origins.origin(("stream", "rd_lambda")).label == "sweep, variant v: set"
 
 
 def test_a_slot_takes_a_name_a_mapping_and_the_short_form(plan_of):
@@ -91,7 +91,7 @@ def test_frame_0_is_shared_exactly_where_it_does_not_vary(plan_of):
     variants = "[{name: v, method: dense}, {name: w, method: dense, set: KEY}]"
     text = f"name: f\n{SCENE}seeds: [0, 1]\nvariants: {variants}\n"
     for key, count in {
-        "{stream.epochs: 3}": 2, "{stream.rate_weight: 0.3}": 2, "{first_frame.lr_factor: 0.1}": 4,
+        "{stream.epochs: 3}": 2, "{stream.rd_lambda: 0.3}": 2, "{first_frame.lr_factor: 0.1}": 4,
         "{structure: other}": 4, "{first_frame.epochs: 3}": 4, "{near: 0.2}": 4, "{scale: 0.5}": 4,
     }.items():  # fmt: skip
         plan = plan_of(text.replace("KEY", key))

@@ -12,7 +12,7 @@ from gsstream_onnx_confidence.estimator import OnnxConfidence
 
 from gsstream.api import InputError, PluginUnavailable, ShapeError
 from gsstream.cli.main import run_command
-from gsstream.testing.cases import world
+from gsstream.testing.cases import get_case
 
 onnx = pytest.importorskip("onnx")
 FOLDER = Path(__file__).parent
@@ -68,13 +68,13 @@ def test_the_contract(networks: Path, output: str) -> None:
 
 
 def test_what_moved_outranks_what_stood_still(networks: Path) -> None:
-    case = world("moving")
+    case = get_case("moving")
     z = part(networks, "change").estimate(case)
     assert z[case.moved].mean() > z[~case.moved].mean() + 1
 
 
 def test_the_map_is_read_where_the_centre_is(networks: Path) -> None:
-    case = world("one")
+    case = get_case("one")
     before = tuple(torch.zeros_like(image) for image in case.now)
     now = [torch.zeros_like(image) for image in case.now]
     for view, image in enumerate(now[:2]):  # two of three views see it change, by 0.02: p = (0.4 + 0.4 + 0) / 3
@@ -100,13 +100,13 @@ def test_networks_that_break_their_contract_are_refused(
     networks: Path, kind: str, output: str, error: type[Exception], message: str
 ) -> None:
     with pytest.raises(error, match=message):
-        part(networks, kind, output=output).estimate(world("moving"))
+        part(networks, kind, output=output).estimate(get_case("moving"))
 
 
 def test_a_file_that_is_no_network_is_refused(tmp_path: Path) -> None:
     (tmp_path / "text.onnx").write_text("hello")
     with pytest.raises(InputError, match="expected an ONNX model"):
-        OnnxConfidence(OnnxConfidence.Config(path=str(tmp_path / "text.onnx"))).estimate(world("moving"))
+        OnnxConfidence(OnnxConfidence.Config(path=str(tmp_path / "text.onnx"))).estimate(get_case("moving"))
 
 
 def test_without_a_file_there_is_no_part(capsys: pytest.CaptureFixture[str]) -> None:

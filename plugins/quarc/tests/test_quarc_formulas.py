@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from gsstream_quarc.births import ChangeGate, change_scores
+from gsstream_quarc.births import ChangeFilter, change_scores
 from gsstream_quarc.method import QuARC
 from gsstream_quarc.settings import GateSettings, QuARCConfig
 from gsstream_recon.settings import BirthSettings, MotionSettings
 
 from gsstream.api import Cameras, Gaussians
 from gsstream.blocks import pixel_size
-from gsstream.testing.stepping import MethodUnderTest
+from gsstream.testing.method_driver import MethodUnderTest
 
 RNG = np.random.default_rng(0)
 
@@ -60,9 +60,9 @@ def test_scores_compare_with_the_median_of_what_is_pulled() -> None:
 def test_only_what_changed_may_be_copied_in_the_order_in_which_it_came() -> None:
     means = np.arange(15).reshape(5, 3) * 10.0 + 1
     rows = torch.tensor([4, 0, 2, 1])
-    gate = ChangeGate(GateSettings(score=0.5), 5)
+    gate = ChangeFilter(GateSettings(score=0.5), 5)
     assert gate(Seen(means, [3.0, 1.0, 0.0, 1.2, 1.5]), rows).tolist() == [4, 0]
-    assert ChangeGate(GateSettings(score=0.0), 5)(Seen(means, [0.0] * 5), rows).tolist() == rows.tolist()
+    assert ChangeFilter(GateSettings(score=0.0), 5)(Seen(means, [0.0] * 5), rows).tolist() == rows.tolist()
     assert gate(Seen(means, [1.0] * 5), rows[:0]).tolist() == []
 
 
@@ -72,10 +72,10 @@ def test_a_cell_takes_so_many_and_remembers_those_of_earlier_rounds() -> None:
     work = Seen(near, [1.0] * 7)
     assert 0.3 < 5 * pixel_size(near, work.cameras) < 5
     rows = torch.tensor([3, 6, 0, 1])
-    assert ChangeGate(settings, 7)(work, rows).tolist() == [3, 6, 0]
-    assert ChangeGate(settings, 6)(work, rows).tolist() == [3, 6, 0], "the one born is in the other cell"
-    assert ChangeGate(settings, 5)(work, rows).tolist() == [3, 6], "row 5 was born there in this frame"
-    assert ChangeGate(settings, 3)(work, rows).tolist() == [6], "three were: no room is left"
+    assert ChangeFilter(settings, 7)(work, rows).tolist() == [3, 6, 0]
+    assert ChangeFilter(settings, 6)(work, rows).tolist() == [3, 6, 0], "the one born is in the other cell"
+    assert ChangeFilter(settings, 5)(work, rows).tolist() == [3, 6], "row 5 was born there in this frame"
+    assert ChangeFilter(settings, 3)(work, rows).tolist() == [6], "three were: no room is left"
 
 
 def test_a_gate_that_lets_everything_through_is_recon_with_rounded_motions() -> None:

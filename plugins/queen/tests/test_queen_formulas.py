@@ -10,7 +10,7 @@ import pytest
 import torch
 from gsstream_queen.births import densify, densify_epochs
 from gsstream_queen.change import changed_tiles, gradient_difference
-from gsstream_queen.gates import BOUND, gates, initial_logits, open_probability, shift
+from gsstream_queen.gates import BOUND, gates, initial_logits, open_probability, open_logit
 from gsstream_queen.latents import cosines, decoder, initial_weights, rounded, weight_of
 from gsstream_queen.settings import (
     BirthSettings,
@@ -26,8 +26,8 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from gsstream.api import Rng
-from gsstream.blocks import DensifyStatistics, children
-from gsstream.testing import world
+from gsstream.blocks import DensifyStatistics, split_or_clone
+from gsstream.testing import get_case
 from gsstream.testing.cases import RENDERER, scene
 
 GATE = GateSettings()
@@ -145,7 +145,7 @@ class TestBirths:
         quats, sizes = torch.randn(9, 4, generator=generator), torch.rand(9, 3, generator=generator) + 0.1
         rows = replace(scene(torch.zeros(9, 3), scales=sizes.log()), quats=quats)
         halves, seeded = torch.ones(9, dtype=torch.bool), torch.Generator().manual_seed(7)
-        born = children(rows, torch.arange(9), halves, seeded).means
+        born = split_or_clone(rows, torch.arange(9), halves, seeded).means
         draws = torch.randn(9, 3, generator=torch.Generator().manual_seed(7)) * sizes
         for q, v, got in zip(quats, draws, born, strict=True):
             w, x, y, z = (q / q.norm()).tolist()
@@ -165,7 +165,7 @@ class TestChange:
     @pytest.mark.parametrize("loss", ["mse", "l2norm"])
     @pytest.mark.parametrize("aggregate", ["mean-vector", "sum-of-norms"])
     def test_it_is_the_gradient_of_the_difference_of_two_distances(self, loss: str, aggregate: str) -> None:
-        case = world("moving")
+        case = get_case("moving")
         found = gradient_difference(case, ChangeSettings(loss=loss, aggregate=aggregate))  # type: ignore[arg-type]
         gradients = []
         for view in range(len(case.cameras)):
@@ -185,10 +185,10 @@ class TestChange:
         assert moved > 3 * found.difference[~case.moved].mean(), "what moved feels more than what did not"
 
     def test_still_images_change_nothing(self) -> None:
-        assert float(gradient_difference(world("moving").blended(0), ChangeSettings()).difference.max()) == 0  # type: ignore[arg-type]
+        assert float(gradient_difference(get_case("moving").blended(0), ChangeSettings()).difference.max()) == 0  # type: ignore[arg-type]
 
     def test_tiles_follow_the_dynamic_rows(self) -> None:
-        case = world("moving")
+        case = get_case("moving")
         everyone = torch.ones(len(case.gaussians), dtype=torch.bool)
         settings = MaskSettings(pixels=1, dilate=0)
         masks = changed_tiles(case, everyone, RENDERER, settings)  # type: ignore[arg-type]
@@ -226,7 +226,7 @@ def old_rows(number: int, **settings: object) -> OldRows:
 
 
 def test_l0_is_a_sum_or_a_mean() -> None:
-    probability = float(torch.sigmoid(torch.tensor(-shift(GateSettings()))))
+    probability = float(torch.sigmoid(torch.tensor(-open_logit(GateSettings()))))
     for over, factor in (("sum", 7.0), ("mean", 1.0)):
         rows = old_rows(7, gate=GateSettings(l0=0.25, l0_over=over))
         assert float(rows._penalty().detach()) == pytest.approx(0.25 * factor * probability, rel=1e-6)

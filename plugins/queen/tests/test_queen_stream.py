@@ -20,8 +20,8 @@ from gsstream.player.playback import Playback
 SOURCE = "synthetic:frames=5&views=3&width=64&height=48&supersample=1"
 SETTINGS = {
     "first_frame.max_iterations": 40, "first_frame.max_points": 500, "stream.epochs": 3,
-    "stepper.births.every": 1, "stepper.births.gradient": 1e-4, "stepper.births.most": 30,
-    "stepper.change.dynamic": 1e-7,
+    "streaming_method.births.every": 1, "streaming_method.births.gradient": 1e-4, "streaming_method.births.most": 30,
+    "streaming_method.change.dynamic": 1e-7,
 }  # fmt: skip
 
 
@@ -130,9 +130,9 @@ def test_gates_close_where_they_cost(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("stepper.sh0.latnt=3", "unknown key 'stepper.params.sh0.latnt'; did you mean 'latent'?"),
-        ("stepper.gate.gamma=0.5", "stepper.params.gate.gamma: input should be less than 0, got 0.5"),
-        ("stream.rate_weight=0.5", "stream.rate_weight: the stepper 'queen' does not read it"),
+        ("streaming_method.sh0.latnt=3", "unknown key 'streaming_method.params.sh0.latnt'; did you mean 'latent'?"),
+        ("streaming_method.gate.gamma=0.5", "streaming_method.params.gate.gamma: input should be less than 0, got 0.5"),
+        ("stream.rd_lambda=0.5", "stream.rd_lambda: the streaming_method 'queen' does not read it"),
     ],
 )
 def test_wrong_settings_are_refused(
@@ -150,4 +150,4 @@ def test_the_other_commands_know_it(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert run_command(["evaluate", out, "--source", SOURCE]) == 0
     assert run_command(["play", out, "--out", str(tmp_path / "frames"), "--frames", "0:2"]) == 0
     assert run_command(["methods", "queen"]) == 0
-    assert "stepper   queen" in capsys.readouterr().out
+    assert "streaming_method   queen" in capsys.readouterr().out

@@ -14,13 +14,13 @@ from gsstream_recon.settings import BirthSettings, MotionSettings, ReConConfig
 
 from gsstream.api import Cameras, Displacement, Gaussians, Layout, LossAndGrad, Rng, Scene, Wrt, apply_motion
 from gsstream.blocks import pixel_size
-from gsstream.testing.stepping import MethodUnderTest
+from gsstream.testing.method_driver import MethodUnderTest
 
 RNG = np.random.default_rng(0)
 RIG = Cameras(
     ("a", "b"), np.stack([np.eye(4), np.eye(4)]), np.tile(np.diag([50.0, 50, 1]), (2, 1, 1)), 32, 24
 )  # fmt: skip
-ANCHOR = MotionSettings(measure="anchor", per_anchor=5, pixels=0.2, step=0.01, turn_step=0.001)
+ANCHOR = MotionSettings(measure="anchor", per_anchor=5, pixels=0.2, step=0.01, rotation_step=0.001)
 
 
 def scene_of(means: np.ndarray, moved: Displacement | None = None) -> Scene:
@@ -155,7 +155,7 @@ def test_the_pull_to_rest_keeps_what_the_images_say_nothing_about() -> None:
 def test_rounded_motions_are_shown_while_they_are_fitted_and_sent_as_they_are() -> None:
     """Cells hold one Gaussian each here, so none turns about a centre; shifts are the sums of whole steps."""
     means = RNG.uniform((-0.3, -0.3, 2.7), (0.3, 0.3, 3.3), (80, 3))
-    settings = ANCHOR.model_copy(update={"step": 0.5, "turn_step": 1.0, "pixels": 0.01, "lr": 0.2})
+    settings = ANCHOR.model_copy(update={"step": 0.5, "rotation_step": 1.0, "pixels": 0.01, "lr": 0.2})
     scene = scene_of(means)
     work, after = fitted(scene, means + 0.1 * means[:, :1], np.arange(80), settings, rounded=True)
     step = 0.5 * pixel_size(scene.gaussians.means, RIG)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 
 from gsstream.api import Cameras, Gaussians, ScreenGradient
-from gsstream.testing import World, images, make_world, rig, scene
+from gsstream.testing import World, images, make_case, rig, scene
 
 __all__ = ["SIZE", "context", "gaussians", "images", "moving", "rig", "told"]
 Images = Sequence[torch.Tensor]
@@ -27,7 +27,7 @@ def context(
     blobs: Gaussians[torch.Tensor], cameras: Cameras, before: Images, now: Images, sigma: float = 0.0
 ) -> World:
     """What an estimator sees between two sets of images."""
-    still = make_world("given images", blobs, cameras.select([]))
+    still = make_case("given images", blobs, cameras.select([]))
     return dataclasses.replace(still, cameras=cameras, before=tuple(before), now=tuple(now), sigma=sigma)
 
 

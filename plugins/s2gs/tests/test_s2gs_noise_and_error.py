@@ -10,7 +10,7 @@ from gsstream_s2gs.error_aware import ErrorAware
 from gsstream_s2gs.gumbel_sigmoid import GumbelSigmoid
 from gsstream_s2gs.noise_normalised import NoiseNormalised
 from gsstream_s2gs.uniform_random import UniformRandom
-from gsstream_s2gs.whitened import pulls
+from gsstream_s2gs.noise_ratios import noise_ratios
 from s2gs_scene import SIZE, context, gaussians, images, moving, rig
 
 from gsstream.api import ShapeError
@@ -47,14 +47,14 @@ class TestNoiseNormalised:
 
     def test_the_ratio_is_one_under_noise(self) -> None:
         """Independent reference: energies of two independent noises have equal expectations."""
-        ratios = torch.stack([pulls(still(0.01, seed), 0.001, 1, seed, error=False).change_ratio for seed in range(4)])
+        ratios = torch.stack([noise_ratios(still(0.01, seed), 0.001, 1, seed, error=False).change_ratio for seed in range(4)])
         seen = (ratios > 0).all(0)
         assert int(seen.sum()) >= 40
         # Median over draws and Gaussians: the mean of a ratio is pulled up by small denominators.
         assert float(ratios[:, seen].median()) == pytest.approx(1.0, abs=0.15)
 
     def test_error_of_a_perfect_scene_is_noise_too(self) -> None:
-        found = pulls(still(0.01), 0.001, 4, 0, error=True)
+        found = noise_ratios(still(0.01), 0.001, 4, 0, error=True)
         seen = found.change_ratio > 0
         assert float(found.error_ratio[seen].median()) == pytest.approx(1.0, abs=0.25)
 
@@ -87,7 +87,7 @@ class TestNoiseNormalised:
 
     def test_the_least_sigma_bounds_the_ratio(self) -> None:
         case, _ = moving()
-        strict = NoiseNormalised(NoiseNormalised.Config(least_sigma=0.1)).estimate(case)
+        strict = NoiseNormalised(NoiseNormalised.Config(min_sigma=0.1)).estimate(case)
         assert float(strict.max()) < float(NoiseNormalised().estimate(case).max())
 
 
@@ -109,7 +109,7 @@ class TestErrorAware:
             case = displaced(still(0.005), row, 0.12)
             opened = (part.estimate(case) == 1.0).nonzero()[:, 0]
             assert len(opened) <= 1
-            error = pulls(case, 0.001, 2, 0, error=True).error_ratio
+            error = noise_ratios(case, 0.001, 2, 0, error=True).error_ratio
             assert opened.tolist() == [int(error.argmax())]
             found += int(opened[0]) == row
         # Neighbours in front of or behind the misplaced one feel its error as well.

@@ -9,7 +9,7 @@ import pytest
 import torch
 from gsstream_stream3dgs.cache import Cache, Lookup
 from gsstream_stream3dgs.method import Stream3DGS
-from gsstream_stream3dgs.motion import fitted_cache, moved, said_by, shape_of
+from gsstream_stream3dgs.motion import fitted_cache, moved, coded_cache, shape_of
 from gsstream_stream3dgs.settings import BirthSettings, CacheSettings, Stream3DGSConfig
 
 from gsstream.api import (
@@ -25,7 +25,7 @@ from gsstream.api import (
     apply_field,
     field_rows,
 )
-from gsstream.testing.stepping import MethodUnderTest
+from gsstream.testing.method_driver import MethodUnderTest
 
 RNG = np.random.default_rng(0)
 RIG = Cameras(
@@ -159,7 +159,7 @@ def test_two_bodies_find_their_own_ways(sent) -> None:
     scene, settings = scene_of(means), SMALL.model_copy(update={"sent": sent})
     found = fitted_cache(scene, Pulled(aims), np.arange(80), 40, settings, Rng(0))
     assert found is not None
-    after = apply_delta(scene, Delta((said_by(scene, *found, RIG, settings),))).gaussians.means
+    after = apply_delta(scene, Delta((coded_cache(scene, *found, RIG, settings),))).gaussians.means
     assert np.abs(after - aims).mean() < 0.3 * np.abs(means - aims).mean()
     assert fitted_cache(scene, Pulled(means), np.zeros(0, np.int64), 1, settings, Rng(0)) is None
 
@@ -168,7 +168,7 @@ def test_only_marked_rows_move() -> None:
     means = RNG.normal((0, 0, 3), 0.02, (40, 3))
     scene, some = scene_of(means), np.arange(0, 40, 3)
     rows, cache = fitted_cache(scene, Pulled(means + 0.03), some, 5, SMALL, Rng(0))
-    after = apply_delta(scene, Delta((said_by(scene, rows, cache, RIG, SMALL),))).gaussians.means
+    after = apply_delta(scene, Delta((coded_cache(scene, rows, cache, RIG, SMALL),))).gaussians.means
     assert np.flatnonzero((after != scene.gaussians.means).any(1)).tolist() == rows.tolist() == some.tolist()
 
 

@@ -75,7 +75,7 @@ class Timid(Confidence):
         return torch.where(logits > self.config.floor, logits - 2 * _largest_change(context), logits)
 
 
-@spoils("check_confidence_leaves_no_trace")
+@spoils("check_confidence_no_grad_left")
 class Tracked(Confidence):
     """The result hangs on the graph of the means."""
 

@@ -40,7 +40,7 @@ class OneGumbel(Gate):
         return (-torch.log(-torch.log(u))).float()
 
 
-@spoils("check_gate_really_stochastic")
+@spoils("check_gate_stochastic")
 class Table(Gate):
     """Takes the noise of hierarchies of 256 nodes from a table that never changes."""
 
@@ -111,7 +111,7 @@ class TwoFaced(Gate):
         return gates
 
 
-@spoils("check_gate_bound")
+@spoils("check_gate_clamp")
 class Creeping(Gate):
     """Bounding again moves large logits a little further."""
 

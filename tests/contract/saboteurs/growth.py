@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gsstream.core.changes import Rows, in_nodes
+from gsstream.core.changes import Rows, add_to_nodes
 from gsstream.testing.growth.example import ExampleGrowth
 from gsstream.testing.working import INDEX
 from saboteurs.register import spoils
@@ -19,7 +19,7 @@ def copies(scene: Any, number: int, unit: int = 0) -> Rows:
     """The first Gaussians once more, beside themselves."""
     rows = np.arange(number)
     born = scene.gaussians.rows(rows)
-    return Rows(in_nodes(born, scene.layout.node_of[rows], np.full(number, unit, np.uint8)))
+    return Rows(add_to_nodes(born, scene.layout.node_of[rows], np.full(number, unit, np.uint8)))
 
 
 @spoils("check_growth_fits")

@@ -15,7 +15,7 @@ from gsstream.input.recordings.open import open_source
 from gsstream.method.base import Step
 from gsstream.packet import KeyState, PlayerState, decode_packet, encode_key
 from gsstream.testing.cases import fingerprint
-from gsstream.testing.stepping import FRAMES, SOURCE, MethodUnderTest
+from gsstream.testing.method_driver import FRAMES, SOURCE, MethodUnderTest
 
 METHOD_SABOTEURS: dict[str, type[MethodUnderTest]] = {}
 
@@ -145,7 +145,7 @@ class Gambler(Remembered):
         return super().step(state, frame)
 
 
-@_spoils("check_method_inputs_kept")
+@_spoils("check_method_inputs_unchanged")
 class Scribbler(Remembered):
     """Darkens the images of the last frame once it is done with them."""
 
@@ -156,7 +156,7 @@ class Scribbler(Remembered):
         return step
 
 
-@_spoils("check_method_takes_first_frame")
+@_spoils("check_method_reuses_first_frame")
 class Stubborn(Remembered):
     """Reconstructs frame 0 although it was given one."""
 
@@ -164,7 +164,7 @@ class Stubborn(Remembered):
         return self.begin(frame)
 
 
-@_spoils("check_method_says_what_it_is")
+@_spoils("check_method_meta")
 class Impostor(Remembered):
     """Signs its stream with another method's name."""
 

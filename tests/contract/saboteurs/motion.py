@@ -42,7 +42,7 @@ class Moody(Base):
         return (everything(number, CALLS["moody"]),)
 
 
-@spoils("check_motion_rests")
+@spoils("check_motion_static_frame")
 class Restless(Base):
     """Goes on moving where nothing changes."""
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from gsstream.core.joint import JointCode
+from gsstream.core.joint import JointLayout
 from gsstream.parts.optimiser.adam import ReferenceAdam
 from gsstream.parts.optimiser.joint import JointResidualOptimiser
 from gsstream.parts.optimiser.residual import ResidualEpoch, ResidualOptimiser
@@ -117,7 +117,7 @@ class Forgiving(Adam):
 class Hurried(Adam):
     """Its own residual optimiser learns at twice the rates."""
 
-    def residual_optimiser(self, code: JointCode, *start: Any) -> JointResidualOptimiser:
+    def residual_optimiser(self, code: JointLayout, *start: Any) -> JointResidualOptimiser:
         return JointResidualOptimiser(replace(code, lrs=2 * code.lrs), *start, self)
 
 
@@ -135,6 +135,6 @@ class _Thaws(Joint):
 class Thawed(Adam):
     """Its own iterations train rows that are to wait."""
 
-    def residual_optimiser(self, code: JointCode, *start: Any) -> ResidualOptimiser:
+    def residual_optimiser(self, code: JointLayout, *start: Any) -> ResidualOptimiser:
         made: ResidualOptimiser = _Thaws(code, *start, self)
         return made

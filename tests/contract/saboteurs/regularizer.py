@@ -101,7 +101,7 @@ class NoRows(Regularizer):
         return {**terms, "gates": terms["gates"] + lost}
 
 
-@spoils("check_regularizer_uses_what_it_says")
+@spoils("check_regularizer_reads_weights")
 class Exchanged(Regularizer):
     """Two terms under each other's name."""
 

@@ -80,7 +80,7 @@ class _SeesEverywhere(Session):
         return _SeesEverywhere(self._renderer, gaussians, None, self._cameras, self._background)
 
 
-@spoils("check_renderer_visible")
+@spoils("check_renderer_contributing")
 class Unmasked(Reference):
     """Names everyone who is drawn anywhere in the image, whichever tiles are asked about."""
 

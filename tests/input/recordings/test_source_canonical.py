@@ -11,7 +11,7 @@ import pytest
 
 from gsstream.core.errors import SourceError
 from gsstream.core.world import World
-from gsstream.encode import in_own_world, open_recording
+from gsstream.encode import to_rig_coordinates, open_recording
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
 from gsstream.recipe.model import Recipe
 from tools.worlds import Moved, world
@@ -64,7 +64,7 @@ def test_the_split_does_not_move_the_world():
 
 
 def test_a_source_of_ones_own_is_placed_and_closed():
-    source = in_own_world(Moved(open_source("synthetic:frames=1&views=3&width=16&height=12"), FAR))
+    source = to_rig_coordinates(Moved(open_source("synthetic:frames=1&views=3&width=16&height=12"), FAR))
     assert source.info.train.extent == pytest.approx(1, abs=0.2), "test cameras count, too"
     assert source.points() is not None
     source.close()

@@ -15,7 +15,7 @@ import pytest
 
 from gsstream.core.errors import EndOfRecording, SourceError
 from gsstream.core.frame import Arrival
-from gsstream.input.recordings.base import FrameSource, GrowingSource
+from gsstream.input.recordings.base import FrameSource, LiveSource
 from gsstream.input.recordings.disturbed import DisturbedSource
 from gsstream.input.recordings.multiview import MultiviewSource
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
@@ -41,7 +41,7 @@ def test_camera() -> str:
 
 def test_it_reads_what_the_folder_reader_reads(folder: Path) -> None:
     live, finished = open_source(f"watch:{folder}", 0.5), open_source(str(folder), 0.5)
-    assert isinstance(live, GrowingSource)
+    assert isinstance(live, LiveSource)
     assert live.info.uri == finished.info.uri
     for split in ("train", "test"):
         assert np.array_equal(live.frame(3, split).images, finished.frame(3, split).images)

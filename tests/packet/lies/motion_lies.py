@@ -55,8 +55,8 @@ def _lying_motions(state: PlayerState, delta: Delta, data: bytes) -> Iterator[tu
         yield f"{wrong} shades", headed(flags, wrong, cell, shift, turn), "shades: expected 1 to 16"
     for wrong in (0.0, -0.0, -1.0, nan, inf, -inf, 1e9):
         yield f"cell {wrong}", headed(flags, shades, wrong, shift, turn), "cell: expected a float32 above 0"
-        yield f"shift step {wrong}", headed(flags, shades, cell, wrong, turn), "shift_step: expected a float32"
-        yield f"turn step {wrong}", headed(flags, shades, cell, shift, wrong), "turn_step: expected a float32"
+        yield f"shift step {wrong}", headed(flags, shades, cell, wrong, turn), "translation_step: expected a float32"
+        yield f"turn step {wrong}", headed(flags, shades, cell, shift, wrong), "rotation_step: expected a float32"
     yield "other cells", headed(flags, shades, cell * 100, shift, turn), "gate runs cover more than the 15 nodes"
     every = (np.arange(count + 1) % 2).astype(np.uint8)
     yield "one group more", head + pack_blobs([encode_gates(every, 1), symbols]), "gates: 1 levels in"

@@ -7,14 +7,14 @@ from dataclasses import replace
 import pytest
 
 from gsstream.core.rng import Rng
-from gsstream.engine.budget.pace import Allowance
+from gsstream.engine.budget.epoch_scheduler import Allowance
 from gsstream.engine.budget.plan import FramePlan
-from gsstream.engine.step.active.change import detect_change
-from gsstream.engine.step.motion import Moved, moved
+from gsstream.engine.step.active.change import detect_changed_tiles
+from gsstream.engine.step.motion import Moved, propose_motion
 from gsstream.input.recordings.open import open_source
 from gsstream.packet.changes.motion import encode_motions
-from gsstream.parts.motion.coasting import Coasting
-from gsstream.testing.stepping import SOURCE
+from gsstream.parts.motion.constant_velocity import Coasting
+from gsstream.testing.method_driver import SOURCE
 from gsstream.testing.working import method_with
 
 
@@ -22,9 +22,9 @@ def within(max_bytes: int | None) -> Moved:
     parts = method_with("motion", Coasting(Coasting.Config(votes=0, share=0, displaced=0, asked=0))).parts
     state = method_with("motion", Coasting()).chain()[1].state
     frame = replace(open_source(SOURCE).frame(2), cameras=state.previous.cameras)
-    plan = FramePlan(epochs=1, change_threshold=6.0, rate_weight=0.0, max_bytes=max_bytes)
-    change = detect_change(state.previous, frame, 6.0)
-    return moved(parts, state, frame, change, Rng(0), Allowance(plan, 0.0, float))
+    plan = FramePlan(epochs=1, change_threshold=6.0, rd_lambda=0.0, max_bytes=max_bytes)
+    change = detect_changed_tiles(state.previous, frame, 6.0)
+    return propose_motion(parts, state, frame, change, Rng(0), Allowance(plan, 0.0, float))
 
 
 @pytest.mark.parametrize("spare", [0, -1])

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from gsstream.core.changes.motion import Moves, moves_of, transformed
+from gsstream.core.changes.motion import GroupTransforms, predict_transforms, transform_groups
 from gsstream.core.gaussians import Gaussians
-from gsstream.engine.step.context import FrameView
+from gsstream.engine.step.context import EngineContext
 from gsstream.parts.motion.groups import changed_groups, known_groups, pixel_size
-from gsstream.parts.motion.newton import Damping, NewtonDescent, newton_moves
+from gsstream.parts.motion.newton import Damping, DampedNewton, fit_transforms_newton
 from gsstream.parts.render.transforms import curvature_of
 from gsstream.parts.render.wrt import WrtTransforms
-from gsstream.testing.cases import world
-from gsstream.testing.working import AtWork, at_work
+from gsstream.testing.cases import get_case
+from gsstream.testing.working import FitFixture, fit_fixture
 
 FREE = Damping(0.0, 1e-9, 1e9)
 
@@ -32,7 +32,7 @@ def bowls(views: int, groups: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("views", [1, 2, 7])
 def test_after_each_view_of_the_first_pass_it_stands_at_the_bottom_of_all_seen_so_far(views: int) -> None:
     matrices, bottoms = bowls(views, 5, 2)
-    descent = NewtonDescent(np.zeros((5, 6)), FREE)
+    descent = DampedNewton(np.zeros((5, 6)), FREE)
     for view in range(views):
         slope = (matrices[view] @ (descent.values - bottoms[view])[..., None])[..., 0]
         descent.step(slope, matrices[view])
@@ -43,7 +43,7 @@ def test_after_each_view_of_the_first_pass_it_stands_at_the_bottom_of_all_seen_s
 def test_a_view_that_is_not_measured_is_taken_to_curve_as_the_others_do() -> None:
     matrices, bottoms = bowls(3, 4, 3)
     same = np.broadcast_to(matrices.mean(0), matrices.shape)
-    measured, taken = NewtonDescent(np.zeros((4, 6)), FREE), NewtonDescent(np.zeros((4, 6)), FREE)
+    measured, taken = DampedNewton(np.zeros((4, 6)), FREE), DampedNewton(np.zeros((4, 6)), FREE)
     for step in range(7):
         view = step % 3
         for descent, curvature in ((measured, same[0]), (taken, same[0] if step < 3 else None)):
@@ -53,14 +53,14 @@ def test_a_view_that_is_not_measured_is_taken_to_curve_as_the_others_do() -> Non
 
 def test_a_group_that_no_picture_holds_moves_by_no_more_than_its_slope_over_hold() -> None:
     slope = np.random.default_rng(4).standard_normal((3, 6))
-    descent = NewtonDescent(np.zeros((3, 6)), Damping(0.1, 50.0, 0.5))
+    descent = DampedNewton(np.zeros((3, 6)), Damping(0.1, 50.0, 0.5))
     descent.step(slope, np.zeros((3, 6, 6)))
     np.testing.assert_allclose(descent.values, -slope / 50)
 
 
 def test_no_number_moves_further_than_the_longest_step_and_its_direction_stays() -> None:
     slope = 1e9 * np.array([[1.0, -2.0, 0.5, 0.0, 0.0, 0.0], [1e-12] * 6])
-    descent = NewtonDescent(np.zeros((2, 6)), Damping(0.1, 40.0, 0.5))
+    descent = DampedNewton(np.zeros((2, 6)), Damping(0.1, 40.0, 0.5))
     descent.step(slope, np.broadcast_to(np.eye(6), (2, 6, 6)))
     np.testing.assert_allclose(descent.values[0], [-0.25, 0.5, -0.125, 0, 0, 0])
     assert np.abs(descent.values[1]).max() < 1e-3, "one group's length is not another's"
@@ -75,12 +75,12 @@ def places(means: np.ndarray, case: object, view: int) -> np.ndarray:
 @pytest.mark.parametrize("number", range(6))
 def test_curvature_is_how_far_rows_go_on_the_screen_times_what_holds_them_there(number: int) -> None:
     """d^T C d of a group is the sum over its rows of (shift on the screen)^T S (shift on the screen)."""
-    case, rng = world("cloud"), np.random.default_rng(5)
+    case, rng = get_case("cloud"), np.random.default_rng(5)
     rows = np.arange(0, len(case.gaussians), 7)
     base = case.gaussians.map(lambda value: value.double().numpy()).rows(rows)
     place = np.arange(len(rows)) % 2
     centre = np.stack([base.means[place == k].mean(0) for k in range(2)])
-    moves = Moves(np.arange(len(rows)), place, centre, 0.05 * rng.standard_normal((2, 3)), np.zeros((2, 3)))
+    moves = GroupTransforms(np.arange(len(rows)), place, centre, 0.05 * rng.standard_normal((2, 3)), np.zeros((2, 3)))
     roots = rng.standard_normal((len(rows), 2, 2))
     tensors = roots @ np.swapaxes(roots, 1, 2)
     structure = np.stack([tensors[:, 0, 0], tensors[:, 0, 1], tensors[:, 1, 1]], 1)
@@ -101,7 +101,7 @@ def test_curvature_is_how_far_rows_go_on_the_screen_times_what_holds_them_there(
     assert np.linalg.eigvalsh(curvature).min() > -1e-9 * np.abs(curvature).max()
 
 
-def transformed64(base: Gaussians[np.ndarray], moves: Moves) -> np.ndarray:
+def transformed64(base: Gaussians[np.ndarray], moves: GroupTransforms) -> np.ndarray:
     """Means after rigid motions, in double precision: x' = R (x - centre) + centre + shift."""
     x, y, z = moves.turn.T
     zero = np.zeros_like(x)
@@ -112,25 +112,25 @@ def transformed64(base: Gaussians[np.ndarray], moves: Moves) -> np.ndarray:
 
 
 def test_the_transform_by_hand_is_that_of_the_stream() -> None:
-    case, rng = world("cloud"), np.random.default_rng(6)
+    case, rng = get_case("cloud"), np.random.default_rng(6)
     base = case.gaussians.map(torch.Tensor.numpy)
     place = np.zeros(len(base.means), np.int64)
-    moves = Moves(np.arange(len(place)), place, *(0.3 * rng.standard_normal((1, 3)) for _ in range(3)))
-    np.testing.assert_allclose(transformed(base, moves).means, transformed64(base, moves), atol=1e-5)
+    moves = GroupTransforms(np.arange(len(place)), place, *(0.3 * rng.standard_normal((1, 3)) for _ in range(3)))
+    np.testing.assert_allclose(transform_groups(base, moves).means, transformed64(base, moves), atol=1e-5)
 
 
-def moving(case: AtWork) -> tuple[Gaussians[torch.Tensor], Moves]:
+def moving(case: FitFixture) -> tuple[Gaussians[torch.Tensor], GroupTransforms]:
     """All groups that lie in what changed, where they stand, and the work narrowed to them."""
     groups = known_groups(case.scene, case.work.cameras, 12, 2)
     able = changed_groups(groups, case.work, 0.75, 0.5)
-    start = moves_of(case.scene, groups, able.astype(np.uint8), predicted=True)
+    start = predict_transforms(case.scene, groups, able.astype(np.uint8), predicted=True)
     case.work.narrow(torch.from_numpy(start.rows))
     return case.scene.gaussians.rows(start.rows).map(torch.from_numpy), start._replace(rows=np.arange(len(start.rows)))
 
 
 @pytest.mark.parametrize("tiles", ["all", "changed"])
 def test_gradients_are_the_same_with_and_without_curvature(tiles: Literal["all", "changed"]) -> None:
-    case = at_work()
+    case = fit_fixture()
     base, moves = moving(case)
     found, without = (case.work.loss_and_grad(1, WrtTransforms(base, moves, curved), tiles) for curved in (True, False))
     torch.testing.assert_close(found.grad, without.grad, rtol=1e-5, atol=1e-9)
@@ -141,11 +141,11 @@ def test_gradients_are_the_same_with_and_without_curvature(tiles: Literal["all",
 
 
 def test_nothing_that_changed_holds_nothing() -> None:
-    case = at_work(changed=False)
+    case = fit_fixture(changed=False)
     rows = np.arange(0, len(case.scene.gaussians.means), 3)
     case.work.narrow(torch.from_numpy(rows))
     zeros = np.zeros((1, 3))
-    moves = Moves(np.arange(len(rows)), np.zeros(len(rows), np.int64), zeros, zeros, zeros)
+    moves = GroupTransforms(np.arange(len(rows)), np.zeros(len(rows), np.int64), zeros, zeros, zeros)
     base = case.scene.gaussians.rows(rows).map(torch.from_numpy)
     found = case.work.loss_and_grad(0, WrtTransforms(base, moves, curvature=True), "changed")
     assert not found.grad.any()
@@ -156,25 +156,25 @@ def test_nothing_that_changed_holds_nothing() -> None:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_body_that_moved_is_found_where_it_went(seed: int) -> None:
     """The pictures are renders of a cloud of which one half moved by a pixel or two and turned by a degree or two."""
-    cloud, work, rng = world("cloud"), at_work().work, np.random.default_rng(seed)
+    cloud, work, rng = get_case("cloud"), fit_fixture().work, np.random.default_rng(seed)
     cameras, gaussians = cloud.cameras, cloud.gaussians.map(torch.Tensor.numpy)
     rows = np.flatnonzero(gaussians.means[:, 0] < np.median(gaussians.means[:, 0]))
     pixel, zeros = pixel_size(gaussians.means, cameras), np.zeros((1, 3))
     centre = gaussians.means[rows].mean(0, keepdims=True, dtype=np.float64)
     shift, turn = pixel * rng.uniform(-2, 2, (1, 3)), rng.uniform(-0.02, 0.02, (1, 3))
-    moves = Moves(rows, np.zeros(len(rows), np.int64), centre, shift, turn)
-    after = transformed(gaussians, moves).map(torch.from_numpy)
+    moves = GroupTransforms(rows, np.zeros(len(rows), np.int64), centre, shift, turn)
+    after = transform_groups(gaussians, moves).map(torch.from_numpy)
     blank: np.ndarray = np.zeros((len(cameras), cameras.height, cameras.width, 3), np.float32)
     frame = replace(work._frame, images=blank, cameras=cameras)
 
-    def seen(images: np.ndarray) -> FrameView:
-        return FrameView(work._parts, cloud.gaussians, work.hierarchy, replace(frame, images=images), frame, None)
+    def seen(images: np.ndarray) -> EngineContext:
+        return EngineContext(work._parts, cloud.gaussians, work.hierarchy, replace(frame, images=images), frame, None)
 
     images = np.stack([seen(blank).shown(after, view).numpy() for view in range(len(cameras))])
     arm = float(np.linalg.norm(gaussians.means[rows] - centre, axis=1).mean())
     unit, order = np.array([pixel] * 3 + [pixel / arm] * 3), np.random.default_rng(0)
-    scene, start = replace(at_work().scene, gaussians=gaussians), moves._replace(shift=zeros, turn=zeros)
-    found = newton_moves(scene, seen(images), start, unit, 8 * len(cameras), order, Damping(0.1, 1.0, 0.5))
+    scene, start = replace(fit_fixture().scene, gaussians=gaussians), moves._replace(shift=zeros, turn=zeros)
+    found = fit_transforms_newton(scene, seen(images), start, unit, 8 * len(cameras), order, Damping(0.1, 1.0, 0.5))
     wanted = np.concatenate([shift, turn], 1)
     before, now = np.abs(wanted / unit).max(), np.abs((found - wanted) / unit).max()
     assert now < 0.15, f"{now:.2f} of {before:.2f} pixels are left"

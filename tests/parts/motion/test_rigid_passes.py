@@ -12,7 +12,7 @@ import torch
 from gsstream.engine.step.active.change import Change
 from gsstream.parts.motion.rigid import Rigid
 from gsstream.parts.render.wrt import WrtRows
-from gsstream.testing.working import AtWork, at_work
+from gsstream.testing.working import FitFixture, fit_fixture
 
 
 def near_by_hand(tiles: np.ndarray) -> np.ndarray:
@@ -32,7 +32,7 @@ def test_near_is_what_changed_and_what_lies_beside_it_in_the_same_view(share: fl
 
 
 def differentiated(
-    case: AtWork, tiles: torch.Tensor | None, looked_at: Literal["all", "changed"]
+    case: FitFixture, tiles: torch.Tensor | None, looked_at: Literal["all", "changed"]
 ) -> tuple[float, torch.Tensor]:
     """Loss of view 0 and its gradient by all means when these tiles changed."""
     work = case.work
@@ -42,7 +42,7 @@ def differentiated(
 
 
 def test_changed_tiles_alone_leave_out_all_else() -> None:
-    case = at_work()
+    case = fit_fixture()
     assert case.work._change is not None
     tiles = torch.zeros_like(case.work._change.tiles)
     _, slope = differentiated(case, tiles, "changed")
@@ -57,7 +57,7 @@ def test_changed_tiles_alone_leave_out_all_else() -> None:
     torch.testing.assert_close(slope_unknown, slope_without)
 
 
-def noted(case: AtWork) -> list[str]:
+def noted(case: FitFixture) -> list[str]:
     """The tiles that each call is to look at, noted as the calls are made."""
     asked: list[str] = []
     body = case.work.loss_and_grad
@@ -72,7 +72,7 @@ def noted(case: AtWork) -> list[str]:
 
 @pytest.mark.parametrize(("effort", "calls"), [(1.0, 6), (0.5, 3), (0.2, 1), (0.01, 1)])
 def test_a_hurried_frame_fits_motion_in_its_share_of_the_passes(effort: float, calls: int) -> None:
-    case = at_work()
+    case = fit_fixture()
     case.work._frame = replace(case.work._frame, effort=effort)
     made = noted(case)
     Rigid(Rigid.Config(epochs=2)).propose(case.scene, case.work, case.rng)
@@ -81,7 +81,7 @@ def test_a_hurried_frame_fits_motion_in_its_share_of_the_passes(effort: float, c
 
 @pytest.mark.parametrize(("everywhere", "tiles"), [(False, "changed"), (True, "all")])
 def test_motions_look_everywhere_unless_told_to_look_near_the_change(everywhere: bool, tiles: str) -> None:
-    case = at_work()
+    case = fit_fixture()
     asked = noted(case)
     Rigid(Rigid.Config(everywhere=everywhere)).propose(case.scene, case.work, case.rng)
     assert set(asked) == {tiles}

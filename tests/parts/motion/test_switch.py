@@ -10,30 +10,30 @@ import pytest
 import torch
 
 from gsstream.core.changes import Displacement, Groups, Layout, Scene
-from gsstream.core.changes.motion import Moves, moves_of, transformed
+from gsstream.core.changes.motion import GroupTransforms, predict_transforms, transform_groups
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
-from gsstream.engine.step.active.change import detect_change
-from gsstream.engine.step.context import FrameView
-from gsstream.parts.motion.coasting import Coasting
+from gsstream.engine.step.active.change import detect_changed_tiles
+from gsstream.engine.step.context import EngineContext
+from gsstream.parts.motion.constant_velocity import Coasting
 from gsstream.parts.motion.groups import pixel_size
-from gsstream.parts.motion.switch import gains, some_views
+from gsstream.parts.motion.switch import loss_change, rotating_views
 from gsstream.parts.render.wrt import WrtRows
-from gsstream.testing.stepping import MethodUnderTest
-from gsstream.testing.working import at_work
+from gsstream.testing.method_driver import MethodUnderTest
+from gsstream.testing.working import fit_fixture
 
 #: Axis * tan(angle / 2): a third of a radian, mostly about the axis that the cameras look along.
 TURN = np.float32([0.05, 0.05, 0.15])
 
 
 @cache
-def body(turns: bool = False) -> tuple[Scene, Moves]:
+def body(turns: bool = False) -> tuple[Scene, GroupTransforms]:
     """Three soft Gaussians some pixels apart, each a group.
 
     They are balls and were displaced by a pixel to the side in the last frame; or they are long, stand still and turn.
     """
-    case = at_work()
+    case = fit_fixture()
     pixel = pixel_size(case.scene.gaussians.means, case.work.cameras)
     means = np.median(case.scene.gaussians.means, 0) + 9 * pixel * np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
     gaussians = Gaussians(
@@ -45,17 +45,17 @@ def body(turns: bool = False) -> tuple[Scene, Moves]:
     shift = np.tile(np.float32([pixel, 0, 0]), (3, 1))
     groups = Groups(float(np.float32(pixel)), 1, np.arange(3, dtype=np.int32), 3)
     scene = Scene(gaussians, layout, Displacement(np.arange(3), shift, np.zeros_like(shift)), groups)
-    moves = moves_of(scene, groups, np.ones(3, np.uint8), predicted=True)
+    moves = predict_transforms(scene, groups, np.ones(3, np.uint8), predicted=True)
     if turns:
         moves = moves._replace(shift=np.zeros_like(moves.shift), turn=np.tile(TURN, (3, 1)).astype(moves.turn.dtype))
     return scene, moves
 
 
-def frame_in_which(share: float, turns: bool = False) -> FrameView:
+def frame_in_which(share: float, turns: bool = False) -> EngineContext:
     """Return the frame that shows this share of the last displacement once more, or of the turn."""
     scene, moves = body(turns)
-    method, case = MethodUnderTest("dense"), at_work()
-    there = transformed(scene.gaussians, moves._replace(shift=moves.shift * share, turn=moves.turn * share))
+    method, case = MethodUnderTest("dense"), fit_fixture()
+    there = transform_groups(scene.gaussians, moves._replace(shift=moves.shift * share, turn=moves.turn * share))
     cameras = case.work.cameras
     stands, shows = (
         np.stack([case.work.shown(gaussians.map(torch.from_numpy), view).numpy() for view in range(len(cameras))])
@@ -64,13 +64,13 @@ def frame_in_which(share: float, turns: bool = False) -> FrameView:
     previous = replace(case.work._previous, images=stands.clip(0, 1))
     frame = replace(previous, index=3, images=shows.clip(0, 1), cameras=cameras)
     change, forest = (
-        detect_change(previous, frame, 6.0),
+        detect_changed_tiles(previous, frame, 6.0),
         Hierarchy(torch.arange(3), torch.arange(3), torch.zeros(3).long()),
     )
-    return FrameView(method.parts, scene.gaussians.map(torch.from_numpy), forest, frame, previous, None, change)
+    return EngineContext(method.parts, scene.gaussians.map(torch.from_numpy), forest, frame, previous, None, change)
 
 
-def loss(work: FrameView, gaussians, view: int) -> float:  # type: ignore[no-untyped-def]
+def loss(work: EngineContext, gaussians, view: int) -> float:  # type: ignore[no-untyped-def]
     work.narrow(torch.arange(len(gaussians)))
     return float(work.loss_and_grad(view, WrtRows(gaussians.map(torch.from_numpy))).loss)
 
@@ -83,9 +83,9 @@ def test_the_switch_says_what_two_renders_say(share: float, sign: int, turns: bo
     work = frame_in_which(share, turns)
     views = range(len(work.cameras))
     expected = sum(
-        loss(work, transformed(scene.gaussians, moves), view) - loss(work, scene.gaussians, view) for view in views
+        loss(work, transform_groups(scene.gaussians, moves), view) - loss(work, scene.gaussians, view) for view in views
     )
-    found = gains(scene, frame_in_which(share, turns), moves, views)
+    found = loss_change(scene, frame_in_which(share, turns), moves, views)
     assert np.sign(expected) == sign
     assert np.sign(found).tolist() == [sign] * 3
     # The loss is no parabola, and one group hides another: the size is right within a factor of two, or of three where
@@ -108,7 +108,7 @@ def test_coasting_goes_on_only_where_that_explains_the_images(share: float) -> N
 
 def test_views_take_turns() -> None:
     for number, share in ((11, 0.5), (3, 0.01), (27, 1.0), (1, 0.5)):
-        turns = [some_views(number, share, frame) for frame in range(number)]
+        turns = [rotating_views(number, share, frame) for frame in range(number)]
         count = max(1, round(share * number))
         assert all(len(views) == count and 0 <= views.min() <= views.max() < number for views in turns)
         assert np.unique(np.concatenate(turns)).tolist() == list(range(number))

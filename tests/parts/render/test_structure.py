@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsstream.parts.render.structure import LEAST_ERROR, weighed_structure
+from gsstream.parts.render.structure import MIN_ERROR, weighted_structure_tensor
 
 
 def by_hand(image: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -19,7 +19,7 @@ def by_hand(image: np.ndarray, target: np.ndarray) -> np.ndarray:
             for c in range(3):
                 right = 0.5 * (image[y, min(x + 1, width - 1), c] - image[y, max(x - 1, 0), c])
                 down = 0.5 * (image[min(y + 1, height - 1), x, c] - image[max(y - 1, 0), x, c])
-                weight = 1 / math.sqrt((image[y, x, c] - target[y, x, c]) ** 2 + LEAST_ERROR**2)
+                weight = 1 / math.sqrt((image[y, x, c] - target[y, x, c]) ** 2 + MIN_ERROR**2)
                 out[y, x] += weight * np.array([right * right, right * down, down * down])
     return out
 
@@ -28,18 +28,18 @@ def by_hand(image: np.ndarray, target: np.ndarray) -> np.ndarray:
 def test_it_is_the_sum_over_channels_of_products_of_slopes(shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(1)
     image, target = rng.random((2, *shape, 3))
-    found = weighed_structure(torch.from_numpy(image), torch.from_numpy(target))
+    found = weighted_structure_tensor(torch.from_numpy(image), torch.from_numpy(target))
     np.testing.assert_allclose(found.numpy(), by_hand(image, target), rtol=1e-12, atol=1e-12)
 
 
 def test_a_picture_of_one_colour_holds_nothing() -> None:
-    found = weighed_structure(torch.full((4, 4, 3), 0.3), torch.rand(4, 4, 3))
+    found = weighted_structure_tensor(torch.full((4, 4, 3), 0.3), torch.rand(4, 4, 3))
     assert not found.any()
 
 
 @pytest.mark.parametrize("shift", [(0.5, 0.0), (0.0, 0.5), (0.4, -0.3)])
 def test_it_foretells_the_squares_of_what_a_small_shift_changes(shift: tuple[float, float]) -> None:
-    """Compared with itself a picture has the weight 1 / LEAST_ERROR everywhere."""
+    """Compared with itself a picture has the weight 1 / MIN_ERROR everywhere."""
     y, x = torch.meshgrid(torch.arange(40.0), torch.arange(40.0), indexing="ij")
 
     def picture(dx: float, dy: float) -> torch.Tensor:
@@ -47,8 +47,8 @@ def test_it_foretells_the_squares_of_what_a_small_shift_changes(shift: tuple[flo
         return wave[..., None].expand(-1, -1, 3)
 
     image, inner = picture(0, 0), (slice(2, -2), slice(2, -2))
-    xx, xy, yy = weighed_structure(image, image)[inner].sum((0, 1))
+    xx, xy, yy = weighted_structure_tensor(image, image)[inner].sum((0, 1))
     dx, dy = shift
     foretold = dx * dx * xx + 2 * dx * dy * xy + dy * dy * yy
-    found = ((picture(dx, dy) - image)[inner] ** 2).sum() / LEAST_ERROR
+    found = ((picture(dx, dy) - image)[inner] ** 2).sum() / MIN_ERROR
     assert float(foretold) == pytest.approx(float(found), rel=0.03)

@@ -17,7 +17,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.shapes import IntArray
-from gsstream.engine.step.active.change import Change, detect_change
+from gsstream.engine.step.active.change import Change, detect_changed_tiles
 from gsstream.parts.render.base import RenderSession
 
 #: Least share of the views a Gaussian projects into in which it must lie in or beside changed tiles.
@@ -38,7 +38,7 @@ def candidates(
     return ((open_probability > threshold)[hierarchy.node_of] & changed).nonzero()[:, 0]
 
 
-class VoteBook:
+class VoteCache:
     """The votes of a frame that were counted so far: a centre that has not moved since keeps its own.
 
     Arguments:
@@ -65,8 +65,8 @@ class VoteBook:
 
 
 def changed_rows(
-    change: Change | None, means: torch.Tensor, cameras: Cameras, session: RenderSession, least_votes: float,
-    book: VoteBook | None = None,
+    change: Change | None, means: torch.Tensor, cameras: Cameras, session: RenderSession, min_votes: float,
+    book: VoteCache | None = None,
 ) -> torch.Tensor:  # fmt: skip
     """Return [N] bool: Gaussians seen in a changed tile, with at least this share of votes; all without a ``change``.
 
@@ -75,7 +75,7 @@ def changed_rows(
         cameras: training cameras.
         means: [N, 3] centres of the session's scene.
         session: asked which Gaussians are visible in which tiles.
-        least_votes: 0 to 1.
+        min_votes: 0 to 1.
         book: votes of this change that are known from other scenes of the frame; None: of none.
     """
     if change is None:
@@ -84,12 +84,12 @@ def changed_rows(
         return torch.zeros(len(means), dtype=torch.bool)
     seen = session.visible_anywhere(change.tiles)
     rows = seen.nonzero()[:, 0]
-    seen[rows] = (book or VoteBook(change, cameras)).of(means, rows) >= least_votes
+    seen[rows] = (book or VoteCache(change, cameras)).of(means, rows) >= min_votes
     return seen
 
 
-def rows_in_change(
-    session: RenderSession, means: torch.Tensor, previous: Frame, frame: Frame, threshold: float, least_votes: float
+def rows_in_changed_tiles(
+    session: RenderSession, means: torch.Tensor, previous: Frame, frame: Frame, threshold: float, min_votes: float
 ) -> IntArray:
     """Return the rows [A] int64, ascending, in what changed between two frames; all where it is not detected.
 
@@ -97,14 +97,14 @@ def rows_in_change(
         session: of the scene that ``previous`` shows.
         means: [N, 3] its centres.
         previous, frame: training images before and now.
-        threshold: as for :func:`detect_change`.
-        least_votes: as for :func:`changed_rows`.
+        threshold: as for :func:`detect_changed_tiles`.
+        min_votes: as for :func:`changed_rows`.
     """
-    change = detect_change(previous, frame, threshold)
-    return changed_rows(change, means, frame.cameras, session, least_votes).nonzero()[:, 0].numpy()
+    change = detect_changed_tiles(previous, frame, threshold)
+    return changed_rows(change, means, frame.cameras, session, min_votes).nonzero()[:, 0].numpy()
 
 
-def released(gates: torch.Tensor, num_levels: int, hierarchy: Hierarchy, waiting: torch.Tensor | None) -> torch.Tensor:
+def keep_mask(gates: torch.Tensor, num_levels: int, hierarchy: Hierarchy, waiting: torch.Tensor | None) -> torch.Tensor:
     """Return [A] bool: rows that stay in the optimisation; those whose gate has closed leave it.
 
     A closed gate draws its rows as they were, so nothing that is seen changes.

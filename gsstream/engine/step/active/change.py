@@ -15,9 +15,9 @@ from gsstream.engine.step.active.blocks import BLOCK, changed_blocks
 from gsstream.parts.render.base import TILE
 
 #: Blocks of a 16 x 16 tile (of 16) that must exceed the threshold.
-LEAST_BLOCKS = 2
+MIN_BLOCKS = 2
 #: Upper bound on the noise of one pixel of one image; see MOST_SIGMA of blocks.
-MOST_PIXEL_SIGMA = 16 / 255
+MAX_PIXEL_SIGMA = 16 / 255
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Change:
         return inside, v.astype(np.int32) * np.int32(-(-self.width // TILE)) + u.astype(np.int32)
 
 
-def detect_change(previous: Frame, frame: Frame, threshold: float) -> Change | None:
+def detect_changed_tiles(previous: Frame, frame: Frame, threshold: float) -> Change | None:
     """Compare two frames view by view.
 
     Arguments:
@@ -93,11 +93,11 @@ def detect_change(previous: Frame, frame: Frame, threshold: float) -> Change | N
 def _changed(before: FloatArray, after: FloatArray, threshold: float) -> BoolArray:
     """[rows, columns] bool of one view."""
     moved = changed_blocks(after - before, threshold)
-    count, blocks = marked_per_tile(moved, TILE // BLOCK)
-    return np.asarray(count >= np.minimum(LEAST_BLOCKS, blocks))
+    count, blocks = count_per_tile(moved, TILE // BLOCK)
+    return np.asarray(count >= np.minimum(MIN_BLOCKS, blocks))
 
 
-def marked_per_tile(marked: BoolArray, side: int = TILE) -> tuple[IntArray, IntArray]:
+def count_per_tile(marked: BoolArray, side: int = TILE) -> tuple[IntArray, IntArray]:
     """Count what is marked in each tile: ([rows, columns] how many are, and how many there are).
 
     A tile cut off by the border has fewer to show a change with.

@@ -16,7 +16,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip, images_in, natural
+from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip, images_in, natural_sort_key
 from gsstream.input.recordings.poses import from_llff
 
 POSES_FILE = "poses_bounds.npy"
@@ -34,11 +34,11 @@ def camera_clips(folder: Path, pattern: str) -> dict[str, Clip]:
     if videos:
         from gsstream.input.recordings.video import VideoClip
 
-        return {p.stem: VideoClip(p) for p in sorted(videos, key=natural)}
-    folders = sorted((p for p in folder.glob(pattern) if p.is_dir()), key=natural)
+        return {p.stem: VideoClip(p) for p in sorted(videos, key=natural_sort_key)}
+    folders = sorted((p for p in folder.glob(pattern) if p.is_dir()), key=natural_sort_key)
     if folders:
         return {p.name: folder_clip(p / "images" if (p / "images").is_dir() else p) for p in folders}
-    instants = sorted((p for p in folder.glob("frame*") if p.is_dir()), key=natural)
+    instants = sorted((p for p in folder.glob("frame*") if p.is_dir()), key=natural_sort_key)
     if not instants:
         raise SourceError(
             f"{folder}: no videos {pattern}.mp4, no folders {pattern}/ and no folders frame000001/ with pictures"

@@ -75,8 +75,8 @@ def read(folder: Path, missing: Missing = "skip") -> Recording:
         told = ", ".join(f"{name} {w} x {h}" for name, (w, h) in sizes.items())
         raise SourceError(f"{path}: all cameras of a rig must share one image size, got {told}; {PREPARE}")
     names = tuple(groups)
-    judges = {str(f) for key in ("test_filenames", "val_filenames") for f in data.get(key) or ()}
-    test = tuple(name for name, entries in groups.items() if any(e["file_path"] in judges for e in entries))
+    held_out = {str(f) for key in ("test_filenames", "val_filenames") for f in data.get(key) or ()}
+    test = tuple(name for name, entries in groups.items() if any(e["file_path"] in held_out for e in entries))
     return Recording(
         name=folder.resolve().name,
         where=str(path),

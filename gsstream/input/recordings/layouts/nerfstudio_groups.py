@@ -11,7 +11,7 @@ import numpy as np
 
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.clips import natural
+from gsstream.input.recordings.clips import natural_sort_key
 
 Entry = dict[str, Any]
 Pose = Callable[[Path, Entry], FloatArray]
@@ -134,7 +134,7 @@ def _named(groups: Sequence[list[Entry]]) -> dict[str, list[Entry]]:
 
 def _sorted(cameras: dict[str, list[Entry]]) -> dict[str, list[Entry]]:
     ordered = {name: sorted(entries, key=_when) for name, entries in cameras.items()}
-    return dict(sorted(ordered.items(), key=lambda item: natural(Path(item[0]))))
+    return dict(sorted(ordered.items(), key=lambda item: natural_sort_key(Path(item[0]))))
 
 
 def _time(path: Path, entry: Entry) -> float:
@@ -145,4 +145,4 @@ def _time(path: Path, entry: Entry) -> float:
 
 
 def _when(entry: Entry) -> tuple[float, list[tuple[int, str]]]:
-    return float(entry.get("time", 0.0)), natural(Path(entry["file_path"]))
+    return float(entry.get("time", 0.0)), natural_sort_key(Path(entry["file_path"]))

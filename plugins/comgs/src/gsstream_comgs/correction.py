@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gsstream.api import FrameWork, Gaussians, Layout, Residual, WrtRows
+from gsstream.api import FitContext, Gaussians, Layout, Residual, WrtRows
 from gsstream.blocks import rows_backward
 from gsstream_comgs.settings import CorrectionSettings
 
@@ -13,7 +13,7 @@ from gsstream_comgs.settings import CorrectionSettings
 RATES = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 0.05, "sh0": 2.5e-3}
 
 
-def error_rows(work: FrameWork, share: float) -> torch.Tensor:
+def high_error_rows(work: FitContext, share: float) -> torch.Tensor:
     """Return the rows [A], ascending, that the error of the scene pulls at most.
 
     The pull is the mean over the views of the screen gradient of the mean absolute error.
@@ -31,7 +31,7 @@ def error_rows(work: FrameWork, share: float) -> torch.Tensor:
 
 
 def corrected(
-    work: FrameWork, layout: Layout, epochs: int, settings: CorrectionSettings, order: np.random.Generator
+    work: FitContext, layout: Layout, epochs: int, settings: CorrectionSettings, order: np.random.Generator
 ) -> Residual | None:
     """Return the correction of a key frame; None where nothing is corrected.
 
@@ -42,7 +42,7 @@ def corrected(
         settings: of corrections.
         order: draws the order of the views.
     """
-    rows = error_rows(work, settings.share)
+    rows = high_error_rows(work, settings.share)
     if not len(rows):
         return None
     work.narrow(rows)

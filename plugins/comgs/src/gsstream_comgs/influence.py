@@ -42,9 +42,9 @@ def weights_of(means: torch.Tensor, points: KeyPoints) -> torch.Tensor:
     x, c = means - middle, points.centre - middle
     turned = matrices(points.quat).transpose(1, 2) / points.size.exp()[:, :, None]
     metric = turned.transpose(1, 2) @ turned
-    pulled = torch.einsum("kij,kj->ki", metric, c)
+    mapped = torch.einsum("kij,kj->ki", metric, c)
     squares = (x[:, :, None] * x[:, None]).flatten(1)
-    distance = squares @ metric.flatten(1).T - 2 * x @ pulled.T + (pulled * c).sum(1)
+    distance = squares @ metric.flatten(1).T - 2 * x @ mapped.T + (mapped * c).sum(1)
     weights = torch.exp(-0.5 * distance.clamp_min(0))
     return weights / weights.sum(1, keepdim=True).clamp_min(1)
 
@@ -66,7 +66,7 @@ def field_of(means: torch.Tensor, points: KeyPoints) -> Field:
     return Field(shift, weights @ points.turn)
 
 
-def moved_by(gaussians: Gaussians[torch.Tensor], field: Field) -> Gaussians[torch.Tensor]:
+def apply_motion_field(gaussians: Gaussians[torch.Tensor], field: Field) -> Gaussians[torch.Tensor]:
     """Return Gaussians, raw values, moved and turned by a field.
 
     Arguments:

@@ -20,7 +20,7 @@ from gsstream.api import (
     send_delta,
     send_key,
 )
-from gsstream.blocks import rows_in_change
+from gsstream.blocks import rows_in_changed_tiles
 from gsstream_comgs.correction import corrected
 from gsstream_comgs.motion import fitted_motion
 from gsstream_comgs.settings import ComGSConfig
@@ -47,7 +47,7 @@ class ComGS(StreamingMethod[ComGSState]):
     source = "ComGS (NeurIPS 2025)"
 
     Config = ComGSConfig
-    heeds = ("stream.epochs",)
+    recipe_keys = ("stream.epochs",)
 
     def begin(self, frame: Frame, tools: Tools) -> Step[ComGSState]:
         first = tools.first_frame(frame)
@@ -69,7 +69,7 @@ class ComGS(StreamingMethod[ComGSState]):
             scene, delta = state.player.scene, Delta()
             work = tools.open(state.player, state.previous, frame)
             settings, means = self.config.motion, work.gaussians.means
-            rows = rows_in_change(work.session, means, state.previous, frame, settings.change, settings.votes)
+            rows = rows_in_changed_tiles(work.session, means, state.previous, frame, settings.change, settings.votes)
             motion = fitted_motion(scene, work, rows, epochs, self.config.motion, order) if len(rows) else None
             if motion is not None:
                 delta = Delta((motion,))

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gsstream.api import FrameWork, IntArray, Motion, Scene, WrtRows
-from gsstream.blocks import neighbour_distance, pixel_size, rows_backward, said_by_cells
-from gsstream_comgs.influence import KeyPoints, field_of, moved_by
+from gsstream.api import FitContext, IntArray, Motion, Scene, WrtRows
+from gsstream.blocks import neighbour_distance, pixel_size, rows_backward, approximate_by_cells
+from gsstream_comgs.influence import KeyPoints, field_of, apply_motion_field
 from gsstream_comgs.settings import MotionSettings
 
 
-def gradient_difference(work: FrameWork) -> torch.Tensor:
+def gradient_difference(work: FitContext) -> torch.Tensor:
     """Return [N]: the size of the change, from the frame before to this one, of the pull at every Gaussian's centre.
 
     It is that of the mean over the views of the gradient of the squared error; the render itself cancels.
@@ -25,7 +25,7 @@ def gradient_difference(work: FrameWork) -> torch.Tensor:
 
 
 def fitted_motion(
-    scene: Scene, work: FrameWork, rows: IntArray, epochs: int, settings: MotionSettings, order: np.random.Generator
+    scene: Scene, work: FitContext, rows: IntArray, epochs: int, settings: MotionSettings, order: np.random.Generator
 ) -> Motion | None:
     """Return the motion of a frame; None where nothing moves.
 
@@ -62,13 +62,13 @@ def fitted_motion(
     views = len(work.cameras)
     for _ in range(epochs):
         for view in order.permutation(views):
-            there = moved_by(base, field_of(base.means, points()))
+            there = apply_motion_field(base, field_of(base.means, points()))
             rows_backward(there, work.loss_and_grad(int(view), WrtRows(there)).grad)
             adam.step()
             adam.zero_grad()
     with torch.no_grad():
         field = field_of(base.means, points())
-    return said_by_cells(scene, rows, field.shift.numpy(), field.turn.numpy(), side, settings.step * pixel)
+    return approximate_by_cells(scene, rows, field.shift.numpy(), field.turn.numpy(), side, settings.step * pixel)
 
 
 def _start(centres: torch.Tensor, pixel: float) -> KeyPoints:

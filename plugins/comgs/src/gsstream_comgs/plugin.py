@@ -10,7 +10,7 @@ def gsstream_components() -> list[ComponentSpec]:
     """The method as one part."""
     return [
         ComponentSpec(
-            kind="stepper",
+            kind="streaming_method",
             name="comgs",
             target="gsstream_comgs.method:ComGS",
             summary="two hundred key points move what is around them; masked corrections at key frames",

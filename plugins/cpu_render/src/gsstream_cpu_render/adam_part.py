@@ -7,7 +7,7 @@ from typing import final
 
 import torch
 
-from gsstream.api import AdamState, Gaussians, JointCode, ResidualOptimiser, RowOptimiser
+from gsstream.api import AdamState, Gaussians, JointLayout, ResidualOptimiser, RowOptimiser
 from gsstream_cpu_render.adam_step import step_table
 from gsstream_cpu_render.residual import CpuResidualOptimiser
 
@@ -29,6 +29,6 @@ class CpuAdam(RowOptimiser):
             step_table(name, values[name].detach(), gradient, states[name], lrs[name])
 
     def residual_optimiser(
-        self, code: JointCode, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor
+        self, code: JointLayout, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor
     ) -> ResidualOptimiser:
         return CpuResidualOptimiser(code, base, units, matrix)

@@ -14,9 +14,9 @@ from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import SplatArrays, raise_on_faults, require_splats
 from gsstream_cpu_render.autograd import splats_of
 from gsstream_cpu_render.checks import Float32, as_array, refuse_value
-from gsstream_cpu_render.loss import PhotometricTarget
+from gsstream_cpu_render.loss import PreparedImage
 from gsstream_cpu_render.native import native_scene
-from gsstream_cpu_render.pool import Lease
+from gsstream_cpu_render.pool import PooledRasterizer
 
 Ids = NDArray[np.uint32]
 
@@ -24,11 +24,11 @@ Ids = NDArray[np.uint32]
 class CachedView:
     """A camera's cache and its render of the scene as it was when the session opened or last was committed."""
 
-    def __init__(self, held: Lease, splats: SplatArrays) -> None:
+    def __init__(self, held: PooledRasterizer, splats: SplatArrays) -> None:
         self.held, self.rasterizer = held, held.rasterizer
         self.image, self.transmittance = self.rasterizer.forward(splats)
         self.rasterizer.forget()
-        self.rasterizer.shed_scratch()
+        self.rasterizer.free_scratch()
         self._frozen: tuple[Ids, Any] | None = None
         self.scenes = 0  # how many changes of the scene it has seen
 
@@ -58,15 +58,15 @@ class CachedView:
     def loss_and_grad(self, rows: Gaussians[torch.Tensor], target: ViewTarget) -> LossAndGrad[Gaussians[torch.Tensor]]:
         """Render the active rows, compare, differentiate."""
         grad = rows.map(lambda value: torch.empty(value.shape))
-        loss = self.rasterizer.pull_active(splats_of(rows), *self._compared(target), splats_of(grad))
+        loss = self.rasterizer.loss_and_grad_active(splats_of(rows), *self._compared(target), splats_of(grad))
         return LossAndGrad(torch.tensor(loss, dtype=torch.float64), grad)
 
     def comparison(self, target: ViewTarget) -> Any:
         """What renders of this view are compared with, as the kernels take it."""
         return self.rasterizer.comparison(*self._compared(target))
 
-    def _compared(self, target: ViewTarget) -> tuple[Any, PhotometricTarget, float, list[Any], Any]:
-        prepared: PhotometricTarget = target.prepared
+    def _compared(self, target: ViewTarget) -> tuple[Any, PreparedImage, float, list[Any], Any]:
+        prepared: PreparedImage = target.prepared
         weights = None if target.tile_weights is None else as_array("tile_weights", target.tile_weights)
         return self.image, prepared, target.dssim, exposure_arrays(target), weights
 

@@ -22,7 +22,7 @@ MOST = 1e15
 
 
 @dataclass(frozen=True)
-class PhotometricTarget:
+class PreparedImage:
     """A target image with its window statistics, computed once and used in every iteration of a frame.
 
     ``image`` [H, W, 3] float32 (a private copy). Statistics are made strip by strip where they are first needed, for
@@ -89,7 +89,7 @@ def photometric_loss(
     Args:
         image: [H, W, 3] float32. With a mask, pixels up to 5 beyond active tiles are read too (SSIM windows), so the
             inactive part must hold the rest of the picture, for instance the cached render of the previous frame.
-        target: [H, W, 3] float32, or a PhotometricTarget, which saves blurring it again.
+        target: [H, W, 3] float32, or a PreparedImage, which saves blurring it again.
         dssim_weight: w in [0, 1].
         tile_mask: [ceil(H/16), ceil(W/16)] bool or uint8; None means all tiles. The sums are divided by 3 H W as in
             the dense loss, so that losses of disjoint masks add up to it.
@@ -105,7 +105,7 @@ def photometric_loss(
     if not 0.0 <= dssim_weight <= 1.0:
         refuse_value(f"dssim_weight: expected a number in [0, 1], got {dssim_weight!r}")
     image = _image("image", image)
-    known = target if isinstance(target, PhotometricTarget) else None
+    known = target if isinstance(target, PreparedImage) else None
     goal = native_array("target", target if known is None else known.image, np.float32, image.shape)
     height, width, _ = image.shape
     wanted = _mask(tile_mask, height, width)

@@ -7,7 +7,7 @@ from typing import Any, final
 import torch
 
 from gsstream.api import Loss
-from gsstream_cpu_render.loss import PhotometricTarget, photometric_loss
+from gsstream_cpu_render.loss import PreparedImage, photometric_loss
 
 
 @final
@@ -17,7 +17,7 @@ class CpuLoss(Loss):
     source = "3DGS (Kerbl et al. 2023)"
 
     def prepare(self, target: torch.Tensor) -> Any:
-        return PhotometricTarget(target.detach().numpy())
+        return PreparedImage(target.detach().numpy())
 
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None

@@ -32,7 +32,7 @@ def loss_and_grad_of_transforms(
     transforms = [np.ascontiguousarray(part, np.float64) for part in (moves.centre, moves.shift, moves.turn)]
     splats = SplatArrays(*(np.ascontiguousarray(value.detach().numpy(), np.float32) for _, value in wrt.base.items()))
     given = rasterizer, native_scene(splats), compared, place, *transforms, grad, curvature
-    faults, l1, dssim = _native.pull_moved(*given)
+    faults, l1, dssim = _native.transform_loss_and_grad(*given)
     values = target.prepared.image.size
     loss = weighted(l1, dssim, target.dssim, 1.0 / values)
     if faults or not np.isfinite(loss):

@@ -19,7 +19,7 @@ from gsstream_cpu_render.arrays import (
     require_splats,
 )
 from gsstream_cpu_render.checks import Float32, refuse, refuse_value
-from gsstream_cpu_render.loss import PhotometricTarget, weighted
+from gsstream_cpu_render.loss import PreparedImage, weighted
 from gsstream_cpu_render.view import NEAR, Background, checked_view
 
 
@@ -55,9 +55,9 @@ class NativeRasterizer:
         self._native.forget()
         self._coefficients, self._scene_rows = 1, 0
 
-    def shed_scratch(self) -> None:
+    def free_scratch(self) -> None:
         """Free the memory that only full passes need; the cache stays. No backward may follow; call freeze again."""
-        self._native.shed_scratch()
+        self._native.free_scratch()
 
     def release(self) -> Any:
         """Give away the native object with its memory. This object is of no use afterwards."""
@@ -96,7 +96,7 @@ class NativeRasterizer:
         return self._native
 
     def comparison(
-        self, cached_image: Float32 | None, target: PhotometricTarget, dssim_weight: float,
+        self, cached_image: Float32 | None, target: PreparedImage, dssim_weight: float,
         colours: Sequence[Float32 | None], weights: Float32 | None,
     ) -> Any:  # fmt: skip
         """What renders are compared with, as the one handle that the kernels take.
@@ -121,8 +121,8 @@ class NativeRasterizer:
         except ValueError as error:
             refuse_value(str(error))
 
-    def pull_active(
-        self, rows: SplatArrays, cached_image: Float32, target: PhotometricTarget, dssim_weight: float,
+    def loss_and_grad_active(
+        self, rows: SplatArrays, cached_image: Float32, target: PreparedImage, dssim_weight: float,
         colours: Sequence[Float32 | None], weights: Float32 | None, out: SplatArrays,
     ) -> float:  # fmt: skip
         """Render the active rows, judge the picture and write the gradient by the rows: one iteration of a fit.
@@ -148,15 +148,15 @@ class NativeRasterizer:
         rows = require_splats(rows, self._native.active_count)
         comparison = self.comparison(cached_image, target, dssim_weight, colours, weights)
         try:
-            result = self._native.pull_active(native_scene(rows), comparison, *out)
+            result = self._native.loss_and_grad_active(native_scene(rows), comparison, *out)
         except ValueError as error:
             refuse_value(str(error))
         self._coefficients = rows.shN.shape[1] + 1
         return _loss_of(result, rows, target, dssim_weight)
 
-    def pull_whole(
-        self, splats: SplatArrays, target: PhotometricTarget, dssim_weight: float,
-        colours: Sequence[Float32 | None], out: Sequence[Float32], map_slope: Float32 | None,
+    def full_loss_and_grad(
+        self, splats: SplatArrays, target: PreparedImage, dssim_weight: float,
+        colours: Sequence[Float32 | None], out: Sequence[Float32], exposure_grad: Float32 | None,
     ) -> float:  # fmt: skip
         """Render all Gaussians, judge the picture and write the gradient by all of them: an iteration of frame 0.
 
@@ -167,7 +167,7 @@ class NativeRasterizer:
             splats: raw parameters of N Gaussians.
             target, dssim_weight, colours: as for ``comparison``.
             out: arrays like those of ``splats``, and [N, 2] for the 2-D means in pixels; the gradient is written here.
-            map_slope: [12] for the gradient by the matrix and the offset of ``colours``; None: not wanted.
+            exposure_grad: [12] for the gradient by the matrix and the offset of ``colours``; None: not wanted.
 
         Returns:
             The loss.
@@ -179,7 +179,7 @@ class NativeRasterizer:
         comparison = self.comparison(None, target, dssim_weight, colours, None)
         camera = self._view[:-1]  # the background is the comparison's
         try:
-            result = _native.pull_whole(self._native, native_scene(splats), *camera, comparison, *out, map_slope)
+            result = _native.full_loss_and_grad(self._native, native_scene(splats), *camera, comparison, *out, exposure_grad)
         except ValueError as error:
             refuse_value(str(error))
         return _loss_of(result, splats, target, dssim_weight)
@@ -226,7 +226,7 @@ class NativeRasterizer:
 
 
 def _loss_of(
-    result: tuple[int, float, float], splats: SplatArrays, target: PhotometricTarget, dssim_weight: float
+    result: tuple[int, float, float], splats: SplatArrays, target: PreparedImage, dssim_weight: float
 ) -> float:
     """The loss of fault bits and sums as a kernel gives them; raises InputError for faults."""
     faults, l1, dssim = result

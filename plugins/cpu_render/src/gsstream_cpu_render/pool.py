@@ -16,7 +16,7 @@ from gsstream_cpu_render.checks import Float32
 from gsstream_cpu_render.rasterizer import NumpyRasterizer
 from gsstream_cpu_render.view import Background
 
-MOST_IDLE = 32
+MAX_IDLE = 32
 
 #: Taken twice by one thread when the collector, called while it is held, finds a lease that nobody holds any more.
 _lock = threading.RLock()
@@ -50,7 +50,7 @@ class Passes(ABC):
         """Gradients in the order of SplatGradients. ``splats`` are those of the forward."""
 
 
-class Lease:
+class PooledRasterizer:
     """A rasteriser for one owner; its memory returns to the pool when the last reference to the lease goes.
 
     With ``own`` it came from the system and goes back there.
@@ -60,24 +60,24 @@ class Lease:
         self.rasterizer = rasterizer
         if not own:
             # Not __del__, which may run after this module's names are gone when Python ends. Nothing needs memory then.
-            weakref.finalize(self, _give_back, rasterizer).atexit = False
+            weakref.finalize(self, _return_to_pool, rasterizer).atexit = False
 
 
-def _give_back(rasterizer: NumpyRasterizer) -> None:
+def _return_to_pool(rasterizer: NumpyRasterizer) -> None:
     native = rasterizer.release()
     with _lock:
-        if len(_idle) < MOST_IDLE and native.isa == _native.active_isa():
+        if len(_idle) < MAX_IDLE and native.isa == _native.active_isa():
             _idle.append(native)
 
 
-def lease(cameras: Rig, view: int, background: Background, own: bool = False) -> Lease:
+def acquire_rasterizer(cameras: Rig, view: int, background: Background, own: bool = False) -> PooledRasterizer:
     """A rasteriser for camera ``view`` of a rig; ``own``: with memory that nobody had before or gets after."""
     with _lock:
         # An object keeps the kernels of the instruction set it was made for.
         _idle[:] = [native for native in _idle if native.isa == _native.active_isa()]
         native = _idle.pop() if _idle and not own else None
     pose = (cameras.viewmats[view], cameras.Ks[view])
-    return Lease(NumpyRasterizer(*pose, cameras.width, cameras.height, background, cameras.near, native=native), own)
+    return PooledRasterizer(NumpyRasterizer(*pose, cameras.width, cameras.height, background, cameras.near, native=native), own)
 
 
 def release_idle_memory() -> int:

@@ -225,7 +225,7 @@ class NumpyRasterizer(NativeRasterizer):
         self._call("visible_in_cache", visible)
         return v_means2d, visible.view(np.bool_)
 
-    def pull_cached(self, splats: SplatArrays, v_image: Float32) -> tuple[NDArray[np.int64], Float32]:
+    def backward_cached_rows(self, splats: SplatArrays, v_image: Float32) -> tuple[NDArray[np.int64], Float32]:
         """What `backward_cached` gives of the rows that ``v_image`` reaches: [K] ascending and [K, 2], the same bits.
 
         All other rows have a gradient of zero. Work and memory do not grow with the number of rows of the scene, but
@@ -238,12 +238,12 @@ class NumpyRasterizer(NativeRasterizer):
             InputError: as `backward_cached`.
         """
         splats = require_splats(splats)
-        count = self._call("pull_cached", native_scene(splats), self._upstream(v_image, None)[0])
+        count = self._call("backward_cached_rows", native_scene(splats), self._upstream(v_image, None)[0])
         rows, gradient = np.empty(count, np.int64), np.empty((count, 2), np.float32)
-        self._call("pulled_rows", rows, gradient)
+        self._call("high_gradient_rows", rows, gradient)
         return rows, gradient
 
-    def drawn_in_cache(self, tile_mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    def contributing_in_cache(self, tile_mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
         """Say which rows of the cached scene added light to a pixel of the marked tiles: [N] bool.
 
         Nothing is rendered or differentiated; the lists of the marked tiles are read. At the image's border the 4 x 4
@@ -255,9 +255,9 @@ class NumpyRasterizer(NativeRasterizer):
         Raises:
             InputError: wrong dtype or shape, no full forward yet, tiles that are not cached.
         """
-        self._expect("drawn_in_cache")
+        self._expect("contributing_in_cache")
         drawn = np.empty(self._native.scene_count, np.uint8)
-        self._call("drawn_in_cache", require_mask(tile_mask, self.width, self.height), drawn)
+        self._call("contributing_in_cache", require_mask(tile_mask, self.width, self.height), drawn)
         return drawn.view(np.bool_)
 
     def forward_cached(

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from gsstream.api import Cameras, Gaussians, PartConfig, Renderer, RenderOutput, RenderSession
 from gsstream_cpu_render.autograd import differentiable
-from gsstream_cpu_render.pool import lease
+from gsstream_cpu_render.pool import acquire_rasterizer
 from gsstream_cpu_render.session import CpuSession, FullPass
 from gsstream_cpu_render.threads import instruction_set
 from gsstream_cpu_render.view import Background
@@ -45,7 +45,7 @@ class CpuRenderer(Renderer):
     def render(
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, background: Background
     ) -> RenderOutput:
-        return differentiable(FullPass(lease(cameras, view, background), None), gaussians, None)
+        return differentiable(FullPass(acquire_rasterizer(cameras, view, background), None), gaussians, None)
 
     def open(
         self,

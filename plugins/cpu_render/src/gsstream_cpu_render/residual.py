@@ -15,7 +15,7 @@ from gsstream.api import (
     AnalyticGate,
     AnalyticPenalty,
     Gaussians,
-    JointCode,
+    JointLayout,
     ResidualEpoch,
     ResidualOptimiser,
     unwrapped,
@@ -40,7 +40,7 @@ class CpuResidualOptimiser(ResidualOptimiser):
     """
 
     def __init__(
-        self, code: JointCode, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor
+        self, code: JointLayout, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor
     ) -> None:
         self._code, self._base, self._units = code, base.map(torch.Tensor.contiguous), units.float().contiguous()
         self._native = _native.ResidualTable(_blocks(code), code.width, matrix.shape[1])
@@ -87,7 +87,7 @@ class CpuResidualOptimiser(ResidualOptimiser):
         by_gate = torch.empty(len(latents))
         results = [value.numpy() for value in (latents, matrix, by_gate)]
         inputs = self._latents.detach(), self._units, self._gates
-        self._native.pull(*(value.numpy() for value in inputs), upstream, rd_lambda, *results)
+        self._native.backward(*(value.numpy() for value in inputs), upstream, rd_lambda, *results)
         self._pending = latents, matrix
         return by_gate
 
@@ -158,7 +158,7 @@ def _table(values: torch.Tensor, state: AdamState) -> tuple[object, ...]:
     return (*parts, state.steps.numpy())
 
 
-def _blocks(code: JointCode) -> list[tuple[int, int, int, int, bool, bool]]:
+def _blocks(code: JointLayout) -> list[tuple[int, int, int, int, bool, bool]]:
     """Columns of each attribute; whether it is measured in units, and has a decoder."""
     blocks = []
     for name, rows in code.latent.items():

@@ -36,7 +36,7 @@ from gsstream_cpu_render.cached_view import CachedView, Ids, freeze_views, updat
 from gsstream_cpu_render.checks import Float32, as_array
 from gsstream_cpu_render.loss_part import CpuLoss
 from gsstream_cpu_render.moved import loss_and_grad_of_transforms
-from gsstream_cpu_render.pool import Lease, Passes, lease
+from gsstream_cpu_render.pool import PooledRasterizer, Passes, acquire_rasterizer
 from gsstream_cpu_render.view import Background
 from gsstream_cpu_render.whole import loss_and_grad_of_scene
 
@@ -90,7 +90,7 @@ class CpuSession(RenderSession):
         upstream = as_array("image_gradient", image_gradient.contiguous())
         splats = splats_of(self._gaussians)
         cached = self._view(view)  # its owner while the native call runs
-        rows, gradient = cached.rasterizer.pull_cached(splats, upstream)
+        rows, gradient = cached.rasterizer.backward_cached_rows(splats, upstream)
         return RowGradient(torch.from_numpy(rows), torch.from_numpy(gradient))
 
     def visible(self, view: int, tiles: torch.Tensor) -> torch.Tensor:
@@ -98,7 +98,7 @@ class CpuSession(RenderSession):
         if not bool(tiles.any()):
             return torch.zeros(len(self._gaussians), dtype=torch.bool)
         cached = self._view(view)  # its owner while the native call runs
-        return torch.from_numpy(cached.rasterizer.drawn_in_cache(as_array("tiles", tiles)))
+        return torch.from_numpy(cached.rasterizer.contributing_in_cache(as_array("tiles", tiles)))
 
     def visible_anywhere(self, tiles: torch.Tensor) -> torch.Tensor:
         views = tiles.flatten(1).any(1).nonzero()[:, 0].tolist()
@@ -199,8 +199,8 @@ class CpuSession(RenderSession):
     def cache_bytes(self) -> RenderCache:
         return RenderCache({index: view.bytes() for index, view in self._views.items()}, len(self._gaussians))
 
-    def _lease(self, view: int, own: bool = False) -> Lease:
-        return lease(self._cameras, view, self._background, own)
+    def _lease(self, view: int, own: bool = False) -> PooledRasterizer:
+        return acquire_rasterizer(self._cameras, view, self._background, own)
 
     def _view(self, view: int) -> CachedView:
         """A view with its cache filled, kept for the next call unless the caches together are beyond the budget."""
@@ -229,7 +229,7 @@ def _ascending(rows: torch.Tensor) -> tuple[Ids, torch.Tensor | None]:
 class FullPass(Passes):
     """Forward and backward of a whole scene with a rasteriser of its own."""
 
-    def __init__(self, held: Lease, mask: Any) -> None:
+    def __init__(self, held: PooledRasterizer, mask: Any) -> None:
         self._held, self._mask = held, mask
 
     def forward(self, splats: SplatArrays) -> tuple[Float32, Float32]:

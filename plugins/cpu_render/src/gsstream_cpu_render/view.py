@@ -11,7 +11,7 @@ from gsstream_cpu_render.checks import Float32, refuse, refuse_value
 
 Background = tuple[float, float, float]
 NEAR = 0.01
-MOST_PIXELS = 65536
+MAX_PIXELS = 65536
 
 
 class View(NamedTuple):
@@ -43,8 +43,8 @@ def checked_view(
         refuse_value(f"K: expected positive focal lengths in pixels, got fx = {fx:g}, fy = {fy:g}")
     if skew != 0:
         refuse_value(f"K: expected no skew (K[0, 1] = 0), got {skew:g}; undistort the images first")
-    if not (1 <= width <= MOST_PIXELS and 1 <= height <= MOST_PIXELS):
-        refuse_value(f"image size: expected 1 to {MOST_PIXELS} pixels a side, got {width} x {height}")
+    if not (1 <= width <= MAX_PIXELS and 1 <= height <= MAX_PIXELS):
+        refuse_value(f"image size: expected 1 to {MAX_PIXELS} pixels a side, got {width} x {height}")
     if not 0 < near < np.inf:
         refuse_value(f"near: expected a positive distance in scene units, got {near}")
     if view.background.shape != (3,) or not np.isfinite(view.background).all():

@@ -8,10 +8,10 @@ import torch
 from gsstream.api import Gaussians, LossAndGrad, ViewTarget, WrtScene
 from gsstream_cpu_render.autograd import splats_of
 from gsstream_cpu_render.cached_view import exposure_arrays
-from gsstream_cpu_render.pool import Lease
+from gsstream_cpu_render.pool import PooledRasterizer
 
 
-def loss_and_grad_of_scene(held: Lease, target: ViewTarget, wrt: WrtScene) -> LossAndGrad[Gaussians[torch.Tensor]]:
+def loss_and_grad_of_scene(held: PooledRasterizer, target: ViewTarget, wrt: WrtScene) -> LossAndGrad[Gaussians[torch.Tensor]]:
     """Return loss and gradients by the rows of a whole scene.
 
     Arguments:
@@ -24,7 +24,7 @@ def loss_and_grad_of_scene(held: Lease, target: ViewTarget, wrt: WrtScene) -> Lo
     means2d = torch.empty(len(rows), 2)
     by_exposure = None if target.exposure is None else np.empty(12, np.float32)
     out = (*splats_of(grad), means2d.numpy())
-    loss = held.rasterizer.pull_whole(
+    loss = held.rasterizer.full_loss_and_grad(
         splats_of(rows), target.prepared, target.dssim, exposure_arrays(target), out, by_exposure
     )
     return LossAndGrad(

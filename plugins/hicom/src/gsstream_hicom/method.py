@@ -22,7 +22,7 @@ from gsstream.api import (
     send_delta,
     send_key,
 )
-from gsstream.blocks import replaced_by_copies, rows_in_change
+from gsstream.blocks import replace_with_copies, rows_in_changed_tiles
 from gsstream_hicom.motion import fitted_motions
 from gsstream_hicom.settings import HiCoMConfig
 
@@ -50,7 +50,7 @@ class HiCoM(StreamingMethod[HiCoMState]):
     source = "HiCoM (Gao et al. 2024)"
 
     Config = HiCoMConfig
-    heeds = ("stream.epochs",)
+    recipe_keys = ("stream.epochs",)
 
     def begin(self, frame: Frame, tools: Tools) -> Step[HiCoMState]:
         first = tools.first_frame(frame)
@@ -71,7 +71,7 @@ class HiCoM(StreamingMethod[HiCoMState]):
             scene = state.player.scene
             work = tools.open(state.player, state.previous, frame)
             settings, means = self.config.motion, work.gaussians.means
-            rows = rows_in_change(work.session, means, state.previous, frame, settings.change, settings.votes)
+            rows = rows_in_changed_tiles(work.session, means, state.previous, frame, settings.change, settings.votes)
             order = tools.rng.numpy("hicom", frame.index)
             motions, moved = fitted_motions(
                 scene, work, rows, max(1, epochs - for_births), self.config.motion, order
@@ -88,7 +88,7 @@ class HiCoM(StreamingMethod[HiCoMState]):
         """As many of the least opaque leave as there are more than in frame 0; then this frame's are born."""
         deaths = np.sort(np.argsort(scene.gaussians.opacities, kind="stable")[: len(scene.gaussians) - number])
         births = self.config.births
-        return replaced_by_copies(
+        return replace_with_copies(
             scene, deaths, work, epochs, tools.rng, gradient=births.gradient, most=births.most, rounds=births.rounds,
             prune_opacity=births.prune_opacity,
         )  # fmt: skip

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gsstream.api import FloatArray, FrameWork, Groups, IntArray, Motion, Scene, apply_motion, groups_for
-from gsstream.blocks import Moves, each_alone, felt_most, fitted_moves, groups_within, moves_of, pixel_size
+from gsstream.api import FloatArray, FitContext, Groups, IntArray, Motion, Scene, apply_motion, groups_for
+from gsstream.blocks import GroupTransforms, elementwise, groupwise_max, fit_transforms_adam, groups_of_rows, predict_transforms, pixel_size
 from gsstream_hicom.settings import MotionSettings
 
 #: The box whose volume the cells share holds this part of the Gaussians along each axis.
@@ -27,7 +27,7 @@ def cell_sides(means: FloatArray, settings: MotionSettings) -> list[float]:
 
 
 def fitted_motions(
-    scene: Scene, work: FrameWork, rows: IntArray, epochs: int, settings: MotionSettings, order: np.random.Generator
+    scene: Scene, work: FitContext, rows: IntArray, epochs: int, settings: MotionSettings, order: np.random.Generator
 ) -> tuple[tuple[Motion, ...], Scene]:
     """Return the motions of a frame, one for each grid, and the scene after them.
 
@@ -44,7 +44,7 @@ def fitted_motions(
     total = epochs * len(work.cameras)
     for level, side in enumerate(cell_sides(scene.gaussians.means, settings)):
         groups = groups_for(scene, side, 1, regroup=True)
-        able = np.flatnonzero(groups_within(groups, rows))
+        able = np.flatnonzero(groups_of_rows(groups, rows))
         iterations = total * (level + 1) // settings.levels - total * level // settings.levels
         if not len(able) or not iterations:
             continue
@@ -58,19 +58,19 @@ def fitted_motions(
 
 
 def _fitted(
-    scene: Scene, start: Scene, work: FrameWork, groups: Groups, able: IntArray, iterations: int, pixel: float,
+    scene: Scene, start: Scene, work: FitContext, groups: Groups, able: IntArray, iterations: int, pixel: float,
     settings: MotionSettings, order: np.random.Generator,
 ) -> Motion:  # fmt: skip
     """One grid: the transforms of its cells, rounded."""
     marks = np.zeros(groups.count, np.uint8)
     marks[able] = 1
-    moves = _warm(scene, start, moves_of(scene, groups, marks, predicted=False), settings.momentum)
+    moves = _warm(scene, start, predict_transforms(scene, groups, marks, predicted=False), settings.momentum)
     # Half a cell from its centre, a turn of one unit moves a Gaussian by a pixel, too.
     turn = pixel / groups.cell
     unit = np.array([pixel] * 3 + [turn] * 3)
-    measure = each_alone if settings.measure == "each" else felt_most
+    measure = elementwise if settings.measure == "each" else groupwise_max
     rates = [settings.lr] * iterations
-    found = fitted_moves(scene, work, moves, unit, rates, order, measure, settings.pull)
+    found = fit_transforms_adam(scene, work, moves, unit, rates, order, measure, settings.l1_weight)
     steps = float(np.float32(settings.step * pixel)), float(np.float32(settings.step * turn))
     symbols = np.rint(found / np.array([steps[0]] * 3 + [steps[1]] * 3)).astype(np.int32)
     moved = symbols.any(1)
@@ -78,7 +78,7 @@ def _fitted(
     return Motion(groups.cell, 1, marks, symbols[moved], *steps, predicted=False, regroup=True)
 
 
-def _warm(scene: Scene, start: Scene, moves: Moves, momentum: float) -> Moves:
+def _warm(scene: Scene, start: Scene, moves: GroupTransforms, momentum: float) -> GroupTransforms:
     """Moves that begin with a share of the last frame's motion, less what coarser cells have moved by already."""
     if start.moved is None or momentum == 0:
         return moves

@@ -10,7 +10,7 @@ def gsstream_components() -> list[ComponentSpec]:
     """The method as one part."""
     return [
         ComponentSpec(
-            kind="stepper",
+            kind="streaming_method",
             name="hicom",
             target="gsstream_hicom.method:HiCoM",
             summary="rigid motion of the cells of three nested grids, Gaussians added and removed at constant number",

@@ -16,7 +16,7 @@ class MotionSettings(PartConfig):
     per_cell: float = Field(default=5.0, gt=0, description="Gaussians per cell of the finest grid, on average")
     momentum: float = Field(default=0.6, ge=0, le=1, description="share of the last frame's motion to begin with")
     lr: float = Field(default=0.25, gt=0, le=10, description="step of the fit, pixels per iteration")
-    pull: float = Field(default=0.0, ge=0, description="weight of the mean absolute motion, pixels, in the loss")
+    l1_weight: float = Field(default=0.0, ge=0, description="weight of the mean absolute motion, pixels, in the loss")
     step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
     measure: Literal["each", "cell"] = Field(
         default="each",

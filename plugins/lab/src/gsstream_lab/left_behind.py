@@ -15,7 +15,7 @@ from gsstream.core.frame import Frame
 from gsstream.core.projection import inside, project
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.core.storage import packed, unpacked
-from gsstream.engine.run.displacement import screen_ways
+from gsstream.engine.run.displacement import screen_displacement
 from gsstream.input.recordings.base import FrameSource
 from gsstream.metrics.moving import changed_mask, dilate
 from gsstream.packet import PacketKind, PlayerState, StreamReader, decode_packet
@@ -80,7 +80,7 @@ class LeftBehind:
             self._rows = np.where(visible, np.arange(len(visible)), -1)
             return
         delta = player.delta
-        if delta is None or not delta.edits_rows or player.before is None:
+        if delta is None or not delta.has_row_edit or player.before is None:
             return
         source = gather_rows(player.before.node_of, delta.births, delta.deaths)
         self._rows = np.append(self._rows, -1)[np.minimum(source, len(self._rows))]
@@ -101,7 +101,7 @@ class LeftBehind:
         body = in_hull(start, frame.cameras, changed)
         start, end = start[body], end[body]
         outside = ~in_hull(end, frame.cameras, changed)
-        unmoved = ~outside & (screen_ways(start, end, frame.cameras) < UNMOVED)
+        unmoved = ~outside & (screen_displacement(start, end, frame.cameras) < UNMOVED)
         return {"body": len(start), "outside": int(outside.sum()), "unmoved": int(unmoved.sum())}
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gsstream.api import FrameWork, IntArray
+from gsstream.api import FitContext, IntArray
 from gsstream.blocks import pixel_size
 from gsstream_quarc.settings import GateSettings
 
 
-def change_scores(work: FrameWork, views: int) -> torch.Tensor:
+def change_scores(work: FitContext, views: int) -> torch.Tensor:
     """Return [N] the change score g / (g + median) of every Gaussian, 0 to 1; 0 where no view pulls.
 
     g is the size of the change, from the frame before to this one, of the pull of the squared error at a Gaussian's
@@ -26,13 +26,13 @@ def change_scores(work: FrameWork, views: int) -> torch.Tensor:
         now = work.image(int(view))
         upstream = 2 * (work.previous_image(int(view)) - now) / now.numel()
         size += work.screen_gradient(int(view), upstream).gradient.norm(dim=1)
-    pulled = size > 0
-    if not bool(pulled.any()):
+    reached = size > 0
+    if not bool(reached.any()):
         return size
-    return size / (size + size[pulled].median())
+    return size / (size + size[reached].median())
 
 
-class ChangeGate:
+class ChangeFilter:
     """Chooses places for births: those that changed, at most some in a cell."""
 
     def __init__(self, settings: GateSettings, kept: int) -> None:
@@ -44,7 +44,7 @@ class ChangeGate:
         """
         self.settings, self.kept = settings, kept
 
-    def __call__(self, work: FrameWork, rows: torch.Tensor) -> torch.Tensor:
+    def __call__(self, work: FitContext, rows: torch.Tensor) -> torch.Tensor:
         """Return the rows that may be copied, in the order in which they come.
 
         Arguments:

@@ -6,8 +6,8 @@ from typing import final
 
 from gsstream_recon.method import AnchoredMethod
 
-from gsstream.blocks import Admitted
-from gsstream_quarc.births import ChangeGate
+from gsstream.blocks import CopyFilter
+from gsstream_quarc.births import ChangeFilter
 from gsstream_quarc.settings import QuARCConfig
 
 
@@ -26,5 +26,5 @@ class QuARC(AnchoredMethod):
     Config = QuARCConfig
     rounded = True
 
-    def admission(self, kept: int) -> Admitted:
-        return ChangeGate(self.config.gate, kept)
+    def admission(self, kept: int) -> CopyFilter:
+        return ChangeFilter(self.config.gate, kept)

@@ -10,7 +10,7 @@ def gsstream_components() -> list[ComponentSpec]:
     """The method as one part."""
     return [
         ComponentSpec(
-            kind="stepper",
+            kind="streaming_method",
             name="quarc",
             target="gsstream_quarc.method:QuARC",
             summary="rounded motions of anchors on three levels, Gaussians added where four views changed",

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import torch
 
 from gsstream.api import Gaussians
-from gsstream.blocks import SPLIT_SIZE, children
+from gsstream.blocks import SPLIT_SIZE, split_or_clone
 from gsstream_queen.settings import BirthSettings
 
 
-class Litter(NamedTuple):
+class AddedByDensify(NamedTuple):
     """``gaussians`` that are born, and the rows [P] of parents that they replace (those that were split)."""
 
     gaussians: Gaussians[torch.Tensor]
@@ -27,9 +27,9 @@ def densify_epochs(settings: BirthSettings, epochs: int) -> frozenset[int]:
 
 
 def densify(
-    rows: Gaussians[torch.Tensor], pull: torch.Tensor, may: torch.Tensor, room: int, extent: float,
+    rows: Gaussians[torch.Tensor], grad_norm: torch.Tensor, may: torch.Tensor, room: int, extent: float,
     settings: BirthSettings, generator: torch.Generator,
-) -> Litter:  # fmt: skip
+) -> AddedByDensify:  # fmt: skip
     """Clone small and split large rows that the images pull at most.
 
     Arguments:
@@ -38,11 +38,11 @@ def densify(
         room: births at most.
         extent: of the rig, scene units.
     """
-    hot = (may & (pull > settings.gradient)).nonzero()[:, 0]
+    hot = (may & (grad_norm > settings.gradient)).nonzero()[:, 0]
     large = rows.scales.exp().amax(1) > SPLIT_SIZE * extent
-    order = hot[torch.argsort(pull[hot], descending=True, stable=True)]
+    order = hot[torch.argsort(grad_norm[hot], descending=True, stable=True)]
     cost = torch.cumsum(torch.where(large[order], 2, 1), 0)
     chosen = order[cost <= room].sort().values
     parents = torch.cat([chosen[~large[chosen]], chosen[large[chosen]].repeat_interleave(2)])
-    return Litter(children(rows, parents, large[parents], generator), chosen[large[chosen]])
+    return AddedByDensify(split_or_clone(rows, parents, large[parents], generator), chosen[large[chosen]])
 

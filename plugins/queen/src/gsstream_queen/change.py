@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 
 from gsstream.api import FrameTools, Renderer
-from gsstream.blocks import marked_per_tile
+from gsstream.blocks import count_per_tile
 from gsstream_queen.settings import ChangeSettings, MaskSettings
 
 TILE = 16
@@ -70,7 +70,7 @@ def changed_tiles(
     for view in range(len(cameras)):
         with torch.no_grad():
             alpha = renderer.render(alone, cameras, view, (0.0, 0.0, 0.0)).alpha
-        count, size = marked_per_tile((alpha > settings.alpha).numpy())
+        count, size = count_per_tile((alpha > settings.alpha).numpy())
         changed = torch.from_numpy(count >= size * settings.pixels / TILE**2).float()[None, None]
         kernel = 2 * settings.dilate + 1
         masks.append(torch.nn.functional.max_pool2d(changed, kernel, 1, settings.dilate)[0, 0] > 0)

@@ -12,7 +12,7 @@ from gsstream_queen.settings import GateSettings
 BOUND = math.log(1000.0)
 
 
-def shift(settings: GateSettings) -> float:
+def open_logit(settings: GateSettings) -> float:
     """Logit at which the stretched gate begins to open: temperature * ln(-gamma / eta)."""
     return settings.temperature * math.log(-settings.gamma / settings.eta)
 
@@ -31,7 +31,7 @@ def initial_logits(difference: torch.Tensor, seen: torch.Tensor, settings: GateS
     median = difference[seen].median()
     # ln p / (1 - p) = ln m / median; over a median of 0 everything that changed is sure.
     sure = torch.full_like(difference[moved], BOUND)
-    logits[moved] = (difference[moved] / median).log() + shift(settings) if float(median) > 0 else sure
+    logits[moved] = (difference[moved] / median).log() + open_logit(settings) if float(median) > 0 else sure
     return logits.clamp(-BOUND, BOUND)
 
 
@@ -43,4 +43,4 @@ def gates(logits: torch.Tensor, settings: GateSettings) -> torch.Tensor:
 
 def open_probability(logits: torch.Tensor, settings: GateSettings) -> torch.Tensor:
     """[N] probability that a gate with noise would not be 0: what L0 counts."""
-    return torch.sigmoid(logits - shift(settings))
+    return torch.sigmoid(logits - open_logit(settings))

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from gsstream.api import (
-    Births,
+    AddedGaussians,
     Delta,
     Frame,
     FrameTools,
@@ -54,7 +54,7 @@ class Queen(StreamingMethod[QueenState]):
     source = "QUEEN (Girish et al. 2024)"
 
     Config = QueenConfig
-    heeds = ("stream.epochs",)
+    recipe_keys = ("stream.epochs",)
 
     def begin(self, frame: Frame, tools: Tools) -> Step[QueenState]:
         first = tools.first_frame(frame)
@@ -129,9 +129,9 @@ class Queen(StreamingMethod[QueenState]):
         return Delta((Residual(gates, 1, symbols, steps, quantise_decoders(learned)),)).with_rows(rows)
 
 
-def births(born: Gaussians[torch.Tensor], nodes: int) -> Births | None:
+def births(born: Gaussians[torch.Tensor], nodes: int) -> AddedGaussians | None:
     """Each new Gaussian is a node of its own, behind the old ones."""
     if len(born) == 0:
         return None
     own = nodes + np.arange(len(born), dtype=np.int64)
-    return Births(born.map(lambda value: value.numpy()), own, np.zeros(len(born), np.uint8), own)
+    return AddedGaussians(born.map(lambda value: value.numpy()), own, np.zeros(len(born), np.uint8), own)

@@ -10,7 +10,7 @@ def gsstream_components() -> list[ComponentSpec]:
     """The method as one part."""
     return [
         ComponentSpec(
-            kind="stepper",
+            kind="streaming_method",
             name="queen",
             target="gsstream_queen.method:Queen",
             summary="quantised latent residuals on every Gaussian, hard-concrete gates on positions, masked births",

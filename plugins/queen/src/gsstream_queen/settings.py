@@ -123,7 +123,7 @@ class QueenConfig(PartConfig):
     )  # fmt: skip
     rate: float = Field(
         default=0.0, ge=0, le=10,
-        description="weight of the latents' bits per training pixel, as stream.rate_weight (ours), to 10",
+        description="weight of the latents' bits per training pixel, as stream.rd_lambda (ours), to 10",
     )  # fmt: skip
     rows: Literal["all", "dynamic"] = Field(
         default="all", description="which Gaussians are trained; all: published; dynamic: only those"

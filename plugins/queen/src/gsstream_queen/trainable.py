@@ -14,7 +14,7 @@ from gsstream_queen.latents import Tensors, coded, decoder, rounded, width
 from gsstream_queen.settings import QueenConfig
 
 #: 3DGS, raw units per iteration (centres: fraction of the rig's extent from the settings).
-BORN_RATES = {"quats": 1e-3, "scales": 5e-3, "opacities": 0.05, "sh0": 2.5e-3, "shN": 1.25e-4}
+ADDED_LRS = {"quats": 1e-3, "scales": 5e-3, "opacities": 0.05, "sh0": 2.5e-3, "shN": 1.25e-4}
 #: Under the root of the latents' variance, symbols squared.
 SPREAD_EPSILON = 1e-8
 ADAM_EPS = 1e-15  # 3DGS: tiny gradients of tiny Gaussians must still move them
@@ -70,10 +70,10 @@ class OldRows:
             weight = decoder(self._weights[name], policy, width(self._base, name))
             changed[name] = base + (rounded(self._latents[name]) @ weight).reshape(base.shape)
         if self._moving:
-            changed["means"] = self._base.means + rounded(self._gated_shift()) * self._unit
+            changed["means"] = self._base.means + rounded(self._gated_translation()) * self._unit
         return Gaussians(**changed)
 
-    def _gated_shift(self) -> torch.Tensor:
+    def _gated_translation(self) -> torch.Tensor:
         if self._config.means.policy == "direct":
             return self._shift
         return self._shift * gates(self._logits, self._config.gate)[:, None]
@@ -112,7 +112,7 @@ class OldRows:
         with torch.no_grad():
             symbols = {name: torch.round(value).to(torch.int32) for name, value in self._latents.items()}
             if self._moving:
-                symbols["means"] = torch.round(self._gated_shift()).to(torch.int32)
+                symbols["means"] = torch.round(self._gated_translation()).to(torch.int32)
             decoders = {
                 name: decoder(self._weights[name], policy, width(self._base, name)).detach().clone()
                 for name, policy in self._policies.items()
@@ -126,7 +126,7 @@ class NewRows:
     def __init__(self, born: Gaussians[torch.Tensor], lr_means: float) -> None:
         """``lr_means``: scene units per iteration."""
         self._leaves = {name: value.detach().clone().requires_grad_() for name, value in born.items()}
-        rates = {"means": lr_means, **BORN_RATES}
+        rates = {"means": lr_means, **ADDED_LRS}
         groups = [{"params": [self._leaves[name]], "lr": rates[name]} for name in ATTRIBUTES]
         self._adam = torch.optim.Adam(groups, eps=ADAM_EPS, fused=True)
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsstream.api import FloatArray, IntArray, PlayerState, Rng
-from gsstream.blocks import gather_rows, nearest_among, nearest_rows
+from gsstream.blocks import gather_rows, k_nearest, nearest_rows
 from gsstream_recon.settings import MotionSettings
 
 #: Added to distances before they are inverted, as a share of their mean: an anchor may lie where an old one lay.
@@ -65,7 +65,7 @@ def followed(anchors: AnchorLevels, player: PlayerState) -> AnchorLevels:
         anchors: rows of the scene before the packet.
         player: what players have after it.
     """
-    if player.delta is None or player.before is None or not player.delta.edits_rows:
+    if player.delta is None or player.before is None or not player.delta.has_row_edit:
         return anchors
     source = gather_rows(player.before.node_of, player.delta.births, player.delta.deaths)
     place = np.full(int(player.before.node_counts.sum()), -1, np.int64)
@@ -123,7 +123,7 @@ def inherited(past: FloatArray, old: list[Level], new: list[Level], neighbours: 
         motion = before.mean(left)
         left = left - motion[before.of]
         if old is not new:
-            distance, near = nearest_among(now.at, before.at, min(neighbours, len(before.at)))
+            distance, near = k_nearest(now.at, before.at, min(neighbours, len(before.at)))
             weight = 1 / (distance + NEAR * distance.mean() + 1e-12)
             motion = (motion[near] * (weight / weight.sum(1, keepdims=True))[..., None]).sum(1)
         motions.append(motion)

@@ -23,7 +23,7 @@ from gsstream.api import (
     send_delta,
     send_key,
 )
-from gsstream.blocks import Admitted, replaced_by_copies, rows_in_change
+from gsstream.blocks import CopyFilter, replace_with_copies, rows_in_changed_tiles
 from gsstream_recon.anchors import AnchorLevels, anchors_after, due, followed
 from gsstream_recon.motion import fitted_motion
 from gsstream_recon.settings import ReConConfig
@@ -44,7 +44,7 @@ class ReConState:
 class AnchoredMethod(StreamingMethod[ReConState]):
     """Moves Gaussians by anchors on several levels, then adds some at constant number."""
 
-    heeds = ("stream.epochs",)
+    recipe_keys = ("stream.epochs",)
     Config = ReConConfig
     #: Whether the motion of every anchor is rounded while it is fitted.
     rounded = False
@@ -69,7 +69,7 @@ class AnchoredMethod(StreamingMethod[ReConState]):
             scene, settings = state.player.scene, self.config.motion
             work = tools.open(state.player, state.previous, frame)
             means = work.gaussians.means
-            rows = rows_in_change(work.session, means, state.previous, frame, settings.change, settings.votes)
+            rows = rows_in_changed_tiles(work.session, means, state.previous, frame, settings.change, settings.votes)
             anchors = due(state.anchors, frame.index, len(scene.gaussians), settings, tools.rng)
             motion = fitted_motion(
                 scene, work, rows, (state.anchors, anchors), max(1, epochs - for_births), settings,
@@ -88,12 +88,12 @@ class AnchoredMethod(StreamingMethod[ReConState]):
         """As many of the least opaque leave as there are more than in frame 0; then this frame's are born."""
         deaths = np.sort(np.argsort(scene.gaussians.opacities, kind="stable")[: len(scene.gaussians) - number])
         births = self.config.births
-        return replaced_by_copies(
+        return replace_with_copies(
             scene, deaths, work, epochs, tools.rng, gradient=births.gradient, most=births.most, rounds=births.rounds,
             prune_opacity=births.prune_opacity, admitted=self.admission(number),
         )  # fmt: skip
 
-    def admission(self, kept: int) -> Admitted | None:
+    def admission(self, kept: int) -> CopyFilter | None:
         """Return what chooses which of the Gaussians that are pulled may be copied; None, as here: all of them.
 
         Arguments:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gsstream.api import FloatArray, FrameWork, IntArray, Motion, Scene, WrtTransforms, groups_for
+from gsstream.api import FloatArray, FitContext, IntArray, Motion, Scene, WrtTransforms, groups_for
 from gsstream.blocks import (
-    Descent,
-    Moves,
-    each_alone,
-    felt_most,
-    groups_within,
-    moves_of,
+    GroupAdam,
+    GroupTransforms,
+    elementwise,
+    groupwise_max,
+    groups_of_rows,
+    predict_transforms,
     pixel_size,
 )
 from gsstream_recon.anchors import AnchorLevels, Level, bound, inherited
@@ -20,7 +20,7 @@ from gsstream_recon.settings import MotionSettings
 
 
 def fitted_motion(
-    scene: Scene, work: FrameWork, rows: IntArray, anchors: tuple[AnchorLevels | None, AnchorLevels], epochs: int,
+    scene: Scene, work: FitContext, rows: IntArray, anchors: tuple[AnchorLevels | None, AnchorLevels], epochs: int,
     settings: MotionSettings, order: np.random.Generator, rounded: bool = False,
 ) -> Motion | None:  # fmt: skip
     """Return the motion of a frame; None where nothing moves.
@@ -41,13 +41,13 @@ def fitted_motion(
     pixel = pixel_size(scene.gaussians.means, work.cameras)
     side = float(np.float32(settings.pixels * pixel))
     groups = groups_for(scene, side, 1, regroup=True)
-    marks = groups_within(groups, rows).astype(np.uint8)
+    marks = groups_of_rows(groups, rows).astype(np.uint8)
     if not marks.any():
         return None
-    cells = moves_of(scene, groups, marks, predicted=False)
+    cells = predict_transforms(scene, groups, marks, predicted=False)
     # Half a cell from its centre, a turn of one unit moves a Gaussian by a pixel, too.
     unit = np.array([pixel] * 3 + [pixel / side] * 3)
-    steps = float(np.float32(settings.step * pixel)), float(np.float32(settings.turn_step))
+    steps = float(np.float32(settings.step * pixel)), float(np.float32(settings.rotation_step))
     step = np.array([steps[0]] * 3 + [steps[1]] * 3)
     levels = bound(cells.centre, scene.gaussians.means, anchors[1])
     start = _start(scene, cells, anchors, levels, settings)
@@ -61,7 +61,7 @@ def fitted_motion(
 
 
 def _start(
-    scene: Scene, cells: Moves, anchors: tuple[AnchorLevels | None, AnchorLevels], levels: list[Level],
+    scene: Scene, cells: GroupTransforms, anchors: tuple[AnchorLevels | None, AnchorLevels], levels: list[Level],
     settings: MotionSettings,
 ) -> list[FloatArray]:  # fmt: skip
     """Motions [K, 6] of the anchors that begin with a share of the last frame's."""
@@ -76,12 +76,12 @@ def _start(
 
 
 def _fitted(
-    scene: Scene, work: FrameWork, cells: Moves, levels: list[Level], start: list[FloatArray], unit: FloatArray,
+    scene: Scene, work: FitContext, cells: GroupTransforms, levels: list[Level], start: list[FloatArray], unit: FloatArray,
     step: FloatArray | None, epochs: int, settings: MotionSettings, order: np.random.Generator,
 ) -> FloatArray:  # fmt: skip
     """Shifts and turns [C, 6] of the cells; all levels learn at once."""
-    measure = each_alone if settings.measure == "each" else felt_most
-    descents = [Descent(values / unit, measure) for values in start]
+    measure = elementwise if settings.measure == "each" else groupwise_max
+    descents = [GroupAdam(values / unit, measure) for values in start]
     work.narrow(torch.from_numpy(cells.rows))
     base = scene.gaussians.rows(cells.rows).map(torch.from_numpy)
     local = cells._replace(rows=np.arange(len(cells.rows)))
@@ -89,15 +89,15 @@ def _fitted(
         for view in order.permutation(len(work.cameras)):
             sums = _sums(levels, descents, unit, step)
             moves = local._replace(shift=sums[:, :3], turn=sums[:, 3:])
-            slope = work.loss_and_grad(int(view), WrtTransforms(base, moves)).grad.numpy() * unit
+            grad = work.loss_and_grad(int(view), WrtTransforms(base, moves)).grad.numpy() * unit
             for level, descent in zip(levels, descents, strict=True):
-                pull = settings.pull * np.sign(descent.values) / descent.values.size
-                descent.step(level.sum(slope) + pull, settings.lr)
+                l1_weight = settings.l1_weight * np.sign(descent.values) / descent.values.size
+                descent.step(level.sum(grad) + l1_weight, settings.lr)
     return _sums(levels, descents, unit, step)
 
 
 def _sums(
-    levels: list[Level], descents: list[Descent], unit: FloatArray, step: FloatArray | None
+    levels: list[Level], descents: list[GroupAdam], unit: FloatArray, step: FloatArray | None
 ) -> FloatArray:
     """[C, 6]: what the anchors of all levels say, each rounded to ``step`` where there is one."""
     total: FloatArray = np.zeros((len(levels[0].of), 6))

@@ -10,7 +10,7 @@ def gsstream_components() -> list[ComponentSpec]:
     """The method as one part."""
     return [
         ComponentSpec(
-            kind="stepper",
+            kind="streaming_method",
             name="recon",
             target="gsstream_recon.method:ReCon",
             summary="motions of anchors on three levels add up, Gaussians added and removed at constant number",

@@ -19,7 +19,7 @@ class MotionSettings(PartConfig):
     neighbours: int = Field(default=3, ge=1, le=100, description="old anchors from which a new one inherits")
     momentum: float = Field(default=0.6, ge=0, le=1, description="share of the last frame's motion to begin with")
     lr: float = Field(default=0.25, gt=0, le=10, description="step of the fit on each level, pixels per iteration")
-    pull: float = Field(default=0.0, ge=0, description="weight of the mean absolute motion, pixels, in the loss")
+    l1_weight: float = Field(default=0.0, ge=0, description="weight of the mean absolute motion, pixels, in the loss")
     measure: Literal["each", "anchor"] = Field(
         default="each",
         description="what a step is divided by; each: every number of an anchor by its own slope (Adam); anchor: all "
@@ -35,7 +35,7 @@ class MotionSettings(PartConfig):
         default=6.0, gt=0, le=1000, description="side of the cells that follow anchors, pixels; their motion is sent"
     )
     step: float = Field(default=0.1, gt=0, le=10, description="quantisation step of shifts, pixels")
-    turn_step: float = Field(default=0.01, gt=0, le=1, description="quantisation step of turns, tan(angle / 2)")
+    rotation_step: float = Field(default=0.01, gt=0, le=1, description="quantisation step of turns, tan(angle / 2)")
 
 
 class BirthSettings(PartConfig):

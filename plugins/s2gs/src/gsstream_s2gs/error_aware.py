@@ -10,7 +10,7 @@ import torch
 from pydantic import Field
 
 from gsstream.api import ConfidenceEstimator, ConfidenceTraits, FrameContext, PartConfig
-from gsstream_s2gs.whitened import pulls
+from gsstream_s2gs.noise_ratios import noise_ratios
 
 
 @final
@@ -45,7 +45,7 @@ class ErrorAware(ConfidenceEstimator):
         error_logit: float = Field(
             default=1.0, ge=-10, le=50, description="logit of Gaussians that open for error, -10 to 50"
         )
-        least_sigma: float = Field(
+        min_sigma: float = Field(
             default=0.4 / 255, gt=0, le=1, description="least noise of a camera, image units"
         )
         probes: int = Field(default=2, ge=1, le=64, description="noise draws per view, 1 to 64")
@@ -66,7 +66,7 @@ class ErrorAware(ConfidenceEstimator):
     def estimate(self, context: FrameContext) -> torch.Tensor:
         """Logits [N] float32 in [-limit, limit]. Raises ShapeError when a gradient is not finite."""
         config = self.config
-        found = pulls(context, config.least_sigma, config.probes, config.seed, error=config.budget > 0)
+        found = noise_ratios(context, config.min_sigma, config.probes, config.seed, error=config.budget > 0)
         logits = config.gain * (found.change_ratio - config.threshold)
         # Below the threshold there is no change to speak of: one defined value, which the active set can tell.
         logits = logits.where(found.change_ratio > config.threshold, torch.full_like(logits, config.floor))

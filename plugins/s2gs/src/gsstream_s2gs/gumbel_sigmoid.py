@@ -97,7 +97,7 @@ class GumbelSigmoid(GateSampler):
         hard = torch.round(soft * steps) / steps
         # alpha - alpha is exactly 0, so the value is exactly the level; soft + (hard - soft) would be an ulp off.
         tau = self.config.temperature
-        through = (alpha - alpha.detach()) * (slope(alpha.detach() / tau) / tau)
+        through = (alpha - alpha.detach()) * (sigmoid_derivative(alpha.detach() / tau) / tau)
         if self.config.clamp_gradient:
             through = through * ((hard > 0) & (hard < 1))
         return hard + through
@@ -127,7 +127,7 @@ class GumbelSigmoid(GateSampler):
         return logits.clamp(-self.config.logit_bound, self.config.logit_bound)
 
 
-def slope(x: torch.Tensor) -> torch.Tensor:
+def sigmoid_derivative(x: torch.Tensor) -> torch.Tensor:
     """Derivative of the sigmoid; equally accurate at both ends, while s (1 - s) loses all digits at the upper one."""
     return torch.sigmoid(x) * torch.sigmoid(-x)
 

@@ -10,7 +10,7 @@ import torch
 from pydantic import Field
 
 from gsstream.api import ConfidenceEstimator, ConfidenceTraits, FrameContext, PartConfig
-from gsstream_s2gs.whitened import pulls
+from gsstream_s2gs.noise_ratios import noise_ratios
 
 
 @final
@@ -32,7 +32,7 @@ class NoiseNormalised(ConfidenceEstimator):
             default=4.0, gt=0, le=1000, description="r at which p = 0.5, in units of the noise, up to 1000"
         )
         gain: float = Field(default=1.0, gt=0, le=100, description="logit per unit of r, 0 to 100")
-        least_sigma: float = Field(
+        min_sigma: float = Field(
             default=0.4 / 255, gt=0, le=1,
             description="least noise of a camera, image units; 0.4/255 is 8-bit rounding of two frames",
         )  # fmt: skip
@@ -53,7 +53,7 @@ class NoiseNormalised(ConfidenceEstimator):
     def estimate(self, context: FrameContext) -> torch.Tensor:
         """Logits [N] float32 in [-limit, limit]. Raises ShapeError when a gradient is not finite."""
         config = self.config
-        found = pulls(context, config.least_sigma, config.probes, config.seed, error=False)
+        found = noise_ratios(context, config.min_sigma, config.probes, config.seed, error=False)
         logits = config.gain * (found.change_ratio - config.threshold)
         logits = logits.where(found.change_ratio > 0, torch.full_like(logits, config.floor))
         return logits.clamp(-config.limit, config.limit).float()

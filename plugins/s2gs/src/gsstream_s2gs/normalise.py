@@ -45,6 +45,6 @@ def minmax(values: torch.Tensor, limit: float) -> torch.Tensor:
 
 def noise_units(values: torch.Tensor, expected: torch.Tensor, threshold: float, floor: float) -> torch.Tensor:
     """m / (m expected from noise) - threshold. ``floor`` where not even noise moves the Gaussian."""
-    felt = expected > 0
-    logits = values / expected.where(felt, torch.ones_like(expected)) - threshold
-    return logits.where(felt, torch.full_like(values, floor))
+    reached = expected > 0
+    logits = values / expected.where(reached, torch.ones_like(expected)) - threshold
+    return logits.where(reached, torch.full_like(values, floor))

@@ -139,9 +139,9 @@ class ViewSpaceGradient(ConfidenceEstimator):
         reached = torch.zeros(len(means), dtype=torch.bool, device=means.device)
         views = len(context.cameras)
         for view in range(views):
-            pulled = context.screen_gradient_rows(view, self._upstream(context, view))
-            total[pulled.rows] += self._scaled(context, view, pulled.gradient)
-            reached[pulled.rows] = True
+            found = context.screen_gradient_rows(view, self._upstream(context, view))
+            total[found.rows] += self._scaled(context, view, found.gradient)
+            reached[found.rows] = True
         rows = reached.nonzero()[:, 0]
         magnitude = total[rows].norm(dim=1) / max(views, 1)
         return rows, magnitude, torch.zeros_like(magnitude), torch.ones_like(rows, dtype=torch.bool)

@@ -50,8 +50,8 @@ class _Interpolated(torch.autograd.Function):
         return torch.from_numpy(lookup.matrix @ table.detach().numpy())
 
     @staticmethod
-    def backward(ctx: Any, *slopes: torch.Tensor) -> tuple[torch.Tensor, None]:
-        return torch.from_numpy(ctx.matrix.T @ slopes[0].numpy()), None
+    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
+        return torch.from_numpy(ctx.matrix.T @ grads[0].numpy()), None
 
 
 class Cache:

@@ -23,8 +23,8 @@ from gsstream.api import (
     send_delta,
     send_key,
 )
-from gsstream.blocks import replaced_by_copies, rows_in_change
-from gsstream_stream3dgs.motion import fitted_cache, said_by
+from gsstream.blocks import replace_with_copies, rows_in_changed_tiles
+from gsstream_stream3dgs.motion import fitted_cache, coded_cache
 from gsstream_stream3dgs.settings import Stream3DGSConfig
 
 
@@ -51,7 +51,7 @@ class Stream3DGS(StreamingMethod[Stream3DGSState]):
     source = "3DGStream (Sun et al. 2024)"
 
     Config = Stream3DGSConfig
-    heeds = ("stream.epochs",)
+    recipe_keys = ("stream.epochs",)
 
     def begin(self, frame: Frame, tools: Tools) -> Step[Stream3DGSState]:
         first = tools.first_frame(frame)
@@ -72,13 +72,13 @@ class Stream3DGS(StreamingMethod[Stream3DGSState]):
             scene = state.player.scene
             work = tools.open(state.player, state.previous, frame)
             cache, means = self.config.cache, work.gaussians.means
-            rows = rows_in_change(work.session, means, state.previous, frame, cache.change, cache.votes)
+            rows = rows_in_changed_tiles(work.session, means, state.previous, frame, cache.change, cache.votes)
             # Those of the frame before are given up: they neither move nor hide what does.
             rows = rows[rows < state.number]
             work = work.on(work.gaussians.rows(slice(0, state.number)))
             passes = max(1, epochs - for_births)
             found = fitted_cache(scene, work, rows, passes, self.config.cache, tools.rng) if len(rows) else None
-            said = None if found is None else said_by(scene, *found, frame.cameras, self.config.cache)
+            said = None if found is None else coded_cache(scene, *found, frame.cameras, self.config.cache)
             moves = Delta(() if said is None else (said,))
             moved = apply_delta(scene, moves)
             work = work.on(moved.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
@@ -95,7 +95,7 @@ class Stream3DGS(StreamingMethod[Stream3DGSState]):
         if not epochs:
             return Rows(deaths=deaths)
         births = self.config.births
-        return replaced_by_copies(
+        return replace_with_copies(
             scene, deaths, work, epochs, tools.rng, gradient=births.gradient, most=births.most, rounds=births.rounds,
             prune_opacity=births.prune_opacity,
         )  # fmt: skip

@@ -9,7 +9,7 @@ from gsstream.api import (
     Cameras,
     Field,
     FieldShape,
-    FrameWork,
+    FitContext,
     Gaussians,
     IntArray,
     Motion,
@@ -18,13 +18,13 @@ from gsstream.api import (
     WrtRows,
     field_rows,
 )
-from gsstream.blocks import pixel_size, rows_backward, said_by_cells
+from gsstream.blocks import pixel_size, rows_backward, approximate_by_cells
 from gsstream_stream3dgs.cache import Cache, Lookup
 from gsstream_stream3dgs.settings import CacheSettings
 
 
 def fitted_cache(
-    scene: Scene, work: FrameWork, rows: IntArray, epochs: int, settings: CacheSettings, rng: Rng
+    scene: Scene, work: FitContext, rows: IntArray, epochs: int, settings: CacheSettings, rng: Rng
 ) -> tuple[IntArray, Cache] | None:
     """Return the cache of a frame and the rows [A] that it moves; None where none may move.
 
@@ -76,7 +76,7 @@ def shape_of(scene: Scene, extent: float, settings: CacheSettings, rng: Rng) -> 
     )  # fmt: skip
 
 
-def said_by(
+def coded_cache(
     scene: Scene, rows: IntArray, cache: Cache, cameras: Cameras, settings: CacheSettings
 ) -> Field | Motion | None:
     """Return what is sent of a cache: the cache, or the rigid motions of cells; None where nothing moves.
@@ -98,7 +98,7 @@ def said_by(
         shift, turn = cache()
     pixel = pixel_size(scene.gaussians.means, cameras)
     side = float(np.float32(settings.pixels * pixel))
-    return said_by_cells(
+    return approximate_by_cells(
         scene, rows, (cache.shape.reach * shift).numpy(), turn.numpy(), side, settings.step * pixel
     )
 

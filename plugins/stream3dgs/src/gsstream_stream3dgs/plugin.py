@@ -10,7 +10,7 @@ def gsstream_components() -> list[ComponentSpec]:
     """The method as one part."""
     return [
         ComponentSpec(
-            kind="stepper",
+            kind="streaming_method",
             name="stream3dgs",
             target="gsstream_stream3dgs.method:Stream3DGS",
             summary="a hash grid and a small network move what is there; Gaussians that live for one frame",

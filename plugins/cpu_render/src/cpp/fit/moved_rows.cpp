@@ -54,7 +54,7 @@ void move_row(const MovedRows& moved, const std::vector<Turn>& turns, std::size_
 }
 
 // Adds force and torque of one row to those of its group.
-void add_row(const MovedRows& moved, std::size_t i, const Workspace& work, double* slope) {
+void add_row(const MovedRows& moved, std::size_t i, const Workspace& work, double* grad) {
   const std::size_t k = static_cast<std::size_t>(moved.place[i]);
   const float *mean = work.means.data() + 3 * i, *q = work.quats.data() + 4 * i;
   const float *force = work.gradient[0].data() + 3 * i, *g = work.gradient[1].data() + 4 * i;
@@ -66,7 +66,7 @@ void add_row(const MovedRows& moved, std::size_t i, const Workspace& work, doubl
   const double torque[] = {2 * (arm[1] * fz - arm[2] * fy) + (-a * x + b * w - c * z + d * y),
                            2 * (arm[2] * fx - arm[0] * fz) + (-a * y + b * z + c * w - d * x),
                            2 * (arm[0] * fy - arm[1] * fx) + (-a * z - b * y + c * x + d * w)};
-  double* out = slope + 6 * k;
+  double* out = grad + 6 * k;
   for (int axis = 0; axis < 3; axis++) {
     out[axis] += force[axis];
     out[3 + axis] += torque[axis];
@@ -109,7 +109,7 @@ void add_curvature(const MovedRows& moved, std::size_t i, const Workspace& work,
 
 }  // namespace
 
-ViewPull pull_moved(Rasterizer& rasterizer, const MovedRows& moved, const ViewComparison& view, double* slope,
+ViewLossGrad transform_loss_and_grad(Rasterizer& rasterizer, const MovedRows& moved, const ViewComparison& view, double* grad,
                     double* curvature) {
   Workspace& work = workspace();
   const std::size_t rows = moved.rows.count;
@@ -127,16 +127,16 @@ ViewPull pull_moved(Rasterizer& rasterizer, const MovedRows& moved, const ViewCo
   const GradientArrays out{gradients[0], gradients[1], gradients[2], gradients[3],
                            gradients[4], gradients[5], work.means2d.require(2 * rows)};
   float* structure = curvature ? work.structure.require(3 * rows) : nullptr;
-  const ViewPull pulled = pull_view(rasterizer, scene, view, out, structure);
+  const ViewLossGrad found = view_loss_and_grad(rasterizer, scene, view, out, structure);
   rasterizer.forget();  // its arrays belong to the next call
-  if (pulled.faults) return pulled;
-  std::fill_n(slope, 6 * moved.groups, 0.0);
-  for (std::size_t i = 0; i < rows; i++) add_row(moved, i, work, slope);
+  if (found.faults) return found;
+  std::fill_n(grad, 6 * moved.groups, 0.0);
+  for (std::size_t i = 0; i < rows; i++) add_row(moved, i, work, grad);
   if (curvature) {
     std::fill_n(curvature, 36 * moved.groups, 0.0);
     for (std::size_t i = 0; i < rows; i++) add_curvature(moved, i, work, rasterizer.camera(), curvature);
   }
-  return pulled;
+  return found;
 }
 
 }  // namespace gsstream_cpu

@@ -17,9 +17,9 @@ struct MovedRows {
   const double *centre, *shift, *turn;  // [K, 3]; turn: axis * tan(angle / 2)
 };
 
-// slope [K, 6]: by the groups' shift and by a small turn in front of theirs, as a turn counts there. curvature [K, 6, 6]: of
+// grad [K, 6]: by the groups' shift and by a small turn in front of theirs, as a turn counts there. curvature [K, 6, 6]: of
 // the sum over all values of the picture; null: not wanted. Nothing is written where there is a fault.
-ViewPull pull_moved(Rasterizer& rasterizer, const MovedRows& moved, const ViewComparison& view, double* slope,
+ViewLossGrad transform_loss_and_grad(Rasterizer& rasterizer, const MovedRows& moved, const ViewComparison& view, double* grad,
                     double* curvature = nullptr);
 
 }  // namespace gsstream_cpu

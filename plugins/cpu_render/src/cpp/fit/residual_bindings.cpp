@@ -56,10 +56,10 @@ class PyResidualTable {
     table_.decode(job, matrix.data(), steps.data());
   }
 
-  void pull(ConstFloatArray latents, ConstFloatArray units, ConstFloatArray gates,
+  void backward(ConstFloatArray latents, ConstFloatArray units, ConstFloatArray gates,
             std::vector<ConstFloatArray> gradients, double weight, FloatArray latent_gradient,
             FloatArray matrix_gradient, FloatArray gate_gradient) {
-    ResidualPullJob job{};
+    ResidualBackwardJob job{};
     job.forward = job_of(latents, units, gates);
     require(job.forward.rows == table_.rows(), "pull must follow a decode of the same rows");
     require(gradients.size() == table_.blocks().size(), "one gradient per attribute");
@@ -77,7 +77,7 @@ class PyResidualTable {
     job.gate_gradient = gate_gradient.data();
     float* matrix_out = matrix_gradient.data();
     const nb::gil_scoped_release released;
-    table_.pull(job, matrix_out);
+    table_.backward(job, matrix_out);
   }
 
   ResidualTable& table() { return table_; }
@@ -205,7 +205,7 @@ void bind_residual(nb::module_& module) {
            nb::arg("features"))
       .def("decode", &PyResidualTable::decode, strict("latents"), strict("matrix"), strict("steps"), strict("units"),
            strict("gates"), strict("base"), strict("out"))
-      .def("pull", &PyResidualTable::pull, strict("latents"), strict("units"), strict("gates"), strict("gradients"),
+      .def("backward", &PyResidualTable::backward, strict("latents"), strict("units"), strict("gates"), strict("gradients"),
            nb::arg("weight"), strict("latent_gradient"), strict("matrix_gradient"), strict("gate_gradient"))
       .def("run", &run, nb::arg("views"), nb::arg("base"), nb::arg("attributes"), strict("units"), strict("steps"),
            strict("node_of"), nb::arg("rule"), nb::arg("weight"), nb::arg("position"), strict("logits"),

@@ -14,7 +14,7 @@ float sigmoid(float x) { return 1.0f / (1.0f + std::exp(-x)); }
 struct Scratch {
   Buffer<float> out[ATTRIBUTES], gradient[ATTRIBUTES];
   Buffer<float> means2d, latent_gradient, matrix_gradient, row_gates, by_row;
-  std::vector<float> gates, slopes, by_node, costs, latent_rates, matrix_rates;
+  std::vector<float> gates, grads, by_node, costs, latent_rates, matrix_rates;
 };
 
 class Run {
@@ -25,7 +25,7 @@ class Run {
     s_.by_row.require(pass.rows);
     latents_.grad = s_.latent_gradient.require(pass.rows * pass.latents.columns);
     matrix_.grad = s_.matrix_gradient.require(pass.matrix.rows * pass.matrix.columns);
-    for (std::vector<float>* values : {&s_.gates, &s_.slopes, &s_.by_node, &s_.costs}) values->resize(pass.nodes);
+    for (std::vector<float>* values : {&s_.gates, &s_.grads, &s_.by_node, &s_.costs}) values->resize(pass.nodes);
   }
 
   // False where there is a fault: then nothing has changed.
@@ -33,13 +33,13 @@ class Run {
     open_gates(view.waiting);
     decode();
     const Scene scene{arrays_, pass_.rows, pass_.sh_degree};
-    const ViewPull pulled = pull_view(*view.rasterizer, scene, view.comparison, gradients_);
-    if (pulled.faults) return false;
+    const ViewLossGrad found = view_loss_and_grad(*view.rasterizer, scene, view.comparison, gradients_);
+    if (found.faults) return false;
     const double l1 = view.comparison.l1_scale, dssim = -view.comparison.ssim_scale;
-    loss = l1 * pulled.sums.l1 + dssim * pulled.sums.dssim;
+    loss = l1 * found.sums.l1 + dssim * found.sums.dssim;
     if (!std::isfinite(loss)) return false;
-    pull_residual();
-    price_gates(view.waiting);
+    residual_backward();
+    gate_penalty(view.waiting);
     return move(view.lr_factor);
   }
 
@@ -70,7 +70,7 @@ class Run {
     for (std::size_t m = 0; m < pass_.nodes; m++) {
       const float x = pass_.logits.param[m] / rule.temperature + rule.shift, soft = sigmoid(x);
       s_.gates[m] = std::nearbyint(soft * rule.levels) / rule.levels;
-      s_.slopes[m] = soft * sigmoid(-x) / rule.temperature;
+      s_.grads[m] = soft * sigmoid(-x) / rule.temperature;
     }
     for (std::size_t i = 0; i < pass_.rows; i++)
       s_.row_gates[i] = waiting && waiting[i] ? 0.0f : s_.gates[static_cast<std::size_t>(pass_.node_of[i])];
@@ -92,18 +92,18 @@ class Run {
     pass_.table->decode(forward, pass_.matrix.param, pass_.steps);
   }
 
-  void pull_residual() {
-    ResidualPullJob backward{};
+  void residual_backward() {
+    ResidualBackwardJob backward{};
     backward.forward = job();
     backward.gradient = upstream_.data();
     backward.weight = pass_.weight;
     backward.latent_gradient = s_.latent_gradient.data();
     backward.gate_gradient = s_.by_row.data();
-    pass_.table->pull(backward, s_.matrix_gradient.data());
+    pass_.table->backward(backward, s_.matrix_gradient.data());
   }
 
   // The gradient of the logits, in s_.by_node; what positions behind open gates cost is added to that of the latents.
-  void price_gates(const uint8_t* waiting) {
+  void gate_penalty(const uint8_t* waiting) {
     const GateRule& rule = pass_.rule;
     const std::size_t columns = pass_.latents.columns;
     std::vector<float>&upstream = s_.by_node, &open = s_.gates;  // gates are not needed any more
@@ -122,11 +122,11 @@ class Run {
           if (rule.motion != 0.0f) gradient[axis] += 2.0f * rule.motion / rule.divisor * open[m] * residual[axis];
         }
       }
-      s_.costs[m] += rule.price + rule.motion * squared;
+      s_.costs[m] += rule.open_weight + rule.motion * squared;
     }
     for (std::size_t m = 0; m < pass_.nodes; m++) {
-      const float slope = open[m] * sigmoid(rule.margin - pass_.logits.param[m]);
-      upstream[m] = upstream[m] * s_.slopes[m] + slope * (s_.costs[m] / rule.divisor);
+      const float grad = open[m] * sigmoid(rule.margin - pass_.logits.param[m]);
+      upstream[m] = upstream[m] * s_.grads[m] + grad * (s_.costs[m] / rule.divisor);
     }
   }
 

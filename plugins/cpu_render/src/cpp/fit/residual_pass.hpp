@@ -14,7 +14,7 @@ namespace gsstream_cpu {
 // Gates are sigmoid(logit / temperature + shift), rounded to steps of 1 / levels; open with probability sigmoid(logit - margin).
 struct GateRule {
   float temperature, shift, levels, margin, bound;
-  float price, motion;  // per row behind an open gate; per squared position residual there
+  float open_weight, motion;  // per row behind an open gate; per squared position residual there
   float divisor;        // of both: the Gaussians of the scene, or 1
 };
 

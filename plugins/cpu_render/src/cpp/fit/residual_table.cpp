@@ -64,7 +64,7 @@ void ResidualTable::decode(ResidualJob job, const float* matrix, const float* st
   for_chunks(job.rows, [&](std::size_t begin, std::size_t end) { kernels.decode(job_, begin, end); });
 }
 
-void ResidualTable::pull(ResidualPullJob job, float* matrix_gradient) {
+void ResidualTable::backward(ResidualBackwardJob job, float* matrix_gradient) {
   const float *units = job.forward.units, *gates = job.forward.gates;
   job.forward = job_;
   job.forward.units = units;
@@ -86,8 +86,8 @@ void ResidualTable::pull(ResidualPullJob job, float* matrix_gradient) {
   job.transposed = transposed_.data();
   job.matrix_partial = partial_.require(chunks * latents_ * dp);
   const ResidualKernels& kernels = residual_kernels();
-  kernels.price(job, scale, tail, cost);
-  for_chunks(job_.rows, [&](std::size_t begin, std::size_t end) { kernels.pull(job, begin, end); });
+  kernels.prepare_rate(job, scale, tail, cost);
+  for_chunks(job_.rows, [&](std::size_t begin, std::size_t end) { kernels.backward(job, begin, end); });
   std::fill_n(matrix_gradient, latents_ * features_, 0.0f);
   for (const ResidualBlock& block : blocks_) {
     if (!block.trained) continue;

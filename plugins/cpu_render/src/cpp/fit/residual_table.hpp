@@ -35,7 +35,7 @@ struct ResidualJob {
   float* const* out;                    // by block: [A, width]
 };
 
-struct ResidualPullJob {
+struct ResidualBackwardJob {
   ResidualJob forward;
   const float* const* gradient;  // by block: [A, width]
   const float* transposed;       // [D, padded L]
@@ -47,9 +47,9 @@ struct ResidualPullJob {
 
 struct ResidualKernels {
   // Fills scale, tail and cost of a job from its spreads and steps.
-  void (*price)(const ResidualPullJob&, float* scale, float* tail, float* cost);
+  void (*prepare_rate)(const ResidualBackwardJob&, float* scale, float* tail, float* cost);
   void (*decode)(const ResidualJob&, std::size_t begin, std::size_t end);
-  void (*pull)(const ResidualPullJob&, std::size_t begin, std::size_t end);
+  void (*backward)(const ResidualBackwardJob&, std::size_t begin, std::size_t end);
 };
 GSS_KERNEL_TABLE(ResidualKernels, residual_kernels)
 
@@ -60,7 +60,7 @@ class ResidualTable {
   // `job` comes with rows, latent, units, gates, base and out; the rest is filled in here. matrix [L, D], steps [L].
   void decode(ResidualJob job, const float* matrix, const float* steps);
   // After decode, of the same rows and gates. `job` comes with gradient, weight and outputs; matrix_gradient [L, D].
-  void pull(ResidualPullJob job, float* matrix_gradient);
+  void backward(ResidualBackwardJob job, float* matrix_gradient);
   const std::vector<ResidualBlock>& blocks() const { return blocks_; }
   std::size_t latents() const { return latents_; }
   std::size_t features() const { return features_; }

@@ -65,7 +65,7 @@ void decode(const ResidualJob& job, std::size_t begin, std::size_t end) {
 }
 
 // What the price of a latent is made of and is the same in every row.
-void price(const ResidualPullJob& job, float* scales, float* tails, float* costs) {
+void prepare_rate(const ResidualBackwardJob& job, float* scales, float* tails, float* costs) {
   for (std::size_t l = 0; l < job.forward.padded_latents; l += LANES) {
     const Floats step = load(job.forward.steps + l), spread = load(job.spread + l), half = broadcast(0.5f);
     const Floats scale = LOG2_OF_E / spread;
@@ -76,19 +76,19 @@ void price(const ResidualPullJob& job, float* scales, float* tails, float* costs
 }
 
 // Derivative by the latent of `weight` times the bits of its symbol; see gsstream.parts.update.rate.laplace_gradient.
-GSS_INLINE Floats rate_slope(const ResidualPullJob& job, std::size_t l, Floats latent) {
+GSS_INLINE Floats rate_grad(const ResidualBackwardJob& job, std::size_t l, Floats latent) {
   const Floats half = broadcast(0.5f), scale = load(job.scale + l), tail = load(job.tail + l);
   const Floats u = latent / load(job.forward.steps + l), magnitude = max(u, -u);
   const Floats grown = exp2(min(magnitude, half) * scale), shrunk = 1.0f / grown;
   const Floats inside = (grown - shrunk) * tail / (2.0f - (grown + shrunk) * tail);
-  const Floats slope = select(greater(half, magnitude), inside, broadcast(1.0f));
-  // At u = 0 the slope inside is 0, whatever the sign.
+  const Floats grad = select(greater(half, magnitude), inside, broadcast(1.0f));
+  // At u = 0 the grad inside is 0, whatever the sign.
   const Floats sign = select(greater(u, Floats{}), broadcast(1.0f), broadcast(-1.0f));
-  return job.weight * slope * sign / load(job.cost + l);
+  return job.weight * grad * sign / load(job.cost + l);
 }
 
 // Gathers the upstream gradient of one row; returns that of its gate, and leaves the gated one in `upstream`.
-GSS_INLINE float gate_row(const ResidualPullJob& job, std::size_t i, float* upstream) {
+GSS_INLINE float gate_row(const ResidualBackwardJob& job, std::size_t i, float* upstream) {
   const ResidualJob& forward = job.forward;
   for (std::size_t b = 0; b < forward.count; b++) {
     const ResidualBlock& block = forward.blocks[b];
@@ -105,9 +105,9 @@ GSS_INLINE float gate_row(const ResidualPullJob& job, std::size_t i, float* upst
   return sum(by_gate);
 }
 
-GSS_INLINE void pull_row(const ResidualPullJob& job, std::size_t i, const float* upstream, float* partial) {
+GSS_INLINE void row_backward(const ResidualBackwardJob& job, std::size_t i, const float* upstream, float* partial) {
   const ResidualJob& forward = job.forward;
-  const bool priced = job.weight != 0.0f && forward.gates[i] > 0.0f;
+  const bool has_rate = job.weight != 0.0f && forward.gates[i] > 0.0f;
   const float *quantised = forward.quantised + i * forward.padded_latents,
               *kept = forward.kept + i * forward.padded_latents;
   float* out = job.latent_gradient + i * forward.latents;
@@ -115,7 +115,7 @@ GSS_INLINE void pull_row(const ResidualPullJob& job, std::size_t i, const float*
     Floats total{};
     const float* weights = job.transposed + l;
     for (std::size_t d = 0; d < forward.features; d++) total += upstream[d] * load(weights + d * forward.padded_latents);
-    if (priced) total += rate_slope(job, l, load(kept + l));
+    if (has_rate) total += rate_grad(job, l, load(kept + l));
     const std::size_t left = forward.latents - l;
     if (left >= LANES) {
       store(out + l, total);
@@ -134,7 +134,7 @@ GSS_INLINE void pull_row(const ResidualPullJob& job, std::size_t i, const float*
   }
 }
 
-void pull(const ResidualPullJob& job, std::size_t begin, std::size_t end) {
+void backward(const ResidualBackwardJob& job, std::size_t begin, std::size_t end) {
   const ResidualJob& forward = job.forward;
   const std::size_t cells = forward.latents * forward.padded_features;
   float* partial = job.matrix_partial + begin / ROW_CHUNK * cells;
@@ -142,14 +142,14 @@ void pull(const ResidualPullJob& job, std::size_t begin, std::size_t end) {
   alignas(64) float upstream[MOST_FEATURES] = {};
   for (std::size_t i = begin; i < end; i++) {
     job.gate_gradient[i] = gate_row(job, i, upstream);
-    pull_row(job, i, upstream, partial);
+    row_backward(job, i, upstream, partial);
   }
 }
 
 }  // namespace
 
 const ResidualKernels& residual_kernels() {
-  static const ResidualKernels table{price, decode, pull};
+  static const ResidualKernels table{prepare_rate, decode, backward};
   return table;
 }
 

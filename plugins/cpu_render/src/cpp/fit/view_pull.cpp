@@ -113,7 +113,7 @@ void weigh(const Grid& grid, const float* weights, const std::vector<uint8_t>& m
 
 // The gradient of a pixel by a row's colour is the share that the row has of its light: so the pass that gives gradients
 // sums up structure, too. `out` is written over.
-void pull_structure(Rasterizer& rasterizer, const Grid& grid, const ViewComparison& view, const float* recorded,
+void structure_backward(Rasterizer& rasterizer, const Grid& grid, const ViewComparison& view, const float* recorded,
                     const GradientArrays& out, std::size_t rows, float* structure) {
   Workspace& work = workspace();
   float* picture = work.structure.require(3 * static_cast<std::size_t>(grid.width) * grid.height);
@@ -142,7 +142,7 @@ PhotometricJob photometric_job(int width, int height, const ViewComparison& view
   return job;
 }
 
-ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparison& view, const GradientArrays& out,
+ViewLossGrad view_loss_and_grad(Rasterizer& rasterizer, const Scene& rows, const ViewComparison& view, const GradientArrays& out,
                    float* structure) {
   Workspace& work = workspace();
   const Grid grid{rasterizer.width(), rasterizer.height(), (rasterizer.width() + kTile - 1) / kTile,
@@ -151,7 +151,7 @@ ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparis
   const std::size_t tiles = static_cast<std::size_t>(grid.columns) * grid.rows;
   float* image = work.image.require(3 * pixels);
   const Target target{{view.background[0], view.background[1], view.background[2]}, image, nullptr};
-  ViewPull result{};
+  ViewLossGrad result{};
   result.faults = rasterizer.forward_layered(rows, target, counted(view.weights, tiles, work.counted));
   if (result.faults) return result;
   work.touched.resize(tiles);
@@ -163,7 +163,7 @@ ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparis
   if (view.matrix) {
     float* mapped = work.recorded.require(3 * pixels);
     for_marked(grid, work.read, [&](std::size_t first, std::size_t count) {
-      apply_colours(view.matrix, view.offset, image + 3 * first, mapped + 3 * first, count);
+      apply_exposure(view.matrix, view.offset, image + 3 * first, mapped + 3 * first, count);
     });
     recorded = mapped;
   }
@@ -174,10 +174,10 @@ ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparis
   result.sums = photometric_run(job);
   if (view.matrix)
     for_marked(grid, work.touched, [&](std::size_t first, std::size_t count) {
-      pull_colours(view.matrix, job.gradient + 3 * first, count);
+      exposure_vjp(view.matrix, job.gradient + 3 * first, count);
     });
   if (view.weights) weigh(grid, view.weights, work.touched, job.gradient);
-  if (structure) pull_structure(rasterizer, grid, view, recorded, out, rows.count, structure);
+  if (structure) structure_backward(rasterizer, grid, view, recorded, out, rows.count, structure);
   rasterizer.backward_layered(job.gradient, out);
   return result;
 }

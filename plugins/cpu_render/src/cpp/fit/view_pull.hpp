@@ -21,7 +21,7 @@ struct ViewComparison {
                                            // left out and stays as it is in the cache. Null: all count once
 };
 
-struct ViewPull {
+struct ViewLossGrad {
   uint32_t faults;       // Fault bits; if any is set, nothing else is written
   PhotometricSums sums;  // over the touched tiles that count and those beside them
 };
@@ -31,7 +31,7 @@ PhotometricJob photometric_job(int width, int height, const ViewComparison& view
 
 // `rows` are the active rows of `rasterizer`, which must be frozen. `out` has one row per active row. `structure` [A, 3]:
 // sums over pixels of each row's share of the light, times the structure of the picture there; null: not wanted.
-ViewPull pull_view(Rasterizer& rasterizer, const Scene& rows, const ViewComparison& view, const GradientArrays& out,
+ViewLossGrad view_loss_and_grad(Rasterizer& rasterizer, const Scene& rows, const ViewComparison& view, const GradientArrays& out,
                    float* structure = nullptr);
 
 }  // namespace gsstream_cpu

@@ -9,7 +9,7 @@ namespace gsstream_cpu {
 // `view.cached_image` and `view.weights` are null. `out` has one row per Gaussian; means2d must be there. `colours` [12]:
 // the gradient of the loss by the colour map's matrix and offset; null: not wanted, as without a map. No backward may
 // follow. Results do not depend on the number of threads.
-ViewPull pull_whole(Rasterizer& rasterizer, const Scene& scene, const Camera& camera, const ViewComparison& view,
+ViewLossGrad full_loss_and_grad(Rasterizer& rasterizer, const Scene& scene, const Camera& camera, const ViewComparison& view,
                     const GradientArrays& out, float* colours);
 
 }  // namespace gsstream_cpu

@@ -80,7 +80,7 @@ GSS_INLINE void through_camera(const Camera& camera, const Splats& s, SplatGradi
       row_gradient[3 * r + i] = chain.axes[3 * r] * s.rotation[3 * i] + chain.axes[3 * r + 1] * s.rotation[3 * i + 1] +
                                 chain.axes[3 * r + 2] * s.rotation[3 * i + 2];
   const float* cam = camera.rotation;
-  // Jacobian: d(x/z), d(y/z) rows are fx [1/z, 0, -x/z^2] and fy [0, 1/z, -y/z^2] with the limited slopes.
+  // Jacobian: d(x/z), d(y/z) rows are fx [1/z, 0, -x/z^2] and fy [0, 1/z, -y/z^2] with the limited grads.
   Floats jxx{}, jxz{}, jyy{}, jyz{};
   for (int j = 0; j < 3; j++) {
     jxx += row_gradient[j] * cam[j];
@@ -89,14 +89,14 @@ GSS_INLINE void through_camera(const Camera& camera, const Splats& s, SplatGradi
     jyz += row_gradient[3 + j] * cam[6 + j];
   }
   const Floats iz = s.inverse_z, fx_z = camera.fx * iz, fy_z = camera.fy * iz;
-  const Floats slope_x = -fx_z * iz * jxz, slope_y = -fy_z * iz * jyz;
+  const Floats grad_x = -fx_z * iz * jxz, grad_y = -fy_z * iz * jyz;
   const Floats to_x = fx_z * out.mean2d[0], to_y = fy_z * out.mean2d[1];
-  chain.view[0] = to_x + select_or_zero(s.x_free, slope_x);
-  chain.view[1] = to_y + select_or_zero(s.y_free, slope_y);
+  chain.view[0] = to_x + select_or_zero(s.x_free, grad_x);
+  chain.view[1] = to_y + select_or_zero(s.y_free, grad_y);
   chain.view[2] = -(to_x * s.view[0] + to_y * s.view[1]) * iz - (fx_z * jxx + fy_z * jyy) * iz;
-  // A free slope depends on z once more than a limited one.
+  // A free grad depends on z once more than a limited one.
   chain.view[2] -=
-      select(s.x_free, 2 * s.x_slope, s.x_slope) * slope_x + select(s.y_free, 2 * s.y_slope, s.y_slope) * slope_y;
+      select(s.x_free, 2 * s.tan_x, s.tan_x) * grad_x + select(s.y_free, 2 * s.tan_y, s.tan_y) * grad_y;
   for (int j = 0; j < 3; j++)
     out.mean[j] = cam[j] * chain.view[0] + cam[3 + j] * chain.view[1] + cam[6 + j] * chain.view[2];
 }

@@ -66,7 +66,7 @@ class Rasterizer {
   // does.
   enum class State { empty, cached, passed, frozen, active_passed, layered_passed };
   // What each operation needs and leaves behind. When it fails, forward leaves `empty`, forward_active and
-  // forward_layered leave `frozen`; on `empty`, forget and shed_scratch do nothing.
+  // forward_layered leave `frozen`; on `empty`, forget and free_scratch do nothing.
   struct Rule {
     const char* operation;
     State needs;
@@ -82,10 +82,10 @@ class Rasterizer {
       {"backward_layered", State::layered_passed, "the same"},
       {"update", State::cached, "cached"},
       {"backward_cached", State::cached, "the same"},
-      {"drawn_in_cache", State::cached, "the same"},
+      {"contributing_in_cache", State::cached, "the same"},
       {"forward_cached", State::cached, "cached or frozen, without its pass"},
       {"forget", State::empty, "cached or frozen, without its pass"},
-      {"shed_scratch", State::empty, "cached"},
+      {"free_scratch", State::empty, "cached"},
   };
   // Throws std::invalid_argument unless the state offers what the operation needs.
   void expect(const std::string& operation) const;
@@ -110,16 +110,16 @@ class Rasterizer {
   // Gradient of the 2-D means [N,2] of the cached scene, from what its forward left: nothing is rendered. Costs follow
   // the pixels at which the image gradient is not zero. `scene`: the values that the cache was made of.
   void backward_cached(const Scene& scene, const float* image_gradient, float* means2d_gradient);
-  // The same of the rows that the image's gradient reaches alone; returns their number. pulled_rows writes which they
+  // The same of the rows that the image's gradient reaches alone; returns their number. reached_rows writes which they
   // are, ascending, and their gradients [K,2]; it may follow once.
-  std::size_t pull_cached(const Scene& scene, const float* image_gradient);
-  void pulled_rows(int64_t* rows, float* means2d_gradient) const;
-  std::size_t pulled_count() const { return screen_.count; }
+  std::size_t backward_cached_rows(const Scene& scene, const float* image_gradient);
+  void reached_rows(int64_t* rows, float* means2d_gradient) const;
+  std::size_t reached_count() const { return screen_.count; }
   // out [N]: 1 for the rows of the cached scene that touch a cached tile.
   void visible_in_cache(uint8_t* out) const;
   // out [N]: 1 for the rows of the cached scene that added light to a pixel of a wanted tile. Costs follow these tiles,
   // but for clearing `out`. Border blocks reach beyond the image and are counted whole.
-  void drawn_in_cache(const uint8_t* mask, uint8_t* out);
+  void contributing_in_cache(const uint8_t* mask, uint8_t* out);
   // The same without clearing `out`, to which other rasterisers may add at the same time.
   void add_drawn(const uint8_t* mask, uint8_t* out);
 
@@ -141,7 +141,7 @@ class Rasterizer {
   // Fault bits; if any is set nothing was changed.
   uint32_t update(const uint32_t* changed, const Scene& rows, const Target& target);
   // Lets go of the memory that only a full pass needs. No backward may follow.
-  void shed_scratch();
+  void free_scratch();
 
   // Tiles rendered by the last forward_active or forward_layered.
   const TileSelection& touched() const { return touched_; }

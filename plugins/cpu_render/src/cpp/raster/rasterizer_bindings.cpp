@@ -57,16 +57,16 @@ class PyRasterizer {
     rasterizer_.backward_cached(scene.scene, v_image.data(), v_means2d.data());
   }
 
-  std::size_t pull_cached(const SceneArrays& scene, ConstFloatArray v_image) {
+  std::size_t backward_cached_rows(const SceneArrays& scene, ConstFloatArray v_image) {
     upstream(v_image, std::nullopt);
     const nb::gil_scoped_release release;
-    return rasterizer_.pull_cached(scene.scene, v_image.data());
+    return rasterizer_.backward_cached_rows(scene.scene, v_image.data());
   }
 
-  void pulled_rows(RowOutArray rows, FloatArray v_means2d) const {
-    require_shape(rows, {rasterizer_.pulled_count()}, "rows");
-    require_shape(v_means2d, {rasterizer_.pulled_count(), 2}, "v_means2d");
-    rasterizer_.pulled_rows(rows.data(), v_means2d.data());
+  void reached_rows(RowOutArray rows, FloatArray v_means2d) const {
+    require_shape(rows, {rasterizer_.reached_count()}, "rows");
+    require_shape(v_means2d, {rasterizer_.reached_count(), 2}, "v_means2d");
+    rasterizer_.reached_rows(rows.data(), v_means2d.data());
   }
 
   void visible_in_cache(ByteOutArray out) const {
@@ -74,15 +74,15 @@ class PyRasterizer {
     rasterizer_.visible_in_cache(out.data());
   }
 
-  void drawn_in_cache(std::optional<ByteArray> tile_mask, ByteOutArray out) {
+  void contributing_in_cache(std::optional<ByteArray> tile_mask, ByteOutArray out) {
     require_shape(out, {rasterizer_.scene_count()}, "out");
     const uint8_t* mask = mask_data(tile_mask, rasterizer_.width(), rasterizer_.height());
     const nb::gil_scoped_release release;
-    rasterizer_.drawn_in_cache(mask, out.data());
+    rasterizer_.contributing_in_cache(mask, out.data());
   }
 
-  void shed_scratch() {
-    rasterizer_.shed_scratch();
+  void free_scratch() {
+    rasterizer_.free_scratch();
     current_ = {};
   }
 
@@ -120,7 +120,7 @@ class PyRasterizer {
   }
 
   // (fault bits, sum of |I - G|, sum of 1 - SSIM); the gradients are written unless there is a fault.
-  std::tuple<uint32_t, double, double> pull_active(const SceneArrays& rows, const ComparisonArrays& comparison,
+  std::tuple<uint32_t, double, double> loss_and_grad_active(const SceneArrays& rows, const ComparisonArrays& comparison,
                                                    FloatArray v_means, FloatArray v_quats, FloatArray v_scales,
                                                    FloatArray v_opacities, FloatArray v_sh0, FloatArray v_shN) {
     require(rows.scene.count == rasterizer_.active_count(), "expected one row per active id");
@@ -131,8 +131,8 @@ class PyRasterizer {
                                          v_sh0, v_shN);
     out.means2d = means2d_.data();
     const nb::gil_scoped_release release;
-    const ViewPull pulled = pull_view(rasterizer_, rows.scene, view, out);
-    return {pulled.faults, pulled.sums.l1, pulled.sums.dssim};
+    const ViewLossGrad found = view_loss_and_grad(rasterizer_, rows.scene, view, out);
+    return {found.faults, found.sums.l1, found.sums.dssim};
   }
 
   void freeze(std::optional<ByteArray> tile_mask, IndexArray active_ids) {
@@ -233,15 +233,15 @@ void bind_rasterizer(nb::module_& module) {
            nb::arg("touched_only"))
       .def("backward_active", &PyRasterizer::backward_active, strict("v_image"), strict("v_alpha").none(),
            GSS_GRADIENTS)
-      .def("pull_active", &PyRasterizer::pull_active, nb::arg("scene"), nb::arg("comparison"), strict("v_means"),
+      .def("loss_and_grad_active", &PyRasterizer::loss_and_grad_active, nb::arg("scene"), nb::arg("comparison"), strict("v_means"),
            strict("v_quats"), strict("v_scales"), strict("v_opacities"), strict("v_sh0"), strict("v_shN"))
       .def("update", &PyRasterizer::update, strict("changed"), nb::arg("scene"), strict("background"), GSS_TARGET)
       .def("backward_cached", &PyRasterizer::backward_cached, nb::arg("scene"), strict("v_image"), strict("v_means2d"))
-      .def("pull_cached", &PyRasterizer::pull_cached, nb::arg("scene"), strict("v_image"))
-      .def("pulled_rows", &PyRasterizer::pulled_rows, strict("rows"), strict("v_means2d"))
+      .def("backward_cached_rows", &PyRasterizer::backward_cached_rows, nb::arg("scene"), strict("v_image"))
+      .def("reached_rows", &PyRasterizer::reached_rows, strict("rows"), strict("v_means2d"))
       .def("visible_in_cache", &PyRasterizer::visible_in_cache, strict("out"))
-      .def("drawn_in_cache", &PyRasterizer::drawn_in_cache, strict("tile_mask").none(), strict("out"))
-      .def("shed_scratch", &PyRasterizer::shed_scratch)
+      .def("contributing_in_cache", &PyRasterizer::contributing_in_cache, strict("tile_mask").none(), strict("out"))
+      .def("free_scratch", &PyRasterizer::free_scratch)
       .def("forward_cached", &PyRasterizer::forward_cached, strict("background"), strict("tile_mask").none(),
            GSS_TARGET)
       .def("visible_rows", &PyRasterizer::visible_rows, strict("out"))

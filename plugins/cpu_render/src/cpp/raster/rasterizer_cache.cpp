@@ -86,14 +86,14 @@ void Rasterizer::backward_cached(const Scene& scene, const float* image_gradient
   differentiate_cached(scene, image_gradient, means2d_gradient, false);
 }
 
-std::size_t Rasterizer::pull_cached(const Scene& scene, const float* image_gradient) {
+std::size_t Rasterizer::backward_cached_rows(const Scene& scene, const float* image_gradient) {
   const Claim claim(busy_);
   expect("backward_cached");
   differentiate_cached(scene, image_gradient, nullptr, true);
   return screen_.count;
 }
 
-void Rasterizer::pulled_rows(int64_t* rows, float* means2d_gradient) const {
+void Rasterizer::reached_rows(int64_t* rows, float* means2d_gradient) const {
   std::copy_n(screen_.rows.data(), screen_.count, rows);
   std::copy_n(screen_gradient_.data(), 2 * screen_.count, means2d_gradient);
 }
@@ -142,22 +142,22 @@ void Rasterizer::visible_in_cache(uint8_t* out) const {
   for (std::size_t row = 0; row < scene_count_; row++) out[row] = cached_visible_.contains(static_cast<uint32_t>(row));
 }
 
-void Rasterizer::drawn_in_cache(const uint8_t* mask, uint8_t* out) {
-  expect("drawn_in_cache");
+void Rasterizer::contributing_in_cache(const uint8_t* mask, uint8_t* out) {
+  expect("contributing_in_cache");
   std::fill_n(out, scene_count_, uint8_t{0});
   add_drawn(mask, out);
 }
 
 void Rasterizer::add_drawn(const uint8_t* mask, uint8_t* out) {
   const Claim claim(busy_);
-  const TileSelection wanted = cached_tiles(mask, "drawn_in_cache");
+  const TileSelection wanted = cached_tiles(mask, "contributing_in_cache");
   for (uint32_t tile : wanted.active)
     for (uint32_t e = cached_lists_.begin[tile]; e < cached_lists_.end[tile]; e++)
       if (cached_lists_.contributed[e] & wanted.blocks[tile])
         std::atomic_ref(out[cached_lists_.entries[e].record]).store(1, std::memory_order_relaxed);
 }
 
-void Rasterizer::shed_scratch() {
+void Rasterizer::free_scratch() {
   const Claim claim(busy_);
   if (state_ != State::empty) state_ = State::cached;
   chunks_.reset();

@@ -13,8 +13,8 @@ struct Splats {
   Floats opacity, transparency;       // in (0,1); 1 - opacity would be 0 from a logit of 17 on
   Floats quat_inverse_norm, quat_norm2;
   Ints largest;                                 // largest_magnitude of the raw geometry
-  Floats view[3], inverse_z, x_slope, y_slope;  // camera space; slopes x/z, y/z limited as above
-  Mask x_free, y_free;                          // where the slope was not limited
+  Floats view[3], inverse_z, tan_x, tan_y;  // camera space; grads x/z, y/z limited as above
+  Mask x_free, y_free;                          // where the grad was not limited
   Floats rotation[9];
   Floats axes[6];                         // 2x3: Jacobian * camera rotation * rotation (without scale)
   Floats xx, xy, yy, inverse_det;         // 2-D covariance with blur
@@ -59,8 +59,8 @@ GSS_INLINE void to_view_space(const Camera& camera, Splats& s) {
   const Floats x = s.view[0] * s.inverse_z, y = s.view[1] * s.inverse_z;
   const Floats x_low = broadcast(camera.x_low), x_high = broadcast(camera.x_high);
   const Floats y_low = broadcast(camera.y_low), y_high = broadcast(camera.y_high);
-  s.x_slope = clamp(x, x_low, x_high);
-  s.y_slope = clamp(y, y_low, y_high);
+  s.tan_x = clamp(x, x_low, x_high);
+  s.tan_y = clamp(y, y_low, y_high);
   s.x_free = both(greater_equal(x, x_low), greater_equal(x_high, x));
   s.y_free = both(greater_equal(y, y_low), greater_equal(y_high, y));
 }
@@ -83,8 +83,8 @@ GSS_INLINE void projection_rows(const Camera& camera, const Splats& s, Floats* r
   const float* r = camera.rotation;
   const Floats jx = camera.fx * s.inverse_z, jy = camera.fy * s.inverse_z;
   for (int j = 0; j < 3; j++) {
-    rows[j] = jx * (r[j] - s.x_slope * r[6 + j]);
-    rows[3 + j] = jy * (r[3 + j] - s.y_slope * r[6 + j]);
+    rows[j] = jx * (r[j] - s.tan_x * r[6 + j]);
+    rows[3 + j] = jy * (r[3 + j] - s.tan_y * r[6 + j]);
   }
 }
 

@@ -89,7 +89,7 @@ void bind_views(nb::module_& module) {
   module.def("freeze_views", &freeze_views, nb::arg("views"), strict("active"),
              "Rasterizer.freeze of several views, in all tiles, to the same rows.");
   module.def("drawn_in_views", &drawn_in_views, nb::arg("views"), strict("out"),
-             "The rows that Rasterizer.drawn_in_cache names in any of several views.");
+             "The rows that Rasterizer.contributing_in_cache names in any of several views.");
 }
 
 }  // namespace gsstream_cpu

@@ -39,7 +39,7 @@ from gsstream_lab.bench.scene import (
     object_points,
     synthetic_points,
 )
-from gsstream_lab.bench.state import under_way
+from gsstream_lab.bench.state import mid_stream_state
 from gsstream_lab.bench.timing import Progress, Timing, torch_threads
 from gsstream_lab.jobs.machine import machine_facts
 
@@ -257,7 +257,7 @@ def _timed(
     last: dict[str, Step] = {}
     for round_ in range(plan.warm_up + plan.repetitions):
         for name, parts in assemblies.items():
-            state = under_way(parts, cases[name].state, last.get(name))
+            state = mid_stream_state(parts, cases[name].state, last.get(name))
             encoder = _encoder(parts, cases[name].frame.cameras)
             encoder.state = state
             started, worked = time.perf_counter(), time.process_time()

@@ -15,10 +15,10 @@ import importlib.metadata
 import warnings
 from typing import Any, Protocol, cast
 
-from gsstream_lab.bench.floor import Peak
+from gsstream_lab.bench.roofline import Peak
 
 ENTRY_POINT_GROUP = "gsstream.bench"
-LOOKS = 40
+OUTPUT_CHECKS = 40
 
 
 class NativeKernel(Protocol):
@@ -79,8 +79,8 @@ def measure_peaks(native: NativeBench | None, threads: tuple[int, ...], known: d
     found = dict(known)
     for count in threads:
         # Many short looks: some of them fall between the work of other programs.
-        gflops = max(native.fma_peak(count, 0.004) for _ in range(LOOKS))
-        gbytes = max(native.copy_peak(count, 64.0) for _ in range(LOOKS // 4))
+        gflops = max(native.fma_peak(count, 0.004) for _ in range(OUTPUT_CHECKS))
+        gbytes = max(native.copy_peak(count, 64.0) for _ in range(OUTPUT_CHECKS // 4))
         if count in known:
             gflops, gbytes = max(gflops, known[count].gflops), max(gbytes, known[count].gbytes_per_second)
         found[count] = Peak(count, gflops, gbytes)

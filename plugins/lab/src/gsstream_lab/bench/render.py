@@ -17,11 +17,11 @@ from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.parts.render import backward as known
 from gsstream.parts.render.base import Renderer, RenderOutput
 from gsstream.plugins.catalog import Catalog
-from gsstream_lab.bench.floor import (
+from gsstream_lab.bench.roofline import (
     Footprints,
     Peak,
     central_tiles,
-    floor_ms,
+    roofline_ms,
     footprints,
     live_pairs,
     pixels_of,
@@ -256,9 +256,9 @@ def _add_floor(result: dict[str, Any], peak: Peak | None) -> None:
     ratio would be on a machine with nothing else to do.
     """
     if peak is None:
-        result |= {"floor_ms": None, "ratio": None, "ratio_cpu": None}
+        result |= {"roofline_ms": None, "ratio": None, "ratio_cpu": None}
         return
     keys = {"pairs": "live_pairs", "visible": "drawn", "rows": "rows", "pixels": "pixels", "floats": "floats"}
-    floor = sum(floor_ms(peak, **{key: result[name] for key, name in keys.items()}))
+    floor = sum(roofline_ms(peak, **{key: result[name] for key, name in keys.items()}))
     least, work = result["total_ms"]["min"], result["total_ms"]["cpu"] / result["threads"]
-    result |= {"floor_ms": round(floor, 5), "ratio": round(least / floor, 3), "ratio_cpu": round(work / floor, 3)}
+    result |= {"roofline_ms": round(floor, 5), "ratio": round(least / floor, 3), "ratio_cpu": round(work / floor, 3)}

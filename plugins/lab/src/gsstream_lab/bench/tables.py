@@ -19,7 +19,7 @@ def render_table(data: Mapping[str, Any]) -> str:
             f"{case['renderer']} ({case['level']})", "all" if case["path"] == "all rows" else f"{case['rows']}",
             scene, f"{case['share']:.0%}", str(case["threads"]), cell(case["forward_ms"]["min"]),
             cell(case["backward_ms"]["min"]), cell(case["total_ms"]["min"]), cell(case["total_ms"]["median"]),
-            cell(case["total_ms"]["cpu"]), cell(case["floor_ms"]), cell(case["ratio"], ".1f"),
+            cell(case["total_ms"]["cpu"]), cell(case["roofline_ms"]), cell(case["ratio"], ".1f"),
             cell(case["ratio_cpu"], ".1f"),
         ])  # fmt: skip
     isa = f", {data['machine']['isa']}" if data["machine"]["isa"] else ""

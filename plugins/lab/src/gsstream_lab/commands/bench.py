@@ -109,9 +109,9 @@ def frame(
     if how.quick:
         changes.insert(0, ("--quick", "stream.epochs=1"))
     recipe = resolve_recipe(method, catalog.recipe_path, (), changes).recipe
-    if recipe.stepper.name != "parts":
+    if recipe.streaming_method.name != "parts":
         raise InputError(
-            f"--method {method}: expected a method made of parts, got the stepper {recipe.stepper.name!r}; time it "
+            f"--method {method}: expected a method made of parts, got the streaming_method {recipe.streaming_method.name!r}; time it "
             "with gsstream run, which reports seconds per frame"
         )
     from gsstream_lab.bench.frame import FramePlan, bench_frame

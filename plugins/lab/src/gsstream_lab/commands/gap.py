@@ -51,7 +51,7 @@ def gap(
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import load_recipe
     from gsstream_lab.gap.fresh import FreshFrames, check_cameras
-    from gsstream_lab.gap.measure import GAP_FILES, measure_gap, usual_frames
+    from gsstream_lab.gap.measure import GAP_FILES, measure_gap, default_frames
 
     file = stream_file(run)
     if not run.is_dir() or not (run / "recipe.yaml").is_file():
@@ -60,7 +60,7 @@ def gap(
     with Playback(file) as playback:
         frames, meta = playback.frames, playback.meta
     check_recipe(file, meta.recipe)
-    chosen = _frames(at, frames) if at is not None else usual_frames(frames)
+    chosen = _frames(at, frames) if at is not None else default_frames(frames)
     recording = open_recording(source or named_recording(file, meta, catalog), recipe, catalog)
     try:
         check_cameras(meta, recording.info)

@@ -45,7 +45,7 @@ def search(
     from gsstream_lab.jobs.folder import recording_uri
     from gsstream_lab.sweep.job import run_job
     from gsstream_lab.sweep.plan import make_plan
-    from gsstream_lab.sweep.search import SweepJudge, climb, usual_ladders, value_of
+    from gsstream_lab.sweep.search import SweepScore, climb, usual_ladders, value_of
     from gsstream_lab.sweep.tune import tuned_recipe
 
     catalog = load_catalog()
@@ -57,10 +57,10 @@ def search(
     ladders = {key: values if start[key] in values else (start[key], *values) for key, values in ladders.items()}
     executor = functools.partial(make_executor, run_job, where.workers, where.threads, where.ray)
     say = (lambda _: None) if quiet else typer.echo
-    judge = SweepJudge(scene_of(recording, 1), method, seed, out, catalog.recipe_path, executor, say)
-    found = climb(start, ladders, judge)
+    score = SweepScore(scene_of(recording, 1), method, seed, out, catalog.recipe_path, executor, say)
+    found = climb(start, ladders, score)
     key = next(iter(ladders))
-    (point,) = make_plan(judge.config(found, key, [found[key]]), Path(), catalog.recipe_path).points
+    (point,) = make_plan(score.config(found, key, [found[key]]), Path(), catalog.recipe_path).points
     (out / FOUND).write_text(tuned_recipe(point.resolved), encoding="utf-8")
     typer.echo("\n".join(f"{key}: {start[key]} -> {value}" for key, value in found.items()))
     source = recording_uri(recording.source, None)

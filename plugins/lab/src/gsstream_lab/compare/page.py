@@ -16,7 +16,7 @@ from gsstream_lab.report.groups import Group, SweepData, waited
 from gsstream_lab.sweep.drive import cell_file
 
 #: Qualities and costs of the curves.
-GOODS, COSTS = ("psnr_changed", "psnr"), ("kb", "cpu_seconds", "seconds")
+QUALITIES, COSTS = ("psnr_changed", "psnr"), ("kb", "cpu_seconds", "seconds")
 #: Columns of the table of all methods.
 _KEYS = (
     "psnr_first", "psnr", "psnr_moving", "psnr_changed", "ssim", "kb", "key_kb", "seconds", "cpu_seconds", "memory",
@@ -43,7 +43,7 @@ def build_page(folder: Path, data: SweepData, source: FrameSource | None) -> lis
     title = f"{data.scenes[0]}: quality against cost"
     blocks += [
         Heading("Quality against cost"),
-        Picture("curves.png", pareto_figure(groups, title, GOODS, costs, joined=True),
+        Picture("curves.png", pareto_figure(groups, title, QUALITIES, costs, joined=True),
                 "PSNR on changed pixels and on the whole image against KB and seconds a frame"),
         all_runs(groups, [key for key in _KEYS if key in data.measured()]),
         _playing(folder, groups),

@@ -13,8 +13,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from gsstream.core.shapes import FloatArray
-from gsstream.evaluation.contact_sheet import changed_most
-from gsstream.evaluation.evaluate import StreamShown
+from gsstream.evaluation.contact_sheet import most_changed_window
+from gsstream.evaluation.evaluate import StreamFrames
 from gsstream.input.recordings.base import FrameSource
 from gsstream.metrics import changed_mask, psnr
 from gsstream.player.play import write_pictures
@@ -62,11 +62,11 @@ class SideBySide:
     def __init__(self, streams: Mapping[str, Path], source: FrameSource) -> None:
         self._stack = ExitStack()
         renderer = find_renderer()
-        self.shown: dict[str, StreamShown] = {}
+        self.shown: dict[str, StreamFrames] = {}
         for name, path in streams.items():
             playback = self._stack.enter_context(Playback(path))
             rig = playback.meta.camera(playback.meta.test.ids[0])
-            self.shown[name] = StreamShown(playback, rig, renderer)
+            self.shown[name] = StreamFrames(playback, rig, renderer)
         one = next(iter(self.shown.values()))
         self.camera, self.frames = one.rig.ids[0], one.frames
         self._source, self._place = source, source.info.test.ids.index(self.camera)
@@ -105,7 +105,7 @@ class SideBySide:
         first, last = self.truth(self.frames[0]), self.frames[-1]
         rows = [*_lines(self.row(last), 4)]
         for frame in chosen:
-            close = changed_most(self.truth(frame), first)
+            close = most_changed_window(self.truth(frame), first)
             if close is not None:
                 rows += _lines(self.row(frame, close), 5)
         return tiles_in_rows(rows)

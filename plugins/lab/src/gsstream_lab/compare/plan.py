@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from gsstream.core.errors import RecipeError
 from gsstream.evaluation.records import mean
-from gsstream.input.recordings.options import JudgedBy
+from gsstream.input.recordings.options import SplitName
 from gsstream.plugins.catalog import Catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream_lab.report.groups import SweepData
@@ -41,7 +41,7 @@ class Wanted:
     scale: float | None = None
     seeds: tuple[int, ...] = (0,)
     settings: Mapping[str, Any] = field(default_factory=dict)
-    split: JudgedBy = "reporting"
+    split: SplitName = "reporting"
 
 
 def own(wanted: Wanted) -> SweepConfig:
@@ -101,8 +101,8 @@ def own_epochs(wanted: Wanted, catalog: Catalog) -> dict[str, int | None]:
     for variant in _variants(wanted, {}):
         files = [Path(name) for name in (variant.recipe, wanted.recipe) if name]
         recipe = resolve_recipe(variant.method, catalog.recipe_path, files).recipe
-        stepper = catalog.resolve("stepper", recipe.stepper.name)
-        reads = recipe.stepper.name == "parts" or EPOCHS in stepper.heeds
+        streaming_method = catalog.resolve("streaming_method", recipe.streaming_method.name)
+        reads = recipe.streaming_method.name == "parts" or EPOCHS in streaming_method.recipe_keys
         out[variant.name] = recipe.stream.epochs if reads else None
     return out
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from gsstream.core.errors import InputError
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.engine.budget.memory import within_memory
-from gsstream.engine.run.encoder import Encoder, Listeners
+from gsstream.engine.budget.memory import limit_memory
+from gsstream.engine.run.encoder import Encoder, Callbacks
 from gsstream.engine.run.output import write_whole
 from gsstream.input.recordings.base import FrameSource, SourceInfo, check_index
 from gsstream.packet import EncodedPacket, StreamMeta, StreamWriter
@@ -69,7 +69,7 @@ class FreshFrames:
             catalog: of the parts that are installed.
         """
         parts = assemble(fresh_recipe(recipe, epochs), catalog)
-        return cls(within_memory(parts, source.info), source, cache)
+        return cls(limit_memory(parts, source.info), source, cache)
 
     @property
     def epochs(self) -> int:
@@ -100,7 +100,7 @@ class FreshFrames:
         if path.is_file():
             return False
         packets: list[EncodedPacket] = []
-        listeners = Listeners(packet=packets.append, progress=lambda done, total, *_: progress(frame, done, total))
+        listeners = Callbacks(packet=packets.append, progress=lambda done, total, *_: progress(frame, done, total))
         Encoder(self.parts, self.source.info, listeners=listeners).encode(self.source.frame(frame, "train"))
         self.cache.mkdir(parents=True, exist_ok=True)
         part = path.with_name(f".{path.name}.{os.getpid()}.part")

@@ -78,8 +78,8 @@ class Gap:
         for frame in (*self.files, *((None,) if len(self.files) > 1 else ())):
             values = [self.mean(column, frame) for column in columns]
             rows.append(["mean" if frame is None else str(frame), *map(_cell, values, columns)])
-        judges = ", ".join(dict.fromkeys(view.camera for view in self.views))
-        note = f"PSNR in dB, judged by {judges}; fresh: that frame alone, up to {self.epochs} passes over its images"
+        held_out = ", ".join(dict.fromkeys(view.camera for view in self.views))
+        note = f"PSNR in dB, judged by {held_out}; fresh: that frame alone, up to {self.epochs} passes over its images"
         return f"{format_table(rows)}\n\n{note}"
 
     def to_json(self) -> str:
@@ -136,7 +136,7 @@ def measure_gap(
     return Gap(tuple(views), dict(fresh), epochs)
 
 
-def usual_frames(frames: Sequence[int]) -> list[int]:
+def default_frames(frames: Sequence[int]) -> list[int]:
     """Return a third, two thirds and the end of a stream's frames, where a gap is measured when nobody says."""
     last = len(frames) - 1
     return sorted({frames[round(share * last)] for share in (1 / 3, 2 / 3, 1)})

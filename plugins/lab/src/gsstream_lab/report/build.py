@@ -12,7 +12,7 @@ from gsstream_lab.report.figures import curve_groups, frame_curves, measured_cos
 from gsstream_lab.report.fronts import Effect, effects, knee, pareto_front
 from gsstream_lab.report.groups import Group, SweepData, seed_noise, waited
 from gsstream_lab.report.paper import beside_ours, paper_table
-from gsstream_lab.report.quantities import BY_KEY, GOODS, cell
+from gsstream_lab.report.quantities import BY_KEY, QUALITIES, cell
 from gsstream_lab.report.rate_curves import curve_blocks
 
 _NOT_MEASURED = {"joules": "energy"}
@@ -91,7 +91,7 @@ def _scene(data: SweepData, scene: str) -> list[Block]:
     blocks.append(Picture(f"{scene}-pareto.png", pareto_figure(groups, f"{scene}: quality against cost"),
                           f"Quality against cost on {scene}, one point per recipe"))  # fmt: skip
     blocks += [_fronts(groups), all_runs(groups, data.measured())]
-    found = effects(groups, [*GOODS, *measured_costs(groups)])
+    found = effects(groups, [*QUALITIES, *measured_costs(groups)])
     if found:
         blocks += [_knobs(found, groups), Text(_READING)]
     blocks += curve_blocks(groups, scene)
@@ -130,9 +130,9 @@ def _some(curves: Sequence[Group], groups: Sequence[Group]) -> str:
 
 def _noise(groups: Sequence[Group]) -> str:
     frames = sorted({len(run.records) for group in groups for run in group.runs})
-    judges = ", ".join(sorted({name for group in groups for run in group.runs for name in run.records[0].psnr}))
-    length = f"{' or '.join(map(str, frames))} frames, judged by {judges or 'no camera'}. "
-    noise = {key: seed_noise(groups, key) for key in (*GOODS, "kb")}
+    held_out = ", ".join(sorted({name for group in groups for run in group.runs for name in run.records[0].psnr}))
+    length = f"{' or '.join(map(str, frames))} frames, judged by {held_out or 'no camera'}. "
+    noise = {key: seed_noise(groups, key) for key in (*QUALITIES, "kb")}
     if not math.isfinite(noise["psnr"]):
         return length + "One seed each: which differences are noise is not known, and nothing is called a tie."
     several = sum(len(group.runs) > 1 for group in groups)
@@ -146,7 +146,7 @@ def _noise(groups: Sequence[Group]) -> str:
 def _fronts(groups: Sequence[Group]) -> Table:
     """Who is on which front, and where the variants as they are stand."""
     rows = [["quality", "cost", "front, cheapest first (knee in brackets)", "not on it"]]
-    for good in GOODS:
+    for good in QUALITIES:
         for cost in measured_costs(groups):
             points = [(group.mean(cost), group.mean(good)) for group in groups]
             front = pareto_front(points)
@@ -188,10 +188,10 @@ def _knobs(found: Sequence[Effect], groups: Sequence[Group]) -> Table:
         head += [BY_KEY[cost].title, "", f"dB per {unit}", f"moving per {unit}"]
     rows = [[*head, "moving against KB"]]
     for effect in found:
-        row = [effect.knob, effect.base.label, *(_delta(effect, good) for good in GOODS)]
+        row = [effect.knob, effect.base.label, *(_delta(effect, good) for good in QUALITIES)]
         for cost in costs:
             share = 100 * effect.deltas[cost] / effect.base.mean(cost)
-            row += [_delta(effect, cost), f"{share:+.0f} %", *(_ratio(effect.per(good, cost)) for good in GOODS)]
+            row += [_delta(effect, cost), f"{share:+.0f} %", *(_ratio(effect.per(good, cost)) for good in QUALITIES)]
         rows.append([*row, effect.verdict("psnr_moving", "kb")])
     return Table("What a knob buys", rows)
 

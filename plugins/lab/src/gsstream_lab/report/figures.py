@@ -17,7 +17,7 @@ from matplotlib.ticker import NullFormatter, StrMethodFormatter
 from gsstream.evaluation.plots import COLORS, plot_runs
 from gsstream_lab.report.fronts import knee, pareto_front
 from gsstream_lab.report.groups import Group, seed_noise, waited
-from gsstream_lab.report.quantities import BY_KEY, COSTS, GOODS
+from gsstream_lab.report.quantities import BY_KEY, COSTS, QUALITIES
 
 _CURVES = len(COLORS)
 #: With more variants than colours, the next ones have another shape.
@@ -34,7 +34,7 @@ def measured_costs(groups: Sequence[Group]) -> list[str]:
 
 
 def pareto_figure(
-    groups: Sequence[Group], title: str, goods: Sequence[str] = GOODS, costs: Sequence[str] | None = None,
+    groups: Sequence[Group], title: str, goods: Sequence[str] = QUALITIES, costs: Sequence[str] | None = None,
     joined: bool = False,
 ) -> bytes:  # fmt: skip
     """Draw one panel per quality and cost: every group, its spread, the front as a line, the knee in a ring.

@@ -76,7 +76,7 @@ QUANTITIES: tuple[Quantity, ...] = (
 )
 BY_KEY: Mapping[str, Quantity] = {quantity.key: quantity for quantity in QUANTITIES}
 #: Pairs of a quality and what it is plotted against.
-GOODS, COSTS = ("psnr", "psnr_moving"), ("kb", "seconds", "cpu_seconds", "memory", "joules")
+QUALITIES, COSTS = ("psnr", "psnr_moving"), ("kb", "seconds", "cpu_seconds", "memory", "joules")
 
 
 def values_of(records: Sequence[FrameRecord], row: Row) -> dict[str, float]:

@@ -18,7 +18,7 @@ from gsstream_lab.report.groups import Group
 from gsstream_lab.report.quantities import BY_KEY, cell
 
 #: Fewer points than this make no curve.
-LEAST_POINTS = 3
+MIN_POINTS = 3
 QUALITIES = ("psnr", "psnr_moving", "psnr_changed")
 
 
@@ -48,7 +48,7 @@ def curves_over(groups: Sequence[Group]) -> dict[str, list[Curve]]:
             rest = Group(group.scene, group.variant, {k: v for k, v in group.axes.items() if k != axis}, ())
             found.setdefault(axis, {}).setdefault(rest.label, []).append(group)
     curves = {
-        axis: [Curve(name, tuple(some)) for name, some in families.items() if len(some) >= LEAST_POINTS]
+        axis: [Curve(name, tuple(some)) for name, some in families.items() if len(some) >= MIN_POINTS]
         for axis, families in found.items()
     }
     return {axis: some for axis, some in curves.items() if len(some) > 1}
@@ -65,7 +65,7 @@ def bd_rate(anchor: Sequence[tuple[float, float]], other: Sequence[tuple[float, 
     """
     from bjontegaard import bd_rate as library
 
-    known = all(len(curve) >= LEAST_POINTS and curve[0][0] > 0 for curve in (anchor, other))
+    known = all(len(curve) >= MIN_POINTS and curve[0][0] > 0 for curve in (anchor, other))
     if not known or max(anchor[0][1], other[0][1]) >= min(anchor[-1][1], other[-1][1]):
         return math.nan
     (rates, quality), (other_rates, other_quality) = zip(*anchor, strict=True), zip(*other, strict=True)

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from gsstream.core.errors import RecipeError
-from gsstream.input.recordings.options import JudgedBy
+from gsstream.input.recordings.options import SplitName
 from gsstream.recipe.check import Model, join_problems, validate
 from gsstream.recipe.document import Empty, Origin, read_file
 
@@ -136,7 +136,7 @@ class SweepConfig(Section):
     samples: int | None = Field(default=None, ge=1, description="random: draws per variant")
     search_seed: int = Field(default=0, ge=0, description="random: seed of the draws")
     first_frame: FirstFrame = Field(default=FirstFrame(), description="how frame 0 is shared")
-    split: JudgedBy = Field(
+    split: SplitName = Field(
         default="tuning",
         description="which cameras judge (data.split of every cell): tuning, to choose settings by the sweep; "
         "reporting: the test cameras, for a table of results",
@@ -185,7 +185,7 @@ class SceneList(Section):
     scenes: list[Scene] = Field(min_length=1, description="recordings")
 
 
-def read_sweep(path: Path, scenes: Path | None = None, split: JudgedBy | None = None) -> SweepConfig:
+def read_sweep(path: Path, scenes: Path | None = None, split: SplitName | None = None) -> SweepConfig:
     """Read a sweep's YAML file.
 
     Arguments:

@@ -32,10 +32,10 @@ USUAL: Mapping[str, Mapping[str, Sequence[Any]]] = {
 }
 
 #: (settings so far, key, values) -> quality of each value, dB, larger is better; nan where it could not be measured.
-Judge = Callable[[Mapping[str, Any], str, Sequence[Any]], list[float]]
+Score = Callable[[Mapping[str, Any], str, Sequence[Any]], list[float]]
 
 
-def climb(start: Mapping[str, Any], ladders: Mapping[str, Sequence[Any]], judge: Judge) -> dict[str, Any]:
+def climb(start: Mapping[str, Any], ladders: Mapping[str, Sequence[Any]], score: Score) -> dict[str, Any]:
     """Return the settings after which no single key has a value that is better by more than ``MARGIN``.
 
     Arguments:
@@ -49,7 +49,7 @@ def climb(start: Mapping[str, Any], ladders: Mapping[str, Sequence[Any]], judge:
     while True:
         before = dict(best)
         for key, values in ladders.items():
-            found = [value if math.isfinite(value) else -math.inf for value in judge(best, key, values)]
+            found = [value if math.isfinite(value) else -math.inf for value in score(best, key, values)]
             top, now = max(found), found[list(values).index(best[key])]
             if top == -math.inf:
                 raise InputError(f"no value of {key} could be judged: runs failed, or no camera is left out to judge")
@@ -77,7 +77,7 @@ def value_of(resolved: ResolvedRecipe, key: str) -> Any:
     return value
 
 
-class SweepJudge:
+class SweepScore:
     """Judges values by the mean PSNR of decoded frames, on training cameras that are left out.
 
     Arguments:
@@ -117,5 +117,5 @@ class SweepJudge:
 def quality(row: Mapping[str, Any]) -> float:
     """Return the mean PSNR of a cell's frames after the first, or of the first where it is alone; nan: not measured."""
     frames = row.get("frames", ())
-    judged = frames[1:] or frames
-    return mean(mean(v for v in frame.get("psnr", {}).values() if v is not None) for frame in judged)
+    scored = frames[1:] or frames
+    return mean(mean(v for v in frame.get("psnr", {}).values() if v is not None) for frame in scored)

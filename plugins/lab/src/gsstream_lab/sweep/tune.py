@@ -70,7 +70,7 @@ def candidates(methods: Sequence[str], budget: Budget) -> list[Variant]:
     for method in methods:
         knobs: list[tuple[str, dict[str, Any]]] = [("", {})]
         if budget.size is not None:
-            knobs += [("+rate-1e-3", {"stream.rate_weight": 1e-3}), ("+rate-3e-3", {"stream.rate_weight": 3e-3})]
+            knobs += [("+rate-1e-3", {"stream.rd_lambda": 1e-3}), ("+rate-3e-3", {"stream.rd_lambda": 3e-3})]
         if budget.time is not None:
             knobs += [("+epochs-4", {"stream.epochs": 4}), ("+change-12", {"stream.change_threshold": 12.0})]
         if budget.limits_frames:

@@ -8,13 +8,13 @@ import numpy as np
 from pydantic import Field
 
 from gsstream.core.changes import Motion, Scene
-from gsstream.core.changes.motion import moves_of
+from gsstream.core.changes.motion import predict_transforms
 from gsstream.core.part import PartConfig
 from gsstream.core.rng import Rng
 from gsstream.parts.motion.base import MotionPart
 from gsstream.parts.motion.groups import changed_groups, displaced_groups, known_groups
-from gsstream.parts.motion.switch import gains, some_views
-from gsstream.parts.render.work import FrameWork
+from gsstream.parts.motion.switch import loss_change, rotating_views
+from gsstream.parts.render.work import FitContext
 
 
 @final
@@ -41,7 +41,7 @@ class Coasting(MotionPart):
 
     source: ClassVar[str] = "gsstream"
 
-    def propose(self, scene: Scene, work: FrameWork, rng: Rng) -> tuple[Motion, ...]:
+    def propose(self, scene: Scene, work: FitContext, rng: Rng) -> tuple[Motion, ...]:
         if scene.moved is None:
             return ()
         groups = known_groups(scene, work.cameras, self.config.pixels, self.config.shades)
@@ -49,8 +49,8 @@ class Coasting(MotionPart):
         moving = displaced_groups(groups, scene, config.displaced)
         moving &= changed_groups(groups, work, config.votes, config.share)
         if config.asked and moving.any():
-            moves = moves_of(scene, groups, moving.astype(np.uint8), predicted=True)
-            change = gains(scene, work, moves, some_views(len(work.cameras), config.asked, work.index))
+            moves = predict_transforms(scene, groups, moving.astype(np.uint8), predicted=True)
+            change = loss_change(scene, work, moves, rotating_views(len(work.cameras), config.asked, work.index))
             moving[np.flatnonzero(moving)[change >= 0]] = False
         symbols = np.zeros((int(moving.sum()), 6), np.int32)
         return (Motion(groups.cell, groups.shades, moving.astype(np.uint8), symbols),)

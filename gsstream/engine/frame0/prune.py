@@ -15,13 +15,13 @@ import torch
 
 from gsstream.core.gaussians import Gaussians
 from gsstream.engine.fit.photometric import render_exposed
-from gsstream.engine.frame0.probes import TrainingViews, probes
+from gsstream.engine.frame0.hutchinson import TrainingViews, hutchinson_samples
 
 #: Probes of a camera. A Gaussian that one camera sees is underestimated tenfold by a quarter of single probes, and by
 #: four together in one case of sixty.
-PROBES = 4
+HUTCHINSON_SAMPLES = 4
 #: Opacity logits above this one count as this one, 0.999: where an opacity is 1 in float32 the images have no slope.
-MOST_LOGIT = 7.0
+MAX_LOGIT = 7.0
 #: How many times as far off the images may be without all that go; the fit that follows closes such gaps.
 GROWTH = 1.25
 #: How often fewer are asked for, a quarter of the error each time.
@@ -41,18 +41,18 @@ def removal_errors(
     Returns [N] float64, the squared change of all channels of all pixels together, and the mean squared error of a
     channel of a pixel.
     """
-    rows = replace(gaussians, opacities=gaussians.opacities.clamp(max=MOST_LOGIT))
+    rows = replace(gaussians, opacities=gaussians.opacities.clamp(max=MAX_LOGIT))
     squares = torch.zeros(len(rows), dtype=torch.float64)
     error = 0.0
-    for probe in probes(views, rows, generator, each=PROBES):
-        squares += probe.slopes.opacities.double().square()
+    for probe in hutchinson_samples(views, rows, generator, each=HUTCHINSON_SAMPLES):
+        squares += probe.grad.opacities.double().square()
         error += probe.error
     # By the opacity o instead of its logit, times o, which is how far it falls: o / (o (1 - o)).
     left = 1 - rows.opacities.double().sigmoid()
-    return squares / PROBES / left**2, error / (PROBES * len(views.frame.cameras))
+    return squares / HUTCHINSON_SAMPLES / left**2, error / (HUTCHINSON_SAMPLES * len(views.frame.cameras))
 
 
-def worth_keeping(errors: torch.Tensor, least: float) -> torch.Tensor:
+def retained_rows(errors: torch.Tensor, least: float) -> torch.Tensor:
     """Return the rows [K] int64, in order, of the Gaussians whose absence adds more than ``least``.
 
     Where no view feels any of them, nothing says which may go, and all remain.
@@ -65,7 +65,7 @@ def worth_keeping(errors: torch.Tensor, least: float) -> torch.Tensor:
     return rows if len(rows) else torch.arange(len(errors))
 
 
-def not_missed(
+def prune_by_error(
     views: TrainingViews, gaussians: Gaussians[torch.Tensor], generator: torch.Generator, least: float
 ) -> torch.Tensor:
     """Return the rows [K] int64, in order, that remain when those go that the training images would not miss.
@@ -81,7 +81,7 @@ def not_missed(
     """
     errors, error = removal_errors(views, gaussians, generator)
     for _ in range(TRIES):
-        rows = worth_keeping(errors, least * error)
+        rows = retained_rows(errors, least * error)
         if len(rows) == len(errors):
             return rows
         if _mean_error(views, gaussians.rows(rows)) <= GROWTH * error:

@@ -34,7 +34,7 @@ class Carried:
 
 
 @final
-class ExampleStepper(StreamingMethod[Carried]):
+class ExampleMethod(StreamingMethod[Carried]):
     """Adds the mean colour difference between the cameras and the scene to every Gaussian."""
 
     source = "gsstream"

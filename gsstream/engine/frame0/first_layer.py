@@ -9,12 +9,12 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import BoolArray
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.frame0.probes import TrainingViews
-from gsstream.engine.frame0.removal import removal_errors
+from gsstream.engine.frame0.hutchinson import TrainingViews
+from gsstream.engine.frame0.prune import removal_errors
 from gsstream.parts.render.exposure import Exposure
 
 
-def first_rows(
+def first_layer_mask(
     parts: Assembly, gaussians: Gaussians[torch.Tensor], frame: Frame, exposure: Exposure | None, rng: Rng
 ) -> BoolArray | None:
     """Return the choice [N] bool of the Gaussians that come first, or None where the packet is to have no layers.
@@ -32,10 +32,10 @@ def first_rows(
     generator = rng.stream("first layer", frame.index)
     views = TrainingViews(parts.renderer, frame, exposure, parts.recipe.background)
     errors, _ = removal_errors(views, gaussians, generator)
-    return most_missed(errors, share)
+    return largest_error_mask(errors, share)
 
 
-def most_missed(errors: torch.Tensor, share: float) -> BoolArray:
+def largest_error_mask(errors: torch.Tensor, share: float) -> BoolArray:
     """Return the choice [N] bool of the rows with the largest errors; of equal ones those that stand first.
 
     Arguments:

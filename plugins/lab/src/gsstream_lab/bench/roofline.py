@@ -135,7 +135,7 @@ def pixels_of(mask: BoolArray, width: int, height: int) -> BoolArray:
     return mask.repeat(TILE, 0).repeat(TILE, 1)[:height, :width]
 
 
-def floor_ms(peak: Peak, *, pairs: int, visible: int, rows: int, pixels: int, floats: int) -> tuple[float, float]:
+def roofline_ms(peak: Peak, *, pairs: int, visible: int, rows: int, pixels: int, floats: int) -> tuple[float, float]:
     """Return the milliseconds that forward and backward take at least.
 
     Arguments:

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from gsstream.engine.budget.pace import Allowance, EpochScheduler
-from gsstream.engine.budget.trim import Fitted
+from gsstream.engine.budget.epoch_scheduler import Allowance, EpochScheduler
+from gsstream.engine.budget.trim import TrimmedDelta
 from gsstream.recipe.model import Stream
 
 
-def usage(pace: EpochScheduler, fitted: Fitted) -> dict[str, Any]:
+def usage(pace: EpochScheduler, fitted: TrimmedDelta) -> dict[str, Any]:
     """Return what the optimisation of a frame used, and what fitting its packet gave up: raw numbers for the log."""
     return {
-        "rate_weight": pace.typical_weight, "estimate": pace.estimate, "stopped_by_clock": pace.stopped_by_clock,
+        "rd_lambda": pace.mean_rate_weight, "estimate": pace.estimate, "stopped_by_clock": pace.stopped_by_clock,
         "untrimmed": fitted.untrimmed, "before": pace.before, "optimise": pace.optimise,
         "dropped": {"symbols": fitted.symbols, "gates": fitted.gates, "births": fitted.births},
     }  # fmt: skip
@@ -27,8 +27,8 @@ def spent(budget: Allowance, used: Mapping[str, Any], stream: Stream, epochs: fl
     plan = budget.plan
     given_up: dict[str, Any] = {}
     if plan.max_bytes is not None:
-        if used["rate_weight"] > 1.05 * stream.rate_weight:
-            given_up["rate_weight"] = [stream.rate_weight, used["rate_weight"]]
+        if used["rd_lambda"] > 1.05 * stream.rd_lambda:
+            given_up["rd_lambda"] = [stream.rd_lambda, used["rd_lambda"]]
         if plan.step_scale > 1:
             given_up["step_scale"] = plan.step_scale
         given_up |= {name: number for name, number in used["dropped"].items() if number}
@@ -46,7 +46,7 @@ def spent(budget: Allowance, used: Mapping[str, Any], stream: Stream, epochs: fl
         "bound": bound,
         "given_up": given_up,
         "spent": {
-            "epochs": epochs, "planned_epochs": plan.epochs, "rate_weight": used["rate_weight"],
+            "epochs": epochs, "planned_epochs": plan.epochs, "rd_lambda": used["rd_lambda"],
             "step_scale": plan.step_scale, "change_threshold": plan.change_threshold, "estimate": used["estimate"],
             "untrimmed": used["untrimmed"], "before": used["before"], "optimise": used["optimise"],
         },

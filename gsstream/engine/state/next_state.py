@@ -7,25 +7,25 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gsstream.core.changes import Births, Layout
+from gsstream.core.changes import AddedGaussians, Layout
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.packet import PlayerState
 
 
-def follow(state: StreamState, player: PlayerState) -> StreamState:
+def next_state(state: StreamState, player: PlayerState) -> StreamState:
     """Return ``state`` after the packet that led to ``player`` (decoded, no key packet).
 
     A resumed run calls this for every packet it replays, so it depends on nothing but the packet.
     """
     decoders = {**state.decoders, **{name: torch.from_numpy(value) for name, value in player.decoders.items()}}
     after = replace(state, player=player, decoders=decoders)
-    if player.delta is None or not player.delta.edits_rows:
+    if player.delta is None or not player.delta.has_row_edit:
         return after
     return replace(after, hierarchy=next_hierarchy(state.hierarchy, player.delta.births, player.layout))
 
 
-def next_hierarchy(hierarchy: Hierarchy, births: Births | None, layout: Layout) -> Hierarchy:
+def next_hierarchy(hierarchy: Hierarchy, births: AddedGaussians | None, layout: Layout) -> Hierarchy:
     """Return the forest after births and deaths. Old nodes stay, also empty ones.
 
     Arguments:

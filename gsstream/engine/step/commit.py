@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 
 from gsstream.core.changes import Delta, Scene, sent_rows
-from gsstream.engine.step.context import FrameView
+from gsstream.engine.step.context import EngineContext
 from gsstream.packet import PlayerState
 from gsstream.parts.render.base import RenderSession
 
 
-def kept_session(view: FrameView, scene: Scene, delta: Delta, player: PlayerState) -> RenderSession | None:
+def commit_session(view: EngineContext, scene: Scene, delta: Delta, player: PlayerState) -> RenderSession | None:
     """Return the session of the decoded scene, in which everything that did not change is still projected and sorted.
 
     None where keeping costs more than it saves: rows came or went, or most of them changed.
@@ -20,7 +20,7 @@ def kept_session(view: FrameView, scene: Scene, delta: Delta, player: PlayerStat
         scene: after the frame's motions, before its residual.
         delta: what was sent. player: what it was decoded to.
     """
-    if delta.edits_rows:
+    if delta.has_row_edit:
         return None
     if delta.is_empty and scene.gaussians is not player.gaussians:
         return None  # not even the motions were sent: the decoded scene is the one before them

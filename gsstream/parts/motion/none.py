@@ -7,7 +7,7 @@ from typing import ClassVar, final
 from gsstream.core.changes import Motion, Scene
 from gsstream.core.rng import Rng
 from gsstream.parts.motion.base import MotionPart
-from gsstream.parts.render.work import FrameWork
+from gsstream.parts.render.work import FitContext
 
 
 @final
@@ -16,5 +16,5 @@ class Still(MotionPart):
 
     source: ClassVar[str] = "gsstream"
 
-    def propose(self, scene: Scene, work: FrameWork, rng: Rng) -> tuple[Motion, ...]:
+    def propose(self, scene: Scene, work: FitContext, rng: Rng) -> tuple[Motion, ...]:
         return ()

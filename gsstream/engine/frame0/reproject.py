@@ -10,7 +10,7 @@ from gsstream.core.world import World
 from gsstream.packet import PlayerState
 
 
-def in_world(first: PlayerState, world: World) -> PlayerState:
+def to_stream_coordinates(first: PlayerState, world: World) -> PlayerState:
     """Return a decoded scene in the coordinates of another stream of the same recording.
 
     Streams of one recording share their coordinates, unless an earlier version wrote one, or its cameras were changed.

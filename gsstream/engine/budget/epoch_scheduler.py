@@ -12,20 +12,20 @@ import torch
 
 from gsstream.core.frame import Frame
 from gsstream.engine.budget.plan import (
-    LEAST_WEIGHT,
-    MOST_TRIMMED,
-    MOST_WEIGHT,
-    SIZE_AIM,
+    MIN_WEIGHT,
+    MAX_TRIMMED,
+    MAX_WEIGHT,
+    SIZE_TARGET,
     UNKNOWN_RESERVE,
     FramePlan,
-    each_with,
-    epochs_within,
+    scale_epoch_seconds,
+    epochs_in,
 )
 from gsstream.engine.budget.schedule import Schedule
 from gsstream.recipe.model import Stream
 
 #: Share of the passes after which the size is first estimated: before that, residuals are still growing.
-SETTLE = 0.25
+SIZE_ESTIMATE_START = 0.25
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class EpochScheduler(Schedule):
         self._timed = allowance if plan.seconds is not None else None
         self.chunk = 1 if self._timed else None
         # With a time budget the number of passes in the plan is a prediction, and the clock may allow more.
-        self._most = max(epochs, round(effort * plan.most_epochs)) if self._timed else epochs
+        self._most = max(epochs, round(effort * plan.max_epochs)) if self._timed else epochs
         self._effort = effort
         self.estimate = 0.0
         self._weights: list[float] = []
@@ -95,8 +95,8 @@ class EpochScheduler(Schedule):
         # The phases before the passes render every view once, forwards and backwards. Without earlier frames to go by,
         # their time is the estimate of a pass.
         before = now - self._timed.started
-        self._each = before if plan.each is None else each_with(plan.each, plan.candidates, candidates)
-        self.epochs = epochs_within(self._left(now), self._each, self._most)
+        self._each = before if plan.each is None else scale_epoch_seconds(plan.each, plan.candidates, candidates)
+        self.epochs = epochs_in(self._left(now), self._each, self._most)
 
     def _left(self, now: float) -> float:
         """Seconds for passes from now on.
@@ -116,7 +116,7 @@ class EpochScheduler(Schedule):
         self.optimise = self._allowance.clock() - self._allowance.started - self.before
 
     @property
-    def typical_weight(self) -> float:
+    def mean_rate_weight(self) -> float:
         """Geometric mean over the last half of the passes: what the bytes of the frame answer to."""
         last = self._weights[len(self._weights) // 2 :] or [self.rd_lambda]
         return math.exp(sum(map(math.log, last)) / len(last)) if min(last) > 0 else self.rd_lambda
@@ -128,11 +128,11 @@ class EpochScheduler(Schedule):
         now = self._timed.clock()
         self._iterations.append(now - self._iteration_began)
         self._iteration_began = now
-        usual = self._usual()
+        usual = self._last_epoch_seconds()
         if usual and self._timed.plan.each is None and len(self._iterations) < self._views:
             self._each = self._views * mean(usual)
             made = len(self._iterations) / self._views
-            self.epochs = epochs_within(self._left(now) + made * self._each, self._each, self._most)
+            self.epochs = epochs_in(self._left(now) + made * self._each, self._each, self._most)
         self.stopped_by_clock = max(usual[-3:], default=0.0) > self._left(now)
         return self.stopped_by_clock
 
@@ -141,13 +141,13 @@ class EpochScheduler(Schedule):
         if self._timed is None:
             return
         now = self._timed.clock()
-        self._each = self._views * mean(self._usual() or self._iterations)
+        self._each = self._views * mean(self._last_epoch_seconds() or self._iterations)
         left = self._left(now)
-        more = 0 if left < 0.25 * self._each else epochs_within(left, self._each, max(1, self._most - done))
+        more = 0 if left < 0.25 * self._each else epochs_in(left, self._each, max(1, self._most - done))
         self.epochs = min(done + more, self._most)
         self.stopped_by_clock = self.epochs == done < self._most
 
-    def _usual(self) -> list[float]:
+    def _last_epoch_seconds(self) -> list[float]:
         """Seconds of the iterations of the last pass.
 
         The first iteration of the frame is left out: it includes work that is done once per frame, and a pass that is
@@ -167,12 +167,12 @@ class EpochScheduler(Schedule):
             return
         self.estimate = estimate()
         self._weights.append(self.rd_lambda)
-        if done < SETTLE * self.epochs:
+        if done < SIZE_ESTIMATE_START * self.epochs:
             return
         expected = self.estimate * plan.correction
         # Between the two bounds the weight stays, and trimming makes the packet fit.
-        wanted = min(max(expected, SIZE_AIM * plan.max_bytes), MOST_TRIMMED * plan.max_bytes)
-        self.rd_lambda = next_weight(self.rd_lambda, expected, wanted)
+        wanted = min(max(expected, SIZE_TARGET * plan.max_bytes), MAX_TRIMMED * plan.max_bytes)
+        self.rd_lambda = next_rate_weight(self.rd_lambda, expected, wanted)
 
 
 def scheduled(stream: Stream, frame: Frame, allowance: Allowance | None) -> Schedule:
@@ -185,11 +185,11 @@ def scheduled(stream: Stream, frame: Frame, allowance: Allowance | None) -> Sche
     """
     epochs = max(1, round(stream.epochs * frame.effort))
     if allowance is None:
-        return Schedule(epochs, stream.rate_weight)
-    return EpochScheduler(allowance, epochs, stream.rate_weight, len(frame.cameras), frame.effort)
+        return Schedule(epochs, stream.rd_lambda)
+    return EpochScheduler(allowance, epochs, stream.rd_lambda, len(frame.cameras), frame.effort)
 
 
-def next_weight(weight: float, expected: float, wanted: float) -> float:
+def next_rate_weight(weight: float, expected: float, wanted: float) -> float:
     """Return the weight of the rate after a pass that would send more or fewer bytes than are wanted.
 
     Bytes fall with about the square root of the weight (docs/results/trade.md), so the first power leads half of the
@@ -203,7 +203,7 @@ def next_weight(weight: float, expected: float, wanted: float) -> float:
     """
     factor = min(max(expected / wanted, 1 / 9), 3.0)
     factor = factor if factor > 1 else factor**0.5
-    return min(max(weight * factor, LEAST_WEIGHT), MOST_WEIGHT)
+    return min(max(weight * factor, MIN_WEIGHT), MAX_WEIGHT)
 
 
 def estimated_bytes(symbols: torch.Tensor) -> float:

@@ -10,7 +10,7 @@ import torch
 from gsstream.api import FrameContext, Rng, check_finite
 
 
-class Pulls(NamedTuple):
+class NoiseRatios(NamedTuple):
     """Ratios to the noise, [N] float64: about 1 under noise alone, 0 for Gaussians that no pixel pulls or sees.
 
     Arguments:
@@ -22,11 +22,11 @@ class Pulls(NamedTuple):
     error_ratio: torch.Tensor
 
 
-def pulls(context: FrameContext, least_sigma: float, probes: int, seed: int, *, error: bool) -> Pulls:
+def noise_ratios(context: FrameContext, min_sigma: float, probes: int, seed: int, *, error: bool) -> NoiseRatios:
     """Both ratios over all views: one backward pass per view for each, and one per probe.
 
     Arguments:
-        least_sigma: least noise of a camera, image units.
+        min_sigma: least noise of a camera, image units.
         probes: noise draws per view that the expectation is averaged over.
         error: whether to measure the error too; it needs a render per view.
 
@@ -37,7 +37,7 @@ def pulls(context: FrameContext, least_sigma: float, probes: int, seed: int, *, 
     lacking, noise = change.clone(), change.clone()
     for view in range(len(context.cameras)):
         now, before = context.image(view), context.previous_image(view)
-        sigma = max(context.noise_sigma(view), least_sigma)
+        sigma = max(context.noise_sigma(view), min_sigma)
         # Unit noise in either case: a difference holds the noise of two images, a mean half the variance of one.
         change += _energy(context, view, (before - now) / (math.sqrt(2) * sigma))
         if error:
@@ -48,7 +48,7 @@ def pulls(context: FrameContext, least_sigma: float, probes: int, seed: int, *, 
             generator = Rng(seed).stream(f"s2gs/whitened/{context.cameras.ids[view]}/{probe}", context.index)
             draw = torch.randn(now.shape, generator=generator, dtype=now.dtype)
             noise += _energy(context, view, draw.to(now.device)) / probes
-    return Pulls(_ratio(change, noise), _ratio(lacking, noise))
+    return NoiseRatios(_ratio(change, noise), _ratio(lacking, noise))
 
 
 def _energy(context: FrameContext, view: int, upstream: torch.Tensor) -> torch.Tensor:
@@ -59,5 +59,5 @@ def _energy(context: FrameContext, view: int, upstream: torch.Tensor) -> torch.T
 
 
 def _ratio(energy: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
-    felt = noise > 0
-    return (energy / noise.where(felt, torch.ones_like(noise))).sqrt() * felt
+    reached = noise > 0
+    return (energy / noise.where(reached, torch.ones_like(noise))).sqrt() * reached

@@ -15,7 +15,7 @@ from gsstream.packet import PlayerState
 from gsstream.player.playback import Playback
 
 
-def between(before: PlayerState, after: PlayerState, share: float) -> Gaussians[FloatArray]:
+def interpolate(before: PlayerState, after: PlayerState, share: float) -> Gaussians[FloatArray]:
     """Return the scene at a moment between two frames that follow each other.
 
     The rows that the later frame displaced have gone and turned ``share`` of their way, at constant speed. Colours,
@@ -29,7 +29,7 @@ def between(before: PlayerState, after: PlayerState, share: float) -> Gaussians[
     if share == 0 or moved is None or after.frame != before.frame + 1:
         return scene
     rows, shift, turn = moved.rows, moved.shift, moved.turn
-    if after.delta is not None and after.delta.edits_rows:
+    if after.delta is not None and after.delta.has_row_edit:
         source = gather_rows(before.layout.node_of, after.delta.births, after.delta.deaths)[rows]
         known = source < len(scene)
         rows, shift, turn = source[known], shift[known], turn[known]
@@ -65,10 +65,10 @@ class Moments:
             return self._before.gaussians
         if self._after is None:
             self._after = self._playback.player_state(frame + 1)
-        return between(self._before, self._after, share)
+        return interpolate(self._before, self._after, share)
 
 
-def moments(frames: Sequence[int], recorded: float, wanted: float) -> list[float]:
+def frame_times(frames: Sequence[int], recorded: float, wanted: float) -> list[float]:
     """Return the times, in frames, of pictures at another rate than the recording's, from the first to the last frame.
 
     Arguments:

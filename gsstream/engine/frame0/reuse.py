@@ -13,15 +13,15 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.frame0.begin import arrange, decoded_anchors, exposure_from_meta, key_state, make_layout
-from gsstream.engine.frame0.first_seen import first_rows
+from gsstream.engine.frame0.begin import sort_into_nodes, decoded_anchors, exposure_from_meta, key_state, make_layout
+from gsstream.engine.frame0.first_layer import first_layer_mask
 from gsstream.engine.state.stream_state import Step
 from gsstream.method.tools import Tools
 from gsstream.packet import PlayerState, StreamMeta, quantise_key
 from gsstream.parts.structure.base import Anchors
 
 
-def begin_from(parts: Assembly, frame: Frame, tools: Tools) -> Step:
+def reuse_first_frame(parts: Assembly, frame: Frame, tools: Tools) -> Step:
     """Start from the decoded frame 0 of another stream, grouped by this method.
 
     Methods can then be compared on the same scene.
@@ -42,11 +42,11 @@ def begin_from(parts: Assembly, frame: Frame, tools: Tools) -> Step:
     with tools.log.phase("code"):
         decoded = replace(first, scene=replace(first.scene, gaussians=quantise_key(first.gaussians)))
         gaussians = decoded.gaussians.map(torch.from_numpy)
-        anchors = taken_anchors(parts, decoded, frame)
-        hierarchy, levels, gaussians = arrange(parts, gaussians, anchors.levels, anchors)
+        anchors = reused_anchors(parts, decoded, frame)
+        hierarchy, levels, gaussians = sort_into_nodes(parts, gaussians, anchors.levels, anchors)
         layout = make_layout(hierarchy, levels, anchors)
         exposure = exposure_from_meta(first.meta)
-        first_seen = first_rows(parts, gaussians, frame, exposure, rng)
+        first_seen = first_layer_mask(parts, gaussians, frame, exposure, rng)
         state, packet = key_state(
             parts, gaussians, layout, hierarchy, frame, meta, exposure, anchors.origin, rng, first_seen
         )
@@ -54,9 +54,9 @@ def begin_from(parts: Assembly, frame: Frame, tools: Tools) -> Step:
     return Step(state, packet, "key")
 
 
-def _check_views(theirs: StreamMeta, cameras: Cameras, judges: tuple[str, ...]) -> None:
+def _check_views(theirs: StreamMeta, cameras: Cameras, held_out: tuple[str, ...]) -> None:
     """Refuse a frame 0 that has learned from cameras that judge here, or whose colour maps are of other cameras."""
-    if seen := [name for name in judges if name in theirs.train.ids]:
+    if seen := [name for name in held_out if name in theirs.train.ids]:
         raise InputError(
             f"the first frame was reconstructed with {', '.join(seen)}, which would judge here; take one of a run with "
             "the same data.split and data.test_cameras"
@@ -68,7 +68,7 @@ def _check_views(theirs: StreamMeta, cameras: Cameras, judges: tuple[str, ...]) 
         )
 
 
-def taken_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
+def reused_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
     """Return the grid on which a frame 0 of another stream goes on.
 
     It is that stream's own, bit for bit, if a structure of the same settings laid it, or if this method's structure
@@ -81,22 +81,22 @@ def taken_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
         frame: training images of frame 0.
     """
     theirs = decoded_anchors(first)
-    if keeps_grid(parts, first.meta.recipe):
+    if can_reuse_grid(parts, first.meta.recipe):
         return theirs
-    grid = parts.structure.seed(cloud_of(first), frame.cameras)
+    grid = parts.structure.seed(point_cloud_of(first), frame.cameras)
     sizes = theirs.cell_sizes[theirs.levels]
     levels = (sizes.log()[:, None] - grid.cell_sizes.log()[None]).abs().argmin(1)
     return replace(theirs, levels=levels, cell_sizes=grid.cell_sizes, origin=grid.origin)
 
 
-def keeps_grid(parts: Assembly, recipe: Mapping[str, Any]) -> bool:
+def can_reuse_grid(parts: Assembly, recipe: Mapping[str, Any]) -> bool:
     """Return whether the grid of a stream serves this method's structure as it is.
 
     Arguments:
         parts: the live parts of the recipe.
         recipe: of the stream, as its key packet holds it.
     """
-    if not parts.structure.claims().lays_grid:
+    if not parts.structure.claims().has_grid:
         return True
     mine, theirs = parts.recipe.structure, recipe.get("structure", {})
     grouping = parts.structure.grouping_settings
@@ -107,7 +107,7 @@ def keeps_grid(parts: Assembly, recipe: Mapping[str, Any]) -> bool:
     return bool(theirs.get("name") == mine.name and laying(theirs.get("params", {})) == laying(mine.params))
 
 
-def cloud_of(first: PlayerState) -> PointCloud:
+def point_cloud_of(first: PlayerState) -> PointCloud:
     """Return the centres of a decoded scene as points; their colour is unknown, grey."""
     means = first.gaussians.means
     return PointCloud(means, np.full_like(means, 0.5), "frame 0 of another stream")

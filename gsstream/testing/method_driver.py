@@ -37,22 +37,22 @@ class MethodUnderTest:
         self.name = name
         catalog = load_catalog()
         recipe = resolve_recipe(name, catalog.recipe_path, (), [("the contract kit", text) for text in TINY]).recipe
-        reads = catalog.resolve("stepper", recipe.stepper.name)().reads
+        reads = catalog.resolve("streaming_method", recipe.streaming_method.name)().reads
         kept = [text for text in TINY if not text.startswith("stream.") or reads(text.partition("=")[0])]
         overrides = [("the contract kit", text) for text in kept]
         self.parts: Assembly = assemble(resolve_recipe(name, catalog.recipe_path, (), overrides), catalog)
         if method is not None:
             ref = ComponentRef(name="under-test", params=method.config.model_dump(mode="json"))
-            recipe = self.parts.recipe.model_copy(update={"stepper": ref})
-            self.parts = replace(self.parts, stepper=method, recipe=recipe)
+            recipe = self.parts.recipe.model_copy(update={"streaming_method": ref})
+            self.parts = replace(self.parts, streaming_method=method, recipe=recipe)
 
     def __repr__(self) -> str:
         return f"method {self.name}"
 
     @property
-    def least_cameras(self) -> int:
+    def min_cameras(self) -> int:
         """How many training cameras it says it needs."""
-        return self.parts.stepper.least_cameras
+        return self.parts.streaming_method.min_cameras
 
     def encoder(self, uri: str = SOURCE, first: PlayerState | None = None) -> Encoder:
         """Return an encoder of this method, before frame 0."""

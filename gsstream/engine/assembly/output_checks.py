@@ -61,7 +61,7 @@ def _optimiser(look: Look, args: tuple[Any, ...], result: object) -> None:
     look.step_values("after the step,", args[0])
 
 
-LOOKS: Mapping[tuple[str, str], Callable[[Look, tuple[Any, ...], Any], None]] = {
+OUTPUT_CHECKS: Mapping[tuple[str, str], Callable[[Look, tuple[Any, ...], Any], None]] = {
     ("confidence", "estimate"): _estimate,
     ("propagation", "propagate"): _propagate,
     ("gate", "init"): _like_logits("init()", None),

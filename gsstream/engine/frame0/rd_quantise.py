@@ -1,4 +1,4 @@
-"""Frame 0 is rounded by what a bit buys (``codec.key_rate``): a value is as exact as the training images feel it.
+"""Frame 0 is rounded by what a bit buys (``codec.key_rd_lambda``): a value is as exact as the training images feel it.
 
 Most Gaussians are small, half hidden or seen from one side, so most of their rotations, sizes and colours may be off by
 several steps and no image shows it; most coefficients of view-dependent colour explain noise and go altogether. How far
@@ -18,19 +18,19 @@ from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.axes import nearest_axes
-from gsstream.engine.frame0.probes import TrainingViews, probes
-from gsstream.engine.frame0.rounding import codes_nearby, codes_towards_zero
-from gsstream.packet.grids import KEY_BITS, color_codes, color_slopes, from_codes
+from gsstream.engine.frame0.hutchinson import TrainingViews, hutchinson_samples
+from gsstream.engine.frame0.rounding import rd_codes_nearby, rd_codes_to_zero
+from gsstream.packet.grids import KEY_BITS, color_codes, color_grads, from_codes
 from gsstream.parts.render.exposure import Exposure
 
 #: How far a code may move, in steps of its grid: a colour by 0.04, an axis by 7 degrees, a scale by a factor of 2.7, an
 #: opacity by a logit. View-dependent colour may go to zero from anywhere.
 REACH: Mapping[str, int] = {"quats": 8, "scales": 16, "opacities": 8, "sh0": 8}
 #: Probes of a camera.
-PROBES = 2
+HUTCHINSON_SAMPLES = 2
 
 
-def cheaper_rows(
+def rd_quantise(
     parts: Assembly, gaussians: Gaussians[torch.Tensor], frame: Frame, exposure: Exposure | None, rng: Rng
 ) -> Gaussians[torch.Tensor]:
     """Return Gaussians that look nearly the same and that a key packet holds in fewer bytes.
@@ -43,17 +43,17 @@ def cheaper_rows(
         rng: random streams by name and frame.
     """
     rows = nearest_axes(gaussians)
-    rate = parts.recipe.codec.key_rate
+    rate = parts.recipe.codec.key_rd_lambda
     if rate == 0 or len(rows) == 0:
         return rows
-    felt, error = felt_codes(parts, rows, frame, exposure, rng.stream("key rate", frame.index))
+    sensitivity, error = code_sensitivity(parts, rows, frame, exposure, rng.stream("key rate", frame.index))
     return Gaussians(
         means=rows.means,
-        **{name: _rounded(name, values, felt[name], rate * error) for name, values in rows.items() if name in KEY_BITS},
+        **{name: _rounded(name, values, sensitivity[name], rate * error) for name, values in rows.items() if name in KEY_BITS},
     )
 
 
-def felt_codes(
+def code_sensitivity(
     parts: Assembly, gaussians: Gaussians[torch.Tensor], frame: Frame, exposure: Exposure | None,
     generator: torch.Generator,
 ) -> tuple[dict[str, FloatArray], float]:  # fmt: skip
@@ -68,28 +68,28 @@ def felt_codes(
 
     Returns attribute -> [N, width] float64: squared change of all images together when a code is one higher.
     """
-    felt: dict[str, FloatArray] = {name: np.zeros(_flat(getattr(gaussians, name)).shape) for name in KEY_BITS}
+    sensitivity: dict[str, FloatArray] = {name: np.zeros(_flat(getattr(gaussians, name)).shape) for name in KEY_BITS}
     error = 0.0
     views = TrainingViews(parts.renderer, frame, exposure, parts.recipe.background)
-    for probe in probes(views, gaussians, generator, each=PROBES):
+    for probe in hutchinson_samples(views, gaussians, generator, each=HUTCHINSON_SAMPLES):
         error += probe.error
         for name, bits in KEY_BITS.items():
-            slopes = _flat(getattr(probe.slopes, name))
+            grads = _flat(getattr(probe.grad, name))
             colors = name in ("sh0", "shN")
-            felt[name] += (color_slopes(slopes, bits) if colors else slopes * 2.0**-bits) ** 2
-    return {name: squares / PROBES for name, squares in felt.items()}, error / (PROBES * len(frame.cameras))
+            sensitivity[name] += (color_grads(grads, bits) if colors else grads * 2.0**-bits) ** 2
+    return {name: squares / HUTCHINSON_SAMPLES for name, squares in sensitivity.items()}, error / (HUTCHINSON_SAMPLES * len(frame.cameras))
 
 
-def _rounded(name: str, values: torch.Tensor, felt: FloatArray, weight: float) -> torch.Tensor:
+def _rounded(name: str, values: torch.Tensor, sensitivity: FloatArray, weight: float) -> torch.Tensor:
     bits = KEY_BITS[name]
     if name == "shN":
-        codes = codes_towards_zero(color_codes(values.numpy(), bits), felt, weight)
+        codes = rd_codes_to_zero(color_codes(values.numpy(), bits), sensitivity, weight)
     elif name == "sh0":
-        codes = codes_nearby(color_codes(values.numpy(), bits), felt, weight, REACH[name])
+        codes = rd_codes_nearby(color_codes(values.numpy(), bits), sensitivity, weight, REACH[name])
     elif name == "quats":
-        codes = _unit_codes(codes_nearby(_flat(values)[:, 1:] * 2.0**bits, felt[:, 1:], weight, REACH[name]), bits)
+        codes = _unit_codes(rd_codes_nearby(_flat(values)[:, 1:] * 2.0**bits, sensitivity[:, 1:], weight, REACH[name]), bits)
     else:
-        codes = codes_nearby(_flat(values) * 2.0**bits, felt, weight, REACH[name])
+        codes = rd_codes_nearby(_flat(values) * 2.0**bits, sensitivity, weight, REACH[name])
     return torch.from_numpy(from_codes(name, codes, bits)).reshape(values.shape)
 
 

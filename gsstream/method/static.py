@@ -14,26 +14,26 @@ from gsstream.packet import PlayerState
 
 
 @dataclass(frozen=True)
-class HoldState:
+class StaticState:
     """Nothing but what the player has."""
 
     player: PlayerState
 
 
 @final
-class Hold(StreamingMethod[HoldState]):
+class Hold(StreamingMethod[StaticState]):
     """Sends frame 0 and then 16 bytes a frame."""
 
     source = "gsstream"
 
-    def begin(self, frame: Frame, tools: Tools) -> Step[HoldState]:
+    def begin(self, frame: Frame, tools: Tools) -> Step[StaticState]:
         first = tools.first_frame(frame)
         packet, player = send_key(first.gaussians, first.layout, first.meta, frame.index)
-        return Step(HoldState(player), packet, "key")
+        return Step(StaticState(player), packet, "key")
 
-    def step(self, state: HoldState, frame: Frame, tools: Tools) -> Step[HoldState]:
+    def step(self, state: StaticState, frame: Frame, tools: Tools) -> Step[StaticState]:
         packet, player = send_delta(state.player, Delta())
-        return Step(HoldState(player), packet, "empty")
+        return Step(StaticState(player), packet, "empty")
 
-    def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> HoldState:
-        return HoldState(player)
+    def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> StaticState:
+        return StaticState(player)

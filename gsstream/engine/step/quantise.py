@@ -13,14 +13,14 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import VARIABLE, Look
 from gsstream.engine.step.problem import Problem, Solution
 from gsstream.packet import quantise_decoders
-from gsstream.parts.update.base import coarser
-from gsstream.parts.update.base import symbols as residual_symbols
+from gsstream.parts.update.base import scale_steps
+from gsstream.parts.update.base import quantise_latents as residual_symbols
 
 #: Largest symbol of 32 bits that float32 represents: anything between it and 2^31 would be rounded up to 2^31.
-MOST_SYMBOL = 2.0**31 - 256
+MAX_INT32_SYMBOL = 2.0**31 - 256
 
 
-def harden(parts: Assembly, problem: Problem, solution: Solution) -> Residual | None:
+def quantise_residual(parts: Assembly, problem: Problem, solution: Solution) -> Residual | None:
     """Return the transmitted integers; None when nothing changes.
 
     A gate behind which every symbol is zero is closed: it would cost bits and change nothing.
@@ -37,7 +37,7 @@ def harden(parts: Assembly, problem: Problem, solution: Solution) -> Residual | 
     final = parts.gate.sample(solution.logits, None)
     gates = torch.round(final * parts.gate.num_levels).numpy().astype(np.uint8)
     rows = solution.rows.numpy()
-    codes = coarser(parts.update.codes(), problem.step_scale)
+    codes = scale_steps(parts.update.codes(), problem.step_scale)
     integers = {name: value.numpy() for name, value in residual_symbols(codes, solution.latents).items()}
     changing = np.zeros(len(rows), bool)
     for value in integers.values():
@@ -48,7 +48,7 @@ def harden(parts: Assembly, problem: Problem, solution: Solution) -> Residual | 
     if not gates.any():
         return None
     sent = np.flatnonzero(np.repeat(gates != 0, layout.node_counts))
-    table = {name: rows_of(value, rows, sent) for name, value in integers.items()}
+    table = {name: gather_rows_or_zero(value, rows, sent) for name, value in integers.items()}
     table = {name: value for name, value in table.items() if value.any()}
     decoders = {name: value.numpy() for name, value in solution.decoders.items() if name in table}
     steps = {name: codes[name].step for name in table}
@@ -63,18 +63,18 @@ def check_solution(parts: Assembly, problem: Problem, solution: Solution) -> Non
         problem: what the optimisation was given.
         solution: what it found.
     """
-    codes, look = coarser(parts.update.codes(), problem.step_scale), Look(
+    codes, look = scale_steps(parts.update.codes(), problem.step_scale), Look(
         parts.checks, "update", parts.part("update"), parts.where
     )
     for name, value in solution.latents.items():
-        most = codes[name].step * MOST_SYMBOL
+        most = codes[name].step * MAX_INT32_SYMBOL
         what = f"{name} after the last iteration ({VARIABLE}=step finds the first)"
         look.values(what, value, limits=(-most, most), rows=solution.rows)
     for name, value in solution.decoders.items():
         look.values(f"decoder of {name}", value)
 
 
-def rows_of(values: np.ndarray[Any, Any], known: IntArray, wanted: IntArray) -> np.ndarray[Any, Any]:
+def gather_rows_or_zero(values: np.ndarray[Any, Any], known: IntArray, wanted: IntArray) -> np.ndarray[Any, Any]:
     """Return the wanted rows of a table; rows that it does not know are zero.
 
     Arguments:

@@ -40,26 +40,26 @@ class TrainingViews:
         return float((image - torch.from_numpy(self.frame.images[view])).square().mean())
 
 
-class Probe(NamedTuple):
+class HutchinsonSample(NamedTuple):
     """One image of random signs, pulled back to the scene.
 
-    ``slopes``: N rows, derivative of the sum of the signed pixels by every raw value. ``error``: mean squared error of
+    ``grad``: N rows, derivative of the sum of the signed pixels by every raw value. ``error``: mean squared error of
     that camera's image.
     """
 
-    slopes: Gaussians[torch.Tensor]
+    grad: Gaussians[torch.Tensor]
     error: float
 
 
-def _taken(leaf: torch.Tensor) -> torch.Tensor:
+def _pop_grad(leaf: torch.Tensor) -> torch.Tensor:
     """The gradient of a leaf, which has none afterwards."""
     gradient, leaf.grad = gradient_of(leaf), None
     return gradient
 
 
-def probes(
+def hutchinson_samples(
     views: TrainingViews, gaussians: Gaussians[torch.Tensor], generator: torch.Generator, *, each: int
-) -> Iterator[Probe]:
+) -> Iterator[HutchinsonSample]:
     """Yield ``each`` probes of every camera.
 
     Arguments:
@@ -79,4 +79,4 @@ def probes(
             signs = torch.randint(0, 2, image.shape, generator=generator).to(image.dtype) * 2 - 1
             upstream = signs if exposure is None else exposure[view].vjp(signs)
             backward([image], [upstream], retain_graph=number < each - 1)
-            yield Probe(leaves.map(_taken), error)
+            yield HutchinsonSample(leaves.map(_pop_grad), error)

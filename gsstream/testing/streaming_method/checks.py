@@ -19,7 +19,7 @@ from gsstream.method.base import Step
 from gsstream.packet import PlayerState, StreamWriter, quantise_key
 from gsstream.testing.cases import fingerprint
 from gsstream.testing.registry import check
-from gsstream.testing.stepping import FRAMES, SOURCE, MethodUnderTest
+from gsstream.testing.method_driver import FRAMES, SOURCE, MethodUnderTest
 
 CUT = 2
 
@@ -34,7 +34,7 @@ def _bytes(what: str, got: Step[Any], expected: Step[Any]) -> None:
     raise AssertionError(f"{what}: packet of frame {frame} differs from byte {place} on ({len(a)} and {len(b)} bytes)")
 
 
-@check("method", kinds=("method", "stepper"))
+@check("method", kinds=("method", "streaming_method"))
 def check_method_closed_loop(method: MethodUnderTest) -> None:
     """A fresh player that has the packets alone reaches the encoder's state bit by bit, frame by frame."""
     player: PlayerState | None = None
@@ -46,14 +46,14 @@ def check_method_closed_loop(method: MethodUnderTest) -> None:
             assert drift == 0.0, f"frame {player.frame}: {name} drifted by {drift:.3g}; expected 0, bitwise on the CPU"
 
 
-@check("method", kinds=("method", "stepper"))
+@check("method", kinds=("method", "streaming_method"))
 def check_method_deterministic(method: MethodUnderTest) -> None:
     """The same seed gives the same packets, byte by byte."""
     for again, first in zip(method.chain(), method.steps, strict=True):
         _bytes("second run", again, first)
 
 
-@check("method", kinds=("method", "stepper"))
+@check("method", kinds=("method", "streaming_method"))
 def check_method_resume(method: MethodUnderTest) -> None:
     """Stopped after frame 1 and continued from the stream alone, the rest is byte by byte the same."""
     with tempfile.TemporaryDirectory() as folder:
@@ -70,7 +70,7 @@ def check_method_resume(method: MethodUnderTest) -> None:
         state = again.state
 
 
-@check("method", kinds=("method", "stepper"))
+@check("method", kinds=("method", "streaming_method"))
 def check_method_failed_frame(method: MethodUnderTest) -> None:
     """A frame that fails leaves the state as it was; the next attempt gives what it would have given."""
     state = method.steps[1].state
@@ -85,7 +85,7 @@ def check_method_failed_frame(method: MethodUnderTest) -> None:
     _bytes("after a failed frame", method.step(state, frame), method.steps[2])
 
 
-@check("method", kinds=("method", "stepper"))
+@check("method", kinds=("method", "streaming_method"))
 def check_method_static_video(method: MethodUnderTest) -> None:
     """When nothing moves, frames cost no more than when something does."""
     still = method.chain(SOURCE + "&static=true")
@@ -97,10 +97,10 @@ def check_method_static_video(method: MethodUnderTest) -> None:
     )
 
 
-@check("method", kinds=("method", "stepper"))
+@check("method", kinds=("method", "streaming_method"))
 def check_method_one_camera(method: MethodUnderTest) -> None:
     """One camera, or as many as it says it needs, are enough to run, and everything stays finite."""
-    for step in method.chain(choose=lambda frame: _with_cameras(frame, method.least_cameras)):
+    for step in method.chain(choose=lambda frame: _with_cameras(frame, method.min_cameras)):
         for name, value in step.state.player.gaussians.items():
             check_finite(f"frame {step.packet.frame}: {name}", value)
 
@@ -109,19 +109,19 @@ def _with_cameras(frame: Frame, number: int) -> Frame:
     return replace(frame, images=frame.images[:number], cameras=frame.cameras.select(range(number)))
 
 
-@check("method", kinds=("method", "stepper"))
+@check("method", kinds=("method", "streaming_method"))
 def check_method_declared_needs(method: MethodUnderTest) -> None:
     """With one camera fewer than it says it needs, frame 0 is refused by an InputError that says how many."""
-    frame = _with_cameras(open_source(SOURCE).frame(0), method.least_cameras - 1)
+    frame = _with_cameras(open_source(SOURCE).frame(0), method.min_cameras - 1)
     try:
         method.begin(frame)
     except InputError as error:
-        assert str(method.least_cameras) in str(error), f"the error does not say how many cameras are needed: {error}"
+        assert str(method.min_cameras) in str(error), f"the error does not say how many cameras are needed: {error}"
         return
-    raise AssertionError(f"started with {len(frame.cameras)} cameras; it says it needs {method.least_cameras}")
+    raise AssertionError(f"started with {len(frame.cameras)} cameras; it says it needs {method.min_cameras}")
 
 
-@check("method", kinds=("method", "stepper"))
+@check("method", kinds=("method", "streaming_method"))
 def check_method_size_is_true(method: MethodUnderTest) -> None:
     """Reported bytes are the bytes written, and no more gates or Gaussians are active than there are."""
     for step in method.steps:
@@ -134,7 +134,7 @@ def check_method_size_is_true(method: MethodUnderTest) -> None:
             assert 0 <= active <= have, f"frame {frame}: {active} active {name} of {have}"
 
 
-@check("method", kinds=("method", "stepper"))
+@check("method", kinds=("method", "streaming_method"))
 def check_method_global_rng(method: MethodUnderTest) -> None:
     """Torch's global generator is neither read nor moved by a frame."""
     state, frame = method.steps[0].state, open_source(SOURCE).frame(1)
@@ -144,8 +144,8 @@ def check_method_global_rng(method: MethodUnderTest) -> None:
     _bytes("frame 1 again", again, method.steps[1])
 
 
-@check("method", kinds=("method", "stepper"))
-def check_method_inputs_kept(method: MethodUnderTest) -> None:
+@check("method", kinds=("method", "streaming_method"))
+def check_method_inputs_unchanged(method: MethodUnderTest) -> None:
     """A frame leaves the images it was given and the state it started from as they were."""
     state, frame = method.steps[1].state, open_source(SOURCE).frame(2)
     before = fingerprint((frame.images, state.player))
@@ -153,8 +153,8 @@ def check_method_inputs_kept(method: MethodUnderTest) -> None:
     assert fingerprint((frame.images, state.player)) == before, "the frame changed its images or the state before it"
 
 
-@check("method", kinds=("method", "stepper"))
-def check_method_takes_first_frame(method: MethodUnderTest) -> None:
+@check("method", kinds=("method", "streaming_method"))
+def check_method_reuses_first_frame(method: MethodUnderTest) -> None:
     """Given frame 0 of another stream, it starts from exactly those Gaussians, in an order of its own."""
     own = method.steps[0].state.player
     given = quantise_key(replace(own.gaussians, means=own.gaussians.means / 2))
@@ -170,8 +170,8 @@ def _sorted_rows(gaussians: Gaussians[FloatArray]) -> FloatArray:
     return np.asarray(rows[np.lexsort(rows.T)])
 
 
-@check("method", kinds=("method", "stepper"))
-def check_method_says_what_it_is(method: MethodUnderTest) -> None:
+@check("method", kinds=("method", "streaming_method"))
+def check_method_meta(method: MethodUnderTest) -> None:
     """The key packet names the method and carries the recipe and the cameras of the run."""
     meta, recipe = method.steps[0].state.player.meta, method.parts.recipe
     assert meta.method == recipe.method, f"method: expected {recipe.method!r}, got {meta.method!r}"
@@ -181,7 +181,7 @@ def check_method_says_what_it_is(method: MethodUnderTest) -> None:
         assert have.ids == want.ids, f"{split} cameras: expected {want.ids}, got {have.ids}"
 
 
-@check("method", kinds=("method", "stepper"))
+@check("method", kinds=("method", "streaming_method"))
 def check_method_skips(method: MethodUnderTest) -> None:
     """A frame that is worth no effort becomes an empty packet, and the stream goes on from it."""
     state, frame = method.steps[0].state, open_source(SOURCE).frame(1)

@@ -13,10 +13,10 @@ from gsstream.recipe.model import Recipe
 #: Sections that, beside the slots of parts, only a method made of parts reads.
 PART_SECTIONS = ("stream", "codec", "budget")
 #: Of those sections, what the engine itself reads for every method, also for frame 0, which it makes for them.
-SESSION_KEYS = ("codec.key_rate", "codec.first_layer", "budget.memory", "stream.on_error")
+SESSION_KEYS = ("codec.key_rd_lambda", "codec.first_layer", "budget.memory", "stream.on_error")
 
 
-def unheeded(
+def unused_keys(
     recipe: Recipe, method: StreamingMethod[Any], parts: Mapping[str, Any]
 ) -> Iterator[KeyPath]:
     """Yield the paths of keys that differ from their default though the method does not read them.

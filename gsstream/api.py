@@ -16,13 +16,13 @@ from gsstream.core.changes import Motion as Motion
 from gsstream.core.changes import Residual as Residual
 from gsstream.core.changes import Rows as Rows
 from gsstream.core.changes import Scene as Scene
+from gsstream.core.changes import add_as_nodes as add_as_nodes
+from gsstream.core.changes import add_to_nodes as add_to_nodes
 from gsstream.core.changes import apply_delta as apply_delta
 from gsstream.core.changes import apply_field as apply_field
 from gsstream.core.changes import apply_motion as apply_motion
 from gsstream.core.changes import field_rows as field_rows
 from gsstream.core.changes import groups_for as groups_for
-from gsstream.core.changes import add_to_nodes as add_to_nodes
-from gsstream.core.changes import add_as_nodes as add_as_nodes
 from gsstream.core.changes import sent_rows as sent_rows
 from gsstream.core.changes.motion import GroupTransforms as GroupTransforms
 from gsstream.core.context import FrameContext as FrameContext

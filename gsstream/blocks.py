@@ -5,9 +5,9 @@ copy: densify, count changed tiles, learn residuals side by side, weigh their ra
 """
 
 from gsstream.core.changes.motion import GroupTransforms as GroupTransforms
-from gsstream.core.changes.motion import quat_to_rotmat as quat_to_rotmat
 from gsstream.core.changes.motion import predict_transforms as predict_transforms
 from gsstream.core.changes.motion import quat_multiply as quat_multiply
+from gsstream.core.changes.motion import quat_to_rotmat as quat_to_rotmat
 from gsstream.core.changes.motion import rodrigues_to_quat as rodrigues_to_quat
 from gsstream.core.changes.motion import transform_groups as transform_groups
 from gsstream.core.changes.rows import gather_rows as gather_rows
@@ -21,20 +21,20 @@ from gsstream.engine.fit.nearest import neighbour_distance as neighbour_distance
 from gsstream.engine.step.active.candidates import changed_rows as changed_rows
 from gsstream.engine.step.active.candidates import rows_in_changed_tiles as rows_in_changed_tiles
 from gsstream.engine.step.active.change import Change as Change
-from gsstream.engine.step.active.change import detect_changed_tiles as detect_changed_tiles
 from gsstream.engine.step.active.change import count_per_tile as count_per_tile
+from gsstream.engine.step.active.change import detect_changed_tiles as detect_changed_tiles
 from gsstream.engine.step.quantise import gather_rows_or_zero as gather_rows_or_zero
 from gsstream.parts.growth.copying import CopyFilter as CopyFilter
 from gsstream.parts.growth.copying import fit_copies as fit_copies
 from gsstream.parts.growth.copying import high_gradient_rows as high_gradient_rows
 from gsstream.parts.growth.copying import replace_with_copies as replace_with_copies
-from gsstream.parts.growth.fitting import fit_added as fit_added
 from gsstream.parts.growth.fitting import concat_gaussians as concat_gaussians
+from gsstream.parts.growth.fitting import fit_added as fit_added
 from gsstream.parts.motion.field import approximate_by_cells as approximate_by_cells
 from gsstream.parts.motion.fitting import GroupAdam as GroupAdam
 from gsstream.parts.motion.fitting import elementwise as elementwise
-from gsstream.parts.motion.fitting import groupwise_max as groupwise_max
 from gsstream.parts.motion.fitting import fit_transforms_adam as fit_transforms_adam
+from gsstream.parts.motion.fitting import groupwise_max as groupwise_max
 from gsstream.parts.motion.groups import groups_of_rows as groups_of_rows
 from gsstream.parts.motion.groups import pixel_size as pixel_size
 from gsstream.parts.optimiser.joint import add_joint as add_joint

@@ -22,8 +22,8 @@ from gsstream.core.world import rig_similarity, snap_cameras
 from gsstream.engine.assembly.assemble import Assembly as Assembly
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.frame0.points import gather_points
-from gsstream.engine.run.encoder import Encoder as Encoder
 from gsstream.engine.run.encoder import Callbacks as Callbacks
+from gsstream.engine.run.encoder import Encoder as Encoder
 from gsstream.engine.run.recording import open_recording as _open
 from gsstream.input.recordings.base import FrameSource as FrameSource
 from gsstream.input.recordings.base import SourceInfo
@@ -103,8 +103,8 @@ def encoder_for_rig(
 ) -> Encoder:
     """Return an encoder of images that come from anywhere; frame 0 is seeded by a plane sweep over them.
 
-    The stream lies in coordinates that the rig defines: cameras of frames are taken there by :meth:`Encoder.with_near_plane`,
-    and what a player shows is taken back by ``meta.world``.
+    The stream lies in coordinates that the rig defines: cameras of frames are taken there by
+    :meth:`Encoder.with_near_plane`, and what a player shows is taken back by ``meta.world``.
 
     Arguments:
         method: a name of ``gsstream methods``.

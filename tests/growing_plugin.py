@@ -13,7 +13,7 @@ import pytest
 import torch
 from pydantic import Field
 
-from gsstream.api import FitContext, Growth, PartConfig, Rng, Rows, Scene, add_to_nodes, add_as_nodes
+from gsstream.api import FitContext, Growth, PartConfig, Rng, Rows, Scene, add_as_nodes, add_to_nodes
 from gsstream.blocks import fit_added
 from gsstream.spec import ComponentSpec, hookimpl
 

@@ -26,7 +26,8 @@ SHIPPED: Mapping[str, tuple[str, ...]] = {
     "player": ("renderer/cpu", "loss/cpu", "optimiser/cpu"),
     "methods": (
         "method/queen", "method/queen-published", "method/queen-m", "method/queen-s", "streaming_method/queen",
-        "method/hicom", "method/hicom-published", "streaming_method/hicom", "method/comgs-s", "method/comgs-l", "streaming_method/comgs",
+        "method/hicom", "method/hicom-published", "streaming_method/hicom",
+        "method/comgs-s", "method/comgs-l", "streaming_method/comgs",
         "method/stream3dgs", "method/stream3dgs-cells", "streaming_method/stream3dgs",
         "method/recon", "method/recon-published", "streaming_method/recon",
         "method/quarc", "method/quarc-published", "streaming_method/quarc",

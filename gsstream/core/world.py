@@ -2,8 +2,8 @@
 
 A similarity, ``x_recording = scale * rotation @ x_stream + offset`` in float64. Recordings come in any unit, turned and
 moved at will; float32 arithmetic, an octree along the axes and absolute thresholds are not indifferent to that. So a
-recording is opened in a frame that its own cameras define (:func:`rig_similarity`), and whatever people read or write is
-taken back to the recording's coordinates.
+recording is opened in a frame that its own cameras define (:func:`rig_similarity`), and whatever people read or write
+is taken back to the recording's coordinates.
 """
 
 from __future__ import annotations

@@ -57,9 +57,10 @@ class Step(Generic[State]):
 class StreamingMethod(Part, Generic[State]):
     """A method. Pure: state goes in and comes out, random numbers come from ``tools.rng`` by name and frame.
 
-    ``recipe_keys`` names the recipe keys that this method reads besides what the engine itself does (frame 0, loss, renderer,
-    recording, packets), for example ``("stream.epochs",)``. A run that changes a key of the parts or of later frames
-    that is not listed here is refused: no option is ignored in silence. A pattern names several: ``("stream.*",)``.
+    ``recipe_keys`` names the recipe keys that this method reads besides what the engine itself does (frame 0, loss,
+    renderer, recording, packets), for example ``("stream.epochs",)``. A run that changes a key of the parts or of later
+    frames that is not listed here is refused: no option is ignored in silence. A pattern names several:
+    ``("stream.*",)``.
     ``min_cameras`` is how many training cameras it needs: a recording with fewer is refused before anything is
     reconstructed.
     """

@@ -17,9 +17,9 @@ from gsstream.packet.base import (
     MAX_UNITS,
     EncodedPacket,
     PacketKind,
+    add_offset,
     build_packet,
     expect,
-    add_offset,
     most_gaussians,
 )  # fmt: skip
 from gsstream.packet.bits import pack_blobs, unpack_blobs

@@ -18,8 +18,8 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError, OutputError
 from gsstream.core.needs import install_extra
 from gsstream.core.shapes import FloatArray
-from gsstream.player.interpolation import Moments, frame_times
 from gsstream.player.camera_file import read_path
+from gsstream.player.interpolation import Moments, frame_times
 from gsstream.player.paths import PATHS, camera_path, resized
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, render, to_bytes

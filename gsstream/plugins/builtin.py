@@ -26,7 +26,12 @@ def gsstream_components() -> list[ComponentSpec]:
         _part("motion", "coasting", "parts.motion.constant_velocity:Coasting", "what moved goes on moving"),
         _part("motion", "rigid", "parts.motion.rigid:Rigid", "one fitted rigid motion per group"),
         _part("growth", "none", "parts.growth.none:NoGrowth", "nothing is born and nothing leaves"),
-        _part("streaming_method", "parts", "engine.method.parts:PartsMethod", "the slots of the recipe, one after the other"),
+        _part(
+            "streaming_method",
+            "parts",
+            "engine.method.parts:PartsMethod",
+            "the slots of the recipe, one after the other",
+        ),
         _part("streaming_method", "hold", "method.static:Hold", "frame 0 and nothing after it"),
         _part("renderer", "reference", "parts.render.reference:ReferenceRenderer", "pure torch: slow, the truth"),
         _part("loss", "reference", "parts.loss.photometric:ReferenceLoss", "L1 + D-SSIM in torch: slow, the truth"),

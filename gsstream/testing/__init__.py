@@ -4,11 +4,11 @@
 """
 
 from gsstream.testing.cases import World as World
+from gsstream.testing.cases import get_case as get_case
 from gsstream.testing.cases import images as images
 from gsstream.testing.cases import make_case as make_case
 from gsstream.testing.cases import rig as rig
 from gsstream.testing.cases import scene as scene
-from gsstream.testing.cases import get_case as get_case
 from gsstream.testing.kit import CheckResult as CheckResult
 from gsstream.testing.kit import parametrize_with_checks as parametrize_with_checks
 from gsstream.testing.kit import run_checks as run_checks

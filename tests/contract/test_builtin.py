@@ -18,8 +18,8 @@ from gsstream.parts.gate.base import GateSampler
 from gsstream.parts.growth.none import NoGrowth
 from gsstream.parts.loss.photometric import ReferenceLoss
 from gsstream.parts.motion.constant_velocity import Coasting
-from gsstream.parts.motion.rigid import Rigid
 from gsstream.parts.motion.none import Still
+from gsstream.parts.motion.rigid import Rigid
 from gsstream.parts.optimiser.adam import ReferenceAdam
 from gsstream.parts.propagation.group_max import GroupMax
 from gsstream.parts.regularizer.none import NoRegularizer

@@ -50,7 +50,7 @@ def turned(monkeypatch: pytest.MonkeyPatch, factor: float, noise: float) -> None
 
 @pytest.mark.parametrize("name", ["cloud", "static"])  # "static" is round
 def test_rounding_is_no_alarm(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loss_and_grad, "world", lambda _: get_case(name))
+    monkeypatch.setattr(loss_and_grad, "get_case", lambda _: get_case(name))
     turned(monkeypatch, factor=1.0, noise=4.0)
     loss_and_grad.check_renderer_loss_and_grad_scene(CpuRenderer())
 

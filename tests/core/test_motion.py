@@ -20,11 +20,11 @@ from gsstream.core.changes import (
     Residual,
     Rows,
     Scene,
+    add_as_nodes,
+    add_to_nodes,
     apply_delta,
     apply_motion,
     groups_for,
-    add_to_nodes,
-    add_as_nodes,
 )
 from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import Gaussians
@@ -342,7 +342,9 @@ def test_misfits_are_refused_in_words() -> None:
     bad = {
         "a mark for each of 6 groups": dataclasses.replace(motion, moving=motion.moving[:-1]),
         "6 symbols for each of 6 moving groups": dataclasses.replace(motion, symbols=motion.symbols[:-1]),
-        "beyond the range of float32": dataclasses.replace(motion, symbols=motion.symbols + 2**30, translation_step=1e38),
+        "beyond the range of float32": dataclasses.replace(
+            motion, symbols=motion.symbols + 2**30, translation_step=1e38
+        ),
     }
     for message, wrong in bad.items():
         with pytest.raises(ShapeError, match=message):

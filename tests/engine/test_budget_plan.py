@@ -17,8 +17,8 @@ from gsstream.core.log import FrameLog
 from gsstream.engine.budget.controller import Controller
 from gsstream.engine.budget.epoch_scheduler import estimated_bytes, next_rate_weight
 from gsstream.engine.budget.plan import (
-    MIN_WEIGHT,
     MAX_WEIGHT,
+    MIN_WEIGHT,
     TIME_MARGIN,
     Past,
     epochs_in,

@@ -15,7 +15,7 @@ from test_encoder import TINY, WORLD, frames
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.encode import encoder_for, open_recording
-from gsstream.engine.frame0.rd_quantise import REACH, rd_quantise, code_sensitivity
+from gsstream.engine.frame0.rd_quantise import REACH, code_sensitivity, rd_quantise
 from gsstream.engine.frame0.rounding import rd_codes_nearby, rd_codes_to_zero
 from gsstream.packet import EncodedPacket, decode_packet
 from gsstream.packet.grids import KEY_BITS, color_codes, color_grads, from_codes, to_codes
@@ -139,7 +139,9 @@ def test_what_is_felt_is_what_a_code_changes(name: str) -> None:
     """Of the most felt code of every attribute, by two renders of every view."""
     packet, encoder = key_packet(0.0)
     scene, frame = scene_of(packet).map(torch.from_numpy), frames()[0]
-    felt = sum(code_sensitivity(encoder.parts, scene, frame, None, Rng(seed).stream("a", 0))[0][name] for seed in range(24))
+    felt = sum(
+        code_sensitivity(encoder.parts, scene, frame, None, Rng(seed).stream("a", 0))[0][name] for seed in range(24)
+    )
     felt = felt / 24
     row, column = np.unravel_index(int(felt.argmax()), felt.shape)
     bits = KEY_BITS[name]

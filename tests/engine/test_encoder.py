@@ -19,7 +19,7 @@ from growing_plugin import growth_installed
 from gsstream.cli.main import run_command
 from gsstream.core.errors import ComponentError, InputError, RecipeError, ShapeError
 from gsstream.core.frame import Frame
-from gsstream.encode import Encoder, Callbacks, encoder_for, encoder_for_rig, open_recording
+from gsstream.encode import Callbacks, Encoder, encoder_for, encoder_for_rig, open_recording
 from gsstream.engine.frame0.begin import decoded_anchors
 from gsstream.engine.keys.resume import rebuild_hierarchy
 from gsstream.method.base import Step

@@ -23,8 +23,8 @@ from gsstream.core.errors import ComponentError
 from gsstream.core.frame import Frame
 from gsstream.core.part import unwrapped
 from gsstream.encode import Encoder, encoder_for, open_recording
-from gsstream.engine.assembly.guard import Guarded, guard
 from gsstream.engine.assembly.call_location import Where
+from gsstream.engine.assembly.guard import Guarded, guard
 from gsstream.engine.method.repeating import RepeatedFrameWarning
 from gsstream.engine.step import frame_step as step_module
 from gsstream.packet import decode_packet
@@ -303,7 +303,17 @@ class TestGuard:
 
     def test_every_part_of_an_assembly_is_guarded_once(self) -> None:
         parts = encoder("gate", lambda part, _: part).parts
-        for slot in ("structure", "confidence", "gate", "motion", "growth", "streaming_method", "renderer", "loss", "optimiser"):
+        for slot in (
+            "structure",
+            "confidence",
+            "gate",
+            "motion",
+            "growth",
+            "streaming_method",
+            "renderer",
+            "loss",
+            "optimiser",
+        ):
             assert isinstance(getattr(parts, slot), Guarded)
             assert not isinstance(parts.part(slot), Guarded)
         with pytest.raises(ComponentError, match=r"propagation .* failed at frame None"):

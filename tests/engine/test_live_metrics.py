@@ -9,7 +9,7 @@ import pytest
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Arrival, Frame
-from gsstream.engine.run.live import COUNTED, latency_words, latency_lines, live_metrics
+from gsstream.engine.run.live import COUNTED, latency_lines, latency_words, live_metrics
 
 RIG = Cameras(
     ("a", "b"), np.eye(4)[None].repeat(2, 0).astype(np.float32), np.eye(3)[None].repeat(2, 0).astype(np.float32), 8, 8
@@ -47,7 +47,12 @@ def test_a_clock_that_is_ahead_shows_and_nothing_is_said_of_recordings_that_are_
     assert (early["latency_seconds"], gone["latency_seconds"]) == (-1.0, None)
     assert latency_words({"live": gone}) == ["latency unknown"]
     assert entry(1, 1.0, None) is None
-    assert latency_words({"live": None}) == latency_words({}) == latency_lines([{"frame": 0}, {"frame": 1, "live": None}]) == []
+    assert (
+        latency_words({"live": None})
+        == latency_words({})
+        == latency_lines([{"frame": 0}, {"frame": 1, "live": None}])
+        == []
+    )
 
 
 def test_the_summary_leaves_dropped_frames_out_of_the_latency_and_counts_them() -> None:

@@ -16,7 +16,7 @@ from gsstream.core.changes import AddedGaussians, Delta, Layout, Rows, Scene
 from gsstream.core.errors import ComponentError
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
-from gsstream.encode import Encoder, Callbacks, encoder_for, open_recording
+from gsstream.encode import Callbacks, Encoder, encoder_for, open_recording
 from gsstream.engine.fit.densify import DensifyStatistics
 from gsstream.engine.frame0 import refine
 from gsstream.engine.frame0.axes import nearest_axes

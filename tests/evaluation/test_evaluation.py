@@ -16,7 +16,7 @@ from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.engine.run.metrics_log import last_written, trim_metrics
-from gsstream.evaluation.contact_sheet import Column, most_changed_window, contact_sheet, sheet_of_stream
+from gsstream.evaluation.contact_sheet import Column, contact_sheet, most_changed_window, sheet_of_stream
 from gsstream.evaluation.evaluate import evaluate
 from gsstream.evaluation.plots import plot_runs
 from gsstream.evaluation.records import FrameRecord, read_lines, read_records

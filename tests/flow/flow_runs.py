@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from gsstream.cli.main import run_command
-from gsstream.core.changes import Rows, add_to_nodes, add_as_nodes
+from gsstream.core.changes import Rows, add_as_nodes, add_to_nodes
 from gsstream.core.frame import Frame
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.state.stream_state import StreamState

@@ -91,7 +91,7 @@ def test_plenty_of_time_makes_the_most_passes(tmp_path: Path) -> None:
 
 
 def test_key_packets_wait_for_a_budget_that_has_room(tmp_path: Path) -> None:
-    encode(tmp_path / "small", *TIGHT, method="s2gs-edge", codec__key_every=2)
+    encode(tmp_path / "small", *TIGHT, method="s2gs-edge", codec__key_interval=2)
     lines = metrics(tmp_path / "small")
     assert [line["status"] for line in lines[1:]].count("key") == 0
     assert ["key_postponed" in line for line in lines] == [False, False, True, True, True, True]
@@ -100,7 +100,7 @@ def test_key_packets_wait_for_a_budget_that_has_room(tmp_path: Path) -> None:
         "a key packet was due and postponed in 4 frames (frames 2 to 5): period: about"
         in (tmp_path / "small" / "summary.txt").read_text()
     )
-    encode(tmp_path / "large", "--budget", "size=1MB", method="s2gs-edge", codec__key_every=2)
+    encode(tmp_path / "large", "--budget", "size=1MB", method="s2gs-edge", codec__key_interval=2)
     assert [line["status"] for line in metrics(tmp_path / "large")][2::2] == ["key", "key"]
 
 

@@ -100,10 +100,10 @@ def test_training_and_transmission_apply_the_same_map(tmp_path: Path, monkeypatc
         seen.append((problem, residual, rows))
         return residual
 
-    original = step_module.harden
-    monkeypatch.setattr(step_module, "harden", harden)
+    original = step_module.quantise_residual
+    monkeypatch.setattr(step_module, "quantise_residual", harden)
     witness = Witness(monkeypatch)
-    keep = {"motion": "still", "codec__trim": 0, "stream__release_closed": "false"}
+    keep = {"motion": "still", "codec__trim": 0, "stream__freeze_closed": "false"}
     encode(tmp_path, "--frames", "4", method="s2gs-edge", **keep)
     assert len(seen) == 3
     for problem, residual, rows in seen:
@@ -267,7 +267,8 @@ SPOILED = {
     "a cell of zero": (lambda motion: (replace(motion, cell=0.0),), "cell: expected a float32 above 0"),
     "no shades": (lambda motion: (replace(motion, shades=0),), "shades: expected 1 to 16"),
     "beyond everything": (
-        lambda motion: (replace(motion, symbols=np.full_like(motion.symbols, 2**31 - 1), translation_step=9e8),), "motion",
+        lambda motion: (replace(motion, symbols=np.full_like(motion.symbols, 2**31 - 1), translation_step=9e8),),
+        "motion",
     ),
     "too many": (lambda motion: (motion,) * 9, "at most 8 motions"),
 }  # fmt: skip

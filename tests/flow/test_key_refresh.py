@@ -19,7 +19,7 @@ from gsstream.packet.base import FILE_HEADER
 from gsstream.player.manifest import manifest
 from gsstream.player.playback import Playback
 
-PERIOD: dict[str, Any] = {"codec__key_every": 2}
+PERIOD: dict[str, Any] = {"codec__key_interval": 2}
 METHODS = ["dense", "s2gs-edge"]
 
 

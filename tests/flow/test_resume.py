@@ -55,7 +55,7 @@ def stands_still(lines: Lines) -> bool:
     return "empty" in [line["status"] for line in lines]
 
 
-PERIOD = {"codec__key_every": 2}
+PERIOD = {"codec__key_interval": 2}
 RUNS: dict[str, Run] = {
     "s2gs-edge": Run(3),
     "key packets, cut at one": Run(2, settings=PERIOD, shows=keys),
@@ -78,8 +78,9 @@ RUNS: dict[str, Run] = {
     "queen with births": Run(
         3, method="queen", shows=lambda lines: sum(line.get("births", 0) for line in lines) > 0,
         settings={
-            "stepper__births__every": 1, "stepper__births__gradient": 1e-5, "stepper__births__most": 30,
-            "stepper__change__dynamic": 1e-7,
+            "streaming_method__births__every": 1, "streaming_method__births__gradient": 1e-5,
+            "streaming_method__births__most": 30,
+            "streaming_method__change__dynamic": 1e-7,
         },
     ),
     "hold": Run(2, method="hold", settings={"stream__epochs": 20}, shows=stands_still),

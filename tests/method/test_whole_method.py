@@ -16,12 +16,12 @@ from gsstream.core.errors import ComponentError, RecipeError
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.method.checked import difference_between
-from gsstream.engine.method.repeating import SkippedWorkWarning, RepeatedFrameWarning
-from gsstream.engine.run.encoder import Encoder, Callbacks
+from gsstream.engine.method.repeating import RepeatedFrameWarning, SkippedWorkWarning
+from gsstream.engine.run.encoder import Callbacks, Encoder
 from gsstream.input.recordings.open import open_source
 from gsstream.method.base import StreamingMethod
-from gsstream.method.static import Hold, StaticState
 from gsstream.method.packets import send_delta
+from gsstream.method.static import Hold, StaticState
 from gsstream.packet import PacketKind
 from gsstream.parts.render.exposure import Exposure
 from gsstream.parts.render.wrt import WrtRows
@@ -29,9 +29,9 @@ from gsstream.player.playback import Playback
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe
+from gsstream.testing.method_driver import SOURCE, MethodUnderTest
 from gsstream.testing.streaming_method.checks import check_method_closed_loop, check_method_resume
 from gsstream.testing.streaming_method.example import ExampleMethod
-from gsstream.testing.method_driver import SOURCE, MethodUnderTest
 
 Follow: Any = ExampleMethod  # final: only what is wrong on purpose may inherit from it
 
@@ -168,7 +168,9 @@ def test_what_a_method_raises_is_reported_with_its_name() -> None:
 
     subject = MethodUnderTest("dense", spoilt(fail))
     start = subject.begin(open_source(SOURCE).frame(0))
-    with pytest.raises(ComponentError, match=r"streaming_method 'Wrong' .* failed at frame 1: RuntimeError: out of ideas"):
+    with pytest.raises(
+        ComponentError, match=r"streaming_method 'Wrong' .* failed at frame 1: RuntimeError: out of ideas"
+    ):
         subject.step(start.state, open_source(SOURCE).frame(1))
 
 
@@ -315,7 +317,9 @@ def test_what_fails_after_a_packet_leaves_the_encoder_as_it_was_and_gives_the_pa
     listeners = Callbacks(packet=sent.append)
     encoder = Encoder(subject.parts, source.info, lambda _: source.points("recording"), listeners=listeners)
     before = encoder.encode(source.frame(0)).state
-    with pytest.raises(ComponentError, match=r"streaming_method 'Wrong' .* failed at frame 1: RuntimeError: out of ideas"):
+    with pytest.raises(
+        ComponentError, match=r"streaming_method 'Wrong' .* failed at frame 1: RuntimeError: out of ideas"
+    ):
         encoder.encode(source.frame(1))
     assert encoder.state is before
     encoder.encode(source.frame(1))
@@ -334,7 +338,9 @@ def test_what_fails_after_a_packet_is_left_out_when_the_recipe_says_so() -> None
 
     subject, source = repeating(pondering(ponder)), open_source(SOURCE)
     start = subject.begin(source.frame(0))
-    with pytest.warns(SkippedWorkWarning, match=r"frame 1: its packet is sound, but .* left out: streaming_method 'Wrong'"):
+    with pytest.warns(
+        SkippedWorkWarning, match=r"frame 1: its packet is sound, but .* left out: streaming_method 'Wrong'"
+    ):
         step = subject.step(start.state, source.frame(1))
     assert asked == [1, 0]
     assert step.state.about == -1
@@ -420,7 +426,10 @@ def test_keys_that_a_whole_method_does_not_read_are_refused() -> None:
 def test_settings_of_a_whole_method() -> None:
     wanted = "unknown key 'streaming_method.params.speed'; none are registered"
     assert refusal("streaming_method.speed=3") == [f"--set streaming_method.speed=3: {wanted}"]
-    assert "streaming_method.name: no streaming_method named 'hodl'; did you mean 'hold'?" in refusal("streaming_method=hodl")[0]
+    assert (
+        "streaming_method.name: no streaming_method named 'hodl'; did you mean 'hold'?"
+        in refusal("streaming_method=hodl")[0]
+    )
     assert wanted in refusal("streaming_method.speed=3", method="dense")[0]
 
 
@@ -510,7 +519,7 @@ RECORDINGS = sorted(
 
 @pytest.mark.parametrize("file", RECORDINGS, ids=[file.stem for file in RECORDINGS])
 def test_the_recipe_of_a_recording_serves_every_method(file: Path) -> None:
-    """It says how frame 0 is made, which the engine does for all; `codec.key_rd_lambda` was refused by all but the parts."""
+    """It describes how frame 0 is made, which the engine does for all methods."""
     catalog = load_catalog()
     for method in catalog.names("method"):
         sets = [("--set", "renderer=reference")]

@@ -13,8 +13,8 @@ from numeric_scenes import some
 
 from gsstream.core.errors import ComponentError
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.engine.assembly.checks import Checks, Look
 from gsstream.engine.assembly.call_location import Where
+from gsstream.engine.assembly.checks import Checks, Look
 
 
 def flat(nodes: int, rows: int) -> Hierarchy:

@@ -10,7 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from packet_scenes import decode_all, make_births, make_edit, make_key, make_packets, make_scene, same_bits
 
-from gsstream.core.changes import AddedGaussians, Delta, Layout, Residual, Rows, apply_delta, add_to_nodes, add_as_nodes, row_gates
+from gsstream.core.changes import (
+    AddedGaussians,
+    Delta,
+    Layout,
+    Residual,
+    Rows,
+    add_as_nodes,
+    add_to_nodes,
+    apply_delta,
+    row_gates,
+)
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.evaluation.stream_stats import stream_stats
 from gsstream.packet import (

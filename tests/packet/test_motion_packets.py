@@ -31,11 +31,11 @@ from gsstream.core.changes import (
     Motion,
     Residual,
     Rows,
+    add_as_nodes,
     apply_delta,
     apply_motion,
     apply_residual,
     gather_rows,
-    add_as_nodes,
     sent_rows,
 )
 from gsstream.evaluation.stream_stats import stream_stats

@@ -11,7 +11,7 @@ from test_player import NUMPY, make_scene, make_stream
 from gsstream.core.changes import Delta, Layout, Residual, Rows, Scene, apply_delta
 from gsstream.core.errors import InputError
 from gsstream.packet import PlayerState
-from gsstream.player.interpolation import Moments, interpolate, frame_times
+from gsstream.player.interpolation import Moments, frame_times, interpolate
 from gsstream.player.play import play
 from gsstream.player.playback import Playback
 

@@ -66,7 +66,9 @@ def make_rows(rng: np.random.Generator, scene: Scene, sh_rest: int) -> Rows:
     born, new = int(rng.integers(1, 9)), int(rng.integers(0, 3))
     parents = nodes + np.arange(new) - rng.integers(0, 3, new).clip(0, nodes)
     where = np.sort(rng.integers(0, nodes + new, born))
-    births = AddedGaussians(make_gaussians(rng, born, sh_rest), where, rng.integers(0, 3, born).astype(np.uint8), parents)
+    births = AddedGaussians(
+        make_gaussians(rng, born, sh_rest), where, rng.integers(0, 3, born).astype(np.uint8), parents
+    )
     gone = np.flatnonzero(rng.random(number) < 0.05)
     return Rows(births if rng.random() < 0.8 or not len(gone) else None, gone)
 

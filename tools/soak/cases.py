@@ -128,7 +128,7 @@ def draw_case(seed: int, index: int, catalog: Catalog) -> Case:
         settings["data.train_views"] = int(rng.integers(2, views))
     if width * height <= REFERENCE_PIXELS and rng.random() < 0.2:
         settings["renderer"] = "reference"
-    streaming_method = stepper_of(method, catalog)
+    streaming_method = streaming_method_of(method, catalog)
     if streaming_method is not None:
         recipe_keys = getattr(catalog.resolve("streaming_method", streaming_method), "recipe_keys", ())
         read = (*recipe_keys, *SESSION_KEYS)
@@ -140,7 +140,7 @@ def draw_case(seed: int, index: int, catalog: Catalog) -> Case:
     return Case(seed, index, source, method, tuple(settings.items()))
 
 
-def stepper_of(method: str, catalog: Catalog) -> str | None:
+def streaming_method_of(method: str, catalog: Catalog) -> str | None:
     """The streaming_method behind a method's name; None where it is made of parts."""
     from gsstream.recipe.load import resolve_recipe
 

@@ -25,9 +25,9 @@ from gsstream.core.changes.residual import decode_residual as decode_residual
 from gsstream.core.changes.residual import sent_rows as sent_rows
 from gsstream.core.changes.rows import AddedGaussians as AddedGaussians
 from gsstream.core.changes.rows import Rows as Rows
+from gsstream.core.changes.rows import add_as_nodes as add_as_nodes
+from gsstream.core.changes.rows import add_to_nodes as add_to_nodes
 from gsstream.core.changes.rows import apply_row_edit as apply_row_edit
 from gsstream.core.changes.rows import gather_rows as gather_rows
-from gsstream.core.changes.rows import add_to_nodes as add_to_nodes
-from gsstream.core.changes.rows import add_as_nodes as add_as_nodes
 from gsstream.core.changes.scene import Layout as Layout
 from gsstream.core.changes.scene import Scene as Scene

@@ -122,7 +122,9 @@ def gather_rows(node_of: IntArray, births: AddedGaussians | None, deaths: IntArr
     return np.asarray(np.insert(kept, places, len(node_of) + np.arange(len(births))))
 
 
-def edited_counts(node_counts: IntArray, node_of: IntArray, births: AddedGaussians | None, deaths: IntArray) -> IntArray:
+def edited_counts(
+    node_counts: IntArray, node_of: IntArray, births: AddedGaussians | None, deaths: IntArray
+) -> IntArray:
     """Return [M + K] int32: Gaussians of each node after births and deaths.
 
     Arguments:

@@ -12,11 +12,11 @@ from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
 from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.core.needs import install_renderer
 from gsstream.core.part import Part, unwrapped
+from gsstream.engine.assembly.call_location import Where
 from gsstream.engine.assembly.checks import Checks, requested_checks
 from gsstream.engine.assembly.guard import guard
 from gsstream.engine.assembly.recipe_keys import unused_keys
 from gsstream.engine.assembly.title import title
-from gsstream.engine.assembly.call_location import Where
 from gsstream.method.base import StreamingMethod
 from gsstream.parts.confidence.base import ConfidenceEstimator
 from gsstream.parts.gate.base import GateSampler
@@ -144,15 +144,16 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
 
 
 def _unused_key_messages(paths: list[KeyPath], resolved: ResolvedRecipe) -> list[str]:
-    """What to say about keys that the streaming_method does not read: each, or in one line where it is the whole method's."""
+    """Return messages about keys that the method does not read: one each, or one line where most come from its base.
+    """
     name, base = resolved.recipe.streaming_method.name, resolved.recipe.method
     from_base = [path for path in paths if resolved.near(path).label == f"method {base}"]
     if len(from_base) > 2:
         where = resolved.near(("streaming_method", "name")).where
         some = ", ".join(".".join(path) for path in from_base[:3])
         return [
-            f"{where}: the streaming_method {name!r} reads none of {len(from_base)} settings that the method {base!r} brings "
-            f"({some}, ...); put it in place of another method: --method dense --set streaming_method={name}"
+            f"{where}: the streaming_method {name!r} reads none of {len(from_base)} settings that the method {base!r} "
+            f"brings ({some}, ...); put it in place of another method: --method dense --set streaming_method={name}"
         ]
     hint = f"the streaming_method {name!r} does not read it; its own settings: gsstream plugins streaming_method/{name}"
     return [f"{resolved.near(path).where}: {'.'.join(path)}: {hint}" for path in paths]

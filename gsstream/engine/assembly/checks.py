@@ -13,8 +13,8 @@ from enum import StrEnum
 import torch
 
 from gsstream.core.errors import InputError
-from gsstream.engine.assembly.fault import fault
 from gsstream.engine.assembly.call_location import Where
+from gsstream.engine.assembly.fault import fault
 
 VARIABLE = "GSSTREAM_CHECKS"
 UNIT = (0.0, 1.0)

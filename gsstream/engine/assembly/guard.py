@@ -12,10 +12,10 @@ from typing import Any, TypeVar, cast
 
 from gsstream.core.errors import GsstreamError, InputError, ShapeError
 from gsstream.core.part import unwrapped
+from gsstream.engine.assembly.call_location import Where
 from gsstream.engine.assembly.checks import Checks, Look
 from gsstream.engine.assembly.fault import fault
 from gsstream.engine.assembly.output_checks import OUTPUT_CHECKS
-from gsstream.engine.assembly.call_location import Where
 from gsstream.parts.optimiser.base import RowOptimiser
 from gsstream.parts.optimiser.residual import ResidualOptimiser
 from gsstream.parts.render.base import RenderSession
@@ -68,7 +68,8 @@ def _line_of(error: Exception, part: object) -> str:
 class Guarded:
     """Calls a part and stands in its place: attributes that are no functions are the part's own.
 
-    What its functions raise passes :func:`error_context`; what they return is looked at (``engine.assembly.output_checks``).
+    What its functions raise passes :func:`error_context`; what they return is checked
+    (``engine.assembly.output_checks``).
     """
 
     def __init__(self, slot: str, part: object, where: Where, level: Checks, kind: str = "") -> None:

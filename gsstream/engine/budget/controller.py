@@ -13,7 +13,7 @@ from typing import Any
 from gsstream.core.log import FrameLog
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.epoch_scheduler import Allowance
-from gsstream.engine.budget.plan import WINDOW, Past, read_past_frame, plan
+from gsstream.engine.budget.plan import WINDOW, Past, plan, read_past_frame
 from gsstream.engine.budget.usage import spent
 from gsstream.method.base import Step
 from gsstream.method.tools import FrameBudget

@@ -12,14 +12,14 @@ import torch
 
 from gsstream.core.frame import Frame
 from gsstream.engine.budget.plan import (
-    MIN_WEIGHT,
     MAX_TRIMMED,
     MAX_WEIGHT,
+    MIN_WEIGHT,
     SIZE_TARGET,
     UNKNOWN_RESERVE,
     FramePlan,
-    scale_epoch_seconds,
     epochs_in,
+    scale_epoch_seconds,
 )
 from gsstream.engine.budget.schedule import Schedule
 from gsstream.recipe.model import Stream

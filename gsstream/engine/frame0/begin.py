@@ -19,9 +19,9 @@ from gsstream.core.rng import Rng
 from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import error_context
-from gsstream.engine.frame0.rd_quantise import rd_quantise
 from gsstream.engine.frame0.first_layer import first_layer_mask
 from gsstream.engine.frame0.optimise import initial_gaussians, optimise_first_frame, sort_by_node
+from gsstream.engine.frame0.rd_quantise import rd_quantise
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.input.seeds.thinning import thin_points
 from gsstream.method.tools import Tools

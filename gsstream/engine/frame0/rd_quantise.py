@@ -49,7 +49,11 @@ def rd_quantise(
     sensitivity, error = code_sensitivity(parts, rows, frame, exposure, rng.stream("key rate", frame.index))
     return Gaussians(
         means=rows.means,
-        **{name: _rounded(name, values, sensitivity[name], rate * error) for name, values in rows.items() if name in KEY_BITS},
+        **{
+            name: _rounded(name, values, sensitivity[name], rate * error)
+            for name, values in rows.items()
+            if name in KEY_BITS
+        },
     )
 
 
@@ -77,7 +81,9 @@ def code_sensitivity(
             grads = _flat(getattr(probe.grad, name))
             colors = name in ("sh0", "shN")
             sensitivity[name] += (color_grads(grads, bits) if colors else grads * 2.0**-bits) ** 2
-    return {name: squares / HUTCHINSON_SAMPLES for name, squares in sensitivity.items()}, error / (HUTCHINSON_SAMPLES * len(frame.cameras))
+    return {name: squares / HUTCHINSON_SAMPLES for name, squares in sensitivity.items()}, error / (
+        HUTCHINSON_SAMPLES * len(frame.cameras)
+    )
 
 
 def _rounded(name: str, values: torch.Tensor, sensitivity: FloatArray, weight: float) -> torch.Tensor:
@@ -87,7 +93,9 @@ def _rounded(name: str, values: torch.Tensor, sensitivity: FloatArray, weight: f
     elif name == "sh0":
         codes = rd_codes_nearby(color_codes(values.numpy(), bits), sensitivity, weight, REACH[name])
     elif name == "quats":
-        codes = _unit_codes(rd_codes_nearby(_flat(values)[:, 1:] * 2.0**bits, sensitivity[:, 1:], weight, REACH[name]), bits)
+        codes = _unit_codes(
+            rd_codes_nearby(_flat(values)[:, 1:] * 2.0**bits, sensitivity[:, 1:], weight, REACH[name]), bits
+        )
     else:
         codes = rd_codes_nearby(_flat(values) * 2.0**bits, sensitivity, weight, REACH[name])
     return torch.from_numpy(from_codes(name, codes, bits)).reshape(values.shape)

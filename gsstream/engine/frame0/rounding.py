@@ -65,10 +65,18 @@ def _by_column(exact: FloatArray, sensitivity: FloatArray, weight: float, candid
     if weight == 0 or nearest.size == 0:
         return nearest
     columns = zip(exact.T, nearest.T, sensitivity.T, strict=True)
-    return np.stack([_column(values, codes, candidate_codes(codes), sensitivities, weight) for values, codes, sensitivities in columns], 1)
+    return np.stack(
+        [
+            _column(values, codes, candidate_codes(codes), sensitivities, weight)
+            for values, codes, sensitivities in columns
+        ],
+        1,
+    )
 
 
-def _column(exact: FloatArray, nearest: IntArray, candidates: IntArray, sensitivity: FloatArray, weight: float) -> IntArray:
+def _column(
+    exact: FloatArray, nearest: IntArray, candidates: IntArray, sensitivity: FloatArray, weight: float
+) -> IntArray:
     error = sensitivity * (candidates - exact) ** 2
     low = int(candidates.min())
     chosen = nearest

@@ -14,9 +14,9 @@ from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.frame0.begin import sort_into_nodes, decoded_anchors, key_state, make_layout
-from gsstream.engine.frame0.rd_quantise import rd_quantise
+from gsstream.engine.frame0.begin import decoded_anchors, key_state, make_layout, sort_into_nodes
 from gsstream.engine.frame0.first_layer import first_layer_mask
+from gsstream.engine.frame0.rd_quantise import rd_quantise
 from gsstream.engine.frame0.refine import SHOWN, is_refined
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.method.tools import Tools

@@ -14,7 +14,7 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import decoded_anchors, exposure_from_meta
-from gsstream.engine.frame0.refine import SHOWN, advance_refinement, start_refinement, is_refining
+from gsstream.engine.frame0.refine import SHOWN, advance_refinement, is_refining, start_refinement
 from gsstream.engine.state.next_state import next_state
 from gsstream.engine.state.refinement import Refinement
 from gsstream.engine.state.stream_state import StreamState
@@ -166,7 +166,9 @@ def rebuild_hierarchy(parts: Assembly, player: PlayerState) -> Hierarchy:
 
 def _check_recipe(parts: Assembly, meta: StreamMeta) -> None:
     old, new = dict(meta.recipe), parts.recipe.model_dump(mode="json")
-    changed = sorted(key for key in new if key != "frames" and _deciding_keys(key, old.get(key)) != _deciding_keys(key, new[key]))
+    changed = sorted(
+        key for key in new if key != "frames" and _deciding_keys(key, old.get(key)) != _deciding_keys(key, new[key])
+    )
     if changed:
         raise OutputError(
             f"the stream was written with another recipe: {', '.join(changed)} differ; resume with the same recipe "

@@ -10,7 +10,7 @@ from gsstream.core.frame import Frame
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.controller import apply_plan
 from gsstream.engine.frame0.begin import begin
-from gsstream.engine.frame0.refine import runs_after_packet, refine_first_frame
+from gsstream.engine.frame0.refine import refine_first_frame, runs_after_packet
 from gsstream.engine.frame0.reuse import reuse_first_frame
 from gsstream.engine.keys.keyframes import key_packet_if_due
 from gsstream.engine.keys.resume import refinement_after, state_after

@@ -16,9 +16,9 @@ from gsstream.core.rng import Rng
 from gsstream.core.world import snap_cameras
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.controller import Controller
-from gsstream.engine.frame0.reproject import to_stream_coordinates
 from gsstream.engine.frame0.optimise import Progress
 from gsstream.engine.frame0.points import gather_points
+from gsstream.engine.frame0.reproject import to_stream_coordinates
 from gsstream.engine.frame0.reuse import point_cloud_of
 from gsstream.engine.keys.resume import check_stream, read_end, states_since_key
 from gsstream.engine.method.wrapped import wrapped

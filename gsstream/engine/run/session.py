@@ -18,12 +18,12 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.memory import limit_memory
 from gsstream.engine.frame0.points import gather_points, with_test_views
 from gsstream.engine.run.displacement import displacement_pixels
-from gsstream.engine.run.encoder import Encoder, Callbacks
+from gsstream.engine.run.encoder import Callbacks, Encoder
 from gsstream.engine.run.live import live_metrics
 from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.run.metrics_log import append_metrics, last_written, trim_metrics
 from gsstream.engine.run.progress import RunProgress
-from gsstream.input.recordings.base import FrameSource, LiveSource, AdaptiveSource, SourceInfo
+from gsstream.input.recordings.base import AdaptiveSource, FrameSource, LiveSource, SourceInfo
 from gsstream.input.recordings.prefetch import Prefetcher
 from gsstream.method.base import Step
 from gsstream.packet import EncodedPacket, PlayerState, StreamReader, StreamWriter

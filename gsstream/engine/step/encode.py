@@ -7,8 +7,8 @@ from functools import partial
 
 from gsstream.core.changes import Delta, sent_rows
 from gsstream.engine.budget.trim import TrimmedDelta, trim_to_size
-from gsstream.engine.step.quantise import gather_rows_or_zero
 from gsstream.engine.step.problem import Solution
+from gsstream.engine.step.quantise import gather_rows_or_zero
 from gsstream.method.packets import delta_packet
 from gsstream.packet import EncodedPacket, PlayerState
 from gsstream.packet.changes.motion import encode_motions

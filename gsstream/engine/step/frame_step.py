@@ -19,14 +19,14 @@ from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.active.candidates import CHANGE_VOTES, candidates
 from gsstream.engine.step.active.change import detect_changed_tiles
 from gsstream.engine.step.active.tiles import tile_weights
+from gsstream.engine.step.commit import commit_session
 from gsstream.engine.step.encode import encode_frame
 from gsstream.engine.step.growth import with_growth
-from gsstream.engine.step.quantise import quantise_residual
-from gsstream.engine.step.commit import commit_session
 from gsstream.engine.step.metrics import log_packet, step_numbers
 from gsstream.engine.step.motion import propose_motion
 from gsstream.engine.step.optimise import optimise
 from gsstream.engine.step.problem import Problem
+from gsstream.engine.step.quantise import quantise_residual
 from gsstream.method.tools import Tools
 from gsstream.packet import decode_packet, encode_empty
 

@@ -22,7 +22,7 @@ from gsstream.engine.step.levels import current_level, level_schedule
 from gsstream.engine.step.lr_factor import lr_factor
 from gsstream.engine.step.problem import Problem, Solution
 from gsstream.parts.optimiser.residual import Iteration, ResidualEpoch
-from gsstream.parts.update.base import scale_steps, init_latents
+from gsstream.parts.update.base import init_latents, scale_steps
 from gsstream.parts.update.joint import joint_layout
 
 #: Rows leave only when at least a tenth of them can: each time, every view has to be frozen anew.
@@ -66,7 +66,9 @@ class _Fit:
         self.stages = level_schedule(parts.recipe.stream, layout.unit_of)
         latents = init_latents(parts.update, problem.base)
         self.decoders = {name: problem.decoders[name] for name in latents if name in problem.decoders}
-        self.code = joint_layout(scale_steps(parts.update.codes(), problem.step_scale), latents, self.decoders, problem.base)
+        self.code = joint_layout(
+            scale_steps(parts.update.codes(), problem.step_scale), latents, self.decoders, problem.base
+        )
         units, matrix = torch.from_numpy(layout.units_of(index)), self.code.join_decoders(self.decoders)
         self.residual = parts.optimiser.residual_optimiser(self.code, problem.base, units, matrix)
         self.gates = TrainedGates(

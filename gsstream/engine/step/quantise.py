@@ -13,8 +13,8 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import VARIABLE, Look
 from gsstream.engine.step.problem import Problem, Solution
 from gsstream.packet import quantise_decoders
-from gsstream.parts.update.base import scale_steps
 from gsstream.parts.update.base import quantise_latents as residual_symbols
+from gsstream.parts.update.base import scale_steps
 
 #: Largest symbol of 32 bits that float32 represents: anything between it and 2^31 would be rounded up to 2^31.
 MAX_INT32_SYMBOL = 2.0**31 - 256

@@ -10,7 +10,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.world import World, rig_similarity, snap_cameras
-from gsstream.input.recordings.base import FrameSource, LiveSource, AdaptiveSource, PointKind, SourceInfo, Split
+from gsstream.input.recordings.base import AdaptiveSource, FrameSource, LiveSource, PointKind, SourceInfo, Split
 
 #: Points farther from the rig than this many of its extents leave the range in which positions can be coded.
 FARTHEST = 1e12

@@ -15,10 +15,10 @@ from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.core.storage import rounded
 from gsstream.input.recordings.base import (
+    AdaptiveSource,
     AttributedPoints,
     FrameSource,
     LiveSource,
-    AdaptiveSource,
     PointKind,
     SingleImages,
     SourceInfo,

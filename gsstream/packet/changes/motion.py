@@ -106,4 +106,8 @@ def _exceeds_range(motion: Motion) -> str | None:
         return None
     sizes = np.abs(motion.symbols.astype(np.float64)).max(0)
     largest = max(float(sizes[:3].max()) * motion.translation_step, float(sizes[3:].max()) * motion.rotation_step)
-    return f"a correction of {largest:g} cannot be, expected at most {_MAX_TRANSLATION:g}" if largest > _MAX_TRANSLATION else None
+    return (
+        f"a correction of {largest:g} cannot be, expected at most {_MAX_TRANSLATION:g}"
+        if largest > _MAX_TRANSLATION
+        else None
+    )

@@ -11,7 +11,7 @@ from gsstream.core.changes import Rows, Scene, add_as_nodes
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import IntArray
-from gsstream.parts.growth.fitting import fit_added, concat_gaussians
+from gsstream.parts.growth.fitting import concat_gaussians, fit_added
 from gsstream.parts.render.work import FitContext
 
 #: (frame as a scene shows it, rows [P] that are pulled, the largest first) -> those that may be copied, in that order.
@@ -63,7 +63,9 @@ def fit_copies(
         room = most - len(born)
         if not passes or (room <= 0 and not len(born)):
             continue
-        copies = _copies(work.on(concat_gaussians(scene, born) if len(born) else scene), gradient, max(0, room), admitted)
+        copies = _copies(
+            work.on(concat_gaussians(scene, born) if len(born) else scene), gradient, max(0, room), admitted
+        )
         born = concat_gaussians(born, copies) if len(born) else copies
         if not len(born):
             continue

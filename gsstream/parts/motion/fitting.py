@@ -41,8 +41,8 @@ class GroupAdam:
 
 
 def fit_transforms_adam(
-    scene: Scene, work: FitContext, start: GroupTransforms, unit: FloatArray, rates: Sequence[float], order: np.random.Generator,
-    measure: Measure, l1_weight: float = 0.0, tiles: Literal["all", "changed"] = "all",
+    scene: Scene, work: FitContext, start: GroupTransforms, unit: FloatArray, rates: Sequence[float],
+    order: np.random.Generator, measure: Measure, l1_weight: float = 0.0, tiles: Literal["all", "changed"] = "all",
 ) -> FloatArray:  # fmt: skip
     """Return the shifts and turns [K, 6] of groups that explain the images best.
 

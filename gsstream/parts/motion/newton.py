@@ -63,8 +63,8 @@ class DampedNewton:
 
 
 def fit_transforms_newton(
-    scene: Scene, work: FitContext, start: GroupTransforms, unit: FloatArray, iterations: int, order: np.random.Generator,
-    damping: Damping, tiles: Literal["all", "changed"] = "all",
+    scene: Scene, work: FitContext, start: GroupTransforms, unit: FloatArray, iterations: int,
+    order: np.random.Generator, damping: Damping, tiles: Literal["all", "changed"] = "all",
 ) -> FloatArray:  # fmt: skip
     """Return the shifts and turns [K, 6] of groups that explain the images best.
 

@@ -79,7 +79,9 @@ def scale_steps(codes: Mapping[str, AttributeCode], factor: float) -> Mapping[st
     return {name: replace(code, step=code.step * factor) for name, code in codes.items()} if factor != 1 else codes
 
 
-def quantise_latents(codes: Mapping[str, AttributeCode], latents: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+def quantise_latents(
+    codes: Mapping[str, AttributeCode], latents: Mapping[str, torch.Tensor]
+) -> dict[str, torch.Tensor]:
     """Return the [A, L] int32 symbols that the packet carries.
 
     Raises ShapeError for latents that are not finite or beyond MAX_SYMBOL steps, whose integers would be arbitrary.

@@ -9,7 +9,7 @@ from gsstream.packet.changes.rows import encode_rows_change
 from gsstream.parts.growth.base import Growth
 from gsstream.testing.cases import fingerprint
 from gsstream.testing.registry import check
-from gsstream.testing.working import fit_fixture, check_closed_loop
+from gsstream.testing.working import check_closed_loop, fit_fixture
 
 
 def _proposed(part: Growth, *, changed: bool = True) -> Rows | None:

@@ -10,7 +10,7 @@ from gsstream.packet.changes.motion import decode_motions, encode_motions
 from gsstream.parts.motion.base import MotionPart
 from gsstream.testing.cases import fingerprint
 from gsstream.testing.registry import check
-from gsstream.testing.working import fit_fixture, check_closed_loop
+from gsstream.testing.working import check_closed_loop, fit_fixture
 
 
 def _proposed(part: MotionPart, *, changed: bool = True) -> tuple[Motion, ...]:

@@ -18,8 +18,8 @@ from gsstream.input.recordings.open import open_source
 from gsstream.method.base import Step
 from gsstream.packet import PlayerState, StreamWriter, quantise_key
 from gsstream.testing.cases import fingerprint
-from gsstream.testing.registry import check
 from gsstream.testing.method_driver import FRAMES, SOURCE, MethodUnderTest
+from gsstream.testing.registry import check
 
 CUT = 2
 

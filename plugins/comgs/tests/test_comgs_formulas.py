@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from gsstream_comgs.correction import corrected
-from gsstream_comgs.influence import Field, KeyPoints, field_of, matrices, apply_motion_field, weights_of
+from gsstream_comgs.influence import Field, KeyPoints, apply_motion_field, field_of, matrices, weights_of
 from gsstream_comgs.settings import CorrectionSettings
 from scipy.spatial.transform import Rotation
 

@@ -11,7 +11,16 @@ from gsstream_cpu_render.renderer import CpuRenderer
 from test_cpu_fit import BACKGROUND, comparison, some_tiles
 from test_cpu_renderer import rig, scene
 
-from gsstream.api import Gaussians, LossAndGrad, GroupTransforms, RenderSession, ShapeError, ViewTarget, WrtRows, WrtTransforms
+from gsstream.api import (
+    Gaussians,
+    GroupTransforms,
+    LossAndGrad,
+    RenderSession,
+    ShapeError,
+    ViewTarget,
+    WrtRows,
+    WrtTransforms,
+)
 from gsstream.core.changes.motion import transform_groups
 from gsstream.parts.loss.photometric import ReferenceLoss
 from gsstream.parts.render.transforms import transform_vjp

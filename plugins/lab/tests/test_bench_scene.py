@@ -13,10 +13,10 @@ from gsstream_lab.bench.roofline import (
     FLOPS_PER_VISIBLE,
     Peak,
     central_tiles,
-    roofline_ms,
     footprints,
     live_pairs,
     pixels_of,
+    roofline_ms,
 )
 from gsstream_lab.bench.scene import (
     OBJECT_ROOM,

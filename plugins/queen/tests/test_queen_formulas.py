@@ -10,7 +10,7 @@ import pytest
 import torch
 from gsstream_queen.births import densify, densify_epochs
 from gsstream_queen.change import changed_tiles, gradient_difference
-from gsstream_queen.gates import BOUND, gates, initial_logits, open_probability, open_logit
+from gsstream_queen.gates import BOUND, gates, initial_logits, open_logit, open_probability
 from gsstream_queen.latents import cosines, decoder, initial_weights, rounded, weight_of
 from gsstream_queen.settings import (
     BirthSettings,

@@ -108,8 +108,10 @@ def test_a_static_recording_costs_headers(tmp_path: Path) -> None:
 
 def test_policies_decide_what_is_sent(tmp_path: Path) -> None:
     """Only sh0 may change: no other section is in any packet, and centres keep their bits."""
-    frozen = {f"stepper__{name}__policy": "frozen" for name in ("means", "quats", "scales", "opacities", "shN")}
-    encode(tmp_path, stepper__births__every=0, stepper__sh0__lr=0.3, **frozen)
+    frozen = {
+        f"streaming_method__{name}__policy": "frozen" for name in ("means", "quats", "scales", "opacities", "shN")
+    }
+    encode(tmp_path, streaming_method__births__every=0, streaming_method__sh0__lr=0.3, **frozen)
     with Playback(tmp_path / "stream.gss") as playback:
         first, last = playback.state_at(0), playback.state_at(4)
     assert first.means.tobytes() == last.means.tobytes()
@@ -122,7 +124,14 @@ def test_gates_close_where_they_cost(tmp_path: Path) -> None:
     """A heavy L0 leaves fewer centres moving than none."""
     moving = []
     for name, weight in (("free", 0.0), ("dear", 100.0)):
-        encode(tmp_path / name, "--frames", "3", stepper__gate__l0=weight, stream__epochs=8, stepper__births__every=0)
+        encode(
+            tmp_path / name,
+            "--frames",
+            "3",
+            streaming_method__gate__l0=weight,
+            stream__epochs=8,
+            streaming_method__births__every=0,
+        )
         moving.append(sum(line["moved_gaussians"] for line in metrics(tmp_path / name)[1:]))
     assert moving[1] < moving[0]
 

@@ -9,8 +9,8 @@ import torch
 from gsstream_s2gs.error_aware import ErrorAware
 from gsstream_s2gs.gumbel_sigmoid import GumbelSigmoid
 from gsstream_s2gs.noise_normalised import NoiseNormalised
-from gsstream_s2gs.uniform_random import UniformRandom
 from gsstream_s2gs.noise_ratios import noise_ratios
+from gsstream_s2gs.uniform_random import UniformRandom
 from s2gs_scene import SIZE, context, gaussians, images, moving, rig
 
 from gsstream.api import ShapeError
@@ -47,7 +47,9 @@ class TestNoiseNormalised:
 
     def test_the_ratio_is_one_under_noise(self) -> None:
         """Independent reference: energies of two independent noises have equal expectations."""
-        ratios = torch.stack([noise_ratios(still(0.01, seed), 0.001, 1, seed, error=False).change_ratio for seed in range(4)])
+        ratios = torch.stack(
+            [noise_ratios(still(0.01, seed), 0.001, 1, seed, error=False).change_ratio for seed in range(4)]
+        )
         seen = (ratios > 0).all(0)
         assert int(seen.sum()) >= 40
         # Median over draws and Gaussians: the mean of a ratio is pulled up by small denominators.

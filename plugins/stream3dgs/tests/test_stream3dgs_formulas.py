@@ -9,7 +9,7 @@ import pytest
 import torch
 from gsstream_stream3dgs.cache import Cache, Lookup
 from gsstream_stream3dgs.method import Stream3DGS
-from gsstream_stream3dgs.motion import fitted_cache, moved, coded_cache, shape_of
+from gsstream_stream3dgs.motion import coded_cache, fitted_cache, moved, shape_of
 from gsstream_stream3dgs.settings import BirthSettings, CacheSettings, Stream3DGSConfig
 
 from gsstream.api import (

@@ -11,7 +11,7 @@ import pytest
 
 from gsstream.core.errors import SourceError
 from gsstream.core.world import World
-from gsstream.encode import to_rig_coordinates, open_recording
+from gsstream.encode import open_recording, to_rig_coordinates
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
 from gsstream.recipe.model import Recipe
 from tools.worlds import Moved, world

@@ -13,7 +13,7 @@ from gsstream.core.changes.motion import GroupTransforms, predict_transforms, tr
 from gsstream.core.gaussians import Gaussians
 from gsstream.engine.step.context import EngineContext
 from gsstream.parts.motion.groups import changed_groups, known_groups, pixel_size
-from gsstream.parts.motion.newton import Damping, DampedNewton, fit_transforms_newton
+from gsstream.parts.motion.newton import DampedNewton, Damping, fit_transforms_newton
 from gsstream.parts.render.transforms import curvature_of
 from gsstream.parts.render.wrt import WrtTransforms
 from gsstream.testing.cases import get_case

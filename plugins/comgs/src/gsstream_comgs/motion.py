@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from gsstream.api import FitContext, IntArray, Motion, Scene, WrtRows
-from gsstream.blocks import neighbour_distance, pixel_size, rows_backward, approximate_by_cells
-from gsstream_comgs.influence import KeyPoints, field_of, apply_motion_field
+from gsstream.blocks import approximate_by_cells, neighbour_distance, pixel_size, rows_backward
+from gsstream_comgs.influence import KeyPoints, apply_motion_field, field_of
 from gsstream_comgs.settings import MotionSettings
 
 

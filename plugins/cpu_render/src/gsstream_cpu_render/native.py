@@ -179,7 +179,9 @@ class NativeRasterizer:
         comparison = self.comparison(None, target, dssim_weight, colours, None)
         camera = self._view[:-1]  # the background is the comparison's
         try:
-            result = _native.full_loss_and_grad(self._native, native_scene(splats), *camera, comparison, *out, exposure_grad)
+            result = _native.full_loss_and_grad(
+                self._native, native_scene(splats), *camera, comparison, *out, exposure_grad
+            )
         except ValueError as error:
             refuse_value(str(error))
         return _loss_of(result, splats, target, dssim_weight)

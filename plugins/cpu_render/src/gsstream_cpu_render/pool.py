@@ -77,7 +77,9 @@ def acquire_rasterizer(cameras: Rig, view: int, background: Background, own: boo
         _idle[:] = [native for native in _idle if native.isa == _native.active_isa()]
         native = _idle.pop() if _idle and not own else None
     pose = (cameras.viewmats[view], cameras.Ks[view])
-    return PooledRasterizer(NumpyRasterizer(*pose, cameras.width, cameras.height, background, cameras.near, native=native), own)
+    return PooledRasterizer(
+        NumpyRasterizer(*pose, cameras.width, cameras.height, background, cameras.near, native=native), own
+    )
 
 
 def release_idle_memory() -> int:

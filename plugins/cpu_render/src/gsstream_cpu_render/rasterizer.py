@@ -240,7 +240,7 @@ class NumpyRasterizer(NativeRasterizer):
         splats = require_splats(splats)
         count = self._call("backward_cached_rows", native_scene(splats), self._upstream(v_image, None)[0])
         rows, gradient = np.empty(count, np.int64), np.empty((count, 2), np.float32)
-        self._call("high_gradient_rows", rows, gradient)
+        self._call("reached_rows", rows, gradient)
         return rows, gradient
 
     def contributing_in_cache(self, tile_mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:

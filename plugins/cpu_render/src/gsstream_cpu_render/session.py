@@ -36,7 +36,7 @@ from gsstream_cpu_render.cached_view import CachedView, Ids, freeze_views, updat
 from gsstream_cpu_render.checks import Float32, as_array
 from gsstream_cpu_render.loss_part import CpuLoss
 from gsstream_cpu_render.moved import loss_and_grad_of_transforms
-from gsstream_cpu_render.pool import PooledRasterizer, Passes, acquire_rasterizer
+from gsstream_cpu_render.pool import Passes, PooledRasterizer, acquire_rasterizer
 from gsstream_cpu_render.view import Background
 from gsstream_cpu_render.whole import loss_and_grad_of_scene
 

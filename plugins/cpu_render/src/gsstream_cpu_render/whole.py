@@ -11,7 +11,9 @@ from gsstream_cpu_render.cached_view import exposure_arrays
 from gsstream_cpu_render.pool import PooledRasterizer
 
 
-def loss_and_grad_of_scene(held: PooledRasterizer, target: ViewTarget, wrt: WrtScene) -> LossAndGrad[Gaussians[torch.Tensor]]:
+def loss_and_grad_of_scene(
+    held: PooledRasterizer, target: ViewTarget, wrt: WrtScene
+) -> LossAndGrad[Gaussians[torch.Tensor]]:
     """Return loss and gradients by the rows of a whole scene.
 
     Arguments:

@@ -5,8 +5,16 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gsstream.api import FloatArray, FitContext, Groups, IntArray, Motion, Scene, apply_motion, groups_for
-from gsstream.blocks import GroupTransforms, elementwise, groupwise_max, fit_transforms_adam, groups_of_rows, predict_transforms, pixel_size
+from gsstream.api import FitContext, FloatArray, Groups, IntArray, Motion, Scene, apply_motion, groups_for
+from gsstream.blocks import (
+    GroupTransforms,
+    elementwise,
+    fit_transforms_adam,
+    groups_of_rows,
+    groupwise_max,
+    pixel_size,
+    predict_transforms,
+)
 from gsstream_hicom.settings import MotionSettings
 
 #: The box whose volume the cells share holds this part of the Gaussians along each axis.

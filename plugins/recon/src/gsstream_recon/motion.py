@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gsstream.api import FloatArray, FitContext, IntArray, Motion, Scene, WrtTransforms, groups_for
+from gsstream.api import FitContext, FloatArray, IntArray, Motion, Scene, WrtTransforms, groups_for
 from gsstream.blocks import (
     GroupAdam,
     GroupTransforms,
     elementwise,
-    groupwise_max,
     groups_of_rows,
-    predict_transforms,
+    groupwise_max,
     pixel_size,
+    predict_transforms,
 )
 from gsstream_recon.anchors import AnchorLevels, Level, bound, inherited
 from gsstream_recon.settings import MotionSettings
@@ -76,8 +76,8 @@ def _start(
 
 
 def _fitted(
-    scene: Scene, work: FitContext, cells: GroupTransforms, levels: list[Level], start: list[FloatArray], unit: FloatArray,
-    step: FloatArray | None, epochs: int, settings: MotionSettings, order: np.random.Generator,
+    scene: Scene, work: FitContext, cells: GroupTransforms, levels: list[Level], start: list[FloatArray],
+    unit: FloatArray, step: FloatArray | None, epochs: int, settings: MotionSettings, order: np.random.Generator,
 ) -> FloatArray:  # fmt: skip
     """Shifts and turns [C, 6] of the cells; all levels learn at once."""
     measure = elementwise if settings.measure == "each" else groupwise_max

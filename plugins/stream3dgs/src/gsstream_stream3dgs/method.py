@@ -24,7 +24,7 @@ from gsstream.api import (
     send_key,
 )
 from gsstream.blocks import replace_with_copies, rows_in_changed_tiles
-from gsstream_stream3dgs.motion import fitted_cache, coded_cache
+from gsstream_stream3dgs.motion import coded_cache, fitted_cache
 from gsstream_stream3dgs.settings import Stream3DGSConfig
 
 

@@ -18,7 +18,7 @@ from gsstream.api import (
     WrtRows,
     field_rows,
 )
-from gsstream.blocks import pixel_size, rows_backward, approximate_by_cells
+from gsstream.blocks import approximate_by_cells, pixel_size, rows_backward
 from gsstream_stream3dgs.cache import Cache, Lookup
 from gsstream_stream3dgs.settings import CacheSettings
 

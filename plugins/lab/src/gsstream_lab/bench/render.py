@@ -17,16 +17,16 @@ from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.parts.render import backward as known
 from gsstream.parts.render.base import Renderer, RenderOutput
 from gsstream.plugins.catalog import Catalog
+from gsstream_lab.bench.native import NativeBench, find_native, measure_peaks
 from gsstream_lab.bench.roofline import (
     Footprints,
     Peak,
     central_tiles,
-    roofline_ms,
     footprints,
     live_pairs,
     pixels_of,
+    roofline_ms,
 )
-from gsstream_lab.bench.native import NativeBench, find_native, measure_peaks
 from gsstream_lab.bench.scene import Points, bench_camera, make_gaussians, synthetic_points
 from gsstream_lab.bench.timing import Progress, Steps, interleaved, torch_threads
 from gsstream_lab.jobs.machine import machine_facts

@@ -111,8 +111,8 @@ def frame(
     recipe = resolve_recipe(method, catalog.recipe_path, (), changes).recipe
     if recipe.streaming_method.name != "parts":
         raise InputError(
-            f"--method {method}: expected a method made of parts, got the streaming_method {recipe.streaming_method.name!r}; time it "
-            "with gsstream run, which reports seconds per frame"
+            f"--method {method}: expected a method made of parts, got the streaming_method "
+            f"{recipe.streaming_method.name!r}; time it with gsstream run, which reports seconds per frame"
         )
     from gsstream_lab.bench.frame import FramePlan, bench_frame
     from gsstream_lab.bench.tables import frame_table

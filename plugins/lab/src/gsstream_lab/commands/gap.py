@@ -51,7 +51,7 @@ def gap(
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import load_recipe
     from gsstream_lab.gap.fresh import FreshFrames, check_cameras
-    from gsstream_lab.gap.measure import GAP_FILES, measure_gap, default_frames
+    from gsstream_lab.gap.measure import GAP_FILES, default_frames, measure_gap
 
     file = stream_file(run)
     if not run.is_dir() or not (run / "recipe.yaml").is_file():

@@ -14,7 +14,7 @@ import numpy as np
 from gsstream.core.errors import InputError
 from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.budget.memory import limit_memory
-from gsstream.engine.run.encoder import Encoder, Callbacks
+from gsstream.engine.run.encoder import Callbacks, Encoder
 from gsstream.engine.run.output import write_whole
 from gsstream.input.recordings.base import FrameSource, SourceInfo, check_index
 from gsstream.packet import EncodedPacket, StreamMeta, StreamWriter

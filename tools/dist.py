@@ -37,11 +37,6 @@ def source_date() -> str:
 def build(out: Path, chosen: Sequence[Path], *, isolated: bool = True) -> dict[str, str]:
     """Build distributions into a folder.
 
-    Arguments:
-        out: must not hold archives yet.
-        chosen: folders of the projects.
-        isolated: each in an environment of its own with the pinned tools; else with what is installed here.
-
     Returns file name -> SHA-256 of all that was built; ``out`` has them as ``SHA256SUMS`` too.
 
     Raises FileExistsError when ``out`` is not empty, subprocess.CalledProcessError when a build fails.

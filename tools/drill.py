@@ -91,14 +91,6 @@ class Capture(threading.Thread):
 def drill(finished: Path, out: Path, fps: float, frames: int, watch: str, options: Sequence[str]) -> dict[str, Any]:
     """Play a recording, follow it, and return what is reported.
 
-    Arguments:
-        finished: the recording's folder.
-        out: new folder.
-        fps: frames per second of the capture.
-        frames: of the capture.
-        watch: options of the source, ``behind=drop&queue=2``.
-        options: of ``gsstream run``, but for its source and folder.
-
     Raises OutputError when ``out`` exists, and GsstreamError when the run fails (its messages have been shown).
     """
     if out.exists():
@@ -134,11 +126,7 @@ def drill(finished: Path, out: Path, fps: float, frames: int, watch: str, option
 
 
 def reported(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the numbers of a drill.
-
-    Arguments:
-        lines: of ``metrics.jsonl``, frame 0 first.
-    """
+    """Return the numbers of a drill."""
     later = lines[1:]
     shown = [line for line in later if line["live"]["policy"] not in ("dropped", "missing")]
     latency = sorted(line["live"]["latency_seconds"] for line in shown)
@@ -162,12 +150,7 @@ def reported(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def evaluated(out: Path, frames: int) -> dict[str, float | None]:
-    """Return the means of ``gsstream evaluate`` over all frames but the first, dropped ones too.
-
-    Arguments:
-        out: of the drill; its capture is finished.
-        frames: of the stream.
-    """
+    """Return the means of ``gsstream evaluate`` over all frames but the first, dropped ones too."""
     path = out / "capture" / CALIBRATION_FILE
     data = json.loads(path.read_text(encoding="utf-8"))
     path.write_text(json.dumps({**data, "frames": frames}), encoding="utf-8")

@@ -66,13 +66,7 @@ class Moved:
 
 
 def world(scale: float = 1.0, offset: Sequence[float] = (0.0, 0.0, 0.0), turn: int | None = None) -> World:
-    """Return a similarity.
-
-    Arguments:
-        scale: new units per old unit.
-        offset: where the old origin goes, new units.
-        turn: seed of a rotation, uniform among all; None: none.
-    """
+    """Return a similarity."""
     if turn is None:
         return World(IDENTITY.rotation, tuple(float(value) for value in offset), scale)
     w, x, y, z = (lambda q: q / np.linalg.norm(q))(np.random.default_rng(turn).normal(size=4))

@@ -94,15 +94,6 @@ def sheet_of_stream(
 ) -> Path:  # fmt: skip
     """Render a contact sheet of a stream's frames against its recording and save it as PNG.
 
-    Arguments:
-        stream: file to read.
-        source: an open recording.
-        frames: to show.
-        out: picture to write.
-        renderer: that draws.
-        camera: id of a test or train camera; default the first test camera.
-        fresh: frame -> stream that begins with its fresh reconstruction (``gsstream gap``).
-
     Raises InputError for an unknown camera or frame.
     """
     with Playback(stream) as playback:
@@ -130,11 +121,7 @@ def sheet_of_stream(
 
 
 def most_changed_window(truth: FloatArray, first: FloatArray) -> tuple[slice, slice] | None:
-    """Return rows and columns of the window with the most changed pixels; None when there are none.
-
-    Arguments:
-        truth, first: [H, W, 3] ground truth of a frame and of the first one; the window is a ``CLOSER``th of that size.
-    """
+    """Return rows and columns of the window with the most changed pixels; None when there are none."""
     changed = changed_mask(truth, first)
     if not changed.any():
         return None

@@ -177,13 +177,6 @@ def evaluate(
 ) -> Evaluation:  # fmt: skip
     """Render a stream's packets with the player and compare every test view with the recording.
 
-    Arguments:
-        stream: file to read.
-        source: an open recording.
-        split: "test" or "train".
-        renderer: that draws.
-        frames, lpips, extras, progress: as for :func:`evaluate_frames`.
-
     Raises InputError when the recording's cameras are not those of the stream, PacketError for a damaged stream.
     """
     renderer = find_renderer() if renderer is None else renderer
@@ -203,14 +196,6 @@ def evaluate_frames(
 
     Colours are clamped to [0, 1] first, as a screen would (3DGS convention). Noise is measured between the first two
     evaluated frames; "moving" and "changed" are relative to the first evaluated frame, which is also the one held.
-
-    Arguments:
-        shown: the pictures.
-        source: an open recording.
-        frames: frame indices; default all that are shown.
-        split: "test" or "train".
-        lpips, extras: measured besides the rest; default: not measured.
-        progress: called with (done, total) after every frame.
 
     Raises InputError when the recording's cameras are not those of the pictures.
     """

@@ -24,15 +24,7 @@ NO_FILES: Mapping[int, Path] = MappingProxyType({})
 
 
 def write_gallery(out: Path, source: FrameSource, *, pictures: bool = True, video: bool = True) -> list[Path]:
-    """Write the summary and every picture a person would look for first; return what was written.
-
-    Arguments:
-        out: a run folder with a stream and metrics.
-        source: the recording, at the scale of the run.
-        pictures: without them only the summary is written, what draws them is not imported, and pictures that the
-            folder holds from before stay as they are.
-        video: among the pictures also an MP4 of the first camera, when PyAV is installed (extra ``video``).
-    """
+    """Write the summary and every picture a person would look for first; return what was written."""
     with Playback(out / STREAM) as playback:
         frames, meta = playback.frames, playback.meta
     records = read_records(out / METRICS)
@@ -70,11 +62,6 @@ def _write_summary(out: Path, meta: StreamMeta, records: Sequence[FrameRecord]) 
 
 def write_sheet(out: Path, source: FrameSource, fresh: Mapping[int, Path] = NO_FILES) -> Path:
     """Write the contact sheet of a run: a few frames, and those that ``fresh`` has another stream for, to compare with.
-
-    Arguments:
-        out: a run folder with a stream.
-        source: the recording, at the scale of the run.
-        fresh: frame -> stream of a reconstruction of that frame from its own images alone.
     """
     from gsstream.evaluation.contact_sheet import sheet_of_stream
 

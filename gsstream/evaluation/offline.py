@@ -24,11 +24,6 @@ _PICTURES = (".png", ".jpg", ".jpeg")
 def numbered(folder: Path, suffixes: Sequence[str], first: int) -> dict[int, Path]:
     """Return frame -> file of a folder; the last number in a file's name counts.
 
-    Arguments:
-        folder: to look in; not in folders below it.
-        suffixes: of files that count, in lower case.
-        first: the number that means frame 0.
-
     Raises InputError when there is no such file, and for a name without a number, one below ``first`` and one twice.
     """
     if not folder.is_dir():
@@ -118,10 +113,6 @@ class Renders:
 
 def bytes_line(files: Sequence[Path], frames: int) -> str:
     """Return the sentence that says what files take; empty without any.
-
-    Arguments:
-        files: files, or folders with all that is in them.
-        frames: number of frames that they hold.
 
     Raises InputError for a path that does not exist.
     """

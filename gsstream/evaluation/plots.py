@@ -45,11 +45,6 @@ _PANELS: Sequence[tuple[str, Series, bool, bool]] = (
 def plot_runs(runs: Mapping[str, Sequence[FrameRecord]], out: str | os.PathLike[str], title: str = "") -> Path:
     """Draw one panel per quantity, one line per run, and save a PNG. Quantities nobody measured get no panel.
 
-    Arguments:
-        runs: name -> records of its frames.
-        out: picture to write.
-        title: of the picture.
-
     Raises InputError when there is nothing to draw.
     """
     curves = {}

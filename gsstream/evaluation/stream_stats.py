@@ -204,13 +204,7 @@ def entropy_bits(values: Any) -> float:
 
 
 def float16_bytes(gaussians: Gaussians[FloatArray], names: Sequence[str], rows: IntArray) -> int:
-    """Return the bytes of these rows as float16 by zstandard level 19: what a plain codec would send.
-
-    Arguments:
-        gaussians: N rows.
-        names: of attributes.
-        rows: [A] which of them.
-    """
+    """Return the bytes of these rows as float16 by zstandard level 19: what a plain codec would send."""
     parts = [getattr(gaussians, name)[rows].astype(np.float16).tobytes() for name in names]
     return len(zstandard.ZstdCompressor(level=19).compress(b"".join(parts)))
 

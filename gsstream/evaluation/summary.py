@@ -91,12 +91,7 @@ def summary_table(runs: Mapping[str, Summary]) -> str:
 
 
 def fitted(text: str, width: float) -> str:
-    """Return a text whose Markdown tables that are wider than a terminal stand upright: a line for each column.
-
-    Arguments:
-        text: lines, some of which are tables as :func:`format_table` makes them.
-        width: characters of a line.
-    """
+    """Return a text whose Markdown tables that are wider than a terminal stand upright: a line for each column."""
     lines, out = text.splitlines(), list[str]()
     while lines:
         count = next((i for i, line in enumerate(lines) if not line.startswith("|")), len(lines))

@@ -46,14 +46,7 @@ def send_key(gaussians: Gaussians[FloatArray], layout: Layout, meta: StreamMeta,
 def delta_packet(
     player: PlayerState, delta: Delta, *, frame: int, known: KnownMotions | None = None
 ) -> EncodedPacket:
-    """Return the packet of a delta, an empty one when nothing changes. Raises ShapeError as :func:`send_delta` does.
-
-    Arguments:
-        player: what players have before it.
-        delta: what the frame changes.
-        frame: its index.
-        known: motions that were encoded before, as for ``encode_delta``.
-    """
+    """Return the packet of a delta, an empty one when nothing changes. Raises ShapeError as :func:`send_delta` does."""
     if delta.is_empty:
         return encode_empty(frame=frame)
     return encode_delta(delta, player.layout, player.decoders, frame=frame, known=known)

@@ -20,10 +20,6 @@ def flicker(
     ``moving_mask``, applied to consecutive frames). The recording's own noise is not part of it: only decoded pictures
     are subtracted, so 0 means a perfectly calm picture, whether right or wrong.
 
-    Arguments:
-        image, last_image: [H, W, 3] decoded, [0, 1], of this frame and the one before. truth, last_truth: recorded.
-        sigma: noise of one recorded image (``noise_sigma``).
-
     Returns nan where everything moves. Raises ShapeError when shapes disagree.
     """
     check_pair(image, last_image)

@@ -19,11 +19,6 @@ def moving_mask(image: FloatArray, first: FloatArray, sigma: float) -> Mask:
     """Return [H, W] bool: pixels that differ from frame 0 beyond noise, dilated by 2 pixels.
 
     Some channel differs by more than max(4 sigma_d, 6/255).
-
-    Arguments:
-        image, first: [H, W, 3] ground truth of this frame and of frame 0, [0, 1].
-        sigma: noise of one image (:func:`gsstream.metrics.noise.noise_sigma`). The difference of two images has
-            sigma_d = sqrt(2) sigma; with 4 sigma instead, dilation would mark a third of a static image as moving.
     """
     check_pair(image, first)
     threshold = max(4 * math.sqrt(2) * sigma, FLOOR)
@@ -32,11 +27,7 @@ def moving_mask(image: FloatArray, first: FloatArray, sigma: float) -> Mask:
 
 
 def changed_mask(image: FloatArray, first: FloatArray) -> Mask:
-    """Return [H, W] bool: some channel differs from frame 0 by more than 0.1; the bodies, without shadows and rims.
-
-    Arguments:
-        image, first: [H, W, 3] ground truth of this frame and of frame 0, [0, 1].
-    """
+    """Return [H, W] bool: some channel differs from frame 0 by more than 0.1; the bodies, without shadows and rims."""
     check_pair(image, first)
     changed: Mask = np.any(np.abs(np.asarray(image, np.float64) - first) > CHANGED, axis=-1)
     return changed
@@ -57,12 +48,5 @@ def dilate(mask: Mask, radius: int) -> Mask:
 
 
 def psnr_moving(image: FloatArray, target: FloatArray, first: FloatArray, sigma: float) -> float:
-    """Return the PSNR on the moving pixels of ``target``; nan where nothing moves.
-
-    Arguments:
-        image: [H, W, 3] decoded.
-        target: [H, W, 3] ground truth of this frame.
-        first: [H, W, 3] ground truth of frame 0.
-        sigma: noise of one image, [0, 1] units.
-    """
+    """Return the PSNR on the moving pixels of ``target``; nan where nothing moves."""
     return psnr(image, target, moving_mask(target, first, sigma))

@@ -27,9 +27,6 @@ def noise_sigma(first: FloatArray, second: FloatArray) -> float:
     MAD of the differences times 1.4826, divided by sqrt 2 (a difference holds the noise of two images). The median is
     taken out first, so an even change of exposure does not count; fewer than half of the pixels may move.
 
-    Arguments:
-        first, second: [H, W, 3] in [0, 1], two frames of one camera.
-
     Images of 8 bits give a coarse answer (steps of about 1/255), and 0 where most pixels do not change at all.
     """
     check_pair(first, second)

@@ -17,10 +17,6 @@ def psnr(image: FloatArray, target: FloatArray, mask: Mask | None = None) -> flo
 
     It is of one image: means over images are means of dB.
 
-    Arguments:
-        image, target: [H, W, 3] in [0, 1]. Values outside are not clamped here; what is shown is clamped before.
-        mask: [H, W] bool, the pixels that count; default all.
-
     Returns inf for equal images, nan for an empty mask. Raises ShapeError when shapes disagree.
     """
     check_pair(image, target)

@@ -27,10 +27,6 @@ def ssim(image: FloatArray, target: FloatArray, border: Border = "zero") -> floa
     By default images are padded as in 3DGS (Kerbl 2023).
 
     Computed in float64. Raises ShapeError when shapes disagree, or are smaller than a window where one must fit.
-
-    Arguments:
-        image, target: [H, W, 3] in [0, 1].
-        border: what stands beyond the border: "zero", "reflect", or "valid" (nothing does).
     """
     luminance, structure = _ssim_maps(image, target, border)
     return float((luminance * structure).mean())

@@ -39,13 +39,6 @@ def encode_delta(
 ) -> EncodedPacket:  # fmt: skip
     """Encode one frame's changes.
 
-    Arguments:
-        frame: its index.
-        delta: decoders of its residual must come from :func:`quantise_decoders`.
-        layout: that of the frame before.
-        previous_decoders: the decoders last sent since the last key packet (:func:`next_decoders`).
-        known: motions that were encoded before; those of the delta are encoded anew unless they are these objects.
-
     Raises ShapeError when a change does not fit the layout, or when there is none: that is an empty packet.
     """
     sections = _motion_sections(delta.motions, known)
@@ -70,12 +63,6 @@ def decode_delta(
     data: bytes, scene: Scene, previous_decoders: Mapping[str, FloatArray], *, offset: int = 0
 ) -> Delta:
     """Decode a complete delta packet.
-
-    Arguments:
-        data: a complete packet.
-        offset: place of the packet in the file, for errors.
-        scene: that of the frame before; the groups of a motion and the rows of a field depend on it.
-        previous_decoders: as for :func:`encode_delta`.
 
     Raises PacketError with the byte offset.
     """

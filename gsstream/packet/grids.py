@@ -25,11 +25,6 @@ _COLORS = ("sh0", "shN")
 def to_codes(name: str, values: FloatArray, bits: int) -> IntArray:
     """Return the [N, width] int32 codes of an attribute.
 
-    Arguments:
-        name: of the attribute.
-        values: [N, ...] float32, raw.
-        bits: fractional bits.
-
     Raises ShapeError for values out of range or quaternions of norm zero.
     """
     flat = np.asarray(values, np.float64).reshape(len(values), math.prod(values.shape[1:]))
@@ -48,36 +43,20 @@ def to_codes(name: str, values: FloatArray, bits: int) -> IntArray:
 
 
 def from_codes(name: str, codes: IntArray, bits: int) -> FloatArray:
-    """Return the [N, width] float32 values of codes.
-
-    Arguments:
-        name: of the attribute.
-        codes: [N, width] int32.
-        bits: fractional bits.
-    """
+    """Return the [N, width] float32 values of codes."""
     if name in _COLORS:
         return _from_luma(codes / _color_scale(bits, codes.shape[1])).astype(np.float32)
     return codes.astype(np.float32) * np.float32(2.0**-bits)
 
 
 def color_codes(values: FloatArray, bits: int) -> FloatArray:
-    """Return the codes [N, width] float64 of colours before they are rounded.
-
-    Arguments:
-        values: [N, ...] coefficients, three channels each.
-        bits: fractional bits.
-    """
+    """Return the codes [N, width] float64 of colours before they are rounded."""
     flat = np.asarray(values, np.float64).reshape(len(values), math.prod(values.shape[1:]))
     return np.asarray(_to_luma(flat) * _color_scale(bits, flat.shape[1]))
 
 
 def color_grads(gradients: FloatArray, bits: int) -> FloatArray:
-    """Return the derivative [N, width] float64 by the codes of colours, from that by the colours themselves.
-
-    Arguments:
-        gradients: [N, ...] derivative by the coefficients, three channels each.
-        bits: fractional bits.
-    """
+    """Return the derivative [N, width] float64 by the codes of colours, from that by the colours themselves."""
     flat = np.asarray(gradients, np.float64).reshape(len(gradients), math.prod(gradients.shape[1:]))
     # A row for each of luma and the two chromas: the colour that one of it makes.
     colors = _from_luma(np.eye(3))

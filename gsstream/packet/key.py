@@ -52,14 +52,7 @@ def quantise_key(gaussians: Gaussians[FloatArray]) -> Gaussians[FloatArray]:
 
 
 def encode_key(state: KeyState, *, frame: int = 0, first: BoolArray | None = None) -> EncodedPacket:
-    """Encode a key packet; ``decode_key`` gives ``quantise_key(state.gaussians)``. Raises ShapeError on a bad state.
-
-    Arguments:
-        state: scene, layout, meta.
-        frame: its index.
-        first: [N] bool: Gaussians that stand before all others, so that a player can draw them before it has the whole
-            packet; None: the packet has no layers.
-    """
+    """Encode a key packet; ``decode_key`` gives ``quantise_key(state.gaussians)``. Raises ShapeError on a bad state."""
     gaussians, layout = state.gaussians, state.layout
     gaussians.validate()
     _check_layout(gaussians, layout)

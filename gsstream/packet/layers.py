@@ -65,11 +65,6 @@ def in_layers(
 ) -> list[tuple[str, bytes]]:
     """Return all sections of a key packet in two layers, in their order.
 
-    Arguments:
-        meta, layout: payloads of these sections.
-        gaussians: N rows, raw values.
-        first: [N] bool: the rows of the first layer.
-
     Raises ShapeError when ``first`` does not fit.
     """
     if first.shape != (len(gaussians),) or first.dtype != np.bool_:
@@ -91,14 +86,7 @@ def in_layers(
 
 
 def decode_layers(data: bytes, sections: Mapping[str, Section], number: int, offset: int) -> Gaussians[FloatArray]:
-    """Return the rows of a sound key packet with layers, both together. Raises PacketError.
-
-    Arguments:
-        data: the packet.
-        sections: of the packet, those of ``ORDER``.
-        number: N, the rows of the scene.
-        offset: place of the packet in the file, for errors.
-    """
+    """Return the rows of a sound key packet with layers, both together. Raises PacketError."""
     rest = sections["rest"]
     with add_offset(sections["layers"].offset):
         in_first, size, checksum = read_head(sections["layers"].data)
@@ -121,9 +109,6 @@ def first_layer(data: bytes) -> FirstLayer | None:
     """Return what can be drawn of the beginning of a key packet, or None: not enough is there, or it has no layers.
 
     What is damaged gives None as well; whoever reads the whole packet says what is wrong with it.
-
-    Arguments:
-        data: bytes from the header of a packet on, as many as are there.
     """
     try:
         return _first_layer(data)

@@ -16,12 +16,7 @@ from gsstream.packet.symbols import decode_symbols, encode_symbols
 
 
 def pattern_of(symbols: Mapping[str, IntArray], names: list[str]) -> IntArray:
-    """Return [A] int32: bit i of a row is set where attribute ``names[i]`` has a symbol that is not zero.
-
-    Arguments:
-        symbols: attribute -> [A, L] residual symbols; of at least one attribute.
-        names: attributes in the order of their sections.
-    """
+    """Return [A] int32: bit i of a row is set where attribute ``names[i]`` has a symbol that is not zero."""
     out = np.zeros(len(symbols[names[0]]), np.int32)
     for bit, name in enumerate(names):
         out |= symbols[name].any(1).astype(np.int32) << bit
@@ -36,11 +31,6 @@ def encode_pattern(pattern: IntArray) -> bytes:
 def decode_pattern(data: bytes, rows: int, attributes: int) -> IntArray:
     """Decode the numbers [rows] of :func:`pattern_of`.
 
-    Arguments:
-        data: the section.
-        rows: number of rows behind open gates.
-        attributes: number of attributes that are sent.
-
     Raises PacketError (without offset) for a number beyond them, or where no attribute is sent.
     """
     if attributes == 0:
@@ -52,13 +42,7 @@ def decode_pattern(data: bytes, rows: int, attributes: int) -> IntArray:
 
 
 def spread(table: IntArray, pattern: IntArray, bit: int) -> IntArray:
-    """Return [A, L]: the rows of a table at the rows of the pattern that have the bit; zeros elsewhere.
-
-    Arguments:
-        table: [K, L] int32, of the K rows that have it.
-        pattern: [A] numbers of :func:`pattern_of`.
-        bit: of the attribute.
-    """
+    """Return [A, L]: the rows of a table at the rows of the pattern that have the bit; zeros elsewhere."""
     out = np.zeros((len(pattern), table.shape[1]), np.int32)
     out[(pattern >> bit & 1) != 0] = table
     return out

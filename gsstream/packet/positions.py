@@ -39,13 +39,7 @@ class Grid(NamedTuple):
 
 
 def quantise_positions(means: FloatArray, scale_codes: IntArray, bits: int) -> FloatArray:
-    """Return [N, 3] float32 positions on their grids. Raises ShapeError when they are too far out for it.
-
-    Arguments:
-        means: [N, 3] scene units.
-        scale_codes: [N, 3] codes of the log scales.
-        bits: their fractional bits.
-    """
+    """Return [N, 3] float32 positions on their grids. Raises ShapeError when they are too far out for it."""
     if len(means) == 0:
         return np.zeros((0, 3), np.float32)
     exponents = step_exponents(scale_codes, bits, floor_exponent(scale_codes, bits), FINENESS)
@@ -56,14 +50,7 @@ def quantise_positions(means: FloatArray, scale_codes: IntArray, bits: int) -> F
 
 
 def encode_positions(means: FloatArray, scale_codes: IntArray, bits: int, floor: int | None = None) -> bytes:
-    """Encode what :func:`quantise_positions` returned; the reader knows N and the scales.
-
-    Arguments:
-        means: [N, 3] on their grids.
-        scale_codes: [N, 3] codes of the log scales.
-        bits: their fractional bits.
-        floor: log2 of the finest step, where these rows are part of a scene; None: that of these rows.
-    """
+    """Encode what :func:`quantise_positions` returned; the reader knows N and the scales."""
     if len(means) == 0:
         return b""
     floor = floor_exponent(scale_codes, bits) if floor is None else floor
@@ -78,13 +65,7 @@ def encode_positions(means: FloatArray, scale_codes: IntArray, bits: int, floor:
 
 
 def decode_positions(data: bytes, scale_codes: IntArray, bits: int) -> FloatArray:
-    """Decode what :func:`encode_positions` wrote. Raises PacketError (without offset).
-
-    Arguments:
-        data: bytes of the section.
-        scale_codes: [N, 3] codes of the log scales.
-        bits: their fractional bits.
-    """
+    """Decode what :func:`encode_positions` wrote. Raises PacketError (without offset)."""
     number = len(scale_codes)
     if number == 0:
         if data:
@@ -106,14 +87,7 @@ def decode_positions(data: bytes, scale_codes: IntArray, bits: int) -> FloatArra
 
 
 def step_exponents(scale_codes: IntArray, bits: int, floor: int, fineness: int) -> IntArray:
-    """Return [N] int64: log2 of each Gaussian's step.
-
-    Arguments:
-        scale_codes: [N, 3] codes of the log scales.
-        bits: their fractional bits.
-        floor: least exponent.
-        fineness: bits below the smallest axis of a Gaussian.
-    """
+    """Return [N] int64: log2 of each Gaussian's step."""
     exponents = (scale_codes.min(1).astype(np.int64) * _LOG2E >> (20 + bits)) - fineness
     return np.asarray(np.maximum(exponents, floor))
 

@@ -37,13 +37,7 @@ def encode_rows(gaussians: Gaussians[FloatArray]) -> dict[str, bytes]:
 def encode_codes(
     means: FloatArray, codes: Mapping[str, IntArray], floor: int | None = None
 ) -> dict[str, bytes]:
-    """Return attribute -> payload of rows that are quantised already, positions first.
-
-    Arguments:
-        means: [N, 3] on their grids.
-        codes: attribute -> [N, width] as :func:`row_codes` gives them.
-        floor: log2 of the finest step of positions, where these rows are part of a scene; None: that of these rows.
-    """
+    """Return attribute -> payload of rows that are quantised already, positions first."""
     out = {"means": encode_positions(means, codes["scales"], KEY_BITS["scales"], floor)}
     for name, table in codes.items():
         head = _FIXED.pack(KEY_BITS[name], table.shape[1])

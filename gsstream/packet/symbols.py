@@ -76,12 +76,7 @@ def encode_symbols(symbols: IntArray) -> bytes:
 
 
 def decode_symbols(data: bytes, rows: int, channels: int) -> IntArray:
-    """Decode [rows, channels] int32. Raises PacketError (without offset) when the bytes are not such a table.
-
-    Arguments:
-        data: bytes of the table.
-        rows, channels: its shape.
-    """
+    """Decode [rows, channels] int32. Raises PacketError (without offset) when the bytes are not such a table."""
     out = np.empty((rows, channels), np.int32)
     if out.size == 0:
         if data:

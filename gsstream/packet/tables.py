@@ -31,13 +31,7 @@ class Table(NamedTuple):
 
 
 def coded_tables(sections: Mapping[str, Section], kind: PacketKind, layout: Layout) -> list[Table]:
-    """Return the tables of a sound packet; ``layout`` is that before it (a key packet's own).
-
-    Arguments:
-        sections: name -> bytes.
-        kind: of the packet.
-        layout: that before the packet; of a key packet its own.
-    """
+    """Return the tables of a sound packet; ``layout`` is that before it (a key packet's own)."""
     if kind == PacketKind.KEY:
         return list(_key_tables({name: section.data for name, section in sections.items()}, layout))
     if kind == PacketKind.DELTA:

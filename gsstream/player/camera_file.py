@@ -30,12 +30,6 @@ _MOST = 1_000_000
 def read_path(path: Path, rig: Cameras, number: int, world: World = IDENTITY) -> Cameras:
     """Return ``number`` cameras along the path of a file.
 
-    Arguments:
-        path: of the file.
-        number: of cameras, at least 1.
-        rig: cameras of the stream; size, intrinsics and near plane are its first camera's where the file has none.
-        world: where the stream's coordinates lie in the recording's, in which the file's poses are.
-
     Raises InputError naming file and camera for anything that is not such a path.
     """
     data = _load(path)

@@ -20,10 +20,6 @@ def interpolate(before: PlayerState, after: PlayerState, share: float) -> Gaussi
 
     The rows that the later frame displaced have gone and turned ``share`` of their way, at constant speed. Colours,
     sizes, births and deaths wait for their frame; so does everything before a key packet, which carries no motion.
-
-    Arguments:
-        before, after: what players have at frame t and at t + 1.
-        share: of the time from t to t + 1, in [0, 1).
     """
     scene, moved = before.gaussians, after.scene.moved
     if share == 0 or moved is None or after.frame != before.frame + 1:
@@ -70,11 +66,6 @@ class Moments:
 
 def frame_times(frames: Sequence[int], recorded: float, wanted: float) -> list[float]:
     """Return the times, in frames, of pictures at another rate than the recording's, from the first to the last frame.
-
-    Arguments:
-        frames: that are played.
-        recorded: frames per second of the recording.
-        wanted: pictures per second, 1 to 1000.
 
     Raises InputError for another rate, and for frames that do not follow each other.
     """

@@ -39,10 +39,6 @@ class MemoryLimit:
     def check_decoding(self, data: bytes, state: PlayerState | None, offset: int) -> None:
         """Refuse a packet by what it announces, before it is decoded.
 
-        Arguments:
-            data: the complete packet. offset: its place in the file.
-            state: what is held while it is decoded.
-
         Raises InputError beyond the limit, PacketError for a damaged packet.
         """
         header, sections = parse_packet(data, offset)
@@ -56,12 +52,7 @@ class MemoryLimit:
         self._check(wanted, f"decoding frame {header.frame}")
 
     def check_pictures(self, width: int, height: int, kept: int = 1) -> None:
-        """Refuse pictures of a size of which ``kept`` are in memory at a time, as bytes. Raises InputError.
-
-        Arguments:
-            width, height: pixels.
-            kept: pictures in memory at a time.
-        """
+        """Refuse pictures of a size of which ``kept`` are in memory at a time, as bytes. Raises InputError."""
         self._check(width * height * (PER_PIXEL + 3 * kept), f"drawing {width} x {height} pixels")
 
     def _check(self, wanted: int, what: str) -> None:

@@ -70,10 +70,6 @@ def resized(rig: Cameras, width: int, height: int) -> Cameras:
     """Return the same cameras with pictures of another size.
 
     The vertical field of view stays, the sides show more or less.
-
-    Arguments:
-        rig: cameras of the stream.
-        width, height: pixels.
     """
     factor = height / rig.height
     Ks = np.diag([factor, factor, 1.0]) @ rig.Ks
@@ -101,11 +97,6 @@ def spiral(rig: Cameras, number: int, turns: float = 2.0) -> Cameras:
     """Return a spiral around the rig's mean position that always looks at the focus point.
 
     It is half as wide as the rig itself.
-
-    Arguments:
-        rig: cameras of the stream.
-        number: of cameras, at least 1.
-        turns: around the mean position.
     """
     focus, up, centers = focus_point(rig), up_direction(rig), rig.centers
     middle = centers.mean(0)

@@ -46,20 +46,6 @@ def play(
 ) -> Played:  # fmt: skip
     """Render a stream from one camera.
 
-    Arguments:
-        stream: file to read.
-        renderer: that draws; None: the fastest that loads.
-        out: ``.mp4`` needs PyAV, and becomes a folder of PNGs (with a warning) where it is missing; ``.webp`` and
-            ``.gif`` are animated pictures; a name without a suffix is a folder.
-        camera: id of a train or test camera, "orbit" or "spiral", or a JSON file with a path
-            (``player.camera_file``); default: the first test, else the first train camera.
-        frames: frame indices in the order to be shown; default: all up to the first damaged packet.
-        fps: pictures per second; default: that of the recording. Another rate shows moments between frames
-            (``player.between``), so that the speed stays; it needs frames that follow each other.
-        progress: called with (done, total) after every picture.
-        size: (width, height) of the pictures; default: that of the camera. The vertical field of view stays.
-        max_memory: bytes that decoding and drawing may take at most; default: what the format allows.
-
     Raises InputError for an unknown camera or frame and beyond ``max_memory``, PacketError for a damaged stream
     (without ``frames``: once the pictures before the damage are written), OutputError when ``out`` cannot be written.
     """
@@ -105,13 +91,7 @@ def check_target(out: Path) -> None:
 
 
 def choose_cameras(playback: Playback, camera: str | None, number: int) -> Cameras:
-    """Return one camera for all pictures (by id), or ``number`` cameras along a path.
-
-    Arguments:
-        playback: an open stream.
-        camera: id of a camera, the name of a path, or a file that holds one; None: the first test camera.
-        number: of pictures.
-    """
+    """Return one camera for all pictures (by id), or ``number`` cameras along a path."""
     meta = playback.meta
     if camera in PATHS:
         return camera_path(camera, meta.train if len(meta.train) else meta.test, number)
@@ -137,14 +117,7 @@ def _images(
 
 
 def write_pictures(out: Path, images: Iterator[Bytes], frames: Sequence[int], fps: float) -> Played:
-    """Write pictures as the suffix of a file says: a video, an animated picture, or a folder of PNGs.
-
-    Arguments:
-        out: file or folder to write.
-        images: [H, W, 3] uint8 each, all of one size.
-        frames: indices, which name the PNGs.
-        fps: pictures per second.
-    """
+    """Write pictures as the suffix of a file says: a video, an animated picture, or a folder of PNGs."""
     suffix = out.suffix.lower()
     if suffix == ".mp4":
         if importlib.util.find_spec("av") is not None:

@@ -27,9 +27,6 @@ class Playback:
     def __init__(self, path: str | os.PathLike[str], *, max_memory: int | None = None) -> None:
         """Open a stream.
 
-        Arguments:
-            max_memory: bytes that decoding a frame may take at most; None: only the limits of the format hold.
-
         Raises SourceError when there is no stream, PacketError when its first packet is not readable, InputError when
         it would take more memory than allowed; so do all methods that decode.
         """

@@ -27,12 +27,7 @@ def ply_properties(sh_rest: int) -> list[str]:
 
 
 def ply_bytes(gaussians: Gaussians[FloatArray], comments: Sequence[str] = ()) -> bytes:
-    """Return a binary little-endian PLY of raw (pre-activation) values.
-
-    Arguments:
-        gaussians: N rows.
-        comments: lines for its header.
-    """
+    """Return a binary little-endian PLY of raw (pre-activation) values."""
     number, rest = len(gaussians), gaussians.shN.shape[1]
     names = ply_properties(rest)
     head = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
@@ -48,13 +43,7 @@ def ply_bytes(gaussians: Gaussians[FloatArray], comments: Sequence[str] = ()) ->
 
 
 def write_ply(path: str | os.PathLike[str], gaussians: Gaussians[FloatArray], comments: Sequence[str] = ()) -> None:
-    """Write :func:`ply_bytes` to a file.
-
-    Arguments:
-        path: of the file.
-        gaussians: N rows.
-        comments: lines for its header.
-    """
+    """Write :func:`ply_bytes` to a file."""
     with open(path, "wb") as file:
         file.write(ply_bytes(gaussians, comments))
 

@@ -21,16 +21,7 @@ def render_numpy(
     viewmat: FloatArray, K: FloatArray, width: int, height: int,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0), near: float = 0.01,
 ) -> FloatArray:  # fmt: skip
-    """Render raw Gaussians for one camera: [height, width, 3] float32.
-
-    Arguments:
-        means, quats, scales, opacities, sh0, shN: shapes as in core.gaussians.
-        viewmat: [4, 4] world-to-camera.
-        K: [3, 3] pixels.
-        width, height: pixels.
-        background: colour behind everything, [0, 1].
-        near: near plane, scene units.
-    """
+    """Render raw Gaussians for one camera: [height, width, 3] float32."""
     viewmat, K = np.asarray(viewmat, np.float64), np.asarray(K, np.float64)
     center = -viewmat[:3, :3].T @ viewmat[:3, 3]
     points = means.astype(np.float64) @ viewmat[:3, :3].T + viewmat[:3, 3]

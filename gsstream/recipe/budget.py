@@ -114,10 +114,6 @@ class Budget(BaseModel):
 def sized(budget: Budget, fps: float) -> Budget:
     """Return the budget with the rate turned into a size of every packet, the smaller one where both are given.
 
-    Arguments:
-        budget: of a recipe.
-        fps: frames per second of the recording.
-
     Raises RecipeError when a frame's share is smaller than an empty packet.
     """
     if budget.rate is None:

@@ -85,15 +85,7 @@ def validate(
     prefix: KeyPath,
     problems: list[str],
 ) -> Model | None:
-    """Validate ``values`` laid over the model's defaults; on failure append one line per problem and return None.
-
-    Arguments:
-        model: pydantic model of the section.
-        values: key -> value, nested.
-        problems: that one line is appended to per problem.
-        origin: full path -> where it was written.
-        prefix: full path of ``values`` in the recipe, e.g. ("gate", "params").
-    """
+    """Validate ``values`` laid over the model's defaults; on failure append one line per problem and return None."""
     if model is Recipe and isinstance(written := values.get("schema_version"), str):
         problem = version_problem("recipe schema", written, SCHEMA_VERSION)
         if problem:

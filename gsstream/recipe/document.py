@@ -81,10 +81,6 @@ class Layer:
 def read_file(path: Path, label: str | None = None) -> Layer:
     """Read a YAML file as a layer.
 
-    Arguments:
-        path: the file.
-        label: provenance of its values; ``file NAME:LINE`` when absent.
-
     Raises:
         RecipeError: unreadable, not YAML, a key given twice, an anchor, a value that is no JSON value.
     """

@@ -61,13 +61,6 @@ def resolve_recipe(
 ) -> ResolvedRecipe:  # fmt: skip
     """Stack the layers and validate the result; every problem found is reported in one error.
 
-    Arguments:
-        method: name given by --method; None takes the one the first file is based on, else "dense".
-        find_method: name -> YAML file (``Catalog.recipe_path``).
-        files: recipe files with differences, later ones win; only the first may say which method it belongs to.
-        overrides: (option, "a.b=value") of the command line, e.g. ("--set", "gate.temperature=0.3"); later ones win.
-        layers: laid over all of it, lowest first (a sweep's scenes, variants and axes).
-
     Raises:
         RecipeError: unknown keys (with the nearest valid name), values out of range, contradictions.
         UnknownName, PluginUnavailable: from ``find_method``.

@@ -32,13 +32,7 @@ def slots() -> list[str]:
 
 
 def recipe_schema(parts: Mapping[str, Mapping[str, PartSchema]], resolved: ResolvedRecipe | None = None) -> Schema:
-    """Return the schema of a recipe file.
-
-    Arguments:
-        parts: slot -> name -> part.
-        resolved: a method's recipe: its values become the defaults, and a slot without ``name`` is held against the
-            part that the method puts there. Without it, such a slot takes the settings of any part of its kind.
-    """
+    """Return the schema of a recipe file."""
     schema = Recipe.model_json_schema()
     definitions: Schema = schema.pop("$defs")
     definitions.pop(ComponentRef.__name__)

@@ -41,12 +41,7 @@ class Rules:
     hosts: tuple[str, ...] | None = None
 
     def refusal(self, request: HTTPConnection, *, guarded: bool) -> tuple[int, str] | None:
-        """Return status and sentence with which a request is refused, or None.
-
-        Arguments:
-            request: any request.
-            guarded: whether it asks for the stream, not for the page.
-        """
+        """Return status and sentence with which a request is refused, or None."""
         name = urlsplit(f"//{request.headers.get('host', '')}").hostname
         if self.hosts is not None and name not in self.hosts:
             return 403, "This server does not answer to that name."
@@ -65,15 +60,7 @@ class Rules:
 
 
 def make_app(stream: Path, *, live: bool, rules: Rules, max_viewers: int, hub_of: list[Hub]) -> Starlette:
-    """Return the application that serves a stream.
-
-    Arguments:
-        stream: the file; it need not exist yet.
-        live: whether the page shows the newest frame as it comes, not the recording from its beginning.
-        rules: who may look.
-        max_viewers: how many may watch live at a time.
-        hub_of: the hub is put here once the server runs.
-    """
+    """Return the application that serves a stream."""
     from starlette.applications import Starlette
     from starlette.middleware import Middleware
     from starlette.middleware.cors import CORSMiddleware

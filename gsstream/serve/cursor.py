@@ -18,14 +18,7 @@ class Cursor:
     """
 
     def __init__(self, follower: Follower, *, max_lag: int = 30, after: tuple[int, bytes] | None = None) -> None:
-        """Begin at the newest key packet, or after a packet that the viewer has.
-
-        Arguments:
-            follower: the stream.
-            max_lag: packets that a viewer may be late before it leaves some out.
-            after: number of the last frame that the viewer has, and the first 16 bytes of its packet, by which it is
-                recognised; what is not recognised is ignored.
-        """
+        """Begin at the newest key packet, or after a packet that the viewer has."""
         self.follower, self.max_lag = follower, max_lag
         self.generation = follower.generation
         #: Times that packets were left out.

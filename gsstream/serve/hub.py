@@ -24,13 +24,7 @@ class Hub:
     """Everything that viewers of one stream share. Lives on one event loop."""
 
     def __init__(self, follower: Follower, *, max_viewers: int, max_lag: int = 30) -> None:
-        """Serve the stream of a follower.
-
-        Arguments:
-            follower: the stream; looked at by :meth:`run` alone.
-            max_viewers: how many may watch at a time.
-            max_lag: packets that a viewer may be late before it is moved to a later key packet.
-        """
+        """Serve the stream of a follower."""
         self.follower, self.max_viewers, self.max_lag = follower, max_viewers, max_lag
         self.viewers: set[Cursor] = set()
         self.state = State("waiting")
@@ -49,12 +43,7 @@ class Hub:
             await asyncio.sleep(LOOK)
 
     async def watch(self, socket: WebSocket, after: tuple[int, bytes] | None) -> None:
-        """Serve one viewer, whose connection is accepted, until it or the server ends it.
-
-        Arguments:
-            socket: the connection.
-            after: what the viewer has already, see :class:`Cursor`.
-        """
+        """Serve one viewer, whose connection is accepted, until it or the server ends it."""
         if len(self.viewers) >= self.max_viewers:
             await socket.close(1013, f"{self.max_viewers} viewers are watching already")
             return

@@ -29,12 +29,7 @@ _LIMIT = 1 << 30
 
 
 def track_rows(source: IntArray, state: PlayerState) -> IntArray:
-    """Return [N'] int64: which row of the key packet each row is after the packet that led to ``state``; -1 is none.
-
-    Arguments:
-        source: [N] the same of the frame before.
-        state: after the packet.
-    """
+    """Return [N'] int64: which row of the key packet each row is after the packet that led to ``state``; -1 is none."""
     if state.delta is None or not state.delta.has_row_edit:
         return source
     assert state.before is not None
@@ -45,13 +40,7 @@ def track_rows(source: IntArray, state: PlayerState) -> IntArray:
 
 
 def encode_join(key: PlayerState, state: PlayerState, source: IntArray) -> bytes:
-    """Return the file that leads from the state of a key packet to a later one.
-
-    Arguments:
-        key: after the key packet.
-        state: the state to join at, without another key packet between the two.
-        source: [N] which row of ``key`` each row of ``state`` was, -1 for rows born since (see :func:`track_rows`).
-    """
+    """Return the file that leads from the state of a key packet to a later one."""
     facts: dict[str, Any] = {"number": len(state.gaussians), "decoders": {}, "groups": None}
     arrays: list[IntArray | FloatArray] = []
     same_rows = np.array_equal(source, np.arange(len(key.gaussians)))
@@ -81,12 +70,7 @@ def encode_join(key: PlayerState, state: PlayerState, source: IntArray) -> bytes
 
 
 def decode_join(key: PlayerState, data: bytes) -> PlayerState:
-    """Return the state that a join leads to. Raises PacketError when it is damaged or belongs to another key packet.
-
-    Arguments:
-        key: after the key packet that the join refers to.
-        data: the file.
-    """
+    """Return the state that a join leads to. Raises PacketError when it is damaged or belongs to another key packet."""
     if len(data) < _HEADER or data[:4] != MAGIC:
         raise PacketError("not a join of a gsstream package", 0)
     version, key_frame, frame, size, checksum = (int(v) for v in np.frombuffer(data, "<u4", 5, 4))

@@ -45,12 +45,6 @@ def package(
     A segment is a key packet with all that follows up to the next one, behind a file header: a valid stream. Its name
     holds a digest of its bytes, so that it never changes under that name and may be cached for ever.
 
-    Arguments:
-        stream: the stream to be packaged; nothing of it is coded anew.
-        out: a folder that is empty, does not exist, or holds a package, which is replaced.
-        renditions: other streams of the same recording; a viewer may change to them at key packets.
-        join_every: seconds of playing after which a segment gets a join (:mod:`gsstream.serve.joins`); 0 writes none.
-
     Raises SourceError when there is no stream, PacketError when it is damaged, InputError when a rendition has other
     frames or ``join_every`` is negative, OutputError when the folder holds something else or cannot be written.
     """

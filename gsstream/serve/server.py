@@ -42,15 +42,6 @@ class Server:
     ) -> None:  # fmt: skip
         """Take the address.
 
-        Arguments:
-            stream: the file; with ``live`` it may come later.
-            live: show the newest frame as it comes, not the recording from its beginning.
-            host: address to serve at; anything but loopback lets other machines look.
-            port: 0 takes any that is free.
-            token: what viewers must add to the address; None: nothing.
-            origins: other web pages that may use the stream, e.g. https://example.org.
-            max_viewers: how many may watch live at a time.
-
         Raises InputError without starlette and uvicorn or for an impossible origin, OutputError when nothing can be
         served at this address.
         """

@@ -101,11 +101,6 @@ class Assembly:
 def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | None = None) -> Assembly:
     """Import every named part, check its parameters against its own Config, and build it.
 
-    Arguments:
-        resolved: a recipe, with the provenance of its values or without.
-        catalog: of the parts that are installed.
-        checks: off, frame or step; None: what the environment says (``engine.assembly.checks``).
-
     Raises:
         InputError: ``checks`` is not a level.
         RecipeError: parameters that a part does not know or refuses, unknown parts; all of them together.
@@ -144,8 +139,7 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
 
 
 def _unused_key_messages(paths: list[KeyPath], resolved: ResolvedRecipe) -> list[str]:
-    """Return messages about keys that the method does not read: one each, or one line where most come from its base.
-    """
+    """Return messages about keys that the method does not read: one each, or one line where most come from its base."""
     name, base = resolved.recipe.streaming_method.name, resolved.recipe.method
     from_base = [path for path in paths if resolved.near(path).label == f"method {base}"]
     if len(from_base) > 2:

@@ -67,12 +67,6 @@ class Look:
         """Raise ComponentError unless ``value`` is a finite floating point tensor of this shape, within ``limits``.
 
         Type and shape are always looked at; numbers once per frame, and with the level "step" in every iteration.
-
-        Arguments:
-            what: the call, for the error: ``"estimate()"``.
-            value: what it returned.
-            shape: that it must have.
-            limits: least and largest value allowed; None: any finite one.
         """
         if not isinstance(value, torch.Tensor) or not value.dtype.is_floating_point:
             got = str(value.dtype) if isinstance(value, torch.Tensor) else type(value).__name__
@@ -101,12 +95,6 @@ class Look:
         """Raise ComponentError unless every number is finite and within ``limits``; the first that is not is named.
 
         One pass without temporary memory when all is well.
-
-        Arguments:
-            what: is looked at, for the error.
-            value: any tensor.
-            limits: least and largest value allowed; None: any finite one.
-            rows: [A] rows of the scene that ``value`` [A, ...] is about, so that the Gaussian can be named.
         """
         if self.level is not Checks.OFF:
             problem = wrong_value(value, limits, rows)
@@ -131,11 +119,6 @@ def wrong_value(
     """Say which number is not finite or not within the limits; empty when all are.
 
     ``rows`` as in :meth:`Look.values`.
-
-    Arguments:
-        value: any tensor.
-        limits: least and largest value allowed; None: any finite one.
-        rows: as in :meth:`Look.values`.
     """
     if value.numel() == 0:
         return ""

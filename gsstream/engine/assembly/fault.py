@@ -10,14 +10,7 @@ from gsstream.spec import ENTRY_POINT_GROUP
 
 
 def fault(message: str, slot: str, part: object, where: Where | None = None) -> ComponentError:
-    """Return the error about a part that failed, or did not do what it must.
-
-    Arguments:
-        message: what was expected, and what came.
-        slot: of the part.
-        part: the part itself, for its class and distribution.
-        where: frame and iteration; None: outside of them.
-    """
+    """Return the error about a part that failed, or did not do what it must."""
     owner = _distribution(type(part).__module__.partition(".")[0])
     place = where or Where()
     return ComponentError(

@@ -39,11 +39,6 @@ def error_context(slot: str, part: object, where: Where) -> Iterator[None]:
 
     A ShapeError is turned, too: it says that this part refuses what another part gave it. Of a renderer so is every
     InputError, because a renderer is given nothing but arrays. Other errors of gsstream pass unchanged.
-
-    Arguments:
-        slot: of the part.
-        part: the part itself.
-        where: frame and iteration at the moment of the call.
     """
     try:
         yield
@@ -146,12 +141,5 @@ class Guarded:
 
 
 def guard(slot: str, part: T, where: Where, level: Checks) -> T:
-    """Return the part behind a guard; one that is guarded already gets this place and this level.
-
-    Arguments:
-        slot: of the part.
-        part: a live part, guarded or not.
-        where: the place that errors name, shared by all parts of a run.
-        level: how closely results are looked at.
-    """
+    """Return the part behind a guard; one that is guarded already gets this place and this level."""
     return cast(T, Guarded(slot, unwrapped(part), where, level))

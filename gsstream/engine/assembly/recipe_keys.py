@@ -19,13 +19,7 @@ SESSION_KEYS = ("codec.key_rd_lambda", "codec.first_layer", "budget.memory", "st
 def unused_keys(
     recipe: Recipe, method: StreamingMethod[Any], parts: Mapping[str, Any]
 ) -> Iterator[KeyPath]:
-    """Yield the paths of keys that differ from their default though the method does not read them.
-
-    Arguments:
-        method: the live method.
-        recipe: with every part's parameters written out.
-        parts: slot -> live part.
-    """
+    """Yield the paths of keys that differ from their default though the method does not read them."""
     default = Recipe()
     for slot in METHOD_SLOTS:
         if slot not in parts or method.reads(slot):

@@ -22,10 +22,6 @@ def title(recipe: Recipe, catalog: Catalog) -> str:
 
     It follows from the values alone, not from where they were written, so that a resumed run has the same name. A
     method that was put in by its part, without a recipe of its own, is called by that part.
-
-    Arguments:
-        recipe: with every part's settings written out, or not.
-        catalog: of the methods that are installed; the name of one that is not stands alone.
     """
     try:
         base = resolve_recipe(recipe.method, catalog.recipe_path).recipe

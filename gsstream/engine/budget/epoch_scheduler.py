@@ -176,13 +176,7 @@ class EpochScheduler(Schedule):
 
 
 def scheduled(stream: Stream, frame: Frame, allowance: Allowance | None) -> Schedule:
-    """Return the schedule of a frame: as the recipe, or the plan of its budget, says.
-
-    Arguments:
-        stream: section ``stream`` of the recipe.
-        frame: of which ``effort`` says what share of the epochs it is worth.
-        allowance: what it may spend; None: no limit.
-    """
+    """Return the schedule of a frame: as the recipe, or the plan of its budget, says."""
     epochs = max(1, round(stream.epochs * frame.effort))
     if allowance is None:
         return Schedule(epochs, stream.rd_lambda)
@@ -195,11 +189,6 @@ def next_rate_weight(weight: float, expected: float, wanted: float) -> float:
     Bytes fall with about the square root of the weight (docs/results/trade.md), so the first power leads half of the
     way to the goal; a factor of three a pass is the most that residuals can follow. What was taken back comes slowly
     again, so the way down is half as fast.
-
-    Arguments:
-        weight: as it was, above 0.
-        expected: bytes that would be sent now.
-        wanted: bytes that are to be sent.
     """
     factor = min(max(expected / wanted, 1 / 9), 3.0)
     factor = factor if factor > 1 else factor**0.5

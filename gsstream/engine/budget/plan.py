@@ -111,13 +111,7 @@ class FramePlan:
 
 
 def plan(budget: Budget, stream: Stream, history: Sequence[Past]) -> FramePlan:
-    """Return what the next frame is to spend.
-
-    Arguments:
-        budget: limits of a frame.
-        stream: the recipe's settings, from which the controller departs.
-        history: earlier frames that were optimised, oldest first.
-    """
+    """Return what the next frame is to spend."""
     recent = history[-WINDOW:]
     each, (before, after) = seconds_per_epoch(recent), _other_seconds(recent)
     epochs = _epochs(budget, stream, each, before + after)
@@ -150,26 +144,14 @@ def seconds_per_epoch(history: Sequence[Past]) -> float | None:
 
 
 def epochs_in(seconds: float, each: float, most: int) -> int:
-    """Return how many passes fit into a time, at least 1.
-
-    Arguments:
-        seconds: that there are.
-        each: seconds of a pass, above 0.
-        most: passes that the recipe asks for.
-    """
+    """Return how many passes fit into a time, at least 1."""
     if each <= 0:
         return most
     return max(1, min(most, math.floor(min(seconds / each, most) + 1e-9)))
 
 
 def scale_epoch_seconds(each: float, then: int, now: int) -> float:
-    """Return the seconds of a pass with another number of candidates; a part of it does not scale.
-
-    Arguments:
-        each: seconds that a pass has taken.
-        then: candidates it had.
-        now: candidates it is to have.
-    """
+    """Return the seconds of a pass with another number of candidates; a part of it does not scale."""
     return each * (FIXED_SHARE + (1 - FIXED_SHARE) * now / then) if then > 0 else each
 
 

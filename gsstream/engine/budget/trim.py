@@ -47,14 +47,6 @@ def trim_to_size(
 ) -> TrimmedDelta:  # fmt: skip
     """Return the delta, with as little given up as makes its packet fit; unchanged when it fits already.
 
-    Arguments:
-        delta: what the frame is to change.
-        layout: nodes and units before the frame.
-        packet: the delta, encoded.
-        curvature: attribute -> [A, L] >= 0, aligned with the symbols of the delta's residual.
-        encode: delta -> packet; a delta that changes nothing must give the smallest packet there is.
-        max_bytes: at least the size of an empty packet.
-
     Raises AssertionError when not even the empty packet fits: a budget's least size forbids that.
     """
     untrimmed = len(packet.data)

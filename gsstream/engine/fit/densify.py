@@ -47,13 +47,6 @@ def grow_and_prune(
 ) -> tuple[TopologyEdit, dict[str, torch.Tensor]]:
     """Clone small and split large Gaussians with large screen gradients; drop transparent and oversized ones.
 
-    Arguments:
-        gaussians: N rows, raw values.
-        statistics: screen gradients since the last call.
-        settings: section ``first_frame`` of the recipe.
-        extent: of the cameras, scene units.
-        generator: of the positions of split Gaussians.
-
     Returns the edit and the new contents of every attribute. The population never exceeds ``settings.max_gaussians``.
     """
     largest = activate_scales(gaussians.scales).amax(1)

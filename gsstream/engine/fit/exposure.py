@@ -29,14 +29,7 @@ class ExposureFit:
         return ExposureFit(Exposure.identity(num_cameras), zeros, zeros, (0,) * num_cameras)
 
     def step(self, view: int, grad: torch.Tensor, lr: float, identity_weight: float) -> ExposureFit:
-        """Make one Adam step of camera ``view``.
-
-        Arguments:
-            view: index of a training camera.
-            grad: [12] gradient of the loss by the camera's colour map.
-            lr: learning rate of the matrix entries; offsets use 0.4 of it.
-            identity_weight: of the squared distance from identity.
-        """
+        """Make one Adam step of camera ``view``."""
         matrix, offset = self.exposure.matrix[view], self.exposure.offset[view]
         grad = grad + identity_weight * torch.cat([(matrix - torch.eye(3)).flatten(), offset])
         count = self.steps[view] + 1

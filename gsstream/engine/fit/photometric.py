@@ -29,12 +29,7 @@ class PhotometricLoss:
         self._prepared: dict[int, Any] = {}
 
     def view_target(self, view: int, tile_weights: torch.Tensor | None = None) -> ViewTarget:
-        """Return what renders of a view are compared with.
-
-        Arguments:
-            view: index of a training camera.
-            tile_weights: [ceil(H / 16), ceil(W / 16)] float32 factors on the gradients of tiles; None: all count once.
-        """
+        """Return what renders of a view are compared with."""
         image = torch.from_numpy(self._images[view])
         if view not in self._prepared:
             self._prepared[view] = self._loss.prepare(image)
@@ -46,16 +41,7 @@ def render_exposed(
     renderer: Renderer, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int,
     background: tuple[float, float, float], exposure: Exposure | None,
 ) -> torch.Tensor:  # fmt: skip
-    """Return [H, W, 3]: a scene as the camera of this view records it; no graph.
-
-    Arguments:
-        renderer: that draws.
-        gaussians: N rows, raw values.
-        cameras: training cameras.
-        view: index of one of them.
-        background: colour behind everything, 0 to 1.
-        exposure: colour maps of the cameras, or None.
-    """
+    """Return [H, W, 3]: a scene as the camera of this view records it; no graph."""
     with torch.no_grad():
         image = renderer.render(gaussians, cameras, view, background).image
     return exposure[view].apply(image) if exposure else image

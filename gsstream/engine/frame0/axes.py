@@ -19,11 +19,7 @@ _HALF = 0.5**0.5
 
 
 def nearest_axes(gaussians: Gaussians[torch.Tensor]) -> Gaussians[torch.Tensor]:
-    """Return Gaussians that draw the same, with unit quaternions whose first component is largest, at least 0.85.
-
-    Arguments:
-        gaussians: N rows, raw values; no quaternion has norm zero.
-    """
+    """Return Gaussians that draw the same, with unit quaternions whose first component is largest, at least 0.85."""
     quats = gaussians.quats.double()
     quats = quats / quats.norm(dim=1, keepdim=True)
     # [N, 24]: first component of the product of each quaternion with each of the rotations.
@@ -49,11 +45,7 @@ def _rotations() -> torch.Tensor:
 
 
 def quat_multiply_torch(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Return the Hamilton products [n, 4] of quaternions, wxyz.
-
-    Arguments:
-        a: [n, 4] the turns that come second. b: [n, 4] those that come first.
-    """
+    """Return the Hamilton products [n, 4] of quaternions, wxyz."""
     w, v, x, u = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
     return torch.cat([w * x - (v * u).sum(1, keepdim=True), w * u + x * v + torch.linalg.cross(v, u)], 1)
 

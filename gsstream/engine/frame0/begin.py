@@ -60,11 +60,6 @@ def seed_anchors(parts: Assembly, points: PointCloud, frame: Frame) -> Anchors:
     """Return anchors, at most as many as frame 0 may have Gaussians.
 
     A structure places one or more for each point, so where there are too many it is given fewer points.
-
-    Arguments:
-        parts: the live parts of the recipe.
-        points: seeds of the scene.
-        frame: training images of frame 0.
     """
     most = parts.recipe.first_frame.max_gaussians
     while True:
@@ -75,13 +70,7 @@ def seed_anchors(parts: Assembly, points: PointCloud, frame: Frame) -> Anchors:
 
 
 def check_cameras(cameras: Cameras, least: int, who: str) -> None:
-    """Raise InputError when there are fewer training cameras than somebody needs.
-
-    Arguments:
-        cameras: training cameras.
-        least: number that is needed.
-        who: who needs them, for the error.
-    """
+    """Raise InputError when there are fewer training cameras than somebody needs."""
     if len(cameras) < least:
         raise InputError(
             f"{who} needs at least {least} training camera{'s'[: least != 1]}, got {len(cameras)}; record with "
@@ -110,14 +99,7 @@ def decoded_anchors(player: PlayerState) -> Anchors:
 def sort_into_nodes(
     parts: Assembly, gaussians: Gaussians[torch.Tensor], levels: torch.Tensor, anchors: Anchors
 ) -> tuple[Hierarchy, torch.Tensor, Gaussians[torch.Tensor]]:
-    """Group the Gaussians and store them node by node: (hierarchy, levels, Gaussians), all in the new order.
-
-    Arguments:
-        parts: the live parts of the recipe.
-        gaussians: N rows, raw values, in any order.
-        levels: [N] level of the anchor of each.
-        anchors: what the structure laid.
-    """
+    """Group the Gaussians and store them node by node: (hierarchy, levels, Gaussians), all in the new order."""
     hierarchy = parts.structure.build(gaussians, anchors)
     with error_context("structure", parts.part("structure"), parts.where):
         hierarchy.validate()
@@ -126,13 +108,7 @@ def sort_into_nodes(
 
 
 def make_layout(hierarchy: Hierarchy, levels: torch.Tensor, anchors: Anchors) -> Layout:
-    """Return what both ends know until the next key packet.
-
-    Arguments:
-        hierarchy: M nodes; ``node_of`` [N] must be sorted.
-        levels: [N] level of each row.
-        anchors: cell sizes of the levels.
-    """
+    """Return what both ends know until the next key packet."""
     counts = torch.bincount(hierarchy.node_of, minlength=hierarchy.num_nodes)
     return Layout(
         node_counts=counts.numpy().astype(np.int32),
@@ -153,19 +129,7 @@ def key_state(
     rng: Rng,
     first: BoolArray | None = None,
 ) -> tuple[StreamState, EncodedPacket]:
-    """Encode a key packet and continue from its decoded bytes.
-
-    Arguments:
-        parts: the live parts of the recipe.
-        gaussians: N rows, stored node by node.
-        layout, hierarchy: how they are stored and grouped.
-        frame: training images of the frame.
-        meta: what the key packet says about the run.
-        exposure: colour maps of the cameras, or None.
-        origin: [3] origin of the structure's grid.
-        rng: random streams by name and frame.
-        first: [N] bool: the Gaussians of the packet's first layer; None: it has no layers.
-    """
+    """Encode a key packet and continue from its decoded bytes."""
     extra: Mapping[str, Any] = {**meta.extra, **exposure_to_meta(exposure), "origin": origin.tolist()}
     arrays: Gaussians[FloatArray] = gaussians.map(lambda t: np.ascontiguousarray(t.numpy()))
     packet = encode_key(KeyState(arrays, layout, replace(meta, extra=extra)), frame=frame.index, first=first)

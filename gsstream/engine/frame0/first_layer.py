@@ -17,15 +17,7 @@ from gsstream.parts.render.exposure import Exposure
 def first_layer_mask(
     parts: Assembly, gaussians: Gaussians[torch.Tensor], frame: Frame, exposure: Exposure | None, rng: Rng
 ) -> BoolArray | None:
-    """Return the choice [N] bool of the Gaussians that come first, or None where the packet is to have no layers.
-
-    Arguments:
-        parts: the live parts of the recipe.
-        gaussians: N rows as players will have them, in the order of the packet.
-        frame: training images of the packet's frame.
-        exposure: colour maps of the cameras, or None.
-        rng: random streams by name and frame.
-    """
+    """Return the choice [N] bool of the Gaussians that come first, or None where the packet is to have no layers."""
     share = parts.recipe.codec.first_layer
     if share == 1 or len(gaussians) == 0:
         return None
@@ -36,12 +28,7 @@ def first_layer_mask(
 
 
 def largest_error_mask(errors: torch.Tensor, share: float) -> BoolArray:
-    """Return the choice [N] bool of the rows with the largest errors; of equal ones those that stand first.
-
-    Arguments:
-        errors: [N] at least 0.
-        share: of the rows that are chosen, 0 to 1; at least one is, where there is any.
-    """
+    """Return the choice [N] bool of the rows with the largest errors; of equal ones those that stand first."""
     order = torch.argsort(errors, descending=True, stable=True)
     chosen = torch.zeros(len(errors), dtype=torch.bool)
     chosen[order[: max(1, round(share * len(errors)))]] = True

@@ -60,14 +60,7 @@ def _pop_grad(leaf: torch.Tensor) -> torch.Tensor:
 def hutchinson_samples(
     views: TrainingViews, gaussians: Gaussians[torch.Tensor], generator: torch.Generator, *, each: int
 ) -> Iterator[HutchinsonSample]:
-    """Yield ``each`` probes of every camera.
-
-    Arguments:
-        views: of the training cameras.
-        gaussians: N rows, raw values, without gradients.
-        generator: of the signs.
-        each: probes of a camera, at least 1; the relative deviation of a sum of their squares falls with its root.
-    """
+    """Yield ``each`` probes of every camera."""
     cameras, exposure = views.frame.cameras, views.exposure
     session = views.renderer.open(gaussians, None, cameras, views.background)
     for view in range(len(cameras)):

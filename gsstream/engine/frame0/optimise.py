@@ -67,12 +67,7 @@ def initial_gaussians(anchors: Anchors, settings: FirstFrame) -> Gaussians[torch
 
 
 def first_frame_lrs(settings: FirstFrame, extent: float) -> dict[str, float]:
-    """Return the learning rate of every attribute at the start of frame 0.
-
-    Arguments:
-        settings: section ``first_frame`` of the recipe.
-        extent: of the cameras, scene units.
-    """
+    """Return the learning rate of every attribute at the start of frame 0."""
     rates = {"quats": schedule.LR_QUATS, "scales": schedule.LR_SCALES, "opacities": schedule.LR_OPACITIES,
              "sh0": schedule.LR_SH0, "shN": schedule.LR_SHN}  # fmt: skip
     return {"means": settings.lr_means * extent, **{name: settings.lr_factor * lr for name, lr in rates.items()}}
@@ -86,16 +81,7 @@ def optimise_first_frame(
     rng: Rng,
     progress: Progress,
 ) -> Reconstruction:
-    """Fit frame 0 on its training images.
-
-    Arguments:
-        levels: [N] int64 octree level of each.
-        parts: the live parts of the recipe.
-        rng: random streams by name and frame.
-        start: [N] initial Gaussians; ``levels`` [N] their octree levels.
-        frame: training images of frame 0.
-        progress: called with (iteration, iterations, smoothed loss, number of Gaussians).
-    """
+    """Fit frame 0 on its training images."""
     settings = parts.recipe.first_frame
     iterations = min(settings.epochs * len(frame.cameras), settings.max_iterations)
     # The name of this random stream is that of older versions, so that a seed still gives the same frame 0.

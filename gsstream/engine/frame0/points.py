@@ -25,12 +25,6 @@ def gather_points(
 ) -> PointCloud:
     """Return the points to seed from. Only the cameras of ``frame`` take part, and points that the source vouches for.
 
-    Arguments:
-        frame: training images of frame 0.
-        settings: section ``first_frame`` of the recipe.
-        rng: random streams by name and frame.
-        shipped: the points that the recording ships, by kind (``FrameSource.points``); None where it ships none.
-
     Raises InputError when the recipe asks for a kind of points that the recording does not have, or nothing is left.
     """
     pixels = frame.images[..., 0].size

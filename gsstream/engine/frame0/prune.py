@@ -33,11 +33,6 @@ def removal_errors(
 ) -> tuple[torch.Tensor, float]:
     """Return what the absence of each Gaussian alone changes, and how far the images are off with all of them.
 
-    Arguments:
-        views: of the training cameras.
-        gaussians: N rows, raw values, without gradients.
-        generator: of random signs, by which the first number is estimated.
-
     Returns [N] float64, the squared change of all channels of all pixels together, and the mean squared error of a
     channel of a pixel.
     """
@@ -56,10 +51,6 @@ def retained_rows(errors: torch.Tensor, least: float) -> torch.Tensor:
     """Return the rows [K] int64, in order, of the Gaussians whose absence adds more than ``least``.
 
     Where no view feels any of them, nothing says which may go, and all remain.
-
-    Arguments:
-        errors: [N] as :func:`removal_errors` gives them.
-        least: squared error, at least 0.
     """
     rows = (errors > least).nonzero()[:, 0]
     return rows if len(rows) else torch.arange(len(errors))
@@ -72,12 +63,6 @@ def prune_by_error(
 
     What one may do without, all together may not: of ten equal Gaussians none is missed. So where the images are off by
     ``GROWTH`` times as much without all of them, only those go that are missed less.
-
-    Arguments:
-        views: of the training cameras.
-        gaussians: N rows, raw values, without gradients.
-        generator: of random signs.
-        least: what a Gaussian's absence must add to stay, in mean squared errors of a channel of a pixel.
     """
     errors, error = removal_errors(views, gaussians, generator)
     for _ in range(TRIES):

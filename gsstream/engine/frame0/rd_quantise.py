@@ -33,15 +33,7 @@ HUTCHINSON_SAMPLES = 2
 def rd_quantise(
     parts: Assembly, gaussians: Gaussians[torch.Tensor], frame: Frame, exposure: Exposure | None, rng: Rng
 ) -> Gaussians[torch.Tensor]:
-    """Return Gaussians that look nearly the same and that a key packet holds in fewer bytes.
-
-    Arguments:
-        parts: the live parts of the recipe.
-        gaussians: N rows as frame 0 was fitted, raw values.
-        frame: training images of frame 0.
-        exposure: colour maps of the cameras, or None.
-        rng: random streams by name and frame.
-    """
+    """Return Gaussians that look nearly the same and that a key packet holds in fewer bytes."""
     rows = nearest_axes(gaussians)
     rate = parts.recipe.codec.key_rd_lambda
     if rate == 0 or len(rows) == 0:
@@ -62,13 +54,6 @@ def code_sensitivity(
     generator: torch.Generator,
 ) -> tuple[dict[str, FloatArray], float]:  # fmt: skip
     """Return how much the training images feel each code, and their mean squared error.
-
-    Arguments:
-        parts: the live parts of the recipe.
-        gaussians: N rows, raw values.
-        frame: training images of frame 0.
-        exposure: colour maps of the cameras, or None.
-        generator: of random signs.
 
     Returns attribute -> [N, width] float64: squared change of all images together when a code is one higher.
     """

@@ -50,13 +50,7 @@ def refine_first_frame(parts: Assembly, state: StreamState, step: Step, frame: F
 
 
 def runs_after_packet(stream: Stream, state: StreamState, frame: Frame) -> bool:
-    """Say whether what a frame gives to the refinement can be made after its packet: its last iterations cannot.
-
-    Arguments:
-        stream: section ``stream`` of the recipe.
-        state: before the frame.
-        frame: one that is skipped makes no iteration.
-    """
+    """Say whether what a frame gives to the refinement can be made after its packet: its last iterations cannot."""
     if not is_refining(stream, state):
         return False
     made = 0 if state.refinement is None else state.refinement.iterations
@@ -79,11 +73,7 @@ def _iterations(stream: Stream) -> int:
 
 
 def start_refinement(player: PlayerState) -> Refinement:
-    """Return the refinement of a first frame, before its first iteration.
-
-    Arguments:
-        player: what players have after the key packet.
-    """
+    """Return the refinement of a first frame, before its first iteration."""
     gaussians = player.gaussians.map(torch.from_numpy)
     count = len(gaussians)
     levels = torch.from_numpy(player.layout.unit_of.astype(np.int64))
@@ -94,16 +84,7 @@ def advance_refinement(
     parts: Assembly, refinement: Refinement, before: PlayerState, after: PlayerState, frame: Frame,
     exposure: Exposure | None, rng: Rng,
 ) -> Refinement:  # fmt: skip
-    """Return the refinement after a frame: moved as the stream moved, and optimised on the frame's pictures.
-
-    Arguments:
-        parts: the live parts of the recipe.
-        refinement: after the frame before.
-        before: what players had then. after: what they have now.
-        frame: its training images.
-        exposure: colour maps of the cameras, or None.
-        rng: random streams by name and frame.
-    """
+    """Return the refinement after a frame: moved as the stream moved, and optimised on the frame's pictures."""
     start, stream = track_motion(refinement, before, after), parts.recipe.stream
     if frame.effort == 0 or is_refined(stream, start):
         return start
@@ -121,12 +102,7 @@ def advance_refinement(
 
 
 def track_motion(refinement: Refinement, before: PlayerState, after: PlayerState) -> Refinement:
-    """Return the refinement with every Gaussian moved and turned as the one it came from was.
-
-    Arguments:
-        refinement: after the frame before.
-        before: what players had then. after: what they have now.
-    """
+    """Return the refinement with every Gaussian moved and turned as the one it came from was."""
     row_now = _current_rows(before, after)
     ancestors = refinement.ancestors
     alive = ancestors >= 0

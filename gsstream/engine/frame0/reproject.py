@@ -14,10 +14,6 @@ def to_stream_coordinates(first: PlayerState, world: World) -> PlayerState:
     """Return a decoded scene in the coordinates of another stream of the same recording.
 
     Streams of one recording share their coordinates, unless an earlier version wrote one, or its cameras were changed.
-
-    Arguments:
-        first: what players have of a frame.
-        world: of the recording that is encoded.
     """
     if first.meta.world.is_near(world):
         return first

@@ -74,11 +74,6 @@ def reused_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors
     It is that stream's own, bit for bit, if a structure of the same settings laid it, or if this method's structure
     needs no grid: then rates, steps and gates of both streams have the same units. Otherwise it is the grid that this
     structure lays around the decoded centres, and each Gaussian gets the level of the nearest cell size.
-
-    Arguments:
-        parts: the live parts of the recipe.
-        first: the decoded scene.
-        frame: training images of frame 0.
     """
     theirs = decoded_anchors(first)
     if can_reuse_grid(parts, first.meta.recipe):
@@ -90,12 +85,7 @@ def reused_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors
 
 
 def can_reuse_grid(parts: Assembly, recipe: Mapping[str, Any]) -> bool:
-    """Return whether the grid of a stream serves this method's structure as it is.
-
-    Arguments:
-        parts: the live parts of the recipe.
-        recipe: of the stream, as its key packet holds it.
-    """
+    """Return whether the grid of a stream serves this method's structure as it is."""
     if not parts.structure.claims().has_grid:
         return True
     mine, theirs = parts.recipe.structure, recipe.get("structure", {})

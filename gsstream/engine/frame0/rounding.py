@@ -26,11 +26,6 @@ def rd_codes_to_zero(exact: FloatArray, sensitivity: FloatArray, weight: float) 
 
     Of each value: the nearest code, its two neighbours towards zero, and zero, for what may as well not be there. The
     bits of a code are those of a coder that knows how often each one occurs in its column.
-
-    Arguments:
-        exact: [N, width] codes before rounding.
-        felt: [N, width] squared error of all images, for a code that is off by one.
-        weight: squared error that a bit must save, at least 0.
     """
 
     def candidate_codes(nearest: IntArray) -> IntArray:
@@ -43,14 +38,7 @@ def rd_codes_to_zero(exact: FloatArray, sensitivity: FloatArray, weight: float) 
 
 
 def rd_codes_nearby(exact: FloatArray, sensitivity: FloatArray, weight: float, reach: int) -> IntArray:
-    """Return the same among all codes within ``reach`` of the nearest one, for what must stay about what it is.
-
-    Arguments:
-        exact: [N, width] codes before rounding.
-        felt: [N, width] squared error of all images, for a code that is off by one.
-        weight: squared error that a bit must save, at least 0.
-        reach: how many codes up and down, at least 0.
-    """
+    """Return the same among all codes within ``reach`` of the nearest one, for what must stay about what it is."""
     # The nearest one first, then by distance: of equally good ones the nearer is taken.
     offsets = sorted(range(-reach, reach + 1), key=lambda offset: (abs(offset), offset))
 

@@ -31,12 +31,6 @@ def key_packet_if_due(parts: Assembly, step: Step, frame: Frame, tools: Tools) -
 
     A key packet that the budget refuses, or whose frame is skipped, stays due: the next frame tries again. Pure, like a
     frame step.
-
-    Arguments:
-        parts: the live parts of the recipe.
-        step: the frame as it was encoded.
-        frame: its training images.
-        tools: what a key packet tells about the run, and what the budget says of one.
     """
     reason, state = _due(parts, step), step.state
     if reason is None:
@@ -75,15 +69,7 @@ def _postponed(step: Step, reason: str, refused: str, tools: Tools) -> Step:
 
 
 def refined_key_step(parts: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
-    """Return the refined first frame, as it is now, as a key packet, and the state that follows from its bytes.
-
-    Arguments:
-        parts: the live parts of the recipe.
-        state: after the frame, with a refinement.
-        frame: training images of the frame.
-        meta: what the key packet says about the run.
-        rng: random streams by name and frame.
-    """
+    """Return the refined first frame, as it is now, as a key packet, and the state that follows from its bytes."""
     found = state.refinement
     assert found is not None
     cheaper = rd_quantise(parts, found.gaussians, frame, state.exposure, rng)
@@ -92,15 +78,7 @@ def refined_key_step(parts: Assembly, state: StreamState, frame: Frame, meta: St
 
 
 def reencode_as_key(parts: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
-    """Return the current decoded scene as a key packet, and the state that follows from its bytes.
-
-    Arguments:
-        parts: the live parts of the recipe.
-        state: after the frame, as players have it.
-        frame: training images of the frame.
-        meta: what the key packet says about the run.
-        rng: random streams by name and frame.
-    """
+    """Return the current decoded scene as a key packet, and the state that follows from its bytes."""
     gaussians = quantise_key(state.player.gaussians).map(torch.from_numpy)
     levels = decoded_anchors(state.player).levels
     return _key_step(parts, state, gaussians, levels, frame, state.previous.index, meta, rng)

@@ -38,9 +38,6 @@ class Ended(NamedTuple):
 def read_end(path: Path, last: int | None = None) -> Ended:
     """Decode a stream to its last sound packet.
 
-    Arguments:
-        last: stop after this frame, whatever the stream holds beyond it.
-
     Raises PacketError when not even the first key packet is sound.
     """
     player: PlayerState | None = None
@@ -81,11 +78,6 @@ def _decoded_states(path: Path, last: int | None) -> Iterator[tuple[PlayerState,
 def check_stream(parts: Assembly, path: Path, info: SourceInfo) -> bool:
     """Say whether a stream has a complete frame 0 to go on from.
 
-    Arguments:
-        parts: the live parts of the recipe.
-        path: of the stream.
-        info: what the recording says about itself.
-
     Raises OutputError when the recipe or the recording is not the one it was written with.
     """
     if path.stat().st_size < FILE_HEADER.size:
@@ -103,11 +95,6 @@ def state_after(parts: Assembly, states: Iterable[PlayerState], rng: Rng) -> Str
     """Return the encoder state after these player states, the first of which is that of a key packet.
 
     ``previous`` is not set: no stream holds images.
-
-    Arguments:
-        parts: the live parts of the recipe.
-        states: of players, in order, from a key packet on.
-        rng: random streams by name and frame.
     """
     state: StreamState | None = None
     for player in states:
@@ -118,11 +105,6 @@ def state_after(parts: Assembly, states: Iterable[PlayerState], rng: Rng) -> Str
 
 def refinement_after(parts: Assembly, state: StreamState, tools: Tools) -> Refinement | None:
     """Return the first frame as far as it was refined: made again from the packets and pictures since its key packet.
-
-    Arguments:
-        parts: the live parts of the recipe.
-        state: at the end of the stream.
-        tools: which replay the stream and read its pictures.
     """
     stream = parts.recipe.stream
     if not is_refining(stream, state) or state.player.frame == state.key_frame:
@@ -140,13 +122,7 @@ def refinement_after(parts: Assembly, state: StreamState, tools: Tools) -> Refin
 
 
 def key_state_from_player(parts: Assembly, player: PlayerState, rng: Rng) -> StreamState:
-    """Return the encoder state right after a key packet, from the decoded packet alone (``previous`` is not set).
-
-    Arguments:
-        parts: the live parts of the recipe.
-        player: decoded from a key packet.
-        rng: random streams by name and frame.
-    """
+    """Return the encoder state right after a key packet, from the decoded packet alone (``previous`` is not set)."""
     gaussians = player.gaussians.map(torch.from_numpy)
     decoders = parts.update.init_decoders(gaussians, rng.stream("decoders", player.frame))
     return StreamState(

@@ -11,12 +11,7 @@ from gsstream.packet import PlayerState
 
 
 def displacement_pixels(player: PlayerState, cameras: Cameras) -> dict[str, float]:
-    """Return the median and the largest way on the screen of the rows that the last frame displaced, pixels.
-
-    Arguments:
-        player: what players have of the frame.
-        cameras: of the training images; a row's way is the mean over those in whose picture it begins and ends.
-    """
+    """Return the median and the largest way on the screen of the rows that the last frame displaced, pixels."""
     moved = player.scene.moved
     if moved is None:
         return {"median": 0.0, "max": 0.0}
@@ -30,10 +25,6 @@ def screen_displacement(before: FloatArray, after: FloatArray, cameras: Cameras)
     """Return [P] the distance on the screen between two places of each point, pixels, mean over the cameras.
 
     A camera counts that has both places in its picture; nan where none has.
-
-    Arguments:
-        before, after: [P, 3] scene units.
-        cameras: the rig.
     """
     total, count = np.zeros(len(before)), np.zeros(len(before))
     for view in range(len(cameras)):

@@ -25,10 +25,6 @@ def live_metrics(frame: Frame, written: float) -> dict[str, Any] | None:
     None when its files were gone by then. It is not bounded below: a negative one says that the clock which dates the
     images is ahead. ``policy``: what the options of the source did to the frame, None for nothing.
     ``effort``: share of the recipe's epochs that was asked for. ``absent``: training cameras without an image.
-
-    Arguments:
-        frame: as the source delivered it.
-        written: when its packet was complete in the stream file, seconds since 1970.
     """
     arrival = frame.arrival
     if arrival is None:
@@ -63,9 +59,6 @@ def latency_lines(lines: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return what the summary of a run says of its latency; empty for a recording that was not live.
 
     A dropped frame has a latency in its metrics, but it shows nothing new: median and worst are of the others.
-
-    Arguments:
-        lines: of ``metrics.jsonl``, in the order of frames.
     """
     live = {line["frame"]: line["live"] for line in lines if line.get("live") is not None}
     if not live:

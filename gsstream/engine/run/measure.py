@@ -53,11 +53,6 @@ class HeldOut:
     def doubt(self, state: MethodState, train: Frame, measured: Mapping[str, float | None]) -> str:
         """Say when frame 0 shows the training cameras what they saw and the held-out cameras something else.
 
-        Arguments:
-            state: after frame 0.
-            train: its training images.
-            measured: PSNR of the held-out cameras.
-
         Returns one line for a person; empty where there is nothing to say.
         """
         held_out = [value for value in measured.values() if value is not None]
@@ -80,13 +75,7 @@ class HeldOut:
             self._sigma = [noise_sigma(a, b) for a, b in zip(first.images, second.images, strict=True)]
 
     def render(self, state: MethodState, frame: Frame, view: int) -> FloatArray:
-        """Return the decoded image [H, W, 3] of a camera, in [0, 1].
-
-        Arguments:
-            state: what players have.
-            frame: images, for their cameras.
-            view: index of one of these cameras.
-        """
+        """Return the decoded image [H, W, 3] of a camera, in [0, 1]."""
         gaussians = state.player.gaussians.map(torch.from_numpy)
         with torch.no_grad():
             output = self._renderer.render(gaussians, frame.cameras, view, self._background)

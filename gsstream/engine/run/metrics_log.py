@@ -61,11 +61,6 @@ def lost_lines(path: Path, first: int, last: int) -> list[int]:
     """Return the frames of a stream that have no line: a kill fell between their packet and their line.
 
     Tables of such a file leave these frames out; a run that goes on measures them again, or says so.
-
-    Arguments:
-        path: of ``metrics.jsonl``.
-        first: frame of the stream.
-        last: frame of the stream.
     """
     written = {int(line["frame"]) for line in _written(path)}
     return [frame for frame in range(first, last + 1) if frame not in written]

@@ -31,11 +31,6 @@ def claim_output(out: Path, *, resume: bool = False, overwrite: bool = False) ->
 
     Arguments and errors are those of :func:`prepare_output`; besides, OutputError when another run holds the folder,
     saying which. The lock goes with the process, however that ends. Gives whether there is a run to continue.
-
-    Arguments:
-        out: the folder of the run.
-        resume: go on with the run that it holds.
-        overwrite: replace the run that it holds.
     """
     check_output(out, resume=resume, overwrite=overwrite)
     try:
@@ -169,12 +164,6 @@ def ended_by_signals(names: tuple[str, ...] = ("SIGTERM", "SIGHUP")) -> Iterator
 def prepare_output(out: Path, *, resume: bool = False, overwrite: bool = False) -> bool:
     """Make sure a run may write to ``out``; create it when missing.
 
-    Arguments:
-        out: folder of the run.
-        resume: continue the run that ``out`` holds.
-        overwrite: delete the ``RUN_FILES`` and ``MADE_FILES`` of the run that ``out`` holds; anything else stays, and
-            where there is no run, everything does.
-
     Returns:
         Whether there is a run to continue.
 
@@ -193,13 +182,7 @@ def prepare_output(out: Path, *, resume: bool = False, overwrite: bool = False) 
 
 
 def check_output(out: Path, *, resume: bool = False, overwrite: bool = False) -> list[str]:
-    """Make the checks of :func:`prepare_output` and write nothing; return which ``RUN_FILES`` there are.
-
-    Arguments:
-        out: the folder of the run.
-        resume: go on with the run that it holds.
-        overwrite: replace the run that it holds.
-    """
+    """Make the checks of :func:`prepare_output` and write nothing; return which ``RUN_FILES`` there are."""
     if resume and overwrite:
         raise OutputError("--resume continues the run in the output folder, --overwrite deletes it: give one of them")
     if out.exists() and not out.is_dir():

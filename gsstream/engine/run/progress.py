@@ -50,14 +50,7 @@ class RunProgress:
             self._bar.stop()
 
     def first_frame(self, iteration: int, iterations: int, loss: float, count: int) -> None:
-        """Show an iteration of frame 0.
-
-        Arguments:
-            iteration: from 1.
-            iterations: of frame 0 in all.
-            loss: of this iteration.
-            count: Gaussians there are.
-        """
+        """Show an iteration of frame 0."""
         note = f"loss {loss:.4f}, {count} Gaussians"
         now, left = self._clock(), self._seconds_left(iteration, iterations)
         if left is not None and left > _LONG and not self._announced:

@@ -40,11 +40,6 @@ def open_recording(uri: str, recipe: Recipe, catalog: Catalog) -> FrameSource:
 def reopen_recording(uri: str, recipe: Mapping[str, Any], catalog: Catalog) -> FrameSource:
     """Open ``uri`` as the run did whose recipe a stream carries (``StreamMeta.recipe``).
 
-    Arguments:
-        uri: as ``--source`` takes it.
-        recipe: as a stream carries it.
-        catalog: of the parts that are installed.
-
     Raises RecipeError when the stream's recipe has data options that this version does not know, else as
     :func:`open_recording`.
     """

@@ -64,19 +64,7 @@ def run(
     first_frame: PlayerState | None = None,
     listener: RunListener | None = None,
 ) -> RunResult:
-    """Encode a recording into ``out`` (stream.gss, metrics.jsonl, recipe.yaml).
-
-    Arguments:
-        parts: the live parts of the recipe.
-        quiet: show no progress.
-        source: an open recording (``engine.run.recording.open_recording``) at the recipe's scale; the caller closes it.
-        out: a prepared output folder.
-        resume: continue the run that ``out`` holds; the recipe must be the same.
-        measure: render and compare the test cameras of every frame.
-        first_frame: frame 0 of another stream (``engine.run.recording.read_first_frame``), taken over instead of being
-            reconstructed again.
-        listener: told of every frame before and after it is encoded.
-    """
+    """Encode a recording into ``out`` (stream.gss, metrics.jsonl, recipe.yaml)."""
     parts = limit_memory(parts, source.info)
     doing = _Run(parts, source, out, quiet, measure, first_frame, listener or RunListener())
     return doing.encode(resume)

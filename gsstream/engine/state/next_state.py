@@ -26,13 +26,7 @@ def next_state(state: StreamState, player: PlayerState) -> StreamState:
 
 
 def next_hierarchy(hierarchy: Hierarchy, births: AddedGaussians | None, layout: Layout) -> Hierarchy:
-    """Return the forest after births and deaths. Old nodes stay, also empty ones.
-
-    Arguments:
-        hierarchy: before.
-        births: rows that joined, with their new nodes; or None.
-        layout: after births and deaths.
-    """
+    """Return the forest after births and deaths. Old nodes stay, also empty ones."""
     parents, levels = hierarchy.parent, hierarchy.level
     if births is not None and len(births.parents):
         parents = torch.cat([parents, torch.from_numpy(births.parents.astype(np.int64))])

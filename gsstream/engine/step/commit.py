@@ -14,11 +14,6 @@ def commit_session(view: EngineContext, scene: Scene, delta: Delta, player: Play
     """Return the session of the decoded scene, in which everything that did not change is still projected and sorted.
 
     None where keeping costs more than it saves: rows came or went, or most of them changed.
-
-    Arguments:
-        view: the frame, seen from ``scene``.
-        scene: after the frame's motions, before its residual.
-        delta: what was sent. player: what it was decoded to.
     """
     if delta.has_row_edit:
         return None

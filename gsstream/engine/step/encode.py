@@ -17,15 +17,7 @@ from gsstream.packet.changes.motion import encode_motions
 def encode_frame(
     delta: Delta, before: PlayerState, frame: int, solution: Solution, trim: float, budget: int | None = None
 ) -> TrimmedDelta:
-    """Return the delta and its packet, made to fit ``budget``, else less the share ``trim``.
-
-    Arguments:
-        delta: what the frame is to change. before: what players have before it.
-        frame: index of the frame.
-        solution: what the optimisation found.
-        trim: share of the bytes to be given up where no size is asked for, 0 to 1.
-        budget: bytes that the frame may take; None: no limit.
-    """
+    """Return the delta and its packet, made to fit ``budget``, else less the share ``trim``."""
     # Packets of the same motions are made several times, and motions are never trimmed.
     motions = delta.motions
     encoded = partial(delta_packet, before, frame=frame, known=(motions, encode_motions(motions)))

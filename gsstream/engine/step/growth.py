@@ -14,13 +14,6 @@ from gsstream.parts.growth.none import NoGrowth
 def with_growth(parts: Assembly, state: StreamState, delta: Delta, view: EngineContext, rng: Rng) -> Delta:
     """Return the delta with the rows that leave and those that join.
 
-    Arguments:
-        parts: the live parts of the recipe.
-        state: after the frame before.
-        delta: motions and residual of this frame.
-        view: the frame as parts see it.
-        rng: random streams by name and frame.
-
     Raises ComponentError when the part fails, or proposes what does not fit the scene.
     """
     if isinstance(parts.part("growth"), NoGrowth):

@@ -18,10 +18,6 @@ def level_schedule(stream: Stream, unit_of: IntArray) -> tuple[tuple[float, int]
     schedule over empty levels would hold nobody back. It starts at level floor(H / 2); each finer level's stage is
     omega times longer, N_{i+1} = omega N_i. Empty when the recipe does not ask for it or there is nothing to hold back.
     The paper leaves omega and the treatment of inactive levels open: here they keep their previous attributes.
-
-    Arguments:
-        stream: of the recipe.
-        unit_of: [N] level of every Gaussian of the scene.
     """
     if not stream.progressive:
         return ()

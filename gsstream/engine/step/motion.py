@@ -36,15 +36,6 @@ def propose_motion(
 ) -> Moved:  # fmt: skip
     """Ask the motion part, and apply what it proposes as every player will.
 
-    Arguments:
-        parts: the live parts of the recipe.
-        state: after the frame before.
-        frame: training images of this frame.
-        change: what changed in them; None: everything counts as changed.
-        rng: random streams by name and frame.
-        allowance: what the frame may spend. Motions that would take more than their share of its bytes are left out:
-            nothing trims them, and a frame that is too large for its residual too would be given up as a whole.
-
     Raises ComponentError when the part fails, or proposes motions that do not fit the scene or cannot be sent.
     """
     scene = state.player.scene

@@ -25,11 +25,6 @@ def quantise_residual(parts: Assembly, problem: Problem, solution: Solution) -> 
 
     A gate behind which every symbol is zero is closed: it would cost bits and change nothing.
 
-    Arguments:
-        parts: the live parts of the recipe.
-        problem: what the optimisation was given.
-        solution: what it found.
-
     Raises ComponentError when what was learned cannot be sent: not finite, or beyond symbols of 32 bits.
     """
     check_solution(parts, problem, solution)
@@ -56,13 +51,7 @@ def quantise_residual(parts: Assembly, problem: Problem, solution: Solution) -> 
 
 
 def check_solution(parts: Assembly, problem: Problem, solution: Solution) -> None:
-    """Raise ComponentError unless what was learned can be sent: finite, and residuals within 32 bit symbols.
-
-    Arguments:
-        parts: the live parts of the recipe.
-        problem: what the optimisation was given.
-        solution: what it found.
-    """
+    """Raise ComponentError unless what was learned can be sent: finite, and residuals within 32 bit symbols."""
     codes, look = scale_steps(parts.update.codes(), problem.step_scale), Look(
         parts.checks, "update", parts.part("update"), parts.where
     )

@@ -31,13 +31,7 @@ REPAIRS: tuple[tuple[str, str, Repair], ...] = (
 
 
 def check_matches(cameras: Cameras, pairs: list[PairMatches], *, rig_only: bool = False) -> list[Finding]:
-    """Judge every camera by the matches with all others.
-
-    Arguments:
-        cameras: at the size of the images that were matched.
-        pairs: verified matches of a pose-free geometry; pairs with fewer than 30 matches are not counted.
-        rig_only: only say what is wrong with the rig as a whole.
-    """
+    """Judge every camera by the matches with all others."""
     pairs = [pair for pair in pairs if len(pair.first) >= MIN_MATCHES]
     limit = max(1.0, TOLERANCE * cameras.width)
     if len(pairs) < 2:

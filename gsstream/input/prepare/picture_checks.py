@@ -27,11 +27,6 @@ class Thumbnails:
 def read_thumbnails(source: FrameSource, cameras: Cameras, frames: int) -> Thumbnails:
     """Read the first ``frames`` frames of all ``cameras``.
 
-    Arguments:
-        source: an open recording.
-        cameras: ids.
-        frames: how many, from the first.
-
     Raises SourceError for the first image that cannot be read.
     """
     pairs = ((source.frame(t, "train").images, source.frame(t, "test").images) for t in range(frames))

@@ -36,9 +36,6 @@ def first_look(source: FrameSource) -> list[Finding]:
     A part of ``scene validate`` that takes a fraction of a second. Pictures of a recording that still grows are not
     waited for.
 
-    Arguments:
-        source: an open recording.
-
     Raises SourceError when frame 0 cannot be read.
     """
     source = to_file_coordinates(source)
@@ -56,11 +53,7 @@ def first_look(source: FrameSource) -> list[Finding]:
 
 
 def check_poses(frame: Frame) -> list[Finding]:
-    """Find poses that explain the pictures of one instant much better when they are read by another convention.
-
-    Arguments:
-        frame: the training images of at least three cameras.
-    """
+    """Find poses that explain the pictures of one instant much better when they are read by another convention."""
     if len(frame.cameras) < 3:
         return []
     images, cameras = _small(frame)

@@ -74,12 +74,6 @@ class Prepared:
 def prepare(raw: Path, out: Path, options: PrepareOptions, say: Say) -> Prepared:
     """Make the scene ``out`` (cameras.json, pictures, points_frame0.npz).
 
-    Arguments:
-        raw: folder with the raw recording.
-        out: folder to make.
-        options: lens, test cameras, size.
-        say: called with lines for a person.
-
     Raises SourceError for a raw recording that cannot be read, InputError when structure from motion fails or finds
     fewer than two training cameras, OutputError when ``out`` exists and is not an empty folder.
     """

@@ -14,14 +14,7 @@ REPORT, PICTURE = "report.md", "scene.png"
 
 
 def write_report(out: Path, made: Prepared, found: list[Finding], seconds: float) -> list[Path]:
-    """Write both into the scene's folder; return their paths.
-
-    Arguments:
-        out: folder of the scene.
-        made: what was made of the raw recording.
-        found: findings about the scene.
-        seconds: that each step took.
-    """
+    """Write both into the scene's folder; return their paths."""
     mapping = made.mapping
     errors = mapping.camera_error[np.isfinite(mapping.camera_error)]
     lines = [

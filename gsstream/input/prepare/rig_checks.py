@@ -46,11 +46,6 @@ def check_placement(cameras: Cameras, train: int, points: PointCloud | None) -> 
     """Find two cameras in one place, a camera far from all others, and points in another unit.
 
     ``train``: the first so many cameras train.
-
-    Arguments:
-        cameras: training cameras, then test cameras.
-        train: how many of them train.
-        points: that ship with the recording, or None.
     """
     found = []
     centers = cameras.centers

@@ -48,10 +48,6 @@ def undistortion(lens: Lens, size: tuple[int, int], target: tuple[int, int]) -> 
 
     The principal point is the lens's.
 
-    Arguments:
-        lens: model, parameters and size of the raw pictures.
-        size, target: (width, height) of the raw and of the pinhole pictures; of another shape, they are cut evenly.
-
     Raises InputError when no pinhole up to three times the lens's focal length is covered (a wrong lens model).
     """
     base = cut_to(lens.K, size, target)

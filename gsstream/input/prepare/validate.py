@@ -34,13 +34,7 @@ Open = Callable[[float], FrameSource]
 
 
 def validate(open_scene: Open, *, frames: int = FRAMES, features: bool = True) -> list[Finding]:
-    """Return findings about a recording, errors first; none when it is fine.
-
-    Arguments:
-        open_scene: opens the recording at a scale in (0, 1].
-        frames: how many frames, from the first, have their pictures compared.
-        features: match features between the cameras at frame 0 (needs pycolmap; most of the time goes here).
-    """
+    """Return findings about a recording, errors first; none when it is fine."""
     try:
         source = open_scene(1.0)
     except SourceError as fault:

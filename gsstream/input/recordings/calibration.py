@@ -40,12 +40,6 @@ class Calibration:
 def read_calibration(folder: Path, *, growing: bool = False, to_size: bool = False) -> Calibration:
     """Read and check ``folder/cameras.json``.
 
-    Arguments:
-        folder: of the recording.
-        growing: the number of frames may be left out.
-        to_size: cameras of several sizes are given as they are once cut to the smallest width and height, where
-            pictures are about to be brought to that size; else they are an error.
-
     Raises SourceError saying which file, camera or key is wrong, and what was expected.
     """
     if not folder.is_dir():
@@ -118,13 +112,7 @@ def _rig(path: Path, ids: list[str], cameras: list[dict[str, Any]], to_size: boo
 
 
 def cut_to(K: np.ndarray[Any, Any], size: tuple[int, int], target: tuple[int, int]) -> np.ndarray[Any, Any]:
-    """Return intrinsics [3, 3] of pictures shrunk evenly until they cover ``target``, and cut around their middle.
-
-    Arguments:
-        K: [3, 3] before, pixels, corner origin.
-        size, target: (width, height) before and after. Sides whose shares agree within a pixel are shrunk each by its
-            own share, so that rounded heights cut nothing.
-    """
+    """Return intrinsics [3, 3] of pictures shrunk evenly until they cover ``target``, and cut around their middle."""
     across, down = target[0] / size[0], target[1] / size[1]
     if abs(across * size[1] - target[1]) < 1:
         scaled: np.ndarray[Any, Any] = np.diag([across, down, 1.0]) @ K

@@ -20,9 +20,6 @@ def recording_similarity(source: FrameSource) -> World:
     """Return the world that a recording's cameras define, training and test cameras together.
 
     So it does not depend on the split.
-
-    Arguments:
-        source: an open recording, in the coordinates of its files.
     """
     train, test = source.info.train, source.info.test
     rig = replace(
@@ -38,9 +35,6 @@ def to_file_coordinates(source: FrameSource) -> FrameSource:
     """Return a recording in the coordinates of its files, for checks of what the files say.
 
     Poses that were written the wrong way round are mended by inverting them in those coordinates, and in no others.
-
-    Arguments:
-        source: an open recording; closing it closes the result.
     """
     return source.filed if isinstance(source, CanonicalSource) else source
 

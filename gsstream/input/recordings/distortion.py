@@ -63,12 +63,6 @@ def pinhole_intrinsics(lens: Lens, K: FloatArray, size: tuple[int, int], where: 
 
     Size and principal point stay.
 
-    Arguments:
-        lens: the distortion to be removed.
-        K: [3, 3] of the distorted camera, pixels, corner origin.
-        size: (width, height).
-        where: the camera, for the message.
-
     Raises SourceError when no such image exists (coefficients that fold the picture over itself).
     """
     width, height = size

@@ -27,12 +27,6 @@ def read_image(
 ) -> FloatArray:
     """Decode an image and average it down.
 
-    Arguments:
-        path: of the file.
-        size: (width, height) that it must have.
-        target: (width, height) of the result.
-        declared: who says the size, for the message.
-
     Returns [h, w, 3] float32 in [0, 1]; grey images are repeated over the three channels.
     Raises SourceError naming the file when it is missing, damaged, of another size, or of an unsupported kind.
     """

@@ -70,9 +70,6 @@ class MultiviewSource:
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
         """Return points of frame 0 that ship with the recording, or None when it ships none.
 
-        Arguments:
-            kind: "recording": arrays ``xyz``, ``rgb``; "sparse": ``sparse_xyz``, ``sparse_rgb``.
-
         Raises SourceError when the file is damaged or does not hold the asked kind.
         """
         path = self._folder / POINTS_FILE

@@ -23,11 +23,6 @@ _KNOWN = (
 def open_source(uri: str, scale: float = 1.0) -> FrameSource:
     """Open a recording.
 
-    Arguments:
-        uri: ``demo``, ``synthetic:key=value&...``, ``watch:DIR?key=value&...``, the path of a folder in a known layout,
-            LAYOUT:DIR, or ``disturbed:key=value,...:`` before any of these.
-        scale: images are shrunk by this factor in (0, 1] on reading.
-
     Raises SourceError for an unknown uri, naming what exists, and for a faulty recording.
     """
     if uri == "demo":

@@ -42,13 +42,7 @@ class Sphere:
     surface: Surface
 
     def distance(self, origin: FloatArray, rays: FloatArray, center: FloatArray) -> FloatArray:
-        """Return [P]: ray parameter of the first hit in front of the origin, or 1e9.
-
-        Arguments:
-            origin: [3] where all rays begin.
-            rays: [P, 3] directions.
-            center: [3] of the shape.
-        """
+        """Return [P]: ray parameter of the first hit in front of the origin, or 1e9."""
         offset = (origin - center).astype(np.float32)
         a = np.einsum("pi,pi->p", rays, rays)
         b = np.einsum("pi,pi->p", rays, np.broadcast_to(offset, rays.shape))
@@ -72,13 +66,7 @@ class Box:
     room: bool = False
 
     def distance(self, origin: FloatArray, rays: FloatArray, center: FloatArray) -> FloatArray:
-        """Return [P]: ray parameter of the first hit in front of the origin, or 1e9 (slab method).
-
-        Arguments:
-            origin: [3] where all rays begin.
-            rays: [P, 3] directions.
-            center: [3] of the shape.
-        """
+        """Return [P]: ray parameter of the first hit in front of the origin, or 1e9 (slab method)."""
         offset = (origin - center).astype(np.float32)
         enter, leave = np.full(len(rays), -_FAR), np.full(len(rays), _FAR)
         # Axis by axis: numpy reduces over a last axis of three ten times slower than over columns.
@@ -116,13 +104,7 @@ class Hits:
 
 
 def cast(origin: FloatArray, rays: FloatArray, shapes: list[Placed]) -> Hits:
-    """Return the first hits of rays [P, 3] from one origin [3]; where nothing is hit, distance 1e9 and zeros.
-
-    Arguments:
-        origin: [3] where all rays begin.
-        rays: [P, 3] directions.
-        shapes: that may be hit.
-    """
+    """Return the first hits of rays [P, 3] from one origin [3]; where nothing is hit, distance 1e9 and zeros."""
     distances = np.stack([shape.distance(origin, rays, center) for shape, center in shapes])
     first, distance = distances.argmin(0), distances.min(0)
     albedo, normal = np.zeros_like(rays), np.zeros_like(rays)
@@ -134,13 +116,7 @@ def cast(origin: FloatArray, rays: FloatArray, shapes: list[Placed]) -> Hits:
 
 
 def lit(points: FloatArray, light: FloatArray, shapes: list[Placed]) -> BoolArray:
-    """Return [P] bool: no shape stands between a point and the light, which shines from direction ``light`` [3].
-
-    Arguments:
-        points: [P, 3] scene units.
-        light: [3] direction.
-        shapes: that may stand between.
-    """
+    """Return [P] bool: no shape stands between a point and the light, which shines from direction ``light`` [3]."""
     rays = np.broadcast_to(light.astype(np.float32), points.shape)
     free = np.ones(len(points), bool)
     for shape, center in shapes:

@@ -79,11 +79,6 @@ class SyntheticSource:
     @classmethod
     def from_query(cls, query: str, *, scale: float = 1.0, uri: str | None = None) -> SyntheticSource:
         """Build from ``"frames=40&views=8"``. Raises SourceError naming the option that is unknown or out of range.
-
-        Arguments:
-            query: options of the URI.
-            scale: factor on the image size, in (0, 1].
-            uri: for messages and for the stream.
         """
         known = ", ".join(SyntheticOptions.model_fields)
         try:

@@ -45,12 +45,7 @@ def object_centers(phase: float) -> dict[str, FloatArray]:
 
 
 def arc_cameras(views: int, width: int, height: int) -> Cameras:
-    """Return the test camera in the middle of the arc, then ``views`` cameras over 120 degrees.
-
-    Arguments:
-        views: training cameras.
-        width, height: pixels.
-    """
+    """Return the test camera in the middle of the arc, then ``views`` cameras over 120 degrees."""
     target = np.array([0.0, 0.0, 0.4])
     angles = np.concatenate([[0.0], np.radians(np.linspace(-60, 60, views))])
     heights = np.concatenate([[1.3], np.where(np.arange(views) % 2 == 0, 1.0, 1.6)])

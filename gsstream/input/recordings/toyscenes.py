@@ -94,12 +94,7 @@ class ToyScene:
         return FLASH if self.name == "flash" and index == self.event else 1.0
 
     def shown(self, camera: int, index: int) -> int:
-        """Return the frame whose picture a training camera delivers: when it drops out, the last one it has taken.
-
-        Arguments:
-            camera: number in the training rig, from 0; number 1 drops out.
-            index: of the frame.
-        """
+        """Return the frame whose picture a training camera delivers: when it drops out, the last one it has taken."""
         out = self.name == "dropout" and camera == 1 and self.event <= index < self.event + DROPPED
         return self.event - 1 if out else index
 

@@ -43,10 +43,6 @@ SPLITS: tuple[Split, ...] = ("train", "test")
 def transformed(source: FrameSource, options: DataOptions) -> FrameSource:
     """Return ``source`` as ``options`` want it; the very same object when they change nothing.
 
-    Arguments:
-        source: an open recording.
-        options: section ``data`` of the recipe.
-
     Raises SourceError when an option names a camera that does not exist or leaves nothing to train on.
     """
     return source if options.touches_nothing else TransformedSource(source, options)

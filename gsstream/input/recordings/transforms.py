@@ -70,11 +70,6 @@ class ChosenSplit(NamedTuple):
 def choose_split(options: DataOptions, train: Cameras, test: Cameras) -> ChosenSplit:
     """Return who trains and who judges, as the options of a recipe ask for.
 
-    Arguments:
-        options: section ``data`` of the recipe; of it ``split``, ``test_cameras``, ``train_cameras``, ``train_views``
-            and ``leak``.
-        train, test: cameras of the recording's own split.
-
     Raises SourceError for unknown or repeated ids, a camera on both sides, no training camera left, or a leak in the
     tuning split.
     """
@@ -169,13 +164,7 @@ def _centers(names: tuple[str, ...], train: Cameras, test: Cameras) -> FloatArra
 
 
 def gain_at(options: Disturbances, index: int, rng: Rng) -> float:
-    """Return the factor on all images of frame ``index``, in gain * [1 - amplitude, 1 + amplitude].
-
-    Arguments:
-        options: the disturbances.
-        index: of the frame.
-        rng: random streams by name and frame.
-    """
+    """Return the factor on all images of frame ``index``, in gain * [1 - amplitude, 1 + amplitude]."""
     if options.gain_pattern == "sine":
         wave = math.sin(2 * math.pi * index / options.gain_period)
     else:
@@ -192,30 +181,14 @@ def with_gain(image: FloatArray, factor: float) -> FloatArray:
 
 
 def with_noise(image: FloatArray, sigma: float, camera: str, index: int, rng: Rng) -> FloatArray:
-    """Return the image with Gaussian noise of ``sigma`` 8-bit levels, clipped to [0, 1] (paper, first-frame noise).
-
-    Arguments:
-        image: [H, W, 3] in [0, 1].
-        sigma: 8-bit levels.
-        camera: id.
-        index: of the frame.
-        rng: random streams by name and frame.
-    """
+    """Return the image with Gaussian noise of ``sigma`` 8-bit levels, clipped to [0, 1] (paper, first-frame noise)."""
     noise = rng.numpy(f"data noise {camera}", index).standard_normal(image.shape, np.float32)
     out: FloatArray = np.clip(image + noise * np.float32(sigma / 255), 0, 1)
     return out
 
 
 def is_lost(options: Disturbances, losses: dict[str, list[range]], camera: str, index: int, rng: Rng) -> bool:
-    """Say whether a training camera gives nothing at a frame; never at frame 0.
-
-    Arguments:
-        options: the disturbances.
-        losses: camera -> frames in which it gives nothing.
-        camera: id.
-        index: of the frame.
-        rng: random streams by name and frame.
-    """
+    """Say whether a training camera gives nothing at a frame; never at frame 0."""
     if index == 0:
         return False
     if any(index in frames for frames in losses.get(camera, ())):

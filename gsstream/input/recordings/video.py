@@ -173,11 +173,6 @@ class VideoClip:
 def upright(pixels: np.ndarray[Any, Any], rotation: int, path: Path) -> np.ndarray[Any, Any]:
     """Turn [H, W, 3] pixels counterclockwise by what the file's display matrix says, degrees.
 
-    Arguments:
-        pixels: [H, W, 3].
-        rotation: degrees.
-        path: of the file, for the error.
-
     Raises SourceError for an angle that is no multiple of 90.
     """
     quarters = _quarters(path, rotation)

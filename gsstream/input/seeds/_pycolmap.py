@@ -50,10 +50,6 @@ def extract(folder: Path, most: int, mode: str = "PER_IMAGE", model: str = "SIMP
 
     Images are worked on at the same time, so they are finished in any order; the database that is returned has them in
     the order of their names, and so the same input gives the same numbers whatever the machine.
-
-    Arguments:
-        folder: that holds ``images``. most: features per image.
-        mode: how cameras are shared among images, in COLMAP's words. model: lens model, COLMAP's name.
     """
     pycolmap.set_random_seed(0)
     scratch, database = folder / "features.db", folder / "database.db"
@@ -138,10 +134,6 @@ def observations(reconstruction: Any, points: Any, order: list[int]) -> dict[str
     """Return who saw each point: ``seen_point`` [S], ``seen_image`` [S], ``seen_error`` [S] pixels.
 
     An image is given by the number in its name.
-
-    Arguments:
-        reconstruction: COLMAP's. points: its points, by id.
-        order: ids of the points, in the order of the rows.
     """
     point, image, off = [], [], []
     for row, key in enumerate(order):

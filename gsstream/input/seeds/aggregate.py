@@ -10,12 +10,6 @@ from gsstream.core.shapes import FloatArray
 def aggregate(cost: FloatArray, guide: FloatArray, step: float, jump: float, edge: float = 0.03) -> FloatArray:
     """Sum of the path costs from left, right, above and below.
 
-    Arguments:
-        cost: [D, H, W] float32 matching cost.
-        guide: [H, W] grey image in [0, 1]; depth may jump more cheaply across its edges.
-        step, jump: cost of changing by one plane, and by more.
-        edge: grey difference that halves the jump cost.
-
     Returns [D, H, W] float32.
     """
     down = _both_ways(np.ascontiguousarray(cost.transpose(1, 0, 2)), guide, step, jump, edge)

@@ -31,13 +31,7 @@ class Agreement:
 
 
 def agreement(depths: FloatArray, cameras: Cameras, tolerance: float) -> Agreement:
-    """Compare every pixel's point with all other depth maps; ``tolerance`` is relative to the depth.
-
-    Arguments:
-        depths: [C, H, W] scene units.
-        cameras: the C cameras.
-        tolerance: largest difference that agrees, relative to the depth.
-    """
+    """Compare every pixel's point with all other depth maps; ``tolerance`` is relative to the depth."""
     shape = (len(cameras), cameras.height * cameras.width)
     support, violation = np.zeros(shape, np.int16), np.zeros(shape, np.int16)
     for view in range(len(cameras)):
@@ -55,13 +49,7 @@ def agreement(depths: FloatArray, cameras: Cameras, tolerance: float) -> Agreeme
 
 
 def world_points(depths: FloatArray, cameras: Cameras, view: int) -> FloatArray:
-    """Return [H W, 3]: the points of one depth map.
-
-    Arguments:
-        depths: [C, H, W] scene units.
-        cameras: the C cameras.
-        view: index of one of them.
-    """
+    """Return [H W, 3]: the points of one depth map."""
     return unproject(pixel_centers(cameras.width, cameras.height), depths[view].reshape(-1), cameras, view)
 
 
@@ -70,11 +58,6 @@ def interpolate_depths(depths: FloatArray, known: BoolArray, iterations: int = 3
 
     Inverse depth of a plane is linear in the pixel position, and a harmonic function reproduces linear ones: walls and
     floors without texture are bridged exactly. Views without any known pixel stay as they are.
-
-    Arguments:
-        depths: [C, H, W] scene units.
-        known: [C, H, W] bool.
-        iterations: of the relaxation.
     """
     wanted = known | ~known.any(axis=(1, 2), keepdims=True)
     inverse = 1 / depths
@@ -111,12 +94,6 @@ def color_gains(images: FloatArray, depths: FloatArray, accepted: BoolArray, cam
 
     Robust: the median ratio over accepted points seen by each pair of cameras (at least 50 of them, neither dark nor
     saturated), then least squares over the pairs. Cameras that share no points get 1.
-
-    Arguments:
-        images: [C, H, W, 3] in [0, 1].
-        depths: [C, H, W] scene units.
-        accepted: [C, H, W] bool: pixels whose depth is trusted.
-        cameras: the C cameras.
     """
     count = len(cameras)
     rows: list[FloatArray] = []

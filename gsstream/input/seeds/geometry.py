@@ -14,9 +14,6 @@ def visible_views(points: FloatArray, cameras: Cameras) -> BoolArray:
 
     Occlusion is not considered.
 
-    Arguments:
-        points: [P, 3] scene units.
-
     Returns [P, C] bool.
     """
     visible = np.zeros((len(points), len(cameras)), bool)
@@ -46,13 +43,7 @@ def focus_point(cameras: Cameras) -> FloatArray:
 
 
 def depth_range(cameras: Cameras, near: float = 0.3, far: float = 4.0) -> FloatArray:
-    """Return [C, 2]: nearest and farthest planar depth worth searching, scene units.
-
-    Arguments:
-        cameras: the C cameras.
-        near, far: multiples of each camera's distance to the rig's focus. The far end is at least 1.3 times the
-            distance to the farthest other camera, so that an inside-out dome reaches its opposite wall.
-    """
+    """Return [C, 2]: nearest and farthest planar depth worth searching, scene units."""
     centers = cameras.centers
     gaps = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     distance = np.linalg.norm(centers - focus_point(cameras), axis=1)
@@ -67,11 +58,6 @@ def neighbour_views(cameras: Cameras, count: int, least_angle: float = 5.0) -> I
     They are nearest in direction seen from the focus.
 
     Angles under ``least_angle`` degrees give poor depth and are put back in the order.
-
-    Arguments:
-        cameras: the C cameras.
-        count: partners of each, at most.
-        least_angle: degrees.
     """
     outward = cameras.centers - focus_point(cameras)
     outward = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12)

@@ -72,14 +72,6 @@ def reconstruct(
 ) -> Mapping:  # fmt: skip
     """Map C images [H, W, 3] in [0, 1] of one instant; of different sizes, unless they share a lens.
 
-    Arguments:
-        images: C images of one instant, [H, W, 3] each.
-        model: lens model, a key of LENSES.
-        shared: all cameras have one lens.
-        held: indices of cameras (test cameras) that take no part: no feature of theirs moves a pose or a point; they
-            are registered against the finished points.
-        timeout: seconds after which the process is ended.
-
     The same input gives the same result. Raises InputError when pycolmap is missing or finds nothing to begin with.
     """
     if model not in LENSES:
@@ -99,11 +91,6 @@ def triangulate(images: FloatArray, cameras: Cameras, *, timeout: float = 1800.0
     """Triangulate points of [C, H, W, 3] images in [0, 1] with known poses and pinhole lenses.
 
     Each comes with what every camera saw.
-
-    Arguments:
-        images: [C, H, W, 3] in [0, 1].
-        cameras: the C cameras.
-        timeout: seconds.
     """
     with tempfile.TemporaryDirectory(prefix="gsstream-sfm-") as name:
         folder = Path(name)
@@ -127,13 +114,7 @@ def _mapping(found: dict[str, Any], viewmats: FloatArray, lenses: tuple[Lens, ..
 
 
 def lens_places(lens: Lens, size: tuple[int, int], rays: FloatArray) -> FloatArray:
-    """Return pixels [M, 2] at which a lens shows the directions ``rays`` [M, 2] (x / z, y / z).
-
-    Arguments:
-        lens: model and parameters.
-        size: (width, height).
-        rays: [M, 2] x / z and y / z.
-    """
+    """Return pixels [M, 2] at which a lens shows the directions ``rays`` [M, 2] (x / z, y / z)."""
     with tempfile.TemporaryDirectory(prefix="gsstream-lens-") as name:
         folder = Path(name)
         np.savez(folder / "lens.npz", model=lens.model, params=np.array(lens.params), size=np.array(size), rays=rays)

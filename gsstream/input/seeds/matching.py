@@ -24,10 +24,6 @@ class PairMatches:
 def match_images(images: FloatArray, *, timeout: float = 900.0) -> list[PairMatches]:
     """Match SIFT features of all pairs; keep those of one two-view geometry (fundamental matrix or homography).
 
-    Arguments:
-        images: [C, H, W, 3] float32 in [0, 1].
-        timeout: seconds after which the process is ended.
-
     The same input gives the same matches. Raises InputError when pycolmap is not installed or its process fails.
     """
     with tempfile.TemporaryDirectory(prefix="gsstream-match-") as name:

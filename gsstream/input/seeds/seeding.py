@@ -49,15 +49,6 @@ def photo_consistent_seeds(
 ) -> PhotoSeeds:
     """Find points that several views agree on: plane sweep, cross-view check, bridging of plain surfaces, thinning.
 
-    Arguments:
-        settings: of the search.
-        images: [C, H, W, 3] float32 in [0, 1]; 160 to 320 pixels wide is enough, time grows with pixels times C.
-        cameras: C >= 3 training cameras of that size.
-        count: at most this many seeds.
-        tolerance: relative depth difference that still counts as agreement.
-        min_support: other views that must agree.
-        dominance: supporters needed per view that sees through the point (twice as many for bridged pixels).
-
     Raises InputError for fewer than three cameras and when no two views agree anywhere.
     """
     check_shape("images", images, (len(cameras), cameras.height, cameras.width, 3))
@@ -111,17 +102,6 @@ def fill_volume(
 
     A seed must be seen by ``min_views`` training cameras, keep ``min_distance`` from each of them, and fall on image
     cells without a point in most of the views that see it. Depth is uniform between the rig's near and far end.
-
-    Arguments:
-        cameras: the C cameras.
-        min_views: training cameras that must see a seed.
-        rng: random numbers, numpy.
-        points: what exists already, or None.
-        images: [C, H, W, 3] float32 in [0, 1], for colours: the median over the views that see a seed.
-        count: seeds wanted; fewer come back when little is uncovered.
-        min_distance: scene units.
-        cell: side of the cells, in pixels.
-        attempts: batches of ``count`` candidates tried at most.
     """
     check_shape("images", images, (len(cameras), cameras.height, cameras.width, 3))
     covered = _covered_cells(points, cameras, cell)

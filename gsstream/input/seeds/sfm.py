@@ -26,12 +26,6 @@ def triangulate_points(
 
     Runs in a process of its own, so that an abort inside the native library does not take this one down.
 
-    Arguments:
-        cameras: the C cameras.
-        images: [C, H, W, 3] float32 in [0, 1] of C >= 2 training cameras.
-        max_error: points with a larger mean reprojection error are dropped, pixels.
-        timeout: seconds after which the process is ended.
-
     Returns points in scene units with the mean colour of their features. The same input gives the same points.
     Raises InputError when pycolmap is not installed, when the process fails, and when nothing could be triangulated.
     """
@@ -70,11 +64,6 @@ def write_rig(folder: Path, cameras: Cameras) -> None:
 
 def run_pycolmap(task: str, folder: Path, timeout: float) -> None:
     """Run one task of ``gsstream.input.seeds._pycolmap`` on a folder, in a process of its own.
-
-    Arguments:
-        task: name of a function there.
-        folder: with its input; its output goes there, too.
-        timeout: seconds.
 
     Raises InputError when pycolmap is not installed, and when the process fails or takes more than ``timeout`` seconds.
     """

@@ -50,11 +50,6 @@ class SweepSettings:
 def sweep_depths(images: FloatArray, cameras: Cameras, settings: SweepSettings) -> FloatArray:
     """Return the planar depth of every pixel of every view, right or wrong: nothing is rejected here.
 
-    Arguments:
-        cameras: the C cameras.
-        settings: of the search.
-        images: [C, H, W, 3] float32 in [0, 1] of C >= 2 cameras.
-
     Returns [C, H, W] float32, scene units. Deterministic for any number of workers.
     """
     check_shape("images", images, (len(cameras), cameras.height, cameras.width, 3))
@@ -86,13 +81,6 @@ def agreement(images: FloatArray, cameras: Cameras, settings: SweepSettings, *, 
     """Return how much of the texture of some views lies, at some depth, where the nearest cameras see the same.
 
     A wrong depth seldom looks right, so that poses that do not fit the images agree about next to nothing.
-
-    Arguments:
-        images: [C, H, W, 3] float32 in [0, 1] of C >= 2 cameras.
-        cameras: the C cameras.
-        settings: of the search; texture counts from three times its noise.
-        views: how many of the cameras are looked at, spread over all of them.
-        limit: largest matching cost, 0 to 1, that counts as the same; an uncorrelated match costs 0.5.
 
     Returns the mean over views of the share, 0 to 1, of their textured pixels; 0 where none has texture.
     """

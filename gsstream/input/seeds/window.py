@@ -7,12 +7,7 @@ import torch.nn.functional as F
 
 
 def window_mean(images: torch.Tensor, half: int) -> torch.Tensor:
-    """Return the mean over a square of 2 half + 1 pixels around every pixel; borders are replicated.
-
-    Arguments:
-        images: [N, 1, H, W] float32.
-        half: half width of the square in pixels, >= 0; 0: the pixel itself.
-    """
+    """Return the mean over a square of 2 half + 1 pixels around every pixel; borders are replicated."""
     side = 2 * half + 1
     padded = F.pad(images, (half, half, half, half), mode="replicate")
     return _window_sum(_window_sum(padded, -1, side), -2, side) / (side * side)

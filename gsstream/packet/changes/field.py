@@ -44,13 +44,7 @@ def encode_field(change: Field) -> list[tuple[str, bytes]]:
 
 
 def decode_field(section: Section, scene: Scene, motions: tuple[Motion, ...]) -> Field:
-    """Return the field of a frame. Raises PacketError.
-
-    Arguments:
-        section: of the packet.
-        scene: that of the frame before.
-        motions: of the same packet; which entries a field is sent of depends on where they lead.
-    """
+    """Return the field of a frame. Raises PacketError."""
     with add_offset(section.offset):
         try:
             return _decode(section.data, apply_motions(scene, motions)[0])

@@ -48,11 +48,6 @@ def encode_residual(
 ) -> list[tuple[str, bytes]]:
     """Return the sections of a residual, in order.
 
-    Arguments:
-        residual: its decoders must come from :func:`quantise_decoders`.
-        layout: that of the scene it applies to.
-        previous_decoders: the decoders last sent since the last key packet.
-
     Raises ShapeError when the residual does not fit the layout.
     """
     _check_residual(residual, layout)
@@ -77,13 +72,7 @@ def encode_residual(
 def decode_residual(
     sections: Mapping[str, Section], layout: Layout, previous_decoders: Mapping[str, FloatArray]
 ) -> Residual | None:
-    """Return the residual that the sections of a delta packet hold, if they hold one. Raises PacketError.
-
-    Arguments:
-        sections: name -> section of the packet.
-        layout: nodes and units before the frame.
-        previous_decoders: the decoders last sent since the last key packet.
-    """
+    """Return the residual that the sections of a delta packet hold, if they hold one. Raises PacketError."""
     if "gates" not in sections:
         strange = [name for name in ("pattern", "decoders", *ATTRIBUTES) if name in sections]
         if strange:

@@ -109,12 +109,6 @@ def encode_added(births: AddedGaussians, num_nodes: int) -> bytes:
 def decode_added(section: Section, num_nodes: int, num_units: int, most: int) -> AddedGaussians:
     """Decode births into a scene of M nodes and H units that may grow by ``most`` Gaussians.
 
-    Arguments:
-        section: of the packet.
-        num_nodes: M.
-        num_units: H.
-        most: Gaussians that may be added.
-
     Raises PacketError (without offset where it is that of the section).
     """
     blobs = unpack_blobs(section.data, HEAD_PARTS + len(ATTRIBUTES))

@@ -32,12 +32,6 @@ def known_groups(scene: Scene, cameras: Cameras, pixels: float, shades: int) -> 
     """Return the groups that the scene has had since the last key packet, else those of a grid.
 
     A cell that is known stays: it was measured on the scene of the last key packet, which a resumed run does not have.
-
-    Arguments:
-        scene: decoded, as both ends have it.
-        cameras: training cameras.
-        pixels: side of a cell, in pixels at the scene's median distance.
-        shades: number of classes of brightness, 1 to 16.
     """
     if scene.groups is not None and scene.groups.shades == shades:
         return scene.groups
@@ -46,13 +40,7 @@ def known_groups(scene: Scene, cameras: Cameras, pixels: float, shades: int) -> 
 
 
 def changed_groups(groups: Groups, work: FitContext, votes: float, share: float) -> IntArray:
-    """Return [G] bool: groups of which at least this share of the rows lie in what changed.
-
-    Arguments:
-        groups: G groups of the rows of the scene.
-        work: the frame.
-        votes: as for ``work.changed_rows``. share: 0 to 1.
-    """
+    """Return [G] bool: groups of which at least this share of the rows lie in what changed."""
     changed = work.changed_rows(votes).numpy()
     total = np.bincount(groups.group_of, minlength=groups.count)
     hit = np.bincount(groups.group_of[changed], minlength=groups.count)
@@ -67,13 +55,7 @@ def groups_of_rows(groups: Groups, rows: IntArray) -> IntArray:
 
 
 def displaced_groups(groups: Groups, scene: Scene, share: float) -> IntArray:
-    """Return [G] bool: groups of which the last frame displaced some row, and at least this share of them.
-
-    Arguments:
-        groups: G groups of the rows of the scene.
-        scene: decoded, as both ends have it.
-        share: 0 to 1.
-    """
+    """Return [G] bool: groups of which the last frame displaced some row, and at least this share of them."""
     if scene.moved is None:
         return np.zeros(groups.count, bool)
     total = np.bincount(groups.group_of, minlength=groups.count)

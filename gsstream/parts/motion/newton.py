@@ -44,12 +44,7 @@ class DampedNewton:
         self._total, self._measured, self._seen = np.zeros((len(values), 6, 6)), 0, 0
 
     def step(self, grad: FloatArray, curvature: FloatArray | None = None) -> None:
-        """Replace ``values``: one step against a view's slope [K, 6].
-
-        Arguments:
-            slope: by the values, of the sum over the values of a picture.
-            curvature: [K, 6, 6] of the same; None: as the mean of those before, so not in the first step.
-        """
+        """Replace ``values``: one step against a view's slope [K, 6]."""
         self._seen += 1
         if curvature is not None:
             self._total += curvature
@@ -66,18 +61,7 @@ def fit_transforms_newton(
     scene: Scene, work: FitContext, start: GroupTransforms, unit: FloatArray, iterations: int,
     order: np.random.Generator, damping: Damping, tiles: Literal["all", "changed"] = "all",
 ) -> FloatArray:  # fmt: skip
-    """Return the shifts and turns [K, 6] of groups that explain the images best.
-
-    Arguments:
-        scene: decoded, as both ends have it.
-        work: the frame, seen from this scene; it is narrowed to the rows that move.
-        start: where the fit begins.
-        unit: [6] what a pixel is for shift x, y, z [scene units] and turn x, y, z [tan(angle / 2)].
-        iterations: views that are looked at; the curvature is measured in the first pass over them.
-        order: draws the order of the views, anew for each pass.
-        damping: of the steps.
-        tiles: "changed" compares only in tiles that changed and in those beside them.
-    """
+    """Return the shifts and turns [K, 6] of groups that explain the images best."""
     views, values = len(work.cameras), 3 * work.cameras.height * work.cameras.width
     work.narrow(torch.from_numpy(start.rows))
     base = scene.gaussians.rows(start.rows).map(torch.from_numpy)

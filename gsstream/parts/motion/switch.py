@@ -19,12 +19,6 @@ def loss_change(scene: Scene, work: FitContext, moves: GroupTransforms, views: S
 
     It is the slope of the loss half-way, along the move: for a loss that is quadratic between the two ends it is their
     difference, and one pass over the views answers for every group at once.
-
-    Arguments:
-        scene: decoded, before the motion.
-        work: the frame; narrowed to the rows that move.
-        moves: K groups and how each would move.
-        views: training cameras that are asked.
     """
     work.narrow(torch.from_numpy(moves.rows))
     base = scene.gaussians.rows(moves.rows).map(torch.from_numpy)
@@ -35,12 +29,6 @@ def loss_change(scene: Scene, work: FitContext, moves: GroupTransforms, views: S
 
 
 def rotating_views(number: int, share: float, frame: int) -> IntArray:
-    """Return the views that take their turn in a frame: a share of all, evenly spread, others in the next frame.
-
-    Arguments:
-        number: of training cameras.
-        share: of them, 0 to 1; at least one is asked.
-        frame: index of the frame.
-    """
+    """Return the views that take their turn in a frame: a share of all, evenly spread, others in the next frame."""
     count = max(1, round(share * number))
     return np.unique((np.arange(count) * number // count + frame) % number)

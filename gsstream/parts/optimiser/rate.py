@@ -28,9 +28,6 @@ def laplace_bits(latents: torch.Tensor, step: float | torch.Tensor, spread: torc
 
     That is -log2 of the mass of Laplace(0, b) within half a symbol of latents / step.
 
-    Arguments:
-        latents: [A, L]. step: latent units per symbol. spread: [L] b > 0, symbols.
-
     Smooth everywhere: flat at zero, linear beyond half a symbol.
     """
     u, half = (latents / step).abs(), 0.5 / spread
@@ -45,11 +42,6 @@ def laplace_gradient(latents: torch.Tensor, step: float | torch.Tensor, spread: 
     The spread is held fixed.
 
     One exponential serves both sinh and cosh: this runs in every iteration.
-
-    Arguments:
-        latents: [A, L].
-        step: latent units per symbol.
-        spread: [L] b > 0, symbols.
     """
     u = latents / step
     magnitude, tail = u.abs(), torch.exp(-0.5 / spread)

@@ -64,14 +64,7 @@ class ReferenceRenderer(Renderer):
     def nudged(
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, offsets: torch.Tensor
     ) -> RenderOutput:
-        """Render on black with every 2-D mean moved: what screen gradients are derivatives of.
-
-        Arguments:
-            gaussians: N rows, raw values.
-            cameras: the rig.
-            view: index of one of its cameras.
-            offsets: [N, 2] pixels.
-        """
+        """Render on black with every 2-D mean moved: what screen gradients are derivatives of."""
         return self._render(gaussians, cameras, view, (0.0, 0.0, 0.0), offsets)
 
     def _render(
@@ -124,11 +117,6 @@ def project(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """Project Gaussians into a camera, by EWA splatting.
 
-    Arguments:
-        gaussians: N rows, raw values.
-        cameras: the rig.
-        view: index of one of its cameras.
-
     Returns means2d [N, 2] px, conics [N, 2, 2], colours [N, 3], depths [N], opacities [N].
     """
     dtype = gaussians.means.dtype
@@ -171,13 +159,7 @@ def _check_quats(quats: torch.Tensor) -> None:
 
 
 def footprint_in_image(gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int) -> torch.Tensor:
-    """Return [N] bool: Gaussians in front of the camera whose visible box holds or crosses pixel centres.
-
-    Arguments:
-        gaussians: N rows, raw values.
-        cameras: the rig.
-        view: index of one of its cameras.
-    """
+    """Return [N] bool: Gaussians in front of the camera whose visible box holds or crosses pixel centres."""
     means2d, conics, _, depths, opacities = project(gaussians, cameras, view)
     variances = torch.linalg.inv(conics).diagonal(dim1=1, dim2=2)  # [N, 2] px^2
     reach = 2 * torch.log(opacities / ALPHA_CUT)
@@ -191,17 +173,7 @@ def composite(
     means2d: torch.Tensor, conics: torch.Tensor, colors: torch.Tensor, opacities: torch.Tensor,
     start: int, stop: int, width: int, background: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
-    """Composite depth-sorted splats front to back over some image rows; return image and alpha.
-
-    Arguments:
-        means2d: [N, 2] pixels, nearest Gaussian first.
-        conics: [N, 2, 2] inverse covariances.
-        colors: [N, 3].
-        opacities: [N].
-        start, stop: image rows [start, stop).
-        width: of the image.
-        background: colour behind everything, 0 to 1.
-    """
+    """Composite depth-sorted splats front to back over some image rows; return image and alpha."""
     dtype = means2d.dtype
     ys, xs = torch.meshgrid(
         torch.arange(start, stop, dtype=dtype) + 0.5, torch.arange(width, dtype=dtype) + 0.5, indexing="ij"
@@ -221,13 +193,7 @@ def composite(
 
 
 def evaluate_sh(sh0: torch.Tensor, shN: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-    """Return the colours [N, 3] of spherical harmonics: max(0, 0.5 + their sum).
-
-    Arguments:
-        sh0: [N, 1, 3] degree 0.
-        shN: [N, K - 1, 3] higher degrees.
-        directions: [N, 3] from the camera, of any length.
-    """
+    """Return the colours [N, 3] of spherical harmonics: max(0, 0.5 + their sum)."""
     x, y, z = (directions / directions.norm(dim=-1, keepdim=True).clamp_min(1e-10)).unbind(-1)
     basis = [torch.full_like(x, SH0)]
     bases = shN.shape[1] + 1

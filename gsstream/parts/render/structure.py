@@ -15,10 +15,6 @@ def weighted_structure_tensor(image: torch.Tensor, target: torch.Tensor) -> torc
     of the border see the border again), weighed by 1 / sqrt(error^2 + MIN_ERROR^2): where a picture is shifted by a
     small d, d^T S d / 2 is what the sum of sqrt(error^2 + MIN_ERROR^2) grows by beyond its slope, by the parabola
     that lies above it (iteratively reweighed least squares).
-
-    Arguments:
-        image: [H, W, 3] as rendered, in the colours of the target.
-        target: [H, W, 3] what the camera recorded.
     """
     down, right = _image_gradients(image, 0), _image_gradients(image, 1)
     weight = ((image - target).square() + MIN_ERROR**2).rsqrt()

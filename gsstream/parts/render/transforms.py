@@ -12,12 +12,7 @@ from gsstream.core.shapes import FloatArray
 
 
 def transform_vjp(leaves: Gaussians[torch.Tensor], moves: GroupTransforms) -> FloatArray:
-    """Return the gradient [K, 6] by shift and turn of the groups, from that of the rows that they have moved.
-
-    Arguments:
-        leaves: the A rows after they moved, with their gradients.
-        moves: of these rows, which it counts from 0 to A - 1.
-    """
+    """Return the gradient [K, 6] by shift and turn of the groups, from that of the rows that they have moved."""
     number = len(moves.centre)
     if leaves.means.grad is None:
         return np.zeros((number, 6))
@@ -45,14 +40,6 @@ def curvature_of(
     over rows of share * (slope * shift)^2 is at least the square of the sum, also where rows of several groups share a
     pixel: the blocks together lie above the matrix of Gauss-Newton of all groups at once, so each can be solved for
     itself. In units of the loss, which is a mean over all values of a picture; its SSIM counts as if it were L1.
-
-    Arguments:
-        means: [A, 3] centres of the rows after they moved.
-        moves: of these rows, which it counts from 0 to A - 1.
-        cameras: the training cameras.
-        view: index of one of them.
-        structure: [A, 3] sums over pixels of the share that a row has of a pixel's light, times the structure tensor of
-            the picture there (xx, xy, yy, per pixel^2).
     """
     by_row = _on_screen(means, moves, cameras, view)
     xx, xy, yy = structure.T.astype(np.float64)

@@ -26,23 +26,14 @@ MOST_OF_ROUGHNESS = 1.5
 
 
 def changed_blocks(difference: FloatArray, threshold: float) -> BoolArray:
-    """Return [ceil(H / 4), ceil(W / 4)] bool: blocks whose mean difference exceeds the noise of block means.
-
-    Arguments:
-        difference: [H, W, 3] of two pictures of one camera, image units.
-        threshold: multiple of the robust spread of the block means.
-    """
+    """Return [ceil(H / 4), ceil(W / 4)] bool: blocks whose mean difference exceeds the noise of block means."""
     means = block_means(difference)
     marked = np.abs(means) > threshold * block_sigma(means)
     return np.asarray(marked[..., 0] | marked[..., 1] | marked[..., 2])
 
 
 def block_sigma(means: FloatArray) -> float:
-    """Return the noise of block means of a difference, image units, within its bounds.
-
-    Arguments:
-        means: [rows, columns, 3] of :func:`block_means`.
-    """
+    """Return the noise of block means of a difference, image units, within its bounds."""
     spread = MAD_TO_SIGMA * float(median_deviation(means))
     if spread <= LEAST_SIGMA:  # then it does not matter what second differences admit
         return LEAST_SIGMA

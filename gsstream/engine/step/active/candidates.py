@@ -27,14 +27,7 @@ CHANGE_VOTES = 0.75
 def candidates(
     changed: torch.Tensor, open_probability: torch.Tensor, hierarchy: Hierarchy, threshold: float
 ) -> torch.Tensor:
-    """Return the rows [A] int64, ascending, that take part in a frame.
-
-    Arguments:
-        hierarchy: node of each Gaussian.
-        changed: [N] bool of :func:`changed_rows`.
-        open_probability: [M] probability that a node's gate is not zero.
-        threshold: rows whose gate opens with at most this probability are left out.
-    """
+    """Return the rows [A] int64, ascending, that take part in a frame."""
     return ((open_probability > threshold)[hierarchy.node_of] & changed).nonzero()[:, 0]
 
 
@@ -108,12 +101,6 @@ def keep_mask(gates: torch.Tensor, num_levels: int, hierarchy: Hierarchy, waitin
     """Return [A] bool: rows that stay in the optimisation; those whose gate has closed leave it.
 
     A closed gate draws its rows as they were, so nothing that is seen changes.
-
-    Arguments:
-        num_levels: gate values that are not zero.
-        hierarchy: node of each of the A rows.
-        gates: [M] deterministic gates as they are now.
-        waiting: [A] bool, rows of units that do not take part yet: they had no say and stay. None: no row waits.
     """
     keep = (torch.round(gates * num_levels) > 0)[hierarchy.node_of]
     return keep if waiting is None else keep | waiting

@@ -14,14 +14,7 @@ from gsstream.engine.step.active.change import Change
 
 
 def tile_weights(change: Change | None, view: int, share: float, generator: torch.Generator) -> torch.Tensor | None:
-    """Return [ceil(H / 16), ceil(W / 16)] float32 factors on the gradients of a view's tiles; None: all count once.
-
-    Arguments:
-        change: what changed; None: everything.
-        view: index of a training camera.
-        share: of the quiet tiles that is looked at, in (0, 1]; with 1 nothing is drawn.
-        generator: of the draws.
-    """
+    """Return [ceil(H / 16), ceil(W / 16)] float32 factors on the gradients of a view's tiles; None: all count once."""
     if change is None or share == 1:
         return None
     near = change.near[view]

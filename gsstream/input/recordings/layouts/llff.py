@@ -59,11 +59,6 @@ def _by_instant(instants: list[Path], pattern: str) -> dict[str, Clip]:
 def read_poses_bounds(path: Path, names: Sequence[str], size: tuple[int, int]) -> Cameras:
     """Return the rig of poses_bounds.npy for pictures of ``size`` (width, height).
 
-    Arguments:
-        path: of the file.
-        names: ids of the cameras, in the order of its rows.
-        size: (width, height) of the pictures.
-
     Raises SourceError when the file is not such an array, has another number of rows than there are cameras, or was
     made for pictures of another shape.
     """

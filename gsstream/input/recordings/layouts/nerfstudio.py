@@ -46,9 +46,6 @@ def looks_like(folder: Path) -> bool:
 def read(folder: Path, missing: Missing = "skip") -> Recording:
     """Read one rig of cameras that stand still.
 
-    Arguments:
-        missing: entries whose picture is missing are skipped with a warning, or refused.
-
     Raises SourceError for a camera that moves, for cameras of different sizes, and for what is not as expected.
     """
     path = folder / FILE

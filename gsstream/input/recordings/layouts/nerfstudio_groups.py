@@ -26,10 +26,6 @@ def group_entries(path: Path, frames: list[Entry], pose: Pose) -> dict[str, list
     One folder per camera with one pose each; else entries of one pose and one set of intrinsics, where ``time`` (or
     equal numbers of them) says that they are a recording; else one camera per entry, a still scene.
 
-    Arguments:
-        frames: the entries of the file.
-        path: the file, for messages. pose: reads and checks an entry's pose.
-
     Raises SourceError for a camera that moves, and for cameras that are not all there at all times.
     """
     by_folder: dict[str, list[Entry]] = {}

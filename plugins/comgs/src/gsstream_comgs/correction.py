@@ -17,10 +17,6 @@ def high_error_rows(work: FitContext, share: float) -> torch.Tensor:
     """Return the rows [A], ascending, that the error of the scene pulls at most.
 
     The pull is the mean over the views of the screen gradient of the mean absolute error.
-
-    Arguments:
-        work: the frame, seen from the scene that is to be corrected.
-        share: of the Gaussians that are returned at most; those without a pull are not.
     """
     total = torch.zeros(len(work.gaussians))
     for view in range(len(work.cameras)):
@@ -33,15 +29,7 @@ def high_error_rows(work: FitContext, share: float) -> torch.Tensor:
 def corrected(
     work: FitContext, layout: Layout, epochs: int, settings: CorrectionSettings, order: np.random.Generator
 ) -> Residual | None:
-    """Return the correction of a key frame; None where nothing is corrected.
-
-    Arguments:
-        work: the frame, seen from the scene after its motion.
-        layout: of the scene: one node for each Gaussian, one unit.
-        epochs: passes over the training cameras.
-        settings: of corrections.
-        order: draws the order of the views.
-    """
+    """Return the correction of a key frame; None where nothing is corrected."""
     rows = high_error_rows(work, settings.share)
     if not len(rows):
         return None

@@ -31,12 +31,7 @@ class Field(NamedTuple):
 
 
 def weights_of(means: torch.Tensor, points: KeyPoints) -> torch.Tensor:
-    """Return [A, K]: how much each key point moves each Gaussian, 0 to 1; the sum over key points is at most 1.
-
-    Arguments:
-        means: [A, 3] centres.
-        points: K key points.
-    """
+    """Return [A, K]: how much each key point moves each Gaussian, 0 to 1; the sum over key points is at most 1."""
     # Distances as one product of tables: squares of x against the metric of each key point, about the points' mean.
     middle = points.centre.mean(0)
     x, c = means - middle, points.centre - middle
@@ -50,12 +45,7 @@ def weights_of(means: torch.Tensor, points: KeyPoints) -> torch.Tensor:
 
 
 def field_of(means: torch.Tensor, points: KeyPoints) -> Field:
-    """Return how key points move Gaussians.
-
-    Arguments:
-        means: [A, 3] centres.
-        points: K key points.
-    """
+    """Return how key points move Gaussians."""
     weights = weights_of(means, points)
     unit = torch.cat([torch.ones_like(points.turn[:, :1]), points.turn], 1)
     turning = matrices(unit) - torch.eye(3)
@@ -67,12 +57,7 @@ def field_of(means: torch.Tensor, points: KeyPoints) -> Field:
 
 
 def apply_motion_field(gaussians: Gaussians[torch.Tensor], field: Field) -> Gaussians[torch.Tensor]:
-    """Return Gaussians, raw values, moved and turned by a field.
-
-    Arguments:
-        gaussians: A rows.
-        field: of these rows.
-    """
+    """Return Gaussians, raw values, moved and turned by a field."""
     quats = product(torch.cat([torch.ones_like(field.turn[:, :1]), field.turn], 1), gaussians.quats)
     values = dict(gaussians.items())
     return Gaussians(**{**values, "means": gaussians.means + field.shift, "quats": quats})

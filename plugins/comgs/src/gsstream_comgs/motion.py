@@ -27,16 +27,7 @@ def gradient_difference(work: FitContext) -> torch.Tensor:
 def fitted_motion(
     scene: Scene, work: FitContext, rows: IntArray, epochs: int, settings: MotionSettings, order: np.random.Generator
 ) -> Motion | None:
-    """Return the motion of a frame; None where nothing moves.
-
-    Arguments:
-        scene: decoded, as both ends have it.
-        work: the frame, seen from this scene.
-        rows: [A] Gaussians that may move, ascending.
-        epochs: passes over the training cameras.
-        settings: of key points.
-        order: draws the order of the views.
-    """
+    """Return the motion of a frame; None where nothing moves."""
     difference = gradient_difference(work)[torch.from_numpy(rows)]
     number = min(settings.keypoints, int((difference > 0).sum()))
     if number == 0:

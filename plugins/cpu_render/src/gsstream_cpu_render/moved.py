@@ -17,14 +17,7 @@ from gsstream_cpu_render.native import native_scene
 def loss_and_grad_of_transforms(
     rasterizer: Any, compared: Any, target: ViewTarget, wrt: WrtTransforms
 ) -> LossAndGrad[torch.Tensor] | None:
-    """Return loss, gradient and curvature; None where there is a fault.
-
-    Arguments:
-        rasterizer: native, frozen to the rows.
-        compared: ``target`` as the kernels take it.
-        target: what the render is compared with.
-        wrt: rows and their transforms.
-    """
+    """Return loss, gradient and curvature; None where there is a fault."""
     moves = wrt.transforms
     groups = len(moves.centre)
     grad, curvature = np.empty((groups, 6)), np.empty((groups, 6, 6)) if wrt.curvature else None

@@ -101,12 +101,6 @@ class NativeRasterizer:
     ) -> Any:  # fmt: skip
         """What renders are compared with, as the one handle that the kernels take.
 
-        Arguments:
-            cached_image: [H, W, 3] the cached render; None where every Gaussian moves.
-            target: what the picture is compared with. dssim_weight: w in [0, 1].
-            colours: [3, 3] and [3], the map from colours of the scene to those of the target; or twice None.
-            weights: [ceil(H / 16), ceil(W / 16)] factors on the gradients of tiles, 0: left out; None: all count once.
-
         Raises:
             InputError: arrays of another shape.
         """
@@ -133,11 +127,6 @@ class NativeRasterizer:
         of `forward_active` by 1e-4 of a Gaussian's colour and rounding; where nothing lies behind the active rows,
         not at all. The bits do not depend on earlier calls. Tiles that are left out stay as they are in the cache.
 
-        Arguments:
-            rows: raw parameters of the A active Gaussians, in the order of active_ids.
-            cached_image, target, dssim_weight, colours, weights: as for ``comparison``.
-            out: like ``rows``; the gradient is written here.
-
         Returns:
             The loss, of the tiles that are not left out.
 
@@ -162,12 +151,6 @@ class NativeRasterizer:
 
         It stands for `forward`, `photometric_loss` and `backward`, one after the other; whole images are neither made
         nor copied. No backward may follow. The bits do not depend on earlier calls or on the number of threads.
-
-        Arguments:
-            splats: raw parameters of N Gaussians.
-            target, dssim_weight, colours: as for ``comparison``.
-            out: arrays like those of ``splats``, and [N, 2] for the 2-D means in pixels; the gradient is written here.
-            exposure_grad: [12] for the gradient by the matrix and the offset of ``colours``; None: not wanted.
 
         Returns:
             The loss.

@@ -70,12 +70,6 @@ class NumpyRasterizer(NativeRasterizer):
     ) -> tuple[Float32, Float32]:
         """Render. Also fills the cache for `freeze`.
 
-        Arguments:
-            splats: raw parameters of N Gaussians. Not copied: keep them unchanged until `backward`.
-            tile_mask: [ceil(H / 16), ceil(W / 16)] bool or uint8; pixels of other tiles are left untouched.
-            image: [H, W, 3] output; a new one (background everywhere) if None.
-            transmittance: [H, W] output; a new one (ones) if None.
-
         Raises:
             InputError: wrong dtype, shape or layout, values that are not finite, a singular quaternion.
         """
@@ -96,11 +90,6 @@ class NumpyRasterizer(NativeRasterizer):
         out: SplatGradients | None = None,
     ) -> SplatGradients:
         """Gradients of sum(v_image * image) + sum(v_alpha * (1 - transmittance)) over the tiles of the last forward.
-
-        Arguments:
-            v_image: [H, W, 3]. v_alpha: [H, W] or None.
-            compact: one row per entry of `visible_rows()` instead of one per Gaussian (zero where unseen).
-            out: arrays to write, e.g. memory of the caller's; new ones if None.
 
         Raises:
             InputError: wrong dtype, shape or layout, or no matching forward.
@@ -134,10 +123,6 @@ class NumpyRasterizer(NativeRasterizer):
     def freeze(self, tile_mask: NDArray[np.bool_] | None, active_ids: NDArray[np.uint32]) -> None:
         """Freeze all Gaussians of the last full forward but `active_ids`, and the view to `tile_mask`.
 
-        Arguments:
-            tile_mask: tiles to render in active passes; must be covered by the full forward. None: all.
-            active_ids: [A] uint32, strictly ascending.
-
         Raises:
             InputError: no full forward yet, ids out of range or unsorted, tiles that are not cached.
         """
@@ -156,12 +141,6 @@ class NumpyRasterizer(NativeRasterizer):
         touched_only: bool = False,
     ) -> tuple[Float32, Float32]:
         """Render the frozen tiles with new values of the active rows: bit-identical to `forward` of the whole scene.
-
-        Arguments:
-            rows: raw parameters of the A active Gaussians, in the order of active_ids.
-            image, transmittance: outputs as in `forward`; other tiles are left untouched.
-            touched_only: render only the 4 x 4 blocks that active rows touch now or touched when cached. All other
-                pixels are as in the cache: put a copy of the cached image into `image`.
 
         Raises:
             InputError: wrong dtype, shape or layout, values that are not finite, no `freeze` since the last forward.
@@ -195,10 +174,6 @@ class NumpyRasterizer(NativeRasterizer):
         Afterwards the cache, and ``image`` and ``transmittance`` if they held the cached render, have the bits that
         `forward` of the changed scene would have given them. Ends the freeze.
 
-        Arguments:
-            changed: [A] uint32, strictly ascending rows of the cached scene. rows: their new values, A rows.
-            image, transmittance: [H, W, 3] and [H, W], written where a touched tile lies.
-
         Raises:
             InputError: as forward, unordered ids, no full forward yet. Nothing was changed then.
         """
@@ -212,9 +187,6 @@ class NumpyRasterizer(NativeRasterizer):
 
         Nothing is rendered, and work follows the pixels at which ``v_image`` [H, W, 3] is not zero. Same bits as
         `backward` of a full forward gives. A backward of an active pass may still follow.
-
-        Arguments:
-            splats: the values the cache was made of (`forward`, then every `update`).
 
         Raises:
             InputError: wrong dtype, shape or layout, no full forward yet, another number of rows.
@@ -231,9 +203,6 @@ class NumpyRasterizer(NativeRasterizer):
         All other rows have a gradient of zero. Work and memory do not grow with the number of rows of the scene, but
         for one bit of each.
 
-        Arguments:
-            splats, v_image: as for `backward_cached`.
-
         Raises:
             InputError: as `backward_cached`.
         """
@@ -248,9 +217,6 @@ class NumpyRasterizer(NativeRasterizer):
 
         Nothing is rendered or differentiated; the lists of the marked tiles are read. At the image's border the 4 x 4
         blocks are counted whole, so a row may be named for a pixel up to three beyond the edge.
-
-        Arguments:
-            tile_mask: [ceil(H / 16), ceil(W / 16)] bool or uint8; tiles that the cache covers. None: all.
 
         Raises:
             InputError: wrong dtype or shape, no full forward yet, tiles that are not cached.

@@ -165,9 +165,6 @@ class CpuSession(RenderSession):
 
         None where iterations have to be made one by one: rows in no order, a wide session, in which nothing stands
         still that could be left out, another loss, or caches that do not all fit into the budget.
-
-        Arguments:
-            views: indices of cameras of the rig. targets: one for each.
         """
         known = all(type(unwrapped(target.loss)) is CpuLoss for target in targets)
         if self._ids is None or self._order is not None or not known:

@@ -14,13 +14,7 @@ from gsstream_cpu_render.pool import PooledRasterizer
 def loss_and_grad_of_scene(
     held: PooledRasterizer, target: ViewTarget, wrt: WrtScene
 ) -> LossAndGrad[Gaussians[torch.Tensor]]:
-    """Return loss and gradients by the rows of a whole scene.
-
-    Arguments:
-        held: a rasteriser of the camera.
-        target: what the render is compared with, by the native loss; all tiles count.
-        wrt: all N rows of the scene.
-    """
+    """Return loss and gradients by the rows of a whole scene."""
     rows = wrt.values.map(torch.Tensor.detach)
     grad = rows.map(lambda value: torch.empty(value.shape))
     means2d = torch.empty(len(rows), 2)

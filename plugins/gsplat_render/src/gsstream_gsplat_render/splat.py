@@ -61,12 +61,7 @@ def draw(
     probe: torch.Tensor | None = None,
     mask: torch.Tensor | None = None,
 ) -> Drawn:
-    """Draw raw Gaussians [N] that are on the device already.
-
-    Arguments:
-        probe: [N, 2] added to the 2-D means, pixels; its gradient is theirs.
-        mask: [tile rows, tile columns] bool; other tiles show the background with alpha 0 and pass no gradient.
-    """
+    """Draw raw Gaussians [N] that are on the device already."""
     if len(gaussians) == 0:
         return _empty(view)
     opacities = gaussians.opacities.sigmoid()

@@ -22,12 +22,7 @@ BOX = (0.05, 0.95)
 
 
 def cell_sides(means: FloatArray, settings: MotionSettings) -> list[float]:
-    """Return the side of the cells of every grid, scene units, the coarsest first.
-
-    Arguments:
-        means: [N, 3] centres, N > 0.
-        settings: number of grids and of Gaussians in a cell of the finest.
-    """
+    """Return the side of the cells of every grid, scene units, the coarsest first."""
     low, high = np.quantile(means.astype(np.float64), BOX, axis=0)
     volume = float(np.prod(np.maximum(high - low, 1e-6)))
     finest = max((volume * settings.per_cell / len(means)) ** (1 / 3), 1e-6)
@@ -37,16 +32,7 @@ def cell_sides(means: FloatArray, settings: MotionSettings) -> list[float]:
 def fitted_motions(
     scene: Scene, work: FitContext, rows: IntArray, epochs: int, settings: MotionSettings, order: np.random.Generator
 ) -> tuple[tuple[Motion, ...], Scene]:
-    """Return the motions of a frame, one for each grid, and the scene after them.
-
-    Arguments:
-        scene: decoded, as both ends have it.
-        work: the frame, seen from this scene.
-        rows: [A] Gaussians that may move; a cell moves when at least half of its Gaussians are among them.
-        epochs: passes over the training cameras, spread over the grids.
-        settings: of the motion.
-        order: draws the order of the views.
-    """
+    """Return the motions of a frame, one for each grid, and the scene after them."""
     pixel = pixel_size(scene.gaussians.means, work.cameras)
     start, motions = scene, []
     total = epochs * len(work.cameras)

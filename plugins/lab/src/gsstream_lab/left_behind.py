@@ -57,23 +57,12 @@ class LeftBehind:
     _rows: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def after(self, player: PlayerState, frame: Frame, is_key: bool) -> dict[str, int]:
-        """Return what :meth:`measure` finds in a frame, once its rows are followed.
-
-        Arguments:
-            player: what players have of the frame.
-            frame: its training images.
-            is_key: whether its packet is a key packet: the count begins anew there.
-        """
+        """Return what :meth:`measure` finds in a frame, once its rows are followed."""
         self.follow(player, frame if is_key else None)
         return self.measure(player, frame)
 
     def follow(self, player: PlayerState, key: Frame | None) -> None:
-        """Keep track of rows through births and deaths.
-
-        Arguments:
-            player: what players have of the frame.
-            key: the training images of a key frame, which everything begins from; None for other frames.
-        """
+        """Keep track of rows through births and deaths."""
         if key is not None:
             visible = player.gaussians.opacities.reshape(-1) > FAINT
             self._images, self._places = packed(np.clip(key.images, 0, 1), "uint8"), player.gaussians.means
@@ -86,12 +75,7 @@ class LeftBehind:
         self._rows = np.append(self._rows, -1)[np.minimum(source, len(self._rows))]
 
     def measure(self, player: PlayerState, frame: Frame) -> dict[str, int]:
-        """Return how many Gaussians belong to moving bodies, and how many of them are outside or unmoved.
-
-        Arguments:
-            player: what players have of the frame.
-            frame: its training images.
-        """
+        """Return how many Gaussians belong to moving bodies, and how many of them are outside or unmoved."""
         changed = [
             dilate(changed_mask(image, first), 1)
             for image, first in zip(frame.images, unpacked(self._images), strict=True)
@@ -106,13 +90,7 @@ class LeftBehind:
 
 
 def in_hull(points: FloatArray, cameras: Cameras, masks: list[Any]) -> Any:
-    """Return [P] bool: most cameras that have a point in their picture, and two at least, see a marked pixel there.
-
-    Arguments:
-        points: [P, 3] scene units.
-        cameras: the rig.
-        masks: [H, W] bool for each camera.
-    """
+    """Return [P] bool: most cameras that have a point in their picture, and two at least, see a marked pixel there."""
     marked, seen = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     for view, mask in enumerate(masks):
         uv, depth = project(points, cameras, view)

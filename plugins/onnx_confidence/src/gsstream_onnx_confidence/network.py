@@ -19,11 +19,6 @@ Array = np.ndarray[Any, np.dtype[np.float32]]
 def run_network(path: str, output: Output, previous: Array, current: Array) -> Array:
     """The network's map for two images.
 
-    Arguments:
-        path: ONNX file with two float32 inputs [1, 3, H, W] in [0, 1], previous image first, and one float32 output.
-        output: "change": [1, 1, H, W], probabilities in [0, 1]; "flow": [1, 2, H, W], pixels (x, y).
-        previous, current: [H, W, 3] in [0, 1].
-
     Returns [channels, H, W]. Raises InputError when the file cannot be used or the network fails, ShapeError when its
     output has another shape, is not finite, or a probability leaves [0, 1].
     """

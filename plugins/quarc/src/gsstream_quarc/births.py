@@ -15,10 +15,6 @@ def change_scores(work: FitContext, views: int) -> torch.Tensor:
 
     g is the size of the change, from the frame before to this one, of the pull of the squared error at a Gaussian's
     centre, summed over the views; the render itself cancels. The median is that of the Gaussians that are pulled.
-
-    Arguments:
-        work: the frame, seen from the scene that is searched.
-        views: training cameras that are asked, spread evenly over the rig; all when there are no more.
     """
     size = torch.zeros(len(work.gaussians))
     number = len(work.cameras)
@@ -36,21 +32,11 @@ class ChangeFilter:
     """Chooses places for births: those that changed, at most some in a cell."""
 
     def __init__(self, settings: GateSettings, kept: int) -> None:
-        """Prepare the choice.
-
-        Arguments:
-            settings: of the choice.
-            kept: Gaussians that were there before; those behind them were born in an earlier round of the frame.
-        """
+        """Prepare the choice."""
         self.settings, self.kept = settings, kept
 
     def __call__(self, work: FitContext, rows: torch.Tensor) -> torch.Tensor:
-        """Return the rows that may be copied, in the order in which they come.
-
-        Arguments:
-            work: the frame, seen from the scene that is searched.
-            rows: [P] Gaussians that are pulled, the most pulled first.
-        """
+        """Return the rows that may be copied, in the order in which they come."""
         settings, means = self.settings, work.gaussians.means.numpy()
         if settings.score:
             rows = rows[change_scores(work, settings.views)[rows] >= settings.score]

@@ -30,14 +30,7 @@ def densify(
     rows: Gaussians[torch.Tensor], grad_norm: torch.Tensor, may: torch.Tensor, room: int, extent: float,
     settings: BirthSettings, generator: torch.Generator,
 ) -> AddedByDensify:  # fmt: skip
-    """Clone small and split large rows that the images pull at most.
-
-    Arguments:
-        rows: the trained rows as they are now.
-        pull: [A] mean screen gradients. may: [A] bool, who may have children (dynamic rows).
-        room: births at most.
-        extent: of the rig, scene units.
-    """
+    """Clone small and split large rows that the images pull at most."""
     hot = (may & (grad_norm > settings.gradient)).nonzero()[:, 0]
     large = rows.scales.exp().amax(1) > SPLIT_SIZE * extent
     order = hot[torch.argsort(grad_norm[hot], descending=True, stable=True)]

@@ -18,12 +18,7 @@ def open_logit(settings: GateSettings) -> float:
 
 
 def initial_logits(difference: torch.Tensor, seen: torch.Tensor, settings: GateSettings) -> torch.Tensor:
-    """[N] logits such that a gate is open with p = m / (m + median), the published confidence.
-
-    Arguments:
-        difference: [N] m, the view-space gradient difference, not negative.
-        seen: [N] bool; medians are taken over these. Who is not seen, or does not change, gets the lowest logit.
-    """
+    """[N] logits such that a gate is open with p = m / (m + median), the published confidence."""
     logits = torch.full_like(difference, -BOUND)
     moved = seen & (difference > 0)
     if not bool(moved.any()):

@@ -43,13 +43,6 @@ def due(anchors: AnchorLevels | None, frame: int, number: int, settings: MotionS
     """Return the anchors of a frame: those of the frame before, or new ones when these are old or a level has none.
 
     Both ends could draw them: from the seed of the run and the number of the frame.
-
-    Arguments:
-        anchors: of the frame before; None at first.
-        frame: its index.
-        number: N, Gaussians before the frame, above 0.
-        settings: of the motion.
-        rng: random streams by name and frame.
     """
     if anchors is not None and frame - anchors.drawn < settings.every and all(map(len, anchors.rows)):
         return anchors
@@ -59,12 +52,7 @@ def due(anchors: AnchorLevels | None, frame: int, number: int, settings: MotionS
 
 
 def followed(anchors: AnchorLevels, player: PlayerState) -> AnchorLevels:
-    """Return the same anchors as rows of the scene after a packet, without those whose Gaussian left.
-
-    Arguments:
-        anchors: rows of the scene before the packet.
-        player: what players have after it.
-    """
+    """Return the same anchors as rows of the scene after a packet, without those whose Gaussian left."""
     if player.delta is None or player.before is None or not player.delta.has_row_edit:
         return anchors
     source = gather_rows(player.before.node_of, player.delta.births, player.delta.deaths)
@@ -75,13 +63,7 @@ def followed(anchors: AnchorLevels, player: PlayerState) -> AnchorLevels:
 
 
 def anchors_after(players: Iterable[PlayerState], settings: MotionSettings, rng: Rng) -> AnchorLevels | None:
-    """Return the anchors after the last of the packets since a key packet, which is the first; None without another.
-
-    Arguments:
-        players: what players have after each packet.
-        settings: of the motion.
-        rng: random streams by name and frame.
-    """
+    """Return the anchors after the last of the packets since a key packet, which is the first; None without another."""
     anchors, number = None, 0
     for player in players:
         if player.delta is not None:
@@ -91,13 +73,7 @@ def anchors_after(players: Iterable[PlayerState], settings: MotionSettings, rng:
 
 
 def bound(centres: FloatArray, means: FloatArray, anchors: AnchorLevels) -> list[Level]:
-    """Return the levels, the coarsest first: each cell follows the nearest anchor of each.
-
-    Arguments:
-        centres: [C, 3] of the cells, C > 0.
-        means: [N, 3] centres of the Gaussians.
-        anchors: rows of them, some on each level.
-    """
+    """Return the levels, the coarsest first: each cell follows the nearest anchor of each."""
     levels = []
     for rows in anchors.rows:
         at = means[rows].astype(np.float64)
@@ -111,12 +87,6 @@ def inherited(past: FloatArray, old: list[Level], new: list[Level], neighbours: 
 
     The coarsest level says the mean of its cells, each finer one the mean of what is left. An anchor that was drawn
     anew takes the mean of the nearest old ones of its level, weighed by one over the distance.
-
-    Arguments:
-        past: [C, 6] motion of the cells in the last frame.
-        old: the levels of anchors then, of the same cells.
-        new: the levels now; ``old`` itself where no anchor was drawn.
-        neighbours: old anchors that a new one inherits from.
     """
     motions, left = [], past
     for before, now in zip(old, new, strict=True):

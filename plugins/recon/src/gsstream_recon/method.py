@@ -94,11 +94,7 @@ class AnchoredMethod(StreamingMethod[ReConState]):
         )  # fmt: skip
 
     def admission(self, kept: int) -> CopyFilter | None:
-        """Return what chooses which of the Gaussians that are pulled may be copied; None, as here: all of them.
-
-        Arguments:
-            kept: Gaussians that were there before the frame and stay.
-        """
+        """Return what chooses which of the Gaussians that are pulled may be copied; None, as here: all of them."""
         return None
 
     def _send(

@@ -27,16 +27,6 @@ def fitted_motion(
 
     Cells of a fine grid follow the nearest anchor of each level: a cell's shift and turn, about its own centre, are the
     sums of theirs.
-
-    Arguments:
-        scene: decoded, as both ends have it.
-        work: the frame, seen from this scene.
-        rows: [A] Gaussians that may move; a cell moves when at least half of its Gaussians are among them.
-        anchors: those of the frame before, as rows of this scene, None at first; and those of this frame.
-        epochs: passes over the training cameras.
-        settings: of the motion.
-        order: draws the order of the views.
-        rounded: fit with every anchor's motion rounded, as if there were no rounding in the gradient.
     """
     pixel = pixel_size(scene.gaussians.means, work.cameras)
     side = float(np.float32(settings.pixels * pixel))

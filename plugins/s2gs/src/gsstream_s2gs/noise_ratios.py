@@ -25,11 +25,6 @@ class NoiseRatios(NamedTuple):
 def noise_ratios(context: FrameContext, min_sigma: float, probes: int, seed: int, *, error: bool) -> NoiseRatios:
     """Both ratios over all views: one backward pass per view for each, and one per probe.
 
-    Arguments:
-        min_sigma: least noise of a camera, image units.
-        probes: noise draws per view that the expectation is averaged over.
-        error: whether to measure the error too; it needs a render per view.
-
     Raises ShapeError when an image's gradient is not finite.
     """
     means = context.gaussians.means

@@ -19,12 +19,7 @@ class Lookup:
     """Where positions lie in the grids: entries and weights, which stay while the cache is trained."""
 
     def __init__(self, shape: FieldShape, unit: FloatArray) -> None:
-        """Prepare the look-up.
-
-        Arguments:
-            shape: of the grid.
-            unit: [A, 3] positions, 0 to 1 along each axis of the box.
-        """
+        """Prepare the look-up."""
         from scipy.sparse import csr_array
 
         #: For each level the entries that some position is interpolated from, ascending: only these are trained.
@@ -61,13 +56,7 @@ class Cache:
     """
 
     def __init__(self, shape: FieldShape, lookup: Lookup, entry_step: float, weight_step: float) -> None:
-        """Begin at rest.
-
-        Arguments:
-            shape: of the grid and the network.
-            lookup: of the positions that are asked.
-            entry_step, weight_step: quantisation steps of the packet.
-        """
+        """Begin at rest."""
         self.shape, self.lookup = shape, lookup
         self.entry_step = max(1, round(entry_step / ENTRY_UNIT))
         self.weight_step = max(1, round(weight_step / WEIGHT_UNIT))
@@ -85,11 +74,7 @@ class Cache:
         return [(value.detach() / step).round() for value, step in zip(self.learned, self.steps, strict=True)]
 
     def __call__(self, rounded: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return shifts and turns of the positions.
-
-        Arguments:
-            rounded: with what is learned rounded as the packet has it; gradients pass the rounding as if it were not.
-        """
+        """Return shifts and turns of the positions."""
         learned: list[torch.Tensor] = list(self.learned)
         if rounded:
             sent = [symbols * step for symbols, step in zip(self.symbols(), self.steps, strict=True)]
@@ -118,11 +103,7 @@ class Cache:
             value.grad = None
 
     def field(self, marks: IntArray | None) -> Field:
-        """Return the change of a frame that says what was learned.
-
-        Arguments:
-            marks: [N] uint8 rows that move, as the look-up has them; None: all in the box.
-        """
+        """Return the change of a frame that says what was learned."""
         table, *layers = (symbols.numpy().astype(np.int32) for symbols in self.symbols())
         ends = np.cumsum([len(which) for which in self.lookup.touched])[:-1]
         entries = tuple(np.split(table, ends))

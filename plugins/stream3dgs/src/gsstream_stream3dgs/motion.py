@@ -26,16 +26,7 @@ from gsstream_stream3dgs.settings import CacheSettings
 def fitted_cache(
     scene: Scene, work: FitContext, rows: IntArray, epochs: int, settings: CacheSettings, rng: Rng
 ) -> tuple[IntArray, Cache] | None:
-    """Return the cache of a frame and the rows [A] that it moves; None where none may move.
-
-    Arguments:
-        scene: decoded, as both ends have it.
-        work: the frame, seen from this scene.
-        rows: [A] Gaussians that may move, ascending; those outside the box do not.
-        epochs: passes over the training cameras.
-        settings: of the cache.
-        rng: random streams by name and frame.
-    """
+    """Return the cache of a frame and the rows [A] that it moves; None where none may move."""
     shape = shape_of(scene, work.cameras.extent, settings, rng)
     marks = np.zeros(len(scene.gaussians), np.uint8)
     marks[rows] = 1
@@ -58,12 +49,6 @@ def fitted_cache(
 
 def shape_of(scene: Scene, extent: float, settings: CacheSettings, rng: Rng) -> FieldShape:
     """Return the shape of a frame's field: its box is that of most Gaussians, its first weights those of every frame.
-
-    Arguments:
-        scene: decoded, as both ends have it; N > 0.
-        extent: of the rig, scene units.
-        settings: of the cache.
-        rng: random streams by name and frame.
     """
     means = scene.gaussians.means.astype(np.float64)
     low, high = np.quantile(means, [settings.box, 1 - settings.box], axis=0).astype(np.float32)
@@ -79,15 +64,7 @@ def shape_of(scene: Scene, extent: float, settings: CacheSettings, rng: Rng) -> 
 def coded_cache(
     scene: Scene, rows: IntArray, cache: Cache, cameras: Cameras, settings: CacheSettings
 ) -> Field | Motion | None:
-    """Return what is sent of a cache: the cache, or the rigid motions of cells; None where nothing moves.
-
-    Arguments:
-        scene: decoded, as both ends have it.
-        rows: [A] Gaussians that it moves, ascending.
-        cache: of the frame.
-        cameras: those of the frame.
-        settings: of the cache.
-    """
+    """Return what is sent of a cache: the cache, or the rigid motions of cells; None where nothing moves."""
     if settings.sent == "field":
         if len(rows) == len(scene.gaussians):
             return cache.field(None)
@@ -104,13 +81,7 @@ def coded_cache(
 
 
 def moved(gaussians: Gaussians[torch.Tensor], shift: torch.Tensor, turn: torch.Tensor) -> Gaussians[torch.Tensor]:
-    """Return Gaussians, raw values, shifted and turned.
-
-    Arguments:
-        gaussians: A rows.
-        shift: [A, 3] scene units.
-        turn: [A, 3] axis * tan(angle / 2).
-    """
+    """Return Gaussians, raw values, shifted and turned."""
     quat = torch.nn.functional.normalize(torch.cat([torch.ones_like(turn[:, :1]), turn], 1), dim=1)
     w0, x0, y0, z0 = quat.unbind(1)
     w1, x1, y1, z1 = gaussians.quats.unbind(1)

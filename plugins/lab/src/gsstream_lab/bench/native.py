@@ -67,13 +67,7 @@ def find_native(name: str) -> NativeBench | None:
 
 
 def measure_peaks(native: NativeBench | None, threads: tuple[int, ...], known: dict[int, Peak]) -> dict[int, Peak]:
-    """Return the better of the peaks known and those measured now: other work only ever lowers them.
-
-    Arguments:
-        native: the benchmark of a renderer.
-        threads: to use.
-        known: peaks so far, or None.
-    """
+    """Return the better of the peaks known and those measured now: other work only ever lowers them."""
     if native is None:
         return known
     found = dict(known)

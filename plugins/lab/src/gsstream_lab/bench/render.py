@@ -91,13 +91,7 @@ class _Case:
 
 
 def bench_render(plan: RenderPlan, catalog: Catalog, progress: Progress) -> dict[str, Any]:
-    """Measure everything in the plan; plain JSON values.
-
-    Arguments:
-        plan: what is measured.
-        catalog: of the parts that are installed.
-        progress: called with lines for a person.
-    """
+    """Measure everything in the plan; plain JSON values."""
     machine, skipped = machine_facts(), []
     natives = {name: find_native(name) for name in plan.renderers}
     measuring = next((native for native in natives.values() if native is not None), None)

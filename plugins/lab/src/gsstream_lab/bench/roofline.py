@@ -64,13 +64,7 @@ class Footprints:
 
 
 def footprints(gaussians: Gaussians[FloatArray], cameras: Cameras, view: int = 0) -> Footprints:
-    """Project a scene with the reference renderer's formulas.
-
-    Arguments:
-        gaussians: N rows, raw values.
-        cameras: the rig.
-        view: index of one of them.
-    """
+    """Project a scene with the reference renderer's formulas."""
     with torch.no_grad():
         means2d, conics, _, depths, opacities = project(gaussians.map(torch.from_numpy), cameras, view)
         variances = torch.linalg.inv(conics).diagonal(dim1=1, dim2=2)
@@ -111,12 +105,7 @@ def live_pairs(scene: Footprints) -> IntArray:
 
 
 def central_tiles(width: int, height: int, share: float) -> BoolArray:
-    """Return [tile rows, tile columns] bool: the share of tiles nearest to the image's centre, at least one.
-
-    Arguments:
-        width, height: pixels.
-        share: of the tiles, 0 to 1.
-    """
+    """Return [tile rows, tile columns] bool: the share of tiles nearest to the image's centre, at least one."""
     rows, columns = -(-height // TILE), -(-width // TILE)
     y, x = np.mgrid[:rows, :columns] + 0.5
     distance = np.hypot(x - columns / 2, y - rows / 2).ravel()
@@ -126,23 +115,12 @@ def central_tiles(width: int, height: int, share: float) -> BoolArray:
 
 
 def pixels_of(mask: BoolArray, width: int, height: int) -> BoolArray:
-    """Return a tile mask as a pixel mask [H, W].
-
-    Arguments:
-        mask: [tile rows, tile columns] bool.
-        width, height: pixels.
-    """
+    """Return a tile mask as a pixel mask [H, W]."""
     return mask.repeat(TILE, 0).repeat(TILE, 1)[:height, :width]
 
 
 def roofline_ms(peak: Peak, *, pairs: int, visible: int, rows: int, pixels: int, floats: int) -> tuple[float, float]:
-    """Return the milliseconds that forward and backward take at least.
-
-    Arguments:
-        peak: what the machine can do.
-        pairs: live pixel pairs. visible: Gaussians that are drawn. rows: Gaussians given and differentiated.
-        pixels: pixels drawn. floats: parameters of a Gaussian.
-    """
+    """Return the milliseconds that forward and backward take at least."""
     image = 4 * _FLOAT * pixels
     moved = (_FLOAT * floats * rows + image, 2 * _FLOAT * floats * rows + image)
     return tuple(  # type: ignore[return-value]

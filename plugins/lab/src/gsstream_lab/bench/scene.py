@@ -92,14 +92,7 @@ def read_points(path: Path) -> Points:
 
 
 def make_gaussians(points: Points, count: int, seed: int, *, degree: int = 2) -> Gaussians[FloatArray]:
-    """Return ``count`` Gaussians at these points, float32: drawn from them without replacement, then near them.
-
-    Arguments:
-        points: to draw from.
-        count: of Gaussians.
-        seed: of the draw.
-        degree: of the harmonics, 0 to 3.
-    """
+    """Return ``count`` Gaussians at these points, float32: drawn from them without replacement, then near them."""
     rng = Rng(seed).numpy("bench gaussians", count)
     have = len(points.xyz)
     chosen = rng.permutation(have)[: min(have, count)]
@@ -154,10 +147,6 @@ def bench_camera(width: int, height: int, points: Points | None = None) -> Camer
     """Return one camera that sees about half of the scene.
 
     It is the points' own, scaled to cover the image, or one in the room.
-
-    Arguments:
-        width, height: pixels.
-        points: of the scene, with a camera or without.
     """
     if points is not None and points.viewmat is not None and points.K is not None:
         old_width, old_height = 2 * points.K[0, 2], 2 * points.K[1, 2]
@@ -172,10 +161,6 @@ def arc_rig(views: int, width: int, height: int) -> Cameras:
     """Return ``views`` cameras on an arc of 60 degrees that look at the object.
 
     They are 2.4 units away and 60 degrees wide.
-
-    Arguments:
-        views: number of cameras.
-        width, height: pixels.
     """
     angles = np.deg2rad(np.linspace(-30, 30, views)) if views > 1 else np.zeros(1)
     viewmats = np.tile(np.eye(4), (views, 1, 1))

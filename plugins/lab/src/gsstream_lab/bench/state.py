@@ -14,11 +14,6 @@ def mid_stream_state(parts: Assembly, state: StreamState, last: Step | None) -> 
     """Return the state in the middle of a stream: with the caches that this variant's own step leaves behind.
 
     A step hands its session's caches on to the next scene, so each repetition needs them anew.
-
-    Arguments:
-        parts: the live parts of the variant.
-        state: after the frame before.
-        last: the step made from this state before, or None.
     """
     left = None if last is None else last.state.session
     if left is None:

@@ -57,11 +57,6 @@ def interleaved(cases: Sequence[Steps], repetitions: int, warm_up: int) -> list[
     """Time all cases in turn, ``repetitions`` times over: a slow second of the machine falls on all of them alike.
 
     The first ``warm_up`` rounds are not counted.
-
-    Arguments:
-        cases: each with the steps that are timed, by name.
-        repetitions: rounds that count.
-        warm_up: first rounds, which do not.
     """
     found: list[dict[str, list[tuple[float, float]]]] = [{name: [] for name in case.steps} for case in cases]
     for round_ in range(warm_up + repetitions):

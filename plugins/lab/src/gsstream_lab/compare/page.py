@@ -30,13 +30,7 @@ _CHANGED = (
 
 
 def build_page(folder: Path, data: SweepData, source: FrameSource | None) -> list[Block]:
-    """Return the blocks of the page, in reading order.
-
-    Arguments:
-        folder: of the comparison.
-        data: its table.
-        source: the recording, for the pictures; None: the page has none.
-    """
+    """Return the blocks of the page, in reading order."""
     groups = list(data.groups)
     blocks: list[Block] = [Text(data.config["description"]), *where_it_ran(data), Text(_CHANGED)]
     costs = [key for key in COSTS if key != "seconds" or not waited(groups)]

@@ -37,11 +37,7 @@ class Tile:
 
 
 def tiles_in_rows(rows: Sequence[Sequence[Tile]]) -> Bytes:
-    """Return one picture [H, W, 3] uint8: rows of tiles, each under its title.
-
-    Arguments:
-        rows: from top to bottom; tiles of one row stand side by side.
-    """
+    """Return one picture [H, W, 3] uint8: rows of tiles, each under its title."""
     heights = [max(tile.image.shape[0] for tile in row) + 2 * _LINE + _GAP for row in rows]
     width = max(sum(tile.image.shape[1] + _GAP for tile in row) for row in rows)
     sheet = Image.new("RGB", (width, sum(heights)), "white")
@@ -82,13 +78,7 @@ class SideBySide:
         return np.asarray(self._source.frame(frame, "test").images[self._place])
 
     def row(self, frame: int, close: tuple[slice, slice] | None = None) -> list[Tile]:
-        """Return the ground truth of a frame and what every stream shows of it.
-
-        Arguments:
-            frame: its index.
-            close: rows and columns of the part that is shown enlarged, titled with the PSNR on changed pixels; None:
-                the whole, with the PSNR of the whole.
-        """
+        """Return the ground truth of a frame and what every stream shows of it."""
         truth, first = self.truth(frame), self.truth(self.frames[0])
         part = (slice(None), slice(None)) if close is None else close
         mask = None if close is None else changed_mask(truth, first)
@@ -111,12 +101,7 @@ class SideBySide:
         return tiles_in_rows(rows)
 
     def video(self, out: Path, fps: float) -> bytes:
-        """Write every frame of every stream side by side as an animated WebP and return its bytes.
-
-        Arguments:
-            out: file to write.
-            fps: pictures per second.
-        """
+        """Write every frame of every stream side by side as an animated WebP and return its bytes."""
 
         def pictures() -> Iterator[Bytes]:
             for frame in self.frames:
@@ -130,12 +115,7 @@ class SideBySide:
 
 
 def picture_files(streams: Mapping[str, Path], source: FrameSource) -> tuple[bytes, bytes, str]:
-    """Return the sheet (JPEG), the video (WebP) and the camera that both are seen from.
-
-    Arguments:
-        streams: name -> file, of the same frames of one recording.
-        source: the recording, which has test cameras.
-    """
+    """Return the sheet (JPEG), the video (WebP) and the camera that both are seen from."""
     with tempfile.TemporaryDirectory() as folder, SideBySide(streams, source) as together:
         sheet = Path(folder) / "sheet.jpg"
         Image.fromarray(together.sheet()).save(sheet, quality=90)

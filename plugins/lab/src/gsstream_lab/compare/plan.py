@@ -50,13 +50,7 @@ def own(wanted: Wanted) -> SweepConfig:
 
 
 def equal_epochs(wanted: Wanted, epochs: Sequence[int], catalog: Catalog) -> SweepConfig:
-    """Return the sweep in which every method makes the same number of passes.
-
-    Arguments:
-        wanted: what is compared.
-        epochs: numbers of passes over the training cameras a frame; several give a curve each.
-        catalog: of the methods that are installed.
-    """
+    """Return the sweep in which every method makes the same number of passes."""
     read = own_epochs(wanted, catalog)
     axes = {name: list(epochs) for name, number in read.items() if number is not None}
     without = [name for name, number in read.items() if number is None]
@@ -69,12 +63,6 @@ def equal_time(wanted: Wanted, seconds: Sequence[float], measured: SweepData, ca
 
     The number is that of its own recipe times the ratio of the times, at least 1. What does not depend on passes is
     not taken out, so what a method really took stands in the table.
-
-    Arguments:
-        wanted: what is compared.
-        seconds: processor seconds a frame; several give a curve each.
-        measured: the methods at their own settings.
-        catalog: of the methods that are installed.
     """
     axes: dict[str, list[int]] = {}
     for name, number in own_epochs(wanted, catalog).items():
@@ -86,12 +74,7 @@ def equal_time(wanted: Wanted, seconds: Sequence[float], measured: SweepData, ca
 
 
 def own_seconds(measured: SweepData, name: str) -> float:
-    """Return the processor seconds a frame of a method at its own settings; nan when it did not run.
-
-    Arguments:
-        measured: of the methods at their own settings.
-        name: of the method, as in tables.
-    """
+    """Return the processor seconds a frame of a method at its own settings; nan when it did not run."""
     return mean(group.mean("cpu_seconds") for group in measured.groups if group.variant == name and not group.axes)
 
 
@@ -108,11 +91,7 @@ def own_epochs(wanted: Wanted, catalog: Catalog) -> dict[str, int | None]:
 
 
 def scene_name(source: str) -> str:
-    """Return the name of a recording in tables: the last part of its URI, or the name of its source.
-
-    Arguments:
-        source: as for ``--source``.
-    """
+    """Return the name of a recording in tables: the last part of its URI, or the name of its source."""
     scheme, _, rest = source.partition(":")
     last = Path(rest or scheme).name if "=" not in rest else scheme
     return re.sub(r"[^\w.+-]", "-", last, flags=re.ASCII).lstrip("_.+-") or "recording"

@@ -30,10 +30,6 @@ def fresh_recipe(recipe: Recipe, epochs: int | None = None) -> Recipe:
 
     It is the run's own but for the seeds: the points of a recording belong to frame 0, so others are found by a plane
     sweep over the frame's images (triangulated ones stay triangulated).
-
-    Arguments:
-        recipe: of the run.
-        epochs: passes over the training cameras in place of the recipe's; the bound on iterations is lifted.
     """
     first = recipe.first_frame
     changes: dict[str, object] = {} if first.points == "sfm" else {"points": "auto"}
@@ -60,14 +56,7 @@ class FreshFrames:
     def of_run(
         cls, recipe: Recipe, source: FrameSource, cache: Path, catalog: Catalog, epochs: int | None = None
     ) -> FreshFrames:
-        """Return those of a run by its recipe.
-
-        Arguments:
-            recipe: of the run. epochs: as in :func:`fresh_recipe`.
-            source: the recording as the run opened it.
-            cache: folder that keeps them.
-            catalog: of the parts that are installed.
-        """
+        """Return those of a run by its recipe."""
         parts = assemble(fresh_recipe(recipe, epochs), catalog)
         return cls(limit_memory(parts, source.info), source, cache)
 
@@ -88,10 +77,6 @@ class FreshFrames:
 
     def make(self, frame: int, progress: Progress = lambda *_: None) -> bool:
         """Reconstruct a frame, unless the cache has it; return whether it was made now.
-
-        Arguments:
-            frame: its index.
-            progress: told about the iterations.
 
         Raises SourceError for a frame that the recording does not have; the file appears complete or not at all.
         """
@@ -115,12 +100,7 @@ class FreshFrames:
 
 
 def check_cameras(meta: StreamMeta, info: SourceInfo) -> None:
-    """Raise InputError when a recording's cameras are not those of a stream, or when none of them judges.
-
-    Arguments:
-        meta: of the stream.
-        info: of the recording, opened as the run did.
-    """
+    """Raise InputError when a recording's cameras are not those of a stream, or when none of them judges."""
     if len(meta.test) == 0:
         raise InputError("the stream has no test cameras, so there is nothing to judge by (data.test_cameras)")
     for split, theirs, here in (("training", meta.train, info.train), ("test", meta.test, info.test)):

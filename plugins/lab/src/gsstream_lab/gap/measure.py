@@ -57,12 +57,7 @@ class Gap:
     epochs: int
 
     def mean(self, quantity: str, frame: int | None = None) -> float:
-        """Return a quantity's mean over cameras, then over frames, dB.
-
-        Arguments:
-            quantity: a name of :class:`GapView`, or such a name after ``gap_``: fresh less stream.
-            frame: this one alone.
-        """
+        """Return a quantity's mean over cameras, then over frames, dB."""
         if quantity.startswith("gap_"):
             name = quantity.removeprefix("gap_")
             frames = self.files if frame is None else (frame,)
@@ -102,14 +97,6 @@ def measure_gap(
     """Render frames of a stream and their fresh reconstructions for the test cameras, and compare with the recording.
 
     Moving and changed pixels are those against the stream's first frame; noise is measured between its first two.
-
-    Arguments:
-        stream: the file of the run.
-        fresh: frame -> stream that begins with its reconstruction.
-        source: the recording as the run opened it.
-        epochs: what the reconstructions were made with, for the record.
-        renderer: that draws; default: the player's.
-        progress: called with (done, total) after every frame.
 
     Raises InputError when the recording has no test cameras.
     """

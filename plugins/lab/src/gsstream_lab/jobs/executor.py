@@ -84,12 +84,6 @@ class LocalExecutor:
 def make_executor(work: Work, workers: int | None, threads: int, ray: str | None = None) -> Executor:
     """Return processes on this machine, or tasks on the Ray cluster at ``ray``.
 
-    Arguments:
-        work: what a worker does.
-        threads: of each worker.
-        ray: address of a cluster; None: this machine.
-        workers: jobs at a time; None: as many as the processors allow.
-
     Raises what :class:`gsstream_lab.jobs.ray_executor.RayExecutor` raises.
     """
     if ray is not None:

@@ -34,15 +34,6 @@ def finished_tasks(
 ) -> Iterator[tuple[T, Finished | None]]:
     """Run tasks and yield each once it is over, in the order in which they end.
 
-    Arguments:
-        executor: that runs them.
-        tasks: those to run; of those that could start, the first does.
-        have: ids of tasks whose result is there. The caller adds to it, before it asks for the next task, the id of a
-            finished one that others may go on from.
-        after: id of the task that one waits for; None: it can start.
-        job: what the executor is given; asked for when the task starts.
-        lost: told a task that starts again, and how its worker died.
-
     A task comes with its outcome; without one (``Finished.outcome`` is None) when every worker that had it died; with
     None when it never started, because what it waits for is over and not in ``have``.
     """

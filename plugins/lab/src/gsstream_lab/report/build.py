@@ -33,11 +33,7 @@ _WAITED = (
 
 
 def build_report(data: SweepData, sheets: Mapping[str, Picture]) -> list[Block]:
-    """Return all blocks, in reading order.
-
-    Arguments:
-        sheets: scene -> contact sheet.
-    """
+    """Return all blocks, in reading order."""
     blocks: list[Block] = []
     if data.config["description"]:
         blocks.append(Text(data.config["description"]))
@@ -107,9 +103,6 @@ def one_machine(facts: Sequence[Mapping[str, Any]]) -> bool:
     """Say whether runs were made on one machine in one state.
 
     Runs with other plugins list other distributions; they compare as long as those that both have are the same.
-
-    Arguments:
-        facts: of each machine that the table knows.
     """
     for name in {name for one in facts for name in one} - {"distributions"}:
         if any(one.get(name) != facts[0].get(name) for one in facts):
@@ -159,12 +152,7 @@ def _fronts(groups: Sequence[Group]) -> Table:
 
 
 def all_runs(groups: Sequence[Group], keys: Sequence[str]) -> Table:
-    """Return a table with a row for each group.
-
-    Arguments:
-        groups: rows.
-        keys: of the quantities, columns.
-    """
+    """Return a table with a row for each group."""
     rows = [["recipe", "seeds", *(BY_KEY[key].title for key in keys)]]
     for group in groups:
         cells = [cell(key, group.mean(key), group.spread(key)) for key in keys]
@@ -207,12 +195,6 @@ def _ratio(value: float) -> str:
 
 def write_sheets(folder: Path, data: SweepData, scenes: Sequence[str], recordings: Path | None) -> dict[str, Picture]:
     """Write a contact sheet of the first variant of each scene.
-
-    Arguments:
-        folder: of the sweep.
-        data: the sweep's table.
-        scenes: names.
-        recordings: folder in which relative recordings lie.
 
     Raises InputError when a recording cannot be found.
     """

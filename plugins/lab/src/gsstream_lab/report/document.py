@@ -59,13 +59,7 @@ img { max-width: 100%; height: auto; margin: 0.6em 0 }
 
 
 def write_report(title: str, blocks: Sequence[Block], out: Path) -> list[Path]:
-    """Write ``report.html`` (self-contained), ``report.md`` and the images it names. Raises OutputError.
-
-    Arguments:
-        title: of the report.
-        blocks: in reading order.
-        out: folder to write.
-    """
+    """Write ``report.html`` (self-contained), ``report.md`` and the images it names. Raises OutputError."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         written = [out / "report.html", out / "report.md"]

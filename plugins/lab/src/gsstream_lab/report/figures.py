@@ -43,13 +43,6 @@ def pareto_figure(
 
     Points far below the rest stand at the lower edge as triangles with their value. Names that would cover one another
     are left out, those of the front last.
-
-    Arguments:
-        groups: what is drawn.
-        title: of the figure.
-        goods: qualities, a row of panels each.
-        costs: a column each; default: those that are measured.
-        joined: whether a thin line joins the groups of one variant.
     """
     costs = measured_costs(groups) if costs is None else costs
     figure = Figure(figsize=(3.6 * len(costs), 6.8), dpi=100, layout="constrained")

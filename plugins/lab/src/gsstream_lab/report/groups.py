@@ -154,13 +154,7 @@ def seed_noise(groups: Sequence[Group], key: str) -> float:
 
 
 def is_tie(first: Group, second: Group, key: str, noise: float) -> bool | None:
-    """Say whether two means differ by no more than two standard errors of their difference; None: noise unknown.
-
-    Arguments:
-        first, second: groups.
-        key: of a quantity.
-        noise: standard deviation between seeds; nan: unknown.
-    """
+    """Say whether two means differ by no more than two standard errors of their difference; None: noise unknown."""
     if not math.isfinite(noise):
         return None
     error = noise * math.sqrt(1 / len(first.runs) + 1 / len(second.runs))

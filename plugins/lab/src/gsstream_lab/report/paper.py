@@ -53,12 +53,6 @@ def beside_ours(
     """Return the paper's rows, each followed by our run in the same columns.
 
     Moving pixels and processor seconds of our run stand behind them.
-
-    Arguments:
-        table: of the paper.
-        groups: of the sweep.
-        scene: its name.
-        variants: row -> our variant; by default the one of that name.
     """
     ours = {group.variant: group for group in groups if not group.axes}
     more = [key for key in ("psnr_moving", "cpu_seconds") if any(math.isfinite(g.mean(key)) for g in ours.values())]

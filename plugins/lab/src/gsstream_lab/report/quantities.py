@@ -87,11 +87,6 @@ def values_of(records: Sequence[FrameRecord], row: Row) -> dict[str, float]:
 
 def cell(key: str, value: float, spread: float = math.nan) -> str:
     """Return ``31.22`` or ``31.22 ± 0.04``; "-" for what was not measured.
-
-    Arguments:
-        key: of the quantity.
-        value: mean.
-        spread: over seeds; nan: none.
     """
     if not math.isfinite(value):
         return "-"

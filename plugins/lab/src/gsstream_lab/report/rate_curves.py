@@ -57,9 +57,6 @@ def curves_over(groups: Sequence[Group]) -> dict[str, list[Curve]]:
 def bd_rate(anchor: Sequence[tuple[float, float]], other: Sequence[tuple[float, float]]) -> float:
     """Return by how many percent ``other`` needs more bytes than ``anchor`` at equal quality; below 0 it needs fewer.
 
-    Arguments:
-        anchor, other: points (bytes above 0, dB), both rising.
-
     Returns:
         Percent; nan when a curve has fewer than three points, or no quality is reached by both.
     """

@@ -188,11 +188,6 @@ class SceneList(Section):
 def read_sweep(path: Path, scenes: Path | None = None, split: SplitName | None = None) -> SweepConfig:
     """Read a sweep's YAML file.
 
-    Arguments:
-        path: the file.
-        scenes: a file whose recordings take the place of the sweep's.
-        split: which cameras judge, in place of what the sweep says.
-
     Raises RecipeError with file and line of every problem.
     """
     config = _read(path, SweepConfig)

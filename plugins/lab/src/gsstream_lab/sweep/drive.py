@@ -38,13 +38,6 @@ def run_sweep(
 ) -> SweepResult:
     """Make every cell of a plan that the table in ``out`` does not hold yet.
 
-    Arguments:
-        plan: cells and shared frames 0.
-        executor: that runs them.
-        out: folder of the table (``table.jsonl``), the streams (``cells/ID.gss``) and the shared frames 0.
-        data: folder in which relative recordings are looked up.
-        say: told one line at a time.
-
     Raises OutputError when another sweep works in ``out`` or it cannot be written. KeyboardInterrupt passes through,
     with everything that is finished on disk and no worker left.
     """

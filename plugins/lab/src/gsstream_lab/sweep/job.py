@@ -147,13 +147,7 @@ def _measure(measure: Measure, stream: Path, recording: FrameSource, frames: lis
 
 
 def frame_values(evaluation: Evaluation, frame: int, lpips: bool) -> dict[str, dict[str, float | None]]:
-    """Return quantity -> camera -> value of one frame; None where it is not defined.
-
-    Arguments:
-        evaluation: of the stream.
-        frame: its index.
-        lpips: whether LPIPS was measured.
-    """
+    """Return quantity -> camera -> value of one frame; None where it is not defined."""
     views = [view for view in evaluation.views if view.frame == frame]
     names = [name for name in views[0].__slots__ if name not in _PLACE and (lpips or "lpips" not in name)]
     values = {name: {view.camera: _plain(getattr(view, name)) for view in views} for name in names}

@@ -85,11 +85,6 @@ class Plan:
 def make_plan(config: SweepConfig, folder: Path, find_method: FindMethod) -> Plan:
     """Resolve every cell of a sweep.
 
-    Arguments:
-        config: the sweep's file.
-        folder: where the sweep's file lies; recipe files and bases of variants are relative to it.
-        find_method: name -> recipe file (``Catalog.recipe_path``).
-
     Raises RecipeError for keys and values that no recipe has, UnknownName for methods and bases of variants.
     """
     config = with_bases(config, folder)

@@ -14,9 +14,6 @@ from gsstream_lab.sweep.config import SweepConfig, Variant, flat_settings, read_
 def with_bases(config: SweepConfig, folder: Path) -> SweepConfig:
     """Replace every ``base`` of a sweep's variants by what it stands for.
 
-    Arguments:
-        folder: where the sweep's file lies; bases are relative to it, and so are the recipe files of the result.
-
     Raises:
         RecipeError: a file that cannot be read, bases that go in a circle, a base with axes of its own.
         UnknownName: the file has no such variant.

@@ -38,11 +38,6 @@ Score = Callable[[Mapping[str, Any], str, Sequence[Any]], list[float]]
 def climb(start: Mapping[str, Any], ladders: Mapping[str, Sequence[Any]], score: Score) -> dict[str, Any]:
     """Return the settings after which no single key has a value that is better by more than ``MARGIN``.
 
-    Arguments:
-        start: key -> value to begin with, among the values of its ladder.
-        ladders: key -> values to try, in the order in which keys take their turn.
-        judge: what values of one key come to while the others stay as they are.
-
     Raises InputError when no value of a key can be measured.
     """
     best = dict(start)

@@ -99,13 +99,7 @@ class TableWriter:
             raise OutputError(f"cannot write {self._path}: {error.strerror}; free some space and go on") from error
 
     def append_once(self, record: str, key: str, values: Mapping[str, Any]) -> None:
-        """Append a machine or a recipe unless the table has it.
-
-        Arguments:
-            record: kind of the line.
-            key: id of the value.
-            values: of the line.
-        """
+        """Append a machine or a recipe unless the table has it."""
         if key not in self._known:
             self.append(record, {"id": key, **values})
             self._known.add(key)

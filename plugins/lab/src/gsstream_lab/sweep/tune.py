@@ -81,14 +81,7 @@ def candidates(methods: Sequence[str], budget: Budget) -> list[Variant]:
 
 
 def pilot(scene: Scene, methods: Sequence[str], budget: Budget, seed: int) -> SweepConfig:
-    """Return the sweep that tries them.
-
-    Arguments:
-        scene: recording and recipe of it.
-        methods: names.
-        budget: that must be kept.
-        seed: of all runs.
-    """
+    """Return the sweep that tries them."""
     return SweepConfig(
         name="tune", description="pilot of gsstream tune", scenes=[scene], seeds=[seed],
         variants=candidates(methods, budget), first_frame=FirstFrame(share="scene"),
@@ -96,13 +89,7 @@ def pilot(scene: Scene, methods: Sequence[str], budget: Budget, seed: int) -> Sw
 
 
 def give_first_frame(plan: Plan, out: Path, stream: Path) -> None:
-    """Let the pilot take frame 0 over from a stream. Raises InputError when ``out`` has another one already.
-
-    Arguments:
-        plan: of the pilot.
-        out: its folder.
-        stream: that holds the frame 0.
-    """
+    """Let the pilot take frame 0 over from a stream. Raises InputError when ``out`` has another one already."""
     content = stream.read_bytes()
     (out / FIRST_FRAMES).mkdir(parents=True, exist_ok=True)
     table = TableWriter(out)
@@ -116,13 +103,7 @@ def give_first_frame(plan: Plan, out: Path, stream: Path) -> None:
 
 
 def trial_of(name: str, row: Mapping[str, Any], budget: Budget) -> Trial:
-    """Return a cell's line of the sweep's table, held against the budget.
-
-    Arguments:
-        name: of the candidate.
-        row: of the table.
-        budget: that must be kept.
-    """
+    """Return a cell's line of the sweep's table, held against the budget."""
     if row["status"] != "done":
         return Trial(name, error=str(row.get("error", "it was not run")))
     later = [frame for frame in row["frames"] if frame["frame"] > 0]

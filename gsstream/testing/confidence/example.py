@@ -1,4 +1,4 @@
-"""Share of the largest change: how far a change in the images pulls a Gaussian, against the strongest pull."""
+"""Share of the largest change: the gradient of a change in the images by a Gaussian, relative to the largest."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ class ExampleConfidence(ConfidenceEstimator):
     source = "gsstream"
 
     class Config(PartConfig):
-        gain: float = Field(default=10.0, gt=0, le=100, description="steepness, logits per share of the largest pull")
+        gain: float = Field(default=10.0, gt=0, le=100, description="steepness, logits per share of the largest gradient")
         floor: float = Field(default=-6.0, ge=-50, le=0, description="logit of a Gaussian that nothing pulls")
 
     traits = ConfidenceTraits(needs_renderer=True, finds_motion=True, monotone_in_change=True)
 
     def claims(self) -> ConfidenceTraits:
-        # A share of the largest pull: an even change of light makes a few Gaussians suspect, never half of them.
+        # A share of the largest gradient: an even change of light makes a few Gaussians suspect, never half of them.
         return replace(self.traits, floor=self.config.floor, brightness=0.0)
 
     def estimate(self, context: FrameContext) -> torch.Tensor:
-        change = torch.zeros(len(context.gaussians), dtype=torch.float64)
+        total = torch.zeros(len(context.gaussians), dtype=torch.float64)
         for view in range(len(context.cameras)):
             change = context.previous_image(view) - context.image(view)
             check_finite(f"change of view {view}", change)
             gradient, visible = context.screen_gradient(view, change)
-            change += gradient.double().norm(dim=1) * visible
-        logits = torch.full_like(change, self.config.floor)
-        changed = change > 0
+            total += gradient.double().norm(dim=1) * visible
+        logits = torch.full_like(total, self.config.floor)
+        changed = total > 0
         if bool(changed.any()):
-            share = change[changed] / change.max()
+            share = total[changed] / total.max()
             logits[changed] = (self.config.gain * (share - 0.5)).clamp_min(self.config.floor)
         return logits.float()

@@ -21,8 +21,8 @@ class ExampleConfidence(ConfidenceEstimator):
     source = "gsstream"
 
     class Config(PartConfig):
-        gain: float = Field(default=10.0, gt=0, le=100, description="steepness, logits per share of the largest gradient")
-        floor: float = Field(default=-6.0, ge=-50, le=0, description="logit of a Gaussian that nothing pulls")
+        gain: float = Field(default=10.0, gt=0, le=100, description="steepness, logits per share of the largest")
+        floor: float = Field(default=-6.0, ge=-50, le=0, description="logit of a Gaussian without a gradient")
 
     traits = ConfidenceTraits(needs_renderer=True, finds_motion=True, monotone_in_change=True)
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
-from gsstream_lab.commands.compare import _at_time
-from gsstream_lab.compare.pictures import Tile, tiles_in_rows
-from gsstream_lab.compare.plan import EPOCHS, Wanted, equal_epochs, equal_time, own, own_epochs, scene_name
+from gsstream_lab.commands.options import RecordingOptions, scene_name
 from gsstream_lab.report.groups import SweepData, read_sweep_data
+from gsstream_lab.report.pictures import Tile, tiles_in_rows
+from gsstream_lab.sweep.compare import EPOCHS, equal_epochs, equal_time, own_epochs, own_settings
+from gsstream_lab.sweep.config import SweepConfig
 from gsstream_lab.sweep.plan import make_plan
 from gsstream_lab.sweep.table import read_table
 from PIL import Image
@@ -76,10 +78,15 @@ def test_the_same_command_goes_on_and_equal_time_uses_what_was_measured(compared
     assert len(table.first_frames) == 1
 
 
+def planned(*methods: str, seeds: Sequence[int] = (0,)) -> SweepConfig:
+    return own_settings(methods, RecordingOptions("demo").scene(), seeds)
+
+
 def test_equal_epochs_leaves_methods_alone_that_make_none() -> None:
-    catalog, wanted = load_catalog(), Wanted(("hold", "dense"), "demo", seeds=(0, 1))
-    assert own_epochs(wanted, catalog) == {"hold": None, "dense": 20}
-    config = equal_epochs(wanted, [2, 5], catalog)
+    catalog, config = load_catalog(), planned("hold", "dense", seeds=(0, 1))
+    assert own_epochs(config, catalog) == {"hold": None, "dense": 20}
+    assert equal_epochs(config, [], catalog).variants[1].axes == {EPOCHS: [20]}, "those of the first that makes any"
+    config = equal_epochs(config, [2, 5], catalog)
     plan = make_plan(config, Path(), catalog.recipe_path)
     assert [(cell.variant, cell.seed, cell.axes.get(EPOCHS)) for cell in plan.points] == [
         (name, seed, epochs)
@@ -90,33 +97,33 @@ def test_equal_epochs_leaves_methods_alone_that_make_none() -> None:
     assert "no passes in hold" in config.description
 
 
-def test_without_seconds_the_first_method_that_makes_passes_sets_the_time(compared, monkeypatch) -> None:
-    out, data = compared
-    catalog, wanted = load_catalog(), Wanted(("hold", "dense"), SOURCE)
-    monkeypatch.setattr("gsstream_lab.report.groups.read_sweep_data", lambda _: data)
-    config = _at_time(wanted, [], out, catalog)
-    assert {variant.name: variant.axes for variant in config.variants} == {"hold": {}, "dense": {EPOCHS: [20]}}
-    with pytest.raises(InputError, match="no method that makes passes"):
-        _at_time(Wanted(("hold",), SOURCE), [], out, catalog)
+@pytest.mark.parametrize(
+    ("seconds", "epochs"), [([], [20]), ([1.0], [10]), ([1e-9, 1e-8], [1]), ([4.0, 1.0], [40, 10])],
+    ids=["time of the first that makes passes", "half the time", "at least one pass", "a curve"],
+)  # fmt: skip
+def test_equal_time_gives_passes_in_proportion(seconds: list[float], epochs: list[int]) -> None:
+    config = equal_time(planned("hold", "dense"), seconds, {"hold": 0.1, "dense": 2.0}, load_catalog())
+    assert {variant.name: variant.axes for variant in config.variants} == {"hold": {}, "dense": {EPOCHS: epochs}}
 
 
-def test_equal_time_asks_for_at_least_one_pass(compared) -> None:
-    config = equal_time(Wanted(("dense", "hold"), SOURCE), [1e-9, 1e-8], compared[1], load_catalog())
-    assert [variant.axes for variant in config.variants] == [{EPOCHS: [1]}, {}]
+def test_without_seconds_some_method_must_have_run() -> None:
+    for methods, took in ((("hold",), {"hold": 0.1}), (("dense",), {})):
+        with pytest.raises(InputError, match="no method that makes passes"):
+            equal_time(planned(*methods), [], took, load_catalog())
 
 
 def test_recipe_files_are_methods_and_names_are_used_once(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("base: dense\nstream: {epochs: 3}\n")
     mine = str(tmp_path / "mine.yaml")
-    assert own_epochs(Wanted((mine,), "demo"), load_catalog()) == {"mine": 3}
+    assert own_epochs(planned(mine), load_catalog()) == {"mine": 3}
     with pytest.raises(RecipeError, match="two methods are called 'mine'"):
-        own(Wanted((mine, mine), "demo"))
+        planned(mine, mine)
 
 
 @pytest.mark.parametrize(
     ("source", "name"),
     [("demo", "demo"), ("n3dv:/data/flame_salmon/", "flame_salmon"), ("/data/pick blocks", "pick-blocks"),
-     (SOURCE, "synthetic"), ("..", "recording")],
+     (SOURCE, "synthetic"), ("..", "recording"), ("../rec/k.1?missing=refuse", "k.1"), ("/", "recording")],
 )  # fmt: skip
 def test_recordings_are_called_by_their_last_part(source: str, name: str) -> None:
     assert scene_name(source) == name

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 from flow_runs import WORLD, encode, metrics
-from gsstream_lab.commands.tune import _name
 from gsstream_lab.report.groups import read_sweep_data
 from gsstream_lab.sweep.table import read_table
 from gsstream_lab.sweep.tune import Trial, candidates, choose, nearest, trial_of, tune_table
@@ -79,12 +78,6 @@ def test_the_best_that_fits_is_chosen() -> None:
     assert "<- chosen" in table[2]
     assert "| good" in table[2]
     assert "failed: it broke" in table[-1]
-
-
-def test_progress_calls_the_recording_by_its_name() -> None:
-    names = {"demo": "demo", "synthetic:frames=6&views=3": "synthetic", "n3dv:/data/coffee martini/": "coffee",
-             "../rec/k.1?missing=refuse": "k.1", "/": "scene"}  # fmt: skip
-    assert {uri: _name(uri) for uri in names} == names
 
 
 def command(out: Path, budget: str, *more: str) -> list[str]:

@@ -2,40 +2,16 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from gsstream.cli import options
 from gsstream.cli.grouped import grouped
 from gsstream.cli.listing import plural
-from gsstream_lab.commands.options import RecordingOptions, WorkerOptions
-
-if TYPE_CHECKING:
-    from gsstream.plugins.catalog import Catalog
-    from gsstream_lab.compare.plan import Wanted
-    from gsstream_lab.jobs.base import Executor
-    from gsstream_lab.sweep.config import SweepConfig
-
-
-class At(StrEnum):
-    """What is equal between the methods."""
-
-    own = "own"
-    epochs = "epochs"
-    time = "time"
-
-
-class Split(StrEnum):
-    """Which cameras judge."""
-
-    reporting = "reporting"
-    tuning = "tuning"
+from gsstream_lab.commands.options import RecordingOptions, WorkerOptions, progress
 
 
 @dataclass(frozen=True)
@@ -43,12 +19,12 @@ class Equal:
     """What every method gets the same of."""
 
     at: Annotated[
-        At,
+        Literal["own", "epochs", "time"],
         typer.Option(
             "--at", help="own: the settings of each recipe; epochs: the same passes a frame; time: the same processor "
             "time, by passes in proportion to what a run at own settings took.",
         ),
-    ] = At.own
+    ] = "own"
     epochs: Annotated[
         str | None,
         typer.Option("--epochs", metavar="N,...", help="With --at epochs; several give curves; default: the first's."),
@@ -57,6 +33,15 @@ class Equal:
         str | None,
         typer.Option("--seconds", metavar="S,...", help="With --at time, a frame; default: what the first takes."),
     ] = None
+
+    def numbers(self) -> tuple[list[int], list[float]]:
+        """Return what --epochs and --seconds say. Raises InputError for one that means nothing here."""
+        from gsstream.core.errors import InputError
+
+        for option, text, where in (("--epochs", self.epochs, "epochs"), ("--seconds", self.seconds, "time")):
+            if text is not None and self.at != where:
+                raise InputError(f"{option} {text} belongs to --at {where}, got --at {self.at}")
+        return _integers(self.epochs, "--epochs", 1), _numbers(self.seconds, "--seconds", 1e-3)
 
 
 @grouped
@@ -67,7 +52,9 @@ def compare(
     equal: Equal,
     where: WorkerOptions,
     seeds: Annotated[str, typer.Option("--seeds", metavar="N,...", help="Seeds of every random stream.")] = "0",
-    split: Annotated[Split, typer.Option("--split", help="Which cameras judge, as data.split.")] = Split.reporting,
+    split: Annotated[
+        Literal["reporting", "tuning"], typer.Option("--split", help="Which cameras judge, as data.split.")
+    ] = "reporting",
     pictures: Annotated[
         bool, typer.Option("--pictures/--no-pictures", help="Pictures hold images of the recording: mind its licence.")
     ] = True,
@@ -76,110 +63,64 @@ def compare(
     """Encode one recording with several methods and show them side by side.
 
     All begin with one frame 0; report.html and report.md are written.
-    Curves of quality on changed pixels and on the whole image against KB and seconds, all numbers, pictures side by
-    side from a held-out camera, and a video of all methods. Finished runs are kept: the same command goes on, and more
-    methods may join. A run that fails is recorded and the others go on (exit code 1 at the end).
+    The report of the sweep, and pictures side by side from a held-out camera, and a video of all methods. Finished runs
+    are kept: the same command goes on, and more methods may join. A run that fails is recorded and the others go on
+    (exit code 1 at the end).
     """
     from gsstream.plugins.catalog import load_catalog
-    from gsstream_lab.compare.plan import Wanted
-    from gsstream_lab.jobs.executor import make_executor
-    from gsstream_lab.sweep.job import run_job
-
-    wanted = Wanted(
-        tuple(name.strip() for name in methods.split(",") if name.strip()), recording.source, recording.recipe,
-        recording.frames, recording.scale, tuple(int(seed) for seed in _numbers(seeds, "--seeds", 0, whole=True)),
-        recording.changes(), split.value,
-    )  # fmt: skip
-    catalog, limits = load_catalog(), _limits(equal.at, equal.epochs, equal.seconds)
-    executor = functools.partial(make_executor, run_job, where.workers, where.threads, where.ray)
-    failed = _run(wanted, equal.at, limits, out, catalog, executor, quiet)
-    _write_page(out, recording.source, catalog, pictures, quiet)
-    if failed:
-        typer.echo(f"{plural(failed, 'run')} failed; the page says why", err=True)
-        raise typer.Exit(1)
-
-
-def _run(
-    wanted: Wanted, at: At, limits: list[float], out: Path, catalog: Catalog, executor: Callable[[], Executor],
-    quiet: bool,
-) -> int:  # fmt: skip
-    """Make every run that is not there yet; returns the number of those that failed."""
-    from gsstream_lab.compare.plan import own
+    from gsstream_lab.report.groups import read_sweep_data
+    from gsstream_lab.sweep.compare import equal_epochs, equal_time, own_settings
     from gsstream_lab.sweep.drive import run_sweep
     from gsstream_lab.sweep.plan import make_plan
 
-    say = (lambda _: None) if quiet else typer.echo
-
-    def made(config: SweepConfig) -> int:
-        return len(run_sweep(make_plan(config, Path(), catalog.recipe_path), out, executor(), say=say).failed)
-
-    if at is At.epochs:
-        return made(_at_epochs(wanted, [int(number) for number in limits], catalog))
-    failed = made(own(wanted))
-    return made(_at_time(wanted, limits, out, catalog)) if at is At.time else failed
-
-
-def _limits(at: At, epochs: str | None, seconds: str | None) -> list[float]:
-    """What --epochs or --seconds says; nothing given: empty. Raises InputError for one that means nothing here."""
-    from gsstream.core.errors import InputError
-
-    for option, text, where in (("--epochs", epochs, At.epochs), ("--seconds", seconds, At.time)):
-        if text is not None and at is not where:
-            raise InputError(f"{option} {text} belongs to --at {where.value}, got --at {at.value}")
-    if epochs is not None:
-        return _numbers(epochs, "--epochs", 1, whole=True)
-    return [] if seconds is None else _numbers(seconds, "--seconds", 1e-3)
+    epochs, seconds = equal.numbers()
+    names = [name.strip() for name in methods.split(",") if name.strip()]
+    catalog, config = load_catalog(), own_settings(names, recording.scene(), _integers(seeds, "--seeds", 0), split)
+    if equal.at == "epochs":
+        config = equal_epochs(config, epochs, catalog)
+    plan = make_plan(config, Path(), catalog.recipe_path)
+    result = run_sweep(plan, out, where.executor(), say=progress(quiet))
+    if equal.at == "time":
+        took = {one.variant: one.mean("cpu_seconds") for one in read_sweep_data(out).groups}
+        plan = make_plan(equal_time(config, seconds, took, catalog), Path(), catalog.recipe_path)
+        result = run_sweep(plan, out, where.executor(), say=progress(quiet))
+    _write_page(out, pictures, quiet)
+    if result.failed:
+        typer.echo(f"{plural(len(result.failed), 'run')} failed; the page says why", err=True)
+        raise typer.Exit(1)
 
 
-def _numbers(text: str, option: str, least: float, whole: bool = False) -> list[float]:
+def _numbers(text: str | None, option: str, least: float, kind: type = float) -> list[float]:
     from gsstream.core.errors import InputError
 
     try:
-        found = [float(int(part)) if whole else float(part) for part in text.split(",")]
+        found = [] if text is None else [kind(part) for part in text.split(",")]
     except ValueError:
-        found = []
-    if not found or not least <= min(found) <= max(found) < float("inf") or len(set(found)) < len(found):
-        kind = "whole numbers" if whole else "numbers"
-        raise InputError(f"{option} {text}: expected different {kind} from {least:g} on, such as 3,6,12")
+        found = [-1]
+    if found and (not least <= min(found) <= max(found) < float("inf") or len(set(found)) < len(found)):
+        raise InputError(
+            f"{option} {text}: expected different {'whole ' if kind is int else ''}numbers from {least:g} on, such as "
+            "3,6,12"
+        )
     return found
 
 
-def _at_epochs(wanted: Wanted, epochs: list[int], catalog: Catalog) -> SweepConfig:
-    from gsstream_lab.compare.plan import equal_epochs, own_epochs
-
-    known = [number for number in own_epochs(wanted, catalog).values() if number is not None]
-    return equal_epochs(wanted, epochs or known[:1] or [1], catalog)
+def _integers(text: str | None, option: str, least: int) -> list[int]:
+    return [int(number) for number in _numbers(text, option, least, int)]
 
 
-def _at_time(wanted: Wanted, seconds: list[float], out: Path, catalog: Catalog) -> SweepConfig:
-    """The second half of --at time, once every method has run at its own settings."""
-    from gsstream.core.errors import InputError
-    from gsstream_lab.compare.plan import equal_time, own_epochs, own_seconds
+def _write_page(out: Path, pictures: bool, quiet: bool) -> None:
+    from gsstream_lab.report.build import build_report
+    from gsstream_lab.report.document import Block, write_report
     from gsstream_lab.report.groups import read_sweep_data
-
-    measured = read_sweep_data(out)
-    took = [own_seconds(measured, name) for name, number in own_epochs(wanted, catalog).items() if number is not None]
-    known = [value for value in took if value > 0]
-    if not seconds and not known:
-        raise InputError("--at time: no method that makes passes over the cameras has run; say --seconds")
-    return equal_time(wanted, seconds or known[:1], measured, catalog)
-
-
-def _write_page(out: Path, source: str, catalog: Catalog, pictures: bool, quiet: bool) -> None:
-    from gsstream.engine.run.recording import reopen_recording
-    from gsstream_lab.compare.page import build_page
-    from gsstream_lab.jobs.folder import recording_uri
-    from gsstream_lab.report.document import write_report
-    from gsstream_lab.report.groups import read_sweep_data
+    from gsstream_lab.report.pictures import decoding, recording_of, side_by_side
 
     data = read_sweep_data(out)
-    recipe = data.table.recipes[data.groups[0].runs[0].row["recipe"]]["values"]
-    recording = reopen_recording(recording_uri(source, None), recipe, catalog)
-    try:
-        with_pictures = pictures and len(recording.info.test) > 0
-        blocks = build_page(out, data, recording if with_pictures else None)
-    finally:
-        recording.close()
-    written = write_report(f"Methods side by side: {data.scenes[0]}", blocks, out)
+    (scene,) = data.scenes
+    shown: list[Block] = [decoding(out, data, scene)]
+    if pictures:
+        with recording_of(data, scene, None) as source:
+            shown += side_by_side(out, data, scene, source) if len(source.info.test) else []
+    written = write_report(f"Methods side by side: {scene}", build_report(data, {scene: shown}), out)
     if not quiet:
         typer.echo("\n".join(f"wrote {path}" for path in written[:2]))

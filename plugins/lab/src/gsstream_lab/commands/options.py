@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import re
+import shlex
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from gsstream.cli import options
+
+if TYPE_CHECKING:
+    from gsstream_lab.jobs.base import Executor
+    from gsstream_lab.sweep.config import Scene
 
 
 @dataclass(frozen=True)
@@ -23,11 +30,23 @@ class RecordingOptions:
     frames: Annotated[int | None, typer.Option("--frames", help="Number of frames; default: all, in pilots 5.")] = None
     scale: options.Scale = None
 
-    def changes(self) -> dict[str, Any]:
-        """Return recipe key -> value of ``--set``. Raises RecipeError for one that is not KEY=VALUE."""
+    def scene(self, frames: int | None = None) -> Scene:
+        """Return the recording as the scene of a sweep. Raises RecipeError for a ``--set`` that is not KEY=VALUE."""
         from gsstream.recipe.document import read_override
+        from gsstream_lab.sweep.config import Scene
 
-        return {".".join(path): leaf.value for path, leaf in map(read_override, self.settings or ())}
+        return Scene(
+            name=scene_name(self.source), uri=self.source, scale=self.scale, frames=self.frames or frames,
+            recipe=None if self.recipe is None else str(self.recipe.resolve()),
+            set={".".join(path): leaf.value for path, leaf in map(read_override, self.settings or ())},
+        )  # fmt: skip
+
+    def next_command(self, recipe: Path, out: Path) -> str:
+        """Return the command that encodes the whole recording with a recipe, ready for a shell."""
+        from gsstream_lab.jobs.folder import recording_uri
+
+        source = recording_uri(self.source, None)
+        return shlex.join(["gsstream", "run", "--source", source, "--recipe", str(recipe), "--out", str(out)])
 
 
 @dataclass(frozen=True)
@@ -42,3 +61,22 @@ class WorkerOptions:
         str | None,
         typer.Option("--ray", metavar="ADDRESS", help="Run on this Ray cluster (extra: ray); 'local' starts one here."),
     ] = None
+
+    def executor(self) -> Executor:
+        """Return workers that run the cells of one sweep."""
+        from gsstream_lab.jobs.executor import make_executor
+        from gsstream_lab.sweep.job import run_job
+
+        return make_executor(run_job, self.workers, self.threads, self.ray)
+
+
+def progress(quiet: bool) -> Callable[[str], Any]:
+    """Return what takes the lines that a sweep prints while it works."""
+    return (lambda _: None) if quiet else typer.echo
+
+
+def scene_name(source: str) -> str:
+    """Return what tables call a recording: the last part of its URI, or the name of its source."""
+    scheme, _, rest = source.partition("?")[0].partition(":")
+    last = Path(rest or scheme).name if "=" not in rest else scheme
+    return re.sub(r"[^\w.+-]", "-", last, flags=re.ASCII).lstrip("_.+-") or "recording"

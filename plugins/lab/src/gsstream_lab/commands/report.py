@@ -40,12 +40,16 @@ def report(
         if name not in swept.scenes:
             raise UnknownName("scene with a finished run", name, swept.scenes)
     # The slow imports come last, so that a mistake on the command line is answered at once.
-    from gsstream_lab.report.build import build_report, write_sheets
+    from gsstream_lab.report.build import build_report
     from gsstream_lab.report.document import write_report
+    from gsstream_lab.report.pictures import contact_sheet, recording_of
 
-    pictures = write_sheets(folder, swept, wanted, data) if wanted else {}
+    shown = {}
+    for name in wanted:
+        with recording_of(swept, name, data) as source:
+            shown[name] = contact_sheet(folder, swept, name, source)
     title = f"Sweep {swept.config['name']}"
-    written = write_report(title, build_report(swept, pictures), out or folder / "report")
+    written = write_report(title, build_report(swept, shown), out or folder / "report")
     typer.echo("\n".join(f"wrote {path}" for path in written[:2]))
     if swept.missing or swept.failed:
         typer.echo(f"{plural(len(swept.missing), 'cell')} not run yet, {len(swept.failed)} failed", err=True)

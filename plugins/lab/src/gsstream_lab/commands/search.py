@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,7 +9,7 @@ import typer
 
 from gsstream.cli import options
 from gsstream.cli.grouped import grouped
-from gsstream_lab.commands.options import RecordingOptions, WorkerOptions
+from gsstream_lab.commands.options import RecordingOptions, WorkerOptions, progress
 
 FOUND = "found.yaml"
 
@@ -40,10 +39,6 @@ def search(
     from gsstream.engine.assembly.assemble import assemble
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
-    from gsstream_lab.commands.tune import next_command, scene_of
-    from gsstream_lab.jobs.executor import make_executor
-    from gsstream_lab.jobs.folder import recording_uri
-    from gsstream_lab.sweep.job import run_job
     from gsstream_lab.sweep.plan import make_plan
     from gsstream_lab.sweep.search import SweepScore, climb, usual_ladders, value_of
     from gsstream_lab.sweep.tune import tuned_recipe
@@ -55,16 +50,13 @@ def search(
     ladders = _ladders(tried) or usual_ladders(parts.recipe)
     start = {key: value_of(parts, key) for key in ladders}
     ladders = {key: values if start[key] in values else (start[key], *values) for key, values in ladders.items()}
-    executor = functools.partial(make_executor, run_job, where.workers, where.threads, where.ray)
-    say = (lambda _: None) if quiet else typer.echo
-    score = SweepScore(scene_of(recording, 1), method, seed, out, catalog.recipe_path, executor, say)
+    score = SweepScore(recording.scene(1), method, seed, out, catalog.recipe_path, where.executor, progress(quiet))
     found = climb(start, ladders, score)
     key = next(iter(ladders))
     (point,) = make_plan(score.config(found, key, [found[key]]), Path(), catalog.recipe_path).points
     (out / FOUND).write_text(tuned_recipe(point.resolved), encoding="utf-8")
     typer.echo("\n".join(f"{key}: {start[key]} -> {value}" for key, value in found.items()))
-    source = recording_uri(recording.source, None)
-    typer.echo(f"\nwrote {out / FOUND}; next: {next_command(source, out / FOUND, out / 'run')}")
+    typer.echo(f"\nwrote {out / FOUND}; next: {recording.next_command(out / FOUND, out / 'run')}")
 
 
 def _ladders(tried: list[str] | None) -> dict[str, tuple[Any, ...]]:

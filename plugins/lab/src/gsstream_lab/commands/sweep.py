@@ -10,7 +10,7 @@ import typer
 from gsstream.cli import options
 from gsstream.cli.grouped import grouped
 from gsstream.cli.listing import plural, table
-from gsstream_lab.commands.options import WorkerOptions
+from gsstream_lab.commands.options import WorkerOptions, progress
 
 if TYPE_CHECKING:
     from gsstream_lab.sweep.plan import Plan
@@ -47,12 +47,9 @@ def sweep(
     if dry_run:
         typer.echo(_describe(plan, out))
         return
-    from gsstream_lab.jobs.executor import make_executor
     from gsstream_lab.sweep.drive import run_sweep
-    from gsstream_lab.sweep.job import run_job
 
-    executor = make_executor(run_job, where.workers, where.threads, where.ray)
-    result = run_sweep(plan, out, executor, data=data, say=(lambda _: None) if quiet else typer.echo)
+    result = run_sweep(plan, out, where.executor(), data=data, say=progress(quiet))
     if not quiet:
         made = plural(result.made - len(result.failed), "cell")
         typer.echo(f"{out / 'table.jsonl'}: {made} made, {result.kept} kept; next: gsstream report {out}")

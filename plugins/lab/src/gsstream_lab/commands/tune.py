@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,12 +11,11 @@ from gsstream.cli import options
 from gsstream.cli.grouped import grouped
 from gsstream.cli.listing import fitting, plural
 from gsstream.cli.streams import stream_file
-from gsstream_lab.commands.options import RecordingOptions
+from gsstream_lab.commands.options import RecordingOptions, WorkerOptions, progress
 
 if TYPE_CHECKING:
     from gsstream.recipe.budget import Budget
     from gsstream.recipe.model import Recipe
-    from gsstream_lab.sweep.config import Scene
     from gsstream_lab.sweep.plan import Plan
     from gsstream_lab.sweep.tune import Trial
 
@@ -54,32 +51,18 @@ def tune(
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.budget import budget_overrides
     from gsstream.recipe.load import resolve_recipe
-    from gsstream_lab.jobs.folder import recording_uri
     from gsstream_lab.sweep.plan import make_plan
-    from gsstream_lab.sweep.tune import METHODS, pilot
+    from gsstream_lab.sweep.tune import METHODS, give_first_frame, pilot
 
     catalog = load_catalog()
     limits = _limits(resolve_recipe(None, catalog.recipe_path, (), budget_overrides(budget)).recipe, recording.source)
     known = catalog.names("method")
     tried = methods or [name for name in METHODS if name in known]
-    plan = make_plan(pilot(scene_of(recording, FRAMES), tried, limits, seed), Path(), catalog.recipe_path)
+    plan = make_plan(pilot(recording.scene(FRAMES), tried, limits, seed), Path(), catalog.recipe_path)
     if first_frame is not None:
-        from gsstream_lab.sweep.tune import give_first_frame
-
         give_first_frame(plan, out, stream_file(first_frame))
     trials = _run(plan, limits, out, workers, quiet)
-    _tell(plan, trials, limits, out, recording_uri(recording.source, None))
-
-
-def scene_of(recording: RecordingOptions, frames: int) -> Scene:
-    """Return the recording of a pilot, with the number of frames where none is given."""
-    from gsstream_lab.sweep.config import Scene
-
-    return Scene(
-        name=_name(recording.source), uri=recording.source,
-        recipe=str(recording.recipe.resolve()) if recording.recipe else None, scale=recording.scale,
-        frames=recording.frames or frames, set=recording.changes(),
-    )  # fmt: skip
+    _tell(plan, trials, limits, out, recording)
 
 
 def _limits(recipe: Recipe, source: str) -> Budget:
@@ -99,33 +82,20 @@ def _limits(recipe: Recipe, source: str) -> Budget:
 
 
 def _run(plan: Plan, limits: Budget, out: Path, workers: int | None, quiet: bool) -> list[Trial]:
-    from gsstream_lab.jobs.executor import make_executor, usable_processors
+    from gsstream_lab.jobs.executor import usable_processors
     from gsstream_lab.sweep.drive import run_sweep
-    from gsstream_lab.sweep.job import run_job
     from gsstream_lab.sweep.table import read_table
     from gsstream_lab.sweep.tune import trial_of
 
     processors = usable_processors()
     # Candidates that run at the same time would slow each other down.
     workers = workers or (1 if limits.time is not None else processors)
-    executor = make_executor(run_job, workers, max(1, processors // workers))
-    run_sweep(plan, out, executor, say=(lambda _: None) if quiet else typer.echo)
+    run_sweep(plan, out, WorkerOptions(workers, max(1, processors // workers)).executor(), say=progress(quiet))
     rows = read_table(out).cells
     return [trial_of(point.variant, rows.get(point.id, {"status": "missing"}), limits) for point in plan.points]
 
 
-def _name(uri: str) -> str:
-    """What progress lines and the table call the recording: the last word of where it is."""
-    found = re.search(r"[A-Za-z0-9][\w.+-]*", re.split(r"[/\\]", uri.partition("?")[0].rstrip("/"))[-1])
-    return found[0] if found else "scene"
-
-
-def next_command(source: str, recipe: Path, out: Path) -> str:
-    """Return the command that encodes the whole recording with a recipe, ready for a shell."""
-    return shlex.join(["gsstream", "run", "--source", source, "--recipe", str(recipe), "--out", str(out)])
-
-
-def _tell(plan: Plan, trials: list[Trial], limits: Budget, out: Path, source: str) -> None:
+def _tell(plan: Plan, trials: list[Trial], limits: Budget, out: Path, recording: RecordingOptions) -> None:
     from gsstream_lab.sweep.tune import choose, nearest, tune_table, tuned_recipe
 
     chosen = choose(trials)
@@ -134,7 +104,7 @@ def _tell(plan: Plan, trials: list[Trial], limits: Budget, out: Path, source: st
         resolved = next(point.resolved for point in plan.points if point.variant == chosen.name)
         file = out / "tuned.yaml"
         file.write_text(tuned_recipe(resolved), encoding="utf-8")
-        typer.echo(f"\nwrote {file}: {chosen.name}; next: {next_command(source, file, out / 'run')}")
+        typer.echo(f"\nwrote {file}: {chosen.name}; next: {recording.next_command(file, out / 'run')}")
         return
     close = nearest(trials)
     if close is None:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-from gsstream_lab.report.document import Block, Heading, Picture, Table, Text
-from gsstream_lab.report.figures import curve_groups, frame_curves, measured_costs, pareto_figure
+from gsstream_lab.report.document import Block, Picture, Table
+from gsstream_lab.report.figures import curve_groups, frame_curves, measured_costs, measured_goods, pareto_figure
 from gsstream_lab.report.fronts import Effect, effects, knee, pareto_front
 from gsstream_lab.report.groups import Group, SweepData, seed_noise, waited
 from gsstream_lab.report.paper import beside_ours, paper_table
@@ -17,8 +16,9 @@ from gsstream_lab.report.rate_curves import curve_blocks
 
 _NOT_MEASURED = {"joules": "energy"}
 _MEANS = (
-    "All quality is of frames decoded from packets. Means are over test cameras, then over the frames after the first; "
-    "seconds are wall time, CPU s the time of the run's process."
+    "All quality is of frames that the same player decoded from packets. Means are over test cameras, then over the "
+    "frames after the first; seconds are wall time, CPU s the time of the run's process. Moving pixels differ from frame "
+    "0 by more than noise, changed ones by more than 0.1. KB are 1,000 bytes of packets, key packets apart."
 )
 _JUDGES = {
     "reporting": "The cameras that judge are the test cameras (reporting split): choose no setting by this page.",
@@ -32,23 +32,19 @@ _WAITED = (
 )
 
 
-def build_report(data: SweepData, sheets: Mapping[str, Picture]) -> list[Block]:
+def build_report(data: SweepData, shown: Mapping[str, Sequence[Block]]) -> list[Block]:
     """Return all blocks, in reading order."""
-    blocks: list[Block] = []
-    if data.config["description"]:
-        blocks.append(Text(data.config["description"]))
-    blocks += where_it_ran(data)
+    blocks: list[Block] = [data.config["description"]] if data.config["description"] else []
+    blocks += _where_it_ran(data)
     for scene in data.scenes:
-        blocks += _scene(data, scene)
-        if scene in sheets:
-            blocks += [Heading(f"{scene}: pictures", 3), sheets[scene]]
+        blocks += [*_scene(data, scene), *shown.get(scene, ())]
     if data.failed:
-        rows = [["cell", "reason"], *([label, reason.splitlines()[0]] for label, reason in data.failed.items())]
-        blocks += [Heading("Failed"), Table("Cells that failed", rows)]
+        rows = [["run", "reason"], *([label, reason.splitlines()[0]] for label, reason in data.failed.items())]
+        blocks += ["## Failed", Table("Runs that failed", rows)]
     return blocks
 
 
-def where_it_ran(data: SweepData) -> list[Block]:
+def _where_it_ran(data: SweepData) -> list[Block]:
     """Return what ran where, by which cameras it was judged, and what was not measured."""
     runs = [run for group in data.groups for run in group.runs]
     rows = {run.id: run.row for run in runs}
@@ -78,18 +74,19 @@ def where_it_ran(data: SweepData) -> list[Block]:
         notes.append(_WAITED)
     if not one_machine([data.table.machines[key]["facts"] for key in machines]):
         notes.append("The runs are of several machines or states of the code: their seconds do not compare.")
-    return [Text(" ".join(notes)), Table("Where it ran", [head, *lines])]
+    return [" ".join(notes), Table("Where it ran", [head, *lines])]
 
 
 def _scene(data: SweepData, scene: str) -> list[Block]:
     groups = data.of(scene)
-    blocks: list[Block] = [Heading(scene), Text(_noise(groups))]
-    blocks.append(Picture(f"{scene}-pareto.png", pareto_figure(groups, f"{scene}: quality against cost"),
-                          f"Quality against cost on {scene}, one point per recipe"))  # fmt: skip
-    blocks += [_fronts(groups), all_runs(groups, data.measured())]
+    blocks: list[Block] = [f"## {scene}", _noise(groups)]
+    if measured_goods(groups):
+        blocks.append(Picture(f"{scene}-pareto.png", pareto_figure(groups, f"{scene}: quality against cost"),
+                              f"Quality against cost on {scene}, one point per recipe"))  # fmt: skip
+    blocks += [_fronts(groups), _all_runs(groups, data.measured())]
     found = effects(groups, [*QUALITIES, *measured_costs(groups)])
     if found:
-        blocks += [_knobs(found, groups), Text(_READING)]
+        blocks += [_knobs(found, groups), _READING]
     blocks += curve_blocks(groups, scene)
     for name, rows in data.config.get("paper_tables", {}).items():
         blocks.append(beside_ours(paper_table(name), groups, scene, rows))
@@ -151,8 +148,8 @@ def _fronts(groups: Sequence[Group]) -> Table:
     return Table("Pareto fronts", rows)
 
 
-def all_runs(groups: Sequence[Group], keys: Sequence[str]) -> Table:
-    """Return a table with a row for each group."""
+def _all_runs(groups: Sequence[Group], keys: Sequence[str]) -> Table:
+    """A row for each group, a column for each quantity."""
     rows = [["recipe", "seeds", *(BY_KEY[key].title for key in keys)]]
     for group in groups:
         cells = [cell(key, group.mean(key), group.spread(key)) for key in keys]
@@ -191,38 +188,3 @@ def _delta(effect: Effect, key: str) -> str:
 
 def _ratio(value: float) -> str:
     return f"{value:.3g}" if math.isfinite(value) else "-"
-
-
-def write_sheets(folder: Path, data: SweepData, scenes: Sequence[str], recordings: Path | None) -> dict[str, Picture]:
-    """Write a contact sheet of the first variant of each scene.
-
-    Raises InputError when a recording cannot be found.
-    """
-    import tempfile
-
-    from gsstream.engine.run.recording import reopen_recording
-    from gsstream.evaluation.contact_sheet import sheet_of_stream
-    from gsstream.plugins.catalog import load_catalog
-    from gsstream_lab.jobs.folder import recording_uri
-    from gsstream_lab.sweep.drive import cell_file
-    from gsstream_lab.sweep.plan import disturbed_uri
-
-    out, catalog = {}, load_catalog()
-    uris = {scene["name"]: scene["uri"] for scene in data.config["scenes"]}
-    disturbed = {variant["name"]: variant.get("disturbed") for variant in data.config["variants"]}
-    for scene in scenes:
-        group = data.of(scene)[0]
-        run = group.runs[0]
-        recipe = data.table.recipes[run.row["recipe"]]["values"]
-        uri = disturbed_uri(uris[scene], disturbed[run.row["variant"]], run.row["seed"])
-        source = reopen_recording(recording_uri(uri, recordings), recipe, catalog)
-        frames = sorted({0, len(run.records) // 2, len(run.records) - 1})
-        try:
-            with tempfile.TemporaryDirectory() as temporary:
-                sheet = Path(temporary) / "sheet.jpg"
-                sheet_of_stream(cell_file(folder, run.id), source, frames, sheet)
-                text = f"{group.label} on {scene}: ground truth, decoded, error, what was allowed to change"
-                out[scene] = Picture(f"{scene}-sheet.jpg", sheet.read_bytes(), text)
-        finally:
-            source.close()
-    return out

@@ -17,7 +17,7 @@ from matplotlib.ticker import NullFormatter, StrMethodFormatter
 from gsstream.evaluation.plots import COLORS, plot_runs
 from gsstream_lab.report.fronts import knee, pareto_front
 from gsstream_lab.report.groups import Group, seed_noise, waited
-from gsstream_lab.report.quantities import BY_KEY, COSTS, QUALITIES
+from gsstream_lab.report.quantities import BY_KEY, COSTS, DRAWN_QUALITIES
 
 _CURVES = len(COLORS)
 #: With more variants than colours, the next ones have another shape.
@@ -33,19 +33,22 @@ def measured_costs(groups: Sequence[Group]) -> list[str]:
     return [key for key in COSTS if key not in useless and all(math.isfinite(group.mean(key)) for group in groups)]
 
 
-def pareto_figure(
-    groups: Sequence[Group], title: str, goods: Sequence[str] = QUALITIES, costs: Sequence[str] | None = None,
-    joined: bool = False,
-) -> bytes:  # fmt: skip
-    """Draw one panel per quality and cost: every group, its spread, the front as a line, the knee in a ring.
+def measured_goods(groups: Sequence[Group]) -> list[str]:
+    """Return qualities that every group has; none where no camera judges."""
+    return [key for key in DRAWN_QUALITIES if all(math.isfinite(group.mean(key)) for group in groups)]
 
-    The spread is that over seeds.
 
-    Points far below the rest stand at the lower edge as triangles with their value. Names that would cover one another
-    are left out, those of the front last.
+def pareto_figure(groups: Sequence[Group], title: str) -> bytes:
+    """Draw a panel for each quality and cost that all groups have: groups with their spread over seeds, and the front.
+
+    The front is a dark line with its knee in a ring; where recipes differ in one knob alone, a thin line joins those of
+    one variant. Points far below the rest stand at the lower edge as triangles with their value. Names that would cover
+    one another are left out, those of the front last.
     """
-    costs = measured_costs(groups) if costs is None else costs
-    figure = Figure(figsize=(3.6 * len(costs), 6.8), dpi=100, layout="constrained")
+    costs = measured_costs(groups)
+    goods = measured_goods(groups)
+    joined = len({key for group in groups for key in group.axes}) == 1
+    figure = Figure(figsize=(3.6 * len(costs), 3.4 * len(goods)), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(goods), len(costs), squeeze=False, sharey="row", sharex="col")
     variants = list(dict.fromkeys(group.variant for group in groups))
@@ -61,7 +64,7 @@ def pareto_figure(
                     _name(axis, name, line[-1], True)
             if row == len(goods) - 1:
                 axis.set_xlabel(BY_KEY[cost].title, fontsize=9)
-        axes[row, 0].set_ylabel(_QUALITY.get(good, BY_KEY[good].title), fontsize=9)
+        axes[row, 0].set_ylabel(_QUALITY[good], fontsize=9)
     handles = [
         axes[0, 0].scatter([], [], s=24, color=color, marker=shape, label=name)
         for name, (color, shape) in looks.items()

@@ -75,7 +75,8 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("gaussians", "Gaussians, k", ".1f", None, lambda _, f, __: mean(x["num_gaussians"] / 1000 for x in f)),
 )
 BY_KEY: Mapping[str, Quantity] = {quantity.key: quantity for quantity in QUANTITIES}
-#: Pairs of a quality and what it is plotted against.
+DRAWN_QUALITIES = ("psnr", "psnr_moving", "psnr_changed")
+#: Pairs of a quality and what it is weighed against.
 QUALITIES, COSTS = ("psnr", "psnr_moving"), ("kb", "seconds", "cpu_seconds", "memory", "joules")
 
 

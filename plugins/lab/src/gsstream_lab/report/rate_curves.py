@@ -12,14 +12,13 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gsstream_lab.report.document import Block, Picture, Table, Text
+from gsstream_lab.report.document import Block, Picture, Table
 from gsstream_lab.report.fronts import pareto_front
 from gsstream_lab.report.groups import Group
-from gsstream_lab.report.quantities import BY_KEY, cell
+from gsstream_lab.report.quantities import BY_KEY, DRAWN_QUALITIES, cell
 
 #: Fewer points than this make no curve.
 MIN_POINTS = 3
-QUALITIES = ("psnr", "psnr_moving", "psnr_changed")
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +79,7 @@ def curve_blocks(groups: Sequence[Group], scene: str) -> list[Block]:
     for axis, curves in curves_over(groups).items():
         blocks += [
             _table(axis, curves),
-            Text(_READING),
+            _READING,
             Picture(f"{scene}-{axis.rpartition('.')[2]}-curves.png", _figure(axis, curves),
                     f"Quality against bytes on {scene}, a curve for each recipe over {axis}"),
         ]  # fmt: skip
@@ -96,13 +95,13 @@ _READING = (
 
 def _table(axis: str, curves: Sequence[Curve]) -> Table:
     head = ["recipe", axis, "KB/frame"]
-    for quality in QUALITIES:
+    for quality in DRAWN_QUALITIES:
         head += [BY_KEY[quality].title, "BD-rate"]
     rows = [head]
     for curve in curves:
         values = [group.axes[axis] for group in curve.groups]
         row = [curve.name, f"{values[0]} to {values[-1]}", _range(curve, "kb")]
-        for quality in QUALITIES:
+        for quality in DRAWN_QUALITIES:
             delta = math.nan if curve is curves[0] else bd_rate(curves[0].points(quality), curve.points(quality))
             row += [_range(curve, quality), f"{delta:+.0f} %" if math.isfinite(delta) else "-"]
         rows.append(row)
@@ -121,7 +120,7 @@ def _figure(axis: str, curves: Sequence[Curve]) -> bytes:
     from gsstream.evaluation.plots import COLORS
     from gsstream_lab.report.figures import png
 
-    shown = [q for q in QUALITIES if any(math.isfinite(g.mean(q)) for curve in curves for g in curve.groups)]
+    shown = [q for q in DRAWN_QUALITIES if any(math.isfinite(g.mean(q)) for curve in curves for g in curve.groups)]
     figure = Figure(figsize=(4.2 * len(shown), 3.8), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     for panel, quality in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):

@@ -1,10 +1,11 @@
-"""Pictures of several streams beside one another and the ground truth: a sheet, and a video as an animated picture."""
+"""Pictures of a scene's streams: a contact sheet of one, and all beside one another and the ground truth."""
 
 from __future__ import annotations
 
 import tempfile
+import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,20 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from gsstream.core.shapes import FloatArray
-from gsstream.evaluation.contact_sheet import most_changed_window
+from gsstream.engine.run.recording import reopen_recording
+from gsstream.evaluation.contact_sheet import most_changed_window, sheet_of_stream
 from gsstream.evaluation.evaluate import StreamFrames
 from gsstream.input.recordings.base import FrameSource
 from gsstream.metrics import changed_mask, psnr
 from gsstream.player.play import write_pictures
 from gsstream.player.playback import Playback
 from gsstream.player.render import find_renderer, to_bytes
+from gsstream.plugins.catalog import load_catalog
+from gsstream_lab.jobs.folder import recording_uri
+from gsstream_lab.report.document import Block, Picture, Table
+from gsstream_lab.report.groups import SweepData
+from gsstream_lab.sweep.drive import cell_file
+from gsstream_lab.sweep.plan import disturbed_uri
 
 TRUTH = "ground truth"
 _LINE, _GAP = 15, 4
@@ -114,13 +122,60 @@ class SideBySide:
         return out.read_bytes()
 
 
-def picture_files(streams: Mapping[str, Path], source: FrameSource) -> tuple[bytes, bytes, str]:
-    """Return the sheet (JPEG), the video (WebP) and the camera that both are seen from."""
-    with tempfile.TemporaryDirectory() as folder, SideBySide(streams, source) as together:
-        sheet = Path(folder) / "sheet.jpg"
+@contextmanager
+def recording_of(data: SweepData, scene: str, recordings: Path | None) -> Iterator[FrameSource]:
+    """Open the recording of a scene as its first run saw it. Raises InputError where it cannot be found."""
+    group = data.of(scene)[0]
+    run = group.runs[0]
+    uri = next(one["uri"] for one in data.config["scenes"] if one["name"] == scene)
+    variant = next(one for one in data.config["variants"] if one["name"] == group.variant)
+    uri = recording_uri(disturbed_uri(uri, variant.get("disturbed"), run.seed), recordings)
+    source = reopen_recording(uri, data.table.recipes[run.row["recipe"]]["values"], load_catalog())
+    try:
+        yield source
+    finally:
+        source.close()
+
+
+def contact_sheet(folder: Path, data: SweepData, scene: str, source: FrameSource) -> list[Block]:
+    """Return the contact sheet of the first run of a scene: what it shows, its errors, what was allowed to change."""
+    group = data.of(scene)[0]
+    run = group.runs[0]
+    frames = sorted({0, len(run.records) // 2, len(run.records) - 1})
+    with tempfile.TemporaryDirectory() as temporary:
+        sheet = sheet_of_stream(cell_file(folder, run.id), source, frames, Path(temporary) / "sheet.jpg").read_bytes()
+    text = f"{group.label} on {scene}: ground truth, decoded, error, what was allowed to change"
+    return [f"### {scene}: pictures", Picture(f"{scene}-sheet.jpg", sheet, text)]
+
+
+def side_by_side(folder: Path, data: SweepData, scene: str, source: FrameSource) -> list[Block]:
+    """Return a sheet and a video of the first seed of every group, seen from the first test camera."""
+    streams = {group.label: cell_file(folder, group.runs[0].id) for group in data.of(scene)}
+    with tempfile.TemporaryDirectory() as temporary, SideBySide(streams, source) as together:
+        sheet = Path(temporary) / "sheet.jpg"
         Image.fromarray(together.sheet()).save(sheet, quality=90)
-        video = together.video(Path(folder) / "video.webp", source.info.fps)
-        return sheet.read_bytes(), video, together.camera
+        video = together.video(Path(temporary) / "video.webp", source.info.fps)
+        text = f"Camera {together.camera}: the last frame, then what changed most close up, with PSNR on changed pixels"
+        return [
+            "### Pictures", Picture("pictures.jpg", sheet.read_bytes(), text),
+            "### Video", Picture("video.webp", video, f"Every frame from camera {together.camera}"),
+        ]  # fmt: skip
+
+
+def decoding(folder: Path, data: SweepData, scene: str) -> Table:
+    """Return what the player takes here to decode a frame after the first of the first seed of every group."""
+    rows = [["method", "decoding, ms/frame", "stream, KB"]]
+    for group in data.of(scene):
+        file = cell_file(folder, group.runs[0].id)
+        with Playback(file) as playback:
+            first, *later = playback.frames
+            playback.state_at(first)
+            started = time.perf_counter()
+            for frame in later:
+                playback.state_at(frame)
+            spent = 1000 * (time.perf_counter() - started) / max(1, len(later))
+        rows.append([group.label, f"{spent:.1f}", f"{file.stat().st_size / 1000:.0f}"])
+    return Table("Playing the first seed here, when this page was made: decoding alone, without drawing", rows)
 
 
 def _lines(tiles: Sequence[Tile], most: int) -> list[Sequence[Tile]]:

@@ -17,7 +17,7 @@ from gsstream_lab.report.rate_curves import curve_blocks
 _NOT_MEASURED = {"joules": "energy"}
 _MEANS = (
     "All quality is of frames that the same player decoded from packets. Means are over test cameras, then over the "
-    "frames after the first; seconds are wall time, CPU s the time of the run's process. Moving pixels differ from frame "
+    "frames after the first; seconds are wall time, CPU s the time of the process. Moving pixels differ from frame "
     "0 by more than noise, changed ones by more than 0.1. KB are 1,000 bytes of packets, key packets apart."
 )
 _JUDGES = {

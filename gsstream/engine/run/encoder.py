@@ -101,16 +101,19 @@ class Encoder:
                 follows a packet, that packet has been handed out; the same frame gives it again.
         """
         frame.validate()
-        frame = self.with_near_plane(frame)
+        if self.state is not None and frame.index != self.state.player.frame + 1:
+            expected = self.state.player.frame + 1
+            raise InputError(f"frame {frame.index}: expected frame {expected}, frames are encoded in order")
+        frame, method = self.with_near_plane(frame), self.method
         log, worked = FrameLog(), time.process_time()
         tools = self._tools(log=log)
         with one_torch_thread():
-            step = self._begin(frame, tools) if self.state is None else self._step(frame, tools)
+            step = method.begin(frame, tools) if self.state is None else method.step(self.state, frame, tools)
         step = replace(step, packet=replace(step.packet, decoded=None))  # a queue of packets must not hold scenes
         self._listeners.packet(step.packet)
         if self.state is not None:  # only now: whoever waits for the packet does not wait for this
             with one_torch_thread():
-                step = self.method.follow_up(self.state, step, frame, tools)
+                step = method.follow_up(self.state, step, frame, tools)
         log.set(cpu_seconds=time.process_time() - worked, peak_memory_mb=peak_memory_mb())
         step = replace(step, metrics={"frame": frame.index, "status": step.status, **log.entry()})
         self.state = step.state
@@ -147,15 +150,6 @@ class Encoder:
         """Return the frame with the near plane that the recipe gives this rig, in the stream's coordinates."""
         cameras = snap_cameras(self.info.world.inverse_cameras(frame.cameras)) if self._place else frame.cameras
         return replace(frame, cameras=replace(cameras, near=self.near))
-
-    def _begin(self, frame: Frame, tools: RunTools) -> Step[Any]:
-        return self.method.begin(frame, tools)
-
-    def _step(self, frame: Frame, tools: RunTools) -> Step[Any]:
-        expected = self.state.player.frame + 1
-        if frame.index != expected:
-            raise InputError(f"frame {frame.index}: expected frame {expected}, frames are encoded in order")
-        return self.method.step(self.state, frame, tools)
 
     def _tools(self, **changes: Any) -> RunTools:
         return RunTools(

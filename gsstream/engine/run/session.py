@@ -64,10 +64,36 @@ def run(
     first_frame: PlayerState | None = None,
     listener: RunListener | None = None,
 ) -> RunResult:
-    """Encode a recording into ``out`` (stream.gss, metrics.jsonl, recipe.yaml)."""
-    parts = limit_memory(parts, source.info)
-    doing = _Run(parts, source, out, quiet, measure, first_frame, listener or RunListener())
-    return doing.encode(resume)
+    """Encode a recording into ``out`` (stream.gss, metrics.jsonl, recipe.yaml).
+
+    Arguments:
+        parts: the live parts of the recipe.
+        source: an open recording at the recipe's scale; the caller closes it.
+        out: a prepared output folder.
+        resume: continue the run that ``out`` holds; the recipe must be the same.
+        quiet: show no progress.
+        measure: render and compare the test cameras of every frame.
+        first_frame: frame 0 of another stream, taken over instead of being reconstructed.
+        listener: called before and after every frame.
+    """
+    state = _Run(limit_memory(parts, source.info), source, out, quiet, measure, first_frame)
+    listener, done = listener or RunListener(), state.prepare(resume)
+    indices = itertools.count(done) if state.total is None else range(done, state.total)
+    with (
+        _stop_on_interrupt(state.progress.say, source) as stop,
+        # This is also the way when resuming finds no complete frame 0: the incomplete one is cut off and made again.
+        StreamWriter.open(out / STREAM, resume=resume, last_frame=done - 1 if done else None) as state.writer,
+        state.progress,
+        Prefetcher(source, indices, storage=parts.recipe.data.images) as frames,
+    ):
+        for train, test, waited in _timed(frames, source):
+            listener.before()
+            step = state.encoder.encode(train)
+            state.record(step, train, test, {**listener.after(step), "wait_seconds": waited})
+            done = train.index + 1
+            if stop.is_set():
+                break
+    return RunResult(out, done, stop.is_set() and (state.total is None or done < state.total))
 
 
 class _Run:
@@ -75,9 +101,9 @@ class _Run:
 
     def __init__(
         self, parts: Assembly, source: FrameSource, out: Path, quiet: bool, measure: bool,
-        first_frame: PlayerState | None, listener: RunListener,
+        first_frame: PlayerState | None,
     ) -> None:  # fmt: skip
-        self.source, self.out, self.listener = source, out, listener
+        self.source, self.out = source, out
         self.total = _num_frames(source.info, parts.recipe.frames)
         self.held_out = HeldOut(parts.renderer, parts.recipe.background) if measure else None
         self.progress = RunProgress(self.total, quiet)
@@ -87,39 +113,20 @@ class _Run:
         #: When the last packet was complete in the file, seconds since 1970.
         self.written = 0.0
 
-    def encode(self, resume: bool) -> RunResult:
+    def prepare(self, resume: bool) -> int:
+        """Go on after what the folder holds, or write the recipe into it; return the first frame to encode."""
         last = self._resume() if resume else None
-        done = 0 if last is None else last + 1
         if last is None:
             save_resolved(self.out / RECIPE, self.encoder.parts.resolved)
-        if done > 0:
-            self._restore_metrics(done)
-        indices = itertools.count(done) if self.total is None else range(done, self.total)
-        recipe = self.encoder.parts.recipe
-        with (
-            _stop_on_interrupt(self.progress.say, self.source) as stop,
-            # This is also the way when resuming finds no complete frame 0: the incomplete one is cut off and made
-            # again.
-            StreamWriter.open(self.out / STREAM, resume=resume, last_frame=last) as writer,
-            self.progress,
-            Prefetcher(self.source, indices, storage=recipe.data.images) as frames,
-        ):
-            self.writer = writer
-            for train, test, waited in _timed(frames):
-                self._advance(_with_current_epoch_scale(train, self.source), test, waited)
-                done = train.index + 1
-                if stop.is_set():
-                    break
-        return RunResult(self.out, done, stop.is_set() and (self.total is None or done < self.total))
+            return 0
+        self._restore_metrics(last + 1)
+        return last + 1
 
-    def _advance(self, train: Frame, test: Frame, waited: float) -> None:
-        """Encode one frame, and write down what it cost and how good it is."""
-        self.listener.before()
-        step = self.encoder.encode(train)
-        metrics = {**step.metrics, **self.listener.after(step)}
-        metrics |= {"wait_seconds": waited, "live": live_metrics(train, self.written)}
+    def record(self, step: Step[Any], train: Frame, test: Frame, numbers: Mapping[str, Any]) -> None:
+        """Write down what a frame cost and how good it is."""
+        metrics = {**step.metrics, **numbers, "live": live_metrics(train, self.written)}
         metrics["displacement_pixels"] = displacement_pixels(step.state.player, train.cameras)
-        # Who is behind does not spend time on the quality of what he drops: ``evaluate`` measures it.
+        # A run that is behind does not spend time on the quality of frames that it drops: ``evaluate`` measures it.
         dropped = metrics["live"] is not None and metrics["live"]["policy"] == "dropped"
         if self.held_out and len(test.cameras) and not dropped:
             metrics |= self.held_out.measure(step.state, self.encoder.with_near_plane(test))
@@ -181,22 +188,21 @@ def _num_frames(info: SourceInfo, wanted: int | None) -> int | None:
     return min((number for number in (info.num_frames, wanted) if number is not None), default=None)
 
 
-def _with_current_epoch_scale(frame: Frame, source: FrameSource) -> Frame:
-    """The frame with what it is worth now: it was read ahead, and the run may have fallen behind since."""
-    if frame.arrival is None or not isinstance(source, AdaptiveSource):
-        return frame
-    return replace(frame, effort=min(frame.effort, source.effort(frame.index)))
+def _timed(frames: Prefetcher, source: FrameSource) -> Iterator[tuple[Frame, Frame, float]]:
+    """(train, test, seconds waited for decoding) of every frame.
 
-
-def _timed(frames: Prefetcher) -> Iterator[tuple[Frame, Frame, float]]:
-    """(train, test, seconds waited for decoding) of every frame."""
+    Frames are read ahead, and the run may have fallen behind since: an adaptive source is asked again for their effort.
+    """
     while True:
         started = time.perf_counter()
         try:
             train, test = next(frames)
         except StopIteration:
             return
-        yield train, test, time.perf_counter() - started
+        waited = time.perf_counter() - started
+        if train.arrival is not None and isinstance(source, AdaptiveSource):
+            train = replace(train, effort=min(train.effort, source.effort(train.index)))
+        yield train, test, waited
 
 
 @contextmanager

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import re
 
+#: What helps against something that was written for an older major version.
+NEWER_PLUGIN = "ask its author for a newer version"
+NEWER_RECIPE = "write its keys as 'gsstream recipe METHOD' shows them, and set schema_version to that number"
 
-def version_problem(what: str, written: str, spoken: str) -> str | None:
-    """Say why something written for another version cannot be used here; None when it can.
+
+def version_problem(what: str, written: str, spoken: str, cure: str = NEWER_PLUGIN) -> str | None:
+    """Return why something written for another version cannot be used here; None when it can.
 
     Arguments:
         what: the noun of the sentence, e.g. ``"component API"``.
         written: "major.minor" declared by the plugin or file.
         spoken: "major.minor" of this gsstream.
+        cure: what helps where it is too old.
     """
     match = re.fullmatch(r"(\d+)\.(\d+)", written)
     if match is None:
@@ -21,5 +26,5 @@ def version_problem(what: str, written: str, spoken: str) -> str | None:
     if (major, minor) > (own_major, own_minor):
         return f"built for {what} {written}, this gsstream speaks {spoken}: upgrade gsstream"
     if major < own_major:
-        return f"built for {what} {written}, this gsstream speaks {spoken}: ask its author for a newer version"
+        return f"built for {what} {written}, this gsstream speaks {spoken}: {cure}"
     return None

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from gsstream.core.errors import RecipeError, suggest
-from gsstream.core.versions import version_problem
+from gsstream.core.versions import NEWER_RECIPE, version_problem
 from gsstream.recipe.document import Empty, KeyPath, Layer, Leaf, Origin
 from gsstream.recipe.model import SCHEMA_VERSION, ComponentRef, Recipe
 
@@ -87,7 +87,7 @@ def validate(
 ) -> Model | None:
     """Validate ``values`` laid over the model's defaults; on failure append one line per problem and return None."""
     if model is Recipe and isinstance(written := values.get("schema_version"), str):
-        problem = version_problem("recipe schema", written, SCHEMA_VERSION)
+        problem = version_problem("recipe schema", written, SCHEMA_VERSION, NEWER_RECIPE)
         if problem:
             problems.append(f"{origin(('schema_version',)).where}: {problem}")
             return None

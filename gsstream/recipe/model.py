@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from gsstream.input.recordings.options import DataOptions
 from gsstream.recipe.budget import Budget
 
-SCHEMA_VERSION = "1.0"
+SCHEMA_VERSION = "2.0"
 #: Sections of a recipe that do not influence frame 0. A section that is not listed counts as one that does.
 LATER_KEYS = (
     "schema_version", "method", "seed", "frames", "confidence", "propagation", "gate", "regularizer", "update",
@@ -159,7 +159,7 @@ class Recipe(Section):
     #: Colour behind everything: black, as in the recordings of the papers.
     background: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.0)
 
-    schema_version: Literal["1.0"] = Field(default="1.0", description="version of this schema")
+    schema_version: Literal["2.0"] = Field(default="2.0", description="version of this schema")
     method: str = Field(default="dense", description="name of the method this recipe belongs to")
     seed: int = Field(default=0, ge=0, description="seed of every random stream")
     structure: ComponentRef = Field(default=ComponentRef(name="flat"), description="how Gaussians are grouped")

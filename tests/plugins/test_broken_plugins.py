@@ -13,9 +13,9 @@ REASONS = {
     "raises_at_import": "ModuleNotFoundError: No module named 'a_package_nobody_has'",
     "exits_at_import": "SystemExit: no licence found",
     "unspeakable": "Unspeakable: its message cannot be read: RuntimeError",
-    "other_major": "from-the-future: built for component API 2.0, this gsstream speaks 1.0: upgrade gsstream",
-    "newer_minor": "newer-gate: built for component API 1.3, this gsstream speaks 1.0: upgrade gsstream",
-    "older_major": "from-the-past: built for component API 0.9, this gsstream speaks 1.0: ask its author for a "
+    "other_major": "from-the-future: built for component API 3.0, this gsstream speaks 2.0: upgrade gsstream",
+    "newer_minor": "newer-gate: built for component API 2.3, this gsstream speaks 2.0: upgrade gsstream",
+    "older_major": "from-the-past: built for component API 1.0, this gsstream speaks 2.0: ask its author for a "
     "newer version",
     "duplicate_name": "declares the gate 'always-open', which gsstream 0.1.0 already provides; rename it",
     "unknown_hook": "implements the hook 'gsstream_component', which this gsstream does not know; did you mean "
@@ -153,18 +153,18 @@ def test_unknown_names_mention_quarantine(lab) -> None:
 @pytest.mark.parametrize(
     ("speaks", "refused", "advice"),
     [
-        ("1.4", {"other_major": "2.0", "older_major": "0.9"}, "upgrade gsstream"),
-        ("1.2", {"other_major": "2.0", "older_major": "0.9", "newer_minor": "1.3"}, "upgrade gsstream"),
-        ("2.1", {"older_major": "0.9", "newer_minor": "1.3", "healthy": "1.0"}, "ask its author for a newer version"),
+        ("2.4", {"other_major": "3.0", "older_major": "1.0"}, "upgrade gsstream"),
+        ("2.2", {"other_major": "3.0", "older_major": "1.0", "newer_minor": "2.3"}, "upgrade gsstream"),
+        ("3.1", {"older_major": "1.0", "newer_minor": "2.3", "healthy": "2.0"}, "ask its author for a newer version"),
     ],
 )
 def test_the_rule_for_versions_as_gsstream_grows(lab, speaks: str, refused: dict[str, str], advice: str) -> None:
-    """Tiny distributions written for 0.9, 1.0, 1.3 and 2.0, and a gsstream that speaks another version each time."""
+    """Tiny distributions written for 1.0, 2.0, 2.3 and 3.0, and a gsstream that speaks another version each time."""
     for fault in ("other_major", "older_major"):
         lab.install(fault)
     newer = (BROKEN / "newer_minor.py").read_text().partition("@hookimpl\ndef gsstream_viewers")[0]
     lab.add("newer_minor", newer)
-    lab.add("healthy", HEALTHY.replace('summary="mine"', 'summary="mine", api="1.0"'))
+    lab.add("healthy", HEALTHY.replace('summary="mine"', 'summary="mine", api="2.0"'))
     code = (
         "import sys, gsstream\ngsstream.API_VERSION = sys.argv.pop(1)\n"
         "import gsstream.plugins.builtin\nfrom gsstream.cli.main import main\nmain()\n"

@@ -146,8 +146,12 @@ def test_messages(lab) -> None:
     assert lab.refuse("codec:\n  first_layer: 3.0\n") == (
         "run.yaml:2:3: codec.first_layer: input should be less than or equal to 1, got 3.0"
     )
-    assert lab.refuse("schema_version: '1.3'\n") == (
-        "run.yaml:1:1: built for recipe schema 1.3, this gsstream speaks 1.0: upgrade gsstream"
+    assert lab.refuse("schema_version: '2.3'\n") == (
+        "run.yaml:1:1: built for recipe schema 2.3, this gsstream speaks 2.0: upgrade gsstream"
+    )
+    assert lab.refuse("schema_version: '1.0'\n") == (
+        "run.yaml:1:1: built for recipe schema 1.0, this gsstream speaks 2.0: write its keys as 'gsstream recipe "
+        "METHOD' shows them, and set schema_version to that number"
     )
 
 
@@ -252,7 +256,7 @@ def test_any_text_is_a_recipe_or_a_recipe_error(text: str, tmp_path_factory: pyt
         outcome = str(load_recipe(path).recipe.schema_version)
     except RecipeError as error:  # any other exception fails the test
         outcome = str(error)
-    assert outcome == "1.0" or "run.yaml" in outcome
+    assert outcome == "2.0" or "run.yaml" in outcome
 
 
 def test_deep_nesting_and_foreign_bytes_are_refused(lab, tmp_path: Path) -> None:

@@ -5,4 +5,4 @@ from gsstream.spec import ComponentSpec, hookimpl
 
 @hookimpl
 def gsstream_components():
-    return [ComponentSpec(kind="gate", name="from-the-past", target="nowhere:Gate", summary="a gate", api="0.9")]
+    return [ComponentSpec(kind="gate", name="from-the-past", target="nowhere:Gate", summary="a gate", api="1.0")]

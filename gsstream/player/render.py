@@ -106,7 +106,8 @@ def render(
     chosen = find_renderer() if renderer is None else renderer
     size = (cameras.width, cameras.height)
     pose = (cameras.viewmats[view], cameras.Ks[view])
-    image = chosen.render_numpy(*(array for _, array in gaussians.items()), *pose, *size, background, near=cameras.near)
+    arrays = [array for _, array in gaussians.items()]
+    image = chosen.render_numpy(arrays, *pose, *size, background, near=cameras.near)
     check_shape(f"image of renderer {chosen.name!r}", image, (cameras.height, cameras.width, 3))
     check_finite(f"image of renderer {chosen.name!r}", image)
     return np.asarray(image, np.float32)

@@ -61,7 +61,7 @@ def image(renderer: Renderer, seed: int) -> float:
 def image_numpy(seed: int) -> float:
     scene, cameras = random_scene(seed, bases=(1, 4, 9, 16)[seed % 4]), camera()
     arrays = [value.numpy() for _, value in scene.items()]
-    got = render_numpy(*arrays, cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height, (0.2, 0.5, 0.9))
+    got = render_numpy(arrays, cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height, (0.2, 0.5, 0.9))
     slope = upstream(cameras, seed)
     want = rendered(ReferenceRenderer(), scene.map(torch.Tensor.double), cameras, slope)[0]
     return worst(torch.from_numpy(got), want)

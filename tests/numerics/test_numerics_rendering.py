@@ -86,7 +86,7 @@ def test_the_players_renderer_agrees(case: str) -> None:
     arrays = [value.numpy() for _, value in scene.items()]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        got = render_numpy(*arrays, cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height, BACK)
+        got = render_numpy(arrays, cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height, BACK)
     want, _ = rendered(ReferenceRenderer(), scene.map(torch.Tensor.double), cameras, upstream(cameras))
     assert worst(torch.from_numpy(got), want) < 1e-6
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -49,9 +48,8 @@ def begin(parts: Assembly, frame: Frame, tools: Tools) -> Step:
         hierarchy, levels, decoded = sort_into_nodes(parts, decoded, found.levels, anchors)
         layout = make_layout(hierarchy, levels, anchors)
         first = first_layer_mask(parts, decoded, frame, found.exposure, rng)
-        state, packet = key_state(
-            parts, decoded, layout, hierarchy, frame, tools.meta(frame), found.exposure, anchors.origin, rng, first
-        )
+        meta = key_meta(tools.meta(frame), found.exposure, anchors.origin)
+        state, packet = key_state(parts, decoded, layout, hierarchy, frame, meta, rng, first)
     log.set(iterations=found.iterations)
     return Step(state, packet, "key")
 
@@ -124,15 +122,12 @@ def key_state(
     hierarchy: Hierarchy,
     frame: Frame,
     meta: StreamMeta,
-    exposure: Exposure | None,
-    origin: torch.Tensor,
     rng: Rng,
     first: BoolArray | None = None,
 ) -> tuple[StreamState, EncodedPacket]:
-    """Encode a key packet and continue from its decoded bytes."""
-    extra: Mapping[str, Any] = {**meta.extra, **exposure_to_meta(exposure), "origin": origin.tolist()}
+    """Encode a key packet and continue from its decoded bytes; ``meta`` is that of :func:`key_meta`."""
     arrays: Gaussians[FloatArray] = gaussians.map(lambda t: np.ascontiguousarray(t.numpy()))
-    packet = encode_key(KeyState(arrays, layout, replace(meta, extra=extra)), frame=frame.index, first=first)
+    packet = encode_key(KeyState(arrays, layout, meta), frame=frame.index, first=first)
     player = decode_packet(None, packet.data)
     decoders = parts.update.init_decoders(gaussians, rng.stream("decoders", frame.index))
     state = StreamState(
@@ -140,6 +135,11 @@ def key_state(
         exposure=exposure_from_meta(player.meta), key_frame=player.frame,
     )  # fmt: skip
     return state, replace(packet, decoded=player)
+
+
+def key_meta(meta: StreamMeta, exposure: Exposure | None, origin: torch.Tensor) -> StreamMeta:
+    """Return what a key packet says about the run, with the colour maps and the origin [3] of the structure's grid."""
+    return replace(meta, extra={**meta.extra, **exposure_to_meta(exposure), "origin": origin.tolist()})
 
 
 def exposure_to_meta(exposure: Exposure | None) -> dict[str, Any]:

@@ -13,7 +13,14 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.frame0.begin import decoded_anchors, exposure_from_meta, key_state, make_layout, sort_into_nodes
+from gsstream.engine.frame0.begin import (
+    decoded_anchors,
+    exposure_from_meta,
+    key_meta,
+    key_state,
+    make_layout,
+    sort_into_nodes,
+)
 from gsstream.engine.frame0.first_layer import first_layer_mask
 from gsstream.engine.state.stream_state import Step
 from gsstream.method.tools import Tools
@@ -47,9 +54,8 @@ def reuse_first_frame(parts: Assembly, frame: Frame, tools: Tools) -> Step:
         layout = make_layout(hierarchy, levels, anchors)
         exposure = exposure_from_meta(first.meta)
         first_seen = first_layer_mask(parts, gaussians, frame, exposure, rng)
-        state, packet = key_state(
-            parts, gaussians, layout, hierarchy, frame, meta, exposure, anchors.origin, rng, first_seen
-        )
+        meta = key_meta(meta, exposure, anchors.origin)
+        state, packet = key_state(parts, gaussians, layout, hierarchy, frame, meta, rng, first_seen)
     tools.log.set(iterations=0)
     return Step(state, packet, "key")
 

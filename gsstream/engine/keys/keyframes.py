@@ -14,7 +14,7 @@ from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.frame0.begin import decoded_anchors, key_state, make_layout, sort_into_nodes
+from gsstream.engine.frame0.begin import decoded_anchors, key_meta, key_state, make_layout, sort_into_nodes
 from gsstream.engine.frame0.first_layer import first_layer_mask
 from gsstream.engine.frame0.rd_quantise import rd_quantise
 from gsstream.engine.frame0.refine import SHOWN, is_refined
@@ -98,7 +98,6 @@ def _key_step(
     # A resumed run must compare the next frame with the picture this scene shows, which may be an older one.
     meta = replace(meta, extra={**meta.extra, SHOWN: shown})
     first = first_layer_mask(parts, gaussians, frame, state.exposure, rng) if layered else None
-    after, packet = key_state(
-        parts, gaussians, layout, hierarchy, frame, meta, state.exposure, anchors.origin, rng, first
-    )
+    meta = key_meta(meta, state.exposure, anchors.origin)
+    after, packet = key_state(parts, gaussians, layout, hierarchy, frame, meta, rng, first)
     return Step(after, packet, "key")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Literal
 
 import torch
@@ -36,21 +37,18 @@ class EngineContext:
         previous: training images that this scene shows.
         change: what changed since; None: everything counts as changed.
         session: a render session of this scene that is kept from before, or None.
-        photometric: loss of the same images and colour maps, with what it has made of them; None: a new one.
-        votes: counted so far in the frame; None: none.
     """
 
     def __init__(
         self, parts: Assembly, gaussians: Gaussians[torch.Tensor], hierarchy: Hierarchy, frame: Frame, previous: Frame,
         exposure: Exposure | None, change: Change | None = None, session: RenderSession | None = None,
-        photometric: PhotometricLoss | None = None, votes: VoteCache | None = None,
     ) -> None:  # fmt: skip
         self._parts, self._gaussians, self._hierarchy = parts, gaussians, hierarchy
         self._frame, self._previous, self._change = frame, previous, change
         self._background = parts.recipe.background
-        self.photometric = photometric or PhotometricLoss(parts.loss, DSSIM, frame.images, exposure)
+        self.photometric = PhotometricLoss(parts.loss, DSSIM, frame.images, exposure)
         self._session = session
-        self._votes = votes or (None if change is None else VoteCache(change, frame.cameras))
+        self._votes = None if change is None else VoteCache(change, frame.cameras)
 
     @property
     def session(self) -> RenderSession:
@@ -149,7 +147,7 @@ class EngineContext:
         return self.photometric.view_target(view, tile_weights)
 
     def on(self, gaussians: Gaussians[torch.Tensor], session: RenderSession | None = None) -> EngineContext:
-        return EngineContext(
-            self._parts, gaussians, self._hierarchy, self._frame, self._previous, self.photometric.exposure,
-            self._change, session, self.photometric, self._votes,
-        )  # fmt: skip
+        # The loss of the same images and the votes that were counted are shared, not made again.
+        other = copy(self)
+        other._gaussians, other._session = gaussians, session
+        return other

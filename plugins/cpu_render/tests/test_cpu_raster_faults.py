@@ -183,7 +183,7 @@ def test_two_objects_in_two_threads_do_not_disturb_each_other() -> None:
 def test_numpy_interface_imports_no_torch() -> None:
     code = (
         "import sys, numpy as np; from gsstream_cpu_render.rasterizer import render_numpy;"
-        "z = np.zeros; image = render_numpy(z((1, 3)), z((1, 4)) + 1, z((1, 3)), z(1), z((1, 1, 3)), z((1, 0, 3)),"
+        "z = np.zeros; image = render_numpy((z((1, 3)), z((1, 4)) + 1, z((1, 3)), z(1), z((1, 1, 3)), z((1, 0, 3))),"
         "np.eye(4), np.eye(3), 8, 8); assert image.shape == (8, 8, 3); sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

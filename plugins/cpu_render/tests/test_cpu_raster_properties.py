@@ -200,7 +200,7 @@ def test_gaussian_counts_only_beyond_the_near_plane() -> None:
 def test_render_numpy_takes_any_float_layout() -> None:
     splats = random_splats(60, 8, 4)
     want = NumpyRasterizer(*axis_camera(), 40, 36).forward(splats)[0]
-    got = render_numpy(*(np.asfortranarray(a.astype(np.float64)) for a in splats), *axis_camera(), 40, 36)
+    got = render_numpy([np.asfortranarray(a.astype(np.float64)) for a in splats], *axis_camera(), 40, 36)
     assert np.array_equal(got, want)
 
 

@@ -50,7 +50,7 @@ def test_all_rows_equal_torch_in_float64(isa: str, d: int) -> None:
         grad = rng.standard_normal(start.shape).astype(np.float32)
         reference.grad = torch.tensor(grad, dtype=torch.float64)
         optimizer.step()
-        adam_rows(grad=grad, lr=0.01, beta1=0.8, beta2=0.99, eps=1e-8, **rows)
+        adam_rows(grad=grad, lr=0.01, betas=(0.8, 0.99), eps=1e-8, **rows)
     wanted = reference.detach().numpy()
     assert (rows["step"] == 50).all()
     np.testing.assert_allclose(rows["param"], wanted, rtol=0, atol=2e-6)
@@ -182,8 +182,8 @@ def test_wrong_arrays_are_refused(arguments: dict[str, Any], message: str) -> No
         {"lr": -1.0},
         {"lr": float("nan")},
         {"lr": np.full(3, -1, np.float32)},
-        {"beta1": 1.0},
-        {"beta2": -0.1},
+        {"betas": (1.0, 0.999)},
+        {"betas": (0.9, -0.1)},
         {"eps": -1.0},
     ],
 )

@@ -23,7 +23,7 @@ def main() -> None:
     viewmat = np.eye(4, dtype=np.float32)
     viewmat[2, 3] = 4
     intrinsics = np.array([[60, 0, 32], [0, 60, 24], [0, 0, 1]], np.float32)
-    arguments = (*(array.astype(np.float32) for array in scene), viewmat, intrinsics, *size, (0.1, 0.2, 0.3))
+    arguments = ([array.astype(np.float32) for array in scene], viewmat, intrinsics, *size, (0.1, 0.2, 0.3))
     expected = reference(*arguments, near=0.01)
     for isa in _native.supported_isas():
         _native.select_isa(isa)

@@ -23,11 +23,9 @@ def adam_rows(
     step: Any,
     *,
     lr: Any,
-    beta1: float = 0.9,
-    beta2: float = 0.999,
+    betas: tuple[float, float] = (0.9, 0.999),
     eps: float = 1e-15,
     rows: Any | None = None,
-    check_finite: bool = True,
 ) -> None:
     """Update the chosen rows in place; each row's bias is corrected by the number of steps that row has taken.
 
@@ -36,17 +34,16 @@ def adam_rows(
         grad: like param, or with one row per id when ``rows`` are ids.
         step: [n] int32 step counts, incremented for touched rows.
         lr: a number, [d] rates per column or [n] per row; if n = d, give it as [1, d] or [n, 1].
-        beta1, beta2: in [0, 1). eps: >= 0 (1e-15 as in 3D Gaussian splatting).
+        betas: two numbers in [0, 1). eps: >= 0 (1e-15 as in 3D Gaussian splatting).
         rows: None (all), a bool mask [n], or strictly increasing int64 ids.
-        check_finite: look through the gradient first; a bad value changes nothing.
 
     Raises:
         ShapeError: shape, dtype, layout, ids, or a gradient value that is not finite.
-        InputError: lr, beta1, beta2 or eps out of range.
+        InputError: lr, betas or eps out of range.
     """
     table = _Table(param, exp_avg, exp_avg_sq)
     steps = native_array("step", step, np.int32, (table.n,), writable=True)
-    _run(table, grad, steps, lr, (beta1, beta2, eps), _rows(rows, table.n), check_finite)
+    _run(table, grad, steps, lr, (*betas, eps), _rows(rows, table.n))
 
 
 class _Table:
@@ -73,12 +70,11 @@ def _run(
     lr: Any,
     settings: tuple[float, float, float],
     rows: tuple[NDArray[np.int64] | None, NDArray[np.uint8] | None],
-    check_finite: bool,
 ) -> None:
     beta1, beta2, eps = settings
-    for name, beta in (("beta1", beta1), ("beta2", beta2)):
+    for beta in (beta1, beta2):
         if not 0.0 <= beta < 1.0:
-            refuse_value(f"{name}: expected a number in [0, 1), got {beta!r}")
+            refuse_value(f"betas: expected numbers in [0, 1), got {beta!r}")
     if not (eps >= 0.0 and math.isfinite(eps)):
         refuse_value(f"eps: expected a finite number >= 0, got {eps!r}")
     ids, mask = rows
@@ -87,7 +83,7 @@ def _run(
     common, per_column, per_row = _rates(lr, table.n, table.d)
     bad = _native.adam_update(
         table.param, gradient, table.exp_avg, table.exp_avg_sq, steps, ids, mask,
-        common, per_column, per_row, beta1, beta2, eps, check_finite,
+        common, per_column, per_row, beta1, beta2, eps, True,
     )  # fmt: skip
     if bad >= 0:
         row, column = divmod(bad, table.d)

@@ -8,6 +8,8 @@ max(0, 0.5 + harmonics). Results are bit-identical for any number of threads. Af
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -25,19 +27,18 @@ from gsstream_cpu_render.view import NEAR, Background
 
 
 def render_numpy(
-    means: Float32, quats: Float32, scales: Float32, opacities: Float32, sh0: Float32, shN: Float32,
-    viewmat: ArrayLike, K: ArrayLike, width: int, height: int,
+    arrays: Sequence[Float32], viewmat: ArrayLike, K: ArrayLike, width: int, height: int,
     background: Background = (0.0, 0.0, 0.0), near: float = NEAR,
 ) -> Float32:  # fmt: skip
-    """Render raw Gaussians (shapes: SplatArrays; any float dtype or layout) for one camera: [height, width, 3].
+    """Render raw Gaussians for one camera: [height, width, 3].
 
-    Arguments as NumpyRasterizer. A rasteriser kept for many frames saves the allocation of its scratch memory.
+    ``arrays`` are means, quats, scales, opacities, sh0 and shN, of any float dtype or layout (shapes: SplatArrays); the
+    other arguments are those of NumpyRasterizer, which saves the allocation of scratch memory when it is kept.
 
     Raises:
         InputError: wrong shapes, values that are not finite, a quaternion without direction.
     """
-    parts = (means, quats, scales, opacities, sh0, shN)
-    splats = SplatArrays(*(np.ascontiguousarray(part, np.float32) for part in parts))
+    splats = SplatArrays(*(np.ascontiguousarray(part, np.float32) for part in arrays))
     return NumpyRasterizer(viewmat, K, width, height, background, near).forward(splats)[0]
 
 

@@ -37,7 +37,8 @@ def changed(scene: str, motion: str, first: PlayerState | None, frames: int) -> 
     catalog = load_catalog()
     changes = [("test", f"motion={motion}"), *(("test", setting) for setting in SETTINGS)]
     parts = assemble(resolve_recipe("s2gs-edge", catalog.recipe_path, (), changes), catalog)
-    source = open_recording(WORLD + scene, parts.recipe, catalog)
+    uri = f"disturbed:lost_cameras=cam01@{EVENT}-{EVENT + 4}:{WORLD}paths" if scene == "dropout" else WORLD + scene
+    source = open_recording(uri, parts.recipe, catalog)
     settings, held, found = parts.recipe.first_frame, HeldOut(parts.renderer, parts.recipe.background), []
     encoder = Encoder(
         parts, source.info, lambda frame: gather_points(source.points, frame, settings, encoder.rng), first_frame=first

@@ -33,9 +33,8 @@ class SyntheticOptions(BaseModel):
     scene: SceneName = Field(
         default="paths",
         description="what happens. paths: two objects on smooth paths; at frame 'event' they stop (stop) or turn back "
-        "(reversal), the light flashes for that frame (flash), a training camera gives its last picture for four "
-        "frames (dropout); a ball bounces off the floor (bounce), goes through a tunnel (occlusion) or comes into view "
-        "(enters), a door slides away from a picture (door)",
+        "(reversal), or the light flashes for that frame (flash); a ball bounces off the floor (bounce) or goes through "
+        "a tunnel (occlusion)",
     )
     event: int = Field(default=8, ge=1, le=100_000, description="the frame at which the scene's event happens")
     frames: int = Field(default=40, ge=1, description="number of frames")
@@ -53,7 +52,7 @@ class SyntheticOptions(BaseModel):
 class SyntheticSource:
     """Objects move on known paths among static ones, inside a textured room; all surfaces are finite.
 
-    Which ones, and what happens to them, says the option ``scene`` (``source.toyscenes``).
+    Which ones, and what happens to them, says the option ``scene`` (:class:`ToyScene`).
 
     Images are quantised to 8 bits after noise, like a camera's. Thread-safe; the same options give the same bits.
     """
@@ -114,8 +113,7 @@ class SyntheticSource:
         """Ray-cast one instant. Raises SourceError for an index outside the recording."""
         check_index(self._info, index)
         cameras = self._info.train if split == "train" else self._info.test
-        shown = [self._scene.shown(i, index) if split == "train" else index for i in range(len(cameras))]
-        images = np.stack([self._image(cameras, i, shown[i]) for i in range(len(cameras))])
+        images = np.stack([self._image(cameras, i, index) for i in range(len(cameras))])
         return Frame(index, index / self._info.fps, images, cameras)
 
     def points(self, kind: PointKind = "recording") -> PointCloud:
@@ -172,24 +170,6 @@ class SyntheticSource:
             nearer = (moving.distance < behind.distance).reshape(cameras.height, n, cameras.width, n)
             masks.append(nearer.any(axis=(1, 3)))
         return np.stack(masks)
-
-    def new_mask(self, index: int, split: Split = "train") -> BoolArray:
-        """Return [C, H, W] bool: pixels whose centre shows a surface that no training camera sees at frame 0.
-
-        That is the ball of the scene "enters" and the picture behind the door of "door"; nothing in other scenes.
-        """
-        check_index(self._info, index)
-        cameras = self._info.train if split == "train" else self._info.test
-        moving = self._scene.moving(index)
-        new = moving if self._options.scene == "enters" else self._scene.revealed()
-        shape = (len(cameras), cameras.height, cameras.width)
-        if not new:
-            return np.zeros(shape, bool)
-        views = [_camera_rays(cameras, i, 1) for i in range(len(cameras))]
-        first = [cast(*view, self._static + moving).distance for view in views]
-        own = [cast(*view, new).distance for view in views]
-        mask: BoolArray = np.stack([a <= b for a, b in zip(own, first, strict=True)]).reshape(shape)
-        return mask
 
     def close(self) -> None:
         """Drop the cached background."""

@@ -129,7 +129,6 @@ def test_frame_by_phase(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         (["render", "--threads", "0"], "--threads: expected integers >= 1"),
         (["render", "--sizes", "100x20"], "--sizes: expected GAUSSIANSxWIDTHxHEIGHT, got '100x20'"),
         (["render", "--sizes", "100x2x2"], "--sizes: expected integers >= 8"),
-        (["render", "--points", "missing.npz"], "cannot read points from missing.npz"),
         (["frame", "--size", "80"], "--size: expected WIDTHxHEIGHT, got '80'"),
         (["frame", "--static", "a"], "--static: expected integers >= 1, got 'a'"),
         (["frame", "--method", "denze"], "did you mean 'dense'?"),

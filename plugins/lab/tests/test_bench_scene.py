@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,25 +20,23 @@ from gsstream_lab.bench.roofline import (
 from gsstream_lab.bench.scene import (
     OBJECT_ROOM,
     Points,
-    bench_camera,
+    arc_rig,
     make_gaussians,
     morton_order,
     neighbour_spacing,
     object_points,
-    read_points,
     synthetic_points,
 )
 from gsstream_lab.bench.timing import Steps, interleaved
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsstream.core.errors import InputError
 from gsstream.core.gaussians import Gaussians
 from gsstream.parts.render.reference import ALPHA_CUT, ALPHA_MAX, TRANSMITTANCE_MIN, project
 
 
 def scene(count: int = 300, seed: int = 0) -> Gaussians[np.ndarray]:
-    return make_gaussians(synthetic_points(count, seed), count, seed)
+    return make_gaussians(synthetic_points(count, seed), seed)
 
 
 def test_the_same_seed_gives_the_same_scene_and_another_seed_another() -> None:
@@ -52,7 +49,7 @@ def test_the_same_seed_gives_the_same_scene_and_another_seed_another() -> None:
 
 
 def test_a_scene_has_the_statistics_it_promises() -> None:
-    made = make_gaussians(synthetic_points(20_000, 0), 20_000, 0)
+    made = make_gaussians(synthetic_points(20_000, 0), 0)
     widths = np.exp(made.scales)
     assert 3 < np.median(widths.max(1) / widths.min(1)) < 30, "thin in one axis"
     opacities = 1 / (1 + np.exp(-made.opacities))
@@ -62,7 +59,7 @@ def test_a_scene_has_the_statistics_it_promises() -> None:
     shuffled = made.means[np.random.default_rng(0).permutation(20_000)]
     assert np.median(steps) < 0.1 * np.median(np.linalg.norm(np.diff(shuffled, axis=0), axis=1)), "Morton order"
     assert np.linalg.norm(made.means, axis=1).min() > 0.7 * OBJECT_ROOM, "room for the object"
-    seen = footprints(made, bench_camera(320, 240)).visible.mean()
+    seen = footprints(made, arc_rig(1, 320, 240)).visible.mean()
     assert 0.3 < seen < 0.9
 
 
@@ -73,36 +70,8 @@ def test_static_parts_of_any_size_lie_on_the_same_surfaces() -> None:
 
 
 def test_the_object_is_seen_by_every_camera() -> None:
-    made = make_gaussians(object_points(50, 0), 50, 0)
-    assert footprints(made, bench_camera(80, 60)).visible.all()
-
-
-@pytest.mark.parametrize("count", [40, 100, 250])
-def test_points_from_a_file_are_thinned_or_filled_up(tmp_path: Path, count: int) -> None:
-    rng = np.random.default_rng(0)
-    xyz, rgb = rng.normal(size=(100, 3)).astype(np.float32), rng.integers(0, 256, (100, 3)).astype(np.uint8)
-    np.savez(tmp_path / "p.npz", means3d=xyz, colors=rgb, viewmats=np.eye(4)[None], Ks=np.diag([50.0, 50, 1])[None] + 1)
-    points = read_points(tmp_path / "p.npz")
-    assert 0 <= points.rgb.min() <= points.rgb.max() <= 1
-    made = make_gaussians(points, count, 0)
-    made.validate()
-    assert len(made) == count
-    original = {tuple(row) for row in xyz.tolist()}
-    assert sum(tuple(row) in original for row in made.means.tolist()) == min(100, count)
-    camera = bench_camera(64, 48, points)
-    assert (camera.width, camera.height) == (64, 48)
-    assert camera.Ks[0, 0, 2] == 32
-
-
-def test_points_that_are_none_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "text.npz").write_text("no")
-    np.savez(tmp_path / "other.npz", xyz=np.zeros((3, 2)), rgb=np.zeros((3, 2)))
-    with pytest.raises(InputError, match=r"cannot read points from .*text\.npz"):
-        read_points(tmp_path / "text.npz")
-    with pytest.raises(InputError, match=r"other\.npz: expected xyz and rgb .*\[3, 2\]"):
-        read_points(tmp_path / "other.npz")
-    with pytest.raises(InputError, match="cannot read points"):
-        read_points(tmp_path / "missing.npz")
+    made = make_gaussians(object_points(50, 0), 0)
+    assert footprints(made, arc_rig(1, 80, 60)).visible.all()
 
 
 @given(st.integers(2, 60), st.integers(0, 2**31))
@@ -117,7 +86,7 @@ def test_order_and_spacing_of_any_points(count: int, seed: int) -> None:
 
 
 def test_live_pairs_are_those_of_a_naive_count() -> None:
-    made, camera = scene(120), bench_camera(40, 30)
+    made, camera = scene(120), arc_rig(1, 40, 30)
     counts = live_pairs(footprints(made, camera))
     means2d, conics, _, depths, opacities = project(made.map(torch.from_numpy), camera, 0)
     naive = np.zeros((30, 40), np.int64)
@@ -145,7 +114,7 @@ def test_central_tiles_grow_from_the_middle_and_hold_their_share() -> None:
 
 
 def test_rows_that_move_have_their_centre_in_the_tiles() -> None:
-    made = footprints(scene(2000), bench_camera(64, 48))
+    made = footprints(scene(2000), arc_rig(1, 64, 48))
     mask = central_tiles(64, 48, 0.25)
     rows = made.in_tiles(mask)
     assert 0 < len(rows) < made.visible.sum()
@@ -179,5 +148,5 @@ def test_cases_take_turns_and_warm_up_does_not_count() -> None:
 
 
 def test_two_points_are_enough() -> None:
-    made = make_gaussians(Points(np.array([[0.0, 0, 0], [1, 0, 0]]), np.full((2, 3), 0.5)), 2, 0)
+    made = make_gaussians(Points(np.array([[0.0, 0, 0], [1, 0, 0]]), np.full((2, 3), 0.5)), 0)
     made.validate()

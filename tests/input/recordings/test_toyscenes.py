@@ -63,33 +63,8 @@ def test_a_flash_lights_one_frame_of_all_cameras_and_moves_nothing() -> None:
         np.testing.assert_allclose(bright, np.minimum(1.6 * dark, 1), atol=1.6 / 255)
 
 
-def test_a_camera_drops_out_for_four_frames_and_the_others_do_not_notice() -> None:
-    source, paths = scene("dropout"), scene("paths")
-    for index in range(EVENT - 1, EVENT + 5):
-        mine, true = source.frame(index).images, paths.frame(index).images
-        np.testing.assert_array_equal(mine[[0, 2]], true[[0, 2]])
-        shown = EVENT - 1 if EVENT <= index < EVENT + 4 else index
-        np.testing.assert_array_equal(mine[1], paths.frame(shown).images[1])
-        np.testing.assert_array_equal(source.frame(index, "test").images, paths.frame(index, "test").images)
-
-
-@pytest.mark.parametrize("name", ["enters", "door"])
-def test_what_is_new_is_on_no_picture_before_the_event(name: str) -> None:
-    source = scene(name)
-    for index in range(EVENT):
-        assert not source.new_mask(index).any()
-        assert not source.new_mask(index, "test").any()
-    shares = [source.new_mask(t, "test").mean() for t in (EVENT + 2, EVENT + 5, EVENT + 9)]
-    assert 0 < shares[0] < shares[1]
-    assert shares[-1] > 0.01
-    # It is what changed: where the mask says new, the picture is another one than at frame 0.
-    mask = source.new_mask(19, "test")
-    other = (np.abs(source.frame(19, "test").images - source.frame(0, "test").images).max(-1) > 0.05)[mask]
-    assert other.mean() > 0.8
-
-
 def test_nothing_happens_where_nothing_moves_and_a_wrong_name_is_explained() -> None:
-    for name in ("stop", "reversal", "bounce", "occlusion", "enters", "door"):
+    for name in ("stop", "reversal", "bounce", "occlusion"):
         still = scene(name, static=1)
         assert still.frame(0).images.tobytes() == still.frame(19).images.tobytes(), name
     with pytest.raises(SourceError, match="option 'scene' = 'stops'"):

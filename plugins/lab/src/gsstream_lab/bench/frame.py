@@ -197,8 +197,8 @@ def _encoder(parts: Assembly, rig: Cameras, first: PlayerState | None = None) ->
 
 def _scene(plan: FramePlan, static: int) -> Gaussians[FloatArray]:
     degree = plan.recipe.first_frame.sh_degree
-    still = make_gaussians(synthetic_points(static, plan.seed), static, plan.seed, degree=degree)
-    moving = make_gaussians(object_points(plan.moving, plan.seed), plan.moving, plan.seed + 1, degree=degree)
+    still = make_gaussians(synthetic_points(static, plan.seed), plan.seed, degree=degree)
+    moving = make_gaussians(object_points(plan.moving, plan.seed), plan.seed + 1, degree=degree)
     parts = dict(still.items())
     return Gaussians(**{name: np.concatenate([parts[name], value]) for name, value in moving.items()})
 

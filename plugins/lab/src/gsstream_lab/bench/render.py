@@ -27,7 +27,7 @@ from gsstream_lab.bench.roofline import (
     pixels_of,
     roofline_ms,
 )
-from gsstream_lab.bench.scene import Points, bench_camera, make_gaussians, synthetic_points
+from gsstream_lab.bench.scene import arc_rig, make_gaussians, synthetic_points
 from gsstream_lab.bench.timing import Progress, Steps, interleaved, torch_threads
 from gsstream_lab.jobs.machine import machine_facts
 
@@ -56,7 +56,6 @@ class RenderPlan:
         shares: of tiles that are drawn, (0, 1].
         renderers: names of renderer parts.
         repetitions, warm_up: rounds that count, and rounds before them.
-        points: where Gaussians stand; None: synthetic.
     """
 
     sizes: tuple[Size, ...]
@@ -66,8 +65,6 @@ class RenderPlan:
     repetitions: int
     warm_up: int
     seed: int = 0
-    points: Points | None = None
-    points_name: str = "synthetic"
 
 
 @dataclass
@@ -124,9 +121,7 @@ def bench_render(plan: RenderPlan, catalog: Catalog, progress: Progress) -> dict
     return {
         "schema": SCHEMA,
         "machine": {**machine, "isa": measuring.instruction_set() if measuring else None},
-        "settings": {
-            "points": plan.points_name, "seed": plan.seed, "repetitions": plan.repetitions, "warm_up": plan.warm_up,
-        },
+        "settings": {"seed": plan.seed, "repetitions": plan.repetitions, "warm_up": plan.warm_up},
         "peaks": [{"threads": p.threads, "gflops": p.gflops, "gbytes_per_second": p.gbytes_per_second}
                   for p in peaks.values()],
         "scenes": scenes,
@@ -136,9 +131,8 @@ def bench_render(plan: RenderPlan, catalog: Catalog, progress: Progress) -> dict
 
 
 def _scene(plan: RenderPlan, size: Size) -> _Scene:
-    points = plan.points or synthetic_points(size.gaussians, plan.seed)
-    gaussians = make_gaussians(points, size.gaussians, plan.seed)
-    camera = bench_camera(size.width, size.height, plan.points)
+    gaussians = make_gaussians(synthetic_points(size.gaussians, plan.seed), plan.seed)
+    camera = arc_rig(1, size.width, size.height)
     prints = footprints(gaussians, camera)
     upstream = Rng(plan.seed).numpy("bench gradient").normal(size=(size.height, size.width, 3)).astype(np.float32)
     scene = _Scene(size, gaussians, camera, prints, live_pairs(prints), upstream / np.float32(upstream.size))

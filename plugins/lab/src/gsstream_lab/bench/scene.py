@@ -1,4 +1,4 @@
-"""Scenes for benchmarks: made from a seed, or from a file of points; statistics like those of trained scenes.
+"""Scenes for benchmarks: made from a seed; statistics like those of trained scenes.
 
 Like a trained scene: anisotropic with one thin axis, log-normal scales around the distance to the neighbours, a few
 large ones, opacities either faint or nearly opaque, rows in Morton order (memory order follows space). Not like one:
@@ -8,12 +8,10 @@ orientations are random, so surfaces are rougher and a pixel needs more Gaussian
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.errors import InputError
 from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray, IntArray
@@ -27,12 +25,10 @@ _NEIGHBOURS = 8
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """``xyz`` [P, 3], ``rgb`` [P, 3] in [0, 1], and the camera that came with them: viewmat [4, 4] and K [3, 3]."""
+    """``xyz`` [P, 3], ``rgb`` [P, 3] in [0, 1]."""
 
     xyz: FloatArray
     rgb: FloatArray
-    viewmat: FloatArray | None = None
-    K: FloatArray | None = None
 
 
 def synthetic_points(count: int, seed: int) -> Points:
@@ -67,46 +63,15 @@ def object_points(count: int, seed: int) -> Points:
     return Points(directions * OBJECT_RADIUS + OBJECT_CENTER, rgb)
 
 
-def read_points(path: Path) -> Points:
-    """Read a .npz of points.
-
-    It holds ``xyz`` or ``means3d`` [P, 3], ``rgb`` or ``colors`` [P, 3] (uint8 or [0, 1]), and optionally ``viewmats``
-    [C, 4, 4] and ``Ks`` [C, 3, 3], of which the first camera is used.
-
-    Raises InputError naming the file and what it lacks.
-    """
-    try:
-        with np.load(path) as data:
-            arrays = {name: data[name] for name in data.files}
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot read points from {path}: {error}; expected a .npz file") from error
-    xyz, rgb = arrays.get("xyz", arrays.get("means3d")), arrays.get("rgb", arrays.get("colors"))
-    if xyz is None or rgb is None or xyz.shape != rgb.shape or xyz.ndim != 2 or xyz.shape[1] != 3 or len(xyz) < 2:
-        shapes = {name: list(value.shape) for name, value in arrays.items()}
-        raise InputError(f"{path}: expected xyz and rgb (or means3d and colors), both [P, 3] with P > 1, got {shapes}")
-    rgb = rgb / 255.0 if rgb.dtype == np.uint8 else rgb
-    poses, intrinsics = arrays.get("viewmats"), arrays.get("Ks")
-    if poses is None or intrinsics is None:
-        return Points(np.asarray(xyz, np.float64), np.asarray(rgb, np.float64))
-    return Points(np.asarray(xyz, np.float64), np.asarray(rgb, np.float64), poses[0], intrinsics[0])
-
-
-def make_gaussians(points: Points, count: int, seed: int, *, degree: int = 2) -> Gaussians[FloatArray]:
-    """Return ``count`` Gaussians at these points, float32: drawn from them without replacement, then near them."""
+def make_gaussians(points: Points, seed: int, *, degree: int = 2) -> Gaussians[FloatArray]:
+    """Return a Gaussian at each of these points, float32."""
+    count = len(points.xyz)
     rng = Rng(seed).numpy("bench gaussians", count)
-    have = len(points.xyz)
-    chosen = rng.permutation(have)[: min(have, count)]
-    extra = rng.integers(0, have, max(0, count - have))
+    chosen = rng.permutation(count)
     xyz, rgb = points.xyz[chosen], points.rgb[chosen]
     order = morton_order(xyz)
-    spacing = neighbour_spacing(xyz[order])
-    if len(extra):
-        near = rng.integers(0, len(order), len(extra))
-        more = xyz[order][near] + rng.normal(size=(len(extra), 3)) * 0.7 * spacing[near, None]
-        xyz, rgb = np.concatenate([xyz, more]), np.concatenate([rgb, rgb[order][near]])
-        order = morton_order(xyz)
-        spacing = neighbour_spacing(xyz[order])
     xyz, rgb = xyz[order], rgb[order]
+    spacing = neighbour_spacing(xyz)
     widths = spacing[:, None] * np.exp(rng.normal(size=(count, 3)) * 0.6) * 0.7
     widths[np.arange(count), rng.integers(0, 3, count)] *= 0.2
     widths[rng.random(count) < 0.02] *= 4
@@ -141,20 +106,6 @@ def neighbour_spacing(xyz: FloatArray) -> FloatArray:
     nearest = np.sort(distances, axis=1)[:, : min(3, count - 1)].mean(1)
     spacing: FloatArray = nearest.clip(1e-4, max(1e-4, float(np.quantile(nearest, 0.99))))
     return spacing
-
-
-def bench_camera(width: int, height: int, points: Points | None = None) -> Cameras:
-    """Return one camera that sees about half of the scene.
-
-    It is the points' own, scaled to cover the image, or one in the room.
-    """
-    if points is not None and points.viewmat is not None and points.K is not None:
-        old_width, old_height = 2 * points.K[0, 2], 2 * points.K[1, 2]
-        scale = max(width / old_width, height / old_height)
-        K = np.diag([scale, scale, 1.0]) @ np.asarray(points.K, np.float64)
-        K[0, 2], K[1, 2], K[0, 1] = width / 2, height / 2, 0.0
-        return Cameras(("bench",), np.asarray(points.viewmat, np.float64)[None], K[None], width, height)
-    return arc_rig(1, width, height)
 
 
 def arc_rig(views: int, width: int, height: int) -> Cameras:

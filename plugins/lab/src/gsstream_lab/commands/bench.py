@@ -44,10 +44,6 @@ def render(
     renderers: Annotated[
         str, typer.Option("--renderers", help="Renderer parts, see 'gsstream plugins'.")
     ] = "cpu,reference",
-    points: Annotated[
-        Path | None,
-        typer.Option("--points", help="Place Gaussians at the points of this .npz: xyz, rgb (or means3d, colors)."),
-    ] = None,
     repetitions: Repetitions = 10,
 ) -> None:
     """Time forward and backward of renderers and compare them with the least time this machine could need.
@@ -61,7 +57,6 @@ def render(
 
     _check(how.out)
     from gsstream_lab.bench.render import RenderPlan, bench_render
-    from gsstream_lab.bench.scene import read_points
     from gsstream_lab.bench.tables import render_table
 
     plan = RenderPlan(
@@ -72,8 +67,6 @@ def render(
         repetitions=2 if how.quick else repetitions,
         warm_up=1 if how.quick else 2,
         seed=how.seed,
-        points=None if points is None else read_points(points),
-        points_name="synthetic" if points is None else points.name,
     )
     _report(bench_render(plan, load_catalog(), _progress(how.quiet)), render_table, how.out)
 

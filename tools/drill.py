@@ -33,11 +33,16 @@ from gsstream.evaluation.records import mean, read_lines
 from gsstream.input.recordings.calibration import CALIBRATION_FILE, frame_path, read_calibration
 from gsstream.input.recordings.multiview import POINTS_FILE
 from gsstream.input.recordings.open import DEMO_FOLDER
-from tools.drift import there_and_back
 
 WATCH = "behind=drop&ready=rename"
 GSSTREAM = (sys.executable, "-c", "from gsstream.cli.main import main; main()")
 _POLICIES = ("dropped", "missing", "hurried", "held")
+
+
+def there_and_back(index: int, length: int) -> int:
+    """Frame of a recording of ``length`` frames to show at ``index``: 0, 1, ..., length - 1, ..., 1, 0, 1, ..."""
+    place = index % max(1, 2 * length - 2)
+    return min(place, 2 * length - 2 - place) if length > 1 else 0
 
 
 class Capture(threading.Thread):

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from similar_worlds import world
 
 from gsstream.core.errors import OutputError
 from gsstream.core.world import IDENTITY
@@ -14,7 +15,6 @@ from gsstream.encode import encoder_for, open_recording
 from gsstream.engine.frame0.reproject import to_stream_coordinates
 from gsstream.packet import KeyState, PlayerState, StreamWriter, decode_packet, encode_key
 from gsstream.player.render import render
-from tools.worlds import world
 
 SOURCE = "synthetic:frames=2&views=3&width=32&height=24&supersample=1"
 TINY = {

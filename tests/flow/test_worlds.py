@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from early_densify import densifying
+from similar_worlds import Moved, encode, world
 
 from gsstream.core.world import IDENTITY, World
 from gsstream.engine.assembly.assemble import assemble
@@ -16,7 +17,6 @@ from gsstream.input.recordings.canonical import CanonicalSource, recording_simil
 from gsstream.input.recordings.open import open_source
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
-from tools.worlds import Moved, encode, world
 
 SOURCE = "synthetic:frames=3&views=6&width=40&height=30&supersample=1&motion=3"
 SMALL = {  # hold reads no setting of later frames

@@ -12,13 +12,19 @@ from flow_runs import TINY, demo_copy
 
 from gsstream.core.errors import GsstreamError, OutputError
 from gsstream.engine.run.metrics_log import read_metrics
-from tools.drill import Capture, main, reported
+from tools.drill import Capture, main, reported, there_and_back
 
 
 def line(index: int, latency: float, policy: str | None = None, **more: Any) -> dict[str, Any]:
     live = {"latency_seconds": latency, "policy": policy, "effort": 1.0, "absent": []}
     sizes = {"frame": index, "status": "delta", "bytes": {"header": 1000}, "seconds": {"code": 2.0}, "cpu_seconds": 1.0}
     return {**sizes, "live": live, **more}
+
+
+def test_the_loop_never_jumps() -> None:
+    order = [there_and_back(index, 4) for index in range(13)]
+    assert order == [0, 1, 2, 3, 2, 1, 0, 1, 2, 3, 2, 1, 0]
+    assert [there_and_back(index, 1) for index in range(3)] == [0, 0, 0]
 
 
 def test_dropped_frames_do_not_count_for_latency() -> None:

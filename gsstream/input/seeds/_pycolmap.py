@@ -33,16 +33,7 @@ def triangulate(folder: Path) -> None:
     sparse = folder / "sparse"
     sparse.mkdir()
     reconstruction = pycolmap.triangulate_points(reconstruction, database, folder / IMAGES, sparse, options=options)
-    points = reconstruction.points3D
-    order = sorted(points)
-    np.savez(
-        folder / RESULT,
-        xyz=np.array([points[i].xyz for i in order]).reshape(-1, 3),
-        rgb=np.array([points[i].color for i in order], np.uint8).reshape(-1, 3),
-        error=np.array([points[i].error for i in order]),
-        track=np.array([points[i].track.length() for i in order], np.int64),
-        **observations(reconstruction, points, order),
-    )
+    np.savez(folder / RESULT, **_points_of(reconstruction))
 
 
 def extract(folder: Path, most: int, mode: str = "PER_IMAGE", model: str = "SIMPLE_RADIAL") -> Path:
@@ -130,21 +121,26 @@ def match(folder: Path) -> None:
     )
 
 
-def observations(reconstruction: Any, points: Any, order: list[int]) -> dict[str, Any]:
-    """Return who saw each point: ``seen_point`` [S], ``seen_image`` [S], ``seen_error`` [S] pixels.
+def _points_of(reconstruction: Any) -> dict[str, Any]:
+    """All points, and which image saw each: ``seen_point`` [S], ``seen_image`` [S], ``seen_error`` [S] pixels.
 
     An image is given by the number in its name.
     """
-    point, image, off = [], [], []
-    for row, key in enumerate(order):
-        for element in points[key].track.elements:
+    points = [point for _, point in sorted(reconstruction.points3D.items())]
+    row, image, off = [], [], []
+    for number, point in enumerate(points):
+        for element in point.track.elements:
             shown = reconstruction.images[element.image_id]
-            point.append(row)
+            row.append(number)
             image.append(int(Path(shown.name).stem))
-            there = shown.project_point(points[key].xyz)
+            there = shown.project_point(point.xyz)
             off.append(np.inf if there is None else np.linalg.norm(there - shown.points2D[element.point2D_idx].xy))
     return {
-        "seen_point": np.array(point, np.int64),
+        "xyz": np.array([point.xyz for point in points]).reshape(-1, 3),
+        "rgb": np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+        "error": np.array([point.error for point in points]),
+        "track": np.array([point.track.length() for point in points], np.int64),
+        "seen_point": np.array(row, np.int64),
         "seen_image": np.array(image, np.int64),
         "seen_error": np.array(off, np.float64),
     }
@@ -196,18 +192,12 @@ def reconstruct(folder: Path) -> None:
     for index, pose in poses.items():
         if pose is not None:
             viewmats[index] = np.vstack([pose.matrix(), (0, 0, 0, 1)])
-    order = sorted(best.points3D)
-    points = best.points3D
     np.savez(
         folder / RESULT,
         viewmats=viewmats,
         held_error=held_error,
         cameras=np.array([cameras.get(index, known[index]).params for index in sorted(images)]),
-        xyz=np.array([points[i].xyz for i in order]).reshape(-1, 3),
-        rgb=np.array([points[i].color for i in order], np.uint8).reshape(-1, 3),
-        error=np.array([points[i].error for i in order]),
-        track=np.array([points[i].track.length() for i in order], np.int64),
-        **observations(best, points, order),
+        **_points_of(best),
     )
 
 

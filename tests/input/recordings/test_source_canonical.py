@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from similar_worlds import Moved, world
 
 from gsstream.core.errors import SourceError
 from gsstream.core.world import World
 from gsstream.encode import open_recording, to_rig_coordinates
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
 from gsstream.recipe.model import Recipe
-from tools.worlds import Moved, world
 
 FAR = world(1e3, (5e8, 5.2e9, 3e5), turn=2)  # millimetres in UTM coordinates
 

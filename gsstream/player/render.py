@@ -84,7 +84,7 @@ def _entry_points() -> list[importlib.metadata.EntryPoint]:
 def _load(point: importlib.metadata.EntryPoint) -> PlayerRenderer:
     function = point.load()
     # Tried here, where another renderer can still be chosen, and not at the first picture.
-    inspect.signature(function).bind(*[None] * 8, 1, 1, (0.0, 0.0, 0.0), near=0.01)
+    inspect.signature(function).bind([], None, None, 1, 1, (0.0, 0.0, 0.0), near=0.01)
     return PlayerRenderer(point.name, function)
 
 

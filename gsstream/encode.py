@@ -8,15 +8,27 @@
         encoder = encoder_for("s2gs-fast", source)
         for index in range(3):
             writer.append(encoder.encode(source.frame(index)).packet)
+
+A method is also composed: parts that are given, live or by name, take the places of those in the recipe of a method.
+That of ``dense`` groups nothing, moves nothing, opens every gate and corrects every Gaussian::
+
+    from gsstream.parts.motion.rigid import Rigid
+    from gsstream_s2gs.octree import StreamingOctree
+
+    motion = Rigid(Rigid.Config(epochs=3))
+    encoder = encoder_for("dense", source, structure=StreamingOctree(), motion=motion, confidence="view-gradient")
+
+A whole method is given as ``streaming_method``. Classes of live parts need not be declared by a plugin.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame as Frame
 from gsstream.core.world import rig_similarity, snap_cameras
 from gsstream.engine.assembly.assemble import Assembly as Assembly
@@ -29,10 +41,35 @@ from gsstream.input.recordings.base import FrameSource as FrameSource
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.input.recordings.canonical import CanonicalSource, recording_similarity
 from gsstream.method.base import Step as Step
+from gsstream.method.base import StreamingMethod
 from gsstream.packet import StreamWriter as StreamWriter
+from gsstream.parts.confidence.base import ConfidenceEstimator
+from gsstream.parts.gate.base import GateSampler
+from gsstream.parts.growth.base import Growth
+from gsstream.parts.motion.base import MotionPart
+from gsstream.parts.propagation.base import Propagation
+from gsstream.parts.regularizer.base import Regularizer
+from gsstream.parts.render.base import Renderer
+from gsstream.parts.structure.base import Structure
+from gsstream.parts.update.base import UpdateRule
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe as Recipe
+
+
+class Parts(TypedDict, total=False):
+    """Parts by slot: a live one, or the name of one, which takes its settings from ``settings``."""
+
+    structure: Structure | str
+    confidence: ConfidenceEstimator | str
+    propagation: Propagation | str
+    gate: GateSampler | str
+    motion: MotionPart | str
+    update: UpdateRule | str
+    growth: Growth | str
+    regularizer: Regularizer | str
+    streaming_method: StreamingMethod[Any] | str
+    renderer: Renderer | str
 
 
 def recipe_for(method: str, settings: Mapping[str, Any] | None = None) -> Recipe:
@@ -79,8 +116,9 @@ def to_rig_coordinates(source: FrameSource) -> FrameSource:
 
 
 def encoder_for(
-    method: str, source: FrameSource, settings: Mapping[str, Any] | None = None, listeners: Callbacks | None = None
-) -> Encoder:
+    method: str, source: FrameSource, settings: Mapping[str, Any] | None = None, listeners: Callbacks | None = None,
+    **parts: Unpack[Parts],
+) -> Encoder:  # fmt: skip
     """Return an encoder of a recording, before its frame 0.
 
     Arguments:
@@ -88,19 +126,23 @@ def encoder_for(
         source: an open recording, of :func:`open_recording` or :func:`to_rig_coordinates`; its points seed frame 0.
         settings: as for :func:`recipe_for`.
         listeners: what is told of the work.
+        parts: in place of those in the method's recipe, by slot: live, or by name.
+
+    Raises InputError for a part that does not fit its slot, and as :func:`recipe_for` does.
     """
-    parts = assemble(recipe_for(method, settings), load_catalog())
+    assembly = _assembled(method, settings, parts)
 
     def seeds(frame: Frame) -> Any:
-        return gather_points(source.points, frame, parts.recipe.first_frame, encoder.rng)
+        return gather_points(source.points, frame, assembly.recipe.first_frame, encoder.rng)
 
-    encoder = Encoder(parts, source.info, seeds, listeners=listeners)
+    encoder = Encoder(assembly, source.info, seeds, listeners=listeners)
     return encoder
 
 
 def encoder_for_rig(
-    method: str, cameras: Cameras, *, fps: float = 30.0, settings: Mapping[str, Any] | None = None, name: str = "rig"
-) -> Encoder:
+    method: str, cameras: Cameras, *, fps: float = 30.0, settings: Mapping[str, Any] | None = None, name: str = "rig",
+    **parts: Unpack[Parts],
+) -> Encoder:  # fmt: skip
     """Return an encoder of images that come from anywhere; frame 0 is seeded by a plane sweep over them.
 
     The stream lies in coordinates that the rig defines: cameras of frames are taken there by
@@ -112,9 +154,24 @@ def encoder_for_rig(
         fps: frames per second, for players.
         settings: as for :func:`recipe_for`.
         name: what the stream says of its origin.
+        parts: as for :func:`encoder_for`.
     """
     world = rig_similarity(cameras)
     info = SourceInfo(
         name, f"rig:{name}", None, fps, snap_cameras(world.inverse_cameras(cameras)), cameras.select([]), world=world
     )
-    return Encoder(assemble(recipe_for(method, settings), load_catalog()), info, place=True)
+    return Encoder(_assembled(method, settings, parts), info, place=True)
+
+
+def _assembled(method: str, settings: Mapping[str, Any] | None, parts: Parts) -> Assembly:
+    """The live parts of a method's recipe, with these in place of its own."""
+    given: dict[str, Any] = dict(parts)
+    unknown = sorted(given.keys() - Parts.__annotations__.keys())
+    if unknown:
+        raise InputError(f"no slot is called {', '.join(unknown)}: expected some of {', '.join(Parts.__annotations__)}")
+    named = {slot: part for slot, part in given.items() if isinstance(part, str)}
+    live = {slot: part for slot, part in given.items() if slot not in named}
+    for key in settings or {}:
+        if key.partition(".")[0] in live:
+            raise InputError(f"{key}: the part is given live, with settings of its own; make it with this one")
+    return assemble(recipe_for(method, {**named, **(settings or {})}), load_catalog(), live=live)

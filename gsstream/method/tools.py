@@ -118,7 +118,7 @@ class Tools(Protocol):
         """Show how far the optimisation of frame 0 is."""
 
     def meta(self, frame: Frame) -> StreamMeta:
-        """Return what a key packet of this frame says about the run."""
+        """Return what a key packet of this frame says about the run, and of the scene that players have before it."""
 
     def key_refusal(self, num_gaussians: int) -> str | None:
         """Return why a later key packet of so many Gaussians does not fit the budget now; None: it may be sent."""

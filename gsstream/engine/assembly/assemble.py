@@ -6,6 +6,7 @@ import copy
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
@@ -15,6 +16,7 @@ from gsstream.core.part import Part, unwrapped
 from gsstream.engine.assembly.call_location import Where
 from gsstream.engine.assembly.checks import Checks, requested_checks
 from gsstream.engine.assembly.guard import guard
+from gsstream.engine.assembly.live import with_live
 from gsstream.engine.assembly.recipe_keys import unused_keys
 from gsstream.engine.assembly.title import title
 from gsstream.method.base import StreamingMethod
@@ -98,23 +100,31 @@ class Assembly:
         return ResolvedRecipe(self.recipe, self.origins)
 
 
-def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | None = None) -> Assembly:
+def assemble(
+    resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | None = None,
+    live: Mapping[str, Part] = MappingProxyType({}),
+) -> Assembly:  # fmt: skip
     """Import every named part, check its parameters against its own Config, and build it.
 
+    ``live``: slot -> part that takes the place of the one the recipe names.
+
     Raises:
-        InputError: ``checks`` is not a level.
+        InputError: ``checks`` is not a level, or a live part does not fit its slot.
         RecipeError: parameters that a part does not know or refuses, unknown parts; all of them together.
         PluginUnavailable: a part's plugin is in quarantine or the part is not what it claims to be.
     """
     level = requested_checks(checks)
     if isinstance(resolved, Recipe):
         resolved = ResolvedRecipe(resolved, {})
+    resolved = with_live(resolved, live, catalog)
     problems: list[str] = []
     parts: dict[str, Any] = {}
     refs: dict[str, ComponentRef] = {}
     for slot in SLOTS:
         ref: ComponentRef = getattr(resolved.recipe, slot)
-        if slot == "renderer" and ref.name == "auto":
+        if slot in live:
+            built: Part | None = live[slot]
+        elif slot == "renderer" and ref.name == "auto":
             part = _auto_renderer(ref, resolved, catalog, problems)
             ref = ComponentRef(name=part[0]) if part else ref
             built = part[1] if part else None
@@ -130,7 +140,8 @@ def assemble(resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | 
     join_problems(problems)
     parts["loss"] = loss
     parts["optimiser"] = _optimiser(catalog)
-    owners = sorted({catalog.entry(slot, ref.name).distribution for slot, ref in refs.items()})
+    declared = (catalog.entries.get((slot, ref.name)) for slot, ref in refs.items())
+    owners = sorted({entry.distribution for entry in declared if entry})
     recipe = resolved.recipe.model_copy(update=refs)
     return Assembly(
         recipe=recipe, origins=resolved.origins, distributions=tuple(owners), checks=level,

@@ -28,6 +28,9 @@ from gsstream.packet import EncodedPacket, KeyState, PlayerState, StreamMeta, de
 from gsstream.parts.render.exposure import Exposure
 from gsstream.parts.structure.base import Anchors
 
+#: What key packets say of the scene itself, which later ones say, too: colour maps of the cameras, origin of its grid.
+CARRIED = ("exposure", "origin")
+
 
 def begin(parts: Assembly, frame: Frame, tools: Tools) -> Step:
     """Reconstruct frame 0 and write it as a key packet.
@@ -139,7 +142,9 @@ def key_state(
 
 def key_meta(meta: StreamMeta, exposure: Exposure | None, origin: torch.Tensor) -> StreamMeta:
     """Return what a key packet says about the run, with the colour maps and the origin [3] of the structure's grid."""
-    return replace(meta, extra={**meta.extra, **exposure_to_meta(exposure), "origin": origin.tolist()})
+    own = {**exposure_to_meta(exposure), "origin": origin.tolist()}
+    others = {name: value for name, value in meta.extra.items() if name not in own}
+    return replace(meta, extra={**others, **own})
 
 
 def exposure_to_meta(exposure: Exposure | None) -> dict[str, Any]:

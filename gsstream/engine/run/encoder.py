@@ -16,6 +16,7 @@ from gsstream.core.rng import Rng
 from gsstream.core.world import snap_cameras
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.controller import Controller
+from gsstream.engine.frame0.begin import CARRIED
 from gsstream.engine.frame0.optimise import Progress
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.frame0.reproject import to_stream_coordinates
@@ -167,6 +168,8 @@ class Encoder:
     def _meta(self, frame: Frame) -> StreamMeta:
         info, recipe = self.info, self.parts.recipe
         distributions = {"gsstream", *self.parts.distributions}
+        known = {} if self.state is None else self.state.player.meta.extra
+        carried = {name: known[name] for name in CARRIED if name in known}
         return StreamMeta(
             method=recipe.method,
             source=info.name,
@@ -176,6 +179,6 @@ class Encoder:
             fps=info.fps,
             background=recipe.background,
             plugins={name: version(name) for name in sorted(distributions)},
-            extra={"source_uri": info.uri, "licence": info.licence, "title": self.parts.title},
+            extra={"source_uri": info.uri, "licence": info.licence, "title": self.parts.title, **carried},
             world=info.world,
         )

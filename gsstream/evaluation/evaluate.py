@@ -117,7 +117,7 @@ class Evaluation:
         rows = [["", "PSNR 0", "PSNR", "dB/100", "SSIM", "moving", "changed"]]
         if self.lpips_variant:
             names, forms, rows = [*names, "lpips"], [*forms, ".4f"], [[*rows[0], "LPIPS"]]
-        for label, prefix in (("decoded", ""), ("frame 0 held", "hold_")):
+        for label, prefix in (("decoded", ""), ("frame 0 held", "static_")):
             whole = self.series(prefix + "psnr")
             (first, psnr_first), later = next(iter(whole.items())), dict(list(whole.items())[1:])
             known = {t: v for t, v in later.items() if math.isfinite(v)}

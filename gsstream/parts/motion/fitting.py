@@ -54,7 +54,7 @@ def fit_transforms_adam(
         rates: length of the step of every iteration, in units; their number is that of the iterations.
         order: draws the order of the views, anew for each pass.
         measure: what the steps of each number are divided by, squared.
-        pull: weight of the mean absolute value of all numbers, in units, beside the photometric loss.
+        l1_weight: weight of the mean absolute value of all numbers, in units, beside the photometric loss.
         tiles: "changed" compares only in tiles that changed and in those beside them.
     """
     views = len(work.cameras)

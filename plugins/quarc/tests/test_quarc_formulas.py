@@ -80,7 +80,7 @@ def test_a_cell_takes_so_many_and_remembers_those_of_earlier_rounds() -> None:
 
 def test_a_gate_that_lets_everything_through_is_recon_with_rounded_motions() -> None:
     births = BirthSettings(gradient=1e-7, rounds=2, most=9, prune_opacity=0.0)
-    motion = MotionSettings(measure="anchor", change=6.0, step=0.02)
+    motion = MotionSettings(measure="anchor", change=6.0, step=0.02, rounded=True)
     some = {}
     for name, gate in {
         "open": GateSettings(score=0.0, per_cell=1000), "one": GateSettings(score=0.0, per_cell=1, pixels=1e3),

@@ -24,7 +24,6 @@ class QuARC(AnchoredMethod):
     source = "QuARC-GS (arXiv 2608.18285)"
 
     Config = QuARCConfig
-    rounded = True
 
     def admission(self, kept: int) -> CopyFilter:
         return ChangeFilter(self.config.gate, kept)

@@ -46,8 +46,6 @@ class AnchoredMethod(StreamingMethod[ReConState]):
 
     recipe_keys = ("stream.epochs",)
     Config = ReConConfig
-    #: Whether the motion of every anchor is rounded while it is fitted.
-    rounded = False
 
     def begin(self, frame: Frame, tools: Tools) -> Step[ReConState]:
         first = tools.first_frame(frame)
@@ -73,7 +71,7 @@ class AnchoredMethod(StreamingMethod[ReConState]):
             anchors = due(state.anchors, frame.index, len(scene.gaussians), settings, tools.rng)
             motion = fitted_motion(
                 scene, work, rows, (state.anchors, anchors), max(1, epochs - for_births), settings,
-                tools.rng.numpy("recon", frame.index), self.rounded,
+                tools.rng.numpy("recon", frame.index),
             )  # fmt: skip
             moved = scene if motion is None else apply_motion(scene, motion)[0]
             work = work.on(moved.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
@@ -110,8 +108,8 @@ class AnchoredMethod(StreamingMethod[ReConState]):
 class ReCon(AnchoredMethod):
     """Moves Gaussians by anchors drawn among them on three levels, and adds some (ReCon-GS, NeurIPS 2025).
 
-    Half of a frame's passes fit the motions of anchors; the other half fits Gaussians that are copied where the images
-    pull at the scene. In the next frame as many of the least opaque leave, so the number stays that of frame 0. Anchors
+    Half of a frame's passes fit the motions of anchors; the other half fits Gaussians that are copied where the
+    gradient is large. In the next frame as many of the least opaque leave, so the number stays that of frame 0. Anchors
     are drawn anew every second frame and inherit what the old ones knew. What is sent are rigid motions of small cells,
     each the sum of its anchors' motions, births and deaths: attributes of what is there never change.
     Where this differs from what is published, and why: README of this plugin.

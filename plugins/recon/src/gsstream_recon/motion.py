@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 
@@ -19,15 +21,32 @@ from gsstream_recon.anchors import AnchorLevels, Level, bound, inherited
 from gsstream_recon.settings import MotionSettings
 
 
+@dataclass(frozen=True)
+class AnchoredCells:
+    """Cells that follow the nearest anchor of each level: a cell's shift and turn are the sums of theirs.
+
+    ``unit`` [6] is a step of one pixel in each number; anchors' numbers are rounded to ``step`` [6] unless it is None.
+    """
+
+    cells: GroupTransforms
+    levels: list[Level]
+    unit: FloatArray
+    step: FloatArray | None
+
+    def sums(self, descents: list[GroupAdam]) -> FloatArray:
+        """Return shifts and turns [C, 6] of the cells, from the numbers that each level's anchors have reached."""
+        total: FloatArray = np.zeros((len(self.levels[0].of), 6))
+        for level, descent in zip(self.levels, descents, strict=True):
+            values = descent.values * self.unit
+            total += (values if self.step is None else np.rint(values / self.step) * self.step)[level.of]
+        return total
+
+
 def fitted_motion(
     scene: Scene, work: FitContext, rows: IntArray, anchors: tuple[AnchorLevels | None, AnchorLevels], epochs: int,
-    settings: MotionSettings, order: np.random.Generator, rounded: bool = False,
+    settings: MotionSettings, order: np.random.Generator,
 ) -> Motion | None:  # fmt: skip
-    """Return the motion of a frame; None where nothing moves.
-
-    Cells of a fine grid follow the nearest anchor of each level: a cell's shift and turn, about its own centre, are the
-    sums of theirs.
-    """
+    """Return the motion of a frame, of cells of a fine grid, each about its own centre; None where nothing moves."""
     pixel = pixel_size(scene.gaussians.means, work.cameras)
     side = float(np.float32(settings.pixels * pixel))
     groups = groups_for(scene, side, 1, regroup=True)
@@ -40,8 +59,8 @@ def fitted_motion(
     steps = float(np.float32(settings.step * pixel)), float(np.float32(settings.rotation_step))
     step = np.array([steps[0]] * 3 + [steps[1]] * 3)
     levels = bound(cells.centre, scene.gaussians.means, anchors[1])
-    start = _start(scene, cells, anchors, levels, settings)
-    found = _fitted(scene, work, cells, levels, start, unit, step if rounded else None, epochs, settings, order)
+    anchored = AnchoredCells(cells, levels, unit, step if settings.rounded else None)
+    found = _fitted(scene, work, anchored, _start(scene, cells, anchors, levels, settings), epochs, settings, order)
     symbols = np.rint(found / step).astype(np.int32)
     moved = symbols.any(1)
     if not moved.any():
@@ -66,10 +85,11 @@ def _start(
 
 
 def _fitted(
-    scene: Scene, work: FitContext, cells: GroupTransforms, levels: list[Level], start: list[FloatArray],
-    unit: FloatArray, step: FloatArray | None, epochs: int, settings: MotionSettings, order: np.random.Generator,
+    scene: Scene, work: FitContext, anchored: AnchoredCells, start: list[FloatArray], epochs: int,
+    settings: MotionSettings, order: np.random.Generator,
 ) -> FloatArray:  # fmt: skip
     """Shifts and turns [C, 6] of the cells; all levels learn at once."""
+    cells, unit = anchored.cells, anchored.unit
     measure = elementwise if settings.measure == "each" else groupwise_max
     descents = [GroupAdam(values / unit, measure) for values in start]
     work.narrow(torch.from_numpy(cells.rows))
@@ -77,21 +97,10 @@ def _fitted(
     local = cells._replace(rows=np.arange(len(cells.rows)))
     for _ in range(epochs):
         for view in order.permutation(len(work.cameras)):
-            sums = _sums(levels, descents, unit, step)
+            sums = anchored.sums(descents)
             moves = local._replace(shift=sums[:, :3], turn=sums[:, 3:])
             grad = work.loss_and_grad(int(view), WrtTransforms(base, moves)).grad.numpy() * unit
-            for level, descent in zip(levels, descents, strict=True):
+            for level, descent in zip(anchored.levels, descents, strict=True):
                 l1_weight = settings.l1_weight * np.sign(descent.values) / descent.values.size
                 descent.step(level.sum(grad) + l1_weight, settings.lr)
-    return _sums(levels, descents, unit, step)
-
-
-def _sums(
-    levels: list[Level], descents: list[GroupAdam], unit: FloatArray, step: FloatArray | None
-) -> FloatArray:
-    """[C, 6]: what the anchors of all levels say, each rounded to ``step`` where there is one."""
-    total: FloatArray = np.zeros((len(levels[0].of), 6))
-    for level, descent in zip(levels, descents, strict=True):
-        values = descent.values * unit
-        total += (values if step is None else np.rint(values / step) * step)[level.of]
-    return total
+    return anchored.sums(descents)

@@ -22,8 +22,8 @@ class MotionSettings(PartConfig):
     l1_weight: float = Field(default=0.0, ge=0, description="weight of the mean absolute motion, pixels, in the loss")
     measure: Literal["each", "anchor"] = Field(
         default="each",
-        description="what a step is divided by; each: every number of an anchor by its own slope (Adam); anchor: all "
-        "six by the largest",
+        description="what a step is divided by; each: every number of an anchor by its own gradient (Adam); anchor: "
+        "all six by the largest",
     )  # fmt: skip
     change: float = Field(
         default=0.0, ge=0, description="cells in what changed move alone: multiple of the noise of blocks; 0: all cells"
@@ -36,6 +36,7 @@ class MotionSettings(PartConfig):
     )
     step: float = Field(default=0.1, gt=0, le=10, description="quantisation step of shifts, pixels")
     rotation_step: float = Field(default=0.01, gt=0, le=1, description="quantisation step of turns, tan(angle / 2)")
+    rounded: bool = Field(default=False, description="round every anchor's motion to these steps while it is fitted")
 
 
 class BirthSettings(PartConfig):

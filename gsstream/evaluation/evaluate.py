@@ -14,7 +14,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
 from gsstream.core.shapes import FloatArray
-from gsstream.evaluation.records import mean
+from gsstream.evaluation.records import finite_or_none, mean
 from gsstream.evaluation.summary import format_table
 from gsstream.input.recordings.base import FrameSource
 from gsstream.metrics import (
@@ -99,9 +99,9 @@ class Evaluation:
     def to_json(self) -> str:
         """Return everything as JSON; nan and inf become null."""
         unknown = ("extra",) if self.lpips_variant else ("lpips", "static_lpips", "extra")
-        views = [{k: _plain(v) for k, v in asdict(view).items() if k not in unknown} for view in self.views]
+        views = [{k: finite_or_none(v) for k, v in asdict(view).items() if k not in unknown} for view in self.views]
         for row, view in zip(views, self.views, strict=True):
-            row |= {name: _plain(value) for name, value in view.extra.items()}
+            row |= {name: finite_or_none(value) for name, value in view.extra.items()}
         variants = {"ssim_variant": SSIM_VARIANT}
         if self.lpips_variant:
             variants["lpips_variant"] = self.lpips_variant
@@ -249,7 +249,3 @@ def _match(rig: Cameras, recorded: Cameras, split: str) -> list[int]:
             "open the recording at the scale of the run"
         )
     return [recorded.ids.index(name) for name in rig.ids]
-
-
-def _plain(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -56,6 +56,16 @@ def mean(values: Iterable[float]) -> float:
     return sum(kept) / len(kept) if kept else math.nan
 
 
+def mean_of_views(frames: Iterable[Mapping[str, Any]], name: str) -> float:
+    """Return the mean of a quantity of ``metrics.jsonl`` over cameras, then over frames; nan: not measured."""
+    return mean(mean(v for v in (frame.get(name) or {}).values() if v is not None) for frame in frames)
+
+
+def finite_or_none(value: Any) -> Any:
+    """Return a value as JSON holds it: None for a number that is not finite."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def read_records(path: str | os.PathLike[str]) -> list[FrameRecord]:
     """Read ``metrics.jsonl`` (or the folder that holds it), in the order of frames; the last entry of a frame counts.
 

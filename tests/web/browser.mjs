@@ -1,7 +1,7 @@
 // A Chromium without a window, driven through its debugging pipe: no package is needed for it.
 
 import { spawn } from "node:child_process";
-import { mkdtempSync, readFileSync, readdirSync, rmSync } from "node:fs";
+import { mkdtempSync, rmSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 
@@ -105,22 +105,6 @@ export class Browser {
   async screenshot() {
     const { data } = await this.send("Page.captureScreenshot", { format: "png" });
     return Buffer.from(data, "base64");
-  }
-
-  /** Milliseconds of processor time that the browser's processes have taken (Linux). */
-  processorTime() {
-    let ticks = 0;
-    for (const name of readdirSync("/proc").filter((entry) => /^\d+$/.test(entry))) {
-      try {
-        const stat = readFileSync(`/proc/${name}/stat`, "utf8");
-        const fields = stat.slice(stat.lastIndexOf(")") + 2).split(" ");
-        if (Number(fields[2]) === this.child.pid) ticks += Number(fields[11]) + Number(fields[12]);
-      } catch (error) {
-        // A process that ended in between.
-        if (!["ENOENT", "ESRCH"].includes(error.code)) throw error;
-      }
-    }
-    return 10 * ticks;
   }
 
   async stop() {

@@ -1,6 +1,6 @@
 // Carry out steps in a headless browser. Usage: node scenario.mjs CHROMIUM STEPS RESULTS (both JSON files)
 //
-// STEPS: { width, height, throttle (bytes/s), steps: [[name, ...arguments], ...] }. RESULTS: a list with what each
+// STEPS: { width, height, steps: [[name, ...arguments], ...] }. RESULTS: a list with what each
 // step gave, and `messages`, the errors that the page reported.
 
 import { readFileSync, writeFileSync } from "node:fs";
@@ -17,14 +17,6 @@ const actions = {
   until: (expression, seconds) => browser.until(expression, seconds),
   evaluate: (expression) => browser.evaluate(expression),
   pause,
-  processor: () => browser.processorTime(),
-  throttle: (bytes) =>
-    browser.send("Network.emulateNetworkConditions", {
-      offline: false,
-      latency: 20,
-      downloadThroughput: bytes,
-      uploadThroughput: bytes,
-    }),
   screenshot: async (path) => writeFileSync(path, await browser.screenshot()),
   key: async (key) => {
     await browser.send("Input.dispatchKeyEvent", { type: "keyDown", key, text: key.length === 1 ? key : undefined });

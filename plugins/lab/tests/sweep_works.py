@@ -20,6 +20,15 @@ seeds: [0, 1]
 variants: [{name: dense, method: dense}]
 axes: {stream.epochs: [1, 2]}
 """
+#: Small enough to be encoded in a test.
+REAL = """
+name: real
+scenes: [{name: world, uri: "synthetic:frames=3&views=3&width=64&height=48&supersample=1", frames: 2}]
+set: {first_frame: {max_iterations: 5, max_points: 200}}
+variants: [{name: dense, method: dense}]
+axes: {stream.epochs: [1, 2]}
+measure: {fps: true}
+"""
 FRAME = {"frame": 0, "status": "key", "bytes": {"layout": 10}, "seconds": {"code": 0.5}, "num_gaussians": 1}
 
 

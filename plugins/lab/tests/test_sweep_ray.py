@@ -16,21 +16,12 @@ from gsstream_lab.jobs.ray_executor import RayExecutor
 from gsstream_lab.sweep.drive import run_sweep
 from gsstream_lab.sweep.job import run_job
 from gsstream_lab.sweep.table import read_table
-from sweep_works import TWO_SEEDS
+from sweep_works import REAL, TWO_SEEDS
 
 from gsstream.core.errors import PluginUnavailable
 
 HAVE_RAY = importlib.util.find_spec("ray") is not None
 needs_ray = pytest.mark.skipif(not HAVE_RAY, reason="needs Ray (extra: ray)")
-REAL = """
-name: real
-scenes: [{name: world, uri: "synthetic:frames=3&views=3&width=64&height=48&supersample=1", frames: 2}]
-set: {first_frame: {max_iterations: 5, max_points: 200}}
-variants: [{name: dense, method: dense}]
-axes: {stream.epochs: [1, 2]}
-"""
-
-
 @pytest.fixture
 def marks(tmp_path, monkeypatch):
     """Where the workers of these tests leave their ids; also on the path of Ray's workers."""

@@ -12,19 +12,11 @@ from pathlib import Path
 
 import pytest
 from gsstream_lab.sweep.table import read_table
+from sweep_works import REAL
 
 from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError
 from gsstream.player.playback import Playback
-
-SWEEP = """
-name: real
-scenes: [{name: world, uri: "synthetic:frames=3&views=3&width=64&height=48&supersample=1", frames: 2}]
-set: {first_frame: {max_iterations: 5, max_points: 200}}
-variants: [{name: dense, method: dense}]
-axes: {stream.epochs: [1, 2]}
-measure: {fps: true}
-"""
 
 
 def start(config: Path, out: Path) -> subprocess.Popen[str]:
@@ -42,7 +34,7 @@ def cells_of(out: Path) -> list[dict]:
 
 def test_a_killed_sweep_goes_on_without_repeating_a_cell(tmp_path):
     config, out = tmp_path / "sweep.yaml", tmp_path / "out"
-    config.write_text(SWEEP)
+    config.write_text(REAL)
     with start(config, out) as process:
         deadline = time.monotonic() + 300
         # One cell is in the table, and the next one has begun to write its stream.
@@ -94,7 +86,7 @@ def _check_cells(table, out: Path) -> None:
 def test_a_dry_run_shows_the_plan_and_writes_nothing(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("GSSTREAM_LOAD_PLUGINS", "lab")
     config, out = tmp_path / "sweep.yaml", tmp_path / "out"
-    config.write_text(SWEEP)
+    config.write_text(REAL)
     assert run_command(["sweep", str(config), "--out", str(out), "--dry-run"]) == 0
     text = capsys.readouterr().out
     assert text.count("to make\n") == 2

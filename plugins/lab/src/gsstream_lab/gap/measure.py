@@ -13,7 +13,7 @@ import numpy as np
 
 from gsstream.core.errors import InputError
 from gsstream.core.shapes import FloatArray
-from gsstream.evaluation.records import mean
+from gsstream.evaluation.records import finite_or_none, mean
 from gsstream.evaluation.summary import format_table
 from gsstream.input.recordings.base import FrameSource
 from gsstream.metrics import changed_mask, moving_mask, noise_sigma, psnr
@@ -79,13 +79,16 @@ class Gap:
 
     def to_json(self) -> str:
         """Return everything as JSON; what is not defined is null."""
-        frames = {str(t): {name: _plain(self.mean(f"gap_{name}", t)) for name in _QUANTITIES} for t in self.files}
+
+        def gaps(frame: int | None) -> dict[str, Any]:
+            return {name: finite_or_none(self.mean(f"gap_{name}", frame)) for name in _QUANTITIES}
+
         data = {
-            "gap": frames,
-            "mean": {name: _plain(self.mean(f"gap_{name}")) for name in _QUANTITIES},
+            "gap": {str(frame): gaps(frame) for frame in self.files},
+            "mean": gaps(None),
             "epochs": self.epochs,
             "files": {str(frame): str(path) for frame, path in self.files.items()},
-            "views": [{key: _plain(value) for key, value in asdict(view).items()} for view in self.views],
+            "views": [{key: finite_or_none(value) for key, value in asdict(view).items()} for view in self.views],
         }
         return json.dumps(data, indent=1, allow_nan=False)
 
@@ -138,7 +141,3 @@ def _cell(value: float, column: str) -> str:
     if not math.isfinite(value):
         return "-"
     return f"{value:+.2f}" if column.startswith("gap_") else f"{value:.2f}"
-
-
-def _plain(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value

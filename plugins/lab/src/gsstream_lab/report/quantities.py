@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from gsstream.evaluation.records import FrameRecord, mean
+from gsstream.evaluation.records import FrameRecord, mean, mean_of_views
 from gsstream.evaluation.summary import Summary, summarise
 from gsstream_lab.energy import total_joules
 
@@ -36,10 +36,7 @@ def _per_frame(name: str) -> Callable[[Summary, Sequence[Row], Row], float]:
 
 
 def _per_view(name: str) -> Callable[[Summary, Sequence[Row], Row], float]:
-    """Mean over cameras, then over frames."""
-    return lambda _, frames, __: mean(
-        mean(v for v in frame[name].values() if v is not None) for frame in frames if frame.get(name)
-    )
+    return lambda _, frames, __: mean_of_views(frames, name)
 
 
 def _of_run(name: str) -> Callable[[Summary, Sequence[Row], Row], float]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gsstream.core.errors import OutputError
-from gsstream.evaluation.records import mean
+from gsstream.evaluation.records import mean, mean_of_views
 from gsstream_lab.jobs.base import Executor, Finished
 from gsstream_lab.jobs.folder import only_one, recording_uri
 from gsstream_lab.jobs.schedule import finished_tasks
@@ -188,10 +188,7 @@ def write_whole(path: Path, content: bytes) -> None:
 def summary_line(frames: Sequence[Mapping[str, Any]]) -> str:
     """Return ``31.22 dB (moving 29.27), 25.6 KB, 0.45 s/frame``: means over the frames after the first."""
     later = frames[1:] or frames
-    whole, moving = (
-        mean(value for frame in later for value in frame.get(name, {}).values() if value is not None)
-        for name in ("psnr", "psnr_moving")
-    )
+    whole, moving = (mean_of_views(later, name) for name in ("psnr", "psnr_moving"))
     size, seconds = (mean(sum(frame[name].values()) for frame in later) for name in ("bytes", "seconds"))
     return f"{whole:.2f} dB (moving {moving:.2f}), {size / 1000:.1f} KB, {seconds:.2f} s/frame"
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import math
 import os
 import statistics
 import tempfile
@@ -148,10 +147,12 @@ def _measure(measure: Measure, stream: Path, recording: FrameSource, frames: lis
 
 def frame_values(evaluation: Evaluation, frame: int, lpips: bool) -> dict[str, dict[str, float | None]]:
     """Return quantity -> camera -> value of one frame; None where it is not defined."""
+    from gsstream.evaluation.records import finite_or_none
+
     views = [view for view in evaluation.views if view.frame == frame]
     names = [name for name in views[0].__slots__ if name not in _PLACE and (lpips or "lpips" not in name)]
-    values = {name: {view.camera: _plain(getattr(view, name)) for view in views} for name in names}
-    return values | {name: {view.camera: _plain(view.extra[name]) for view in views} for name in views[0].extra}
+    values = {name: {view.camera: finite_or_none(getattr(view, name)) for view in views} for name in names}
+    return values | {name: {view.camera: finite_or_none(view.extra[name]) for view in views} for name in views[0].extra}
 
 
 def frames_per_second(stream: Path) -> float:
@@ -201,7 +202,3 @@ def _code_hash(parts: Assembly) -> str:
                 with contextlib.suppress(FileNotFoundError):
                     digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
-
-
-def _plain(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gsstream.core.errors import InputError
-from gsstream.evaluation.records import mean
+from gsstream.evaluation.records import mean_of_views
 from gsstream.recipe.load import FindMethod, ResolvedRecipe
 from gsstream_lab.jobs.base import Executor
 from gsstream_lab.sweep.config import FirstFrame, Scene, SweepConfig, Variant
@@ -113,4 +113,4 @@ def quality(row: Mapping[str, Any]) -> float:
     """Return the mean PSNR of a cell's frames after the first, or of the first where it is alone; nan: not measured."""
     frames = row.get("frames", ())
     scored = frames[1:] or frames
-    return mean(mean(v for v in frame.get("psnr", {}).values() if v is not None) for frame in scored)
+    return mean_of_views(scored, "psnr")

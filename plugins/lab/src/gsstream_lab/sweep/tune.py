@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from gsstream.core.errors import InputError
-from gsstream.evaluation.records import mean
+from gsstream.evaluation.records import mean, mean_of_views
 from gsstream.evaluation.summary import format_table
 from gsstream.recipe.budget import Budget
 from gsstream.recipe.load import ResolvedRecipe
@@ -113,13 +113,8 @@ def trial_of(name: str, row: Mapping[str, Any], budget: Budget) -> Trial:
     limits = (budget.size or math.inf, budget.time or math.inf, budget.memory or math.inf)
     costs = zip(sizes, seconds, memory, strict=True)
     inside = sum(all(cost <= limit for cost, limit in zip(frame, limits, strict=True)) for frame in costs)
-    return Trial(name, _mean(later, "psnr"), _mean(later, "psnr_moving"), sizes, seconds, max(memory), inside)
-
-
-def _mean(frames: Sequence[Mapping[str, Any]], name: str) -> float:
-    """Over cameras, then over frames."""
-    values = [mean(v for v in frame.get(name, {}).values() if v is not None) for frame in frames]
-    return mean(values)
+    whole, moving = (mean_of_views(later, name) for name in ("psnr", "psnr_moving"))
+    return Trial(name, whole, moving, sizes, seconds, max(memory), inside)
 
 
 def choose(trials: Sequence[Trial]) -> Trial | None:

@@ -1,4 +1,4 @@
-"""Gaussians that are copied where the images pull at the scene, and fitted while the rest holds still."""
+"""Gaussians that are copied where the gradient is large, and fitted while the rest does not change."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gsstream.core.shapes import IntArray
 from gsstream.parts.growth.fitting import concat_gaussians, fit_added
 from gsstream.parts.render.work import FitContext
 
-#: (frame as a scene shows it, rows [P] that are pulled, the largest first) -> those that may be copied, in that order.
+#: (frame as a scene shows it, rows [P], the largest gradient first) -> those that may be copied, in that order.
 CopyFilter = Callable[[FitContext, torch.Tensor], torch.Tensor]
 
 

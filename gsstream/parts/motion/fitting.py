@@ -15,12 +15,12 @@ from gsstream.parts.render.work import FitContext
 from gsstream.parts.render.wrt import WrtTransforms
 
 BETAS, EPSILON = (0.9, 0.99), 1e-12
-#: Squared slopes [K, 6] -> by what every number's slope is measured, squared.
+#: Squared gradients [K, 6] -> by what every number's gradient is divided, squared.
 Measure = Callable[[FloatArray], FloatArray]
 
 
 class GroupAdam:
-    """Descends along slopes with Adam's moments, in steps of given length.
+    """Descends along gradients with Adam's moments, in steps of given length.
 
     Arguments:
         values: [K, 6] where it begins.
@@ -32,7 +32,7 @@ class GroupAdam:
         self._first, self._second, self._steps = np.zeros_like(values), np.zeros_like(values), 0
 
     def step(self, grad: FloatArray, rate: float) -> None:
-        """Replace ``values``: one step of length ``rate`` against a slope [K, 6]."""
+        """Replace ``values``: one step of length ``rate`` against a gradient [K, 6]."""
         self._steps += 1
         self._first = BETAS[0] * self._first + (1 - BETAS[0]) * grad
         self._second = BETAS[1] * self._second + (1 - BETAS[1]) * grad**2
@@ -76,15 +76,15 @@ def fit_transforms_adam(
 
 
 def elementwise(second: FloatArray) -> FloatArray:
-    """Return the squared slopes as they are: every number is measured by itself, as Adam does."""
+    """Return the squared gradients as they are: every number is measured by itself, as Adam does."""
     return second
 
 
 def groupwise_max(second: FloatArray) -> FloatArray:
-    """Return the squared slope [K, 1] that all six numbers of a group are measured by: that of the one felt most.
+    """Return the squared gradient [K, 1] that all six numbers of a group are divided by: the largest of them.
 
     With a measure of its own every number would make steps of full size, those that the images say nothing about too
     (depth, the turn of a ball), and so would groups that are hardly seen: noise, which the residual has to mend. A
-    group that feels less than the others do on average is measured by them.
+    group whose gradient is below the mean of all groups is divided by that mean.
     """
     return np.asarray(np.maximum(second.max(1, keepdims=True), second.mean()))

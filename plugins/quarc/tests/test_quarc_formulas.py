@@ -23,16 +23,16 @@ def rig(views: int) -> Cameras:
 
 
 class Seen:
-    """A frame in which every Gaussian is pulled along x by what its number says, in every view."""
+    """A frame in which every Gaussian has a given gradient along x, in every view."""
 
-    def __init__(self, means: np.ndarray, pulls: list[float], views: int = 7) -> None:
+    def __init__(self, means: np.ndarray, gradients: list[float], views: int = 7) -> None:
         zeros = torch.zeros(len(means))
         self.gaussians = Gaussians(
             means=torch.from_numpy(means.astype(np.float32)), quats=zeros[:, None].repeat(1, 4),
             scales=zeros[:, None].repeat(1, 3), opacities=zeros, sh0=zeros[:, None, None].repeat(1, 1, 3),
             shN=torch.zeros(len(means), 0, 3),
         )  # fmt: skip
-        self.pulls, self.cameras, self.asked = torch.tensor(pulls), rig(views), []
+        self.gradients, self.cameras, self.asked = torch.tensor(gradients), rig(views), []
 
     def image(self, view: int) -> torch.Tensor:
         return torch.zeros(2, 2, 3)
@@ -43,10 +43,10 @@ class Seen:
     def screen_gradient(self, view: int, upstream: torch.Tensor):
         assert upstream.unique().tolist() == pytest.approx([2 / 12]), "the gradient of a mean squared error"
         self.asked.append(view)
-        return type("Found", (), {"gradient": torch.stack([self.pulls, 0 * self.pulls], 1)})
+        return type("Found", (), {"gradient": torch.stack([self.gradients, 0 * self.gradients], 1)})
 
 
-def test_scores_compare_with_the_median_of_what_is_pulled() -> None:
+def test_scores_compare_with_the_median_of_gradients_that_are_not_zero() -> None:
     work = Seen(RNG.normal(size=(6, 3)), [0.0, 1.0, 2.0, 6.0, 0.0, 0.0])
     assert change_scores(work, 4).tolist() == pytest.approx([0, 1 / 3, 1 / 2, 3 / 4, 0, 0])
     assert work.asked == [0, 2, 4, 6], "four views, spread over the seven"

@@ -35,7 +35,7 @@ def scene_of(means: np.ndarray, moved: Displacement | None = None) -> Scene:
     return Scene(gaussians, Layout.flat(number, 1.0), moved)
 
 
-class Pulled:
+class SquaredDistances:
     """A frame whose loss is the squared distance of every Gaussian to where it belongs."""
 
     cameras = RIG
@@ -58,7 +58,7 @@ class Pulled:
 def fitted(scene: Scene, aims: np.ndarray, rows: np.ndarray, settings: MotionSettings, epochs: int = 30, before=None):
     """(the frame, the scene after the motion that was found)."""
     anchors = due(before, 1, len(scene.gaussians), settings, Rng(0))
-    work = Pulled(aims)
+    work = SquaredDistances(aims)
     motion = fitted_motion(scene, work, rows, (before, anchors), epochs, settings, np.random.default_rng(0))
     return work, scene if motion is None else apply_motion(scene, motion)[0]
 

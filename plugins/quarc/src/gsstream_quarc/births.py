@@ -11,10 +11,10 @@ from gsstream_quarc.settings import GateSettings
 
 
 def change_scores(work: FitContext, views: int) -> torch.Tensor:
-    """Return [N] the change score g / (g + median) of every Gaussian, 0 to 1; 0 where no view pulls.
+    """Return [N] the change score g / (g + median) of every Gaussian, 0 to 1; 0 where g is 0.
 
-    g is the size of the change, from the frame before to this one, of the pull of the squared error at a Gaussian's
-    centre, summed over the views; the render itself cancels. The median is that of the Gaussians that are pulled.
+    g is the length of the change, from the frame before to this one, of the squared error's gradient by a Gaussian's
+    2-D mean, summed over the views; the render itself cancels. The median is that of the Gaussians whose g is not 0.
     """
     size = torch.zeros(len(work.gaussians))
     number = len(work.cameras)

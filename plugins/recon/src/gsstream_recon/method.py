@@ -92,7 +92,7 @@ class AnchoredMethod(StreamingMethod[ReConState]):
         )  # fmt: skip
 
     def admission(self, kept: int) -> CopyFilter | None:
-        """Return what chooses which of the Gaussians that are pulled may be copied; None, as here: all of them."""
+        """Return what chooses which Gaussians with a large gradient may be copied; None, as here: all of them."""
         return None
 
     def _send(

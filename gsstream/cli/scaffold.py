@@ -50,10 +50,11 @@ def files(name: str, kind: str) -> Mapping[str, str]:
     """Return path -> text of every file of the distribution."""
     package = "gsstream_" + name.replace("-", "_")
     words = "".join(word.capitalize() for word in re.split("[-_]", name) if word)
-    cls = words if words.endswith(kind.capitalize()) else words + kind.capitalize()
+    suffix = kind.rpartition("_")[2].capitalize()
+    cls = words if words.endswith(suffix) else words + suffix
     # The example is one that the contract kit is proven on; it is read as text, so that nothing heavy is imported.
     example = Path(gsstream.__file__).parent / "testing" / kind / "example.py"
-    part = example.read_text(encoding="utf-8").replace(f"Example{kind.capitalize()}", cls)
+    part = example.read_text(encoding="utf-8").replace(f"Example{suffix}", cls)
     summary = part.splitlines()[0].strip('"')
     values = {"name": name, "kind": kind, "package": package, "cls": cls, "summary": summary, "module": kind}
     values["use"] = _fill(PART_KINDS[kind].use or "", values)

@@ -119,7 +119,7 @@ class TestFlat:
         assert Flat().seed(points, rig()).cell_sizes.tolist() == [1.0]
 
     def test_nothing_to_start_from(self) -> None:
-        with pytest.raises(InputError, match="expected at least 1, got 0; set first_frame"):
+        with pytest.raises(InputError, match="expected at least 1, got 0; do the cameras have a common view"):
             Flat().seed(cloud(0), rig())
 
 

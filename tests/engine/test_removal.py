@@ -39,7 +39,7 @@ def fitted(**settings: Any) -> Gaussians[np.ndarray]:
 def images(renderer: Renderer, scene: Gaussians[torch.Tensor], exposure: Exposure | None = None) -> torch.Tensor:
     cameras = frames()[0].cameras
     drawn = [renderer.render(scene, cameras, view, BLACK).image for view in range(len(cameras))]
-    return torch.stack([image if exposure is None else exposure.apply(v, image) for v, image in enumerate(drawn)])
+    return torch.stack([image if exposure is None else exposure[v].apply(image) for v, image in enumerate(drawn)])
 
 
 @pytest.mark.parametrize("exposed", [False, True])

@@ -108,19 +108,20 @@ class WrongLoss(Loss):
     def prepare(self, image: torch.Tensor) -> Any:
         return image
 
-    def evaluate(self, image: torch.Tensor, target: Any, dssim: float, tiles: Any = None) -> tuple[float, torch.Tensor]:
+    def evaluate(self, image: torch.Tensor, target: Any, dssim: float, tiles: Any = None) -> tuple[Any, torch.Tensor]:
         difference = image - target
-        return float("inf") if COUNTER.now(3) else float(difference.square().mean()), difference / difference.numel()
+        value = torch.tensor(float("inf")) if COUNTER.now(3) else difference.square().mean()
+        return value, difference / difference.numel()
 
 
 class WrongGradient(WrongLoss):
     """Its value is fine; the gradient at one pixel is not, from iteration 3 on."""
 
-    def evaluate(self, image: torch.Tensor, target: Any, dssim: float, tiles: Any = None) -> tuple[float, torch.Tensor]:
+    def evaluate(self, image: torch.Tensor, target: Any, dssim: float, tiles: Any = None) -> tuple[Any, torch.Tensor]:
         COUNTER.calls += 1
         gradient = (image - target) / image.numel()
         gradient[7, 9] = NAN if COUNTER.calls > 3 else 0.0
-        return 1.0, gradient
+        return torch.tensor(1.0), gradient
 
 
 class WrongOptimiser(RowOptimiser):

@@ -106,8 +106,8 @@ def test_training_and_transmission_apply_the_same_map(tmp_path: Path, monkeypatc
     keep = {"motion": "still", "codec__trim": 0, "stream__freeze_closed": "false"}
     encode(tmp_path, "--frames", "4", method="s2gs-edge", **keep)
     assert len(seen) == 3
-    for problem, residual, rows in seen:
-        before = witness.states[problem.frame - 1].player.scene
+    for frame, (problem, residual, rows) in enumerate(seen, 1):
+        before = witness.states[frame - 1].player.scene
         sent = apply_delta(before, Delta((residual,))).gaussians
         active = problem.rows.numpy()
         assert residual.gates.any()

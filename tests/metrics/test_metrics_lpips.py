@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from test_trade import NUMPY, Rendered, make_stream
+from evaluation.test_evaluation import NUMPY, Rendered, make_stream
 
 from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError, ShapeError

@@ -21,7 +21,7 @@ from numeric_scenes import some
 from gsstream.core.errors import ComponentError, ShapeError
 from gsstream.core.frame import Frame
 from gsstream.engine.step.active.change import detect_changed_tiles
-from gsstream.engine.step.optimise import _FrameRun
+from gsstream.engine.step.optimise import _Fit
 from gsstream.input.recordings.open import open_source
 from gsstream.metrics import psnr
 from gsstream.parts.optimiser.adam import ReferenceAdam
@@ -185,13 +185,13 @@ def test_a_spike_of_the_learning_rate_is_refused_or_survived_never_sent_as_garba
     lr: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     subject, state, frame = begun()
-    plain = _FrameRun.__init__
+    plain = _Fit.__init__
 
     def spiked(self: Any, *args: Any) -> None:
         plain(self, *args)
         self.code.lrs.mul_(lr)
 
-    monkeypatch.setattr(_FrameRun, "__init__", spiked)
+    monkeypatch.setattr(_Fit, "__init__", spiked)
     now = shown(frame, 1, lambda images: images * 0.6)
     if lr == 1e3:
         assert_sound(subject.step(state, now).state)

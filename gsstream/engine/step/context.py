@@ -139,11 +139,11 @@ class EngineContext:
         self._session = self.session_for(rows)
 
     def loss_and_grad(self, view: int, wrt: Wrt[G], tiles: Literal["all", "changed"] = "all") -> LossAndGrad[G]:
-        self._parts.where.count()
         weights = changed_tile_weights(self._change, view) if tiles == "changed" else None
         return self.session.loss_and_grad(view, self.view_target(view, weights), wrt)
 
     def view_target(self, view: int, tile_weights: torch.Tensor | None = None) -> ViewTarget:
+        self._parts.where.count()  # a target is asked for once in every iteration
         return self.photometric.view_target(view, tile_weights)
 
     def on(self, gaussians: Gaussians[torch.Tensor], session: RenderSession | None = None) -> EngineContext:

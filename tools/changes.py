@@ -30,7 +30,7 @@ EQUAL = {
 #: Names of values that are joined to paths by "/".
 PATHS = re.compile(r"(path|folder|root|directory|out|home|dir|parent|cwd)\b|Path\(")
 #: Calls that only say something.
-OUTPUT_CHECKS = re.compile(r"(warn|print|log|add_argument|TypeVar)$")
+TOLD = re.compile(r"(warn|print|log|add_argument|TypeVar)$")
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def _counting(node: ast.AST) -> Iterator[ast.AST]:
             continue
         for child in value if isinstance(value, list) else [value]:
             said = isinstance(child, ast.keyword) and child.arg in EQUAL
-            told = isinstance(child, ast.Call) and OUTPUT_CHECKS.search(ast.unparse(child.func))
+            told = isinstance(child, ast.Call) and TOLD.search(ast.unparse(child.func))
             if isinstance(child, ast.AST) and not said and not told:
                 yield child
 

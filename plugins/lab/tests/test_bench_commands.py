@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from gsstream_lab.bench.native import OUTPUT_CHECKS, find_native, measure_peaks
+from gsstream_lab.bench.native import MEASURED, find_native, measure_peaks
 
 from gsstream.cli.main import run_command
 
@@ -84,8 +84,8 @@ def test_the_reference_renderer_is_left_out_where_it_would_take_minutes(tmp_path
 
 def test_peaks_keep_the_better_of_two_measurements() -> None:
     class Machine:
-        flops = iter([*[4.0] * 7, 10.0, *[5.0] * (OUTPUT_CHECKS - 8), *[9.0] * OUTPUT_CHECKS])
-        bytes_ = iter([*[0.5] * (OUTPUT_CHECKS // 4 - 1), 1.0, 3.0, *[2.0] * (OUTPUT_CHECKS // 4 - 1)])
+        flops = iter([*[4.0] * 7, 10.0, *[5.0] * (MEASURED - 8), *[9.0] * MEASURED])
+        bytes_ = iter([*[0.5] * (MEASURED // 4 - 1), 1.0, 3.0, *[2.0] * (MEASURED // 4 - 1)])
 
         def fma_peak(self, threads: int, seconds: float) -> float:
             return next(self.flops)

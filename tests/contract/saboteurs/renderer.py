@@ -12,7 +12,7 @@ from gsstream.core.context import ScreenGradient
 from gsstream.parts.render.base import RenderOutput, RenderSession, ScatterSession
 from gsstream.parts.render.reference import ReferenceRenderer
 from gsstream.parts.render.target import ViewTarget
-from gsstream.parts.render.wrt import LossAndGrad, WrtTransforms
+from gsstream.parts.render.wrt import LossAndGrad, WrtRows, WrtScene, WrtTransforms
 from gsstream.testing.renderer.example import ExampleRenderer
 from saboteurs.register import spoils
 
@@ -32,14 +32,12 @@ class Overshoot(Reference):
 
 
 @spoils("check_renderer_reference")
-class Corners(Adapter):
-    """Pixel centres at whole numbers: the picture is half a pixel off."""
+class Strong(Adapter):
+    """Everything stands out from the background by a hundredth too much; gradients are right."""
 
     def render(self, gaussians: Any, cameras: Cameras, view: int, background: Any) -> RenderOutput:
-        Ks = cameras.Ks.copy()
-        Ks[:, :2, 2] += 0.5
-        drawn: RenderOutput = super().render(gaussians, replace(cameras, Ks=Ks), view, background)
-        return drawn
+        drawn: RenderOutput = super().render(gaussians, cameras, view, background)
+        return replace(drawn, image=drawn.image + 0.01 * (drawn.image.detach() - torch.tensor(background)))
 
 
 @spoils("check_renderer_gradient")
@@ -128,7 +126,7 @@ class Forgetful(Reference):
 class _HurriesOpacities(Session):
     def loss_and_grad(self, view: int, target: ViewTarget, wrt: Any) -> LossAndGrad[Any]:
         found = super().loss_and_grad(view, target, wrt)
-        if isinstance(wrt, WrtTransforms):
+        if not isinstance(wrt, WrtRows):
             return found  # type: ignore[no-any-return]
         return replace(found, grad=replace(found.grad, opacities=1.1 * found.grad.opacities))
 
@@ -149,6 +147,8 @@ class _TurnsTwice(Session):
 
     def loss_and_grad(self, view: int, target: ViewTarget, wrt: Any) -> LossAndGrad[Any]:
         found: LossAndGrad[Any] = super().loss_and_grad(view, target, wrt)
+        if not isinstance(wrt, WrtScene):
+            return found
         return replace(found, grad=replace(found.grad, quats=2 * found.grad.quats))
 
 
@@ -161,30 +161,34 @@ class Turning(Reference):
         return session
 
 
-class _ForgetsTiles(Session):
+class _LeavesTraces(Session):
     def loss_and_grad(self, view: int, target: ViewTarget, wrt: Any) -> LossAndGrad[Any]:
-        found: LossAndGrad[Any] = super().loss_and_grad(view, replace(target, tile_weights=None), wrt)
+        found: LossAndGrad[Any] = super().loss_and_grad(view, target, wrt)
+        if isinstance(wrt, WrtRows):
+            wrt.values.means.grad = torch.zeros_like(wrt.values.means)
         return found
 
 
 @spoils("check_renderer_grad")
-class Unweighted(Reference):
-    """Differentiates in all tiles, whatever they count."""
+class Untidy(Reference):
+    """Leaves a gradient on the rows that it was given."""
 
     def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
-        session: RenderSession = _ForgetsTiles(self, gaussians, active, cameras, background)
+        session: RenderSession = _LeavesTraces(self, gaussians, active, cameras, background)
         return session
 
 
 class _Decays(Session):
     def loss_and_grad(self, view: int, target: ViewTarget, wrt: Any) -> LossAndGrad[Any]:
         found: LossAndGrad[Any] = super().loss_and_grad(view, target, wrt)
-        return replace(found, grad=found.grad.map(lambda value: value + 1e-9))
+        if target.tile_weights is not None or isinstance(wrt, WrtTransforms):
+            return found
+        return replace(found, grad=found.grad.map(lambda value: value + 1e-30))
 
 
 @spoils("check_renderer_grad_unseen")
 class Decaying(Reference):
-    """Adds a little decay to every gradient, that of rows out of view too."""
+    """Adds a trace of decay to every gradient: only those of rows out of view, which are 0, differ by it."""
 
     def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
         session: RenderSession = _Decays(self, gaussians, active, cameras, background)

@@ -18,7 +18,7 @@ from typing import Any, Protocol, cast
 from gsstream_lab.bench.roofline import Peak
 
 ENTRY_POINT_GROUP = "gsstream.bench"
-OUTPUT_CHECKS = 40
+MEASURED = 40
 
 
 class NativeKernel(Protocol):
@@ -73,8 +73,8 @@ def measure_peaks(native: NativeBench | None, threads: tuple[int, ...], known: d
     found = dict(known)
     for count in threads:
         # Many short looks: some of them fall between the work of other programs.
-        gflops = max(native.fma_peak(count, 0.004) for _ in range(OUTPUT_CHECKS))
-        gbytes = max(native.copy_peak(count, 64.0) for _ in range(OUTPUT_CHECKS // 4))
+        gflops = max(native.fma_peak(count, 0.004) for _ in range(MEASURED))
+        gbytes = max(native.copy_peak(count, 64.0) for _ in range(MEASURED // 4))
         if count in known:
             gflops, gbytes = max(gflops, known[count].gflops), max(gbytes, known[count].gbytes_per_second)
         found[count] = Peak(count, gflops, gbytes)

@@ -8,13 +8,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import ATTRIBUTES
-
-if TYPE_CHECKING:
-    from gsstream.packet.state import PlayerState
 
 FORMAT_MAJOR, FORMAT_MINOR = 2, 3
 FORMAT_VERSION = f"{FORMAT_MAJOR}.{FORMAT_MINOR}"
@@ -88,12 +85,12 @@ class EncodedPacket:
     Arguments:
         data: every byte, header included.
         sizes: section name -> bytes; ``header`` holds the fixed header and the section headers. The sum is len(data).
-        decoded: the state that ``decode_packet`` made of it, where it was decoded; it is not written.
+        decoded: the PlayerState that ``decode_packet`` made of it, where it was decoded; it is not written.
     """
 
     data: bytes
     sizes: Mapping[str, int]
-    decoded: PlayerState | None = field(default=None, compare=False, repr=False)
+    decoded: object = field(default=None, compare=False, repr=False)
 
     @property
     def kind(self) -> PacketKind:

@@ -1,6 +1,7 @@
 """A public name that goes raises the number of the interface.
 
-``python tests/core/test_public_names.py`` writes the list. It holds which names plugins and scripts may import, and for which number.
+``python tests/core/test_public_names.py`` writes the list of the names that plugins and scripts may import, with the
+number of the interface that they belong to.
 """
 
 from __future__ import annotations

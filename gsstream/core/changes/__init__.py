@@ -12,9 +12,9 @@ from gsstream.core.changes.delta import row_gates as row_gates
 from gsstream.core.changes.field import Field as Field
 from gsstream.core.changes.field import apply_field as apply_field
 from gsstream.core.changes.field import field_rows as field_rows
+from gsstream.core.changes.groups import Groups as Groups
 from gsstream.core.changes.hashgrid import FieldShape as FieldShape
 from gsstream.core.changes.history import Displacement as Displacement
-from gsstream.core.changes.motion import Groups as Groups
 from gsstream.core.changes.motion import Motion as Motion
 from gsstream.core.changes.motion import apply_motion as apply_motion
 from gsstream.core.changes.motion import groups_for as groups_for

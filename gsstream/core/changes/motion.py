@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gsstream.core.changes.groups import Groups
 from gsstream.core.changes.scene import Scene
 from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import SH0, Gaussians
@@ -24,35 +25,6 @@ HALF_GRID = 1 << 15
 MAX_BRIGHTNESS_BINS = 16
 #: Cells per row up to which groups are numbered by a table of all cells around the rows.
 MAX_CELLS_PER_ROW = 64
-
-
-@dataclass(frozen=True, slots=True)
-class Groups:
-    """Which group each row belongs to.
-
-    Arguments:
-        cell: side of a cell, scene units; rows of one cell and one shade are a group.
-        shades: number of classes of brightness, 1 to 16.
-        group_of: [N] int32 group of each row.
-        count: G, the number of groups; some may have lost all their rows since.
-    """
-
-    cell: float
-    shades: int
-    group_of: IntArray
-    count: int
-
-    def gathered(self, source: IntArray) -> Groups | None:
-        """Return the groups of the rows after births and deaths; a birth joins the group of the row stored before it.
-
-        Without any row that was there before, there is nothing to join: None.
-        """
-        old = source < len(self.group_of)
-        if not bool(old.any()):
-            return None
-        before = np.maximum.accumulate(np.where(old, np.arange(len(source)), -1))
-        before[before < 0] = int(np.argmax(old))
-        return replace(self, group_of=self.group_of[source[before]])
 
 
 @dataclass(frozen=True, slots=True)

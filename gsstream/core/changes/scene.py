@@ -11,8 +11,8 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray, IntArray
 
 if TYPE_CHECKING:
+    from gsstream.core.changes.groups import Groups
     from gsstream.core.changes.history import Displacement
-    from gsstream.core.changes.motion import Groups
 
 
 @dataclass(frozen=True, slots=True)

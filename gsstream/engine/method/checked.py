@@ -95,8 +95,9 @@ class Checked(StreamingMethod[Any]):
             )
         if step.metrics:
             raise self._fault(f"its step has metrics ({', '.join(step.metrics)}): write numbers to tools.log.set(...)")
-        player = step.packet.decoded
-        if player is None or player is not step.state.player or self._parts.checks is Checks.STEP:
+        player: PlayerState = step.state.player
+        # A packet that was decoded when it was made carries what it was decoded to.
+        if step.packet.decoded is not player or self._parts.checks is Checks.STEP:
             player = decode_packet(before, step.packet.data)
             difference = difference_between(player, step.state.player)
             if difference:

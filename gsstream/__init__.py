@@ -1,6 +1,6 @@
 """gsstream: online free-viewpoint video as a stream of 3D Gaussians.
 
-Importing this package is cheap: it pulls in no torch and no plugin.
+Importing this package is cheap: it imports neither torch nor a plugin.
 """
 
 __version__ = "0.1.0"

@@ -1,7 +1,7 @@
 """Functions that the engine itself is built from, for methods and parts that do more than fill a slot.
 
 ``gsstream.api`` has the nouns (records and contracts); these are the functions that such a method would otherwise
-copy: densify, count changed tiles, learn residuals side by side, weigh their rate, judge a view, fit a packet.
+copy: densify, count changed tiles, learn residuals side by side, weigh their rate, compare a view, fit a packet.
 """
 
 from gsstream.core.changes.motion import GroupTransforms as GroupTransforms

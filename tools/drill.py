@@ -176,7 +176,7 @@ def _own() -> float:
 
 
 def _busy() -> float | None:
-    """Processor seconds that the machine has worked since it started; None where nobody counts them."""
+    """Processor seconds that the machine has worked since it started; None where the system does not count them."""
     try:
         fields = Path("/proc/stat").read_text(encoding="ascii").splitlines()[0].split()[1:]
     except OSError:

@@ -76,7 +76,7 @@ def _slots(resolved: ResolvedRecipe, catalog: Catalog) -> Iterator[tuple[str, st
 
 
 def _everything(resolved: ResolvedRecipe, catalog: Catalog) -> Iterator[tuple[str, ...]]:
-    """One row per setting of the recipe and of the parts it names; values nobody set say so."""
+    """One row per setting of the recipe and of the parts it names; defaults are marked as such."""
     from gsstream.cli.plugins import setting_rows
     from gsstream.recipe.model import ComponentRef, Recipe
 

@@ -58,7 +58,7 @@ class FrameContext(Protocol):
         """Return [H, W, 3]: ``gaussians`` as a camera would record them, without a gradient."""
 
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
-        """Pull an upstream gradient [H, W, 3] back to the 2-D means of ``gaussians`` in one backward pass."""
+        """Backpropagate an upstream gradient [H, W, 3] to the 2-D means of ``gaussians`` in one backward pass."""
 
     def screen_gradient_rows(self, view: int, image_gradient: torch.Tensor) -> RowGradient:
         """Return what :meth:`screen_gradient` does of the rows that it reaches, without arrays of all N rows."""

@@ -8,7 +8,7 @@
     │   ├── SourceError                a recording cannot be read or contradicts itself
     │   │   └── EndOfRecording         a growing recording ended before this frame; ends a run, fails none
     │   ├── RecipeError                a recipe key or value is unknown or out of range
-    │   ├── UnknownName                a method, part or source that nobody registered
+    │   ├── UnknownName                a method, part or source that is not registered
     │   └── OutputError                the place to write to is unusable (holds another run, not writable)
     ├── PacketError (ValueError)       a stream is damaged; carries the byte offset
     ├── PluginUnavailable              a part exists but its plugin is quarantined
@@ -63,7 +63,7 @@ class OutputError(InputError):
 
 
 class UnknownName(InputError):
-    """A name nobody registered. The message offers the nearest known one."""
+    """A name that is not registered. The message offers the nearest known one."""
 
     def __init__(self, kind: str, name: str, known: Iterable[str], hint: str = "") -> None:
         self.kind, self.name, self.known = kind, name, tuple(sorted(known))

@@ -1,4 +1,4 @@
-"""The kinds of parts, in one table. Whoever needs a list of kinds, slots or contracts derives it from here.
+"""The kinds of parts, in one table. Every list of kinds, slots or contracts is derived from it.
 
 A new kind is one entry here, a room with its contract class, and a room of its name in ``gsstream.testing``:
 ``checks``, an ``example`` that new plugins start from (``use``), and ``behaviour``, what the common checks need to know
@@ -24,7 +24,7 @@ class PartKind:
         contract: "module:Class" of the abstract base class, as text, so that listing kinds imports no torch; None:
             there is no class to inherit from (a source is anything that is called as ``target(uri, scale)``).
         slot: a method that is made of parts has one of this kind.
-        default: the part that a recipe names when nobody chooses; None: recipes have no section of this name.
+        default: the part that a recipe names by default; None: recipes have no section of this name.
         behaviour: the common checks of behaviour (purity, shapes, precision, permutation) are made on it, beside those
             of settings and declaration, which every kind with a contract gets.
         use: the options by which a run names such a part, with <name> and <kind>; None: the engine chooses, so a plugin

@@ -63,7 +63,7 @@ def find_renderer() -> PlayerRenderer:
 def named_renderer(name: str) -> PlayerRenderer:
     """Return the renderer of this name: "numpy", or one that a plugin offers.
 
-    Raises UnknownName for a name that nobody offers, PluginUnavailable with the reason for one that does not load.
+    Raises UnknownName for a name that is not registered, PluginUnavailable with the reason for one that does not load.
     """
     if name == "numpy":
         return PlayerRenderer("numpy", render_numpy)

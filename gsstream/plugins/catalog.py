@@ -58,7 +58,7 @@ class Catalog:
 
         Raises:
             PluginUnavailable: it exists, but its plugin is in quarantine.
-            UnknownName: nobody declares it; the message offers the nearest name.
+            UnknownName: no plugin declares it; the message offers the nearest name.
         """
         found = self.entries.get((kind, name))
         if found is not None:
@@ -80,7 +80,7 @@ class Catalog:
 
         Raises:
             PluginUnavailable: quarantined, not importable, or not what its declaration says.
-            UnknownName: nobody declares it.
+            UnknownName: no plugin declares it.
         """
         entry = self.entry(kind, name)
         assert not isinstance(entry.spec, MethodSpec), "methods shipped as recipes have no class"
@@ -95,7 +95,7 @@ class Catalog:
 
         Raises:
             PluginUnavailable: quarantined, or the file is not where the declaration says.
-            UnknownName: nobody declares it.
+            UnknownName: no plugin declares it.
         """
         entry = self.entry("method", method)
         assert isinstance(entry.spec, MethodSpec), "only recipes have the kind method"

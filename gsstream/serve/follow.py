@@ -152,9 +152,9 @@ class Follower:
 
 
 def writer_is_gone(folder: Path) -> bool:
-    """Say whether ``folder`` is that of a run which nobody carries on: it was killed, or it failed.
+    """Say whether ``folder`` is that of a run without a running encoder: it was killed, or it failed.
 
-    False also when nobody can tell: no run wrote here, or one on another machine does.
+    False also when that is unknown: no run wrote here, or one on another machine does.
     """
     try:
         holder = json.loads((folder / LOCK).read_text(encoding="utf-8"))

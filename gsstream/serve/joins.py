@@ -1,4 +1,4 @@
-"""Joins: the state in the middle of a segment, in a file beside the stream, so that nobody replays it from its key.
+"""Joins: the state in the middle of a segment, in a file beside the stream, so that no player replays it from its key.
 
 A join says in which bits a state differs from that of the key packet before it. The stream is not touched, and a player
 reaches the very state that its deltas lead to. Layout of the bytes: docs/reference/package-format.md.

@@ -60,7 +60,7 @@ def package(
         manifest = {"format": f"gsstream {FORMAT_VERSION}", **main, "renditions": others}
         new = _files(manifest)
         size = _copy(resources.files("gsstream") / "web", folder)
-        # The manifest last: whoever reads the folder meanwhile finds every file that it names.
+        # The manifest last, so that a concurrent reader finds every file that it names.
         _replace(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
         for name in old - new:
             (folder / name).unlink(missing_ok=True)
@@ -166,7 +166,7 @@ def _check_frames(path: str | os.PathLike[str], entry: dict[str, Any], main: dic
 
 
 def _replace(path: Path, data: bytes) -> None:
-    """Write a file in one step: nobody sees half of it."""
+    """Write a file atomically: no reader sees half of it."""
     partial = path.with_name(path.name + ".part")
     partial.write_bytes(data)
     partial.replace(path)

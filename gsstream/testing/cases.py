@@ -266,7 +266,7 @@ def _made(name: str) -> World:
 
 
 def get_case(name: str) -> World:
-    """Return a fresh copy of a named world, so that a part that spoils its inputs spoils nobody else's."""
+    """Return a fresh copy of a named world, so that a part that spoils its inputs does not spoil another's."""
     fresh: World = _copy(_made(name))
     return fresh
 

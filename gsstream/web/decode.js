@@ -16,7 +16,7 @@ import { decodeKey } from "./key.js";
  *
  * A state has `frame`, `number` (Gaussians), `scene` (attribute -> Float32Array), `widths` (values a row), `layout`,
  * `meta`, `decoders`, `groups` and `moved` (what the next packet may refer to), `turned` (whether a motion was since
- * the key packet), `spare` (memory for motions), and `change`: what this packet did, for whoever shows it.
+ * the key packet), `spare` (memory for motions), and `change`: what this packet changed, for the view.
  */
 export function decodePacket(state, data, offset = 0) {
   const { header, sections } = parsePacket(data, offset);

@@ -1,6 +1,6 @@
 // Bytes of a file from a web server, in order, through the ways in which servers and connections fail.
 
-/** Why nothing comes, in one sentence for whoever looks at the page. */
+/** Why nothing comes, in one sentence for the viewer of the page. */
 export class SourceError extends Error {
   constructor(message) {
     super(message);

@@ -3,7 +3,7 @@
 /** Pauses before connecting again, in milliseconds; the last one is repeated. */
 export const settings = { pauses: [500, 1000, 2000, 4000, 8000], patience: 15_000, ask: 5_000, first: 300 };
 
-/** Why a connection ended, in the words of whoever looks at the page. */
+/** Why a connection ended, in a sentence for the viewer of the page. */
 function reasonOf(opened, { code, reason }, host) {
   if (code === 1013 && reason) return `${reason}`;
   if (code === 1012) return "The server was stopped";

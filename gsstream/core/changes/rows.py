@@ -83,7 +83,7 @@ def apply_row_edit(scene: Scene, rows: Rows) -> Scene:
 
 
 def add_as_nodes(gaussians: Gaussians[FloatArray], unit_of: IntArray, num_nodes: int) -> AddedGaussians:
-    """Return births that each bring a root node of their own, so that they share a gate with nobody.
+    """Return births that each bring a root node of their own, so that each has a gate of its own.
 
     Arguments:
         gaussians: B rows, raw values.

@@ -108,7 +108,7 @@ class Guarded:
             return getattr(self._subject, name)
         except Exception as error:
             if isinstance(error, AttributeError) and getattr_static(self._subject, name, None) is None:
-                raise  # the part has none, which whoever asks may want to know
+                raise  # the part has no such attribute, which the caller may test for
             with error_context(self._slot, self._part, self._where):
                 raise
 

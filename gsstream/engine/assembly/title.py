@@ -55,7 +55,7 @@ def _changes(recipe: Recipe, base: Recipe, catalog: Catalog) -> Iterator[str]:
 
 
 def _defaults(slot: str, part: str, catalog: Catalog) -> dict[str, Any]:
-    """The settings of a part that nobody set."""
+    """The settings of a part at their defaults."""
     try:
         return dict(catalog.resolve(slot, part).Config().model_dump(mode="json"))
     except (GsstreamError, ValueError):

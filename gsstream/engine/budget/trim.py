@@ -3,7 +3,8 @@
 What a symbol is worth is read from the optimiser: the running mean of a latent's squared gradient stands for its
 curvature (empirical Fisher), so moving it by d costs about curvature * d^2 of loss, up to one factor for all. What it
 costs is its code length in its channel's histogram. Each symbol then takes the cheapest of itself, one step nearer to
-zero, and zero, at a price of loss per bit raised until the packet fits (rate-distortion optimised quantisation).
+zero, and zero, at a weight of loss per bit that is raised until the packet fits (rate-distortion optimised
+quantisation).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from gsstream.packet import EncodedPacket
 
 #: Most packets that are encoded in search of one that fits, and the share of the limit that counts as close enough.
 TRIES, GOOD_ENOUGH = 8, 0.95
-#: Steps of the search for a price per bit; bits that an open gate takes besides its rows.
+#: Steps of the search for a weight per bit; bits that an open gate takes besides its rows.
 _BISECTIONS, _GATE_BITS = 24, 3.0
 
 
@@ -95,7 +96,7 @@ def _trimmed(
 class _Table:
     """Symbols of all attributes side by side with their worth and code lengths.
 
-    A zero has no choice, and most symbols are zeros: only the K others are weighed against a price.
+    A zero has no choice, and most symbols are zeros: only the K others are weighed against their bits.
     """
 
     def __init__(self, residual: Residual, curvature: Mapping[str, FloatArray], layout: Layout) -> None:
@@ -124,11 +125,11 @@ class _Table:
             self.lengths[:, of] = code(self.values[:, of])
         self.closed = self._by_gate(self.losses[2])
         self.bits = float(self.lengths[0].sum() + self.fixed.sum())
-        #: A price at which nothing is worth its bits.
+        #: A weight at which nothing is worth its bits.
         self.most = float(self.losses[2].sum()) + 1e-30
 
     def at_most(self, bits: float) -> Residual | None:
-        """The residual at the lowest price at which it is estimated to take no more than ``bits``; None: nothing."""
+        """The residual at the lowest weight at which it is estimated to take no more than ``bits``; None: nothing."""
         low, high = self.most * 1e-14, self.most * 10
         if self._choose(low)[2] <= bits:
             return self._residual(*self._choose(low)[:2])
@@ -138,7 +139,7 @@ class _Table:
         return self._residual(*self._choose(high)[:2])
 
     def _choose(self, rd_lambda: float) -> tuple[IntArray, BoolArray, float]:
-        """(symbols [K], open [G] of the gates, bits) at a price of loss per bit."""
+        """(symbols [K], open [G] of the gates, bits) at a weight of loss per bit."""
         costs = self.losses + rd_lambda * self.lengths
         nearer = costs[1] < costs[0]
         zero = costs[2] < np.where(nearer, costs[1], costs[0])  # of equal costs the first, as argmin would have it

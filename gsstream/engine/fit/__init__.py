@@ -1,1 +1,1 @@
-"""What every optimisation shares: rows with their optimiser state, and how a view is judged."""
+"""What every optimisation shares: rows with their optimiser state, and how a view is compared."""

@@ -1,7 +1,7 @@
 """The fit of the cameras' colour maps while frame 0 is optimised.
 
 Rigs are rarely colour-matched. Without this the Gaussians explain the differences between cameras with floaters and
-view-dependent colour, and held-out views pay. The mean map is held at identity, so a camera nobody fitted (the
+view-dependent colour, and held-out views pay. The mean map is held at identity, so a camera that was not fitted (the
 held-out ones) sees the scene as it is.
 """
 
@@ -44,7 +44,7 @@ class ExposureFit:
         return ExposureFit(exposure, _put(self.first, view, first), _put(self.second, view, second), steps)
 
     def centered(self) -> ExposureFit:
-        """Shift all maps so that their mean is identity: the gauge that held-out cameras are judged in."""
+        """Shift all maps so that their mean is identity: the gauge in which held-out cameras are compared."""
         matrix, offset = self.exposure.matrix, self.exposure.offset
         centered = Exposure(matrix - matrix.mean(0) + torch.eye(3), offset - offset.mean(0))
         return replace(self, exposure=centered)

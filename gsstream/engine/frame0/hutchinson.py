@@ -1,7 +1,7 @@
-"""How much the training images feel each value of a scene: the slopes of images of random signs.
+"""Sensitivity of the training images to each value of a scene: gradients of images of random signs.
 
-The mean square of such a slope is the sum of the squared slopes of all pixels, so a pass over the cameras gives the
-diagonal of the Gauss-Newton matrix (Hutchinson's estimate) without one pass for every pixel.
+The mean square of such a gradient is the sum of the squared gradients of all pixels, so a pass over the cameras gives
+the diagonal of the Gauss-Newton matrix (Hutchinson's estimate) without one pass for every pixel.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class TrainingViews:
 
 
 class HutchinsonSample(NamedTuple):
-    """One image of random signs, pulled back to the scene.
+    """One image of random signs, backpropagated to the scene.
 
     ``grad``: N rows, derivative of the sum of the signed pixels by every raw value. ``error``: mean squared error of
     that camera's image.

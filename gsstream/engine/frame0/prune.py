@@ -1,10 +1,10 @@
 """Which Gaussians the training images would not miss: the squared error that each one's absence adds to them.
 
 Growth follows gradients, which says where Gaussians are wanted, never which ones have become superfluous. A pixel is
-linear in the opacity of one Gaussian, so what its absence changes there is known from the slope. (Speedy-Splat, Hanson
-et al. 2025, ranks by a like score and drops a fixed share; the exact change, and the bound by what an image is off by
-anyway, which leaves the number to the scene, are ours.) Opacity or blending weight are no such measure: a Gaussian may
-fill many pixels with what is behind it anyway.
+linear in the opacity of one Gaussian, so what its absence changes there is known from the gradient. (Speedy-Splat,
+Hanson et al. 2025, ranks by a like score and drops a fixed share; the exact change, and the bound by what an image is
+off by anyway, which leaves the number to the scene, are ours.) Opacity or blending weight are no such measure: a
+Gaussian may fill many pixels with what is behind it anyway.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gsstream.engine.frame0.hutchinson import TrainingViews, hutchinson_samples
 #: Probes of a camera. A Gaussian that one camera sees is underestimated tenfold by a quarter of single probes, and by
 #: four together in one case of sixty.
 HUTCHINSON_SAMPLES = 4
-#: Opacity logits above this one count as this one, 0.999: where an opacity is 1 in float32 the images have no slope.
+#: Opacity logits above this one count as this one, 0.999: where an opacity is 1 in float32 the gradient is 0.
 MAX_LOGIT = 7.0
 #: How many times as far off the images may be without all that go; the fit that follows closes such gaps.
 GROWTH = 1.25
@@ -50,7 +50,7 @@ def removal_errors(
 def retained_rows(errors: torch.Tensor, least: float) -> torch.Tensor:
     """Return the rows [K] int64, in order, of the Gaussians whose absence adds more than ``least``.
 
-    Where no view feels any of them, nothing says which may go, and all remain.
+    Where the images depend on none of them, all remain.
     """
     rows = (errors > least).nonzero()[:, 0]
     return rows if len(rows) else torch.arange(len(errors))

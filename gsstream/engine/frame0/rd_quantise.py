@@ -1,8 +1,8 @@
-"""Frame 0 is rounded by what a bit buys (``codec.key_rd_lambda``): a value is as exact as the training images feel it.
+"""Rate-distortion quantisation of frame 0 (``codec.key_rd_lambda``) by the sensitivity of the training images.
 
 Most Gaussians are small, half hidden or seen from one side, so most of their rotations, sizes and colours may be off by
 several steps and no image shows it; most coefficients of view-dependent colour explain noise and go altogether. How far
-a code may move is bounded, because other cameras may feel what the training cameras do not.
+a code may move is bounded, because other cameras may be sensitive where the training cameras are not.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def code_sensitivity(
     parts: Assembly, gaussians: Gaussians[torch.Tensor], frame: Frame, exposure: Exposure | None,
     generator: torch.Generator,
 ) -> tuple[dict[str, FloatArray], float]:  # fmt: skip
-    """Return how much the training images feel each code, and their mean squared error.
+    """Return the sensitivity of the training images to each code, and their mean squared error.
 
     Returns attribute -> [N, width] float64: squared change of all images together when a code is one higher.
     """

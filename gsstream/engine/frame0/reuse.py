@@ -61,7 +61,7 @@ def reuse_first_frame(parts: Assembly, frame: Frame, tools: Tools) -> Step:
 
 
 def _check_views(theirs: StreamMeta, cameras: Cameras, held_out: tuple[str, ...]) -> None:
-    """Refuse a frame 0 that has learned from cameras that judge here, or whose colour maps are of other cameras."""
+    """Refuse a frame 0 that was trained on cameras held out here, or whose colour maps are of other cameras."""
     if seen := [name for name in held_out if name in theirs.train.ids]:
         raise InputError(
             f"the first frame was reconstructed with {', '.join(seen)}, which would judge here; take one of a run with "

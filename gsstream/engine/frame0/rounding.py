@@ -1,8 +1,8 @@
 """Rounding by what a bit buys: each value takes the code with the least squared error plus weight times bits.
 
 Video encoders call it rate-distortion optimised quantisation. Among the codes near a value some occur more often than
-others, and cost fewer bits; where the images hardly feel the value, one of those does as well. A player does not know
-of it: the format is the same.
+others, and cost fewer bits; where the images are hardly sensitive to the value, one of those does as well. A player
+does not know of it: the format is the same.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from gsstream.core.shapes import FloatArray, IntArray
 
 #: How often the bits of a code are estimated from what was chosen. The third time changes next to nothing.
 ROUNDS = 3
-#: Count of a code that nobody has chosen yet, so that its bits are many, but a number.
+#: Count of a code that has not occurred yet, so that its bits are many, but a number.
 UNUSED = 0.05
 #: [N] nearest codes -> [K, N] codes to choose from.
 _Near = Callable[[IntArray], IntArray]

@@ -90,7 +90,7 @@ def _key_step(
 ) -> Step:  # fmt: skip
     """A key packet of Gaussians on its grids, of these levels, which show the pictures of the frame ``shown``.
 
-    A periodic one has no layers: whoever plays on needs none, and to find them would cost the frame time.
+    A periodic one has no layers: a player that continues needs none, and to find them would cost the frame time.
     """
     anchors = decoded_anchors(state.player)
     hierarchy, levels, gaussians = sort_into_nodes(parts, gaussians, levels, anchors)

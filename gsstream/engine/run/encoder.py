@@ -112,7 +112,7 @@ class Encoder:
             step = method.begin(frame, tools) if self.state is None else method.step(self.state, frame, tools)
         step = replace(step, packet=replace(step.packet, decoded=None))  # a queue of packets must not hold scenes
         self._listeners.packet(step.packet)
-        if self.state is not None:  # only now: whoever waits for the packet does not wait for this
+        if self.state is not None:  # only now, so that the packet is not delayed by it
             with one_torch_thread():
                 step = method.follow_up(self.state, step, frame, tools)
         log.set(cpu_seconds=time.process_time() - worked, peak_memory_mb=peak_memory_mb())

@@ -46,7 +46,7 @@ def run_lock(out: Path, what: str = "run") -> Iterator[None]:
     """Hold an existing folder for one ``what``. Raises OutputError naming process and machine that hold it already."""
     try:
         import fcntl
-    except ImportError:  # no such lock on this system: nobody is kept out
+    except ImportError:  # no such lock on this system: the folder is not protected
         yield
         return
     path = out / LOCK

@@ -70,7 +70,7 @@ class RunProgress:
             self.say(f"frame 0: iteration {iteration}/{iterations}, {note}{rest}")
 
     def _seconds_left(self, iteration: int, iterations: int) -> float | None:
-        """Return how long the iterations that are left take at the pace so far; None while nobody can tell."""
+        """Return how long the iterations that are left take at the pace so far; None while it is unknown."""
         if self._begun is None:
             self._begun = (iteration, self._clock())
         first, begun = self._begun
@@ -107,7 +107,7 @@ def _duration(seconds: float) -> str:
 def frame_line(metrics: Mapping[str, Any], total: int | None) -> str:
     """Return ``frame 3/29: 27.31 dB (moving 24.90), 8.4 KB, 0.52 s, 4.1 % active``.
 
-    ``total`` is None while nobody knows it.
+    ``total`` is None while it is unknown.
     """
     values = [v for v in metrics.get("psnr", {}).values() if v is not None]
     moving = [v for v in metrics.get("psnr_moving", {}).values() if v is not None]

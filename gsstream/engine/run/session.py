@@ -218,7 +218,7 @@ def _stop_on_interrupt(say: Callable[[str], None], source: FrameSource) -> Itera
             raise KeyboardInterrupt
         stop.set()
         if isinstance(source, LiveSource):
-            source.interrupt()  # the frame in flight may be one that nobody has captured yet
+            source.interrupt()  # the frame in flight may be one that is not captured yet
         say("stopping after this frame; interrupt again to stop at once")
 
     previous = signal.signal(signal.SIGINT, handler)

@@ -30,7 +30,8 @@ from gsstream.parts.render.wrt import G, LossAndGrad, Wrt
 class EngineContext:
     """One frame over a decoded scene (implements ``render.work.FitContext`` and ``method.tools.FrameTools``).
 
-    Images are as recorded; gradients are pulled through the camera's colour map, so that parts need not know it.
+    Images are as recorded; gradients are backpropagated through the camera's colour map, so that parts need not know
+    it.
 
     Arguments:
         gaussians, hierarchy: the decoded scene before the frame and its groups.

@@ -21,7 +21,7 @@ class RegularizerTraits(Traits):
         differentiable: gradients flow from the terms to gates and residuals.
         reduction: over Gaussians.
         weights: settings that its terms are proportional to.
-        gate_terms: terms that price gates alone: no residual changes them.
+        gate_terms: terms that depend on gates alone: no residual changes them.
     """
 
     differentiable: bool = False

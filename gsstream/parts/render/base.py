@@ -40,7 +40,7 @@ class Renderer(Part):
     def screen_gradient(
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, image_gradient: torch.Tensor
     ) -> ScreenGradient:
-        """Pull an upstream image gradient [H, W, 3] back to the 2-D means (pixels) of a scene on black.
+        """Backpropagate an upstream image gradient [H, W, 3] to the 2-D means (pixels) of a scene on black.
 
         By default a session is asked. A renderer that opens a ``ScatterSession`` overrides this method: that session
         asks its renderer.

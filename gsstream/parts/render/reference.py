@@ -49,7 +49,7 @@ class ReferenceRenderer(Renderer):
             output = self._render(fixed, cameras, view, (0.0, 0.0, 0.0), probe)
             (gradient,) = torch.autograd.grad((output.image * image_gradient).sum(), probe, allow_unused=True)
         gradient = torch.zeros_like(probe) if gradient is None else gradient.detach()
-        # Visibility must not be read from the gradient: a Gaussian in view that nothing pulls on has gradient 0.
+        # Visibility must not be read from the gradient: a Gaussian in view may have gradient 0.
         return ScreenGradient(gradient, footprint_in_image(fixed, cameras, view) | (gradient != 0).any(1))
 
     def open(

@@ -57,7 +57,7 @@ class RenderSession(ABC):
 
     @abstractmethod
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
-        """Pull an upstream image gradient [H, W, 3] back to the 2-D means (pixels) of the session's scene.
+        """Backpropagate an upstream image gradient [H, W, 3] to the 2-D means (pixels) of the session's scene.
 
         What this projects and sorts, ``render`` need not do again. Where the gradient is zero in most of the image, a
         renderer may spend work only on the rest.

@@ -11,9 +11,9 @@ MIN_ERROR = 0.03
 def weighted_structure_tensor(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Return [H, W, 3]: the structure tensor of a picture at every pixel, as xx, xy and yy per pixel^2.
 
-    It is the sum over the channels of the products of the two slopes (Lucas and Kanade 1981; central differences, those
-    of the border see the border again), weighed by 1 / sqrt(error^2 + MIN_ERROR^2): where a picture is shifted by a
-    small d, d^T S d / 2 is what the sum of sqrt(error^2 + MIN_ERROR^2) grows by beyond its slope, by the parabola
+    It is the sum over the channels of the products of the two gradients (Lucas and Kanade 1981; central differences,
+    those of the border see the border again), weighed by 1 / sqrt(error^2 + MIN_ERROR^2): where a picture is shifted by
+    a small d, d^T S d / 2 is what the sum of sqrt(error^2 + MIN_ERROR^2) grows by beyond its slope, by the parabola
     that lies above it (iteratively reweighed least squares).
     """
     down, right = _image_gradients(image, 0), _image_gradients(image, 1)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 class FitContext(FrameContext, Protocol):
     """A frame that a part works on: it renders with some rows moving, and is told how well that explains the images.
 
-    Colour maps of the cameras are applied and pulled through where they belong; a part need not know them.
+    Colour maps of the cameras are applied and differentiated where they belong; a part need not know them.
     """
 
     @property

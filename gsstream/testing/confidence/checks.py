@@ -90,7 +90,7 @@ def check_confidence_no_grad_left(part: ConfidenceEstimator) -> None:
 
 @check("confidence")
 def check_confidence_no_cameras(part: ConfidenceEstimator) -> None:
-    """Without a camera nobody sees anything: at most the declared floor."""
+    """Without a camera no Gaussian is visible: logits are at most the declared floor."""
     got = part.estimate(get_case("cloud").views([]))
     finite("no cameras", got)
     at_most("no cameras", got, part.claims().floor, 1e-5, "float32 of the declared floor")

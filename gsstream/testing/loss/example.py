@@ -48,7 +48,7 @@ class ExampleLoss(Loss):
         leaf = image.detach().requires_grad_()
         counted = inside = torch.ones_like(image[..., :1])
         if tile_mask is not None:
-            # Windows of the tiles beside see what changed; their own gradient belongs to whoever drew them.
+            # Windows of the tiles beside see what changed; their own gradient belongs to the call that rendered them.
             beside = max_pool2d(tile_mask[None].to(image.dtype), 3, 1, 1)[0]
             counted, inside = (pixels(mask, image) for mask in (beside, tile_mask.to(image.dtype)))
         with torch.enable_grad():

@@ -155,7 +155,7 @@ def check_regularizer_empty(part: Regularizer) -> None:
 
 @check("regularizer", trait="gate_terms")
 def check_regularizer_reads_weights(part: Regularizer) -> None:
-    """Terms said to price gates alone (gate_terms) do not depend on the residual."""
+    """Terms declared to depend on gates alone (gate_terms) do not depend on the residual."""
     case = get_case("cloud")
     still, moving = (_terms(part, case, None, factor * case.residual) for factor in (0.0, 1.0))
     for name in part.claims().gate_terms:

@@ -74,7 +74,7 @@ class BinarySteGate(GateSampler):
         z = logits if noise is None else logits + noise.detach().to(logits.dtype)
         tau = self.config.temperature
         x = z.detach() / tau
-        # The soft gate's slope; s (1 - s) would be exactly 0 from x = 17 on, and an open gate not feel the images.
+        # The soft gate's derivative; s (1 - s) is exactly 0 from x = 17 on: no gradient for an open gate.
         # z - z is exactly 0, so the value is exactly 0 or 1.
         through = (z - z.detach()) * (torch.sigmoid(x) * torch.sigmoid(-x) / tau)
         if self.config.clamp_gradient:

@@ -25,7 +25,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_image: torch.Tensor | None, v_alpha: torch.Tensor | None) -> Any:
-        splats = splats_of(Gaussians(*ctx.saved_tensors))  # also proves that nobody changed them since
+        splats = splats_of(Gaussians(*ctx.saved_tensors))  # also proves that they are unchanged since
         if v_image is None and v_alpha is None:
             return (None,) * (2 + len(ATTRIBUTES))
         if v_image is None and v_alpha is not None:

@@ -119,7 +119,7 @@ class NativeRasterizer:
         self, rows: SplatArrays, cached_image: Float32, target: PreparedImage, dssim_weight: float,
         colours: Sequence[Float32 | None], weights: Float32 | None, out: SplatArrays,
     ) -> float:  # fmt: skip
-        """Render the active rows, judge the picture and write the gradient by the rows: one iteration of a fit.
+        """Render the active rows, compute the loss and write the gradient by the rows: one iteration of a fit.
 
         It stands for `forward_active` with ``touched_only``, `photometric_loss` with ``around`` and `backward_active`,
         one after the other; whole images are neither made nor copied, and frozen Gaussians in front of all active ones
@@ -147,7 +147,7 @@ class NativeRasterizer:
         self, splats: SplatArrays, target: PreparedImage, dssim_weight: float,
         colours: Sequence[Float32 | None], out: Sequence[Float32], exposure_grad: Float32 | None,
     ) -> float:  # fmt: skip
-        """Render all Gaussians, judge the picture and write the gradient by all of them: an iteration of frame 0.
+        """Render all Gaussians, compute the loss and write the gradient by all of them: an iteration of frame 0.
 
         It stands for `forward`, `photometric_loss` and `backward`, one after the other; whole images are neither made
         nor copied. No backward may follow. The bits do not depend on earlier calls or on the number of threads.

@@ -18,7 +18,7 @@ from gsstream_cpu_render.view import Background
 
 MAX_IDLE = 32
 
-#: Taken twice by one thread when the collector, called while it is held, finds a lease that nobody holds any more.
+#: Taken twice by one thread when the collector, called while it is held, finds an abandoned lease.
 _lock = threading.RLock()
 _idle: list[Any] = []
 
@@ -71,7 +71,7 @@ def _return_to_pool(rasterizer: NumpyRasterizer) -> None:
 
 
 def acquire_rasterizer(cameras: Rig, view: int, background: Background, own: bool = False) -> PooledRasterizer:
-    """A rasteriser for camera ``view`` of a rig; ``own``: with memory that nobody had before or gets after."""
+    """A rasteriser for camera ``view`` of a rig; ``own``: with memory that is not shared or reused."""
     with _lock:
         # An object keeps the kernels of the instruction set it was made for.
         _idle[:] = [native for native in _idle if native.isa == _native.active_isa()]

@@ -30,7 +30,7 @@ def densify(
     rows: Gaussians[torch.Tensor], grad_norm: torch.Tensor, may: torch.Tensor, room: int, extent: float,
     settings: BirthSettings, generator: torch.Generator,
 ) -> AddedByDensify:  # fmt: skip
-    """Clone small and split large rows that the images pull at most."""
+    """Clone small and split large rows with the largest screen gradient."""
     hot = (may & (grad_norm > settings.gradient)).nonzero()[:, 0]
     large = rows.scales.exp().amax(1) > SPLIT_SIZE * extent
     order = hot[torch.argsort(grad_norm[hot], descending=True, stable=True)]

@@ -78,7 +78,7 @@ class MaskSettings(PartConfig):
 
 
 class BirthSettings(PartConfig):
-    """Masked densification: dynamic Gaussians that the images pull at are cloned or split."""
+    """Masked densification: dynamic Gaussians with a large screen gradient are cloned or split."""
 
     every: int = Field(default=2, ge=0, le=1000, description="epochs between two densifications; 0: no births, to 1000")
     after: float = Field(default=0.04, ge=0, le=1, description="share of the epochs before the first one, 0 to 1")

@@ -79,7 +79,7 @@ class OldRows:
         return self._shift * gates(self._logits, self._config.gate)[:, None]
 
     def step(self) -> None:
-        """Add the pull of the L0 penalty, step everything once, keep the logits in their bounds."""
+        """Add the gradient of the L0 penalty, step everything once, keep the logits in their bounds."""
         if self._adam is None:
             return
         penalty = self._penalty()
@@ -101,7 +101,7 @@ class OldRows:
             opened = open_probability(self._logits, gate).sum()
             penalty = penalty + gate.l0 * (opened if gate.l0_over == "sum" else opened / self._total)
         if self._config.sigma and len(self._base) > 1 and self._latents:
-            # The root has no slope at a spread of 0, where every frame begins.
+            # The root has no derivative at a spread of 0, where every frame begins.
             spread = [(value.var(0) + SPREAD_EPSILON).sqrt().sum() for value in self._latents.values()]
             channels = sum(value.shape[1] for value in self._latents.values())
             penalty = penalty + self._config.sigma * torch.stack(spread).sum() / channels

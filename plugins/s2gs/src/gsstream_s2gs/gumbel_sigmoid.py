@@ -21,8 +21,8 @@ class GumbelSigmoid(GateSampler):
     """g = round_levels(sigmoid((alpha + n) / tau)), n ~ Logistic(0, 1) (paper, "Differentiable Gate Sampling").
 
     * alpha is the propagated confidence logit itself; nothing passes through a probability.
-    * The slope of the soft gate is sigmoid(x) sigmoid(-x), small but alive at either end. The usual g (1 - g) is
-      exactly 0 from x = 17 on in float32, so an open gate would no longer feel the images but still the price.
+    * The derivative of the soft gate is sigmoid(x) sigmoid(-x), small but alive at either end. The usual g (1 - g) is
+      exactly 0 from x = 17 on in float32, so an open gate would get no gradient from the images, only from the penalty.
     * Rounding is to multiples of 1 / ``levels``: 10 is the paper's one decimal (multi-level STE), 1 its binary STE.
       The gradient is that of the soft gate (straight-through), alive also where the rounded gate is 0 or 1.
       Ties of the scaled value go to the even level, so a soft gate of exactly 0.5 / levels is closed.

@@ -1,4 +1,4 @@
-"""View-space gradient difference: what changed between two frames, as the Gaussians feel it."""
+"""View-space gradient difference: the change between two frames by the means of Gaussians."""
 
 from __future__ import annotations
 

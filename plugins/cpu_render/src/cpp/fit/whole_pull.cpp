@@ -32,7 +32,7 @@ void for_rows(int width, int height, Fn&& fn) {
   });
 }
 
-// Pulls the gradient back through the colour map, and finds the map's own grad on the way.
+// Backpropagates through the colour map, and computes the map's own gradient.
 void map_backward(int width, int height, const ViewComparison& view, const float* image, float* gradient, float* colours) {
   const std::size_t pixels = static_cast<std::size_t>(width);
   std::vector<double>& grads = workspace().grads;

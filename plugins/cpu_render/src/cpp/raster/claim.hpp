@@ -1,4 +1,4 @@
-// Proof that nobody else runs the same Rasterizer.
+// Proof that no other thread runs the same Rasterizer.
 #pragma once
 #include <stdexcept>
 

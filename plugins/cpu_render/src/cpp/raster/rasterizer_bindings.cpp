@@ -188,7 +188,7 @@ class PyRasterizer {
 
   Rasterizer rasterizer_;
   SceneArrays current_;
-  Buffer<float> means2d_;  // gradients that nobody asked for
+  Buffer<float> means2d_;  // gradients that the caller does not request
 };
 
 }  // namespace

@@ -6,7 +6,7 @@ A plugin offers itself by an entry point of the group ``gsstream.bench``, named 
     mine = "gsstream_mine.bench"
 
 a module with the functions of :class:`NativeBench` and the class ``Kernel``; it needs no torch. A renderer without one
-is measured through its part alone, and without a floor when nobody measures the machine's peaks.
+is measured through its part alone, and without a floor when the machine's peaks are not measured.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""``gsstream search``: settings for a recording, from short runs judged on cameras that are left out."""
+"""``gsstream search``: settings for a recording, from short runs measured on held-out cameras."""
 
 from __future__ import annotations
 

@@ -127,7 +127,7 @@ def measure_gap(
 
 
 def default_frames(frames: Sequence[int]) -> list[int]:
-    """Return a third, two thirds and the end of a stream's frames, where a gap is measured when nobody says."""
+    """Return a third, two thirds and the end of a stream's frames, where a gap is measured by default."""
     last = len(frames) - 1
     return sorted({frames[round(share * last)] for share in (1 / 3, 2 / 3, 1)})
 

@@ -23,7 +23,7 @@ def only_one(out: Path, what: str) -> Iterator[None]:
     """Hold the folder for one sweep or run; the lock goes with the process, however it ends."""
     try:
         import fcntl
-    except ImportError:  # no such lock on this system: nobody is kept out
+    except ImportError:  # no such lock on this system: the folder is not protected
         yield
         return
     with (out / LOCK).open("w") as file:

@@ -45,7 +45,7 @@ def build_report(data: SweepData, shown: Mapping[str, Sequence[Block]]) -> list[
 
 
 def _where_it_ran(data: SweepData) -> list[Block]:
-    """Return what ran where, by which cameras it was judged, and what was not measured."""
+    """Return what ran where, by which cameras it was measured, and what was not measured."""
     runs = [run for group in data.groups for run in group.runs]
     rows = {run.id: run.row for run in runs}
     machines = {row["machine"] for row in rows.values()}

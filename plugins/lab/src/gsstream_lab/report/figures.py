@@ -34,7 +34,7 @@ def measured_costs(groups: Sequence[Group]) -> list[str]:
 
 
 def measured_goods(groups: Sequence[Group]) -> list[str]:
-    """Return qualities that every group has; none where no camera judges."""
+    """Return qualities that every group has; none where no camera is held out."""
     return [key for key in DRAWN_QUALITIES if all(math.isfinite(group.mean(key)) for group in groups)]
 
 

@@ -1,4 +1,4 @@
-"""A search for settings: one key after the other along its values, judged by sweeps on cameras that are left out.
+"""A search for settings: one key after the other along its values, measured by sweeps on held-out cameras.
 
 Every value is one cell of a sweep (:mod:`gsstream_lab.sweep.drive`), so that a search goes on where it was stopped.
 """
@@ -73,7 +73,7 @@ def value_of(resolved: ResolvedRecipe, key: str) -> Any:
 
 
 class SweepScore:
-    """Judges values by the mean PSNR of decoded frames, on training cameras that are left out.
+    """Compares values by the mean PSNR of decoded frames, on training cameras that are left out.
 
     Arguments:
         scene: recording and number of frames; one frame judges the first, more judge those after it.

@@ -156,4 +156,4 @@ def growing(monkeypatch: pytest.MonkeyPatch, method: str) -> None:
         gone = np.sort(rng.choice(len(player.gaussians), 10, replace=False))
         return delta.with_rows(Rows(births, gone))
 
-    monkeypatch.setattr(step_module, "grown", grown)
+    monkeypatch.setattr(step_module, "with_growth", grown)

@@ -44,13 +44,13 @@ class Refreshed(Witness):
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         super().__init__(monkeypatch)
         self.before: dict[int, Any] = {}
-        original = method.refresh
+        original = method.key_packet_if_due
 
         def refresh(parts, step, *args):
             self.before[step.packet.frame] = step.state
             return original(parts, step, *args)
 
-        monkeypatch.setattr(method, "refresh", refresh)
+        monkeypatch.setattr(method, "key_packet_if_due", refresh)
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -105,14 +105,14 @@ def test_no_latency_contains_its_own_refinement_but_the_last(
 ) -> None:
     """By a clock on which every refinement takes a thousand seconds; the packet is in the file when it begins."""
     clock, held = [0.0], []
-    advanced = refine.advanced
+    advanced = refine.advance_refinement
 
     def slow(*args: Any) -> Any:
         clock[0] += 1000.0
         held.append(written(tmp_path / "run" / "stream.gss")[-1])
         return advanced(*args)
 
-    monkeypatch.setattr(refine, "advanced", slow)
+    monkeypatch.setattr(refine, "advance_refinement", slow)
     shifted = SimpleNamespace(time=lambda: time.time() + clock[0], perf_counter=time.perf_counter)
     monkeypatch.setattr(session, "time", shifted)
     folder = demo_copy(tmp_path / "scene", frames=5)
@@ -141,7 +141,7 @@ def test_frames_that_come_during_the_refinement_wait_as_the_policy_says(
 
     come(0)
     come(1)
-    advanced = refine.advanced
+    advanced = refine.advance_refinement
 
     def busy(*args: Any) -> Any:
         if args[4].index == 1:
@@ -150,7 +150,7 @@ def test_frames_that_come_during_the_refinement_wait_as_the_policy_says(
             (live / "END").touch()
         return advanced(*args)
 
-    monkeypatch.setattr(refine, "advanced", busy)
+    monkeypatch.setattr(refine, "advance_refinement", busy)
     source = f"watch:{live}?behind=drop&queue=1&ready=rename"
     encode(tmp_path / "run", source=source, **{**QUICK, **REFINED})
     lines = metrics(tmp_path / "run")

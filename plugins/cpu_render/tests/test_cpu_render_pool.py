@@ -19,7 +19,7 @@ RIG = Cameras(("one",), np.eye(4)[None], K[None], 16, 16)
 
 def test_a_lease_that_is_collected_while_the_pool_is_at_work(monkeypatch: pytest.MonkeyPatch) -> None:
     """The finaliser once waited for the lock that its own thread held: the encoder stood still for ever."""
-    held = [pool.lease(RIG, 0, (0.0, 0.0, 0.0)) for _ in range(2)]
+    held = [pool.acquire_rasterizer(RIG, 0, (0.0, 0.0, 0.0)) for _ in range(2)]
     held.pop()  # one idle rasteriser, so that the pool has something to look through
     isa = pool._native.active_isa
 
@@ -32,7 +32,7 @@ def test_a_lease_that_is_collected_while_the_pool_is_at_work(monkeypatch: pytest
 
     monkeypatch.setattr(pool, "_native", Collecting())
     made: list[Any] = []
-    worker = threading.Thread(target=lambda: made.append(pool.lease(RIG, 0, (0.0, 0.0, 0.0))), daemon=True)
+    worker = threading.Thread(target=lambda: made.append(pool.acquire_rasterizer(RIG, 0, (0.0, 0.0, 0.0))), daemon=True)
     worker.start()
     worker.join(30)
     assert made, "the pool waits for itself"
@@ -46,7 +46,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream_cpu_render import pool
 rig = Cameras(("one",), np.eye(4)[None], np.array([[[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]]), 16, 16)
-held = pool.lease(rig, 0, (0.0, 0.0, 0.0))
+held = pool.acquire_rasterizer(rig, 0, (0.0, 0.0, 0.0))
 pool._lock = None
 """
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)

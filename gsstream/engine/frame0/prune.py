@@ -50,7 +50,7 @@ def removal_errors(
 def retained_rows(errors: torch.Tensor, least: float) -> torch.Tensor:
     """Return the rows [K] int64, in order, of the Gaussians whose absence adds more than ``least``.
 
-    Where the images depend on none of them, all remain.
+    Where no absence adds more than ``least``, all rows remain.
     """
     rows = (errors > least).nonzero()[:, 0]
     return rows if len(rows) else torch.arange(len(errors))

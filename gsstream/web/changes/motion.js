@@ -42,7 +42,7 @@ export function decodeMotions(section, state) {
 /** Copies of the centres and rotations of a state, in its spare memory if there is any, which then is used up. */
 function copied(state) {
   const { scene, spare } = state;
-  // Until a motion is applied as a whole, its content is undefined.
+  // Until a motion is applied as a whole, the content of the spare memory is undefined.
   state.spare = null;
   if (!spare) return { means: scene.means.slice(), quats: scene.quats.slice() };
   for (const row of spare.rows) {

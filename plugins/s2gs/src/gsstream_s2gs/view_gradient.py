@@ -1,4 +1,4 @@
-"""View-space gradient difference: the change between two frames by the means of Gaussians."""
+"""View-space gradient difference: the gradient of the change between two frames by the projected means."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The incremental mode has the same bits as the full path, whatever changes, in whatever order."""
+"""The incremental mode has the same bits as the full path. In any order of calls: test_cpu_sessions.py."""
 
 from __future__ import annotations
 
@@ -71,27 +71,6 @@ def test_depth_ties_between_active_and_frozen_keep_memory_order() -> None:
     assert equal_bits(subject.forward_active(rows_of(splats, ids)), rasterizer().forward(splats))
 
 
-def test_update_equals_a_full_forward_and_can_be_repeated() -> None:
-    splats = random_splats(200, 6, 4)
-    subject = rasterizer()
-    shown = subject.forward(splats)
-    for frame in range(4):
-        ids, mask = some_ids(200, 25, frame), random_mask(frame)
-        subject.freeze(mask, ids)
-        rows = moved(rows_of(splats, ids), frame)
-        subject.forward_active(rows)
-        subject.update(ids, rows, *shown)
-        splats = with_rows(splats, ids, rows)
-        assert equal_bits(subject.forward_cached(), rasterizer().forward(splats))
-        assert equal_bits(shown, rasterizer().forward(splats))
-    subject.freeze(None, some_ids(200, 25, 99))
-    ids = some_ids(200, 25, 99)
-    subject.forward_active(rows_of(splats, ids))
-    full = rasterizer()
-    full.forward(splats)
-    assert equal_bits(subject.backward_active(*upstream(0)), rows_of_gradients(full.backward(*upstream(0)), ids))
-
-
 def test_forward_cached_renders_only_wanted_tiles() -> None:
     subject = rasterizer()
     want, _ = subject.forward(random_splats(100, 7, 1))
@@ -101,29 +80,6 @@ def test_forward_cached_renders_only_wanted_tiles() -> None:
     pixels = masked_pixels(mask)
     assert np.array_equal(image[pixels], want[pixels])
     assert (image[~pixels] == 7.0).all()
-
-
-def test_freezing_again_unmarks_the_former_active_rows() -> None:
-    splats = random_splats(150, 8, 1)
-    first, second = some_ids(150, 40, 1), some_ids(150, 40, 2)
-    subject = rasterizer()
-    subject.forward(splats)
-    subject.freeze(None, first)
-    subject.forward_active(moved(rows_of(splats, first), 0))
-    subject.freeze(None, second)
-    assert equal_bits(subject.forward_active(rows_of(splats, second)), rasterizer().forward(splats))
-
-
-def test_a_refused_active_pass_leaves_the_cache_usable() -> None:
-    splats, ids = random_splats(100, 9, 1), some_ids(100, 10, 9)
-    subject = rasterizer()
-    want = subject.forward(splats)
-    subject.freeze(None, ids)
-    bad = rows_of(splats, ids)
-    bad.means[3, 1] = np.nan
-    with pytest.raises(InputError, match=r"means: expected finite values, got nan at index \[3, 1\]"):
-        subject.forward_active(bad)
-    assert equal_bits(subject.forward_active(rows_of(splats, ids)), want)
 
 
 def test_order_of_calls_is_checked() -> None:

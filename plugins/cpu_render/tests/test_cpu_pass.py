@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from gsstream_cpu_render.residual import CpuResidualOptimiser
-from gsstream_cpu_render.threads import num_threads, set_num_threads
 
 from gsstream.core.errors import ComponentError
 from gsstream.engine.assembly.assemble import Assembly, assemble
@@ -120,17 +119,6 @@ def test_one_call_finds_what_single_calls_find(case: str, calls: list[int]) -> N
     assert any(float(value.abs().max()) > 0 for value in found.latents.values())
     expected = one_by_one(parts, problem)
     assert_alike(found, expected)
-
-
-def test_any_number_of_threads_gives_the_same_bits() -> None:
-    parts, problem = captured(*CASES["edge: rates, rows that leave"])
-    before, found = num_threads(), []
-    for number in (1, 2, 3):
-        set_num_threads(number)
-        solution = solved(parts, problem)
-        found.append(b"".join(value.numpy().tobytes() for value in (solution.logits, *solution.latents.values())))
-    set_num_threads(before)
-    assert found[0] == found[1] == found[2]
 
 
 def test_gates_that_wait_are_not_moved_by_images() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from cpu_scenes import BACKGROUND, HEIGHT, WIDTH, as_splats, equal_bits, random_splats, rasterizer, upstream
-from gsstream_cpu_render import threads
 from gsstream_cpu_render.arrays import mask_shape
 from gsstream_cpu_render.rasterizer import NumpyRasterizer, render_numpy
 
@@ -16,26 +15,6 @@ def masked_pixels(mask: np.ndarray, width: int = WIDTH, height: int = HEIGHT) ->
 
 def random_mask(seed: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
     return np.random.default_rng(seed).random(mask_shape(width, height)) < 0.5
-
-
-def test_same_bits_for_any_number_of_threads() -> None:
-    # Large enough for the parallel branches of projection, sort, scatter and both rasters.
-    width, height = 320, 200
-    splats = random_splats(40_000, 0, 4)
-    splats.scales[:] -= 2.0
-    v_image, v_alpha = upstream(0, width, height)
-    before = threads.num_threads()
-    results = []
-    try:
-        for count in (1, 2, 3, 4):
-            threads.set_num_threads(count)
-            subject = rasterizer(width, height, 300.0)
-            results.append((*subject.forward(splats), *subject.backward(v_image, v_alpha), subject.visible_rows()))
-    finally:
-        threads.set_num_threads(before)
-    assert len(results[0][-1]) > 20_000
-    for other in results[1:]:
-        assert equal_bits(results[0], other)
 
 
 def test_a_used_rasteriser_forgets_nothing_into_the_next_frame() -> None:

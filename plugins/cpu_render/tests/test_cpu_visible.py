@@ -1,4 +1,4 @@
-"""Who is visible in marked tiles: read from the cache, and held against the answer by differentiation."""
+"""What is visible in marked tiles: read from the cache, and held against the answer by differentiation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import torch
 from cpu_scenes import BACKGROUND, HEIGHT, WIDTH, camera, random_splats
 from gsstream_cpu_render.rasterizer import NumpyRasterizer
 from gsstream_cpu_render.renderer import CpuRenderer
-from gsstream_cpu_render.threads import num_threads, set_num_threads
 
 from gsstream.api import Cameras, Gaussians, InputError, RenderSession, ScatterSession, ShapeError
 from gsstream.parts.render.reference import ReferenceRenderer, footprint_in_image
@@ -50,27 +49,14 @@ def masks(size: tuple[int, int], seed: int = 0) -> list[torch.Tensor]:
     return [torch.ones(shape, dtype=torch.bool), torch.rand(shape, generator=g) < 0.3, *single]
 
 
-def changed(whole: Scene, ids: torch.Tensor, seed: int) -> Scene:
-    g = torch.Generator().manual_seed(seed)
-    rows = whole.rows(ids).map(lambda t: t + 0.4 * torch.randn(t.shape, generator=g))
-    base = dict(whole.items())
-    return Gaussians(**{name: base[name].index_copy(0, ids, value) for name, value in rows.items()})
-
-
-@pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("seed", range(4))
 def test_it_is_what_differentiation_finds(seed: int, threads: int) -> None:
     """The same kernel draws for both, so nothing may differ; opaque scenes hide rows behind others."""
-    before = num_threads()
-    set_num_threads(threads)
-    try:
-        whole = scene(seed)
-        session, truth = opened(whole), differentiated(whole)
-        for view in (0, 1):
-            for mask in masks(EVEN, seed):
-                assert torch.equal(session.visible(view, mask), truth.visible(view, mask))
-    finally:
-        set_num_threads(before)
+    whole = scene(seed)
+    session, truth = opened(whole), differentiated(whole)
+    for view in (0, 1):
+        for mask in masks(EVEN, seed):
+            assert torch.equal(session.visible(view, mask), truth.visible(view, mask))
 
 
 def test_it_agrees_with_the_reference_renderer() -> None:
@@ -125,43 +111,6 @@ def test_what_lies_behind_a_wall_is_not_visible() -> None:
         assert each.visible(0, masks(EVEN)[0]).tolist()[0] is True
 
 
-@pytest.mark.parametrize("megabytes", [None, 0.0, 0.15])
-def test_after_commits_it_is_what_a_session_opened_anew_says(megabytes: float | None) -> None:
-    whole = scene(2, opaque=False)
-    session = opened(whole, megabytes=megabytes)
-    for frame in range(5):
-        ids = torch.from_numpy(np.sort(np.random.default_rng(frame).permutation(N)[:40]))
-        if frame % 2:
-            session.visible(1, masks(EVEN)[0])
-        session.narrow(ids)
-        session.render(0, whole.rows(ids))
-        whole = changed(whole, ids, frame)
-        session = session.commit(whole, ids)
-        fresh = opened(whole)
-        for view in (0, 1):
-            for mask in masks(EVEN, frame):
-                assert torch.equal(session.visible(view, mask), fresh.visible(view, mask))
-
-
-def test_it_answers_for_the_scene_and_not_for_what_was_rendered_since() -> None:
-    """And between a forward and its backward it changes nothing."""
-    whole, ids = scene(3), torch.arange(0, N, 3)
-    asked, silent = opened(whole), opened(whole)
-    expected = asked.visible(0, masks(EVEN)[1])
-    gradients = []
-    for session in (asked, silent):
-        session.narrow(ids)
-        rows = changed(whole, ids, 5).rows(ids).map(lambda t: t.clone().requires_grad_())
-        image = session.render(0, rows).image
-        if session is asked:
-            assert torch.equal(asked.visible(0, masks(EVEN)[1]), expected)
-        image.square().sum().backward()
-        gradients.append(rows.means.grad)
-    assert gradients[0] is not None
-    assert gradients[1] is not None
-    assert torch.equal(gradients[0], gradients[1])
-
-
 def test_no_marked_tile_costs_nothing() -> None:
     session = opened(scene())
     assert not bool(session.visible(0, masks(EVEN)[0] & False).any())
@@ -195,59 +144,16 @@ def test_the_rasteriser_refuses_tiles_that_it_did_not_draw() -> None:
 
 
 @pytest.mark.parametrize("megabytes", [None, 0.0, 0.05])
-@pytest.mark.parametrize("threads", [1, 3])
 def test_all_cameras_at_once_are_one_after_the_other(threads: int, megabytes: float | None) -> None:
     """Also beyond the budget of the caches, where a view's cache is filled for every call."""
-    whole, before = scene(), num_threads()
-    set_num_threads(threads)
-    try:
-        session = opened(whole, ODD, megabytes)
-        for first, second in zip(masks(ODD), reversed(masks(ODD, 1)), strict=True):
-            asked = torch.stack([first, second])
-            expected = session.visible(0, first) | session.visible(1, second)
-            assert torch.equal(session.visible_anywhere(asked), expected)
-            assert torch.equal(opened(whole, ODD, megabytes).visible_anywhere(asked), expected)
-    finally:
-        set_num_threads(before)
+    session = opened(scene(), ODD, megabytes)
+    for first, second in zip(masks(ODD), reversed(masks(ODD, 1)), strict=True):
+        asked = torch.stack([first, second])
+        expected = session.visible(0, first) | session.visible(1, second)
+        assert torch.equal(session.visible_anywhere(asked), expected)
+        assert torch.equal(opened(scene(), ODD, megabytes).visible_anywhere(asked), expected)
 
 
 def test_tiles_of_another_shape_are_refused_for_all_cameras() -> None:
     with pytest.raises(ShapeError, match="tile"):
         opened(scene()).visible_anywhere(torch.ones(2, 1, 1, dtype=torch.bool))
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_commits_of_all_cameras_at_once_are_one_after_the_other(threads: int) -> None:
-    """The views of a rig are brought to the next scene by several threads; each has the bits of a new session."""
-    whole, ids, before = scene(), torch.arange(3, N, 7), num_threads()
-    later = changed(whole, ids, 5)
-    set_num_threads(threads)
-    try:
-        session = opened(whole, ODD)
-        for view in range(2):
-            session.visible(view, masks(ODD)[0])
-        kept, fresh = session.commit(later, ids), opened(later, ODD)
-        weights = torch.rand(ODD[1], ODD[0], 3, generator=torch.Generator().manual_seed(4))
-        for view in range(2):
-            got, want = (each.screen_gradient(view, weights) for each in (kept, fresh))
-            assert torch.equal(got.gradient, want.gradient)
-            assert torch.equal(got.visible, want.visible)
-            for each in (kept, fresh):
-                each.narrow(ids)
-            images = [each.render(view, later.rows(ids)).image for each in (kept, fresh)]
-            assert torch.equal(*images)
-    finally:
-        set_num_threads(before)
-
-
-def test_a_value_that_is_not_finite_is_refused_by_a_commit_of_all_cameras() -> None:
-    whole, ids = scene(), torch.tensor([2, 5])
-    session = opened(whole)
-    for view in range(2):
-        session.visible(view, masks(EVEN)[0])
-    later = replace(whole, means=whole.means.clone())
-    later.means[5] = float("nan")
-    with pytest.raises(ValueError, match="means"):
-        session.commit(later, ids)
-    everywhere = torch.stack([masks(EVEN)[0]] * 2)
-    assert torch.equal(session.visible_anywhere(everywhere), opened(whole).visible_anywhere(everywhere))

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
+from cpu_scenes import relative_error
 from gsstream_cpu_render.loss_part import CpuLoss
 from gsstream_cpu_render.renderer import CpuRenderer
-from gsstream_cpu_render.threads import num_threads, set_num_threads
 from test_cpu_fit import BACKGROUND, comparison
 from test_cpu_renderer import rig, scene
 
@@ -58,12 +57,8 @@ def test_a_whole_pull_is_the_calls_it_stands_for(coloured: bool, coefficients: i
     assert values(found).keys() == values(want).keys()
     assert ("exposure" in values(found)) == coloured
     for name, value in values(want).items():
-        if value.numel() == 0:
-            continue
-        assert float(value.abs().max()) > 0
-        np.testing.assert_allclose(
-            values(found)[name].numpy(), value.numpy(), rtol=0, atol=2e-6 * float(value.abs().max()), err_msg=name
-        )
+        assert value.numel() == 0 or float(value.abs().max()) > 0
+        assert relative_error(values(found)[name].numpy(), value.numpy()) <= 2e-6, name
 
 
 def test_without_a_colour_map_it_has_the_bits_of_the_calls() -> None:
@@ -79,22 +74,7 @@ def test_it_agrees_with_the_reference_renderer_and_loss() -> None:
     found, want = pulled(rows, wanted), judged(rows, wanted, reference=True)
     assert float(found.loss) == pytest.approx(float(want.loss), rel=1e-4)
     for name, value in values(want).items():
-        np.testing.assert_allclose(
-            values(found)[name].numpy(), value.numpy(), rtol=0, atol=1e-3 * float(value.abs().max()), err_msg=name
-        )
-
-
-def test_it_has_the_same_bits_for_any_number_of_threads_and_after_any_calls() -> None:
-    before, found = num_threads(), []
-    for number in (1, 2, 3):
-        set_num_threads(number)
-        for _ in range(2):
-            found.append(values(pulled(scene(), comparison(coloured=True))))
-            pulled(scene(seed=1, coefficients=1), comparison())
-    set_num_threads(before)
-    for other in found[1:]:
-        for name, value in found[0].items():
-            assert torch.equal(other[name], value), name
+        assert relative_error(values(found)[name].numpy(), value.numpy()) <= 1e-3, name
 
 
 def test_the_colour_maps_slope_is_that_of_the_loss() -> None:

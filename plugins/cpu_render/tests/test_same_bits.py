@@ -1,0 +1,88 @@
+"""Any number of threads gives the same bits: one table of calls, each of which has work for several threads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from cpu_scenes import random_splats, rasterizer, upstream
+from gsstream_cpu_render.adam import adam_rows
+from gsstream_cpu_render.adam_part import CpuAdam
+from gsstream_cpu_render.loss import PreparedImage, photometric_loss, tile_shape
+from gsstream_cpu_render.threads import set_num_threads
+from test_cpu_fit import comparison
+from test_cpu_pass import CASES, captured, solved
+from test_cpu_renderer import scene
+from test_cpu_whole import pulled, values
+from test_native_adam import fresh
+from test_native_loss import near_pair
+
+from gsstream.testing.optimiser.checks import _residual_case
+
+
+def rasterised() -> list[Any]:
+    """Large enough for the parallel branches of projection, sort, scatter and both rasters."""
+    width, height = 320, 200
+    splats = random_splats(40_000, 0, 4)
+    splats.scales[:] -= 2.0
+    subject = rasterizer(width, height, 300.0)
+    made = [*subject.forward(splats), *subject.backward(*upstream(0, width, height)), subject.visible_rows()]
+    assert len(made[-1]) > 20_000
+    return made
+
+
+def whole_scene() -> list[Any]:
+    """Twice, with a smaller scene in between."""
+    first = pulled(scene(), comparison(coloured=True))
+    pulled(scene(seed=1, coefficients=1), comparison())
+    return [*values(first).values(), *values(pulled(scene(), comparison(coloured=True))).values()]
+
+
+def residual_table() -> list[Any]:
+    code, base, units, matrix = _residual_case()
+    base, units = base.rows(torch.arange(300).repeat(5)), units.repeat(5)
+    table, g = CpuAdam().residual_optimiser(code, base, units, matrix), torch.Generator().manual_seed(5)
+    for _ in range(3):
+        table.forward(torch.rand(1500, generator=g))
+        table.backward(base.map(lambda value: torch.randn(value.shape, generator=g)), 1e-3)
+        table.step()
+    return [table.latents.detach(), table.matrix]
+
+
+def iterations_of_a_residual() -> list[Any]:
+    solution = solved(*captured(*CASES["edge: rates, rows that leave"]))
+    return [solution.logits, *solution.latents.values()]
+
+
+def adam() -> list[Any]:
+    rng = np.random.default_rng(6)
+    mine = fresh(rng.standard_normal((30_000, 3)).astype(np.float32))
+    for _ in range(3):
+        grad, rows = rng.standard_normal((30_000, 3)).astype(np.float32), rng.random(30_000) < 0.5
+        adam_rows(grad=grad, rows=rows, lr=0.01, **mine)
+    return [mine["param"], mine["step"]]
+
+
+def loss() -> list[Any]:
+    """Of all tiles, and of some."""
+    rng = np.random.default_rng(11)
+    image, target = near_pair(rng, 210, 250)
+    mask = rng.random(tile_shape(210, 250)) < 0.4
+    found = [photometric_loss(image, PreparedImage(target), tile_mask=tiles) for tiles in (None, mask)]
+    return [value for each in found for value in (each.value, each.gradient)]
+
+
+CALLS: list[Callable[[], list[Any]]] = [rasterised, whole_scene, residual_table, iterations_of_a_residual, adam, loss]
+
+
+@pytest.mark.parametrize("call", CALLS, ids=lambda call: call.__name__)
+def test_any_number_of_threads_gives_the_same_bits(call: Callable[[], list[Any]], isa: str) -> None:
+    found = []
+    for count in (1, 2, 3, 4, 7):
+        set_num_threads(count)
+        found.append([np.asarray(value).tobytes() for value in call()])
+    assert any(any(value) for value in found[0]), "every result is zero"
+    assert all(other == found[0] for other in found[1:])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import final
 
 import torch
@@ -40,7 +41,7 @@ class SelectiveLeaf(Propagation):
             default=0.5, gt=0, le=1, description="share of suspect nodes from which a tree moves as one, 0 to 1"
         )
         empty: float = Field(
-            default=-50.0, ge=-1e4, le=1e4, description="logit of a subtree without Gaussians, -1e4 to 1e4"
+            default=-50.0, ge=-1e4, le=1e4, description="largest logit of a subtree without Gaussians, -1e4 to 1e4"
         )
 
     traits = PropagationTraits(
@@ -52,7 +53,7 @@ class SelectiveLeaf(Propagation):
         check_shape("logits", logits, (hierarchy.num_gaussians,))
         check_finite("logits", logits)
         root = tree_roots(hierarchy.parent)
-        own = logits.new_full((hierarchy.num_nodes,), self.config.empty)
+        own = logits.new_full((hierarchy.num_nodes,), -math.inf)
         own = own.scatter_reduce(0, hierarchy.node_of, logits, reduce="amax", include_self=False)
         best = self._subtrees(own, hierarchy)
         owners = torch.zeros(hierarchy.num_nodes, dtype=torch.float64, device=logits.device)
@@ -63,11 +64,16 @@ class SelectiveLeaf(Propagation):
         return torch.where(as_one[root], best[root], best)
 
     def _subtrees(self, own: torch.Tensor, hierarchy: Hierarchy) -> torch.Tensor:
-        """[M] maximum over each node and all below it, level by level from the deepest."""
-        best = own
-        for level in range(int(hierarchy.level.max()) if hierarchy.num_nodes else 0, 0, -1):
+        """[M] maximum over each node and all below it; without Gaussians at most the parent's."""
+        best, deepest = own, int(hierarchy.level.max()) if hierarchy.num_nodes else 0
+        for level in range(deepest, 0, -1):
             below = hierarchy.level == level
             best = best.scatter_reduce(0, hierarchy.parent[below], best[below], reduce="amax")
         if bool((best[hierarchy.parent] < best).any()):
             raise ShapeError("level: expected one more than the parent's level at every node that is not a root")
+        without = best == -math.inf
+        best = best.masked_fill(without, self.config.empty)
+        for level in range(1, deepest + 1):
+            at = without & (hierarchy.level == level)
+            best = torch.where(at, torch.minimum(best, best[hierarchy.parent]), best)
         return best

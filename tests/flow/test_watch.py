@@ -134,7 +134,8 @@ def test_an_absent_camera_is_held_or_its_frame_is_dropped(
     finished: Path, tmp_path: Path, truth: list[bytes], policy: str, status: str, done: str
 ) -> None:
     with capturing(finished, tmp_path / "live", absent=["cam01", 2]) as live:
-        got = follow(live, tmp_path / "run", f"?missing={policy}&grace=2")
+        # It has gone on: no camera is given up because this machine is slow.
+        got = follow(live, tmp_path / "run", f"?missing={policy}&grace=600")
     lines = metrics(tmp_path / "run")
     assert [line["status"] for line in lines] == ["key", "delta", status, "delta"]
     assert [line["live"]["policy"] for line in lines] == [None, None, done, None]

@@ -188,6 +188,7 @@ class WatchSource:
         whole: set[str] = set()
         self._decoded, self._faults = {}, {}
         changed = began = time.monotonic()
+        given_up: list[str] = []
         while True:
             ended = (self._folder / self._options.end).exists()
             before = dict(seen)
@@ -200,7 +201,10 @@ class WatchSource:
             now = time.monotonic()
             changed = now if seen != before else changed
             if self._give_up(index, absent, whole, now - began):
-                return absent
+                if absent == given_up:
+                    return absent
+                given_up = absent  # and one more look: an image may have come during this one
+                continue
             if ended or self._stop.is_set() or now - changed >= self._options.timeout:
                 self._end(index, absent, ended)
             self._stop.wait(self._options.poll)

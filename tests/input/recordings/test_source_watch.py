@@ -15,8 +15,10 @@ import pytest
 
 from gsstream.core.errors import EndOfRecording, SourceError
 from gsstream.core.frame import Arrival
+from gsstream.input.recordings import watch
 from gsstream.input.recordings.base import FrameSource, LiveSource
 from gsstream.input.recordings.disturbed import DisturbedSource
+from gsstream.input.recordings.images import read_image
 from gsstream.input.recordings.multiview import MultiviewSource
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
 from gsstream.input.recordings.options import Disturbances
@@ -123,6 +125,26 @@ def test_a_frame_that_was_read_ahead_is_judged_again_when_its_turn_comes(
         image.rename(folder / image.parent.name / image.name)
     # Ten frames wait behind frame 1; frame 0 is always made in full.
     assert [live.effort(0), through.effort(1), through.effort(11)] == worth
+
+
+def test_an_image_that_comes_during_a_look_is_not_given_up(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its camera has gone on by the end of that look, in which the image was not there yet."""
+    live = open_source(f"watch:{folder}?missing=hold&grace=0", 0.25)
+    late = [folder / live.info.train.ids[1] / f"00000{t}.jpg" for t in (1, 2)]
+    for path in late:
+        path.rename(path.with_suffix(".part"))
+
+    def slow(path: Path, *size: Any) -> np.ndarray:
+        if path.stem == "000001":
+            for one in late:
+                if not one.exists():
+                    one.with_suffix(".part").rename(one)
+        return read_image(path, *size)
+
+    monkeypatch.setattr(watch, "read_image", slow)
+    arrival = live.frame(1).arrival
+    assert arrival is not None
+    assert arrival.absent == ()
 
 
 def test_a_file_written_again_changes_no_frame_that_was_decided(folder: Path) -> None:

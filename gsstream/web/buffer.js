@@ -79,8 +79,7 @@ export class PacketBuffer {
     if (join && join.state !== "done") return null;
     const failed = parts.find((part) => part.state === "failed");
     if (failed) return failed.error;
-    const part = parts[parts.length - 1];
-    return part?.state === "done" ? new Error("The stream is cut short here.") : null;
+    return parts.every((part) => part.state === "done") ? new Error("The stream is cut short here.") : null;
   }
 
   /** A packet or the join that leads to a frame turned out to be damaged. Returns whether there is another way. */

@@ -138,6 +138,8 @@ def test_too_few_passes_raise_the_threshold_and_plenty_lower_it_again() -> None:
     poor = replace(USUAL, epochs=2.0)
     assert plan(tight, stream, [poor, poor]).change_threshold == 9.0
     assert plan(tight, stream, [USUAL, poor]).change_threshold == 6.0, "one slow frame is none"
+    assert plan(tight, stream, [USUAL, poor, poor]).change_threshold == 9.0, "the last two count"
+    assert plan(tight, stream, [poor, USUAL, poor]).change_threshold == 6.0
     assert plan(tight, stream, [poor, replace(poor, threshold=20.0)]).change_threshold == 24.0
     assert plan(tight, stream, [replace(USUAL, threshold=12.0)]).change_threshold == pytest.approx(9.6)
     assert plan(tight, stream, [USUAL]).change_threshold == 6.0

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from moving_scenes import make_gaussians, moving_packets
-from node_runs import HERE, NODE, needs_node
+from node_runs import HERE, NODE, needs_node, node
 
 from gsstream.core.changes import AddedGaussians, Delta, Motion, Rows, groups_for
 from gsstream.core.errors import PacketError
@@ -110,3 +110,20 @@ def test_a_scene_without_an_old_row_forgets_its_groups(tmp_path):
     assert done.returncode == 0, done.stderr
     digests = [digest(s) for s in states]
     assert json.loads(done.stdout) == [digests[1:], digests[2:], digests[3:]]
+
+
+@needs_node
+def test_without_its_join_a_frame_waits_for_every_piece_from_the_key_packet_on(tmp_path):
+    """The last piece may be there before the others, and only when all are there is the stream cut short."""
+    code = """
+    const { PacketBuffer } = await load("buffer.js");
+    const segments = [0, 5, 10].map((first) => ({ first, last: first + 4, join: first ? {} : null }));
+    const buffer = new PacketBuffer(segments, () => {});
+    buffer.parts[2].join.state = "failed";
+    return given.map((states) => {
+      buffer.parts.forEach((part, i) => Object.assign(part, { state: states[i], error: { message: "gone" } }));
+      return buffer.failure(12, null)?.message ?? null;
+    });
+    """
+    states = [["absent", "absent", "done"], ["done", "loading", "done"], ["failed", "absent", "done"], ["done"] * 3]
+    assert node(code, states, tmp_path) == [None, None, "gone", "The stream is cut short here."]

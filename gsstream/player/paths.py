@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,60 +11,52 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError
 from gsstream.core.shapes import FloatArray
 from gsstream.core.world import up_direction
+from gsstream.player.region import Region, focus_point, level_axes, recorded_region
 
 PATHS = ("orbit", "spiral")
-#: A rig with a larger gap than this between neighbouring cameras does not surround what it looks at, radians.
-OPEN_GAP = np.pi / 2
-#: Half of the smallest swing, radians: a single camera, or a few side by side, still show some parallax.
-MIN_SWING = np.pi / 18
 
 
-def camera_path(kind: str, rig: Cameras, number: int) -> Cameras:
+def camera_path(kind: str, rig: Cameras, number: int, region: Region | None = None) -> Cameras:
     """Return ``number`` cameras along the path ``kind`` (one of PATHS), with the intrinsics of the rig's first.
 
     Arguments:
         kind: a name of PATHS.
         rig: cameras of the stream.
         number: of cameras, at least 1.
+        region: what an orbit stays in; None: that of the rig.
     """
     if kind not in PATHS:
         raise ShapeError(f"no camera path {kind!r}; known: {', '.join(PATHS)}")
     if len(rig) == 0 or number < 1:
         raise ShapeError(f"a path needs a rig and at least one frame, got {len(rig)} cameras and {number} frames")
-    return orbit(rig, number) if kind == "orbit" else spiral(rig, number)
+    return orbit(rig, number, region or recorded_region(rig)) if kind == "orbit" else spiral(rig, number)
 
 
-def focus_point(rig: Cameras) -> FloatArray:
-    """Return the point [3] nearest to all optical axes, in the least-squares sense.
-
-    Parallel axes (or a single camera) leave the distance open; then it is the rig's extent in front of its middle.
-    """
-    axes, centers = rig.viewmats[:, 2, :3], rig.centers
-    across = np.eye(3)[None] - axes[:, :, None] * axes[:, None, :]
-    matrix = across.sum(0)
-    if np.linalg.cond(matrix) > 1e6:
-        return np.asarray(centers.mean(0) + rig.extent * axes.mean(0))
-    return np.asarray(np.linalg.solve(matrix, np.einsum("cij,cj->i", across, centers)))
-
-
-def orbit(rig: Cameras, number: int) -> Cameras:
-    """Return a path around the focus point at the rig's mean distance and height, starting at its first camera.
+def orbit(rig: Cameras, number: int, region: Region) -> Cameras:
+    """Return a path around the focus of a region at the rig's mean distance and height, starting at its first camera.
 
     Where cameras stand all around, one full turn; else a swing over the arc that they span and back, because nothing
-    was recorded of the other side.
+    was recorded of the other side. Where they look outward, so does the path.
     """
-    focus, up = focus_point(rig), up_direction(rig)
-    offsets = rig.centers - focus
-    height = float((offsets @ up).mean())
-    radius = float(np.linalg.norm(offsets - np.outer(offsets @ up, up), axis=1).mean())
-    start = offsets[0] - (offsets[0] @ up) * up
-    if np.linalg.norm(start) < 1e-9:
-        start = np.cross(up, [1.0, 0, 0]) if abs(up[0]) < 0.9 else np.cross(up, [0, 1.0, 0])
-    first = start / np.linalg.norm(start)
-    second = np.cross(up, first)
-    angle = _angles(np.arctan2(offsets @ second, offsets @ first), number)
-    ring = radius * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
-    return _look_at(rig, focus + height * up + ring, focus, up)
+    arms = region.arms(rig)
+    azimuth, elevation = region.angles(arms)
+    angle = _angles(region, float(azimuth[0]), number)
+    first, second = level_axes(region.up)
+    level = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
+    arm = np.cos(elevation.mean()) * level + np.sin(elevation.mean()) * region.up
+    distance = float(np.linalg.norm(rig.centers - region.focus, axis=1).mean())
+    centers = region.focus + distance * arm
+    return _look_at(rig, centers, centers + arm if region.outward else region.focus, region.up)
+
+
+def joined(rigs: Sequence[Cameras]) -> Cameras:
+    """Return the cameras of several rigs as one, with pictures of the size of the first."""
+    first = rigs[0]
+    scaled = [rig.scaled(first.width, first.height) for rig in rigs]
+    return replace(
+        first, ids=tuple(name for rig in rigs for name in rig.ids),
+        viewmats=np.concatenate([rig.viewmats for rig in scaled]), Ks=np.concatenate([rig.Ks for rig in scaled]),
+    )  # fmt: skip
 
 
 def resized(rig: Cameras, width: int, height: int) -> Cameras:
@@ -77,18 +70,14 @@ def resized(rig: Cameras, width: int, height: int) -> Cameras:
     return replace(rig, Ks=Ks, width=width, height=height)
 
 
-def _angles(cameras: FloatArray, number: int) -> FloatArray:
-    """[number] angles of a path around cameras that stand at these angles, from that of the first (0)."""
-    places = np.sort(cameras % (2 * np.pi))
-    gaps = np.diff(places, append=places[0] + 2 * np.pi)
-    widest = int(gaps.argmax())
+def _angles(region: Region, start: float, number: int) -> FloatArray:
+    """[number] azimuths of a path within a region, from that of the first camera."""
     along = 2 * np.pi * np.arange(number) / number
-    if gaps[widest] <= OPEN_GAP:
-        return np.asarray(along)
-    start, span = places[(widest + 1) % len(places)], 2 * np.pi - gaps[widest]
-    half, middle = max(0.5 * span, MIN_SWING), start + 0.5 * span
-    # The first camera is at angle 0 and somewhere on the arc; the swing begins there.
-    first = (np.pi - middle) % (2 * np.pi) - np.pi
+    if region.azimuth is None:
+        return np.asarray(start + along)
+    middle, half = region.azimuth
+    # The first camera is somewhere on the arc; the swing begins there.
+    first = (start - middle + np.pi) % (2 * np.pi) - np.pi
     phase = np.arcsin(np.clip(first / half, -1, 1))
     return np.asarray(middle + half * np.sin(along + phase))
 

@@ -20,8 +20,9 @@ from gsstream.core.needs import install_extra
 from gsstream.core.shapes import FloatArray
 from gsstream.player.camera_file import read_path
 from gsstream.player.interpolation import Moments, frame_times
-from gsstream.player.paths import PATHS, camera_path, resized
+from gsstream.player.paths import PATHS, camera_path, joined, resized
 from gsstream.player.playback import Playback
+from gsstream.player.region import recorded_region
 from gsstream.player.render import PlayerRenderer, render, to_bytes
 
 _ANIMATED = (".webp", ".gif")
@@ -94,7 +95,8 @@ def choose_cameras(playback: Playback, camera: str | None, number: int) -> Camer
     """Return one camera for all pictures (by id), or ``number`` cameras along a path."""
     meta = playback.meta
     if camera in PATHS:
-        return camera_path(camera, meta.train if len(meta.train) else meta.test, number)
+        rigs = [rig for rig in (meta.test, meta.train) if len(rig)]
+        return camera_path(camera, rigs[-1], number, recorded_region(joined(rigs)))
     if camera is not None and camera.lower().endswith(".json") and camera not in (*meta.test.ids, *meta.train.ids):
         return read_path(Path(camera), meta.test if len(meta.test) else meta.train, number, meta.world)
     return meta.camera((*meta.test.ids, *meta.train.ids)[0] if camera is None else camera)

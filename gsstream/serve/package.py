@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import os
-import shutil
+import re
 from collections.abc import Sequence
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -23,6 +23,8 @@ from gsstream.serve.joins import encode_join, track_rows
 
 MANIFEST = "stream.json"
 SEGMENTS = "segments"
+#: Whole lines of a module: a fifth of what a visitor would load.
+_COMMENTS = re.compile(rb"^[ \t]*(?://[^\n]*|/\*\*.*?\*/)\n", re.MULTILINE | re.DOTALL)
 
 
 class Package(NamedTuple):
@@ -173,14 +175,16 @@ def _replace(path: Path, data: bytes) -> None:
 
 
 def _copy(source: Traversable, target: Path) -> int:
-    """Copy the player's files; returns their bytes."""
+    """Copy the player's files, modules of its own without their comments; returns the bytes that were written."""
     size = 0
     for item in source.iterdir():
         if item.is_dir():
             (target / item.name).mkdir(exist_ok=True)
             size += _copy(item, target / item.name)
         elif not item.name.startswith((".", "__")):
-            with item.open("rb") as data, (target / item.name).open("wb") as out:
-                shutil.copyfileobj(data, out)
-            size += (target / item.name).stat().st_size
+            data = item.read_bytes()
+            if item.name.endswith(".js") and source.name != "vendor":
+                data = _COMMENTS.sub(b"", data)
+            (target / item.name).write_bytes(data)
+            size += len(data)
     return size

@@ -1,9 +1,9 @@
 // Views: where a camera stands and how it looks, and how a hand moves it. Axes: x right, y down, z forward.
 
-const add = (a, b, factor = 1) => a.map((v, i) => v + factor * b[i]);
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-const unit = (a) => a.map((v) => v / (Math.hypot(...a) || 1));
+export const add = (a, b, factor = 1) => a.map((v, i) => v + factor * b[i]);
+export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+export const unit = (a) => a.map((v) => v / (Math.hypot(...a) || 1));
 
 /** All cameras of a stream's meta as views, test cameras first: `{ id, split, eye, right, down, forward, ... }`. */
 export function viewsOf(meta) {
@@ -51,48 +51,59 @@ export function cameraOf(view, width, height) {
   };
 }
 
-/** The point nearest to the optical axes of all views, which they turn around; and the direction that is up. */
+/** Mean squared angle between optical axes below which nothing says where they meet, and the length of their mean. */
+const [PARALLEL, ONE_WAY] = [1e-4, 0.9];
+
+/**
+ * What views turn around: the point nearest to all optical axes, the direction that is up, and whether the cameras look
+ * outward, away from the point. Parallel axes leave the distance open; then it is the rig's extent before its middle.
+ */
 export function pivotOf(views) {
-  const matrix = [0, 0, 0, 0, 0, 0, 0, 0, 0];
-  const right = [0, 0, 0];
-  for (const { eye, forward } of views) {
-    for (let i = 0; i < 3; i += 1) {
-      for (let k = 0; k < 3; k += 1) {
-        const across = (i === k) - forward[i] * forward[k];
-        matrix[3 * i + k] += across;
-        right[i] += across * eye[k];
-      }
-    }
-  }
-  const columns = [0, 1, 2].map((k) => [matrix[k], matrix[3 + k], matrix[6 + k]]);
+  const mean = (of) => views.reduce((sum, view) => add(sum, of(view), 1 / views.length), [0, 0, 0]);
+  const across = (axis, vector) => add(vector, axis, -dot(axis, vector));
+  const columns = [0, 1, 2].map((k) => mean(({ forward }) => across(forward, [0, 1, 2].map((i) => Number(i === k)))));
+  const right = mean(({ eye, forward }) => across(forward, eye));
   const determinant = dot(columns[0], cross(columns[1], columns[2]));
-  const up = upOf(views);
-  if (determinant < 1e-4 * views.length ** 3) {
-    // Parallel axes, or one camera: the distance is open, and three focal lengths of it are a guess.
-    const middle = views.reduce((sum, view) => add(sum, view.eye, 1 / views.length), [0, 0, 0]);
-    return { point: add(middle, views[0].forward, 3), up };
+  const up = upOf(views, mean);
+  const ahead = mean(({ forward }) => forward);
+  const length = Math.hypot(...ahead);
+  if (determinant >= PARALLEL) {
+    const point = [0, 1, 2].map((k) => {
+      const [a, b, c] = columns.map((column, i) => (i === k ? right : column));
+      return dot(a, cross(b, c)) / determinant;
+    });
+    const inward = views.reduce((sum, { eye, forward }) => sum - dot(add(eye, point, -1), forward), 0);
+    const outward = inward <= 1e-9 * views.length;
+    if (!outward || length < ONE_WAY) return { point, up, outward };
   }
-  const solve = (k) => {
-    const changed = columns.map((column, i) => (i === k ? right : column));
-    return dot(changed[0], cross(changed[1], changed[2])) / determinant;
-  };
-  return { point: [solve(0), solve(1), solve(2)], up };
+  const middle = mean(({ eye }) => eye);
+  const extent = 1.1 * Math.max(...views.map(({ eye }) => Math.hypot(...add(eye, middle, -1)))) || 1;
+  return { point: add(middle, length > 1e-3 ? unit(ahead) : views[0].forward, extent), up, outward: false };
 }
 
 /**
- * The direction across the cameras' x axes, which are level unless a camera is rolled; their mean up direction would
- * lean towards the side from which half a circle looks down. It is taken where the x axes are parallel.
+ * The direction across the cameras' x axes, which are level unless a camera is rolled. Their mean up direction would
+ * lean towards the side from which half a circle looks down: it gives the sign, and all where the x axes are parallel.
  */
-function upOf(views) {
-  const mean = unit(views.reduce((sum, view) => add(sum, view.down, -1), [0, 0, 0]));
-  let up = mean;
-  // Power iteration: what is left of a vector after its parts along the x axes are taken away.
-  for (let i = 0; i < 200; i += 1) {
-    const along = views.reduce((sum, { right }) => add(sum, right, dot(right, up) / views.length), [0, 0, 0]);
-    up = unit(add(up, along, -1));
+function upOf(views, meanOf) {
+  let mean = meanOf(({ down }) => down.map((v) => -v));
+  if (Math.hypot(...mean) < 1e-3) mean = views[0].down.map((v) => -v);
+  const rows = [0, 1, 2].map((k) => meanOf(({ right }) => right.map((v) => v * right[k])));
+  // Squared again and again, what is left of the identity has the direction of the smallest eigenvalue alone.
+  let power = rows.map((row, i) => row.map((v, k) => (i === k) - v));
+  for (let i = 0; i < 20; i += 1) {
+    const size = Math.hypot(...power.flat()) || 1;
+    power = power.map((row) => [0, 1, 2].map((k) => dot(row, power.map((other) => other[k])) / size ** 2));
   }
-  const share = views.reduce((sum, { right }) => sum + dot(right, up) ** 2, 0) / views.length;
-  return share < 0.02 && dot(up, mean) > 0.5 ? up : mean;
+  const longest = power.reduce((best, row) => (Math.hypot(...row) > Math.hypot(...best) ? row : best));
+  const axis = unit(longest);
+  const up = axis.map((v) => v * Math.sign(dot(axis, mean)));
+  const smallest = dot(axis, rows.map((row) => dot(row, axis)));
+  // The eigenvalues sum up to 1, and their squares to that of the entries.
+  const squares = rows.reduce((sum, row) => sum + dot(row, row), -(smallest ** 2));
+  const middle = (1 - smallest - Math.sqrt(Math.max(0, 2 * squares - (1 - smallest) ** 2))) / 2;
+  const level = smallest < 0.05 * middle && middle > 1e-3 && dot(up, mean) > 0.5 * Math.hypot(...mean);
+  return level ? up : unit(mean);
 }
 
 function turned(vector, axis, angle) {
@@ -103,23 +114,27 @@ function turned(vector, axis, angle) {
   return vector.map((v, i) => v * cosine + side[i] * sine + axis[i] * along);
 }
 
-function turnView(view, axis, angle, point) {
+export function turnView(view, axis, angle, point) {
   const [right, down, forward] = [view.right, view.down, view.forward].map((v) => unit(turned(v, axis, angle)));
   return { ...view, right, down, forward, eye: add(point, turned(add(view.eye, point, -1), axis, angle)) };
+}
+
+/** The tilted view, unless it goes over the top; one that looks steeply already may come back. */
+function notOver(level, tilted, up) {
+  const [before, after] = [level, tilted].map(({ forward }) => Math.abs(dot(forward, up)));
+  return after < Math.max(0.985, before) ? tilted : level;
 }
 
 /** The view turned around the pivot by angles in radians; it never goes over the top. */
 export function orbited(view, pivot, yaw, pitch) {
   const level = turnView(view, pivot.up, yaw, pivot.point);
-  const tilted = turnView(level, level.right, pitch, pivot.point);
-  return Math.abs(dot(tilted.forward, pivot.up)) < 0.985 ? tilted : level;
+  return notOver(level, turnView(level, level.right, pitch, pivot.point), pivot.up);
 }
 
 /** The view turned where it stands. */
 export function looked(view, pivot, yaw, pitch) {
   const level = turnView(view, pivot.up, yaw, view.eye);
-  const tilted = turnView(level, level.right, pitch, view.eye);
-  return Math.abs(dot(tilted.forward, pivot.up)) < 0.985 ? tilted : level;
+  return notOver(level, turnView(level, level.right, pitch, view.eye), pivot.up);
 }
 
 /** View and pivot moved along the view's own axes, in scene units. */

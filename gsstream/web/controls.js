@@ -1,8 +1,11 @@
 // Mouse, touch and keys move the view: orbit, pan, zoom and fly.
 
 import { distance, looked, moved, orbited, zoomed } from "./camera.js";
+import { outside, returned } from "./region.js";
 
 const RADIANS_PER_PIXEL = 0.006;
+/** In this time a view outside the recorded region comes back most of the way, seconds. */
+const RETURN = 0.15;
 const FLY = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, 1, 0], e: [0, -1, 0] };
 
 /** Moves `scene.view` and `scene.pivot` and calls `scene.moved()`. Listens on `canvas` and, for keys, on `keys`. */
@@ -30,13 +33,20 @@ export class Controls {
     this.abort.abort();
   }
 
-  /** Fly with the keys that are held, for `seconds`; returns whether the view moved. */
+  /** Fly with the keys that are held, for `seconds`, or go back into the region when nothing holds the view outside. */
   fly(seconds) {
     const { scene } = this;
-    if (!this.held.size || !scene.view) return false;
+    if (!scene.view) return;
     const speed = 0.6 * distance(scene.view, scene.pivot) * seconds;
     for (const key of this.held) this._shift(FLY[key].map((v) => v * speed));
-    return true;
+    if (this.held.size || this.pointers.size || !this.outside) return;
+    this._place(scene.view, this.outside < 0.01 ? 1 : 1 - Math.exp(-seconds / RETURN), 0);
+  }
+
+  /** 0 while the view is within the recorded region, 1 where the picture has faded. */
+  get outside() {
+    const { region, view, pivot } = this.scene;
+    return region && view ? outside(region, view, pivot) : 0;
   }
 
   _down(event) {
@@ -78,9 +88,15 @@ export class Controls {
     this._set(view);
   }
 
+  /** What lies beyond the limits and the width in which the picture fades is cut off. */
   _set(view) {
-    this.scene.view = view;
-    this.scene.moved();
+    this._place(view, 1, 1);
+  }
+
+  _place(view, share, slack) {
+    const { scene } = this;
+    Object.assign(scene, scene.region ? returned(scene.region, view, scene.pivot, slack, share) : { view });
+    scene.moved();
   }
 
   _wheel(event) {

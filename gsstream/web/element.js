@@ -1,7 +1,7 @@
 // <gsstream-player src="stream.json">: a player with its controls, for any page.
 //
 // Attributes: src, camera (id of a recorded camera), autoplay, loop ("false" plays once), speed, marks, statistics,
-// controls ("false" shows none).
+// controls ("false" shows none), limits ("none" lets the view leave the recorded region).
 
 import { Controls } from "./controls.js";
 import { Player } from "./player.js";
@@ -99,6 +99,7 @@ export class PlayerElement extends HTMLElement {
       camera: this.getAttribute("camera"),
       loop: this.getAttribute("loop") !== "false",
       speed: Number(this.getAttribute("speed") ?? 1),
+      limits: this.getAttribute("limits") !== "none",
       beforeFrame: (seconds) => this.controls?.fly(seconds),
     });
     this.player.marks = this.hasAttribute("marks");
@@ -140,6 +141,9 @@ export class PlayerElement extends HTMLElement {
     player.addEventListener("frame", () => this._progress());
     player.addEventListener("ready", () => this._fillLists());
     player.addEventListener("state", () => this._progress());
+    player.addEventListener("view", () => {
+      parts.canvas.style.opacity = 1 - this.controls.outside;
+    });
     player.addEventListener("problem", ({ detail }) => this._tell(detail));
     this.addEventListener("keydown", (event) => this._key(event));
     this.addEventListener("pointermove", () => this._wake());

@@ -6,6 +6,7 @@ import { KIND } from "./container.js";
 import { Snapshots, decodePacket } from "./decode.js";
 import { PacketError } from "./errors.js";
 import { Renderer } from "./renderer.js";
+import { regionOf } from "./region.js";
 import { openSource } from "./source.js";
 
 /** Decoding may take so many milliseconds before the page gets its turn; what lies before the target is not drawn. */
@@ -28,7 +29,7 @@ export class Player extends EventTarget {
     this.speed = options.speed ?? 1;
     this.playing = false;
     this.state = null;
-    this.view = this.pivot = null;
+    this.view = this.pivot = this.region = null;
     this.views = [];
     this.buffer = this.problem = null;
     this.snapshots = new Snapshots();
@@ -116,6 +117,7 @@ export class Player extends EventTarget {
   look(index) {
     this.view = { ...this.views[index] };
     this.pivot = pivotOf(this.views);
+    this.region = this.options.limits === false ? null : regionOf(this.views, this.pivot);
     this.moved();
   }
 

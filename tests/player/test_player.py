@@ -18,9 +18,10 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.world import IDENTITY
 from gsstream.packet import KeyState, StreamMeta, StreamWriter, encode_delta, encode_empty, encode_key
 from gsstream.parts.render.reference import ReferenceRenderer
-from gsstream.player.paths import camera_path, focus_point
+from gsstream.player.paths import camera_path
 from gsstream.player.play import play
 from gsstream.player.playback import Playback
+from gsstream.player.region import focus_point
 from gsstream.player.render import PlayerRenderer, SlowRendererWarning, find_renderer, render, to_bytes
 from gsstream.player.software import render_numpy
 

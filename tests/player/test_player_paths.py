@@ -15,8 +15,9 @@ from gsstream.core.errors import InputError, OutputError, PluginUnavailable, Unk
 from gsstream.core.world import World
 from gsstream.player.camera_file import read_path
 from gsstream.player.export import export
-from gsstream.player.paths import MIN_SWING, camera_path, resized
+from gsstream.player.paths import camera_path, resized
 from gsstream.player.play import play
+from gsstream.player.region import MIN_SWING
 from gsstream.player.render import named_renderer
 
 OUT_OF_ARC = 1e-6

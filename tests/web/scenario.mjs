@@ -12,6 +12,8 @@ const plan = JSON.parse(readFileSync(from));
 const browser = await Browser.start(chromium, plan);
 const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
+const mouse = (type, x, y, more) => browser.send("Input.dispatchMouseEvent", { type, x, y, ...more });
+
 const actions = {
   go: (url) => browser.go(url),
   until: (expression, seconds) => browser.until(expression, seconds),
@@ -22,27 +24,18 @@ const actions = {
     await browser.send("Input.dispatchKeyEvent", { type: "keyDown", key, text: key.length === 1 ? key : undefined });
     await browser.send("Input.dispatchKeyEvent", { type: "keyUp", key });
   },
-  drag: async (x, y, dx, dy, button = "left") => {
+  // Press a button and move; `release` lets go.
+  hold: async (x, y, dx, dy, button = "left") => {
     const buttons = button === "left" ? 1 : 2;
-    await browser.send("Input.dispatchMouseEvent", { type: "mousePressed", x, y, button, buttons, clickCount: 1 });
-    for (let i = 1; i <= 8; i += 1) {
-      await browser.send("Input.dispatchMouseEvent", {
-        type: "mouseMoved",
-        x: x + (dx * i) / 8,
-        y: y + (dy * i) / 8,
-        button,
-        buttons,
-      });
-    }
-    await browser.send("Input.dispatchMouseEvent", {
-      type: "mouseReleased",
-      x: x + dx,
-      y: y + dy,
-      button,
-      clickCount: 1,
-    });
+    await mouse("mousePressed", x, y, { button, buttons, clickCount: 1 });
+    for (let i = 1; i <= 8; i += 1) await mouse("mouseMoved", x + (dx * i) / 8, y + (dy * i) / 8, { button, buttons });
   },
-  wheel: (x, y, deltaY) => browser.send("Input.dispatchMouseEvent", { type: "mouseWheel", x, y, deltaX: 0, deltaY }),
+  release: (x, y, button = "left") => mouse("mouseReleased", x, y, { button, clickCount: 1 }),
+  drag: async (x, y, dx, dy, button) => {
+    await actions.hold(x, y, dx, dy, button);
+    await actions.release(x + dx, y + dy, button);
+  },
+  wheel: (x, y, deltaY) => mouse("mouseWheel", x, y, { deltaX: 0, deltaY }),
   // RGBA bytes of a frame, drawn at the recording's size in exact depth order.
   picture: (frame, width, height) =>
     browser.evaluate(`(async () => {

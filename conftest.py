@@ -52,7 +52,7 @@ QUICK_FILES = (
 )  # fmt: skip
 #: Too slow for that in these rooms.
 NOT_QUICK = (
-    "packet/test_fuzz", "packet/test_corrupt", "packet/test_births",
+    "packet/test_fuzz", "packet/test_corrupt", "packet/test_row_edits",
     "packet/test_motion_packets", "player/test_player_memory", "plugins/test_six_rings", "plugins/test_broken_plugins",
     "method/test_whole_method", "recipe/test_recipe_schema", "recipe/test_recipe_typos",
 )  # fmt: skip

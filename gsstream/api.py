@@ -14,7 +14,7 @@ from gsstream.core.changes import Groups as Groups
 from gsstream.core.changes import Layout as Layout
 from gsstream.core.changes import Motion as Motion
 from gsstream.core.changes import Residual as Residual
-from gsstream.core.changes import Rows as Rows
+from gsstream.core.changes import RowEdit as RowEdit
 from gsstream.core.changes import Scene as Scene
 from gsstream.core.changes import add_as_nodes as add_as_nodes
 from gsstream.core.changes import add_to_nodes as add_to_nodes

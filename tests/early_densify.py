@@ -12,7 +12,7 @@ from gsstream.engine.fit import schedule
 
 @contextmanager
 def densifying(begin: int, every: int, gradient: float = schedule.DENSIFY_GRADIENT) -> Iterator[None]:
-    """In this process Gaussians are born from this iteration of frame 0 on, once in so many."""
+    """In this process Gaussians are added from this iteration of frame 0 on, once in so many."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(schedule, "DENSIFY_FROM", begin)
         patch.setattr(schedule, "DENSIFY_EVERY", every)

@@ -1,4 +1,4 @@
-"""A growth part for tests of whole runs, and how to have it installed: Gaussians are born, fitted, and leave."""
+"""A growth part for tests of whole runs, and how to have it installed: Gaussians are added, fitted, and leave."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 import torch
 from pydantic import Field
 
-from gsstream.api import FitContext, Growth, PartConfig, Rng, Rows, Scene, add_as_nodes, add_to_nodes
+from gsstream.api import FitContext, Growth, PartConfig, Rng, RowEdit, Scene, add_as_nodes, add_to_nodes
 from gsstream.blocks import fit_added
 from gsstream.spec import ComponentSpec, hookimpl
 
@@ -25,9 +25,9 @@ class CopyGrowth(Growth):
     source = "gsstream"
 
     class Config(PartConfig):
-        per_frame: int = Field(default=24, ge=1, le=1000, description="Gaussians born in a frame, half as many leave")
+        per_frame: int = Field(default=24, ge=1, le=1000, description="Gaussians added in a frame, half as many go")
 
-    def propose(self, after: Scene, work: FitContext, rng: Rng) -> Rows | None:
+    def propose(self, after: Scene, work: FitContext, rng: Rng) -> RowEdit | None:
         changed = np.flatnonzero(work.changed_rows(0.5).numpy())
         number = min(self.config.per_frame, len(changed))
         if not number:
@@ -41,13 +41,13 @@ class CopyGrowth(Growth):
         fitted = fit_added(scene, copies.map(torch.from_numpy), work, views, 1, rng).map(torch.Tensor.numpy)
         layout = after.layout
         units = layout.unit_of[rows]
-        births = (
+        added = (
             add_to_nodes(fitted, layout.node_of[rows], units)
             if work.index % 2
             else add_as_nodes(fitted, units, len(layout.node_counts))
         )
         faintest = np.argsort(after.gaussians.opacities, kind="stable")[: number // 2]
-        return Rows(births, np.sort(faintest))
+        return RowEdit(added, np.sort(faintest))
 
 
 @hookimpl

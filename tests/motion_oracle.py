@@ -82,7 +82,7 @@ class World:
                 self.moved[row] = (shift, turn)
 
     def edit(self, source: list[int], means: list[Row], quats: list[Row], sh0: list[Row]) -> None:
-        """Last paragraph: rows leave and join. ``source``: for every row, which one it was, or from N on a birth.
+        """Last paragraph: rows leave and join. ``source``: for every row, which one it was, from N on an added one.
 
         The values are those of all rows afterwards.
         """

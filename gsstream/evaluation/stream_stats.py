@@ -186,12 +186,12 @@ def paper_estimate(state: PlayerState, kind: PacketKind) -> float:
             continue
         for column in table.T:
             bits += entropy_bits(np.concatenate([column, np.zeros(number - rows, column.dtype)]))
-    born = 0.0 if delta.births is None else _plain_estimate(delta.births.gaussians)
-    return (bits + entropy_bits(gates != 0)) / 8 + born
+    added = 0.0 if delta.added is None else _plain_estimate(delta.added.gaussians)
+    return (bits + entropy_bits(gates != 0)) / 8 + added
 
 
 def _plain_estimate(gaussians: Gaussians[FloatArray]) -> float:
-    """Bytes of whole Gaussians by the rule of frame 0; also used for births, which the paper's method does not have."""
+    """Bytes of whole Gaussians by the rule of frame 0; used for added ones too, which the paper's method lacks."""
     colors = np.asarray(gaussians.shN).reshape(len(gaussians), -1)
     plain = sum(array.nbytes for name, array in gaussians.items() if name != "shN")
     return float(plain) + sum(entropy_bits(column) for column in colors.T) / 8
@@ -210,19 +210,19 @@ def float16_bytes(gaussians: Gaussians[FloatArray], names: Sequence[str], rows: 
 
 
 def _plain_bytes(state: PlayerState, rows: IntArray) -> int:
-    """:func:`float16_bytes` of a packet: moved rows by what moved, whole Gaussians for keys and births."""
+    """:func:`float16_bytes` of a packet: moved rows by what moved, whole Gaussians for keys and added Gaussians."""
     delta = state.delta
     if delta is None:
         return float16_bytes(state.gaussians, ATTRIBUTES, rows)
-    born = 0
-    if delta.births is not None:
-        born = float16_bytes(delta.births.gaussians, ATTRIBUTES, np.arange(len(delta.births)))
+    added = 0
+    if delta.added is not None:
+        added = float16_bytes(delta.added.gaussians, ATTRIBUTES, np.arange(len(delta.added)))
     names = () if delta.residual is None else tuple(delta.residual.symbols)
     if not delta.has_row_edit:
         return float16_bytes(state.gaussians, names, rows)
     assert state.before is not None
-    source = gather_rows(state.before.node_of, delta.births, delta.deaths)
-    return born + float16_bytes(state.gaussians, names, np.flatnonzero(np.isin(source, rows)))
+    source = gather_rows(state.before.node_of, delta.added, delta.removed)
+    return added + float16_bytes(state.gaussians, names, np.flatnonzero(np.isin(source, rows)))
 
 
 def _packet(entry: Entry, data: bytes, state: PlayerState, seconds: float) -> PacketStats:

@@ -54,7 +54,7 @@ class PacketKind(IntEnum):
 
 
 SECTION_NAMES: Mapping[int, str] = {
-    1: "meta", 2: "layout", 3: "gates", 4: "decoders", 5: "index", 6: "deaths", 7: "births",
+    1: "meta", 2: "layout", 3: "gates", 4: "decoders", 5: "index", 6: "removed", 7: "added",
     8: "motion", 9: "pattern", 10: "field", 11: "layers", 12: "rest",
     **{16 + i: name for i, name in enumerate(ATTRIBUTES)}
 }  # fmt: skip

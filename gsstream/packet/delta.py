@@ -16,7 +16,7 @@ from gsstream.packet.changes.residual import decode_residual, encode_residual
 from gsstream.packet.changes.rows import decode_rows_change, encode_rows_change
 
 #: Sections of a delta packet in the order in which they stand there.
-SECTIONS = ("motion", "field", "gates", "pattern", "decoders", *ATTRIBUTES, "deaths", "births")
+SECTIONS = ("motion", "field", "gates", "pattern", "decoders", *ATTRIBUTES, "removed", "added")
 
 
 def next_decoders(previous: Mapping[str, FloatArray], delta: Delta) -> dict[str, FloatArray]:
@@ -46,8 +46,8 @@ def encode_delta(
         sections += encode_field(delta.field)
     if delta.residual is not None:
         sections += encode_residual(delta.residual, layout, previous_decoders)
-    if delta.rows is not None:
-        sections += encode_rows_change(delta.rows, layout)
+    if delta.row_edit is not None:
+        sections += encode_rows_change(delta.row_edit, layout)
     if not sections:
         raise ShapeError("delta: expected at least one change, got none; encode_empty makes the packet of such a frame")
     return build_packet(PacketKind.DELTA, frame, sections)

@@ -88,11 +88,11 @@ def _delta_tables(data: Mapping[str, bytes], layout: Layout) -> Iterator[Table]:
             yield Table(name, len(data[name]), 8.0 * len(data[name]))
     if "gates" in data:
         yield from _residual_tables(data, layout)
-    if "deaths" in data:
-        gone, _ = decode_gates(data["deaths"], len(layout.unit_of))
-        yield _runs_table("deaths", data["deaths"], gone)
-    if "births" in data:
-        yield from _added_tables(data["births"], layout)
+    if "removed" in data:
+        gone, _ = decode_gates(data["removed"], len(layout.unit_of))
+        yield _runs_table("removed", data["removed"], gone)
+    if "added" in data:
+        yield from _added_tables(data["added"], layout)
 
 
 def _residual_tables(data: Mapping[str, bytes], layout: Layout) -> Iterator[Table]:
@@ -122,15 +122,15 @@ def _runs_table(name: str, data: bytes, marks: IntArray) -> Table:
 
 def _added_tables(data: bytes, layout: Layout) -> Iterator[Table]:
     nodes = len(layout.node_counts)
-    births = decode_added(Section(data, 0), nodes, len(layout.units), MAX_GAUSSIANS)
+    added = decode_added(Section(data, 0), nodes, len(layout.units), MAX_GAUSSIANS)
     blobs = unpack_blobs(data, HEAD_PARTS + len(ATTRIBUTES))
-    used, _ = decode_gates(blobs[2], nodes + len(births.parents))
-    yield _table("births", blobs[1], len(births.parents), 1)
-    yield _runs_table("births", blobs[2], used)
-    yield _table("births", blobs[3], int(np.count_nonzero(used)), 1)
-    yield _table("births", blobs[4], len(births), 1)
+    used, _ = decode_gates(blobs[2], nodes + len(added.parents))
+    yield _table("added", blobs[1], len(added.parents), 1)
+    yield _runs_table("added", blobs[2], used)
+    yield _table("added", blobs[3], int(np.count_nonzero(used)), 1)
+    yield _table("added", blobs[4], len(added), 1)
     rows = dict(zip(ATTRIBUTES, blobs[HEAD_PARTS:], strict=True))
-    yield from (table._replace(name="births") for table in _row_tables(rows, len(births)))
+    yield from (table._replace(name="added") for table in _row_tables(rows, len(added)))
 
 
 def _table(name: str, data: bytes, rows: int, channels: int) -> Table:

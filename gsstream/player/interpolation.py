@@ -19,14 +19,15 @@ def interpolate(before: PlayerState, after: PlayerState, share: float) -> Gaussi
     """Return the scene at a moment between two frames that follow each other.
 
     The rows that the later frame displaced have gone and turned ``share`` of their way, at constant speed. Colours,
-    sizes, births and deaths wait for their frame; so does everything before a key packet, which carries no motion.
+    sizes, added and removed Gaussians wait for their frame; so does everything before a key packet, which carries no
+    motion.
     """
     scene, moved = before.gaussians, after.scene.moved
     if share == 0 or moved is None or after.frame != before.frame + 1:
         return scene
     rows, shift, turn = moved.rows, moved.shift, moved.turn
     if after.delta is not None and after.delta.has_row_edit:
-        source = gather_rows(before.layout.node_of, after.delta.births, after.delta.deaths)[rows]
+        source = gather_rows(before.layout.node_of, after.delta.added, after.delta.removed)[rows]
         known = source < len(scene)
         rows, shift, turn = source[known], shift[known], turn[known]
     means, quats = scene.means.copy(), scene.quats.copy()

@@ -16,8 +16,9 @@ from gsstream.packet import PacketKind, PlayerState
 from gsstream.packet.base import MAX_META, Section, add_offset, parse_packet
 from gsstream.packet.bits import BitReader, unpack_blobs
 
-#: Bytes at the peak for every number of a Gaussian in a key packet or a birth (4 of them stay), for every Gaussian
-#: that a delta reaches, for every byte of meta as JSON (lists of empty objects are worst), and for every pixel.
+#: Bytes at the peak for every number of a Gaussian in a key packet or an added Gaussian (4 of them stay), for every
+#: Gaussian that a delta reaches, for every byte of meta as JSON (lists of empty objects are worst), and for every
+#: pixel.
 PER_NUMBER, PER_DELTA_ROW, PER_META_BYTE, PER_PIXEL = 30, 200, 30, 48
 _COUNTS = struct.Struct("<II")
 
@@ -81,9 +82,9 @@ def _key(sections: dict[str, Section]) -> int:
 
 def _births(sections: dict[str, Section]) -> int:
     """How many Gaussians a delta packet adds, by the head of its section."""
-    if "births" not in sections:
+    if "added" not in sections:
         return 0
-    section = sections["births"]
+    section = sections["added"]
     with add_offset(section.offset):
         # The number stands in the first bits; a head may be as long as the packet, and bits take memory, too.
         return BitReader(unpack_blobs(section.data, 2)[0][:16]).gamma() + 1

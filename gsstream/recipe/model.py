@@ -55,7 +55,7 @@ class FirstFrame(Section):
     lr_factor: float = Field(
         default=2.0, gt=0, le=100,
         description="factor on 3DGS's learning rates of everything but the centres, which are meant for 30,000 "
-        "iterations: in fewer, Gaussians that grow into place faster leave less for others to be born for; 1: as there",
+        "iterations: in fewer, Gaussians that grow into place faster leave less for added ones to fill; 1: as there",
     )  # fmt: skip
     max_gaussians: int = Field(default=60_000, ge=1, description="upper bound on the number of Gaussians")
     prune_error: float = Field(
@@ -169,7 +169,7 @@ class Recipe(Section):
     motion: ComponentRef = Field(default=ComponentRef(name="still"), description="what moves before the residual")
     regularizer: ComponentRef = Field(default=ComponentRef(name="none"), description="what openness costs")
     update: ComponentRef = Field(default=ComponentRef(name="additive"), description="how a gated change is applied")
-    growth: ComponentRef = Field(default=ComponentRef(name="none"), description="which Gaussians are born and leave")
+    growth: ComponentRef = Field(default=ComponentRef(name="none"), description="which Gaussians are added and removed")
     streaming_method: ComponentRef = Field(
         default=ComponentRef(name="parts"),
         description="what goes from frame to frame; parts: the slots above; other methods bring their own",

@@ -33,10 +33,10 @@ def track_rows(source: IntArray, state: PlayerState) -> IntArray:
     if state.delta is None or not state.delta.has_row_edit:
         return source
     assert state.before is not None
-    births = state.delta.births
-    gathered = gather_rows(state.before.node_of, births, state.delta.deaths)
-    born = np.full(0 if births is None else len(births), -1, np.int64)
-    return np.concatenate([source, born])[gathered]
+    added = state.delta.added
+    gathered = gather_rows(state.before.node_of, added, state.delta.removed)
+    none = np.full(0 if added is None else len(added), -1, np.int64)
+    return np.concatenate([source, none])[gathered]
 
 
 def encode_join(key: PlayerState, state: PlayerState, source: IntArray) -> bytes:

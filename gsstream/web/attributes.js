@@ -1,4 +1,4 @@
-// Whole Gaussians as integers: the attribute sections of a key packet, and the births of a delta packet.
+// Whole Gaussians as integers: the attribute sections of a key packet, and the added Gaussians of a delta packet.
 
 import { unpackParts } from "./bits.js";
 import { PacketError, located } from "./errors.js";

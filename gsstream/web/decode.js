@@ -76,13 +76,13 @@ function decodeDelta(found, state, offset) {
   const stray = names.find((name) => RESIDUAL.includes(name));
   if (stray && !found.gates) throw new PacketError(`delta packet: section ${stray} without gates`, found[stray].offset);
   const residual = found.gates ? decodeResidual(found, state, offset) : null;
-  const rows = found.deaths || found.births ? decodeRows(found, state, offset) : null;
+  const rows = found.removed || found.added ? decodeRows(found, state, offset) : null;
   return { motions, residual, rows };
 }
 
 /**
  * Apply what was decoded, in order. Returns what changed: `moved`, lists of rows with their gates and attributes as
- * they were numbered before births and deaths, and `source`, the row each row was before (null when none joined or
+ * they were numbered before Gaussians were added and removed, and `source`, the row each row was before (null when none joined or
  * left; see `applyRows`).
  */
 function applyDelta(state, { motions, residual, rows }) {

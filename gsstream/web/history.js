@@ -50,7 +50,7 @@ function turnBetween(before, b, after, a, out, o) {
   out[o + 2] = known ? (z1 * w0 - w1 * z0 - x1 * y0 + y1 * x0) / w : 0;
 }
 
-/** The displacement of rows after births and deaths; `source` says which of `number` rows each one was. */
+/** The displacement of rows after Gaussians were added and removed; `source` says which of `number` rows each one was. */
 export function gatherDisplacement(moved, source, number) {
   if (!moved) return null;
   const place = new Int32Array(number).fill(-1);
@@ -67,7 +67,7 @@ export function gatherDisplacement(moved, source, number) {
   return { rows: rows.slice(0, at), shift: pick(moved.shift, kept, 3), turn: pick(moved.turn, kept, 3) };
 }
 
-/** The groups of rows after births and deaths: a birth joins the group of the row before it; without old rows, none. */
+/** The groups of rows after Gaussians were added and removed: an added Gaussian joins the group of the row before it; without old rows, none. */
 export function gatherGroups(groups, source, number) {
   if (!groups) return null;
   let first = 0;

@@ -60,25 +60,25 @@ export class ResidentScene {
   }
 
   _follow(change, state, moved) {
-    const { born, dead } = this.slots.follow(change.source, change.before);
+    const { added, removed } = this.slots.follow(change.source, change.before);
     const before = this.capacity;
     this.textures.fit(state, false);
     const { geometry, colours, stamps } = this.textures;
-    for (const slot of born) {
+    for (const slot of added) {
       stamps[slot] = state.frame;
       geometry.mark(slot);
       colours.mark(slot);
     }
-    for (const slot of dead) {
+    for (const slot of removed) {
       stamps[slot] = -1;
       geometry.mark(slot);
     }
     const anew = this.capacity !== before;
-    return { anew, moved: anew ? this.slots.slotOf : [...moved, ...born, ...dead] };
+    return { anew, moved: anew ? this.slots.slotOf : [...moved, ...added, ...removed] };
   }
 }
 
-/** A row keeps its slot for as long as it lives; slots of the dead are given to the born. */
+/** A row keeps its slot until it is removed; added rows take the slots of removed ones. */
 class Slots {
   constructor() {
     this.reset(0);
@@ -93,35 +93,35 @@ class Slots {
   }
 
   /**
-   * Follow births and deaths: `source` says which of `before` rows each row was; beyond are births.
+   * Follow added and removed rows: `source` says which of `before` rows each row was; beyond are added rows.
    *
-   * Returns `{ born, dead }`, lists of slots.
+   * Returns `{ added, removed }`, lists of slots.
    */
   follow(source, before) {
     const slotOf = new Uint32Array(source.length);
-    const lives = new Uint8Array(before);
-    const births = [];
+    const stays = new Uint8Array(before);
+    const addedRows = [];
     source.forEach((row, i) => {
       if (row < before) {
         slotOf[i] = this.slotOf[row];
-        lives[row] = 1;
+        stays[row] = 1;
       } else {
-        births.push(i);
+        addedRows.push(i);
       }
     });
-    const dead = [];
-    for (let row = 0; row < before; row += 1) if (!lives[row]) dead.push(this.slotOf[row]);
-    this.free.push(...dead);
-    const born = births.map((i) => {
+    const removed = [];
+    for (let row = 0; row < before; row += 1) if (!stays[row]) removed.push(this.slotOf[row]);
+    this.free.push(...removed);
+    const added = addedRows.map((i) => {
       slotOf[i] = this.free.length ? this.free.pop() : this.used++;
       return slotOf[i];
     });
-    const alive = new Set(born);
+    const reused = new Set(added);
     this.slotOf = slotOf;
     this.rowOf = new Int32Array(this.used).fill(-1);
     slotOf.forEach((slot, row) => {
       this.rowOf[slot] = row;
     });
-    return { born, dead: dead.filter((slot) => !alive.has(slot)) };
+    return { added, removed: removed.filter((slot) => !reused.has(slot)) };
   }
 }

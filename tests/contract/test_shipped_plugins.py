@@ -36,14 +36,14 @@ def test_everything_shipped_keeps_the_contract(distribution: str, capsys: pytest
 BORN = {"gradient": 1e-6, "rounds": 1, "most": 9}
 ANCHORS = {"measure": "anchor", "change": 6.0, "step": 0.02, "rotation_step": 0.002}
 CACHE = {"levels": 4, "entries": 8, "width": 8, "lr": 0.02, "box": 0.0}
-#: Whole method -> settings under which something moves, and is born, in three frames of one or two passes.
+#: Whole method -> settings under which something moves, and is added, in three frames of one or two passes.
 EAGER: dict[str, list[dict[str, Any]]] = {
     "comgs": [{
         "motion": {"keypoints": 20, "step": 0.02, "change": 0.0}, "correction": {"every": 1, "passes": 1, "step": 1e-3},
     }],
     "hicom": [{"motion": {"measure": "cell", "change": 6.0, "step": 0.02}, "births": BORN}],
     "queen": [{}, {
-        "births": {"every": 1, "after": 0, "until": 1, "gradient": 1e-6, "most": 20}, "rows": "dynamic",
+        "growth": {"every": 1, "start": 0, "stop": 1, "grad_threshold": 1e-6, "max_added": 20}, "rows": "dynamic",
         "change": {"dynamic": 1e-8}, "rate": 1e-3, "sigma": 1e-4,
     }],
     "recon": [{"motion": ANCHORS, "births": BORN}],

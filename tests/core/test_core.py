@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.changes import Delta, Layout, Motion, Residual, Rows, Scene, apply_delta, sent_rows
+from gsstream.core.changes import Delta, Layout, Motion, Residual, RowEdit, Scene, apply_delta, sent_rows
 from gsstream.core.errors import (
     ComponentError,
     GsstreamError,
@@ -319,13 +319,13 @@ class TestDelta:
             apply_delta(Scene(make(5), self.layout()), self.delta(**changes))
 
     @pytest.mark.parametrize("kinds", [
-        (Residual, Motion), (Rows, Motion), (Rows, Residual), (Residual, Residual), (Rows, Rows),
-        (Motion, Rows, Motion),
+        (Residual, Motion), (RowEdit, Motion), (RowEdit, Residual), (Residual, Residual), (RowEdit, RowEdit),
+        (Motion, RowEdit, Motion),
     ])  # fmt: skip
     def test_changes_in_another_order_are_refused(self, kinds: tuple[type, ...]) -> None:
         some = {
             Motion: Motion(1.0, 1, np.zeros(1, np.uint8), np.zeros((0, 6), np.int32)),
-            Residual: self.delta().residual, Rows: Rows(deaths=np.array([0])),
+            Residual: self.delta().residual, RowEdit: RowEdit(removed=np.array([0])),
         }  # fmt: skip
         names = ", ".join(kind.__name__ for kind in kinds)
         wanted = f"motions, then one field, then one residual, then one change of rows; got {names}"
@@ -334,12 +334,12 @@ class TestDelta:
 
     def test_a_residual_or_rows_are_exchanged_in_their_place(self) -> None:
         motion = Motion(1.0, 1, np.zeros(1, np.uint8), np.zeros((0, 6), np.int32))
-        residual, rows = self.delta().residual, Rows(deaths=np.array([0]))
+        residual, rows = self.delta().residual, RowEdit(removed=np.array([0]))
         whole = Delta((motion, motion, residual, rows))
-        assert Delta((motion, motion)).with_rows(rows).with_residual(residual).changes == whole.changes
+        assert Delta((motion, motion)).with_row_edit(rows).with_residual(residual).changes == whole.changes
         assert whole.with_residual(None).changes == (motion, motion, rows)
-        assert whole.with_rows(Rows()).changes == (motion, motion, residual)
-        assert (whole.motions, whole.residual, whole.rows) == ((motion, motion), residual, rows)
+        assert whole.with_row_edit(RowEdit()).changes == (motion, motion, residual)
+        assert (whole.motions, whole.residual, whole.row_edit) == ((motion, motion), residual, rows)
         assert whole.with_residual(None).gates(self.layout()).tolist() == [0, 0, 0]
 
     def test_rows_do_not_depend_on_their_neighbours(self) -> None:

@@ -18,7 +18,7 @@ from gsstream.core.changes import (
     Layout,
     Motion,
     Residual,
-    Rows,
+    RowEdit,
     Scene,
     add_as_nodes,
     add_to_nodes,
@@ -202,7 +202,7 @@ def test_a_frame_without_motion_or_residual_forgets_displacements() -> None:
     scene = scene_of([[0.5, 0, 0], [0.5, 1, 0]])
     scene = play(scene, move(scene, shift=(1, 0, 0)))
     assert scene.moved is not None
-    assert play(scene, Rows(deaths=np.array([0]))).moved is None
+    assert play(scene, RowEdit(removed=np.array([0]))).moved is None
 
 
 @given(SEEDS)
@@ -273,7 +273,7 @@ def spread() -> Scene:
 
 
 def test_births_join_the_group_of_the_row_stored_before_them() -> None:
-    after = play(spread(), Rows(born(3, [2, 0, 0])))
+    after = play(spread(), RowEdit(born(3, [2, 0, 0])))
     assert after.groups.group_of.tolist() == [0, 1, 1, 1, 2, 3, 4, 5, 5]
     assert after.groups.count == 6
     assert after.moved is None, "nothing moved in that frame"
@@ -281,17 +281,17 @@ def test_births_join_the_group_of_the_row_stored_before_them() -> None:
 
 def test_births_in_the_frame_of_a_motion_do_not_count_as_displaced() -> None:
     scene = spread()
-    after = play(scene, move(scene), Rows(born(3, [2, 0, 0])))
+    after = play(scene, move(scene), RowEdit(born(3, [2, 0, 0])))
     assert after.moved.rows.tolist() == [0, 1, 4, 5, 6, 7]
     assert after.moved.shift[:, 0].tolist() == [1, 2, 3, 4, 5, 6]
     following = play(after, move(after))
     step = following.gaussians.means[:, 0] - after.gaussians.means[:, 0]
-    assert step.tolist() == [1, 2, 2, 2, 3, 4, 5, 6, 6], "what was born goes with its neighbours"
+    assert step.tolist() == [1, 2, 2, 2, 3, 4, 5, 6, 6], "what was added goes with its neighbours"
 
 
 def test_deaths_take_rows_out_of_groups_and_displacements() -> None:
     scene = spread()
-    after = play(scene, move(scene), Rows(deaths=np.array([0, 3, 5])))
+    after = play(scene, move(scene), RowEdit(removed=np.array([0, 3, 5])))
     assert after.groups.group_of.tolist() == [1, 2, 4]
     assert after.groups.count == 6, "groups keep their numbers, also empty ones"
     assert after.moved.rows.tolist() == [0, 1, 2]
@@ -302,7 +302,7 @@ def test_deaths_take_rows_out_of_groups_and_displacements() -> None:
 
 def test_first_rows_that_are_born_join_the_first_old_row() -> None:
     scene = spread()
-    after = play(scene, Rows(born(2, [0, 0]), np.array([0, 1])))
+    after = play(scene, RowEdit(born(2, [0, 0]), np.array([0, 1])))
     assert after.gaussians.means[:2].tolist() == [[50] * 3] * 2
     assert after.groups.group_of.tolist() == [2, 2, 2, 3, 4, 5]
 
@@ -310,7 +310,7 @@ def test_first_rows_that_are_born_join_the_first_old_row() -> None:
 @pytest.mark.parametrize("births", [0, 3])
 def test_without_an_old_row_the_groups_are_forgotten(births: int) -> None:
     new = add_as_nodes(scene_of(np.ones((3, 3))).gaussians, np.zeros(3), 3) if births else None
-    after = play(spread(), Rows(new, np.arange(6)))
+    after = play(spread(), RowEdit(new, np.arange(6)))
     assert after.groups is None
     assert play(after, move(after, predicted=True)).groups.count == (1 if births else 0)
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from gsstream.core.changes import Delta, Layout, Motion, Residual, Rows, Scene, add_as_nodes, sent_rows
+from gsstream.core.changes import Delta, Layout, Motion, Residual, RowEdit, Scene, add_as_nodes, sent_rows
 from gsstream.core.gaussians import Gaussians
 from gsstream.engine.budget.trim import _GATE_BITS, _Table, trim_to_size
 from gsstream.packet import EncodedPacket, encode_delta, encode_empty, quantise_decoders
@@ -28,15 +28,15 @@ def scene(seed: int, *, spread: float = 4.0, share: float = 0.7, births: int = 0
     symbols = {name: value for name, value in symbols.items() if value.any()}
     shapes = {"quats": (6, 4), "sh0": (4, 3)}
     decoders = {n: g.normal(size=shapes[n]).astype(np.float32) for n in shapes if n in symbols}
-    born = None
+    added = None
     if births:
         colour = Gaussians(
             means=g.normal(size=(births, 3)), quats=g.normal(size=(births, 4)), scales=g.normal(size=(births, 3)),
             opacities=g.normal(size=births), sh0=g.normal(size=(births, 1, 3)), shN=np.zeros((births, 0, 3)),
         ).map(lambda value: np.asarray(value, np.float32))  # fmt: skip
-        born = add_as_nodes(colour, np.zeros(births, np.uint8), NODES)
+        added = add_as_nodes(colour, np.zeros(births, np.uint8), NODES)
     residual = Residual(gates, 10, symbols, dict.fromkeys(symbols, 0.5), quantise_decoders(decoders))
-    delta = Delta((residual,)).with_rows(Rows(born))
+    delta = Delta((residual,)).with_row_edit(RowEdit(added))
     curvature = {name: g.exponential(size=value.shape) for name, value in symbols.items()}
     return delta, curvature, layout
 
@@ -67,9 +67,9 @@ def test_a_packet_never_exceeds_a_feasible_size(seed: int, share: float, spread:
     assert fitted.untrimmed == whole
     if whole <= limit:
         assert fitted.delta is delta
-        assert (fitted.symbols, fitted.gates, fitted.births) == (0, 0, 0)
+        assert (fitted.symbols, fitted.gates, fitted.added) == (0, 0, 0)
         return
-    assert fitted.symbols + fitted.gates + fitted.births > 0
+    assert fitted.symbols + fitted.gates + fitted.added > 0
     if fitted.delta.is_empty:
         return
     # What was decided is what is sent: the packet decodes to it.
@@ -114,8 +114,8 @@ def test_births_go_when_nothing_else_helps() -> None:
     delta, curvature, layout = scene(1, births=40)
     encode = encoder(layout)
     plain = trim_to_size(delta, encode(delta), curvature, layout, encode, 400)
-    assert plain.delta.births is None
-    assert plain.births == 40
+    assert plain.delta.added is None
+    assert plain.added == 40
     assert len(plain.packet.data) <= 400
 
 

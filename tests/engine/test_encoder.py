@@ -35,7 +35,7 @@ TINY: Mapping[str, Any] = {
     "first_frame.prune_error": 0,
 }  # fmt: skip
 GROWING: Mapping[str, Any] = {"growth": "copies", "growth.per_frame": 24}
-#: Gaussians are born and pruned in the first two of the three frames, so that all that goes on has to go on exactly.
+#: Gaussians are added and pruned in the first two of the three frames, so that all that goes on has to go on exactly.
 REFINING: Mapping[str, Any] = {
     "stream.refine_frames": 3, "stream.refine_iterations": 6,
 }
@@ -115,12 +115,12 @@ def test_it_makes_the_packets_of_a_run_on_disk(tmp_path: Path, case: str) -> Non
 
 
 def test_the_cases_are_what_they_say() -> None:
-    """A case in which nothing moves or nobody is born would prove nothing about it."""
+    """A case in which nothing moves or nobody is added would prove nothing about it."""
     for case, settings in CASES.items():
         later = [step.metrics for step in whole(case)[1:]]
         kinds = [step.status for step in whole(case)]
         assert any(line["moving_groups"] > 0 for line in later) == (settings["motion"] != "still"), case
-        assert any(line["births"] > 0 for line in later) == ("growth" in settings), case
+        assert any(line["added_gaussians"] > 0 for line in later) == ("growth" in settings), case
         # The refined first frame comes first, periods of key packets after it.
         every, refined = settings.get("codec.key_interval", 6), settings.get("stream.refine_frames")
         due = range(0, 6, every) if refined is None else {0, *range(refined, 6, every)}

@@ -1,4 +1,4 @@
-"""Encoder state over births and deaths: hierarchy and decoders follow the packet and nothing else."""
+"""Encoder state while Gaussians are added and removed: hierarchy and decoders follow the packet and nothing else."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsstream.core.changes import AddedGaussians, Delta, Residual, Rows
+from gsstream.core.changes import AddedGaussians, Delta, Residual, RowEdit
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.topology import TopologyEdit
@@ -42,15 +42,15 @@ def step(state: StreamState, delta: Delta) -> StreamState:
 
 
 def delta_of(births: AddedGaussians | None, deaths: list[int] | None = None) -> Delta:
-    return Delta((Rows(births, np.array(deaths or [], np.int64)),))
+    return Delta((RowEdit(births, np.array(deaths or [], np.int64)),))
 
 
 def test_the_forest_grows_with_the_packet(state):
     nodes = len(state.player.layout.node_counts)
     # Two new nodes: one below node 4 (which is below node 0), one below that one, and a new root.
     parents = np.array([4, nodes, nodes + 2])
-    born = AddedGaussians(scene(4), np.array([2, nodes, nodes + 1, nodes + 2]), np.zeros(4, np.uint8), parents)
-    after = step(state, delta_of(born, [0, 7]))
+    added = AddedGaussians(scene(4), np.array([2, nodes, nodes + 1, nodes + 2]), np.zeros(4, np.uint8), parents)
+    after = step(state, delta_of(added, [0, 7]))
     after.hierarchy.validate()
     assert after.hierarchy.num_gaussians == len(after.player.gaussians) == 42
     assert after.hierarchy.level.tolist()[nodes:] == [2, 3, 0]

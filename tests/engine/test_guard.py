@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsstream.core.changes import AddedGaussians, Rows
+from gsstream.core.changes import AddedGaussians, RowEdit
 from gsstream.core.errors import ComponentError
 from gsstream.core.frame import Frame
 from gsstream.core.part import unwrapped
@@ -229,24 +229,24 @@ class Odd(Growth):
         return type(self).wanted(after)
 
 
-def _births(after: Any, **changes: Any) -> Rows:
+def _births(after: Any, **changes: Any) -> RowEdit:
     given = {"nodes": np.zeros(1, np.int64), "unit_of": np.zeros(1, np.uint8), "parents": np.zeros(0, np.int64)}
-    return Rows(AddedGaussians(after.gaussians.rows(np.array([0])), **{**given, **changes}))
+    return RowEdit(AddedGaussians(after.gaussians.rows(np.array([0])), **{**given, **changes}))
 
 
 ODD = {
-    "another type": (lambda after: [1, 2], "expected Rows or None, got list"),
+    "another type": (lambda after: [1, 2], "expected RowEdit or None, got list"),
     "a node that is not there": (
-        lambda after: _births(after, nodes=np.array([10**6])), "births: expected nodes from 0 to",
+        lambda after: _births(after, nodes=np.array([10**6])), "added: expected nodes from 0 to",
     ),
     "a unit that is not there": (
         lambda after: _births(after, unit_of=np.array([200], np.uint8)), "expected units 0 to",
     ),
-    "a row that is not there": (lambda after: Rows(None, np.array([10**6])), "deaths: expected rows from 0 to"),
+    "a row that is not there": (lambda after: RowEdit(None, np.array([10**6])), "removed: expected rows from 0 to"),
     "a number that is none": (
-        lambda after: Rows(replace(
-            _births(after).births, gaussians=after.gaussians.rows(np.array([0])).map(lambda v: np.full_like(v, np.nan))
-        )), "births: means: expected finite values, got nan",
+        lambda after: RowEdit(replace(
+            _births(after).added, gaussians=after.gaussians.rows(np.array([0])).map(lambda v: np.full_like(v, np.nan))
+        )), "added: means: expected finite values, got nan",
     ),
 }  # fmt: skip
 

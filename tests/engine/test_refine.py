@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsstream.core.changes import AddedGaussians, Delta, Layout, Rows, Scene
+from gsstream.core.changes import AddedGaussians, Delta, Layout, RowEdit, Scene
 from gsstream.core.errors import ComponentError
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
@@ -214,14 +214,14 @@ def test_what_came_of_a_gaussian_keeps_its_place_and_turn_relative_to_it(seed: i
 
 
 def test_rows_that_leave_and_join_are_followed() -> None:
-    before, mine, born = some(4, 0), some(4, 1), some(1, 2)
-    # Row 1, the last of the first node, leaves, and one is born in its place.
-    births = AddedGaussians(born, np.zeros(1, np.int64), np.zeros(1, np.uint8), np.zeros(0, np.int64))
+    before, mine, added = some(4, 0), some(4, 1), some(1, 2)
+    # Row 1, the last of the first node, leaves, and one is added in its place.
+    added = AddedGaussians(added, np.zeros(1, np.int64), np.zeros(1, np.uint8), np.zeros(0, np.int64))
     after = Gaussians(**{
-        name: np.concatenate([value[[0]], getattr(born, name), value[[2, 3]]]) for name, value in before.items()
+        name: np.concatenate([value[[0]], getattr(added, name), value[[2, 3]]]) for name, value in before.items()
     })
     after.means[3] += 1.0
-    delta = Delta((Rows(births, np.array([1], np.int64)),))
+    delta = Delta((RowEdit(added, np.array([1], np.int64)),))
     found = track_motion(refinement(mine, [0, 1, 2, 3]), player(before, [2, 2]), player(after, [2, 2], delta))
     assert found.ancestors.tolist() == [0, -1, 2, 3]
     assert found.gaussians.means[3].numpy() == pytest.approx(mine.means[3] + 1.0, abs=1e-5)

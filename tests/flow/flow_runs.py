@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from gsstream.cli.main import run_command
-from gsstream.core.changes import Rows, add_as_nodes, add_to_nodes
+from gsstream.core.changes import RowEdit, add_as_nodes, add_to_nodes
 from gsstream.core.frame import Frame
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.state.stream_state import StreamState
@@ -150,10 +150,10 @@ def growing(monkeypatch: pytest.MonkeyPatch, method: str) -> None:
         copies = replace(copies, means=copies.means + rng.normal(0, 0.02, (20, 3)).astype(np.float32))
         levels = player.layout.unit_of[rows]
         if method == "dense":
-            births = add_as_nodes(copies, levels, len(player.layout.node_counts))
+            added = add_as_nodes(copies, levels, len(player.layout.node_counts))
         else:
-            births = add_to_nodes(copies, player.layout.node_of[rows], levels)
+            added = add_to_nodes(copies, player.layout.node_of[rows], levels)
         gone = np.sort(rng.choice(len(player.gaussians), 10, replace=False))
-        return delta.with_rows(Rows(births, gone))
+        return delta.with_row_edit(RowEdit(added, gone))
 
     monkeypatch.setattr(step_module, "with_growth", grown)

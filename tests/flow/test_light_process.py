@@ -18,7 +18,7 @@ UNWANTED = ("torch._dynamo", "torch._inductor", "sympy", "torch.fx.experimental.
 
 @pytest.mark.parametrize("method", ["s2gs-edge", "hicom"])
 def test_a_run_loads_no_compiler_and_no_symbols(tmp_path: Path, method: str) -> None:
-    """Neither where motions and residuals are fitted, nor where Gaussians are born and fitted."""
+    """Neither where motions and residuals are fitted, nor where Gaussians are added and fitted."""
     source = demo_copy(tmp_path / "demo", frames=2)
     arguments = ["run", "--method", method, "--source", str(source), "--out", str(tmp_path / "out"), "--no-video"]
     settings = ["first_frame.epochs=1", "stream.epochs=1"]

@@ -75,8 +75,8 @@ RUNS: dict[str, Run] = {
     "growing": Run(4, method="dense", grows=True),
     "growing, with shared gates": Run(4, grows=True),
     "frame 0 of another stream": Run(3, prepare=dense_frame_0),
-    "queen with births": Run(
-        3, method="queen", shows=lambda lines: sum(line.get("births", 0) for line in lines) > 0,
+    "queen with growth": Run(
+        3, method="queen", shows=lambda lines: sum(line.get("added_gaussians", 0) for line in lines) > 0,
         settings={
             "streaming_method__births__every": 1, "streaming_method__births__gradient": 1e-5,
             "streaming_method__births__most": 30,
@@ -88,7 +88,7 @@ RUNS: dict[str, Run] = {
 CUTS = ("in a packet", "between packets", "a line lost", "without metrics", "broken off", "not at all")
 #: A run that is broken off leaves what "between packets" makes of a whole one: tried for real where more than the
 #: scene is carried from frame to frame.
-BROKEN_OFF = ("s2gs-edge", "disturbed, two cameras, one late", "a budget of bytes", "queen with births")
+BROKEN_OFF = ("s2gs-edge", "disturbed, two cameras, one late", "a budget of bytes", "queen with growth")
 KNOWN = set(load_catalog().names("method"))
 CELLS = [
     pytest.param(row, cut, id=f"{row}-{cut}")

@@ -21,7 +21,7 @@ from gsstream.packet import StreamReader
 from tests.flow import capture
 from tests.flow.flow_runs import arguments, demo_copy, encode, metrics
 
-#: Six iterations in each of the frames 1 to 3; Gaussians are born and pruned in the first two of them.
+#: Six iterations in each of the frames 1 to 3; Gaussians are added and pruned in the first two of them.
 REFINED: dict[str, Any] = {
     "stream__refine_frames": 3, "stream__refine_iterations": 6,
 }

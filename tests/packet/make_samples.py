@@ -1,8 +1,8 @@
 """Write the stored samples of the current format version. Run once per format version; old samples are never rewritten.
 
-``stream.gss`` has every kind of packet, births and deaths; ``moving.gss`` has motions: from rest, predicted, corrected,
-of groups formed anew, two in a frame, and births after one; ``field.gss`` has fields; ``world.gss`` lies in other
-coordinates than its recording; the key packets of ``layers.gss`` have layers.
+``stream.gss`` has every kind of packet, added and removed Gaussians; ``moving.gss`` has motions: from rest, predicted,
+corrected, of groups formed anew, two in a frame, and added Gaussians after one; ``field.gss`` has fields; ``world.gss``
+lies in other coordinates than its recording; the key packets of ``layers.gss`` have layers.
 
 Usage: python tests/packet/make_samples.py
 """

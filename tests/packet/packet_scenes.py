@@ -16,7 +16,7 @@ from gsstream.core.changes import (
     Layout,
     Motion,
     Residual,
-    Rows,
+    RowEdit,
     Scene,
     apply_motion,
     field_rows,
@@ -100,13 +100,13 @@ def make_births(rng: np.random.Generator, layout: Layout, number: int, new: int,
 
 
 def make_edit(rng: np.random.Generator, state: PlayerState, births: int = 3, deaths: float = 0.2) -> Delta:
-    """A delta with births in old and new nodes and some deaths; one in three moves nothing else."""
+    """A delta with added Gaussians in old and new nodes and some removed; one in three moves nothing else."""
     delta = make_delta(rng, state.layout, share=0.4 * int(rng.random() < 0.7))
     gone = np.flatnonzero(rng.random(len(state.gaussians)) < deaths)
-    born = None
+    added = None
     if births:
-        born = make_births(rng, state.layout, births, int(rng.integers(0, 3)), state.gaussians.shN.shape[1])
-    return delta.with_rows(Rows(born, gone))
+        added = make_births(rng, state.layout, births, int(rng.integers(0, 3)), state.gaussians.shN.shape[1])
+    return delta.with_row_edit(RowEdit(added, gone))
 
 
 def make_motion(
@@ -130,7 +130,7 @@ def make_motions(rng: np.random.Generator, scene: Scene, number: int, **said: bo
 
 def make_moving_packets(seed: int = 0, **sizes: int) -> list[EncodedPacket]:
     """Key, then frames that move: from rest, predicted, corrected with a residual, still, of groups formed anew, two
-    motions at once, with births after the motion, predicted with what was born.
+    motions at once, with added Gaussians after the motion, predicted with what was added.
     """
     rng = np.random.default_rng(seed)
     state = decode_packet(None, encode_key(make_key(rng, **sizes)).data)
@@ -229,7 +229,7 @@ def moving_state() -> tuple[PlayerState, Delta]:
 def make_packets(
     seed: int = 0, frames: int = 7, key_at: int = 4, edits: tuple[int, ...] = (), layers: bool = False, **sizes: int
 ) -> list[EncodedPacket]:
-    """Key, deltas with a decoder that changes once, an empty packet at frame 2, a second key; births at ``edits``.
+    """Key, deltas with a decoder that changes once, an empty packet at frame 2, a second key; rows added at ``edits``.
 
     With ``layers`` the key packets have them.
     """

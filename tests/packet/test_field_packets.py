@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from packet_scenes import begin, decode_all, follow, make_delta, make_field, make_field_packets, make_motion
 
-from gsstream.core.changes import Delta, FieldShape, Rows, Scene, apply_delta, apply_field, apply_motion, field_rows
+from gsstream.core.changes import Delta, FieldShape, RowEdit, Scene, apply_delta, apply_field, apply_motion, field_rows
 from gsstream.core.changes.hashgrid import evaluate_network
 from gsstream.core.errors import ShapeError
 from gsstream.packet import decode_delta, encode_delta
@@ -133,7 +133,7 @@ def test_a_field_stands_between_motion_and_the_rest():
     there, rows = apply_motion(state.scene, motion)
     field = make_field(rng, there)
     residual = make_delta(rng, state.layout, latent=False).residual
-    delta = Delta((motion, field)).with_rows(Rows(deaths=np.array([3]))).with_residual(residual)
+    delta = Delta((motion, field)).with_row_edit(RowEdit(removed=np.array([3]))).with_residual(residual)
     assert [type(change).__name__ for change in delta.changes] == ["Motion", "Field", "Residual", "Rows"]
     after = follow(state, delta)
     assert after.delta.field is not None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from packet_scenes import begin, follow, make_births, make_delta, make_motion, moving_state
 
-from gsstream.core.changes import Delta, Groups, Motion, Rows, Scene, apply_delta
+from gsstream.core.changes import Delta, Groups, Motion, RowEdit, Scene, apply_delta
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.packet import PlayerState, decode_packet, encode_delta
 from gsstream.packet.base import build_packet, parse_packet
@@ -86,7 +86,7 @@ def test_the_limit_of_a_correction_is_that_of_its_own_step():
     follow(state, Delta((motion,)))
 
 
-@pytest.mark.parametrize("delta", [Delta(), Delta((Rows(),))])
+@pytest.mark.parametrize("delta", [Delta(), Delta((RowEdit(),))])
 def test_a_delta_without_changes_is_not_written(delta):
     """No reader would take it: a delta packet has at least one section."""
     state = begin(np.random.default_rng(12))
@@ -98,11 +98,11 @@ def test_sections_in_another_order_are_refused():
     rng = np.random.default_rng(13)
     state = begin(rng)
     delta = Delta((make_motion(rng, state.scene), *make_delta(rng, state.layout, latent=False).changes))
-    delta = delta.with_rows(Rows(make_births(rng, state.layout, 3, 1), np.array([4])))
+    delta = delta.with_row_edit(RowEdit(make_births(rng, state.layout, 3, 1), np.array([4])))
     packet = encode_delta(delta, state.layout, {}, frame=1)
     header, sections = parse_packet(packet.data)
     names = list(sections)
-    assert names == ["motion", "gates", "pattern", "means", "quats", "opacities", "sh0", "deaths", "births"]
+    assert names == ["motion", "gates", "pattern", "means", "quats", "opacities", "sh0", "removed", "added"]
     for first, second in itertools.pairwise(range(len(names))):
         order = list(names)
         order[first], order[second] = order[second], order[first]

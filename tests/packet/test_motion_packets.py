@@ -30,7 +30,7 @@ from gsstream.core.changes import (
     Layout,
     Motion,
     Residual,
-    Rows,
+    RowEdit,
     add_as_nodes,
     apply_delta,
     apply_motion,
@@ -54,7 +54,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def random_frame(rng: np.random.Generator, state: PlayerState, reach: float) -> Delta | None:
-    """Up to three motions of any kind, then perhaps a residual, births and deaths; None: an empty packet."""
+    """Up to three motions of any kind, then perhaps a residual, added and removed Gaussians; None: an empty packet."""
     if rng.random() < 0.15:
         return None
     scene, motions = state.scene, []
@@ -72,7 +72,7 @@ def random_frame(rng: np.random.Generator, state: PlayerState, reach: float) -> 
         motion = dataclasses.replace(motion, rotation_step=float(np.float32(rng.choice([0.01, 0.3, 40.0]))))
         scene, _ = apply_motion(scene, motion)
         motions.append(motion)
-    rest: tuple[Residual | Rows, ...] = ()
+    rest: tuple[Residual | RowEdit, ...] = ()
     if rng.random() < 0.5:
         rest = make_delta(rng, state.layout).changes
     if rng.random() < 0.4:
@@ -82,7 +82,7 @@ def random_frame(rng: np.random.Generator, state: PlayerState, reach: float) -> 
 
 
 def oracle_step(world: World, state: PlayerState, after: PlayerState) -> None:
-    """Step the oracle with what the packet said. Residual and births are not its subject: their values are taken."""
+    """Step the oracle with what the packet said. Values of residual and added Gaussians are taken as they are."""
     if after.delta is None:
         world.moved = {}
         return
@@ -101,11 +101,11 @@ def oracle_step(world: World, state: PlayerState, after: PlayerState) -> None:
         touched |= set(sent_rows(state.layout, after.delta.residual.gates).tolist())
     world.displaced(means, quats, touched)
     if after.delta.has_row_edit:
-        source = gather_rows(state.layout.node_of, after.delta.births, after.delta.deaths).tolist()
+        source = gather_rows(state.layout.node_of, after.delta.added, after.delta.removed).tolist()
         tables = [world.means, world.quats, world.sh0]
-        if after.delta.births is not None:
-            born = World.of(after.delta.births.gaussians)
-            tables = [world.means + born.means, world.quats + born.quats, world.sh0 + born.sh0]
+        if after.delta.added is not None:
+            added = World.of(after.delta.added.gaussians)
+            tables = [world.means + added.means, world.quats + added.quats, world.sh0 + added.sh0]
         world.edit(source, *([table[row] for row in source] for table in tables))
 
 
@@ -266,8 +266,8 @@ def pinned_stream() -> dict[str, PlayerState]:
     world.move(first)
     world.form_groups(1.0, 1, False)
     add("two", first, motion(1.0, 1, world.count, 2))
-    born = add_as_nodes(scene.rows(np.array([0, 5])), np.zeros(2), 6)
-    add("rows", motion(1.0, 1, state.scene.groups.count, 2), Rows(born, np.array([0, 7, 23])))
+    added = add_as_nodes(scene.rows(np.array([0, 5])), np.zeros(2), 6)
+    add("rows", motion(1.0, 1, state.scene.groups.count, 2), RowEdit(added, np.array([0, 7, 23])))
     add("again", motion(1.0, 1, state.scene.groups.count, 1))
     return states
 
@@ -287,12 +287,12 @@ def test_motions_alone_change_nothing_but_centres_and_quaternions():
 
 
 def test_groups_of_a_scene_without_rows_are_forgotten():
-    """A scene without Gaussians has 0 groups; what was born into it belonged to one: an IndexError in players."""
+    """A scene without Gaussians has 0 groups; what was added into it belonged to one: an IndexError in players."""
     rng = np.random.default_rng(11)
     for number in (0, 5):
         state = begin(rng, number, 2)
         motion = make_motion(rng, state.scene)
-        rows = Rows(add_as_nodes(make_scene(rng, 3), np.zeros(3), 2), np.arange(number))
+        rows = RowEdit(add_as_nodes(make_scene(rng, 3), np.zeros(3), 2), np.arange(number))
         state = follow(state, Delta((motion, rows)))
         assert state.scene.groups is None
         assert len(state.gaussians) == 3

@@ -8,7 +8,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation, Slerp
 from test_player import NUMPY, make_scene, make_stream
 
-from gsstream.core.changes import Delta, Layout, Residual, Rows, Scene, apply_delta
+from gsstream.core.changes import Delta, Layout, Residual, RowEdit, Scene, apply_delta
 from gsstream.core.errors import InputError
 from gsstream.packet import PlayerState
 from gsstream.player.interpolation import Moments, frame_times, interpolate
@@ -16,14 +16,14 @@ from gsstream.player.play import play
 from gsstream.player.playback import Playback
 
 
-def two_frames(rows: Rows | None = None) -> tuple[PlayerState, PlayerState]:
+def two_frames(rows: RowEdit | None = None) -> tuple[PlayerState, PlayerState]:
     """A frame, and one in which every second Gaussian goes and turns; opacities name the rows."""
     gaussians, rng = make_scene(4, 20), np.random.default_rng(2)
     gaussians.opacities[:] = np.arange(20)
     layout = Layout(np.ones(20, np.int32), np.zeros(20, np.uint8), np.float32([1]))
     gates = (np.arange(20) % 2 == 0).astype(np.uint8)
     symbols = {name: rng.integers(-9, 10, (10, size)).astype(np.int32) for name, size in (("means", 3), ("quats", 4))}
-    delta = Delta((Residual(gates, 1, symbols, {"means": 0.1, "quats": 0.05}),)).with_rows(rows)
+    delta = Delta((Residual(gates, 1, symbols, {"means": 0.1, "quats": 0.05}),)).with_row_edit(rows)
     before = Scene(gaussians, layout)
     return PlayerState(3, before, None), PlayerState(4, apply_delta(before, delta), None, {}, delta, layout)
 
@@ -52,7 +52,7 @@ def test_rows_go_straight_and_turn_evenly(share: float) -> None:
 
 
 def test_rows_are_found_again_when_others_leave() -> None:
-    before, after = two_frames(Rows(None, np.array([0, 3, 8])))
+    before, after = two_frames(RowEdit(None, np.array([0, 3, 8])))
     scene = interpolate(before, after, 0.5)
     assert len(scene) == 20, "who leaves is there until the next frame"
     here = {name: row for row, name in enumerate(after.gaussians.opacities)}

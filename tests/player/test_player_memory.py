@@ -52,7 +52,7 @@ def test_a_small_file_that_announces_much_is_refused_cheaply(tmp_path) -> None:
 
 @pytest.mark.parametrize("sh_rest", [0, 3, 15])
 def test_the_estimate_bounds_what_decoding_takes(sh_rest) -> None:
-    """Peaks of key packets, deltas, deltas with births and with motions, each against what was announced for them."""
+    """Peaks of keys, deltas, deltas with added Gaussians and with motions, each against what was announced for them."""
     rng = np.random.default_rng(1)
     state, number = None, 20_000
     key = make_key(rng, number, number // 8, sh_rest)

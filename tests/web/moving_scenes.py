@@ -1,11 +1,21 @@
-"""Streams in which every kind of change stands: motions of groups, residuals, births and deaths, one after another."""
+"""Streams with every kind of change: motions of groups, residuals, added and removed Gaussians, one after another."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.changes import AddedGaussians, Delta, Layout, Motion, Residual, Rows, Scene, apply_motion, groups_for
+from gsstream.core.changes import (
+    AddedGaussians,
+    Delta,
+    Layout,
+    Motion,
+    Residual,
+    RowEdit,
+    Scene,
+    apply_motion,
+    groups_for,
+)
 from gsstream.core.changes.residual import sent_rows
 from gsstream.core.gaussians import Gaussians
 from gsstream.packet import (
@@ -61,21 +71,21 @@ def make_residual(rng: np.random.Generator, layout: Layout) -> Residual:
     return Residual(gates, 4, symbols, dict.fromkeys(widths, 0.01), decoders)
 
 
-def make_rows(rng: np.random.Generator, scene: Scene, sh_rest: int) -> Rows:
+def make_rows(rng: np.random.Generator, scene: Scene, sh_rest: int) -> RowEdit:
     nodes, number = len(scene.layout.node_counts), len(scene.gaussians)
-    born, new = int(rng.integers(1, 9)), int(rng.integers(0, 3))
+    added, new = int(rng.integers(1, 9)), int(rng.integers(0, 3))
     parents = nodes + np.arange(new) - rng.integers(0, 3, new).clip(0, nodes)
-    where = np.sort(rng.integers(0, nodes + new, born))
-    births = AddedGaussians(
-        make_gaussians(rng, born, sh_rest), where, rng.integers(0, 3, born).astype(np.uint8), parents
+    where = np.sort(rng.integers(0, nodes + new, added))
+    added = AddedGaussians(
+        make_gaussians(rng, added, sh_rest), where, rng.integers(0, 3, added).astype(np.uint8), parents
     )
     gone = np.flatnonzero(rng.random(number) < 0.05)
-    return Rows(births if rng.random() < 0.8 or not len(gone) else None, gone)
+    return RowEdit(added if rng.random() < 0.8 or not len(gone) else None, gone)
 
 
 def make_delta(rng: np.random.Generator, scene: Scene, sh_rest: int) -> Delta:
     """Zero to three motions, perhaps a residual, perhaps rows; at least one of them."""
-    changes: list[Motion | Residual | Rows] = []
+    changes: list[Motion | Residual | RowEdit] = []
     after = scene
     for _ in range(int(rng.integers(0, 4))):
         cell, shades = [(0.5, 1), (0.5, 1), (0.25, 4)][int(rng.integers(3))]

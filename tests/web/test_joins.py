@@ -13,7 +13,7 @@ import pytest
 from moving_scenes import make_gaussians, moving_packets
 from node_runs import HERE, NODE, needs_node, node
 
-from gsstream.core.changes import AddedGaussians, Delta, Motion, Rows, groups_for
+from gsstream.core.changes import AddedGaussians, Delta, Motion, RowEdit, groups_for
 from gsstream.core.errors import PacketError
 from gsstream.packet import PlayerState, decode_packet, encode_delta
 from gsstream.serve.joins import decode_join, encode_join, track_rows
@@ -96,8 +96,8 @@ def test_a_scene_without_an_old_row_forgets_its_groups(tmp_path):
 
     nodes = len(state.layout.node_counts)
     where = np.sort(rng.integers(0, nodes, 9))
-    born = AddedGaussians(make_gaussians(rng, 9, 3), where, np.zeros(9, np.uint8), np.zeros(0, np.int64))
-    for change in (motion, lambda s: Rows(born, np.arange(len(s.gaussians))), motion):
+    added = AddedGaussians(make_gaussians(rng, 9, 3), where, np.zeros(9, np.uint8), np.zeros(0, np.int64))
+    for change in (motion, lambda s: RowEdit(added, np.arange(len(s.gaussians))), motion):
         packet = encode_delta(Delta((change(state),)), state.layout, state.decoders, frame=state.frame + 1)
         packets.append(packet)
         state = decode_packet(state, packet.data)

@@ -24,7 +24,7 @@ from gsstream.core.changes.residual import changing_rows as changing_rows
 from gsstream.core.changes.residual import decode_residual as decode_residual
 from gsstream.core.changes.residual import sent_rows as sent_rows
 from gsstream.core.changes.rows import AddedGaussians as AddedGaussians
-from gsstream.core.changes.rows import Rows as Rows
+from gsstream.core.changes.rows import RowEdit as RowEdit
 from gsstream.core.changes.rows import add_as_nodes as add_as_nodes
 from gsstream.core.changes.rows import add_to_nodes as add_to_nodes
 from gsstream.core.changes.rows import apply_row_edit as apply_row_edit

@@ -14,14 +14,14 @@ from gsstream.core.changes.field import Field, apply_field
 from gsstream.core.changes.history import displacement_between
 from gsstream.core.changes.motion import Motion, apply_motions, union_rows
 from gsstream.core.changes.residual import Residual, apply_residual, sent_rows
-from gsstream.core.changes.rows import AddedGaussians, Rows, apply_row_edit, gather_rows, join_rows
+from gsstream.core.changes.rows import AddedGaussians, RowEdit, apply_row_edit, gather_rows, join_rows
 from gsstream.core.changes.scene import Layout, Scene
 from gsstream.core.errors import ShapeError
 from gsstream.core.shapes import FloatArray, IntArray
 
-Change: TypeAlias = Motion | Field | Residual | Rows
+Change: TypeAlias = Motion | Field | Residual | RowEdit
 #: The order in which kinds of changes stand in a delta; only motions may stand there more than once.
-ORDER: tuple[type[Motion] | type[Field] | type[Residual] | type[Rows], ...] = (Motion, Field, Residual, Rows)
+ORDER: tuple[type[Motion] | type[Field] | type[Residual] | type[RowEdit], ...] = (Motion, Field, Residual, RowEdit)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,19 +57,19 @@ class Delta:
         return next((change for change in self.changes if isinstance(change, Residual)), None)
 
     @property
-    def rows(self) -> Rows | None:
+    def row_edit(self) -> RowEdit | None:
         """The change of rows, if there is one."""
-        return next((change for change in self.changes if isinstance(change, Rows)), None)
+        return next((change for change in self.changes if isinstance(change, RowEdit)), None)
 
     @property
-    def births(self) -> AddedGaussians | None:
+    def added(self) -> AddedGaussians | None:
         """Gaussians that are added, or None."""
-        return None if self.rows is None else self.rows.births
+        return None if self.row_edit is None else self.row_edit.added
 
     @property
-    def deaths(self) -> IntArray:
+    def removed(self) -> IntArray:
         """[D] rows that are removed."""
-        return np.zeros(0, np.int64) if self.rows is None else self.rows.deaths
+        return np.zeros(0, np.int64) if self.row_edit is None else self.row_edit.removed
 
     @property
     def is_empty(self) -> bool:
@@ -79,7 +79,7 @@ class Delta:
     @property
     def has_row_edit(self) -> bool:
         """Whether Gaussians are added or removed."""
-        return self.rows is not None and not self.rows.is_empty
+        return self.row_edit is not None and not self.row_edit.is_empty
 
     def gates(self, layout: Layout) -> IntArray:
         """Return the gates [M] of the residual; all closed without one."""
@@ -93,10 +93,10 @@ class Delta:
             others.insert(len(self.motions) + (self.field is not None), residual)
         return Delta(tuple(others))
 
-    def with_rows(self, rows: Rows | None) -> Delta:
+    def with_row_edit(self, row_edit: RowEdit | None) -> Delta:
         """Return the same delta with another change of rows, or with none."""
-        others = tuple(change for change in self.changes if not isinstance(change, Rows))
-        return Delta(others if rows is None or rows.is_empty else (*others, rows))
+        others = tuple(change for change in self.changes if not isinstance(change, RowEdit))
+        return Delta(others if row_edit is None or row_edit.is_empty else (*others, row_edit))
 
 
 def apply_delta(scene: Scene, delta: Delta) -> Scene:
@@ -112,11 +112,11 @@ def apply_delta(scene: Scene, delta: Delta) -> Scene:
         after = replace(after, gaussians=apply_residual(after.gaussians, after.layout, delta.residual))
         touched = union_rows(len(after.gaussians), touched, sent_rows(after.layout, delta.residual.gates))
     after = replace(after, moved=displacement_between(scene.gaussians, after.gaussians, touched))
-    return after if delta.rows is None else apply_row_edit(after, delta.rows)
+    return after if delta.row_edit is None else apply_row_edit(after, delta.row_edit)
 
 
 def row_gates(layout: Layout, delta: Delta) -> FloatArray:
-    """Return the gate [N'] float32, 0 to 1, of every row after the delta; births are open.
+    """Return the gate [N'] float32, 0 to 1, of every row after the delta; added rows are open.
 
     ``layout`` is that before the delta.
     """
@@ -127,5 +127,5 @@ def row_gates(layout: Layout, delta: Delta) -> FloatArray:
         gates = np.repeat(residual.gates, layout.node_counts).astype(np.float32) / np.float32(residual.num_levels)
     if not delta.has_row_edit:
         return np.asarray(gates)
-    born = None if delta.births is None else np.ones(len(delta.births), np.float32)
-    return join_rows(gates, born, gather_rows(layout.node_of, delta.births, delta.deaths))
+    added = None if delta.added is None else np.ones(len(delta.added), np.float32)
+    return join_rows(gates, added, gather_rows(layout.node_of, delta.added, delta.removed))

@@ -26,7 +26,7 @@ class Groups:
     count: int
 
     def gathered(self, source: IntArray) -> Groups | None:
-        """Return the groups of the rows after births and deaths; a birth joins the group of the row stored before it.
+        """Return the groups of the rows afterwards; an added Gaussian joins the group of the row stored before it.
 
         Without any row that was there before, there is nothing to join: None.
         """

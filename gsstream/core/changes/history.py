@@ -25,7 +25,7 @@ class Displacement:
     turn: FloatArray
 
     def gathered(self, source: IntArray) -> Displacement:
-        """Return the displacement of the rows after births and deaths; ``source`` is :func:`gather_rows`' result."""
+        """Return the displacement of the rows afterwards; ``source`` is the result of :func:`gather_rows`."""
         kept = np.flatnonzero(np.isin(source, self.rows))
         place = np.searchsorted(self.rows, source[kept])
         return Displacement(kept, self.shift[place], self.turn[place])

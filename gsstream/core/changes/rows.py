@@ -1,6 +1,6 @@
 """Rows: Gaussians that a frame adds and removes, and what becomes of rows and layout then.
 
-Rows stay stored node by node: a Gaussian is born behind the last row of its node. Old rows keep their order, and nodes
+Rows stay stored node by node: a Gaussian is added behind the last row of its node. Old rows keep their order, and nodes
 keep their numbers: a node may become empty, a new one comes behind the old ones.
 """
 
@@ -41,61 +41,61 @@ class AddedGaussians:
 
 
 @dataclass(frozen=True, slots=True)
-class Rows:
+class RowEdit:
     """Rows that leave, then rows that join.
 
     Arguments:
-        births: Gaussians added, or None.
-        deaths: [D] int64 rows removed (of the scene before the births), ascending.
+        added: Gaussians added, or None.
+        removed: [D] int64 rows removed (of the scene before the added Gaussians), ascending.
     """
 
-    births: AddedGaussians | None = None
-    deaths: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    added: AddedGaussians | None = None
+    removed: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
     def is_empty(self) -> bool:
         """Whether no row leaves and none joins."""
-        return self.births is None and len(self.deaths) == 0
+        return self.added is None and len(self.removed) == 0
 
 
-def apply_row_edit(scene: Scene, rows: Rows) -> Scene:
+def apply_row_edit(scene: Scene, rows: RowEdit) -> Scene:
     """Return the scene without the rows that leave and with those that join. Raises ShapeError when they do not fit.
 
-    A birth belongs to the group of the row stored before it, so that it moves with its neighbours.
+    An added Gaussian belongs to the group of the row stored before it, so that it moves with its neighbours.
     """
-    layout, born = scene.layout, rows.births
-    check_removed(rows.deaths, len(layout.unit_of))
+    layout, added = scene.layout, rows.added
+    check_removed(rows.removed, len(layout.unit_of))
     if rows.is_empty:
         return scene
-    if born is not None:
+    if added is not None:
         widths = [(name, int(np.prod(value.shape[1:]))) for name, value in scene.gaussians.items()]
-        check_added(born, len(layout.node_counts), len(layout.units), widths)
-    source = gather_rows(layout.node_of, born, rows.deaths)
+        check_added(added, len(layout.node_counts), len(layout.units), widths)
+    source = gather_rows(layout.node_of, added, rows.removed)
     gaussians = Gaussians(**{
-        name: join_rows(value, None if born is None else getattr(born.gaussians, name), source)
+        name: join_rows(value, None if added is None else getattr(added.gaussians, name), source)
         for name, value in scene.gaussians.items()
     })
-    units = join_rows(layout.unit_of, None if born is None else born.unit_of, source).astype(np.uint8)
-    counts = edited_counts(layout.node_counts, layout.node_of, born, rows.deaths)
+    units = join_rows(layout.unit_of, None if added is None else added.unit_of, source).astype(np.uint8)
+    counts = edited_counts(layout.node_counts, layout.node_of, added, rows.removed)
     moved = None if scene.moved is None else scene.moved.gathered(source)
     groups = None if scene.groups is None else scene.groups.gathered(source)
     return Scene(gaussians, Layout(counts, units, layout.units), moved, groups)
 
 
 def add_as_nodes(gaussians: Gaussians[FloatArray], unit_of: IntArray, num_nodes: int) -> AddedGaussians:
-    """Return births that each bring a root node of their own, so that each has a gate of its own.
+    """Return Gaussians to add, each with a root node of their own, so that each has a gate of its own.
 
     Arguments:
         gaussians: B rows, raw values.
         unit_of: [B] uint8, which of the layout's units each has.
-        num_nodes: M, nodes before the births.
+        num_nodes: M, nodes before the added Gaussians.
     """
     nodes = num_nodes + np.arange(len(gaussians), dtype=np.int64)
     return AddedGaussians(gaussians, nodes, np.asarray(unit_of, np.uint8), nodes)
 
 
 def add_to_nodes(gaussians: Gaussians[FloatArray], nodes: IntArray, unit_of: IntArray) -> AddedGaussians:
-    """Return births into existing nodes; a copy stays in the node of what it was copied from.
+    """Return added Gaussians into existing nodes; a copy stays in the node of what it was copied from.
 
     Arguments:
         gaussians: B rows, raw values, in any order.
@@ -107,81 +107,81 @@ def add_to_nodes(gaussians: Gaussians[FloatArray], nodes: IntArray, unit_of: Int
     return AddedGaussians(gaussians.rows(order), np.asarray(nodes, np.int64)[order], units, np.zeros(0, np.int64))
 
 
-def gather_rows(node_of: IntArray, births: AddedGaussians | None, deaths: IntArray) -> IntArray:
-    """Return [N'] int64: which row each row of the scene afterwards was before; N + j is birth j.
+def gather_rows(node_of: IntArray, added: AddedGaussians | None, removed: IntArray) -> IntArray:
+    """Return [N'] int64: which row each row of the scene afterwards was before; N + j is added row j.
 
     Arguments:
         node_of: [N] node of each row before, ascending.
-        births: rows that join, or None.
-        deaths: [D] rows that leave, ascending.
+        added: rows that join, or None.
+        removed: [D] rows that leave, ascending.
     """
-    kept = np.delete(np.arange(len(node_of), dtype=np.int64), deaths)
-    if births is None or not len(births):
+    kept = np.delete(np.arange(len(node_of), dtype=np.int64), removed)
+    if added is None or not len(added):
         return kept
-    places = np.searchsorted(node_of[kept], births.nodes, side="right")
-    return np.asarray(np.insert(kept, places, len(node_of) + np.arange(len(births))))
+    places = np.searchsorted(node_of[kept], added.nodes, side="right")
+    return np.asarray(np.insert(kept, places, len(node_of) + np.arange(len(added))))
 
 
 def edited_counts(
-    node_counts: IntArray, node_of: IntArray, births: AddedGaussians | None, deaths: IntArray
+    node_counts: IntArray, node_of: IntArray, added: AddedGaussians | None, removed: IntArray
 ) -> IntArray:
-    """Return [M + K] int32: Gaussians of each node after births and deaths.
+    """Return [M + K] int32: Gaussians of each node after Gaussians were added and removed.
 
     Arguments:
         node_counts: [M] Gaussians of each node before.
         node_of: [N] node of each row before.
-        births: rows that join, with K new nodes; or None.
-        deaths: [D] rows that leave, ascending.
+        added: rows that join, with K new nodes; or None.
+        removed: [D] rows that leave, ascending.
     """
-    counts = np.asarray(node_counts, np.int64) - np.bincount(node_of[deaths], minlength=len(node_counts))
-    if births is not None:
-        counts = np.concatenate([counts, np.zeros(len(births.parents), np.int64)])
-        counts += np.bincount(births.nodes, minlength=len(counts))
+    counts = np.asarray(node_counts, np.int64) - np.bincount(node_of[removed], minlength=len(node_counts))
+    if added is not None:
+        counts = np.concatenate([counts, np.zeros(len(added.parents), np.int64)])
+        counts += np.bincount(added.nodes, minlength=len(counts))
     return counts.astype(np.int32)
 
 
-def join_rows(old: Table, born: Table | None, source: IntArray) -> Table:
-    """Return the rows of one attribute after births and deaths.
+def join_rows(old: Table, added: Table | None, source: IntArray) -> Table:
+    """Return the rows of one attribute after Gaussians were added and removed.
 
     Arguments:
         old: [N, ...] rows before.
-        born: [B, ...] rows that join, or None.
+        added: [B, ...] rows that join, or None.
         source: [N'] what :func:`gather_rows` returned.
     """
-    joined: Table = (old if born is None else np.concatenate([old, born]))[source]
+    joined: Table = (old if added is None else np.concatenate([old, added]))[source]
     return joined
 
 
-def check_added(births: AddedGaussians, num_nodes: int, num_units: int, shapes: Sequence[tuple[str, int]]) -> None:
-    """Raise ShapeError unless the births fit a scene of M nodes and H units.
+def check_added(added: AddedGaussians, num_nodes: int, num_units: int, shapes: Sequence[tuple[str, int]]) -> None:
+    """Raise ShapeError unless the added Gaussians fit a scene of M nodes and H units.
 
     Arguments:
-        births: rows that join.
+        added: rows that join.
         num_nodes: M.
         num_units: H.
         shapes: (attribute, number of values per row) of the scene.
     """
-    number, new = len(births.nodes), len(births.parents)
-    if len(births.gaussians) != number or len(births.unit_of) != number:
+    number, new = len(added.nodes), len(added.parents)
+    if len(added.gaussians) != number or len(added.unit_of) != number:
         raise ShapeError(
-            f"births: expected {number} Gaussians and units like nodes, got {len(births.gaussians)} and "
-            f"{len(births.unit_of)}"
+            f"added: expected {number} Gaussians and units like nodes, got {len(added.gaussians)} and "
+            f"{len(added.unit_of)}"
         )
-    nodes = np.asarray(births.nodes)
+    nodes = np.asarray(added.nodes)
     if number and (int(nodes[0]) < 0 or int(nodes[-1]) >= num_nodes + new or np.any(np.diff(nodes) < 0)):
-        raise ShapeError(f"births: expected nodes from 0 to {num_nodes + new - 1}, ascending")
+        raise ShapeError(f"added: expected nodes from 0 to {num_nodes + new - 1}, ascending")
     own = num_nodes + np.arange(new)
-    if np.any(births.parents < 0) or np.any(births.parents > own):
-        raise ShapeError("births: expected for every new node a parent with a smaller number, or its own (a root)")
-    if number and int(np.max(births.unit_of)) >= num_units:
-        raise ShapeError(f"births: expected units 0 to {num_units - 1}, got {int(np.max(births.unit_of))}")
+    if np.any(added.parents < 0) or np.any(added.parents > own):
+        raise ShapeError("added: expected for every new node a parent with a smaller number, or its own (a root)")
+    if number and int(np.max(added.unit_of)) >= num_units:
+        raise ShapeError(f"added: expected units 0 to {num_units - 1}, got {int(np.max(added.unit_of))}")
     for name, width in shapes:
-        got = int(np.prod(getattr(births.gaussians, name).shape[1:]))
+        got = int(np.prod(getattr(added.gaussians, name).shape[1:]))
         if got != width:
-            raise ShapeError(f"births: expected {width} values of {name} like the scene, got {got}")
+            raise ShapeError(f"added: expected {width} values of {name} like the scene, got {got}")
 
 
-def check_removed(deaths: IntArray, number: int) -> None:
-    """Raise ShapeError unless ``deaths`` are rows of N Gaussians, ascending, none twice."""
-    if len(deaths) and (int(deaths[0]) < 0 or int(deaths[-1]) >= number or np.any(np.diff(deaths) <= 0)):
-        raise ShapeError(f"deaths: expected rows from 0 to {number - 1}, ascending and none twice")
+def check_removed(removed: IntArray, number: int) -> None:
+    """Raise ShapeError unless ``removed`` are rows of N Gaussians, ascending, none twice."""
+    if len(removed) and (int(removed[0]) < 0 or int(removed[-1]) >= number or np.any(np.diff(removed) <= 0)):
+        raise ShapeError(f"removed: expected rows from 0 to {number - 1}, ascending and none twice")

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How Gaussians are stored, known to both ends; between two key packets only births and deaths change it.
+    """How Gaussians are stored, known to both ends; between two key packets only added and removed Gaussians change it.
 
     Arguments:
         node_counts: [M] int32, number of Gaussians of each node; Gaussians are stored node by node.

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from gsstream.core.changes import Motion, Rows
+from gsstream.core.changes import Motion, RowEdit
 from gsstream.engine.assembly.checks import UNIT, Checks, Look
 
 
@@ -38,11 +38,11 @@ def _motion(look: Look, args: tuple[Any, ...], result: object) -> None:
 
 
 def _growth(look: Look, args: tuple[Any, ...], result: object) -> None:
-    if result is not None and not isinstance(result, Rows):
-        raise look.fault(f"propose(): expected Rows or None, got {type(result).__name__}")
-    if result is not None and result.births is not None:
-        for name, value in result.births.gaussians.items():
-            look.values(f"births: {name}", torch.as_tensor(value))
+    if result is not None and not isinstance(result, RowEdit):
+        raise look.fault(f"propose(): expected RowEdit or None, got {type(result).__name__}")
+    if result is not None and result.added is not None:
+        for name, value in result.added.gaussians.items():
+            look.values(f"added: {name}", torch.as_tensor(value))
 
 
 def _image(look: Look, args: tuple[Any, ...], result: Any) -> None:

@@ -31,7 +31,7 @@ class TrimmedDelta:
 
     Arguments:
         untrimmed: bytes before anything was given up.
-        symbols, gates, births: how many went, or moved nearer to zero.
+        symbols, gates, added: how many went, or moved nearer to zero.
     """
 
     delta: Delta
@@ -39,7 +39,7 @@ class TrimmedDelta:
     untrimmed: int
     symbols: int = 0
     gates: int = 0
-    births: int = 0
+    added: int = 0
 
 
 def trim_to_size(
@@ -56,10 +56,10 @@ def trim_to_size(
     able = delta.residual is not None and delta.residual.symbols
     found = _trimmed(delta, packet, curvature, layout, encode, max_bytes) if able else None
     if found is None and delta.has_row_edit:
-        # Births cost most per row, so they are given up first: without them the rest may fit.
-        rest = delta.with_rows(None)
+        # Added Gaussians cost most per row, so they are dropped first: without them the rest may fit.
+        rest = delta.with_row_edit(None)
         plain = trim_to_size(rest, encode(rest), curvature, layout, encode, max_bytes)
-        return replace(plain, untrimmed=untrimmed, births=0 if delta.births is None else len(delta.births))
+        return replace(plain, untrimmed=untrimmed, added=0 if delta.added is None else len(delta.added))
     if found is None:
         found = Delta(), encode(Delta())
     assert len(found[1].data) <= max_bytes, "an empty packet is above the budget"

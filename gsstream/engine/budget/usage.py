@@ -15,7 +15,7 @@ def usage(pace: EpochScheduler, fitted: TrimmedDelta) -> dict[str, Any]:
     return {
         "rd_lambda": pace.mean_rate_weight, "estimate": pace.estimate, "stopped_by_clock": pace.stopped_by_clock,
         "untrimmed": fitted.untrimmed, "before": pace.before, "optimise": pace.optimise,
-        "dropped": {"symbols": fitted.symbols, "gates": fitted.gates, "births": fitted.births},
+        "dropped": {"symbols": fitted.symbols, "gates": fitted.gates, "added": fitted.added},
     }  # fmt: skip
 
 

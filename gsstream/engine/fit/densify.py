@@ -75,10 +75,10 @@ def split_or_clone(
         parents: [P] rows that are copied.
         halves: [P] bool, copies that are one half of a split parent; the others are as their parent is.
     """
-    born = gaussians.rows(parents).map(torch.clone)
+    added = gaussians.rows(parents).map(torch.clone)
     if bool(halves.any()):
-        spread = torch.randn(int(halves.sum()), 3, generator=generator) * activate_scales(born.scales[halves])
-        turned = (rotation_matrices(born.quats[halves]) @ spread[..., None])[..., 0]
-        born.means[halves] += turned
-        born.scales[halves] -= float(torch.tensor(SPLIT_SHRINK).log())
-    return born
+        spread = torch.randn(int(halves.sum()), 3, generator=generator) * activate_scales(added.scales[halves])
+        turned = (rotation_matrices(added.quats[halves]) @ spread[..., None])[..., 0]
+        added.means[halves] += turned
+        added.scales[halves] -= float(torch.tensor(SPLIT_SHRINK).log())
+    return added

@@ -136,7 +136,7 @@ def _current_rows(before: PlayerState, after: PlayerState) -> torch.Tensor:
     delta = after.delta
     if delta is None or not delta.has_row_edit:
         return torch.arange(count)
-    source = gather_rows(before.layout.node_of, delta.births, delta.deaths)
+    source = gather_rows(before.layout.node_of, delta.added, delta.removed)
     out = torch.full((count,), -1)
     old = torch.from_numpy(source) < count
     out[torch.from_numpy(source)[old]] = old.nonzero()[:, 0]

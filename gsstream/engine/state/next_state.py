@@ -22,16 +22,16 @@ def next_state(state: StreamState, player: PlayerState) -> StreamState:
     after = replace(state, player=player, decoders=decoders)
     if player.delta is None or not player.delta.has_row_edit:
         return after
-    return replace(after, hierarchy=next_hierarchy(state.hierarchy, player.delta.births, player.layout))
+    return replace(after, hierarchy=next_hierarchy(state.hierarchy, player.delta.added, player.layout))
 
 
-def next_hierarchy(hierarchy: Hierarchy, births: AddedGaussians | None, layout: Layout) -> Hierarchy:
-    """Return the forest after births and deaths. Old nodes stay, also empty ones."""
+def next_hierarchy(hierarchy: Hierarchy, added: AddedGaussians | None, layout: Layout) -> Hierarchy:
+    """Return the forest after Gaussians were added and removed. Old nodes stay, also empty ones."""
     parents, levels = hierarchy.parent, hierarchy.level
-    if births is not None and len(births.parents):
-        parents = torch.cat([parents, torch.from_numpy(births.parents.astype(np.int64))])
+    if added is not None and len(added.parents):
+        parents = torch.cat([parents, torch.from_numpy(added.parents.astype(np.int64))])
         known = levels.tolist()
-        for node, parent in enumerate(births.parents.tolist(), len(known)):
+        for node, parent in enumerate(added.parents.tolist(), len(known)):
             known.append(0 if parent == node else known[parent] + 1)
         levels = torch.tensor(known, dtype=levels.dtype)
     return Hierarchy(torch.from_numpy(layout.node_of), parents, levels)

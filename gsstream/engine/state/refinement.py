@@ -22,7 +22,7 @@ class Refinement:
         levels: [B] int64 octree level of each.
         ancestors: [B] int64 row of the players' scene that each came from; -1: that one is gone.
         moments: attribute -> Adam state of its rows (``RowParameters.moments``); empty before the first iteration.
-        statistics: of the screen gradients since Gaussians were last born.
+        statistics: of the screen gradients since Gaussians were last added.
         iterations: made so far.
     """
 

@@ -38,7 +38,7 @@ def encode_frame(
 
 
 def _share(delta: Delta, encoded: Callable[[Delta], EncodedPacket], size: int, trim: float) -> int:
-    """Bytes left of ``size`` when the residual gives up the share ``trim``; motions and births give up nothing."""
+    """Bytes left of ``size`` when the share ``trim`` is cut from the residual; only the residual is cut."""
     others = delta.with_residual(None)
     fixed = 0 if others.is_empty else len(encoded(others).data)
     return max(fixed + int((1 - trim) * (size - fixed)), len(encoded(Delta()).data))

@@ -1,4 +1,4 @@
-"""Births and deaths of a frame, as the growth part proposes them."""
+"""Gaussians that a frame adds and removes, as the growth part proposes them."""
 
 from __future__ import annotations
 
@@ -23,4 +23,4 @@ def with_growth(parts: Assembly, state: StreamState, delta: Delta, view: EngineC
     with error_context("growth", parts.part("growth"), parts.where):
         if rows is not None:
             apply_delta(after, Delta((rows,)))
-    return delta.with_rows(rows)
+    return delta.with_row_edit(rows)

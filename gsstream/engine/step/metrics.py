@@ -51,15 +51,16 @@ def log_packet(log: FrameLog, player: PlayerState, packet: EncodedPacket) -> Non
 
 def _counts(player: PlayerState, packet: EncodedPacket) -> dict[str, int]:
     rows = sent = 0 if packet.kind is PacketKind.EMPTY else len(player.gaussians)
-    births = gates = deaths = moving = 0
+    added = gates = removed = moving = 0
     delta, before, moved = player.delta, player.before, player.scene.moved
     if packet.kind is PacketKind.DELTA and delta is not None and before is not None:
-        births, deaths = 0 if delta.births is None else len(delta.births), len(delta.deaths)
-        rows = births + (0 if delta.residual is None else changing_rows(delta.residual))
+        added, removed = 0 if delta.added is None else len(delta.added), len(delta.removed)
+        rows = added + (0 if delta.residual is None else changing_rows(delta.residual))
         sent = int((row_gates(before, delta) > 0).sum())
-        gates = int((delta.gates(before) != 0).sum()) + births
+        gates = int((delta.gates(before) != 0).sum()) + added
         moving = sum(int(np.count_nonzero(motion.moving)) for motion in delta.motions)
     return {
-        "active_gaussians": rows, "sent_gaussians": sent, "active_gates": gates, "births": births, "deaths": deaths,
+        "active_gaussians": rows, "sent_gaussians": sent, "active_gates": gates,
+        "added_gaussians": added, "removed_gaussians": removed,
         "moving_groups": moving, "displaced_gaussians": 0 if moved is None else len(moved.rows),
     }  # fmt: skip

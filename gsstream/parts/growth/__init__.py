@@ -1,1 +1,1 @@
-"""Which Gaussians are born and which leave after a frame was optimised."""
+"""Which Gaussians are added and which are removed after a frame was optimised."""

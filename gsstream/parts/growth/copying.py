@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from gsstream.core.changes import Rows, Scene, add_as_nodes
+from gsstream.core.changes import RowEdit, Scene, add_as_nodes
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import IntArray
@@ -19,24 +19,25 @@ CopyFilter = Callable[[FitContext, torch.Tensor], torch.Tensor]
 
 
 def replace_with_copies(
-    scene: Scene, deaths: IntArray, work: FitContext, epochs: int, rng: Rng, *, gradient: float, most: int, rounds: int,
+    scene: Scene, removed: IntArray, work: FitContext, epochs: int, rng: Rng, *,
+    gradient: float, most: int, rounds: int,
     prune_opacity: float, admitted: CopyFilter | None = None,
-) -> Rows:  # fmt: skip
-    """Return the change of rows in which some leave and the frame's copies are born, each a node of its own.
+) -> RowEdit:  # fmt: skip
+    """Return the change of rows in which some leave and the frame's copies are added, each a node of its own.
 
     Arguments:
         scene: N rows, after the frame's motions.
-        deaths: [D] int64 rows that leave, ascending.
+        removed: [D] int64 rows that leave, ascending.
         work, epochs, rng, gradient, most, rounds, prune_opacity, admitted: as for :func:`fit_copies`.
     """
-    kept = scene.gaussians.rows(np.delete(np.arange(len(scene.gaussians)), deaths)).map(torch.from_numpy)
-    born = fit_copies(
+    kept = scene.gaussians.rows(np.delete(np.arange(len(scene.gaussians)), removed)).map(torch.from_numpy)
+    added = fit_copies(
         kept, work, epochs, rng, gradient=gradient, most=most, rounds=rounds, prune_opacity=prune_opacity,
         admitted=admitted,
     ).map(lambda value: value.numpy())
-    if not len(born):
-        return Rows(deaths=deaths)
-    return Rows(add_as_nodes(born, np.zeros(len(born), np.uint8), len(scene.layout.node_counts)), deaths)
+    if not len(added):
+        return RowEdit(removed=removed)
+    return RowEdit(add_as_nodes(added, np.zeros(len(added), np.uint8), len(scene.layout.node_counts)), removed)
 
 
 def fit_copies(
@@ -56,22 +57,22 @@ def fit_copies(
         prune_opacity: opacity below which an added Gaussian is given up, 0 to 1.
         admitted: chooses among the places that are found; None: all of them.
     """
-    born = scene.rows(slice(0, 0))
+    added = scene.rows(slice(0, 0))
     views = list(range(len(work.cameras)))
     for round_ in range(rounds):
         passes = epochs * (round_ + 1) // rounds - epochs * round_ // rounds
-        room = most - len(born)
-        if not passes or (room <= 0 and not len(born)):
+        room = most - len(added)
+        if not passes or (room <= 0 and not len(added)):
             continue
         copies = _copies(
-            work.on(concat_gaussians(scene, born) if len(born) else scene), gradient, max(0, room), admitted
+            work.on(concat_gaussians(scene, added) if len(added) else scene), gradient, max(0, room), admitted
         )
-        born = concat_gaussians(born, copies) if len(born) else copies
-        if not len(born):
+        added = concat_gaussians(added, copies) if len(added) else copies
+        if not len(added):
             continue
-        born = fit_added(scene, born, work, views, passes, rng)
-        born = born.rows(born.opacities.sigmoid() >= prune_opacity)
-    return born
+        added = fit_added(scene, added, work, views, passes, rng)
+        added = added.rows(added.opacities.sigmoid() >= prune_opacity)
+    return added
 
 
 def _copies(work: FitContext, gradient: float, room: int, admitted: CopyFilter | None) -> Gaussians[torch.Tensor]:

@@ -20,35 +20,35 @@ RATES = {"means": 0.1, "quats": 1e-2, "scales": 0.02, "opacities": 0.1, "sh0": 0
 BETAS, EPSILON = (0.9, 0.99), 1e-15
 
 
-def concat_gaussians(scene: Gaussians[Array], born: Gaussians[Array]) -> Gaussians[Array]:
-    """Return the rows of both, those of ``born`` behind those of ``scene``."""
+def concat_gaussians(scene: Gaussians[Array], added: Gaussians[Array]) -> Gaussians[Array]:
+    """Return the rows of both, those of ``added`` behind those of ``scene``."""
     values = {}
     for name, value in scene.items():
-        both = (value, getattr(born, name))
+        both = (value, getattr(added, name))
         values[name] = torch.cat(both) if isinstance(value, torch.Tensor) else np.concatenate(both)
     return cast("Gaussians[Array]", Gaussians(**values))
 
 
 def fit_added(
-    scene: Gaussians[torch.Tensor], born: Gaussians[torch.Tensor], work: FitContext, views: Sequence[int], epochs: int,
+    scene: Gaussians[torch.Tensor], added: Gaussians[torch.Tensor], work: FitContext, views: Sequence[int], epochs: int,
     rng: Rng,
 ) -> Gaussians[torch.Tensor]:  # fmt: skip
     """Return the newborn, optimised in these views while the scene holds still.
 
     Arguments:
         scene: N rows, raw values, as they are without what the newborn replace.
-        born: B rows, raw values.
+        added: B rows, raw values.
         work: the frame.
         views: training cameras to fit to.
         epochs: passes over them.
         rng: of the order of views.
     """
-    inner = work.on(concat_gaussians(scene, born))
-    inner.narrow(torch.arange(len(scene), len(scene) + len(born)))
-    values = {name: value.clone() for name, value in born.items()}
+    inner = work.on(concat_gaussians(scene, added))
+    inner.narrow(torch.arange(len(scene), len(scene) + len(added)))
+    values = {name: value.clone() for name, value in added.items()}
     first = {name: torch.zeros_like(value) for name, value in values.items()}
     second = {name: torch.zeros_like(value) for name, value in values.items()}
-    size = born.scales.exp().mean(1, keepdim=True)
+    size = added.scales.exp().mean(1, keepdim=True)
     order, step = rng.numpy("growth/order", work.index), 0
     for _ in range(epochs):
         for place in order.permutation(len(views)):

@@ -72,6 +72,6 @@ class Structure(Part):
     def build(self, gaussians: Gaussians[torch.Tensor], anchors: Anchors) -> Hierarchy:
         """Group the Gaussians (rows aligned with ``anchors.levels``).
 
-        The engine asks for this at frame 0 and wherever a stream is taken up again; after births and deaths in between
-        it keeps the groups and gives new Gaussians the node that the packet says (``core.births``).
+        The engine asks for this at frame 0 and wherever a stream is taken up again; after rows were added and removed
+        in between it keeps the groups and gives new Gaussians the node that the packet says (``core.changes.rows``).
         """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsstream.core.changes import Rows, apply_row_edit
+from gsstream.core.changes import RowEdit, apply_row_edit
 from gsstream.packet.changes.rows import encode_rows_change
 from gsstream.parts.growth.base import Growth
 from gsstream.testing.cases import fingerprint
@@ -12,10 +12,10 @@ from gsstream.testing.registry import check
 from gsstream.testing.working import check_closed_loop, fit_fixture
 
 
-def _proposed(part: Growth, *, changed: bool = True) -> Rows | None:
+def _proposed(part: Growth, *, changed: bool = True) -> RowEdit | None:
     case = fit_fixture(changed=changed)
     rows = part.propose(case.scene, case.work, case.rng)
-    assert rows is None or isinstance(rows, Rows), f"propose(): expected Rows or None, got {type(rows).__name__}"
+    assert rows is None or isinstance(rows, RowEdit), f"propose(): expected RowEdit or None, got {type(rows).__name__}"
     return rows
 
 
@@ -27,8 +27,8 @@ def check_growth_fits(part: Growth) -> None:
         return
     encode_rows_change(rows, scene.layout)
     after = apply_row_edit(scene, rows)
-    born = 0 if rows.births is None else len(rows.births)
-    wanted = len(scene.gaussians) - len(rows.deaths) + born
+    added = 0 if rows.added is None else len(rows.added)
+    wanted = len(scene.gaussians) - len(rows.removed) + added
     assert len(after.gaussians) == wanted, f"expected {wanted} Gaussians afterwards, got {len(after.gaussians)}"
     for name, value in after.gaussians.items():
         bad = int((~np.isfinite(value)).sum())
@@ -47,10 +47,10 @@ def check_growth_pure(part: Growth) -> None:
 
 @check("growth")
 def check_growth_ends(part: Growth) -> None:
-    """Where no tile of any view changed, nothing is born: births do not go on by themselves."""
+    """Where no tile of any view changed, nothing is added."""
     rows = _proposed(part, changed=False)
-    born = 0 if rows is None or rows.births is None else len(rows.births)
-    assert born == 0, f"nothing changed: expected no births, got {born}"
+    added = 0 if rows is None or rows.added is None else len(rows.added)
+    assert added == 0, f"nothing changed: expected no added Gaussians, got {added}"
 
 
 @check("growth")

@@ -8,12 +8,12 @@ from typing import final
 import numpy as np
 from pydantic import Field
 
-from gsstream.api import FitContext, Growth, PartConfig, Rng, Rows, Scene
+from gsstream.api import FitContext, Growth, PartConfig, Rng, RowEdit, Scene
 
 
 @final
 class ExampleGrowth(Growth):
-    """Removes the most transparent Gaussians of a scene after every frame; none is born."""
+    """Removes the most transparent Gaussians of a scene after every frame; none is added."""
 
     source = "gsstream"
 
@@ -23,10 +23,10 @@ class ExampleGrowth(Growth):
             default=0.01, gt=0, le=0.5, description="largest share of the Gaussians that leaves in one frame, to 0.5"
         )
 
-    def propose(self, after: Scene, work: FitContext, rng: Rng) -> Rows | None:
+    def propose(self, after: Scene, work: FitContext, rng: Rng) -> RowEdit | None:
         # Scenes hold raw values: an opacity is the sigmoid of what is stored.
         opacities, least = after.gaussians.opacities, math.log(self.config.opacity / (1 - self.config.opacity))
         faint = np.flatnonzero(opacities < least)
         most = int(self.config.share * len(opacities))
         faintest = faint[np.argsort(opacities[faint], kind="stable")][:most]
-        return Rows(deaths=np.sort(faintest)) if len(faintest) else None
+        return RowEdit(removed=np.sort(faintest)) if len(faintest) else None

@@ -13,7 +13,7 @@ from gsstream.api import InputError, ShapeError
 Table = NDArray[Any]
 
 
-class Rows:
+class RowEdit:
     """Adam written per row in float64."""
 
     def __init__(self, param: Table) -> None:
@@ -60,7 +60,7 @@ def test_all_rows_equal_torch_in_float64(isa: str, d: int) -> None:
 def test_irregularly_touched_rows(kind: str, d: int) -> None:
     rng = np.random.default_rng(d)
     start = rng.standard_normal((61, d)).astype(np.float32)
-    reference, mine = Rows(start), fresh(start)
+    reference, mine = RowEdit(start), fresh(start)
     for _ in range(50):
         grad = (rng.standard_normal(start.shape) * 10.0 ** rng.integers(-6, 2)).astype(np.float32)
         touched = rng.random(61) < rng.choice([0.0, 0.1, 0.5, 1.0])
@@ -94,7 +94,7 @@ def test_rates_by_column_or_row(shape: str) -> None:
     start = rng.standard_normal((n, d)).astype(np.float32)
     by_row = "row" in shape
     rates = (rng.random((n, 1) if by_row else (1, d)) * 0.1).astype(np.float32)
-    reference, mine = Rows(start), fresh(start)
+    reference, mine = RowEdit(start), fresh(start)
     for _ in range(10):
         grad = rng.standard_normal(start.shape).astype(np.float32)
         reference.update(grad, np.ones(n), rates if by_row else rates[0])

@@ -114,12 +114,12 @@ def test_as_many_leave_as_were_born_in_the_frame_before() -> None:
     method = MethodUnderTest("hicom", HiCoM(HiCoMConfig(motion=CELL, births=births)))
     first, second, third = method.steps
     number = len(first.state.player.gaussians)
-    assert second.metrics["births"] == 7
-    assert second.metrics["deaths"] == 0
-    assert third.metrics["deaths"] == 7
-    assert len(third.state.player.gaussians) == number + third.metrics["births"]
+    assert second.metrics["added_gaussians"] == 7
+    assert second.metrics["removed_gaussians"] == 0
+    assert third.metrics["removed_gaussians"] == 7
+    assert len(third.state.player.gaussians) == number + third.metrics["added_gaussians"]
     faint = np.argsort(second.state.player.gaussians.opacities, kind="stable")[:7]
-    assert sorted(third.state.player.delta.deaths) == sorted(faint)
+    assert sorted(third.state.player.delta.removed) == sorted(faint)
 
 
 class Shown:

@@ -75,7 +75,7 @@ def test_rows_are_followed_through_births_and_deaths_and_faint_ones_are_not_coun
     start = inner_ball(source, 0)
     found = LeftBehind()
     found.after(player(start), source.frame(0), True)
-    # Three leave, two are born in front: 37 of the first are there still, in other rows.
+    # Three leave, two are added in front: 37 of the first are there still, in other rows.
     now = np.concatenate([np.zeros((2, 3)), inner_ball(source, AT)[3:]])
     state = player(now)
 
@@ -85,8 +85,8 @@ def test_rows_are_followed_through_births_and_deaths_and_faint_ones_are_not_coun
         def __len__(self) -> int:
             return 2
 
-    state.delta = SimpleNamespace(has_row_edit=True, births=Born(), deaths=np.array([0, 1, 2]))
-    # Row by row its own node, so that births of node 0 stand first.
+    state.delta = SimpleNamespace(has_row_edit=True, added=Born(), removed=np.array([0, 1, 2]))
+    # Row by row its own node, so that added Gaussians of node 0 stand first.
     state.before = SimpleNamespace(node_of=np.arange(len(start)))
     assert found.after(state, source.frame(AT), False) == {"body": 37, "outside": 0, "unmoved": 0}
     faint = LeftBehind()

@@ -86,6 +86,6 @@ def test_a_gate_that_lets_everything_through_is_recon_with_rounded_motions() -> 
         "open": GateSettings(score=0.0, per_cell=1000), "one": GateSettings(score=0.0, per_cell=1, pixels=1e3),
     }.items():  # fmt: skip
         method = MethodUnderTest("quarc", QuARC(QuARCConfig(motion=motion, births=births, gate=gate)))
-        some[name] = [step.metrics["births"] for step in method.steps[1:]]
+        some[name] = [step.metrics["added_gaussians"] for step in method.steps[1:]]
     assert some["open"] == [9, 9]
     assert all(0 < number < 9 for number in some["one"])

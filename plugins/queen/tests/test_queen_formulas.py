@@ -1,4 +1,4 @@
-"""Gates, latents, births and change, against closed forms and independent walks."""
+"""Gates, latents, densification and change, against closed forms and independent walks."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from gsstream_queen.births import densify, densify_epochs
 from gsstream_queen.change import changed_tiles, gradient_difference
+from gsstream_queen.densify import densify, densify_epochs
 from gsstream_queen.gates import BOUND, gates, initial_logits, open_logit, open_probability
 from gsstream_queen.latents import cosines, decoder, initial_weights, rounded, weight_of
 from gsstream_queen.settings import (
-    BirthSettings,
     ChangeSettings,
     GateSettings,
+    GrowthSettings,
     LatentPolicy,
     MaskSettings,
     QueenConfig,
@@ -107,18 +107,19 @@ class TestLatents:
 
 class TestBirths:
     def test_epochs(self) -> None:
-        published = BirthSettings()
+        published = GrowthSettings()
         assert sorted(densify_epochs(published, 10)) == [2, 4, 6, 8]
         assert sorted(densify_epochs(published, 6)) == [2, 4]
         assert densify_epochs(published, 1) == frozenset()
-        assert densify_epochs(BirthSettings(every=0), 10) == densify_epochs(BirthSettings(most=0), 10) == frozenset()
+        assert densify_epochs(GrowthSettings(every=0), 10) == frozenset()
+        assert densify_epochs(GrowthSettings(max_added=0), 10) == frozenset()
 
     def grow(self, room: int = 100, may: list[bool] | None = None):
         sizes = torch.tensor([0.001, 0.5, 0.001, 0.5])[:, None].expand(4, 3).log()
         rows = scene(torch.arange(12.0).reshape(4, 3), scales=sizes)
         pull = torch.tensor([0.5, 0.9, 1e-9, 0.7])
         allowed = torch.tensor(may or [True] * 4)
-        settings, generator = BirthSettings(gradient=0.1), torch.Generator().manual_seed(0)
+        settings, generator = GrowthSettings(grad_threshold=0.1), torch.Generator().manual_seed(0)
         return rows, densify(rows, pull, allowed, room, 1.0, settings, generator)
 
     def test_small_rows_are_cloned_and_large_ones_split(self) -> None:
@@ -145,9 +146,9 @@ class TestBirths:
         quats, sizes = torch.randn(9, 4, generator=generator), torch.rand(9, 3, generator=generator) + 0.1
         rows = replace(scene(torch.zeros(9, 3), scales=sizes.log()), quats=quats)
         halves, seeded = torch.ones(9, dtype=torch.bool), torch.Generator().manual_seed(7)
-        born = split_or_clone(rows, torch.arange(9), halves, seeded).means
+        added = split_or_clone(rows, torch.arange(9), halves, seeded).means
         draws = torch.randn(9, 3, generator=torch.Generator().manual_seed(7)) * sizes
-        for q, v, got in zip(quats, draws, born, strict=True):
+        for q, v, got in zip(quats, draws, added, strict=True):
             w, x, y, z = (q / q.norm()).tolist()
             matrix = torch.tensor([
                 [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -206,7 +207,7 @@ class TestChange:
 
 def test_settings_that_contradict_themselves() -> None:
     with pytest.raises(ValidationError, match=r"expected after <= until, got 0\.9 and 0\.8"):
-        QueenConfig(births=BirthSettings(after=0.9))
+        QueenConfig(growth=GrowthSettings(start=0.9))
     assert set(QueenConfig().latents()) == {"quats", "scales", "opacities", "sh0", "shN"}
     policies = QueenConfig()
     frozen = policies.model_copy(

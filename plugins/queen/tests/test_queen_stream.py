@@ -1,4 +1,4 @@
-"""Whole runs, tiny: births on the wire, the player's state, settings from the recipe."""
+"""Whole runs, tiny: added Gaussians on the wire, the player's state, settings from the recipe."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from gsstream.player.playback import Playback
 SOURCE = "synthetic:frames=5&views=3&width=64&height=48&supersample=1"
 SETTINGS = {
     "first_frame.max_iterations": 40, "first_frame.max_points": 500, "stream.epochs": 3,
-    "streaming_method.births.every": 1, "streaming_method.births.gradient": 1e-4, "streaming_method.births.most": 30,
+    "streaming_method.growth.every": 1, "streaming_method.growth.grad_threshold": 1e-4,
+    "streaming_method.growth.max_added": 30,
     "streaming_method.change.dynamic": 1e-7,
 }  # fmt: skip
 
@@ -62,11 +63,11 @@ def watched(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Any], 
     return out, states, solved
 
 
-def test_the_player_has_the_encoders_state_through_births_and_deaths(watched) -> None:
+def test_the_player_has_the_encoders_state_as_rows_come_and_go(watched) -> None:
     out, states, _ = watched
     lines = metrics(out)
-    assert sum(line.get("births", 0) for line in lines) > 0, "a stream without births proves too little"
-    assert sum(line.get("deaths", 0) for line in lines) > 0
+    assert sum(line.get("added_gaussians", 0) for line in lines) > 0, "nothing was added: the test proves too little"
+    assert sum(line.get("removed_gaussians", 0) for line in lines) > 0
     with Playback(out / "stream.gss") as playback:
         assert len(playback.state_at(4)) != len(playback.state_at(0))
         for number, state in enumerate(states):
@@ -93,7 +94,7 @@ def test_what_was_trained_is_what_was_sent(watched) -> None:
                 np.testing.assert_array_equal(residual.symbols[name], table.numpy()[kept], err_msg=name)
         for name, sent in residual.decoders.items():
             np.testing.assert_allclose(sent, result.solution.decoders[name].numpy(), rtol=1e-3, atol=1e-6)
-        stay = np.delete(np.arange(len(before.player.gaussians)), delta.deaths)
+        stay = np.delete(np.arange(len(before.player.gaussians)), delta.removed)
         moved = after.player.gaussians.means[: len(stay)] - before.player.gaussians.means[stay]
         closed = gates[before.player.layout.node_of[stay]] == 0
         assert not moved[closed].any()
@@ -111,7 +112,7 @@ def test_policies_decide_what_is_sent(tmp_path: Path) -> None:
     frozen = {
         f"streaming_method__{name}__policy": "frozen" for name in ("means", "quats", "scales", "opacities", "shN")
     }
-    encode(tmp_path, streaming_method__births__every=0, streaming_method__sh0__lr=0.3, **frozen)
+    encode(tmp_path, streaming_method__growth__every=0, streaming_method__sh0__lr=0.3, **frozen)
     with Playback(tmp_path / "stream.gss") as playback:
         first, last = playback.state_at(0), playback.state_at(4)
     assert first.means.tobytes() == last.means.tobytes()
@@ -130,7 +131,7 @@ def test_gates_close_where_they_cost(tmp_path: Path) -> None:
             "3",
             streaming_method__gate__l0=weight,
             stream__epochs=8,
-            streaming_method__births__every=0,
+            streaming_method__growth__every=0,
         )
         moving.append(sum(line["moved_gaussians"] for line in metrics(tmp_path / name)[1:]))
     assert moving[1] < moving[0]
@@ -155,7 +156,7 @@ def test_wrong_settings_are_refused(
 def test_the_other_commands_know_it(tmp_path: Path, capsys: pytest.CaptureFixture[str], watched) -> None:
     out = str(watched[0])
     assert run_command(["info", out]) == 0
-    assert "births" in capsys.readouterr().out
+    assert "growth" in capsys.readouterr().out
     assert run_command(["evaluate", out, "--source", SOURCE]) == 0
     assert run_command(["play", out, "--out", str(tmp_path / "frames"), "--frames", "0:2"]) == 0
     assert run_command(["methods", "queen"]) == 0

@@ -174,8 +174,8 @@ def test_anchors_stay_with_their_gaussians_and_a_resumed_run_finds_them() -> Non
     states = [step.state for step in method.steps]
     assert [state.anchors and state.anchors.drawn for state in states] == [None, 1, 1]
     before, state = states[1:]
-    kept = np.delete(np.arange(len(before.player.gaussians)), state.player.delta.deaths)
-    assert len(state.player.delta.deaths) == 7
+    kept = np.delete(np.arange(len(before.player.gaussians)), state.player.delta.removed)
+    assert len(state.player.delta.removed) == 7
     for old, new in zip(before.anchors.rows, state.anchors.rows, strict=True):
         here = old[np.isin(old, kept)]
         opacities = before.player.gaussians.opacities[here], state.player.gaussians.opacities[new]
@@ -189,7 +189,8 @@ def test_as_many_leave_as_were_born_in_the_frame_before() -> None:
     births = BirthSettings(gradient=1e-7, rounds=1, most=7, prune_opacity=0.0)
     first, second, third = MethodUnderTest("recon", ReCon(ReConConfig(births=births))).steps
     number = len(first.state.player.gaussians)
-    assert (second.metrics["births"], second.metrics["deaths"], third.metrics["deaths"]) == (7, 0, 7)
-    assert len(third.state.player.gaussians) == number + third.metrics["births"]
+    assert (second.metrics["added_gaussians"], second.metrics["removed_gaussians"]) == (7, 0)
+    assert third.metrics["removed_gaussians"] == 7
+    assert len(third.state.player.gaussians) == number + third.metrics["added_gaussians"]
     faint = np.argsort(second.state.player.gaussians.opacities, kind="stable")[:7]
-    assert sorted(third.state.player.delta.deaths) == sorted(faint)
+    assert sorted(third.state.player.delta.removed) == sorted(faint)

@@ -177,9 +177,10 @@ def test_births_live_for_one_frame() -> None:
     small = CacheSettings(levels=2, entries=6, width=4)
     first, second, third = MethodUnderTest("stream3dgs", Stream3DGS(Stream3DGSConfig(cache=small, births=births))).steps
     number = len(first.state.player.gaussians)
-    assert second.metrics["births"] == third.metrics["births"] == third.metrics["deaths"] == 7
+    assert second.metrics["added_gaussians"] == third.metrics["added_gaussians"] == 7
+    assert third.metrics["removed_gaussians"] == 7
     assert len(second.state.player.gaussians) == len(third.state.player.gaussians) == number + 7
-    assert third.state.player.delta.deaths.tolist() == list(range(number, number + 7))
+    assert third.state.player.delta.removed.tolist() == list(range(number, number + 7))
     opacities = [step.state.player.gaussians.opacities[:number].tobytes() for step in (first, second, third)]
     assert len(set(opacities)) == 1, "those of frame 0 stay as they are, but for their places"
     assert second.state.player.delta.field is not None

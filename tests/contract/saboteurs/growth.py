@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gsstream.core.changes import Rows, add_to_nodes
+from gsstream.core.changes import RowEdit, add_to_nodes
 from gsstream.testing.growth.example import ExampleGrowth
 from gsstream.testing.working import INDEX
 from saboteurs.register import spoils
@@ -15,16 +15,16 @@ Base: Any = ExampleGrowth
 CALLS: dict[str, int] = {"moody": 0, "loose": 0}
 
 
-def copies(scene: Any, number: int, unit: int = 0) -> Rows:
+def copies(scene: Any, number: int, unit: int = 0) -> RowEdit:
     """The first Gaussians once more, beside themselves."""
     rows = np.arange(number)
     born = scene.gaussians.rows(rows)
-    return Rows(add_to_nodes(born, scene.layout.node_of[rows], np.full(number, unit, np.uint8)))
+    return RowEdit(add_to_nodes(born, scene.layout.node_of[rows], np.full(number, unit, np.uint8)))
 
 
 @spoils("check_growth_fits")
 class Strange(Base):
-    """Gives birth to Gaussians of a unit that the scene does not have."""
+    """Adds Gaussians of a unit that the scene does not have."""
 
     def propose(self, after: Any, work: Any, rng: Any) -> Any:
         if work.index != INDEX or not bool(work.changed_rows(0.0).any()):
@@ -34,7 +34,7 @@ class Strange(Base):
 
 @spoils("check_growth_pure")
 class Moody(Base):
-    """Gives birth to one more each time it is asked."""
+    """Adds one more at every call."""
 
     def propose(self, after: Any, work: Any, rng: Any) -> Any:
         if work.index != INDEX or not bool(work.changed_rows(0.0).any()):
@@ -45,7 +45,7 @@ class Moody(Base):
 
 @spoils("check_growth_ends")
 class Restless(Base):
-    """Gives birth where nothing changes."""
+    """Adds Gaussians where nothing changes."""
 
     def propose(self, after: Any, work: Any, rng: Any) -> Any:
         if work.index != INDEX or bool(work.changed_rows(0.0).any()):
@@ -55,7 +55,7 @@ class Restless(Base):
 
 @spoils("check_growth_closed_loop")
 class Loose(Base):
-    """Gives birth to one more in every run."""
+    """Adds one more in every run."""
 
     def propose(self, after: Any, work: Any, rng: Any) -> Any:
         if work.index != 1:

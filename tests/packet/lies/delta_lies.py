@@ -1,4 +1,4 @@
-"""Deltas that lie: histograms, modes and steps of residuals, counts and rows of births and deaths that cannot be."""
+"""Deltas that lie: impossible histograms, modes and steps of residuals, counts and rows that are added or removed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from lying import PAST, Victim
 from packet_scenes import begin, make_births, make_delta
 
-from gsstream.core.changes import Delta, Rows
+from gsstream.core.changes import Delta, RowEdit
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.packet import EncodedPacket, encode_delta
 from gsstream.packet.base import parse_packet
@@ -49,10 +49,10 @@ def _residual_lies(packet: EncodedPacket) -> Iterator[tuple[str, str, bytes, str
 
 
 def row_victim() -> Victim:
-    """Four births, two of them in new nodes, and a death."""
+    """Four added Gaussians, two of them in new nodes, and a removed one."""
     rng = np.random.default_rng(8)
     state = begin(rng)
-    delta = Delta().with_rows(Rows(make_births(rng, state.layout, 4, 2), np.array([1])))
+    delta = Delta().with_row_edit(RowEdit(make_births(rng, state.layout, 4, 2), np.array([1])))
     packet = encode_delta(delta, state.layout, {}, frame=1)
     return Victim(state, packet, _row_lies(packet))
 
@@ -65,15 +65,15 @@ def _head(number: int, new: int) -> bytes:
 
 
 def _row_lies(packet: EncodedPacket) -> Iterator[tuple[str, str, bytes, str]]:
-    honest = unpack_blobs(parse_packet(packet.data)[1]["births"].data, HEAD_PARTS + len(ATTRIBUTES))
+    honest = unpack_blobs(parse_packet(packet.data)[1]["added"].data, HEAD_PARTS + len(ATTRIBUTES))
 
     def column(*values: int) -> bytes:
         return encode_symbols(np.array(values, np.int32)[:, None])
 
     for name, part, data, message in (
-        ("births without end", 0, _head(1 << 30, 2), "1073741824 Gaussians and 2 nodes are beyond the limits"),
+        ("added Gaussians without end", 0, _head(1 << 30, 2), "1073741824 Gaussians and 2 nodes are beyond the limits"),
         ("nodes without end", 0, _head(4, 1 << 30), "4 Gaussians and 1073741824 nodes are beyond the limits"),
-        ("a birth less", 0, _head(3, 2), "nodes receive 4 Gaussians, 3 were announced"),
+        ("an added Gaussian less", 0, _head(3, 2), "nodes receive 4 Gaussians, 3 were announced"),
         ("a node more", 0, _head(4, 3), "nodes receive 5 Gaussians, 4 were announced"),
         ("no head", 0, b"", "number code without an end, or too large"),
         ("a parent before all", 1, column(-1, 0), "a parent that is no node before its own"),
@@ -86,6 +86,6 @@ def _row_lies(packet: EncodedPacket) -> Iterator[tuple[str, str, bytes, str]]:
         ("no scales", 7, b"", "scales cut short"),
         ("scales of five", 7, b"\x07\x05", "scales: 5 channels of 7 fractional bits cannot be"),
     ):
-        yield name, "births", pack_blobs([data if i == part else old for i, old in enumerate(honest)]), message
-    yield "a list of no deaths", "deaths", encode_gates(np.zeros(40, np.uint8), 1), "deaths"
-    yield "deaths with levels", "deaths", encode_gates(np.full(40, 2, np.uint8), 2), "deaths"
+        yield name, "added", pack_blobs([data if i == part else old for i, old in enumerate(honest)]), message
+    yield "a list of no removed rows", "removed", encode_gates(np.zeros(40, np.uint8), 1), "removed"
+    yield "removed rows with levels", "removed", encode_gates(np.full(40, 2, np.uint8), 2), "removed"

@@ -53,7 +53,7 @@ class LeftBehind:
 
     _images: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0, 3), np.float32))
     _places: FloatArray = field(default_factory=lambda: np.zeros((0, 3), np.float32))
-    #: Row of the key frame of every row now; -1: born since.
+    #: Row of the key frame of every row now; -1: added since.
     _rows: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def after(self, player: PlayerState, frame: Frame, is_key: bool) -> dict[str, int]:
@@ -62,7 +62,7 @@ class LeftBehind:
         return self.measure(player, frame)
 
     def follow(self, player: PlayerState, key: Frame | None) -> None:
-        """Keep track of rows through births and deaths."""
+        """Keep track of rows while Gaussians are added and removed."""
         if key is not None:
             visible = player.gaussians.opacities.reshape(-1) > FAINT
             self._images, self._places = packed(np.clip(key.images, 0, 1), "uint8"), player.gaussians.means
@@ -71,7 +71,7 @@ class LeftBehind:
         delta = player.delta
         if delta is None or not delta.has_row_edit or player.before is None:
             return
-        source = gather_rows(player.before.node_of, delta.births, delta.deaths)
+        source = gather_rows(player.before.node_of, delta.added, delta.removed)
         self._rows = np.append(self._rows, -1)[np.minimum(source, len(self._rows))]
 
     def measure(self, player: PlayerState, frame: Frame) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""Optimising one frame: epochs over the training cameras, masked at first, with births in between."""
+"""Optimising one frame: epochs over the training cameras, masked at first, with added Gaussians in between."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 
 from gsstream.api import Cameras, FrameTools, Gaussians, Renderer, RenderSession, WrtRows
 from gsstream.blocks import DensifyStatistics, rows_backward
-from gsstream_queen.births import densify, densify_epochs
+from gsstream_queen.densify import densify, densify_epochs
 from gsstream_queen.settings import QueenConfig
 from gsstream_queen.trainable import NewRows, OldRows, Solution, concat
 
@@ -37,10 +37,10 @@ class Problem:
 
 @dataclass(frozen=True)
 class Result:
-    """``born`` Gaussians; ``gone`` [N] bool, rows that leave; ``loss``: mean of the last epoch."""
+    """``added`` Gaussians; ``gone`` [N] bool, rows that leave; ``loss``: mean of the last epoch."""
 
     solution: Solution
-    born: Gaussians[torch.Tensor]
+    added: Gaussians[torch.Tensor]
     gone: torch.Tensor
     loss: float
     iterations: int
@@ -49,7 +49,7 @@ class Result:
 def optimise(config: QueenConfig, problem: Problem, generator: torch.Generator) -> Result:
     """Minimise the photometric loss and the L0 penalty, one view per iteration."""
     run = _Frame(config, problem, generator)
-    events = densify_epochs(config.births, problem.epochs)
+    events = densify_epochs(config.growth, problem.epochs)
     views = len(problem.work.cameras)
     masked = round(config.mask.share * problem.epochs * views) if problem.masks is not None else 0
     losses: list[float] = []
@@ -116,26 +116,27 @@ class _Frame:
         self._statistics = self._statistics.add(full)
 
     def densify(self) -> None:
-        """Let dynamic rows have children; from then on the session holds these too."""
-        config = self._config.births
-        born_so_far = sum(len(rows) for rows in self._new)
+        """Clone and split dynamic rows; from then on the session renders the new rows too."""
+        config = self._config.growth
+        added_so_far = sum(len(rows) for rows in self._new)
         with torch.no_grad():
             rows = self._old.values()
-            may = self._alive & self._problem.dynamic[self._problem.active]
-            litter = densify(
-                rows, self._statistics.mean, may, config.most - born_so_far, self._extent, config, self._generator
+            allowed = self._alive & self._problem.dynamic[self._problem.active]
+            new = densify(
+                rows, self._statistics.mean, allowed, config.max_added - added_so_far, self._extent, config,
+                self._generator,
             )
         self._statistics = DensifyStatistics.zeros(len(self._problem.active))
-        if len(litter.gaussians) == 0:
+        if len(new.gaussians) == 0:
             return
-        self._gone[self._problem.active[litter.replaced]] = True
-        self._new.append(NewRows(litter.gaussians, self._config.means.lr * self._extent))
+        self._gone[self._problem.active[new.replaced]] = True
+        self._new.append(NewRows(new.gaussians, self._config.means.lr * self._extent))
         self._open()
 
     def _open(self) -> None:
-        """A session of the scene without what is gone and with what was born."""
-        born = [rows.values().map(torch.Tensor.detach) for rows in self._new]
-        scene = concat([self._scene.rows(~self._gone), *born])
+        """A session of the scene without what is gone and with what was added."""
+        added = [rows.values().map(torch.Tensor.detach) for rows in self._new]
+        scene = concat([self._scene.rows(~self._gone), *added])
         trained = torch.zeros(len(self._scene), dtype=torch.bool)
         trained[self._problem.active] = True
         old = trained[~self._gone].nonzero()[:, 0]
@@ -147,12 +148,12 @@ class _Frame:
     def result(self, loss: float, iterations: int) -> Result:
         """What is to be sent; transparent new rows are not, transparent dynamic ones leave."""
         with torch.no_grad():
-            faint = self._old.values().opacities.sigmoid() < self._config.births.prune_opacity
-            born = concat([rows.values() for rows in self._new]) if self._new else self._scene.rows(slice(0, 0))
-            born = born.map(torch.Tensor.detach)
-            born = born.rows(born.opacities.sigmoid() >= self._config.births.prune_opacity)
+            faint = self._old.values().opacities.sigmoid() < self._config.growth.prune_opacity
+            added = concat([rows.values() for rows in self._new]) if self._new else self._scene.rows(slice(0, 0))
+            added = added.map(torch.Tensor.detach)
+            added = added.rows(added.opacities.sigmoid() >= self._config.growth.prune_opacity)
         active = self._problem.active
         gone = self._gone.clone()
-        if self._config.births.every:
+        if self._config.growth.every:
             gone[active[faint]] |= self._problem.dynamic[active[faint]]
-        return Result(self._old.solution(), born, gone, loss, iterations)
+        return Result(self._old.solution(), added, gone, loss, iterations)

@@ -17,7 +17,7 @@ from gsstream.api import (
     Layout,
     PlayerState,
     Residual,
-    Rows,
+    RowEdit,
     Step,
     StreamingMethod,
     Tools,
@@ -125,13 +125,13 @@ class Queen(StreamingMethod[QueenState]):
         symbols = {name: value[changed].astype(np.int32) for name, value in table.items() if value.any()}
         steps = {name: self.config.means.step if name == "means" else 1.0 for name in symbols}
         learned = {n: v.numpy() for n, v in result.solution.decoders.items() if n in symbols}
-        rows = Rows(births(result.born, len(layout.node_counts)), np.flatnonzero(result.gone.numpy()))
-        return Delta((Residual(gates, 1, symbols, steps, quantise_decoders(learned)),)).with_rows(rows)
+        rows = RowEdit(added_of(result.added, len(layout.node_counts)), np.flatnonzero(result.gone.numpy()))
+        return Delta((Residual(gates, 1, symbols, steps, quantise_decoders(learned)),)).with_row_edit(rows)
 
 
-def births(born: Gaussians[torch.Tensor], nodes: int) -> AddedGaussians | None:
+def added_of(added: Gaussians[torch.Tensor], nodes: int) -> AddedGaussians | None:
     """Each new Gaussian is a node of its own, behind the old ones."""
-    if len(born) == 0:
+    if len(added) == 0:
         return None
-    own = nodes + np.arange(len(born), dtype=np.int64)
-    return AddedGaussians(born.map(lambda value: value.numpy()), own, np.zeros(len(born), np.uint8), own)
+    own = nodes + np.arange(len(added), dtype=np.int64)
+    return AddedGaussians(added.map(lambda value: value.numpy()), own, np.zeros(len(added), np.uint8), own)

@@ -13,7 +13,7 @@ def gsstream_components() -> list[ComponentSpec]:
             kind="streaming_method",
             name="queen",
             target="gsstream_queen.method:Queen",
-            summary="quantised latent residuals on every Gaussian, hard-concrete gates on positions, masked births",
+            summary="quantised latent residuals of all Gaussians, hard-concrete gates of positions, densification",
         )
     ]
 

@@ -1,4 +1,4 @@
-"""Settings: what happens to each attribute, the gates, the mask and the births. Defaults are the published values."""
+"""Settings of attributes, gates, mask and densification. Defaults are the published values."""
 
 from __future__ import annotations
 
@@ -77,16 +77,17 @@ class MaskSettings(PartConfig):
     dilate: int = Field(default=1, ge=0, le=16, description="tiles by which the mask grows, to 16 (published: 48 px)")
 
 
-class BirthSettings(PartConfig):
+class GrowthSettings(PartConfig):
     """Masked densification: dynamic Gaussians with a large screen gradient are cloned or split."""
 
-    every: int = Field(default=2, ge=0, le=1000, description="epochs between two densifications; 0: no births, to 1000")
-    after: float = Field(default=0.04, ge=0, le=1, description="share of the epochs before the first one, 0 to 1")
-    until: float = Field(default=0.8, ge=0, le=1, description="share of the epochs after which there is none, 0 to 1")
-    gradient: float = Field(
-        default=1.25e-3, gt=0, le=10, description="mean screen gradient that asks for a birth, half image widths, to 10"
+    every: int = Field(default=2, ge=0, le=1000, description="epochs between two densifications, to 1000; 0: none")
+    start: float = Field(default=0.04, ge=0, le=1, description="share of the epochs before the first one, 0 to 1")
+    stop: float = Field(default=0.8, ge=0, le=1, description="share of the epochs after which there is none, 0 to 1")
+    grad_threshold: float = Field(
+        default=1.25e-3, gt=0, le=10,
+        description="mean screen gradient above which a Gaussian is densified, half image widths, to 10",
     )
-    most: int = Field(default=1000, ge=0, le=1_000_000, description="births per frame at most, to 1000000")
+    max_added: int = Field(default=1000, ge=0, le=1_000_000, description="most Gaussians that a frame adds, to 1000000")
     prune_opacity: float = Field(
         default=0.005, ge=0, lt=1, description="dynamic and new Gaussians below this opacity leave, 0 to 1 (3DGS)"
     )
@@ -114,7 +115,7 @@ class QueenConfig(PartConfig):
     )
     gate: GateSettings = Field(default=GateSettings(), description="gates of positions")
     mask: MaskSettings = Field(default=MaskSettings(), description="masked first part of a frame")
-    births: BirthSettings = Field(default=BirthSettings(), description="masked densification")
+    growth: GrowthSettings = Field(default=GrowthSettings(), description="masked densification")
     change: ChangeSettings = Field(default=ChangeSettings(), description="what changed")
     sigma: float = Field(
         default=0.0, ge=0, le=1e6,
@@ -131,10 +132,10 @@ class QueenConfig(PartConfig):
 
     @model_validator(mode="after")
     def _order(self) -> QueenConfig:
-        if self.births.after > self.births.until:
+        if self.growth.start > self.growth.stop:
             raise ValueError(
-                f"births: expected after <= until, got {self.births.after} and {self.births.until}; "
-                "every: 0 switches births off"
+                f"growth: expected start <= stop, got {self.growth.start} and {self.growth.stop}; "
+                "every: 0 switches it off"
             )
         return self
 

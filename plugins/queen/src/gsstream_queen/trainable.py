@@ -121,11 +121,11 @@ class OldRows:
 
 
 class NewRows:
-    """Gaussians born in this frame: every attribute free, rates of 3DGS."""
+    """Gaussians added in this frame: every attribute free, rates of 3DGS."""
 
-    def __init__(self, born: Gaussians[torch.Tensor], lr_means: float) -> None:
+    def __init__(self, added: Gaussians[torch.Tensor], lr_means: float) -> None:
         """``lr_means``: scene units per iteration."""
-        self._leaves = {name: value.detach().clone().requires_grad_() for name, value in born.items()}
+        self._leaves = {name: value.detach().clone().requires_grad_() for name, value in added.items()}
         rates = {"means": lr_means, **ADDED_LRS}
         groups = [{"params": [self._leaves[name]], "lr": rates[name]} for name in ATTRIBUTES]
         self._adam = torch.optim.Adam(groups, eps=ADAM_EPS, fused=True)

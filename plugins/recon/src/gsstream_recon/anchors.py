@@ -55,7 +55,7 @@ def followed(anchors: AnchorLevels, player: PlayerState) -> AnchorLevels:
     """Return the same anchors as rows of the scene after a packet, without those whose Gaussian left."""
     if player.delta is None or player.before is None or not player.delta.has_row_edit:
         return anchors
-    source = gather_rows(player.before.node_of, player.delta.births, player.delta.deaths)
+    source = gather_rows(player.before.node_of, player.delta.added, player.delta.removed)
     place = np.full(int(player.before.node_counts.sum()), -1, np.int64)
     stayed = np.flatnonzero(source < len(place))
     place[source[stayed]] = stayed

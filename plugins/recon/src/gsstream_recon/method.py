@@ -14,7 +14,7 @@ from gsstream.api import (
     FrameTools,
     Layout,
     PlayerState,
-    Rows,
+    RowEdit,
     Scene,
     Step,
     StreamingMethod,
@@ -76,13 +76,13 @@ class AnchoredMethod(StreamingMethod[ReConState]):
             moved = scene if motion is None else apply_motion(scene, motion)[0]
             work = work.on(moved.gaussians.map(torch.from_numpy))  # what was rendered of the scene before goes
         with tools.log.phase("growth"):
-            change = self._rows(moved, state.number, work, for_births, tools) if for_births else Rows()
+            change = self._rows(moved, state.number, work, for_births, tools) if for_births else RowEdit()
         with tools.log.phase("code"):
-            step = self._send(state, frame, Delta(() if motion is None else (motion,)).with_rows(change), anchors)
+            step = self._send(state, frame, Delta(() if motion is None else (motion,)).with_row_edit(change), anchors)
         tools.log.set(iterations=epochs * len(frame.cameras), anchors=[len(level) for level in anchors.rows])
         return step
 
-    def _rows(self, scene: Scene, number: int, work: FrameTools, epochs: int, tools: Tools) -> Rows:
+    def _rows(self, scene: Scene, number: int, work: FrameTools, epochs: int, tools: Tools) -> RowEdit:
         """As many of the least opaque leave as there are more than in frame 0; then this frame's are born."""
         deaths = np.sort(np.argsort(scene.gaussians.opacities, kind="stable")[: len(scene.gaussians) - number])
         births = self.config.births

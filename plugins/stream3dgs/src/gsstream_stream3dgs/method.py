@@ -14,7 +14,7 @@ from gsstream.api import (
     FrameTools,
     Layout,
     PlayerState,
-    Rows,
+    RowEdit,
     Scene,
     Step,
     StreamingMethod,
@@ -85,15 +85,15 @@ class Stream3DGS(StreamingMethod[Stream3DGSState]):
         with tools.log.phase("growth"):
             change = self._rows(moved, state.number, work, for_births, tools)
         with tools.log.phase("code"):
-            step = self._send(state, frame, moves.with_rows(change))
+            step = self._send(state, frame, moves.with_row_edit(change))
         tools.log.set(iterations=epochs * len(frame.cameras))
         return step
 
-    def _rows(self, scene: Scene, number: int, work: FrameTools, epochs: int, tools: Tools) -> Rows:
+    def _rows(self, scene: Scene, number: int, work: FrameTools, epochs: int, tools: Tools) -> RowEdit:
         """Those of the frame before leave, which stand behind the rows of frame 0; then this frame's are born."""
         deaths = np.arange(number, len(scene.gaussians))
         if not epochs:
-            return Rows(deaths=deaths)
+            return RowEdit(removed=deaths)
         births = self.config.births
         return replace_with_copies(
             scene, deaths, work, epochs, tools.rng, gradient=births.gradient, most=births.most, rounds=births.rounds,

@@ -1,4 +1,4 @@
-"""Masked densification: which Gaussians are cloned or split, and what is born of them (3DGS rules)."""
+"""Masked densification: which Gaussians are cloned or split, and what they become (3DGS rules)."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ import torch
 
 from gsstream.api import Gaussians
 from gsstream.blocks import SPLIT_SIZE, split_or_clone
-from gsstream_queen.settings import BirthSettings
+from gsstream_queen.settings import GrowthSettings
 
 
 class AddedByDensify(NamedTuple):
-    """``gaussians`` that are born, and the rows [P] of parents that they replace (those that were split)."""
+    """``gaussians`` that are added, and the rows [P] of parents that they replace (those that were split)."""
 
     gaussians: Gaussians[torch.Tensor]
     replaced: torch.Tensor
 
 
-def densify_epochs(settings: BirthSettings, epochs: int) -> frozenset[int]:
-    """Epochs, counted from 1, after which Gaussians may be born."""
-    if settings.every == 0 or settings.most == 0:
+def densify_epochs(settings: GrowthSettings, epochs: int) -> frozenset[int]:
+    """Epochs, counted from 1, after which Gaussians may be added."""
+    if settings.every == 0 or settings.max_added == 0:
         return frozenset()
     numbers = range(settings.every, epochs + 1, settings.every)
-    return frozenset(n for n in numbers if settings.after * epochs <= n <= settings.until * epochs)
+    return frozenset(n for n in numbers if settings.start * epochs <= n <= settings.stop * epochs)
 
 
 def densify(
-    rows: Gaussians[torch.Tensor], grad_norm: torch.Tensor, may: torch.Tensor, room: int, extent: float,
-    settings: BirthSettings, generator: torch.Generator,
+    rows: Gaussians[torch.Tensor], grad_norm: torch.Tensor, allowed: torch.Tensor, room: int, extent: float,
+    settings: GrowthSettings, generator: torch.Generator,
 ) -> AddedByDensify:  # fmt: skip
     """Clone small and split large rows with the largest screen gradient."""
-    hot = (may & (grad_norm > settings.gradient)).nonzero()[:, 0]
+    hot = (allowed & (grad_norm > settings.grad_threshold)).nonzero()[:, 0]
     large = rows.scales.exp().amax(1) > SPLIT_SIZE * extent
     order = hot[torch.argsort(grad_norm[hot], descending=True, stable=True)]
     cost = torch.cumsum(torch.where(large[order], 2, 1), 0)

@@ -1,4 +1,4 @@
-"""Births and deaths: round trips, where rows go, what is refused, and what the limits hold off."""
+"""Added and removed Gaussians: round trips, where rows go, what is refused, and what the limits hold off."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gsstream.core.changes import (
     Delta,
     Layout,
     Residual,
-    Rows,
+    RowEdit,
     add_as_nodes,
     add_to_nodes,
     apply_delta,
@@ -38,7 +38,7 @@ NONE = np.zeros(0, np.int64)
 
 
 def closed(births: AddedGaussians | None = None, deaths=NONE) -> Delta:
-    return Delta().with_rows(Rows(births, deaths))
+    return Delta().with_row_edit(RowEdit(births, deaths))
 
 
 def first_state(rng, number=40, nodes=12, sh_rest=3):
@@ -47,18 +47,18 @@ def first_state(rng, number=40, nodes=12, sh_rest=3):
 
 def naive(state, delta):
     """Rows of the next scene as (node, unit, values), one Gaussian at a time, in plain Python."""
-    moved = apply_delta(state.scene, delta.with_rows(None)).gaussians
-    gone = set(delta.deaths.tolist())
+    moved = apply_delta(state.scene, delta.with_row_edit(None)).gaussians
+    gone = set(delta.removed.tolist())
     table = [
         (int(node), int(unit), tuple(value[i].tobytes() for _, value in moved.items()))
         for i, (node, unit) in enumerate(zip(state.layout.node_of, state.layout.unit_of, strict=True))
         if i not in gone
     ]
-    if delta.births is not None:
-        coded = quantise_key(delta.births.gaussians)
+    if delta.added is not None:
+        coded = quantise_key(delta.added.gaussians)
         table += [
             (int(node), int(unit), tuple(value[i].tobytes() for _, value in coded.items()))
-            for i, (node, unit) in enumerate(zip(delta.births.nodes, delta.births.unit_of, strict=True))
+            for i, (node, unit) in enumerate(zip(delta.added.nodes, delta.added.unit_of, strict=True))
         ]
     return sorted(table, key=lambda row: row[0])  # stable: old rows first within a node
 
@@ -79,10 +79,10 @@ def test_a_decoded_edit_is_what_plain_python_makes_of_it(seed, number, nodes, bi
         for i, (node, unit) in enumerate(zip(after.layout.node_of, after.layout.unit_of, strict=True))
     ]
     assert encode_delta(after.delta, state.layout, {}, frame=1).data == packet.data
-    assert np.array_equal(after.delta.deaths, delta.deaths)
+    assert np.array_equal(after.delta.removed, delta.removed)
     if births:
         for name in ("nodes", "unit_of", "parents"):
-            assert np.array_equal(getattr(after.delta.births, name), getattr(delta.births, name)), name
+            assert np.array_equal(getattr(after.delta.added, name), getattr(delta.added, name)), name
     assert int(after.layout.node_counts.sum()) == len(after.gaussians) == len(row_gates(state.layout, delta))
     after.gaussians.validate()
 
@@ -118,36 +118,36 @@ def test_everything_may_leave_and_something_come_again():
     state = decode_packet(state, encode_delta(nothing, state.layout, {}, frame=1).data)
     assert len(state.gaussians) == 0
     assert len(state.layout.node_counts) == 12
-    born = add_as_nodes(make_scene(np.random.default_rng(4), 5), np.zeros(5), 12)
-    state = decode_packet(state, encode_delta(closed(born), state.layout, {}, frame=2).data)
-    assert same_bits(state.gaussians, quantise_key(born.gaussians))
+    added = add_as_nodes(make_scene(np.random.default_rng(4), 5), np.zeros(5), 12)
+    state = decode_packet(state, encode_delta(closed(added), state.layout, {}, frame=2).data)
+    assert same_bits(state.gaussians, quantise_key(added.gaussians))
     assert state.layout.node_counts.tolist() == [0] * 12 + [1] * 5
 
 
 def _unfit():
     rng = np.random.default_rng(5)
     state = first_state(rng)
-    births = make_births(rng, state.layout, 4, 2)
+    added = make_births(rng, state.layout, 4, 2)
     change = dataclasses.replace
-    yield state, change(births, nodes=births.nodes[::-1].copy()), NONE, "ascending"
-    yield state, change(births, nodes=np.array([0, 1, 2, 14])), NONE, "nodes from 0 to 13"
-    yield state, change(births, parents=np.array([12, 14])), NONE, "parent"
-    yield state, change(births, parents=np.array([-1, 0])), NONE, "parent"
-    yield state, change(births, unit_of=np.full(4, 3, np.uint8)), NONE, "expected units 0 to 2"
-    yield state, change(births, unit_of=np.zeros(3, np.uint8)), NONE, "units like nodes"
-    yield state, None, np.array([4, 4]), "deaths"
-    yield state, None, np.array([5, 4]), "deaths"
-    yield state, None, np.array([40]), "deaths"
-    yield state, AddedGaussians(births.gaussians.rows(NONE), NONE, NONE.astype(np.uint8), NONE), NONE, "at least 1"
-    bad = change(births.gaussians, means=np.full((4, 3), np.nan, np.float32))
-    yield state, change(births, gaussians=bad), NONE, "finite"
+    yield state, change(added, nodes=added.nodes[::-1].copy()), NONE, "ascending"
+    yield state, change(added, nodes=np.array([0, 1, 2, 14])), NONE, "nodes from 0 to 13"
+    yield state, change(added, parents=np.array([12, 14])), NONE, "parent"
+    yield state, change(added, parents=np.array([-1, 0])), NONE, "parent"
+    yield state, change(added, unit_of=np.full(4, 3, np.uint8)), NONE, "expected units 0 to 2"
+    yield state, change(added, unit_of=np.zeros(3, np.uint8)), NONE, "units like nodes"
+    yield state, None, np.array([4, 4]), "removed"
+    yield state, None, np.array([5, 4]), "removed"
+    yield state, None, np.array([40]), "removed"
+    yield state, AddedGaussians(added.gaussians.rows(NONE), NONE, NONE.astype(np.uint8), NONE), NONE, "at least 1"
+    bad = change(added.gaussians, means=np.full((4, 3), np.nan, np.float32))
+    yield state, change(added, gaussians=bad), NONE, "finite"
 
 
 @pytest.mark.parametrize("case", range(11))
 def test_encoder_refuses_edits_that_do_not_fit(case):
-    state, births, deaths, message = list(_unfit())[case]
+    state, added, removed, message = list(_unfit())[case]
     with pytest.raises(ShapeError, match=message):
-        encode_delta(closed(births, deaths), state.layout, {}, frame=1)
+        encode_delta(closed(added, removed), state.layout, {}, frame=1)
 
 
 def test_births_of_another_degree_are_refused_with_the_packets_offset():
@@ -175,7 +175,7 @@ def test_a_scene_cannot_grow_beyond_the_limit(monkeypatch):
     with pytest.raises(PacketError, match="beyond the limits"):
         decode_delta(packet.data, state.scene, {})
     monkeypatch.setattr("gsstream.packet.changes.rows.MAX_GAUSSIANS", 44)
-    assert len(decode_delta(packet.data, state.scene, {}).births) == 4
+    assert len(decode_delta(packet.data, state.scene, {}).added) == 4
     monkeypatch.undo()
     assert max_added_in(10) == 640
 
@@ -183,8 +183,8 @@ def test_a_scene_cannot_grow_beyond_the_limit(monkeypatch):
 def test_gates_are_shown_on_the_rows_they_moved():
     state = first_state(np.random.default_rng(11), 6, 2)
     layout = Layout(np.int32([4, 2]), state.layout.unit_of, state.layout.units)
-    born = add_to_nodes(make_scene(np.random.default_rng(12), 1), [0], [0])
-    delta = Delta((Residual(np.uint8([0, 2]), 4), Rows(born, np.array([0, 5]))))
+    added = add_to_nodes(make_scene(np.random.default_rng(12), 1), [0], [0])
+    delta = Delta((Residual(np.uint8([0, 2]), 4), RowEdit(added, np.array([0, 5]))))
     assert row_gates(layout, delta).tolist() == [0, 0, 0, 1, 0.5]
 
 
@@ -194,7 +194,7 @@ def test_costs_of_births_are_accounted_for(tmp_path):
         for packet in packets:
             writer.append(packet)
     stats = stream_stats(tmp_path / "s.gss")
-    assert stats.sections("delta")["births"] == sum(p.sizes.get("births", 0) for p in packets) > 0
+    assert stats.sections("delta")["added"] == sum(p.sizes.get("added", 0) for p in packets) > 0
     for found, state in zip(stats.packets, decode_all(packets), strict=True):
         assert found.coded >= found.entropy * 0.99 if found.kind != "empty" else found.coded == 0
         assert (found.float16_zstd > 0) == (state.delta is not None or found.kind == "key")

@@ -149,8 +149,8 @@ def paint_gates(state: PlayerState) -> Gaussians[FloatArray]:
     share: FloatArray = np.zeros(len(gaussians), np.float32)
     if state.delta is not None and state.before is not None:
         share = row_gates(state.before, state.delta)
-        if state.scene.moved is not None and not state.delta.has_row_edit:
-            share[state.scene.moved.rows] = 1.0
+        if state.scene.displacement is not None and not state.delta.has_row_edit:
+            share[state.scene.displacement.rows] = 1.0
     closed, opened = np.array(_CLOSED), np.array(_OPEN)
     color = closed + share[:, None] * (opened - closed)
     return Gaussians(

@@ -63,7 +63,7 @@ def decode_packet(state: PlayerState | None, data: bytes, *, offset: int = 0) ->
         raise PacketError(f"frame {header.frame} needs the state of the frame before it, got {had}", offset)
     if header.kind == PacketKind.EMPTY:
         decode_empty(data, offset=offset)
-        return PlayerState(header.frame, replace(state.scene, moved=None), state.meta, state.decoders)
+        return PlayerState(header.frame, replace(state.scene, displacement=None), state.meta, state.decoders)
     delta = decode_delta(data, state.scene, state.decoders, offset=offset)
     try:
         scene = apply_delta(state.scene, delta)

@@ -22,17 +22,17 @@ def interpolate(before: PlayerState, after: PlayerState, share: float) -> Gaussi
     sizes, added and removed Gaussians wait for their frame; so does everything before a key packet, which carries no
     motion.
     """
-    scene, moved = before.gaussians, after.scene.moved
-    if share == 0 or moved is None or after.frame != before.frame + 1:
+    scene, displacement = before.gaussians, after.scene.displacement
+    if share == 0 or displacement is None or after.frame != before.frame + 1:
         return scene
-    rows, shift, turn = moved.rows, moved.shift, moved.turn
+    rows, translation, rotation = displacement.rows, displacement.translation, displacement.rotation
     if after.delta is not None and after.delta.has_row_edit:
         source = gather_rows(before.layout.node_of, after.delta.added, after.delta.removed)[rows]
         known = source < len(scene)
-        rows, shift, turn = source[known], shift[known], turn[known]
+        rows, translation, rotation = source[known], translation[known], rotation[known]
     means, quats = scene.means.copy(), scene.quats.copy()
-    means[rows] += np.float32(share) * shift
-    quats[rows] = _turned(quats[rows], turn, share)
+    means[rows] += np.float32(share) * translation
+    quats[rows] = _rotated(quats[rows], rotation, share)
     return replace(scene, means=means, quats=quats)
 
 
@@ -82,11 +82,11 @@ def frame_times(frames: Sequence[int], recorded: float, wanted: float) -> list[f
     return [float(time) for time in np.where(whole, times.round(), times)]
 
 
-def _turned(quats: FloatArray, turn: FloatArray, share: float) -> FloatArray:
+def _rotated(quats: FloatArray, rotation: FloatArray, share: float) -> FloatArray:
     """Quaternions [A, 4] turned by a share of a rotation [A, 3] given as axis * tan(angle / 2); lengths stay."""
-    tangent = np.linalg.norm(turn.astype(np.float64), axis=1)
+    tangent = np.linalg.norm(rotation.astype(np.float64), axis=1)
     part = np.tan(share * np.arctan(tangent))
-    x, y, z = (turn * np.divide(part, tangent, out=np.zeros_like(part), where=tangent > 0)[:, None]).T
+    x, y, z = (rotation * np.divide(part, tangent, out=np.zeros_like(part), where=tangent > 0)[:, None]).T
     w1, x1, y1, z1 = quats.astype(np.float64).T
     product = np.stack(
         [w1 - x * x1 - y * y1 - z * z1, x1 + x * w1 + y * z1 - z * y1,

@@ -58,10 +58,11 @@ def encode_join(key: PlayerState, state: PlayerState, source: IntArray) -> bytes
     if (groups := state.scene.groups) is not None:
         facts["groups"] = {"cell": groups.cell, "shades": groups.shades, "count": groups.count}
         arrays.append(_steps(groups.group_of))
-    moved = state.scene.moved
-    facts["moved"] = None if moved is None else len(moved.rows)
-    if moved is not None:
-        arrays += [_steps(moved.rows), _planes(_bits(moved.shift)), _planes(_bits(moved.turn))]
+    displacement = state.scene.displacement
+    facts["displaced"] = None if displacement is None else len(displacement.rows)
+    if displacement is not None:
+        arrays.append(_steps(displacement.rows))
+        arrays += [_planes(_bits(part)) for part in (displacement.translation, displacement.rotation)]
     head = json.dumps(facts, separators=(",", ":")).encode()
     body = len(head).to_bytes(4, "little") + head + b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)
     packed = zstandard.ZstdCompressor(level=_LEVEL, write_content_size=True).compress(body)
@@ -93,14 +94,14 @@ def decode_join(key: PlayerState, data: bytes) -> PlayerState:
         bits[changed] += cursor.planes(facts["changed"][name], width)
         values[name] = bits.view(np.float32).reshape(number, *before.shape[1:])
     decoders = {name: cursor.array("<f4", a * b).reshape(a, b) for name, (a, b) in facts["decoders"].items()}
-    groups, moved = None, None
+    groups, displacement = None, None
     if (said := facts["groups"]) is not None:
         groups = Groups(said["cell"], said["shades"], cursor.steps(number).astype(np.int32), said["count"])
-    if (count := facts["moved"]) is not None:
+    if (count := facts["displaced"]) is not None:
         rows = cursor.steps(count)
-        shift, turn = (cursor.planes(count, 3).view(np.float32) for _ in range(2))
-        moved = Displacement(rows, shift, turn)
-    return PlayerState(frame, Scene(Gaussians(**values), layout, moved, groups), key.meta, decoders)
+        translation, rotation = (cursor.planes(count, 3).view(np.float32) for _ in range(2))
+        displacement = Displacement(rows, translation, rotation)
+    return PlayerState(frame, Scene(Gaussians(**values), layout, displacement, groups), key.meta, decoders)
 
 
 def _tables(key: PlayerState, state: PlayerState) -> Iterator[tuple[str, FloatArray, FloatArray]]:

@@ -33,7 +33,7 @@ class World:
 
     Arguments:
         before, now: images of the two frames, one [H, W, 3] per camera.
-        moved: [N] bool, the truth about what moved.
+        moving_mask: [N] bool, the truth about what moved.
         logits: [N] some confidence.
         residual: [N, 3] some position residual, cells.
         hierarchy: three trees of two levels; flat when there are fewer than twelve Gaussians.
@@ -46,7 +46,7 @@ class World:
     cameras: Cameras
     before: tuple[torch.Tensor, ...]
     now: tuple[torch.Tensor, ...]
-    moved: torch.Tensor
+    moving_mask: torch.Tensor
     logits: torch.Tensor
     residual: torch.Tensor
     hierarchy: Hierarchy
@@ -95,7 +95,7 @@ class World:
     def permuted(self, order: torch.Tensor) -> World:
         """Return the same world with the Gaussians in another order."""
         return replace(
-            self, gaussians=self.gaussians.rows(order), moved=self.moved[order], logits=self.logits[order],
+            self, gaussians=self.gaussians.rows(order), moving_mask=self.moving_mask[order], logits=self.logits[order],
             residual=self.residual[order], hierarchy=self.hierarchy.rows(order),
             anchors=replace(
                 self.anchors, positions=self.anchors.positions[order], colors=self.anchors.colors[order],
@@ -165,16 +165,16 @@ def make_case(name: str, before: Scene, cameras: Cameras, *, shift: float = 0.0)
         shift: [3] scene units.
     """
     n = len(before)
-    moved = (before.means[:, 0] > 0.3) & (before.means[:, 1].abs() < 5) & (shift != 0)
+    moving_mask = (before.means[:, 0] > 0.3) & (before.means[:, 1].abs() < 5) & (shift != 0)
     means = before.means.clone()
-    means[moved, 1] += shift
+    means[moving_mask, 1] += shift
     g = torch.Generator().manual_seed(n + 1)
     xyz, rgb = before.means.numpy().copy(), torch.rand(n, 3, generator=g)
     levels = torch.arange(n) % 2
     sizes = torch.tensor([0.5, 0.25]) * max(1.0, float(before.means.abs().max()) if n else 1.0)
     origin = before.means.amin(0) - 0.1 if n else torch.zeros(3)
     return World(
-        name, before, cameras, images(before, cameras), images(replace(before, means=means), cameras), moved,
+        name, before, cameras, images(before, cameras), images(replace(before, means=means), cameras), moving_mask,
         3 * torch.randn(n, generator=g), torch.randn(n, 3, generator=g), forest(n),
         PointCloud(xyz, rgb.numpy(), name), Anchors(before.means.clone(), rgb, levels, sizes, origin),
     )  # fmt: skip

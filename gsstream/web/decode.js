@@ -1,11 +1,11 @@
 // The state that a stream of packets leads to, bit for bit the one of the encoder. See docs/reference/packet-format.md.
 
-import { decodeMotions, united, SECTIONS as MOTION } from "./changes/motion.js";
+import { decodeMotions, unionRows, SECTIONS as MOTION } from "./changes/motion.js";
 import { applyResidual, decodeResidual, SECTIONS as RESIDUAL } from "./changes/residual.js";
 import { applyRows, decodeRows, SECTIONS as ROWS } from "./changes/rows.js";
 import { KIND, parsePacket } from "./container.js";
 import { PacketError, located } from "./errors.js";
-import { displacement, gatherDisplacement, gatherGroups, pick } from "./history.js";
+import { displacementBetween, gatherDisplacement, gatherGroups, gatherValues } from "./history.js";
 import { decodeKey } from "./key.js";
 
 /**
@@ -15,8 +15,8 @@ import { decodeKey } from "./key.js";
  * is decoded as a whole first, so after a PacketError the state still is that of the frame before.
  *
  * A state has `frame`, `number` (Gaussians), `scene` (attribute -> Float32Array), `widths` (values a row), `layout`,
- * `meta`, `decoders`, `groups` and `moved` (what the next packet may refer to), `turned` (whether a motion was since
- * the key packet), `spare` (memory for motions), and `change`: what this packet changed, for the view.
+ * `meta`, `decoders`, `groups` and `displacement` (for the next packet), `turned` (whether a motion was since the key
+ * packet), `spare` (memory for motions), and `change`: what this packet changed, for the view.
  */
 export function decodePacket(state, data, offset = 0) {
   const { header, sections } = parsePacket(data, offset);
@@ -28,7 +28,7 @@ export function decodePacket(state, data, offset = 0) {
   }
   if (header.kind === KIND.empty) {
     if (header.sections) throw new PacketError("empty packet with sections", offset);
-    state.moved = null;
+    state.displacement = null;
     state.change = { kind: "empty" };
   } else {
     state.change = applyDelta(state, decodeDelta(sections, state, offset));
@@ -54,7 +54,7 @@ export function firstState(frame, number, { scene, layout, meta }) {
     meta,
     decoders: new Map(),
     groups: null,
-    moved: null,
+    displacement: null,
     turned: false,
     spare: null,
     change: { kind: "key" },
@@ -81,14 +81,13 @@ function decodeDelta(found, state, offset) {
 }
 
 /**
- * Apply what was decoded, in order. Returns what changed: `moved`, lists of rows with their gates and attributes as
- * they were numbered before Gaussians were added and removed, and `source`, the row each row was before (null when none joined or
- * left; see `applyRows`).
+ * Apply what was decoded, in order. Returns `moved`, lists of changed rows as numbered before, with gates and
+ * attributes, and `source` of `applyRows` (null without added and removed rows).
  */
 function applyDelta(state, { motions, residual, rows }) {
-  const touched = united(motions?.rows ?? [], residual?.rows ?? []);
-  const means = pick(state.scene.means, touched, 3);
-  const quats = pick(state.scene.quats, touched, 4);
+  const touched = unionRows(motions?.rows ?? [], residual?.rows ?? []);
+  const means = gatherValues(state.scene.means, touched, 3);
+  const quats = gatherValues(state.scene.quats, touched, 4);
   const change = { kind: "delta", moved: [], source: null, before: state.number };
   if (motions) {
     const { means, quats } = state.scene;
@@ -104,11 +103,11 @@ function applyDelta(state, { motions, residual, rows }) {
     const attributes = residual.parts.map((part) => part.name);
     change.moved.push({ rows: residual.rows, gate: residual.gate, attributes });
   }
-  state.moved = displacement(touched, means, quats, state.scene);
+  state.displacement = displacementBetween(touched, means, quats, state.scene);
   if (rows) {
     state.spare = null;
     change.source = applyRows(state, rows);
-    state.moved = gatherDisplacement(state.moved, change.source, change.before);
+    state.displacement = gatherDisplacement(state.displacement, change.source, change.before);
     state.groups = gatherGroups(state.groups, change.source, change.before);
     state.number = change.source.length;
   }

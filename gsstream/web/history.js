@@ -1,7 +1,7 @@
-// How far rows were displaced by the last frame: what a motion is predicted from, and the groups it was said of.
+// Displacement of rows by the last frame, from which a motion is predicted, and the groups of the last motion.
 
 /** Values of `rows` in an array of `width` values a row. */
-export function pick(values, rows, width) {
+export function gatherValues(values, rows, width) {
   const out = new Float32Array(rows.length * width);
   for (let i = 0, to = 0; i < rows.length; i += 1) {
     const from = rows[i] * width;
@@ -11,29 +11,30 @@ export function pick(values, rows, width) {
 }
 
 /**
- * What a frame did to `rows`, ascending, all that it may have touched: `{ rows, shift, turn }` of those that moved, or
- * null when none did. `means` and `quats` are the values of these rows before the frame.
+ * Displacement of `rows`, ascending, by a frame: `{ rows, translation, rotation }` of those that moved, or null.
+ * `means` and `quats` are their values before the frame.
  */
-export function displacement(rows, means, quats, scene) {
+export function displacementBetween(rows, means, quats, scene) {
   const kept = new Uint32Array(rows.length);
-  const shift = new Float32Array(3 * rows.length);
-  const turn = new Float32Array(3 * rows.length);
+  const translation = new Float32Array(3 * rows.length);
+  const rotation = new Float32Array(3 * rows.length);
   let at = 0;
   for (let i = 0; i < rows.length; i += 1) {
     const a = 3 * rows[i];
     const o = 3 * at;
-    shift[o] = scene.means[a] - means[3 * i];
-    shift[o + 1] = scene.means[a + 1] - means[3 * i + 1];
-    shift[o + 2] = scene.means[a + 2] - means[3 * i + 2];
-    turnBetween(quats, 4 * i, scene.quats, 4 * rows[i], turn, o);
-    const shifts = shift[o] !== 0 || shift[o + 1] !== 0 || shift[o + 2] !== 0;
-    if (shifts || turn[o] !== 0 || turn[o + 1] !== 0 || turn[o + 2] !== 0) kept[at++] = rows[i];
+    translation[o] = scene.means[a] - means[3 * i];
+    translation[o + 1] = scene.means[a + 1] - means[3 * i + 1];
+    translation[o + 2] = scene.means[a + 2] - means[3 * i + 2];
+    rotationBetween(quats, 4 * i, scene.quats, 4 * rows[i], rotation, o);
+    const translates = translation[o] !== 0 || translation[o + 1] !== 0 || translation[o + 2] !== 0;
+    if (translates || rotation[o] !== 0 || rotation[o + 1] !== 0 || rotation[o + 2] !== 0) kept[at++] = rows[i];
   }
-  return at ? { rows: kept.slice(0, at), shift: shift.slice(0, 3 * at), turn: turn.slice(0, 3 * at) } : null;
+  if (!at) return null;
+  return { rows: kept.slice(0, at), translation: translation.slice(0, 3 * at), rotation: rotation.slice(0, 3 * at) };
 }
 
 /** The rotation from one quaternion to another as axis * tan(angle / 2), in float64; of more than 120 degrees: none. */
-function turnBetween(before, b, after, a, out, o) {
+function rotationBetween(before, b, after, a, out, o) {
   const w0 = before[b];
   const x0 = before[b + 1];
   const y0 = before[b + 2];
@@ -50,13 +51,13 @@ function turnBetween(before, b, after, a, out, o) {
   out[o + 2] = known ? (z1 * w0 - w1 * z0 - x1 * y0 + y1 * x0) / w : 0;
 }
 
-/** The displacement of rows after Gaussians were added and removed; `source` says which of `number` rows each one was. */
-export function gatherDisplacement(moved, source, number) {
-  if (!moved) return null;
+/** The displacement after rows were added and removed; `source`: which of `number` rows each was. */
+export function gatherDisplacement(displacement, source, number) {
+  if (!displacement) return null;
   const place = new Int32Array(number).fill(-1);
-  for (let i = 0; i < moved.rows.length; i += 1) place[moved.rows[i]] = i;
-  const rows = new Uint32Array(moved.rows.length);
-  const from = new Uint32Array(moved.rows.length);
+  for (let i = 0; i < displacement.rows.length; i += 1) place[displacement.rows[i]] = i;
+  const rows = new Uint32Array(displacement.rows.length);
+  const from = new Uint32Array(displacement.rows.length);
   let at = 0;
   for (let i = 0; i < source.length; i += 1) {
     if (source[i] >= number || place[source[i]] < 0) continue;
@@ -64,10 +65,11 @@ export function gatherDisplacement(moved, source, number) {
     from[at++] = place[source[i]];
   }
   const kept = from.subarray(0, at);
-  return { rows: rows.slice(0, at), shift: pick(moved.shift, kept, 3), turn: pick(moved.turn, kept, 3) };
+  const [translation, rotation] = [displacement.translation, displacement.rotation].map((v) => gatherValues(v, kept, 3));
+  return { rows: rows.slice(0, at), translation, rotation };
 }
 
-/** The groups of rows after Gaussians were added and removed: an added Gaussian joins the group of the row before it; without old rows, none. */
+/** The groups likewise: an added Gaussian joins the group of the row before it; without old rows, none. */
 export function gatherGroups(groups, source, number) {
   if (!groups) return null;
   let first = 0;

@@ -40,9 +40,9 @@ export function decodeJoin(key, data) {
     decoders.set(name, { latents, width, values: new Float32Array(body.int32(latents * width).buffer) });
   }
   const groups = facts.groups && { ...facts.groups, groupOf: body.steps(number) };
-  const moved = facts.moved === null ? null : body.displacement(facts.moved);
+  const displacement = facts.displaced === null ? null : body.displacement(facts.displaced);
   const change = { kind: "key" };
-  return { ...key, frame, number, scene, layout, decoders, groups, moved, turned: true, change };
+  return { ...key, frame, number, scene, layout, decoders, groups, displacement, turned: true, change };
 }
 
 /** The values of one attribute: those of the key packet, plus differences of their bits. */
@@ -117,6 +117,6 @@ class Body {
 
   displacement(count) {
     const rows = Uint32Array.from(this.steps(count));
-    return { rows, shift: this.floats(count), turn: this.floats(count) };
+    return { rows, translation: this.floats(count), rotation: this.floats(count) };
   }
 }

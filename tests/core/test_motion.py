@@ -99,7 +99,7 @@ def test_a_motion_of_no_group_changes_nothing_but_the_groups(seed: int) -> None:
     assert nothing.is_empty
     after = play(scene, nothing)
     assert after.gaussians is scene.gaussians
-    assert after.moved is None
+    assert after.displacement is None
     assert after.groups is not None
 
 
@@ -180,29 +180,29 @@ def test_a_group_is_predicted_by_the_mean_of_what_moved_in_it() -> None:
     scene = dataclasses.replace(scene, layout=Layout(np.int32([1, 1, 1]), np.zeros(3, np.uint8), np.float32([1])))
     table = np.int32([[1, 0, 0], [3, 0, 0]])
     scene = play(scene, Residual(np.uint8([1, 1, 0]), 1, {"means": table}, {"means": 0.25}))
-    assert scene.moved.rows.tolist() == [0, 1]
+    assert scene.displacement.rows.tolist() == [0, 1]
     after = play(scene, move(scene, cell=1000.0))
     assert (after.gaussians.means - scene.gaussians.means).tolist() == [[0.5, 0, 0]] * 3
-    assert after.moved.shift.tolist() == [[0.5, 0, 0]] * 3
+    assert after.displacement.translation.tolist() == [[0.5, 0, 0]] * 3
 
 
 def test_displacement_is_measured_over_the_whole_frame() -> None:
     """Motions there and back, and a residual: what is kept is the sum; a row that came home is not kept."""
     scene = scene_of([[0.5, 0, 0], [100.5, 0, 0]])
     there, back = (move(scene, shift=(s, 0, 0), predicted=False) for s in (4, -4))
-    assert play(scene, there, back).moved is None
+    assert play(scene, there, back).displacement is None
     scene = dataclasses.replace(scene, layout=Layout(np.int32([1, 1]), np.zeros(2, np.uint8), np.float32([1])))
     home = Residual(np.uint8([1, 0]), 1, {"means": np.int32([[-4, 0, 0]])}, {"means": 0.25})
     after = play(scene, there, home)
-    assert after.moved.rows.tolist() == [1]
-    assert after.moved.shift.tolist() == [[1, 0, 0]]
+    assert after.displacement.rows.tolist() == [1]
+    assert after.displacement.translation.tolist() == [[1, 0, 0]]
 
 
 def test_a_frame_without_motion_or_residual_forgets_displacements() -> None:
     scene = scene_of([[0.5, 0, 0], [0.5, 1, 0]])
     scene = play(scene, move(scene, shift=(1, 0, 0)))
-    assert scene.moved is not None
-    assert play(scene, RowEdit(removed=np.array([0]))).moved is None
+    assert scene.displacement is not None
+    assert play(scene, RowEdit(removed=np.array([0]))).displacement is None
 
 
 @given(SEEDS)
@@ -276,14 +276,14 @@ def test_births_join_the_group_of_the_row_stored_before_them() -> None:
     after = play(spread(), RowEdit(born(3, [2, 0, 0])))
     assert after.groups.group_of.tolist() == [0, 1, 1, 1, 2, 3, 4, 5, 5]
     assert after.groups.count == 6
-    assert after.moved is None, "nothing moved in that frame"
+    assert after.displacement is None, "nothing moved in that frame"
 
 
 def test_births_in_the_frame_of_a_motion_do_not_count_as_displaced() -> None:
     scene = spread()
     after = play(scene, move(scene), RowEdit(born(3, [2, 0, 0])))
-    assert after.moved.rows.tolist() == [0, 1, 4, 5, 6, 7]
-    assert after.moved.shift[:, 0].tolist() == [1, 2, 3, 4, 5, 6]
+    assert after.displacement.rows.tolist() == [0, 1, 4, 5, 6, 7]
+    assert after.displacement.translation[:, 0].tolist() == [1, 2, 3, 4, 5, 6]
     following = play(after, move(after))
     step = following.gaussians.means[:, 0] - after.gaussians.means[:, 0]
     assert step.tolist() == [1, 2, 2, 2, 3, 4, 5, 6, 6], "what was added goes with its neighbours"
@@ -294,8 +294,8 @@ def test_deaths_take_rows_out_of_groups_and_displacements() -> None:
     after = play(scene, move(scene), RowEdit(removed=np.array([0, 3, 5])))
     assert after.groups.group_of.tolist() == [1, 2, 4]
     assert after.groups.count == 6, "groups keep their numbers, also empty ones"
-    assert after.moved.rows.tolist() == [0, 1, 2]
-    assert after.moved.shift[:, 0].tolist() == [2, 3, 5]
+    assert after.displacement.rows.tolist() == [0, 1, 2]
+    assert after.displacement.translation[:, 0].tolist() == [2, 3, 5]
     following = play(after, move(after))
     assert (following.gaussians.means[:, 0] - after.gaussians.means[:, 0]).tolist() == [2, 3, 5]
 
@@ -329,11 +329,11 @@ def test_a_turn_beyond_120_degrees_counts_as_none(seed: int) -> None:
         residual = Residual(np.uint8([1]), 1, {"quats": np.int32([[1]])}, {"quats": 1.0}, {"quats": change[None]})
         after = play(scene, residual)
         if not known:
-            assert after.moved is None
+            assert after.displacement is None
         else:
             wanted = axis * np.tan(half)
-            np.testing.assert_allclose(after.moved.turn[0], wanted, atol=3e-6)
-            assert after.moved.shift.tolist() == [[0, 0, 0]]
+            np.testing.assert_allclose(after.displacement.rotation[0], wanted, atol=3e-6)
+            assert after.displacement.translation.tolist() == [[0, 0, 0]]
 
 
 def test_misfits_are_refused_in_words() -> None:

@@ -140,10 +140,11 @@ def test_a_field_stands_between_motion_and_the_rest():
     alone, moved = apply_field(there, field)
     both = apply_delta(state.scene, Delta((motion, field)))
     assert both.gaussians.means.tobytes() == alone.gaussians.means.tobytes()
-    assert set(moved) & set(both.moved.rows.tolist())
-    assert set(both.moved.rows.tolist()) <= set(rows.tolist()) | set(moved.tolist())
+    assert set(moved) & set(both.displacement.rows.tolist())
+    assert set(both.displacement.rows.tolist()) <= set(rows.tolist()) | set(moved.tolist())
     np.testing.assert_array_equal(
-        both.moved.shift, alone.gaussians.means[both.moved.rows] - state.gaussians.means[both.moved.rows]
+        both.displacement.translation,
+        alone.gaussians.means[both.displacement.rows] - state.gaussians.means[both.displacement.rows],
     )
     with pytest.raises(ShapeError, match="one field"):
         Delta((field, field))

@@ -114,15 +114,15 @@ def check_equal(world: World, state: PlayerState) -> None:
     number = len(state.gaussians)
     assert np.array(world.means, np.float32).reshape(number, 3).tobytes() == state.gaussians.means.tobytes()
     assert np.array(world.quats, np.float32).reshape(number, 4).tobytes() == state.gaussians.quats.tobytes()
-    groups, moved = state.scene.groups, state.scene.moved
+    groups, moved = state.scene.groups, state.scene.displacement
     if world.named is None:
         assert groups is None
     else:
         assert (groups.cell, groups.shades) == world.named
         assert (groups.group_of.tolist(), groups.count) == (world.group_of, world.count)
     found = {} if moved is None else {
-        row: (shift, turn)
-        for row, shift, turn in zip(moved.rows.tolist(), moved.shift.tolist(), moved.turn.tolist(), strict=True)
+        row: (translation.tolist(), rotation.tolist())
+        for row, translation, rotation in zip(moved.rows.tolist(), moved.translation, moved.rotation, strict=True)
     }  # fmt: skip
     assert found == world.moved
 
@@ -192,11 +192,11 @@ def test_a_key_packet_forgets_groups_and_displacements():
     """Late join: after a key packet the same bytes mean the same, whatever was before it."""
     rng = np.random.default_rng(5)
     moved = decode_all(make_moving_packets(seed=4, number=30, nodes=9))[-1]
-    assert moved.scene.moved is not None
+    assert moved.scene.displacement is not None
     assert moved.scene.groups is not None
     key = encode_key(KeyState(moved.gaussians, moved.layout, moved.meta), frame=moved.frame + 1)
     late, along = decode_packet(None, key.data), decode_packet(moved, key.data)
-    assert (along.scene.moved, along.scene.groups) == (None, None)
+    assert (along.scene.displacement, along.scene.groups) == (None, None)
     delta = Delta((make_motion(rng, late.scene),))
     assert same_bits(follow(late, delta).gaussians, follow(along, delta).gaussians)
 
@@ -206,7 +206,7 @@ def test_an_empty_packet_forgets_displacements_and_keeps_groups():
     state = begin(rng)
     state = follow(state, Delta((make_motion(rng, state.scene, share=1.0),)))
     still = decode_packet(state, encode_empty(frame=2).data)
-    assert still.scene.moved is None
+    assert still.scene.displacement is None
     assert still.scene.groups is state.scene.groups
     assert still.gaussians is state.gaussians
     on = dataclasses.replace(make_motion(rng, still.scene, share=1.0))
@@ -259,9 +259,10 @@ def pinned_stream() -> dict[str, PlayerState]:
     add("residual", motion(2.0, 2, state.scene.groups.count, 1), residual)
     first = motion(4.0, 1, count(4.0, 1), 2)
     world = World.of(state.gaussians)
+    last = state.scene.displacement
     world.moved = {
-        int(r): (s.tolist(), t.tolist())
-        for r, s, t in zip(state.scene.moved.rows, state.scene.moved.shift, state.scene.moved.turn, strict=True)
+        int(row): (translation.tolist(), rotation.tolist())
+        for row, translation, rotation in zip(last.rows, last.translation, last.rotation, strict=True)
     }
     world.move(first)
     world.form_groups(1.0, 1, False)

@@ -104,7 +104,7 @@ def mismatch(change: Field, touched: list[IntArray]) -> str | None:
 
 
 def apply_field(scene: Scene, change: Field) -> tuple[Scene, IntArray]:
-    """Return the scene after a field, and the rows [A] that it moved. What ``moved`` says stays.
+    """Return the scene after a field, and the rows [A] that it moved. ``scene.displacement`` is not changed.
 
     A centre is shifted by the reach times the first three numbers that the network says of it; a row turns by the
     quaternion (1 + a, b, c, d) of the other four. float64 in a fixed order, rounded to float32 at the end.
@@ -131,8 +131,8 @@ def apply_field(scene: Scene, change: Field) -> tuple[Scene, IntArray]:
     gaussians = scene.gaussians
     # By the limits of weights and reach no shift is above 10^15, so what is finite stays so.
     there = gaussians.means.take(rows, 0).astype(np.float64) + said[:, :3] * shape.reach
-    turn = said[:, 4:] / np.maximum(1.0 + said[:, 3:4], MIN_REAL)
+    rotation = said[:, 4:] / np.maximum(1.0 + said[:, 3:4], MIN_REAL)
     means, quats = gaussians.means.copy(), gaussians.quats.copy()
     means[rows] = there.astype(np.float32)
-    quats[rows] = quat_multiply(rodrigues_to_quat(turn), columns(gaussians.quats, rows).T).astype(np.float32)
+    quats[rows] = quat_multiply(rodrigues_to_quat(rotation), columns(gaussians.quats, rows).T).astype(np.float32)
     return replace(scene, gaussians=replace(gaussians, means=means, quats=quats)), rows

@@ -16,19 +16,19 @@ class Displacement:
 
     Arguments:
         rows: [A] int64, ascending.
-        shift: [A, 3] float32 displacement of the centre, scene units per frame.
-        turn: [A, 3] float32 rotation as axis * tan(angle / 2), per frame.
+        translation: [A, 3] float32 displacement of the centre, scene units per frame.
+        rotation: [A, 3] float32 rotation as axis * tan(angle / 2), per frame.
     """
 
     rows: IntArray
-    shift: FloatArray
-    turn: FloatArray
+    translation: FloatArray
+    rotation: FloatArray
 
     def gathered(self, source: IntArray) -> Displacement:
         """Return the displacement of the rows afterwards; ``source`` is the result of :func:`gather_rows`."""
         kept = np.flatnonzero(np.isin(source, self.rows))
-        place = np.searchsorted(self.rows, source[kept])
-        return Displacement(kept, self.shift[place], self.turn[place])
+        group = np.searchsorted(self.rows, source[kept])
+        return Displacement(kept, self.translation[group], self.rotation[group])
 
 
 def displacement_between(
@@ -42,11 +42,11 @@ def displacement_between(
         rows: [A] int64, ascending, all that the frame may have touched.
     """
     with np.errstate(over="ignore"):  # beyond float32 it is infinite; a motion predicted from that is refused
-        shift = after.means.take(rows, 0) - before.means.take(rows, 0)
-    turn = rotation_between(before.quats.take(rows, 0), after.quats.take(rows, 0))
+        translation = after.means.take(rows, 0) - before.means.take(rows, 0)
+    rotation = rotation_between(before.quats.take(rows, 0), after.quats.take(rows, 0))
     # Number by number: any(1) over rows of three takes six times as long.
-    some = np.flatnonzero(np.logical_or.reduce([column != 0 for column in (*shift.T, *turn.T)]))
-    return Displacement(rows.take(some), shift.take(some, 0), turn.take(some, 0)) if len(some) else None
+    some = np.flatnonzero(np.logical_or.reduce([column != 0 for column in (*translation.T, *rotation.T)]))
+    return Displacement(rows.take(some), translation.take(some, 0), rotation.take(some, 0)) if len(some) else None
 
 
 def rotation_between(before: FloatArray, after: FloatArray) -> FloatArray:
@@ -64,5 +64,5 @@ def rotation_between(before: FloatArray, after: FloatArray) -> FloatArray:
     size = (w0 * w0 + x0 * x0 + y0 * y0 + z0 * z0) * (w1 * w1 + x1 * x1 + y1 * y1 + z1 * z1)
     known = (w != 0) & (4 * (w * w) >= size)
     scale = np.where(known, w, 1.0)
-    turn = [np.where(known, part / scale, 0.0).astype(np.float32) for part in (x, y, z)]
-    return np.stack(turn, 1)
+    rotation = [np.where(known, part / scale, 0.0).astype(np.float32) for part in (x, y, z)]
+    return np.stack(rotation, 1)

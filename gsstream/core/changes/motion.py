@@ -57,17 +57,17 @@ class Motion:
 
 
 class GroupTransforms(NamedTuple):
-    """The rows of moving groups, and the transform of each group: x' = R (x - centre) + centre + shift.
+    """The rows of moving groups, and the transform of each group: x' = R (x - center) + center + translation.
 
-    ``rows`` [A] ascending, ``place`` [A] which of the K moving groups each is in, ``centre``, ``shift``, ``turn``
-    [K, 3] float64 (turn: axis * tan(angle / 2)).
+    ``rows`` [A] ascending, ``group`` [A] which of the K moving groups each is in, ``center``, ``translation``,
+    ``rotation`` [K, 3] float64 (turn: axis * tan(angle / 2)).
     """
 
     rows: IntArray
-    place: IntArray
-    centre: FloatArray
-    shift: FloatArray
-    turn: FloatArray
+    group: IntArray
+    center: FloatArray
+    translation: FloatArray
+    rotation: FloatArray
 
 
 def groups_for(scene: Scene, cell: float, shades: int, regroup: bool = False) -> Groups:
@@ -138,21 +138,21 @@ def predict_transforms(scene: Scene, groups: Groups, moving: IntArray, predicted
     rank[which] = np.arange(len(which))
     # take() throughout: it gathers rows four times as fast as an index in brackets, and players do this in every frame.
     rows = np.flatnonzero(moving.astype(bool).take(groups.group_of))
-    place = rank.take(groups.group_of.take(rows))
-    centre = _means(scene.gaussians.means.take(rows, 0), place, len(which))
-    shift: FloatArray = np.zeros((len(which), 3))
-    turn: FloatArray = np.zeros((len(which), 3))
-    if predicted and scene.moved is not None:
-        past = rank.take(groups.group_of.take(scene.moved.rows))
+    group = rank.take(groups.group_of.take(rows))
+    center = _means(scene.gaussians.means.take(rows, 0), group, len(which))
+    translation: FloatArray = np.zeros((len(which), 3))
+    rotation: FloatArray = np.zeros((len(which), 3))
+    if predicted and scene.displacement is not None:
+        past = rank.take(groups.group_of.take(scene.displacement.rows))
         here = np.flatnonzero(past >= 0)
         past = past.take(here)
-        shift = _means(scene.moved.shift.take(here, 0), past, len(which))
-        turn = _means(scene.moved.turn.take(here, 0), past, len(which))
-    return GroupTransforms(rows, place, centre, shift, turn)
+        translation = _means(scene.displacement.translation.take(here, 0), past, len(which))
+        rotation = _means(scene.displacement.rotation.take(here, 0), past, len(which))
+    return GroupTransforms(rows, group, center, translation, rotation)
 
 
 def apply_motion(scene: Scene, motion: Motion) -> tuple[Scene, IntArray]:
-    """Return the scene after a motion, and the rows [A] of the groups that moved. What ``moved`` says stays.
+    """Return the scene after a motion, and the rows [A] of the groups that moved. ``scene.displacement`` stays.
 
     All arithmetic is float64 in a fixed order; centres and quaternions are rounded to float32 at the end.
 
@@ -165,16 +165,16 @@ def apply_motion(scene: Scene, motion: Motion) -> tuple[Scene, IntArray]:
             f"motion: expected a mark for each of {groups.count} groups, got shape {list(motion.moving.shape)}; "
             "the packet belongs to another scene"
         )
-    moves = predict_transforms(scene, groups, motion.moving, motion.predicted)
-    if motion.symbols.shape != (len(moves.centre), 6):
+    transforms = predict_transforms(scene, groups, motion.moving, motion.predicted)
+    if motion.symbols.shape != (len(transforms.center), 6):
         raise ShapeError(
-            f"motion: expected 6 symbols for each of {len(moves.centre)} moving groups, got shape "
+            f"motion: expected 6 symbols for each of {len(transforms.center)} moving groups, got shape "
             f"{list(motion.symbols.shape)}"
         )
-    shift = moves.shift + motion.symbols[:, :3].astype(np.float64) * float(motion.translation_step)
-    turn = moves.turn + motion.symbols[:, 3:].astype(np.float64) * float(motion.rotation_step)
-    gaussians = transform_groups(scene.gaussians, moves._replace(shift=shift, turn=turn))
-    return replace(scene, gaussians=gaussians, groups=groups), moves.rows
+    translation = transforms.translation + motion.symbols[:, :3].astype(np.float64) * float(motion.translation_step)
+    rotation = transforms.rotation + motion.symbols[:, 3:].astype(np.float64) * float(motion.rotation_step)
+    gaussians = transform_groups(scene.gaussians, transforms._replace(translation=translation, rotation=rotation))
+    return replace(scene, gaussians=gaussians, groups=groups), transforms.rows
 
 
 def apply_motions(scene: Scene, motions: Sequence[Motion]) -> tuple[Scene, IntArray]:
@@ -197,19 +197,19 @@ def union_rows(number: int, *rows: IntArray) -> IntArray:
     return np.flatnonzero(marks)
 
 
-def transform_groups(gaussians: Gaussians[FloatArray], moves: GroupTransforms) -> Gaussians[FloatArray]:
+def transform_groups(gaussians: Gaussians[FloatArray], transforms: GroupTransforms) -> Gaussians[FloatArray]:
     """Return the Gaussians with the rows of moving groups transformed. Raises ShapeError beyond float32."""
-    if len(moves.rows) == 0:
+    if len(transforms.rows) == 0:
         return gaussians
-    rows, place = moves.rows, moves.place
-    quats = rodrigues_to_quat(moves.turn)
+    rows, group = transforms.rows, transforms.group
+    quats = rodrigues_to_quat(transforms.rotation)
     # Column by column: a player does this in every frame, and columns that lie together take half the time.
-    groups = np.concatenate([quat_to_rotmat(quats).reshape(-1, 9), moves.centre, moves.shift, quats], 1)
-    of = np.ascontiguousarray(groups.T).take(place, 1, mode="clip")
-    matrix, centre, shift, turn = of[:9].reshape(3, 3, -1), of[9:12], of[12:15], of[15:]
-    x, y, z = columns(gaussians.means, rows) - centre
+    groups = np.concatenate([quat_to_rotmat(quats).reshape(-1, 9), transforms.center, transforms.translation, quats], 1)
+    of = np.ascontiguousarray(groups.T).take(group, 1, mode="clip")
+    matrix, center, translation, rotation = of[:9].reshape(3, 3, -1), of[9:12], of[12:15], of[15:]
+    x, y, z = columns(gaussians.means, rows) - center
     there = matrix[:, 0] * x
-    for term in (matrix[:, 1] * y, matrix[:, 2] * z, centre, shift):
+    for term in (matrix[:, 1] * y, matrix[:, 2] * z, center, translation):
         there += term
     with np.errstate(over="ignore", invalid="ignore"):
         rounded = there.astype(np.float32)
@@ -217,7 +217,7 @@ def transform_groups(gaussians: Gaussians[FloatArray], moves: GroupTransforms) -
         raise ShapeError("motion: it leads to positions beyond the range of float32")
     means, turns = gaussians.means.copy(), gaussians.quats.copy()
     means[rows] = rounded.T
-    turns[rows] = quat_multiply(turn.T, columns(gaussians.quats, rows).T).astype(np.float32)
+    turns[rows] = quat_multiply(rotation.T, columns(gaussians.quats, rows).T).astype(np.float32)
     return replace(gaussians, means=means, quats=turns)
 
 
@@ -226,9 +226,9 @@ def columns(values: FloatArray, rows: IntArray) -> FloatArray:
     return values.take(rows, 0).T.astype(np.float64, order="C")
 
 
-def rodrigues_to_quat(turn: FloatArray) -> FloatArray:
+def rodrigues_to_quat(rotation: FloatArray) -> FloatArray:
     """Return unit quaternions [K, 4] wxyz, float64, of rotations [K, 3] given as axis * tan(angle / 2)."""
-    x, y, z = turn.T
+    x, y, z = rotation.T
     scale = 1.0 / np.sqrt(1.0 + x * x + y * y + z * z)
     return np.stack([scale, x * scale, y * scale, z * scale], 1)
 
@@ -256,8 +256,8 @@ def quat_multiply(a: FloatArray, b: FloatArray) -> FloatArray:
     ]).T  # fmt: skip
 
 
-def _means(values: FloatArray, place: IntArray, number: int) -> FloatArray:
+def _means(values: FloatArray, group: IntArray, number: int) -> FloatArray:
     """[K, 3] float64 mean of the rows in each of ``number`` places; 0 where there are none."""
-    counts = np.maximum(np.bincount(place, minlength=number), 1)
+    counts = np.maximum(np.bincount(group, minlength=number), 1)
     columns_of = values.T.astype(np.float64, order="C")
-    return np.stack([np.bincount(place, column, number) / counts for column in columns_of], 1)
+    return np.stack([np.bincount(group, column, number) / counts for column in columns_of], 1)

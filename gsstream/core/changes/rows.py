@@ -77,9 +77,9 @@ def apply_row_edit(scene: Scene, rows: RowEdit) -> Scene:
     })
     units = join_rows(layout.unit_of, None if added is None else added.unit_of, source).astype(np.uint8)
     counts = edited_counts(layout.node_counts, layout.node_of, added, rows.removed)
-    moved = None if scene.moved is None else scene.moved.gathered(source)
+    displacement = None if scene.displacement is None else scene.displacement.gathered(source)
     groups = None if scene.groups is None else scene.groups.gathered(source)
-    return Scene(gaussians, Layout(counts, units, layout.units), moved, groups)
+    return Scene(gaussians, Layout(counts, units, layout.units), displacement, groups)
 
 
 def add_as_nodes(gaussians: Gaussians[FloatArray], unit_of: IntArray, num_nodes: int) -> AddedGaussians:

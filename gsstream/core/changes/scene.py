@@ -56,11 +56,11 @@ class Scene:
     Arguments:
         gaussians: N rows, raw values, float32.
         layout: nodes and units of the rows.
-        moved: how far rows were displaced by the last frame; None: nothing moved, or a key packet came last.
+        displacement: how far rows were displaced by the last frame; None: nothing moved, or a key packet came last.
         groups: the groups that the last motion was said of; None until a motion names some after a key packet.
     """
 
     gaussians: Gaussians[FloatArray]
     layout: Layout
-    moved: Displacement | None = None
+    displacement: Displacement | None = None
     groups: Groups | None = None

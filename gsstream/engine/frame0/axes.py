@@ -24,10 +24,10 @@ def nearest_axes(gaussians: Gaussians[torch.Tensor]) -> Gaussians[torch.Tensor]:
     quats = quats / quats.norm(dim=1, keepdim=True)
     # [N, 24]: first component of the product of each quaternion with each of the rotations.
     first = quats @ quat_conjugate(_ROTATIONS).T
-    turn = first.abs().argmax(1)
-    turned = quat_multiply_torch(quats, _ROTATIONS[turn])
+    rotation = first.abs().argmax(1)
+    turned = quat_multiply_torch(quats, _ROTATIONS[rotation])
     turned = turned * turned[:, :1].sign()
-    scales = gaussians.scales.gather(1, _PLACES[turn])
+    scales = gaussians.scales.gather(1, _PLACES[rotation])
     return replace(gaussians, quats=turned.to(gaussians.quats.dtype), scales=scales)
 
 

@@ -116,10 +116,10 @@ def track_motion(refinement: Refinement, before: PlayerState, after: PlayerState
     if len(rows) == 0:
         return replace(refinement, ancestors=now)
     old, there = ancestors[rows], now[rows]
-    turn = rotation_matrices(new[1][there]) @ rotation_matrices(was[1][old]).transpose(1, 2)
+    rotation = rotation_matrices(new[1][there]) @ rotation_matrices(was[1][old]).transpose(1, 2)
     g = refinement.gaussians
     means, quats = g.means.clone(), g.quats.clone()
-    offset = (turn @ (g.means[rows] - was[0][old])[..., None])[..., 0]
+    offset = (rotation @ (g.means[rows] - was[0][old])[..., None])[..., 0]
     means[rows] = new[0][there] + offset
     quats[rows] = quat_multiply_torch(quat_multiply_torch(new[1][there], quat_conjugate(was[1][old])), g.quats[rows])
     return replace(refinement, gaussians=replace(g, means=means, quats=quats), ancestors=now)

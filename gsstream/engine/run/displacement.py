@@ -12,11 +12,11 @@ from gsstream.packet import PlayerState
 
 def displacement_pixels(player: PlayerState, cameras: Cameras) -> dict[str, float]:
     """Return the median and the largest way on the screen of the rows that the last frame displaced, pixels."""
-    moved = player.scene.moved
-    if moved is None:
+    displacement = player.scene.displacement
+    if displacement is None:
         return {"median": 0.0, "max": 0.0}
-    after = player.gaussians.means[moved.rows]
-    ways = screen_displacement(after - moved.shift, after, cameras)
+    after = player.gaussians.means[displacement.rows]
+    ways = screen_displacement(after - displacement.translation, after, cameras)
     ways = ways[np.isfinite(ways)]
     return {"median": float(np.median(ways)), "max": float(ways.max())} if len(ways) else {"median": 0.0, "max": 0.0}
 

@@ -52,7 +52,7 @@ def log_packet(log: FrameLog, player: PlayerState, packet: EncodedPacket) -> Non
 def _counts(player: PlayerState, packet: EncodedPacket) -> dict[str, int]:
     rows = sent = 0 if packet.kind is PacketKind.EMPTY else len(player.gaussians)
     added = gates = removed = moving = 0
-    delta, before, moved = player.delta, player.before, player.scene.moved
+    delta, before, displacement = player.delta, player.before, player.scene.displacement
     if packet.kind is PacketKind.DELTA and delta is not None and before is not None:
         added, removed = 0 if delta.added is None else len(delta.added), len(delta.removed)
         rows = added + (0 if delta.residual is None else changing_rows(delta.residual))
@@ -62,5 +62,5 @@ def _counts(player: PlayerState, packet: EncodedPacket) -> dict[str, int]:
     return {
         "active_gaussians": rows, "sent_gaussians": sent, "active_gates": gates,
         "added_gaussians": added, "removed_gaussians": removed,
-        "moving_groups": moving, "displaced_gaussians": 0 if moved is None else len(moved.rows),
+        "moving_groups": moving, "displaced_gaussians": 0 if displacement is None else len(displacement.rows),
     }  # fmt: skip

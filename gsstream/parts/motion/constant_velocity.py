@@ -42,15 +42,15 @@ class Coasting(MotionPart):
     source: ClassVar[str] = "gsstream"
 
     def propose(self, scene: Scene, work: FitContext, rng: Rng) -> tuple[Motion, ...]:
-        if scene.moved is None:
+        if scene.displacement is None:
             return ()
         groups = known_groups(scene, work.cameras, self.config.pixels, self.config.shades)
         config = self.config
         moving = displaced_groups(groups, scene, config.displaced)
         moving &= changed_groups(groups, work, config.votes, config.share)
         if config.asked and moving.any():
-            moves = predict_transforms(scene, groups, moving.astype(np.uint8), predicted=True)
-            change = loss_change(scene, work, moves, rotating_views(len(work.cameras), config.asked, work.index))
+            transforms = predict_transforms(scene, groups, moving.astype(np.uint8), predicted=True)
+            change = loss_change(scene, work, transforms, rotating_views(len(work.cameras), config.asked, work.index))
             moving[np.flatnonzero(moving)[change >= 0]] = False
         symbols = np.zeros((int(moving.sum()), 6), np.int32)
         return (Motion(groups.cell, groups.shades, moving.astype(np.uint8), symbols),)

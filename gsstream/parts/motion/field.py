@@ -10,7 +10,7 @@ from gsstream.parts.motion.groups import groups_of_rows
 
 
 def approximate_by_cells(
-    scene: Scene, rows: IntArray, shift: FloatArray, turn: FloatArray, side: float, step: float
+    scene: Scene, rows: IntArray, translation: FloatArray, rotation: FloatArray, side: float, step: float
 ) -> Motion | None:
     """Return the rigid motions of small cells that come nearest to a field; None where no cell moves.
 
@@ -19,8 +19,8 @@ def approximate_by_cells(
     Arguments:
         scene: decoded, as both ends have it.
         rows: [A] Gaussians that the field is of, ascending.
-        shift: [A, 3] of their centres, scene units.
-        turn: [A, 3] axis * tan(angle / 2).
+        translation: [A, 3] of their centres, scene units.
+        rotation: [A, 3] axis * tan(angle / 2).
         side: of a cell, scene units; a float32.
         step: of quantisation, scene units.
     """
@@ -28,7 +28,7 @@ def approximate_by_cells(
     place = groups.group_of[rows]
     hits = np.bincount(place, minlength=groups.count)
     able = np.flatnonzero(groups_of_rows(groups, rows))
-    values: FloatArray = np.concatenate([shift, turn], 1).astype(np.float64)
+    values: FloatArray = np.concatenate([translation, rotation], 1).astype(np.float64)
     means = np.stack([np.bincount(place, values[:, i], groups.count) / np.maximum(hits, 1) for i in range(6)], 1)
     # Half a cell from its centre, a turn of one step moves a Gaussian by a step, too.
     steps = float(np.float32(step)), float(np.float32(step / side))

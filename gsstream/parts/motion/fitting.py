@@ -61,13 +61,13 @@ def fit_transforms_adam(
     work.narrow(torch.from_numpy(start.rows))
     base = scene.gaussians.rows(start.rows).map(torch.from_numpy)
     local = start._replace(rows=np.arange(len(start.rows)))
-    descent = GroupAdam(np.concatenate([start.shift, start.turn], 1) / unit, measure)
+    descent = GroupAdam(np.concatenate([start.translation, start.rotation], 1) / unit, measure)
     for step, rate in enumerate(rates):
         if step % views == 0:
             sequence = order.permutation(views)
         values = descent.values
-        moves = local._replace(shift=values[:, :3] * unit[:3], turn=values[:, 3:] * unit[3:])
-        found = work.loss_and_grad(int(sequence[step % views]), WrtTransforms(base, moves), tiles)
+        transforms = local._replace(translation=values[:, :3] * unit[:3], rotation=values[:, 3:] * unit[3:])
+        found = work.loss_and_grad(int(sequence[step % views]), WrtTransforms(base, transforms), tiles)
         grad = found.grad.numpy() * unit
         if l1_weight:
             grad = grad + l1_weight * np.sign(values) / values.size

@@ -56,8 +56,8 @@ def groups_of_rows(groups: Groups, rows: IntArray) -> IntArray:
 
 def displaced_groups(groups: Groups, scene: Scene, share: float) -> IntArray:
     """Return [G] bool: groups of which the last frame displaced some row, and at least this share of them."""
-    if scene.moved is None:
+    if scene.displacement is None:
         return np.zeros(groups.count, bool)
     total = np.bincount(groups.group_of, minlength=groups.count)
-    hit = np.bincount(groups.group_of[scene.moved.rows], minlength=groups.count)
+    hit = np.bincount(groups.group_of[scene.displacement.rows], minlength=groups.count)
     return np.asarray((hit > 0) & (hit >= share * total))

@@ -66,13 +66,13 @@ def fit_transforms_newton(
     work.narrow(torch.from_numpy(start.rows))
     base = scene.gaussians.rows(start.rows).map(torch.from_numpy)
     local = start._replace(rows=np.arange(len(start.rows)))
-    descent = DampedNewton(np.concatenate([start.shift, start.turn], 1) / unit, damping)
+    descent = DampedNewton(np.concatenate([start.translation, start.rotation], 1) / unit, damping)
     for step in range(iterations):
         if step % views == 0:
             sequence = order.permutation(views)
         now, view = descent.values * unit, int(sequence[step % views])
-        moves = local._replace(shift=now[:, :3], turn=now[:, 3:])
-        found = work.loss_and_grad(view, WrtTransforms(base, moves, curvature=step < views), tiles)
+        transforms = local._replace(translation=now[:, :3], rotation=now[:, 3:])
+        found = work.loss_and_grad(view, WrtTransforms(base, transforms, curvature=step < views), tiles)
         curvature = None if found.curvature is None else found.curvature.numpy() * np.outer(unit, unit) * values
         descent.step(found.grad.numpy() * unit * values, curvature)
     return np.asarray(descent.values * unit)

@@ -19,16 +19,15 @@ from gsstream.parts.render.work import FitContext
 
 
 class Units(NamedTuple):
-    """The sizes of one unit: ``shift`` [scene units] is a pixel, ``turn`` [tan(angle / 2)] moves a group's edge as far.
-    """
+    """Steps that move a group by a pixel: ``translation`` [scene units], ``rotation`` [tan(angle / 2)] at its edge."""
 
-    shift: float
-    turn: float
+    translation: float
+    rotation: float
 
     @property
     def row(self) -> FloatArray:
-        """[6] units of shift and turn, side by side."""
-        return np.array([self.shift] * 3 + [self.turn] * 3)
+        """[6] units of translation and rotation, side by side."""
+        return np.array([self.translation] * 3 + [self.rotation] * 3)
 
 
 @final
@@ -78,9 +77,9 @@ class Rigid(MotionPart):
         units = Units(pixel, pixel / groups.cell)
         start = predict_transforms(scene, groups, able.astype(np.uint8), predicted=True)
         found = self._fitted(scene, work, start, units, rng)
-        steps = np.float32(config.step * units.shift), np.float32(config.step * units.turn)
+        steps = np.float32(config.step * units.translation), np.float32(config.step * units.rotation)
         step = np.array([float(steps[0])] * 3 + [float(steps[1])] * 3)
-        predicted = np.concatenate([start.shift, start.turn], 1)
+        predicted = np.concatenate([start.translation, start.rotation], 1)
         symbols = np.rint((found - predicted) / step).astype(np.int32)
         total = np.abs((predicted + symbols * step) / units.row).max(1)
         kept = total >= config.least

@@ -14,18 +14,22 @@ from gsstream.parts.render.work import FitContext
 from gsstream.parts.render.wrt import WrtTransforms
 
 
-def loss_change(scene: Scene, work: FitContext, moves: GroupTransforms, views: Sequence[int] | IntArray) -> FloatArray:
+def loss_change(
+    scene: Scene, work: FitContext, transforms: GroupTransforms, views: Sequence[int] | IntArray
+) -> FloatArray:
     """Return the change [K] of the loss, summed over views, that each group's move brings about; below 0 it helps.
 
     It is the slope of the loss half-way, along the move: for a loss that is quadratic between the two ends it is their
     difference, and one pass over the views answers for every group at once.
     """
-    work.narrow(torch.from_numpy(moves.rows))
-    base = scene.gaussians.rows(moves.rows).map(torch.from_numpy)
-    half = moves._replace(rows=np.arange(len(moves.rows)), shift=moves.shift / 2, turn=moves.turn / 2)
+    work.narrow(torch.from_numpy(transforms.rows))
+    base = scene.gaussians.rows(transforms.rows).map(torch.from_numpy)
+    half = transforms._replace(
+        rows=np.arange(len(transforms.rows)), translation=transforms.translation / 2, rotation=transforms.rotation / 2
+    )
     grads = (work.loss_and_grad(view, WrtTransforms(base, half)).grad.numpy() for view in views)
-    grad = sum(grads, np.zeros((len(moves.centre), 6)))
-    return np.asarray((grad * np.concatenate([moves.shift, moves.turn], 1)).sum(1))
+    grad = sum(grads, np.zeros((len(transforms.center), 6)))
+    return np.asarray((grad * np.concatenate([transforms.translation, transforms.rotation], 1)).sum(1))
 
 
 def rotating_views(number: int, share: float, frame: int) -> IntArray:

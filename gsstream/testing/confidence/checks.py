@@ -60,7 +60,7 @@ def check_confidence_finds_motion(part: ConfidenceEstimator) -> None:
     """What moved outranks what did not: area under the ROC curve at least 0.9. A check of usefulness."""
     case = get_case("moving")
     got = part.estimate(case)
-    moved, still = got[case.moved], got[~case.moved]
+    moved, still = got[case.moving_mask], got[~case.moving_mask]
     pairs = (moved[:, None] > still[None]).float() + 0.5 * (moved[:, None] == still[None]).float()
     auc = float(pairs.mean())
     assert auc >= ENOUGH_AUC, f"AUC of moved against still Gaussians: expected at least {ENOUGH_AUC}, got {auc:.3f}"
@@ -70,7 +70,7 @@ def check_confidence_finds_motion(part: ConfidenceEstimator) -> None:
 def check_confidence_monotone_in_change(part: ConfidenceEstimator) -> None:
     """Blending the change in (0, 1/4, 1/2, 1): the mean logit of what moved does not fall."""
     case = get_case("moving")
-    means = [float(part.estimate(case.blended(share))[case.moved].mean()) for share in (0.0, 0.25, 0.5, 1.0)]
+    means = [float(part.estimate(case.blended(share))[case.moving_mask].mean()) for share in (0.0, 0.25, 0.5, 1.0)]
     slack = 1e-3 * (1 + max(abs(value) for value in means))
     falls = [b - a for a, b in pairwise(means) if b < a - slack]
     assert not falls, f"mean logits at 0, 1/4, 1/2, 1 of the change: {means}; fall by more than {slack:.2g} (float32)"

@@ -40,9 +40,10 @@ def check_motion_fits(part: MotionPart) -> None:
 def check_motion_pure(part: MotionPart) -> None:
     """The scene stays as it was, and the same frame gives the same motions again."""
     case = fit_fixture()
-    before = fingerprint((case.scene.gaussians, case.scene.layout, case.scene.moved))
+    before = fingerprint((case.scene.gaussians, case.scene.layout, case.scene.displacement))
     first = part.propose(case.scene, case.work, case.rng)
-    assert fingerprint((case.scene.gaussians, case.scene.layout, case.scene.moved)) == before, "the scene was changed"
+    after = fingerprint((case.scene.gaussians, case.scene.layout, case.scene.displacement))
+    assert after == before, "the scene was changed"
     assert fingerprint(first) == fingerprint(_proposed(part)), "the second call gives other motions than the first"
 
 

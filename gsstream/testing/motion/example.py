@@ -26,13 +26,13 @@ class ExampleMotion(MotionPart):
         )
 
     def propose(self, scene: Scene, work: FitContext, rng: Rng) -> tuple[Motion, ...]:
-        if scene.moved is None:
+        if scene.displacement is None:
             return ()
         # A packet holds the cell in single precision, and both ends must form the same groups.
         cell = float(np.float32(self.config.cell * work.cameras.extent))
         groups = groups_for(scene, cell, shades=1)
         moved = np.zeros(groups.count, bool)
-        moved[groups.group_of[scene.moved.rows]] = True
+        moved[groups.group_of[scene.displacement.rows]] = True
         changed = work.changed_rows(self.config.votes).numpy()
         total = np.bincount(groups.group_of, minlength=groups.count)
         inside = np.bincount(groups.group_of[changed], minlength=groups.count)

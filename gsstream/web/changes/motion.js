@@ -10,8 +10,8 @@ export const SECTIONS = ["motion"];
 const PREDICTED = 1;
 const REGROUP = 2;
 const MAX_MOTIONS = 8;
-const MAX_SHADES = 16;
-const MAX_SHIFT = 1e18;
+const MAX_BRIGHTNESS_BINS = 16;
+const MAX_TRANSLATION = 1e18;
 const HALF_GRID = 32768;
 const SH0 = 0.28209479177387814;
 
@@ -34,7 +34,7 @@ export function decodeMotions(section, state) {
     const scene = { means, quats, sh0: state.scene.sh0, groups };
     const motion = decodeMotion(part, scene);
     ({ groups } = motion);
-    rows = united(rows, moveRows(scene, motion, state.moved));
+    rows = unionRows(rows, applyTransforms(scene, motion, state.displacement));
   }
   return { means, quats, groups, rows };
 }
@@ -53,7 +53,7 @@ function copied(state) {
 }
 
 /** The rows of two ascending lists, ascending. */
-export function united(a, b) {
+export function unionRows(a, b) {
   const out = new Uint32Array(a.length + b.length);
   let at = 0;
   let i = 0;
@@ -71,19 +71,19 @@ export function united(a, b) {
 
 function decodeMotion(data, scene) {
   if (data.length < 14) throw new PacketError("motion cut short");
-  const [flags, shades] = data;
+  const [flags, brightnessBins] = data;
   if (flags & ~(PREDICTED | REGROUP)) throw new PacketError(`motion: unknown flags ${flags}; a newer player is needed`);
   const view = new DataView(data.buffer, data.byteOffset, data.byteLength);
-  const [cell, shiftStep, turnStep] = [2, 6, 10].map((at) => view.getFloat32(at, true));
-  if (![cell, shiftStep, turnStep].every((value) => value > 0 && value < 1e9)) {
+  const [cell, translationStep, rotationStep] = [2, 6, 10].map((at) => view.getFloat32(at, true));
+  if (![cell, translationStep, rotationStep].every((value) => value > 0 && value < 1e9)) {
     throw new PacketError("motion: expected a cell and steps above 0 and below 1e9");
   }
-  if (shades < 1 || shades > MAX_SHADES) {
-    throw new PacketError(`motion: expected 1 to ${MAX_SHADES} shades, got ${shades}`);
+  if (brightnessBins < 1 || brightnessBins > MAX_BRIGHTNESS_BINS) {
+    throw new PacketError(`motion: expected 1 to ${MAX_BRIGHTNESS_BINS} classes of brightness, got ${brightnessBins}`);
   }
   const known = scene.groups;
-  const keep = known && !(flags & REGROUP) && known.cell === cell && known.shades === shades;
-  const groups = keep ? known : formGroups(scene, cell, shades);
+  const keep = known && !(flags & REGROUP) && known.cell === cell && known.brightnessBins === brightnessBins;
+  const groups = keep ? known : formGroups(scene, cell, brightnessBins);
   const [marks, table] = unpackParts(data.subarray(14), 2);
   const { gates: moving, levels } = decodeGates(marks, groups.count);
   if (levels !== 1) throw new PacketError("motion: groups move or stand still, there are no levels");
@@ -91,22 +91,23 @@ function decodeMotion(data, scene) {
   const symbols = decodeSymbols(table, number, 6);
   let largest = 0;
   for (let i = 0; i < symbols.length; i += 1) largest = Math.max(largest, Math.abs(symbols[i]));
-  if (largest * Math.max(shiftStep, turnStep) > MAX_SHIFT) throw new PacketError("motion: a correction that cannot be");
-  return { groups, moving, number, symbols, shiftStep, turnStep, predicted: (flags & PREDICTED) !== 0 };
+  const step = Math.max(translationStep, rotationStep);
+  if (largest * step > MAX_TRANSLATION) throw new PacketError("motion: a correction that cannot be");
+  return { groups, moving, number, symbols, translationStep, rotationStep, predicted: (flags & PREDICTED) !== 0 };
 }
 
 /** Rows of one cell of a grid and of one class of brightness are a group; groups are numbered by cell, then class. */
-function formGroups({ means, sh0 }, cell, shades) {
+function formGroups({ means, sh0 }, cell, brightnessBins) {
   const number = means.length / 3;
   const keys = new Float64Array(number);
   const index = (value) => Math.min(Math.max(Math.floor(value / cell), -HALF_GRID), HALF_GRID - 1) + HALF_GRID;
   for (let i = 0; i < number; i += 1) {
     const bright = 0.5 + SH0 * (0.25 * sh0[3 * i] + 0.5 * sh0[3 * i + 1] + 0.25 * sh0[3 * i + 2]);
-    const shade = Math.min(Math.max(Math.floor(bright * shades), 0), shades - 1);
+    const shade = Math.min(Math.max(Math.floor(bright * brightnessBins), 0), brightnessBins - 1);
     const place = (index(means[3 * i]) * 2 * HALF_GRID + index(means[3 * i + 1])) * 2 * HALF_GRID;
-    keys[i] = (place + index(means[3 * i + 2])) * MAX_SHADES + shade;
+    keys[i] = (place + index(means[3 * i + 2])) * MAX_BRIGHTNESS_BINS + shade;
   }
-  return { cell, shades, ...ranked(keys) };
+  return { cell, brightnessBins, ...ranked(keys) };
 }
 
 /** The rank of every key among the distinct ones, and how many of these there are. */
@@ -137,7 +138,7 @@ function ranked(keys) {
 }
 
 /** Move the rows of moving groups, which are returned, in place, in float64 and in the format's order of operations. */
-function moveRows(scene, motion, moved) {
+function applyTransforms(scene, motion, displacement) {
   const { groups, moving, number } = motion;
   const rank = new Int32Array(groups.count).fill(-1);
   for (let group = 0, k = 0; group < moving.length; group += 1) if (moving[group]) rank[group] = k++;
@@ -157,13 +158,13 @@ function moveRows(scene, motion, moved) {
     own[3 * k + 2] += means[3 * row + 2];
   }
   divide(own, counts);
-  const { shift, turn } = transforms(motion, moved, rank);
-  const turns = unitQuats(turn);
+  const { translation, rotation } = transforms(motion, displacement, rank);
+  const rotations = rodriguesToQuat(rotation);
   for (let i = 0; i < found; i += 1) {
     const row = rows[i];
     const k = rank[groupOf[row]];
-    moveCentre(means, row, turns, own, shift, k);
-    turnQuat(quats, row, turns, k);
+    transformMean(means, row, rotations, own, translation, k);
+    rotateQuat(quats, row, rotations, k);
   }
   return rows.subarray(0, found);
 }
@@ -172,45 +173,45 @@ function divide(sums, counts) {
   for (let i = 0; i < sums.length; i += 1) sums[i] /= Math.max(counts[(i / 3) | 0], 1);
 }
 
-/** Shift and turn of every moving group: the mean displacement of its rows in the last frame, corrected. */
-function transforms({ groups, number, symbols, shiftStep, turnStep, predicted }, moved, rank) {
-  const shift = new Float64Array(3 * number);
-  const turn = new Float64Array(3 * number);
-  if (predicted && moved) {
+/** Translation and rotation of every moving group: the mean displacement of its rows in the last frame, corrected. */
+function transforms({ groups, number, symbols, translationStep, rotationStep, predicted }, displacement, rank) {
+  const translation = new Float64Array(3 * number);
+  const rotation = new Float64Array(3 * number);
+  if (predicted && displacement) {
     const counts = new Int32Array(number);
-    for (let i = 0; i < moved.rows.length; i += 1) {
-      const k = rank[groups.groupOf[moved.rows[i]]];
+    for (let i = 0; i < displacement.rows.length; i += 1) {
+      const k = rank[groups.groupOf[displacement.rows[i]]];
       if (k < 0) continue;
       counts[k] += 1;
       for (let axis = 0; axis < 3; axis += 1) {
-        shift[3 * k + axis] += moved.shift[3 * i + axis];
-        turn[3 * k + axis] += moved.turn[3 * i + axis];
+        translation[3 * k + axis] += displacement.translation[3 * i + axis];
+        rotation[3 * k + axis] += displacement.rotation[3 * i + axis];
       }
     }
-    divide(shift, counts);
-    divide(turn, counts);
+    divide(translation, counts);
+    divide(rotation, counts);
   }
   for (let k = 0; k < number; k += 1) {
     for (let axis = 0; axis < 3; axis += 1) {
-      shift[3 * k + axis] += symbols[axis * number + k] * shiftStep;
-      turn[3 * k + axis] += symbols[(3 + axis) * number + k] * turnStep;
+      translation[3 * k + axis] += symbols[axis * number + k] * translationStep;
+      rotation[3 * k + axis] += symbols[(3 + axis) * number + k] * rotationStep;
     }
   }
-  return { shift, turn };
+  return { translation, rotation };
 }
 
-/** Unit quaternions wxyz of turns given as axis * tan(angle / 2). */
-function unitQuats(turn) {
-  const out = new Float64Array((turn.length / 3) * 4);
-  for (let k = 0; 3 * k < turn.length; k += 1) {
-    const [x, y, z] = turn.subarray(3 * k, 3 * k + 3);
+/** Unit quaternions wxyz of rotations given as axis * tan(angle / 2). */
+function rodriguesToQuat(rotation) {
+  const out = new Float64Array((rotation.length / 3) * 4);
+  for (let k = 0; 3 * k < rotation.length; k += 1) {
+    const [x, y, z] = rotation.subarray(3 * k, 3 * k + 3);
     const scale = 1 / Math.sqrt(1 + x * x + y * y + z * z);
     out.set([scale, x * scale, y * scale, z * scale], 4 * k);
   }
   return out;
 }
 
-function moveCentre(means, row, quats, centre, shift, k) {
+function transformMean(means, row, quats, centre, translation, k) {
   const w = quats[4 * k];
   const x = quats[4 * k + 1];
   const y = quats[4 * k + 2];
@@ -221,9 +222,9 @@ function moveCentre(means, row, quats, centre, shift, k) {
   const t0 = (1 - 2 * (y * y + z * z)) * d0 + 2 * (x * y - w * z) * d1 + 2 * (x * z + w * y) * d2;
   const t1 = 2 * (x * y + w * z) * d0 + (1 - 2 * (x * x + z * z)) * d1 + 2 * (y * z - w * x) * d2;
   const t2 = 2 * (x * z - w * y) * d0 + 2 * (y * z + w * x) * d1 + (1 - 2 * (x * x + y * y)) * d2;
-  means[3 * row] = t0 + centre[3 * k] + shift[3 * k];
-  means[3 * row + 1] = t1 + centre[3 * k + 1] + shift[3 * k + 1];
-  means[3 * row + 2] = t2 + centre[3 * k + 2] + shift[3 * k + 2];
+  means[3 * row] = t0 + centre[3 * k] + translation[3 * k];
+  means[3 * row + 1] = t1 + centre[3 * k + 1] + translation[3 * k + 1];
+  means[3 * row + 2] = t2 + centre[3 * k + 2] + translation[3 * k + 2];
   if (
     !Number.isFinite(means[3 * row]) ||
     !Number.isFinite(means[3 * row + 1]) ||
@@ -233,7 +234,7 @@ function moveCentre(means, row, quats, centre, shift, k) {
   }
 }
 
-function turnQuat(values, row, quats, k) {
+function rotateQuat(values, row, quats, k) {
   const w0 = quats[4 * k];
   const x0 = quats[4 * k + 1];
   const y0 = quats[4 * k + 2];

@@ -15,8 +15,8 @@ const HEAD_PARTS = 5;
 /**
  * Decode added and removed rows from sections by name. Nothing of `state` changes.
  *
- * Returns `{ removed: Uint8Array [N] or null, added: { number, counts, nodes, unitOf, scene } or null }`; `counts` is the
- * number of added Gaussians of each of the `nodes` nodes there are afterwards.
+ * Returns `{ removed: Uint8Array [N] or null, added: { number, counts, unitOf, scene } or null }`; `counts`: Gaussians
+ * added to each node there is afterwards.
  */
 export function decodeRows(sections, state, offset) {
   const number = state.layout.unitOf.length;
@@ -76,9 +76,7 @@ function checkWidths(added, state, offset) {
   }
 }
 
-/**
- * Let rows leave and join, in place. Returns [N'] the row that each row was before; N + j is added row j.
- */
+/** Remove and add rows, in place. Returns [N'] the row that each row was before; N + j is added row j. */
 export function applyRows(state, { removed, added }) {
   const { layout, scene, widths } = state;
   const source = gatherRows(layout, removed, added);

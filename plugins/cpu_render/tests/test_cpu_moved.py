@@ -84,7 +84,7 @@ def test_curvature_is_that_of_the_default_body(coloured: bool, some: bool, threa
 
 
 def test_a_fault_is_named_by_the_default_body() -> None:
-    far = moves()._replace(shift=np.full((3, 3), 1e39))
+    far = moves()._replace(translation=np.full((3, 3), 1e39))
     with pytest.raises(ShapeError, match="positions beyond the range of float32"):
         fused(far, comparison())
 
@@ -96,7 +96,7 @@ def test_other_losses_and_wide_sessions_take_the_default_body() -> None:
     want = RenderSession.loss_and_grad(session, 1, other, WrtTransforms(rows, given))
     assert torch.equal(fused(given, other).grad, want.grad)
     whole = scene()
-    every = moves()._replace(rows=np.arange(len(whole)), place=np.arange(len(whole)) % 2)
+    every = moves()._replace(rows=np.arange(len(whole)), group=np.arange(len(whole)) % 2)
     wide = CpuRenderer().open(whole, None, rig(), BACKGROUND)
     found = wide.loss_and_grad(1, wanted, WrtTransforms(whole, every))
     assert torch.equal(found.grad, RenderSession.loss_and_grad(wide, 1, wanted, WrtTransforms(whole, every)).grad)

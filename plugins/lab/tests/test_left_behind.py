@@ -22,7 +22,7 @@ def source():
 
 def player(means: np.ndarray, opacity: float = 3.0) -> SimpleNamespace:
     gaussians = SimpleNamespace(means=means.astype(np.float32), opacities=np.full(len(means), opacity, np.float32))
-    return SimpleNamespace(gaussians=gaussians, delta=None, before=None, scene=SimpleNamespace(moved=None))
+    return SimpleNamespace(gaussians=gaussians, delta=None, before=None, scene=SimpleNamespace(displacement=None))
 
 
 def inner_ball(source, frame: int) -> np.ndarray:
@@ -45,13 +45,13 @@ def test_ways_are_those_of_the_projections(source) -> None:
     np.testing.assert_allclose(screen_displacement(before, after, rig), np.nanmean(expected, axis=0), rtol=1e-6)
     behind = np.array([[50.0, 0, 1]])
     assert np.isnan(screen_displacement(behind, behind, rig)).all(), "no camera sees it"
-    moved = SimpleNamespace(rows=np.arange(40), shift=(after - before).astype(np.float32))
+    moved = SimpleNamespace(rows=np.arange(40), translation=(after - before).astype(np.float32))
     state = player(after)
-    state.scene.moved = moved
+    state.scene.displacement = moved
     found = displacement_pixels(state, rig)
     assert found["median"] == pytest.approx(np.median(np.nanmean(expected, axis=0)), rel=1e-3)
     assert found["max"] >= found["median"] > 1
-    state.scene.moved = None
+    state.scene.displacement = None
     assert displacement_pixels(state, rig) == {"median": 0.0, "max": 0.0}
 
 

@@ -70,7 +70,7 @@ def test_the_contract(networks: Path, output: str) -> None:
 def test_what_moved_outranks_what_stood_still(networks: Path) -> None:
     case = get_case("moving")
     z = part(networks, "change").estimate(case)
-    assert z[case.moved].mean() > z[~case.moved].mean() + 1
+    assert z[case.moving_mask].mean() > z[~case.moving_mask].mean() + 1
 
 
 def test_the_map_is_read_where_the_centre_is(networks: Path) -> None:

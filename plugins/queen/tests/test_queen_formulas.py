@@ -182,8 +182,8 @@ class TestChange:
         every = torch.stack(gradients)
         expected = every.mean(0).norm(dim=1) if aggregate == "mean-vector" else every.norm(dim=2).sum(0)
         torch.testing.assert_close(found.difference, expected, atol=1e-6, rtol=1e-4)
-        moved = found.difference[case.moved].mean()
-        assert moved > 3 * found.difference[~case.moved].mean(), "what moved feels more than what did not"
+        moved = found.difference[case.moving_mask].mean()
+        assert moved > 3 * found.difference[~case.moving_mask].mean(), "what moved feels more than what did not"
 
     def test_still_images_change_nothing(self) -> None:
         assert float(gradient_difference(get_case("moving").blended(0), ChangeSettings()).difference.max()) == 0  # type: ignore[arg-type]

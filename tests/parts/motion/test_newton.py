@@ -88,7 +88,7 @@ def test_curvature_is_how_far_rows_go_on_the_screen_times_what_holds_them_there(
     def moved(size: float) -> np.ndarray:
         along = np.zeros((2, 6))
         along[:, number] = size
-        return transformed64(base, moves._replace(shift=moves.shift + along[:, :3], turn=along[:, 3:]))
+        return transformed64(base, moves._replace(translation=moves.translation + along[:, :3], rotation=along[:, 3:]))
 
     now = moved(0.0)
     curvature = curvature_of(now, moves, case.cameras, 1, structure)
@@ -103,12 +103,12 @@ def test_curvature_is_how_far_rows_go_on_the_screen_times_what_holds_them_there(
 
 def transformed64(base: Gaussians[np.ndarray], moves: GroupTransforms) -> np.ndarray:
     """Means after rigid motions, in double precision: x' = R (x - centre) + centre + shift."""
-    x, y, z = moves.turn.T
+    x, y, z = moves.rotation.T
     zero = np.zeros_like(x)
     cross = np.stack([np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)], -2)
     turned = np.linalg.solve(np.eye(3) - cross, np.eye(3) + cross)  # Cayley's transform of tan(angle / 2)
-    arm = base.means - moves.centre[moves.place]
-    return np.asarray((turned[moves.place] @ arm[..., None])[..., 0] + (moves.centre + moves.shift)[moves.place])
+    arm = base.means - moves.center[moves.group]
+    return np.asarray((turned[moves.group] @ arm[..., None])[..., 0] + (moves.center + moves.translation)[moves.group])
 
 
 def test_the_transform_by_hand_is_that_of_the_stream() -> None:
@@ -136,7 +136,7 @@ def test_gradients_are_the_same_with_and_without_curvature(tiles: Literal["all",
     torch.testing.assert_close(found.grad, without.grad, rtol=1e-5, atol=1e-9)
     assert without.curvature is None
     assert found.curvature is not None
-    assert found.curvature.shape == (len(moves.centre), 6, 6)
+    assert found.curvature.shape == (len(moves.center), 6, 6)
     assert float(found.curvature.abs().max()) > 0
 
 
@@ -173,7 +173,7 @@ def test_a_body_that_moved_is_found_where_it_went(seed: int) -> None:
     images = np.stack([seen(blank).shown(after, view).numpy() for view in range(len(cameras))])
     arm = float(np.linalg.norm(gaussians.means[rows] - centre, axis=1).mean())
     unit, order = np.array([pixel] * 3 + [pixel / arm] * 3), np.random.default_rng(0)
-    scene, start = replace(fit_fixture().scene, gaussians=gaussians), moves._replace(shift=zeros, turn=zeros)
+    scene, start = replace(fit_fixture().scene, gaussians=gaussians), moves._replace(translation=zeros, rotation=zeros)
     found = fit_transforms_newton(scene, seen(images), start, unit, 8 * len(cameras), order, Damping(0.1, 1.0, 0.5))
     wanted = np.concatenate([shift, turn], 1)
     before, now = np.abs(wanted / unit).max(), np.abs((found - wanted) / unit).max()

@@ -47,7 +47,8 @@ def body(turns: bool = False) -> tuple[Scene, GroupTransforms]:
     scene = Scene(gaussians, layout, Displacement(np.arange(3), shift, np.zeros_like(shift)), groups)
     moves = predict_transforms(scene, groups, np.ones(3, np.uint8), predicted=True)
     if turns:
-        moves = moves._replace(shift=np.zeros_like(moves.shift), turn=np.tile(TURN, (3, 1)).astype(moves.turn.dtype))
+        rotation = np.tile(TURN, (3, 1)).astype(moves.rotation.dtype)
+        moves = moves._replace(translation=np.zeros_like(moves.translation), rotation=rotation)
     return scene, moves
 
 
@@ -55,7 +56,8 @@ def frame_in_which(share: float, turns: bool = False) -> EngineContext:
     """Return the frame that shows this share of the last displacement once more, or of the turn."""
     scene, moves = body(turns)
     method, case = MethodUnderTest("dense"), fit_fixture()
-    there = transform_groups(scene.gaussians, moves._replace(shift=moves.shift * share, turn=moves.turn * share))
+    part = moves._replace(translation=moves.translation * share, rotation=moves.rotation * share)
+    there = transform_groups(scene.gaussians, part)
     cameras = case.work.cameras
     stands, shows = (
         np.stack([case.work.shown(gaussians.map(torch.from_numpy), view).numpy() for view in range(len(cameras))])

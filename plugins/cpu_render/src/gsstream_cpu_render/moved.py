@@ -18,13 +18,14 @@ def loss_and_grad_of_transforms(
     rasterizer: Any, compared: Any, target: ViewTarget, wrt: WrtTransforms
 ) -> LossAndGrad[torch.Tensor] | None:
     """Return loss, gradient and curvature; None where there is a fault."""
-    moves = wrt.transforms
-    groups = len(moves.centre)
+    transforms = wrt.transforms
+    groups = len(transforms.center)
     grad, curvature = np.empty((groups, 6)), np.empty((groups, 6, 6)) if wrt.curvature else None
-    place = np.ascontiguousarray(moves.place, np.int64)
-    transforms = [np.ascontiguousarray(part, np.float64) for part in (moves.centre, moves.shift, moves.turn)]
+    group = np.ascontiguousarray(transforms.group, np.int64)
+    parts = transforms.center, transforms.translation, transforms.rotation
+    arrays = [np.ascontiguousarray(part, np.float64) for part in parts]
     splats = SplatArrays(*(np.ascontiguousarray(value.detach().numpy(), np.float32) for _, value in wrt.base.items()))
-    given = rasterizer, native_scene(splats), compared, place, *transforms, grad, curvature
+    given = rasterizer, native_scene(splats), compared, group, *arrays, grad, curvature
     faults, l1, dssim = _native.transform_loss_and_grad(*given)
     values = target.prepared.image.size
     loss = weighted(l1, dssim, target.dssim, 1.0 / values)

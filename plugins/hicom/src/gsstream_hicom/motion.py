@@ -74,12 +74,12 @@ def _fitted(
 
 def _warm(scene: Scene, start: Scene, moves: GroupTransforms, momentum: float) -> GroupTransforms:
     """Moves that begin with a share of the last frame's motion, less what coarser cells have moved by already."""
-    if start.moved is None or momentum == 0:
+    if start.displacement is None or momentum == 0:
         return moves
     past: FloatArray = np.zeros((len(scene.gaussians), 3))
-    past[start.moved.rows] = momentum * start.moved.shift
+    past[start.displacement.rows] = momentum * start.displacement.translation
     left = (past - (scene.gaussians.means.astype(np.float64) - start.gaussians.means))[moves.rows]
-    counts = np.bincount(moves.place, minlength=len(moves.centre))
-    columns = [np.bincount(moves.place, left[:, i], len(moves.centre)) / counts for i in range(3)]
-    return moves._replace(shift=np.stack(columns, 1))
+    counts = np.bincount(moves.group, minlength=len(moves.center))
+    columns = [np.bincount(moves.group, left[:, i], len(moves.center)) / counts for i in range(3)]
+    return moves._replace(translation=np.stack(columns, 1))
 

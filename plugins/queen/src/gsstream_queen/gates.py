@@ -20,13 +20,13 @@ def open_logit(settings: GateSettings) -> float:
 def initial_logits(difference: torch.Tensor, seen: torch.Tensor, settings: GateSettings) -> torch.Tensor:
     """[N] logits such that a gate is open with p = m / (m + median), the published confidence."""
     logits = torch.full_like(difference, -BOUND)
-    moved = seen & (difference > 0)
-    if not bool(moved.any()):
+    changed = seen & (difference > 0)
+    if not bool(changed.any()):
         return logits
     median = difference[seen].median()
     # ln p / (1 - p) = ln m / median; over a median of 0 everything that changed is sure.
-    sure = torch.full_like(difference[moved], BOUND)
-    logits[moved] = (difference[moved] / median).log() + open_logit(settings) if float(median) > 0 else sure
+    sure = torch.full_like(difference[changed], BOUND)
+    logits[changed] = (difference[changed] / median).log() + open_logit(settings) if float(median) > 0 else sure
     return logits.clamp(-BOUND, BOUND)
 
 

@@ -58,7 +58,7 @@ def fitted_motion(
     unit = np.array([pixel] * 3 + [pixel / side] * 3)
     steps = float(np.float32(settings.step * pixel)), float(np.float32(settings.rotation_step))
     step = np.array([steps[0]] * 3 + [steps[1]] * 3)
-    levels = bound(cells.centre, scene.gaussians.means, anchors[1])
+    levels = bound(cells.center, scene.gaussians.means, anchors[1])
     anchored = AnchoredCells(cells, levels, unit, step if settings.rounded else None)
     found = _fitted(scene, work, anchored, _start(scene, cells, anchors, levels, settings), epochs, settings, order)
     symbols = np.rint(found / step).astype(np.int32)
@@ -75,12 +75,12 @@ def _start(
 ) -> list[FloatArray]:  # fmt: skip
     """Motions [K, 6] of the anchors that begin with a share of the last frame's."""
     before, now = anchors
-    if scene.moved is None or before is None or not all(map(len, before.rows)):
+    if scene.displacement is None or before is None or not all(map(len, before.rows)):
         return [np.zeros((len(level.at), 6)) for level in levels]
     past: FloatArray = np.zeros((len(scene.gaussians), 6))
-    past[scene.moved.rows] = np.concatenate([scene.moved.shift, scene.moved.turn], 1)
-    mean = Level(cells.centre, cells.place).mean(past[cells.rows])
-    old = levels if before is now else bound(cells.centre, scene.gaussians.means, before)
+    past[scene.displacement.rows] = np.concatenate([scene.displacement.translation, scene.displacement.rotation], 1)
+    mean = Level(cells.center, cells.group).mean(past[cells.rows])
+    old = levels if before is now else bound(cells.center, scene.gaussians.means, before)
     return [settings.momentum * motion for motion in inherited(mean, old, levels, settings.neighbours)]
 
 
@@ -98,7 +98,7 @@ def _fitted(
     for _ in range(epochs):
         for view in order.permutation(len(work.cameras)):
             sums = anchored.sums(descents)
-            moves = local._replace(shift=sums[:, :3], turn=sums[:, 3:])
+            moves = local._replace(translation=sums[:, :3], rotation=sums[:, 3:])
             grad = work.loss_and_grad(int(view), WrtTransforms(base, moves)).grad.numpy() * unit
             for level, descent in zip(anchored.levels, descents, strict=True):
                 l1_weight = settings.l1_weight * np.sign(descent.values) / descent.values.size

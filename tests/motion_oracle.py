@@ -39,21 +39,21 @@ class World:
         """A scene after a key packet."""
         return cls(gaussians.means.tolist(), gaussians.quats.tolist(), gaussians.sh0[:, 0].tolist())
 
-    def form_groups(self, cell: float, shades: int, regroup: bool) -> None:
+    def form_groups(self, cell: float, brightness_bins: int, regroup: bool) -> None:
         """Paragraph "Groups"."""
-        if self.named == (cell, shades) and not regroup:
+        if self.named == (cell, brightness_bins) and not regroup:
             return
         keys = []
         for mean, (red, green, blue) in zip(self.means, self.sh0, strict=True):
             index = [min(max(math.floor(x / cell), -32768), 32767) for x in mean]
             bright = 0.5 + 0.28209479177387814 * (0.25 * red + 0.5 * green + 0.25 * blue)
-            keys.append((*index, min(max(math.floor(bright * shades), 0), shades - 1)))
+            keys.append((*index, min(max(math.floor(bright * brightness_bins), 0), brightness_bins - 1)))
         number = {key: i for i, key in enumerate(sorted(set(keys)))}
-        self.named, self.group_of, self.count = (cell, shades), [number[key] for key in keys], len(number)
+        self.named, self.group_of, self.count = (cell, brightness_bins), [number[key] for key in keys], len(number)
 
     def move(self, motion: Any) -> set[int]:
         """Paragraphs "Transform of a moving group" and "Applied to a row"; returns the rows of moving groups."""
-        self.form_groups(motion.cell, motion.shades, motion.regroup)
+        self.form_groups(motion.cell, motion.brightness_bins, motion.regroup)
         marks = [int(mark) for mark in motion.moving]
         assert len(marks) == self.count
         moving = [group for group in range(self.count) if marks[group]]

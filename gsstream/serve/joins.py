@@ -56,7 +56,7 @@ def encode_join(key: PlayerState, state: PlayerState, source: IntArray) -> bytes
         facts["decoders"][name] = list(decoder.shape)
         arrays.append(decoder.astype("<f4"))
     if (groups := state.scene.groups) is not None:
-        facts["groups"] = {"cell": groups.cell, "shades": groups.shades, "count": groups.count}
+        facts["groups"] = {"cell": groups.cell, "bins": groups.brightness_bins, "count": groups.count}
         arrays.append(_steps(groups.group_of))
     displacement = state.scene.displacement
     facts["displaced"] = None if displacement is None else len(displacement.rows)
@@ -96,7 +96,7 @@ def decode_join(key: PlayerState, data: bytes) -> PlayerState:
     decoders = {name: cursor.array("<f4", a * b).reshape(a, b) for name, (a, b) in facts["decoders"].items()}
     groups, displacement = None, None
     if (said := facts["groups"]) is not None:
-        groups = Groups(said["cell"], said["shades"], cursor.steps(number).astype(np.int32), said["count"])
+        groups = Groups(said["cell"], said["bins"], cursor.steps(number).astype(np.int32), said["count"])
     if (count := facts["displaced"]) is not None:
         rows = cursor.steps(count)
         translation, rotation = (cursor.planes(count, 3).view(np.float32) for _ in range(2))

@@ -65,8 +65,8 @@ export function gatherDisplacement(displacement, source, number) {
     from[at++] = place[source[i]];
   }
   const kept = from.subarray(0, at);
-  const [translation, rotation] = [displacement.translation, displacement.rotation].map((v) => gatherValues(v, kept, 3));
-  return { rows: rows.slice(0, at), translation, rotation };
+  const values = (name) => gatherValues(displacement[name], kept, 3);
+  return { rows: rows.slice(0, at), translation: values("translation"), rotation: values("rotation") };
 }
 
 /** The groups likewise: an added Gaussian joins the group of the row before it; without old rows, none. */

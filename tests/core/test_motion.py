@@ -248,12 +248,12 @@ def test_cells_and_shades_at_their_ends() -> None:
 
 
 @given(SEEDS, st.floats(1e-3, 1e5).map(np.float32), st.integers(1, 16))
-def test_groups_are_those_of_the_text(seed: int, cell: np.float32, shades: int) -> None:
+def test_groups_are_those_of_the_text(seed: int, cell: np.float32, brightness_bins: int) -> None:
     g = np.random.default_rng(seed)
     scene = scene_of(g.normal(size=(40, 3)) * 10.0 ** g.integers(-2, 5), sh0=g.normal(size=40))
     world = World.of(scene.gaussians)
-    world.form_groups(float(cell), shades, False)
-    found = groups_for(scene, float(cell), shades)
+    world.form_groups(float(cell), brightness_bins, False)
+    found = groups_for(scene, float(cell), brightness_bins)
     assert (found.group_of.tolist(), found.count) == (world.group_of, world.count)
 
 

@@ -266,7 +266,7 @@ SPOILED = {
     "symbols of halves": (lambda motion: (replace(motion, symbols=motion.symbols + 0.5),), "expected int32, got"),
     "no cell": (lambda motion: (replace(motion, cell=float("nan")),), "cell: expected a float32 above 0"),
     "a cell of zero": (lambda motion: (replace(motion, cell=0.0),), "cell: expected a float32 above 0"),
-    "no shades": (lambda motion: (replace(motion, shades=0),), "shades: expected 1 to 16"),
+    "no brightness bins": (lambda motion: (replace(motion, brightness_bins=0),), "brightness_bins: expected 1 to 16"),
     "beyond everything": (
         lambda motion: (replace(motion, symbols=np.full_like(motion.symbols, 2**31 - 1), translation_step=9e8),),
         "motion",

@@ -139,7 +139,7 @@ def test_a_packet_that_lies_about_what_it_was_decoded_to_is_found_where_every_st
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("cell", 2.0), ("shades", 3), ("count", 2), ("group_of", np.ones(12, np.int32))]
+    ("field", "value"), [("cell", 2.0), ("brightness_bins", 3), ("count", 2), ("group_of", np.ones(12, np.int32))]
 )
 def test_groups_are_compared_field_by_field(begun, field: str, value: Any) -> None:
     """Equal rows under another cell or in more groups: the marks of the next motion would be of other groups."""

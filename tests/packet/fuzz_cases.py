@@ -140,7 +140,7 @@ def _payload(rng: np.random.Generator, name: str, data: bytes) -> bytes:
 
 
 def _heads(rng: np.random.Generator, data: bytes) -> bytes:
-    """Flags, shades and steps of the first motion replaced by others that could be, and by some that could not."""
+    """Flags, bins and steps of the first motion replaced by others that could be, and by some that could not."""
     at = 1 if data[0] == 1 else 1 + next(i for i, byte in enumerate(data[1:], 1) if byte < 128)
     steps = rng.choice([0.0, 1e-30, 0.01, 1.0, 1e8, 1e9, -1.0, np.nan, np.inf], 3, p=[0.02, *[0.23] * 4, *[0.015] * 4])
     head = struct.pack("<BBfff", int(rng.integers(5)), int(rng.integers(18)), *steps.tolist())

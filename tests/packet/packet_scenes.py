@@ -110,13 +110,14 @@ def make_edit(rng: np.random.Generator, state: PlayerState, births: int = 3, dea
 
 
 def make_motion(
-    rng: np.random.Generator, scene: Scene, cell: float = 1.5, shades: int = 2, share: float = 0.6, **said: bool
+    rng: np.random.Generator, scene: Scene, cell: float = 1.5, brightness_bins: int = 2, share: float = 0.6,
+    **said: bool,
 ) -> Motion:
     """A motion of a share of the scene's groups; most corrections are 0."""
-    groups = groups_for(scene, cell, shades, said.get("regroup", False))
+    groups = groups_for(scene, cell, brightness_bins, said.get("regroup", False))
     moving = (rng.random(groups.count) < share).astype(np.uint8)
     symbols = np.rint(rng.laplace(size=(int(moving.sum()), 6)) * 2).astype(np.int32)
-    return Motion(cell, shades, moving, symbols, float(np.float32(0.02)), float(np.float32(0.01)), **said)
+    return Motion(cell, brightness_bins, moving, symbols, float(np.float32(0.02)), float(np.float32(0.01)), **said)
 
 
 def make_motions(rng: np.random.Generator, scene: Scene, number: int, **said: bool) -> Delta:

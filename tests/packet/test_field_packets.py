@@ -134,7 +134,7 @@ def test_a_field_stands_between_motion_and_the_rest():
     field = make_field(rng, there)
     residual = make_delta(rng, state.layout, latent=False).residual
     delta = Delta((motion, field)).with_row_edit(RowEdit(removed=np.array([3]))).with_residual(residual)
-    assert [type(change).__name__ for change in delta.changes] == ["Motion", "Field", "Residual", "Rows"]
+    assert [type(change).__name__ for change in delta.changes] == ["Motion", "Field", "Residual", "RowEdit"]
     after = follow(state, delta)
     assert after.delta.field is not None
     alone, moved = apply_field(there, field)

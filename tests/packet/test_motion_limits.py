@@ -46,7 +46,7 @@ def test_a_jump_through_the_whole_range_is_kept_without_a_warning():
     means = np.where(np.arange(4)[:, None] % 2, 3e38, -3e38).astype(np.float32) * np.ones((1, 3), np.float32)
     step, half = float(np.float32(9e8)), np.int32([[0, 0, 0, 0, 0, 1 << 30]])
     motion = Motion(step, 1, np.ones(1, np.uint8), half, 1.0, step, predicted=False)
-    groups = Groups(motion.cell, motion.shades, np.zeros(4, np.int32), 1)
+    groups = Groups(motion.cell, motion.brightness_bins, np.zeros(4, np.int32), 1)
     scene = Scene(dataclasses.replace(state.gaussians, means=means), state.layout, groups=groups)
     after = apply_delta(scene, Delta((motion,)))
     assert np.isfinite(after.gaussians.means).all()
@@ -61,7 +61,8 @@ def test_an_encoder_refuses_motions_that_are_none():
     motion, change = delta.motions[0], dataclasses.replace
     wrong = [
         (change(motion, cell=0.1), "cell: expected a float32"), (change(motion, rotation_step=0.1), "rotation_step"),
-        (change(motion, translation_step=0.0), "translation_step"), (change(motion, shades=17), "shades"),
+        (change(motion, translation_step=0.0), "translation_step"),
+        (change(motion, brightness_bins=17), "brightness_bins"),
         (change(motion, symbols=motion.symbols.astype(np.int64)), "int32"),
         (change(motion, symbols=motion.symbols[1:]), "symbols: expected"),
         (change(motion, symbols=motion.symbols[:, :5]), "symbols: expected"),

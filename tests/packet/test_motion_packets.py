@@ -118,7 +118,7 @@ def check_equal(world: World, state: PlayerState) -> None:
     if world.named is None:
         assert groups is None
     else:
-        assert (groups.cell, groups.shades) == world.named
+        assert (groups.cell, groups.brightness_bins) == world.named
         assert (groups.group_of.tolist(), groups.count) == (world.group_of, world.count)
     found = {} if moved is None else {
         row: (translation.tolist(), rotation.tolist())
@@ -166,7 +166,7 @@ def test_motions_round_trip(seed, number, motions, predicted, regroup):
     found = decode_delta(packet.data, state.scene, {})
     assert len(found.motions) == motions
     for sent, got in zip(delta.motions, found.motions, strict=True):
-        for name in ("cell", "shades", "translation_step", "rotation_step", "predicted", "regroup"):
+        for name in ("cell", "brightness_bins", "translation_step", "rotation_step", "predicted", "regroup"):
             assert getattr(got, name) == getattr(sent, name), name
         assert got.moving.tolist() == sent.moving.tolist()
         assert got.symbols.dtype == np.int32
@@ -242,15 +242,15 @@ def pinned_stream() -> dict[str, PlayerState]:
         nonlocal state
         state = states[name] = follow(state, Delta(changes))
 
-    def motion(cell, shades, groups, every, **said):
+    def motion(cell, brightness_bins, groups, every, **said):
         moving = (np.arange(groups) % every == 0).astype(np.uint8)
         symbols = np.arange(6 * int(moving.sum()), dtype=np.int32).reshape(-1, 6) % 11 - 5
-        return Motion(cell, shades, moving, symbols, 0.25, 0.125, **said)
+        return Motion(cell, brightness_bins, moving, symbols, 0.25, 0.125, **said)
 
-    def count(cell, shades):
+    def count(cell, brightness_bins):
         # Cells by the text, of the scene as it is.
         world = World.of(state.gaussians)
-        world.form_groups(cell, shades, False)
+        world.form_groups(cell, brightness_bins, False)
         return world.count
 
     add("rest", motion(2.0, 2, count(2.0, 2), 2, predicted=False))

@@ -51,14 +51,14 @@ def make_meta() -> StreamMeta:
     return StreamMeta("dense", "unit test", {"method": "dense"}, train, test, 30.0, (0.1, 0.2, 0.3))
 
 
-def make_motion(rng: np.random.Generator, scene: Scene, cell: float, shades: int) -> Motion:
+def make_motion(rng: np.random.Generator, scene: Scene, cell: float, brightness_bins: int) -> Motion:
     regroup = bool(rng.random() < 0.2)
-    groups = groups_for(scene, cell, shades, regroup)
+    groups = groups_for(scene, cell, brightness_bins, regroup)
     moving = (rng.random(groups.count) < 0.5).astype(np.uint8)
     symbols = np.rint(3 * rng.laplace(size=(int(moving.sum()), 6))).astype(np.int32)
     predicted = bool(rng.random() < 0.7)
     steps = (float(np.float32(0.01)), float(np.float32(0.003)))
-    return Motion(cell, shades, moving, symbols, *steps, predicted, regroup)
+    return Motion(cell, brightness_bins, moving, symbols, *steps, predicted, regroup)
 
 
 def make_residual(rng: np.random.Generator, layout: Layout) -> Residual:
@@ -88,8 +88,8 @@ def make_delta(rng: np.random.Generator, scene: Scene, sh_rest: int) -> Delta:
     changes: list[Motion | Residual | RowEdit] = []
     after = scene
     for _ in range(int(rng.integers(0, 4))):
-        cell, shades = [(0.5, 1), (0.5, 1), (0.25, 4)][int(rng.integers(3))]
-        changes.append(make_motion(rng, after, cell, shades))
+        cell, brightness_bins = [(0.5, 1), (0.5, 1), (0.25, 4)][int(rng.integers(3))]
+        changes.append(make_motion(rng, after, cell, brightness_bins))
         after = apply_motion(after, changes[-1])[0]
     if rng.random() < 0.7:
         changes.append(make_residual(rng, scene.layout))

@@ -15,13 +15,13 @@ class Groups:
 
     Arguments:
         cell: side of a cell, scene units; rows of one cell and one shade are a group.
-        shades: number of classes of brightness, 1 to 16.
+        brightness_bins: number of classes of brightness, 1 to 16.
         group_of: [N] int32 group of each row.
         count: G, the number of groups; some may have lost all their rows since.
     """
 
     cell: float
-    shades: int
+    brightness_bins: int
     group_of: IntArray
     count: int
 

@@ -32,7 +32,7 @@ class Motion:
     """Rigid transforms of groups of rows.
 
     Arguments:
-        cell, shades: what makes a group (:class:`Groups`); ``cell`` is a float32 above 0.
+        cell, brightness_bins: what makes a group (:class:`Groups`); ``cell`` is a float32 above 0.
         moving: [G] uint8, 1 for the K groups that move.
         symbols: [K, 6] int32 corrections of the prediction: shift x, y, z and turn x, y, z.
         translation_step: scene units per symbol of the shift.
@@ -42,7 +42,7 @@ class Motion:
     """
 
     cell: float
-    shades: int
+    brightness_bins: int
     moving: IntArray
     symbols: IntArray = field(repr=False)
     translation_step: float = 1.0
@@ -70,7 +70,7 @@ class GroupTransforms(NamedTuple):
     rotation: FloatArray
 
 
-def groups_for(scene: Scene, cell: float, shades: int, regroup: bool = False) -> Groups:
+def groups_for(scene: Scene, cell: float, brightness_bins: int, regroup: bool = False) -> Groups:
     """Return the groups of a motion: those the scene knows, unless they are others or are to be formed anew.
 
     Rows are of one group when their centres lie in one cell of a regular grid and their colours in one class of
@@ -79,11 +79,11 @@ def groups_for(scene: Scene, cell: float, shades: int, regroup: bool = False) ->
     Arguments:
         scene: decoded, as both ends have it.
         cell: side of a cell, scene units; a float32 above 0.
-        shades: number of classes of brightness, 1 to 16.
-        regroup: form the groups anew, even if the scene knows some of this cell and these shades.
+        brightness_bins: number of classes of brightness, 1 to 16.
+        regroup: form the groups anew, even if the scene knows some of this cell and number of bins.
     """
     known = scene.groups
-    if known is not None and not regroup and known.cell == cell and known.shades == shades:
+    if known is not None and not regroup and known.cell == cell and known.brightness_bins == brightness_bins:
         return known
     columns = np.ascontiguousarray(scene.gaussians.means.T, np.float64)
     columns /= float(cell)
@@ -91,9 +91,9 @@ def groups_for(scene: Scene, cell: float, shades: int, regroup: bool = False) ->
     x, y, z = index.astype(np.int64) + HALF_GRID
     red, green, blue = scene.gaussians.sh0[:, 0].astype(np.float64).T
     bright = 0.5 + SH0 * (0.25 * red + 0.5 * green + 0.25 * blue)
-    shade = np.clip(np.floor(bright * shades), 0, shades - 1).astype(np.int64)
+    shade = np.clip(np.floor(bright * brightness_bins), 0, brightness_bins - 1).astype(np.int64)
     group_of, count = _numbered((x, y, z, shade), (2 * HALF_GRID, 2 * HALF_GRID, 2 * HALF_GRID, MAX_BRIGHTNESS_BINS))
-    return Groups(cell, shades, group_of, count)
+    return Groups(cell, brightness_bins, group_of, count)
 
 
 def _numbered(digits: Sequence[IntArray], bases: Sequence[int]) -> tuple[IntArray, int]:
@@ -159,7 +159,7 @@ def apply_motion(scene: Scene, motion: Motion) -> tuple[Scene, IntArray]:
     Raises:
         ShapeError: the motion's groups do not fit the scene, or lead out of the range of float32.
     """
-    groups = groups_for(scene, motion.cell, motion.shades, motion.regroup)
+    groups = groups_for(scene, motion.cell, motion.brightness_bins, motion.regroup)
     if motion.moving.shape != (groups.count,):
         raise ShapeError(
             f"motion: expected a mark for each of {groups.count} groups, got shape {list(motion.moving.shape)}; "

@@ -132,7 +132,10 @@ def difference_between(player: PlayerState, claimed: PlayerState) -> str:
 
 def _history_difference(player: PlayerState, claimed: PlayerState) -> str:
     """Describe what differs in what later motions are predicted from; empty when nothing does."""
-    for name, fields in (("moved", ("rows", "shift", "turn")), ("groups", ("cell", "shades", "count", "group_of"))):
+    memory = {
+        "displacement": ("rows", "translation", "rotation"), "groups": ("cell", "brightness_bins", "count", "group_of"),
+    }  # fmt: skip
+    for name, fields in memory.items():
         want, got = getattr(player.scene, name), getattr(claimed.scene, name)
         if want is None and got is None:
             continue

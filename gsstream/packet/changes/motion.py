@@ -61,28 +61,28 @@ def _encode(motion: Motion) -> bytes:
     if problem:
         raise ShapeError(f"motion: {problem}")
     flags = _PREDICTED * motion.predicted | _REGROUP * motion.regroup
-    head = _MOTION.pack(flags, motion.shades, motion.cell, motion.translation_step, motion.rotation_step)
+    head = _MOTION.pack(flags, motion.brightness_bins, motion.cell, motion.translation_step, motion.rotation_step)
     return head + pack_blobs([encode_gates(moving.astype(np.uint8), 1), encode_symbols(motion.symbols)])
 
 
 def _decode(data: bytes, scene: Scene) -> Motion:
     if len(data) < _MOTION.size:
         raise PacketError("motion cut short")
-    flags, shades, cell, translation_step, rotation_step = _MOTION.unpack_from(data)
+    flags, bins, cell, translation_step, rotation_step = _MOTION.unpack_from(data)
     if flags & ~(_PREDICTED | _REGROUP):
         raise PacketError(f"motion: unknown flags {flags}; upgrade gsstream")
-    none = Motion(cell, shades, np.zeros(0, np.uint8), np.zeros((0, 6), np.int32), translation_step, rotation_step)
+    none = Motion(cell, bins, np.zeros(0, np.uint8), np.zeros((0, 6), np.int32), translation_step, rotation_step)
     problem = _misfit(none)
     if problem:
         raise PacketError(f"motion: {problem}")
     regroup = bool(flags & _REGROUP)
-    groups: Groups = groups_for(scene, cell, shades, regroup)
+    groups: Groups = groups_for(scene, cell, bins, regroup)
     marks, table = unpack_blobs(data[_MOTION.size :], 2)
     moving, levels = decode_gates(marks, groups.count)
     if levels != 1:
         raise PacketError("motion: groups move or stand still, there are no levels")
     symbols = decode_symbols(table, int(np.count_nonzero(moving)), 6)
-    motion = Motion(cell, shades, moving, symbols, translation_step, rotation_step, bool(flags & _PREDICTED), regroup)
+    motion = Motion(cell, bins, moving, symbols, translation_step, rotation_step, bool(flags & _PREDICTED), regroup)
     problem = _exceeds_range(motion)
     if problem:
         raise PacketError(f"motion: {problem}")
@@ -95,8 +95,8 @@ def _misfit(motion: Motion) -> str | None:
         value = float(getattr(motion, name))
         if not 0 < value < 1e9 or value != float(np.float32(value)):
             return f"{name}: expected a float32 above 0 and below 1e9, got {value!r}"
-    if not 1 <= motion.shades <= MAX_BRIGHTNESS_BINS or not math.isfinite(motion.cell):
-        return f"shades: expected 1 to {MAX_BRIGHTNESS_BINS}, got {motion.shades}"
+    if not 1 <= motion.brightness_bins <= MAX_BRIGHTNESS_BINS or not math.isfinite(motion.cell):
+        return f"brightness_bins: expected 1 to {MAX_BRIGHTNESS_BINS}, got {motion.brightness_bins}"
     return None
 
 

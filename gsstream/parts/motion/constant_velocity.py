@@ -27,7 +27,7 @@ class Coasting(MotionPart):
 
     class Config(PartConfig):
         pixels: float = Field(default=8.0, gt=0, le=1000, description="side of a group, pixels at median distance")
-        shades: int = Field(default=1, ge=1, le=16, description="classes of brightness that split the groups of a cell")
+        brightness_bins: int = Field(default=1, ge=1, le=16, description="classes of brightness, each its own group")
         votes: float = Field(
             default=0.5, ge=0, le=1, description="share of its views in which a Gaussian must lie in changed tiles"
         )
@@ -44,7 +44,7 @@ class Coasting(MotionPart):
     def propose(self, scene: Scene, work: FitContext, rng: Rng) -> tuple[Motion, ...]:
         if scene.displacement is None:
             return ()
-        groups = known_groups(scene, work.cameras, self.config.pixels, self.config.shades)
+        groups = known_groups(scene, work.cameras, self.config.pixels, self.config.brightness_bins)
         config = self.config
         moving = displaced_groups(groups, scene, config.displaced)
         moving &= changed_groups(groups, work, config.votes, config.share)
@@ -53,4 +53,4 @@ class Coasting(MotionPart):
             change = loss_change(scene, work, transforms, rotating_views(len(work.cameras), config.asked, work.index))
             moving[np.flatnonzero(moving)[change >= 0]] = False
         symbols = np.zeros((int(moving.sum()), 6), np.int32)
-        return (Motion(groups.cell, groups.shades, moving.astype(np.uint8), symbols),)
+        return (Motion(groups.cell, groups.brightness_bins, moving.astype(np.uint8), symbols),)

@@ -28,15 +28,15 @@ def pixel_size(means: FloatArray, cameras: Cameras) -> float:
     return float(median(widths))
 
 
-def known_groups(scene: Scene, cameras: Cameras, pixels: float, shades: int) -> Groups:
+def known_groups(scene: Scene, cameras: Cameras, pixels: float, brightness_bins: int) -> Groups:
     """Return the groups that the scene has had since the last key packet, else those of a grid.
 
     A cell that is known stays: it was measured on the scene of the last key packet, which a resumed run does not have.
     """
-    if scene.groups is not None and scene.groups.shades == shades:
+    if scene.groups is not None and scene.groups.brightness_bins == brightness_bins:
         return scene.groups
     cell = float(np.float32(max(pixels * pixel_size(scene.gaussians.means, cameras), 1e-6)))
-    return groups_for(scene, cell, shades)
+    return groups_for(scene, cell, brightness_bins)
 
 
 def changed_groups(groups: Groups, work: FitContext, votes: float, share: float) -> IntArray:

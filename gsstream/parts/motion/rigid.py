@@ -41,7 +41,7 @@ class Rigid(MotionPart):
 
     class Config(PartConfig):
         pixels: float = Field(default=12.0, gt=0, le=1000, description="side of a group, pixels at median distance")
-        shades: int = Field(default=2, ge=1, le=16, description="classes of brightness that split the groups of a cell")
+        brightness_bins: int = Field(default=2, ge=1, le=16, description="classes of brightness, each its own group")
         votes: float = Field(
             default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in changed tiles"
         )
@@ -67,7 +67,7 @@ class Rigid(MotionPart):
 
     def propose(self, scene: Scene, work: FitContext, rng: Rng) -> tuple[Motion, ...]:
         config = self.config
-        groups = known_groups(scene, work.cameras, config.pixels, config.shades)
+        groups = known_groups(scene, work.cameras, config.pixels, config.brightness_bins)
         able = changed_groups(groups, work, config.votes, config.share)
         if not able.any():
             return ()
@@ -85,7 +85,7 @@ class Rigid(MotionPart):
         kept = total >= config.least
         moving = np.zeros(groups.count, np.uint8)
         moving[np.flatnonzero(able)[kept]] = 1
-        return (Motion(groups.cell, groups.shades, moving, symbols[kept], float(steps[0]), float(steps[1])),)
+        return (Motion(groups.cell, groups.brightness_bins, moving, symbols[kept], float(steps[0]), float(steps[1])),)
 
     def _fitted(self, scene: Scene, work: FitContext, start: GroupTransforms, units: Units, rng: Rng) -> FloatArray:
         """[K, 6] shift and turn of the groups that explain the images best."""

@@ -30,7 +30,7 @@ class ExampleMotion(MotionPart):
             return ()
         # A packet holds the cell in single precision, and both ends must form the same groups.
         cell = float(np.float32(self.config.cell * work.cameras.extent))
-        groups = groups_for(scene, cell, shades=1)
+        groups = groups_for(scene, cell, brightness_bins=1)
         moved = np.zeros(groups.count, bool)
         moved[groups.group_of[scene.displacement.rows]] = True
         changed = work.changed_rows(self.config.votes).numpy()

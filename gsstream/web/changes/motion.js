@@ -10,7 +10,7 @@ export const SECTIONS = ["motion"];
 const PREDICTED = 1;
 const REGROUP = 2;
 const MAX_MOTIONS = 8;
-const MAX_BRIGHTNESS_BINS = 16;
+const MAX_BINS = 16;
 const MAX_TRANSLATION = 1e18;
 const HALF_GRID = 32768;
 const SH0 = 0.28209479177387814;
@@ -71,19 +71,19 @@ export function unionRows(a, b) {
 
 function decodeMotion(data, scene) {
   if (data.length < 14) throw new PacketError("motion cut short");
-  const [flags, brightnessBins] = data;
+  const [flags, bins] = data;
   if (flags & ~(PREDICTED | REGROUP)) throw new PacketError(`motion: unknown flags ${flags}; a newer player is needed`);
   const view = new DataView(data.buffer, data.byteOffset, data.byteLength);
   const [cell, translationStep, rotationStep] = [2, 6, 10].map((at) => view.getFloat32(at, true));
   if (![cell, translationStep, rotationStep].every((value) => value > 0 && value < 1e9)) {
     throw new PacketError("motion: expected a cell and steps above 0 and below 1e9");
   }
-  if (brightnessBins < 1 || brightnessBins > MAX_BRIGHTNESS_BINS) {
-    throw new PacketError(`motion: expected 1 to ${MAX_BRIGHTNESS_BINS} classes of brightness, got ${brightnessBins}`);
+  if (bins < 1 || bins > MAX_BINS) {
+    throw new PacketError(`motion: expected 1 to ${MAX_BINS} classes of brightness, got ${bins}`);
   }
   const known = scene.groups;
-  const keep = known && !(flags & REGROUP) && known.cell === cell && known.brightnessBins === brightnessBins;
-  const groups = keep ? known : formGroups(scene, cell, brightnessBins);
+  const keep = known && !(flags & REGROUP) && known.cell === cell && known.bins === bins;
+  const groups = keep ? known : formGroups(scene, cell, bins);
   const [marks, table] = unpackParts(data.subarray(14), 2);
   const { gates: moving, levels } = decodeGates(marks, groups.count);
   if (levels !== 1) throw new PacketError("motion: groups move or stand still, there are no levels");
@@ -97,17 +97,17 @@ function decodeMotion(data, scene) {
 }
 
 /** Rows of one cell of a grid and of one class of brightness are a group; groups are numbered by cell, then class. */
-function formGroups({ means, sh0 }, cell, brightnessBins) {
+function formGroups({ means, sh0 }, cell, bins) {
   const number = means.length / 3;
   const keys = new Float64Array(number);
   const index = (value) => Math.min(Math.max(Math.floor(value / cell), -HALF_GRID), HALF_GRID - 1) + HALF_GRID;
   for (let i = 0; i < number; i += 1) {
     const bright = 0.5 + SH0 * (0.25 * sh0[3 * i] + 0.5 * sh0[3 * i + 1] + 0.25 * sh0[3 * i + 2]);
-    const shade = Math.min(Math.max(Math.floor(bright * brightnessBins), 0), brightnessBins - 1);
+    const shade = Math.min(Math.max(Math.floor(bright * bins), 0), bins - 1);
     const place = (index(means[3 * i]) * 2 * HALF_GRID + index(means[3 * i + 1])) * 2 * HALF_GRID;
-    keys[i] = (place + index(means[3 * i + 2])) * MAX_BRIGHTNESS_BINS + shade;
+    keys[i] = (place + index(means[3 * i + 2])) * MAX_BINS + shade;
   }
-  return { cell, brightnessBins, ...ranked(keys) };
+  return { cell, bins, ...ranked(keys) };
 }
 
 /** The rank of every key among the distinct ones, and how many of these there are. */

@@ -41,7 +41,7 @@ def _lies(state: PlayerState, delta: Delta, packet: EncodedPacket) -> Iterator[t
 
 def _lying_motions(state: PlayerState, delta: Delta, data: bytes) -> Iterator[tuple[str, bytes, str]]:
     head, (gates, symbols) = data[: HEAD.size], unpack_blobs(data[HEAD.size :], 2)
-    flags, shades, cell, shift, turn = HEAD.unpack(head)
+    flags, bins, cell, shift, turn = HEAD.unpack(head)
     tail, count = pack_blobs([gates, symbols]), state.scene.groups.count
     moving = int(delta.motions[0].moving.sum())
 
@@ -50,14 +50,14 @@ def _lying_motions(state: PlayerState, delta: Delta, data: bytes) -> Iterator[tu
 
     nan, inf = float("nan"), float("inf")
     for bits in (4, 8, 128, 255):
-        yield f"flags {bits}", headed(bits, shades, cell, shift, turn), "unknown flags"
+        yield f"flags {bits}", headed(bits, bins, cell, shift, turn), "unknown flags"
     for wrong in (0, 17, 255):
-        yield f"{wrong} shades", headed(flags, wrong, cell, shift, turn), "shades: expected 1 to 16"
+        yield f"{wrong} brightness_bins", headed(flags, wrong, cell, shift, turn), "brightness_bins: expected 1 to 16"
     for wrong in (0.0, -0.0, -1.0, nan, inf, -inf, 1e9):
-        yield f"cell {wrong}", headed(flags, shades, wrong, shift, turn), "cell: expected a float32 above 0"
-        yield f"shift step {wrong}", headed(flags, shades, cell, wrong, turn), "translation_step: expected a float32"
-        yield f"turn step {wrong}", headed(flags, shades, cell, shift, wrong), "rotation_step: expected a float32"
-    yield "other cells", headed(flags, shades, cell * 100, shift, turn), "gate runs cover more than the 15 nodes"
+        yield f"cell {wrong}", headed(flags, bins, wrong, shift, turn), "cell: expected a float32 above 0"
+        yield f"shift step {wrong}", headed(flags, bins, cell, wrong, turn), "translation_step: expected a float32"
+        yield f"turn step {wrong}", headed(flags, bins, cell, shift, wrong), "rotation_step: expected a float32"
+    yield "other cells", headed(flags, bins, cell * 100, shift, turn), "gate runs cover more than the 15 nodes"
     every = (np.arange(count + 1) % 2).astype(np.uint8)
     yield "one group more", head + pack_blobs([encode_gates(every, 1), symbols]), "gates: 1 levels in"
     few = encode_gates((np.arange(count + 50) == count + 40).astype(np.uint8), 1)
@@ -70,9 +70,9 @@ def _lying_motions(state: PlayerState, delta: Delta, data: bytes) -> Iterator[tu
     none = encode_gates(np.zeros(count, np.uint8), 1)
     yield "nothing moves, but symbols", head + pack_blobs([none, symbols]), "empty table"
     large = encode_symbols(np.full((moving, 6), 2**31 - 1, np.int32))
-    over = HEAD.pack(flags, shades, cell, 9e8, turn)
+    over = HEAD.pack(flags, bins, cell, 9e8, turn)
     yield "a shift that overflows", over + pack_blobs([gates, large]), "cannot be"
-    over = HEAD.pack(flags, shades, cell, shift, 9e8)
+    over = HEAD.pack(flags, bins, cell, shift, 9e8)
     yield "a turn that overflows", over + pack_blobs([gates, large]), "cannot be"
     for cut in range(HEAD.size):
         yield f"cut after {cut} bytes", head[:cut], "motion cut short"

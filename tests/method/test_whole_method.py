@@ -69,7 +69,7 @@ def lose_one(step):
 def remember(step):
     """Claims that a row moved, where players have forgotten it: the next motion would be predicted from it."""
     one = np.ones((1, 3), np.float32)
-    return with_scene(step, moved=Displacement(np.array([0]), one, one))
+    return with_scene(step, displacement=Displacement(np.array([0]), one, one))
 
 
 def regroup(step):
@@ -108,7 +108,7 @@ def misname(step):
         (stand_still, "frame 0 instead of 1"),
         (keep_decoder, "packet: decoders"),
         (other_layout, "packet: layout: units"),
-        (remember, "packet: scene: moved"),
+        (remember, "packet: scene: displacement"),
         (regroup, "packet: scene: groups"),
         (lambda step: replace(step, metrics={"loss": 0.5}), "its step has metrics (loss): write numbers to tools.log"),
         (misname, "expected a packet of frame 1 of the kind it says, 'delta'; got 'empty' of frame 1"),

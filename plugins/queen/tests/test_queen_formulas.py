@@ -206,7 +206,7 @@ class TestChange:
 
 
 def test_settings_that_contradict_themselves() -> None:
-    with pytest.raises(ValidationError, match=r"expected after <= until, got 0\.9 and 0\.8"):
+    with pytest.raises(ValidationError, match=r"expected start <= stop, got 0\.9 and 0\.8"):
         QueenConfig(growth=GrowthSettings(start=0.9))
     assert set(QueenConfig().latents()) == {"quats", "scales", "opacities", "sh0", "shN"}
     policies = QueenConfig()

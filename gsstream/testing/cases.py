@@ -230,9 +230,9 @@ def _sized(name: str, factor: float) -> World:
     )  # fmt: skip
 
 
-def _huge(name: str) -> World:
-    get_case = make_case(name, scene(_cloud(24)), rig())
-    return replace(get_case, logits=1e4 * torch.sign(get_case.logits))
+def _sure(name: str, size: float) -> World:
+    base = make_case(name, scene(_cloud(24)), rig())
+    return replace(base, logits=size * torch.sign(base.logits))
 
 
 WORLDS: dict[str, Callable[[], World]] = {
@@ -250,13 +250,15 @@ WORLDS: dict[str, Callable[[], World]] = {
     "moving": lambda: _moving("moving"),
     "unseen": lambda: make_case("unseen", scene(_unseen()), rig(), shift=0.08),
     "one camera": lambda: _moving("one camera", 1),
-    "huge logits": lambda: _huge("huge logits"),
+    "logits of 20": lambda: _sure("logits of 20", 20.0),
+    "logits of 100": lambda: _sure("logits of 100", 100.0),
+    "huge logits": lambda: _sure("huge logits", 1e4),
 }
 
 #: Worlds at the ends of what there can be; every part of a kind with ``behaviour`` is tried on each.
 EXTREMES = (
     "empty", "one", "two identical", "coincident", "line", "far", "tiny", "vast", "thin", "unseen", "one camera",
-    "huge logits",
+    "logits of 20", "logits of 100", "huge logits",
 )  # fmt: skip
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -18,12 +20,29 @@ Outputs = dict[str, torch.Tensor]
 
 
 @dataclass(frozen=True)
+class Poison:
+    """Something that a part may read and in which a value is put, in place.
+
+    Arguments:
+        what: it is, for the message.
+        named: what a refusal of it must name.
+        put: a value into a world.
+        usual: two values that it may have; where they make no difference to a part, it is not read.
+    """
+
+    what: str
+    named: str
+    put: Callable[[World, float], None]
+    usual: tuple[float, float] = (0.75, 0.25)
+
+
+@dataclass(frozen=True)
 class Behaviour:
     """How the common checks treat a kind; each kind with ``PartKind.behaviour`` has one in its room.
 
     Arguments:
         outputs: every output of every method on a world, tensor by tensor.
-        poison: put a value into something that the part reads, in place; returns what that is.
+        poisons: what a part may read, one value of each.
         keeps_precision: outputs have the precision of the logits given; otherwise they are float32.
         by_gaussian: outputs have a row per Gaussian, which moves with it.
         no_order: outputs whose names begin so are not compared after a permutation: the kind has a check of its own.
@@ -31,7 +50,7 @@ class Behaviour:
     """
 
     outputs: Callable[[Any, World], Outputs]
-    poison: Callable[[World, float], str]
+    poisons: tuple[Poison, ...]
     keeps_precision: bool = True
     by_gaussian: bool = False
     no_order: str | None = None
@@ -60,7 +79,18 @@ def draw(part: GateSampler, number: int, seed: int = 7) -> torch.Tensor | None:
     return part.noise(number, torch.Generator().manual_seed(seed))
 
 
-def poison_logits(world: World, value: float) -> str:
-    """Change the logit of one Gaussian to a value that no logit has."""
-    world.logits[5] = value
-    return "one logit"
+def poisons_of(*paths: str, usual: tuple[float, float] = (0.75, 0.25)) -> tuple[Poison, ...]:
+    """Return a poison of one value for each path of an array in a world; a refusal must name its last word.
+
+    Arguments:
+        paths: such as "gaussians.means".
+        usual: two values that it may have.
+    """
+
+    def put(path: str, world: World, value: float) -> None:
+        array: Any = operator.attrgetter(path)(world)
+        array.reshape(-1)[5] = value
+
+    return tuple(
+        Poison(f"one value of {path}", path.rpartition(".")[2], functools.partial(put, path), usual) for path in paths
+    )

@@ -85,9 +85,9 @@ def test_pictures_count_like_the_stream_that_drew_them(stream: Path, tmp_path: P
     assert "expected 64 x 48 pixels as the recording has at this --scale, got 63 x 48" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("rest", [0, 3, 8, 15])
-def test_a_ply_is_read_as_it_was_written(tmp_path: Path, rest: int) -> None:
-    written, path = scene(7, rest), tmp_path / "a.ply"
+@pytest.mark.parametrize(("number", "rest"), [(7, 0), (7, 3), (7, 8), (7, 15), (0, 3), (1, 0)])
+def test_a_ply_is_read_as_it_was_written(tmp_path: Path, number: int, rest: int) -> None:
+    written, path = scene(number, rest), tmp_path / "a.ply"
     path.write_bytes(ply_bytes(written, ["offset 1.5 -2 1e6"]))
     read, offset = read_ply(path)
     assert offset == (1.5, -2.0, 1e6)
@@ -124,6 +124,7 @@ def test_properties_in_another_order_and_of_other_types_are_read(tmp_path: Path)
         (lambda data: data[:-1], "bytes of vertices"),
         (lambda data: data.replace(b"float opacity", b"float opaque!"), "missing opacity"),
         (lambda data: data.replace(b"vertex 7", b"vertex x"), "header is not that of a 3DGS PLY"),
+        (lambda data: data.replace(b"vertex 7", b"vertex -1"), "header is not that of a 3DGS PLY"),
         (lambda data: data.replace(b"property float x", b"property list x"), "header is not that of a 3DGS PLY"),
         (lambda data: data.replace(b"property float y", b"property float x"), "each property once"),
     ],

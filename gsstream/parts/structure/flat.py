@@ -13,6 +13,7 @@ from gsstream.core.frame import PointCloud
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.part import PartConfig
+from gsstream.core.shapes import check_finite
 from gsstream.parts.structure.base import Anchors, Structure, StructureTraits
 
 
@@ -33,6 +34,8 @@ class Flat(Structure):
     def seed(self, points: PointCloud, cameras: Cameras) -> Anchors:
         if len(points) == 0:
             raise InputError("no points to start from: expected at least 1, got 0; do the cameras have a common view?")
+        check_finite("points.xyz", points.xyz)
+        check_finite("points.rgb", points.rgb)
         positions = torch.as_tensor(points.xyz, dtype=torch.float32)
         span = positions.amax(0) - positions.amin(0)
         unit = float(span.norm()) / self.config.resolution

@@ -24,7 +24,7 @@ from gsstream.core.part import Part
 from gsstream.parts.gate.base import GateSampler
 from gsstream.testing.cases import EXTREMES, World, fingerprint, get_case
 from gsstream.testing.compare import ROUNDING, all_equal, finite
-from gsstream.testing.drive import behaviour_of, draw, outputs
+from gsstream.testing.drive import Poison, behaviour_of, draw, outputs
 from gsstream.testing.recording import SourceUnderTest
 from gsstream.testing.registry import BEHAVED, MIN_REASON, Skip, check, checks_for, kind_of
 
@@ -65,10 +65,17 @@ def check_frozen_and_final(part: Part) -> None:
         except AttributeError:
             continue
         raise AssertionError(f"attribute {name!r} of {cls.__name__} can be set: state belongs into arguments")
+    try:
+        part.config.__setattr__("scratch", None)
+    except ValidationError:
+        pass
+    else:
+        raise AssertionError(f"settings of {cls.__name__} can be set: derive Config from PartConfig, which is frozen")
     assert vars(cls).get("__final__"), f"{cls.__name__} is not marked @final: change behaviour by wrapping"
     assert repr(part.config) in repr(part), f"repr does not show the settings: {part!r}"
     for how, twin in (("deepcopy", copy.deepcopy(part)), ("pickle", pickle.loads(pickle.dumps(part)))):
         assert twin == part, f"{how} gives another part: expected {part!r}, got {twin!r}"
+        assert hash(twin) == hash(part), f"{how} gives an equal part with another hash"
 
 
 @check("common", kinds=ALL)
@@ -194,32 +201,30 @@ def check_extremes(part: Part) -> None:
 
 @check("common", kinds=BEHAVED)
 def check_rejects_nonfinite(part: Part) -> None:
-    """NaN and Inf are refused with a message; a regularizer may hand them on. They are never silently repaired."""
-    for bad in (float("nan"), float("inf")):
-        (clean, _), (spoilt, where), (other, _) = (_poisoned(part, value) for value in (9.0, bad, -9.0))
-        try:
-            got = outputs(part, spoilt)
-        except InputError as error:
-            text = str(error)
-            assert "finite" in text or "nan" in text or "inf" in text, f"the message does not say why: {text}"
-            continue
-        if all(bool((~torch.isfinite(value)).any()) for value in got.values() if value.dtype.is_floating_point):
+    """NaN and +-Inf are refused by name; a regularizer may hand them on. They are never silently repaired."""
+    for poison in behaviour_of(part).poisons:
+        one, other = (outputs(part, _poisoned(poison, value)) for value in poison.usual)
+        read = [name for name, value in one.items() if not torch.equal(value, other[name])]
+        for bad in (float("nan"), float("inf"), -float("inf")):
+            try:
+                got = outputs(part, _poisoned(poison, bad))
+            except InputError as error:
+                text = str(error)
+                assert poison.named in text, f"{poison.what} was {bad}, and the message does not name it: {text}"
+                assert "finite" in text or "nan" in text or "inf" in text, f"the message does not say why: {text}"
+                continue
+            repaired = [name for name in read if bool(torch.isfinite(got[name]).all())]
+            assert not repaired, f"{poison.what} was {bad}, and it was repaired silently; expected an InputError"
             # Seams called once per iteration may hand it on: it shows in the loss.
-            allowed = behaviour_of(part).hands_on or not got
-            assert allowed, f"{where} was {bad}, and it was passed on; expected an InputError"
-            continue
-        ignored = _same(outputs(part, clean), outputs(part, other))
-        assert ignored, f"{where} was {bad}, and it was repaired silently; expected an InputError"
+            allowed = behaviour_of(part).hands_on or not read
+            assert allowed, f"{poison.what} was {bad}, and it was passed on; expected an InputError"
 
 
-def _same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bool:
-    return all(torch.equal(value, second[name]) for name, value in first.items())
-
-
-def _poisoned(part: Part, value: float) -> tuple[World, str]:
-    """The cloud with one value of what the part reads replaced, and which."""
+def _poisoned(poison: Poison, value: float) -> World:
+    """The cloud with one value replaced."""
     case = get_case("cloud")
-    return case, behaviour_of(part).poison(case, value)
+    poison.put(case, value)
+    return case
 
 
 @check("common", kinds=BEHAVED)

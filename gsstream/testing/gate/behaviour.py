@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gsstream.parts.gate.base import GateSampler
 from gsstream.testing.cases import World
-from gsstream.testing.drive import Behaviour, Outputs, draw, poison_logits
+from gsstream.testing.drive import Behaviour, Outputs, draw, poisons_of
 
 
 def outputs(part: GateSampler, world: World) -> Outputs:
@@ -21,4 +21,4 @@ def outputs(part: GateSampler, world: World) -> Outputs:
 
 
 #: The noise stays in place when Gaussians are permuted: check_gate_noise_is_data permutes it too.
-BEHAVIOUR = Behaviour(outputs, poison_logits, by_gaussian=True, no_order="sample(noise)")
+BEHAVIOUR = Behaviour(outputs, poisons_of("logits", usual=(12.0, -12.0)), by_gaussian=True, no_order="sample(noise)")

@@ -113,8 +113,8 @@ def check_gate_gradient_flow(part: GateSampler) -> None:
 
 @check("gate")
 def check_gate_extremes(part: GateSampler) -> None:
-    """Logits of +-1e4 and the ends of float32 give gates in [0, 1], finite probabilities and finite gradients."""
-    for far in (1e4, 3e38):
+    """Logits of +-20, 100, 1e4 and the ends of float32: gates open, probabilities and gradients finite."""
+    for far in (20.0, 100.0, 1e4, 3e38):
         ends = torch.tensor([-far, far])
         for start in (part.init(ends), ends):
             logits = start.detach().clone().requires_grad_(True)

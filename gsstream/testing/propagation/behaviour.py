@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gsstream.parts.propagation.base import Propagation
 from gsstream.testing.cases import World
-from gsstream.testing.drive import Behaviour, Outputs, poison_logits
+from gsstream.testing.drive import Behaviour, Outputs, poisons_of
 
 
 def outputs(part: Propagation, world: World) -> Outputs:
@@ -12,4 +12,4 @@ def outputs(part: Propagation, world: World) -> Outputs:
     return {"propagate()": part.propagate(world.logits, world.hierarchy)}
 
 
-BEHAVIOUR = Behaviour(outputs, poison_logits)
+BEHAVIOUR = Behaviour(outputs, poisons_of("logits", usual=(12.0, -12.0)))

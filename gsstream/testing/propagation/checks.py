@@ -12,7 +12,7 @@ from gsstream.testing.cases import World, flat, get_case
 from gsstream.testing.compare import ROUNDING, at_most, equal, finite
 from gsstream.testing.registry import check
 
-WORLDS = ("one", "two identical", "cloud", "huge logits")
+WORLDS = ("one", "two identical", "coincident", "cloud", "logits of 20", "logits of 100", "huge logits")
 
 
 def _spread(part: Propagation, case: World, logits: torch.Tensor | None = None) -> torch.Tensor:
@@ -81,7 +81,7 @@ def check_propagation_monotone(part: Propagation) -> None:
 @check("propagation", trait="conservative")
 def check_propagation_conservative(part: Propagation) -> None:
     """No suspect is lost: a node is at least as suspect as each of its members."""
-    for name in ("cloud", "huge logits"):
+    for name in WORLDS:
         case = get_case(name)
         held = _spread(part, case)[case.hierarchy.node_of]
         at_most(f"world {name!r}: members against their nodes", case.logits, held, 1e-5, ROUNDING)

@@ -6,7 +6,7 @@ import torch
 
 from gsstream.parts.regularizer.base import Regularizer
 from gsstream.testing.cases import World
-from gsstream.testing.drive import Behaviour, Outputs
+from gsstream.testing.drive import Behaviour, Outputs, poisons_of
 
 
 def outputs(part: Regularizer, world: World) -> Outputs:
@@ -16,10 +16,4 @@ def outputs(part: Regularizer, world: World) -> Outputs:
     return {f"penalty()[{name!r}]": value for name, value in terms.items()}
 
 
-def poison(world: World, value: float) -> str:
-    """Change one coordinate of one residual to a value that none has."""
-    world.residual[5, 0] = value
-    return "one coordinate of one residual"
-
-
-BEHAVIOUR = Behaviour(outputs, poison, hands_on=True)
+BEHAVIOUR = Behaviour(outputs, poisons_of("residual"), hands_on=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gsstream.parts.structure.base import Structure
 from gsstream.testing.cases import World
-from gsstream.testing.drive import Behaviour, Outputs
+from gsstream.testing.drive import Behaviour, Outputs, poisons_of
 
 
 def outputs(part: Structure, world: World) -> Outputs:
@@ -18,11 +18,6 @@ def outputs(part: Structure, world: World) -> Outputs:
     return {**found, "build().node_of": forest.node_of, "build().parent": forest.parent, "build().level": forest.level}
 
 
-def poison(world: World, value: float) -> str:
-    """Change one coordinate of one Gaussian to a value that none has."""
-    world.gaussians.means[5, 0] = value
-    return "one coordinate of one mean"
-
-
+POISONS = poisons_of("gaussians.means", "gaussians.quats", "gaussians.scales", "points.xyz", "points.rgb")
 #: Node names may change with the order: check_structure_label_free compares partitions.
-BEHAVIOUR = Behaviour(outputs, poison, keeps_precision=False, no_order="build")
+BEHAVIOUR = Behaviour(outputs, POISONS, keeps_precision=False, no_order="build")

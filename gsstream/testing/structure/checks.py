@@ -31,7 +31,7 @@ def _built(part: Structure, case: World) -> Hierarchy:
 @check("structure")
 def check_structure_partition(part: Structure) -> None:
     """Every Gaussian has a node, int64 in [0, M); every node has a member or a child."""
-    for name in WORLDS:
+    for name in (*WORLDS, "coincident"):
         case = get_case(name)
         forest = _built(part, case)
         n, m = len(case.gaussians), forest.num_nodes

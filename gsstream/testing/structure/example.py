@@ -37,6 +37,7 @@ class ExampleStructure(Structure):
             raise InputError("no points to start from: expected at least 1, got 0; give points or enable seeding")
         positions = torch.as_tensor(points.xyz, dtype=torch.float32)
         check_finite("points.xyz", positions)
+        check_finite("points.rgb", points.rgb)
         side = float((positions.amax(0) - positions.amin(0)).max())
         return Anchors(
             positions=positions,

@@ -31,6 +31,14 @@ def test_what_stops_stands_still_from_the_event_on_and_goes_the_usual_way_before
     assert stop.frame(EVENT - 1).images.tobytes() != stop.frame(EVENT).images.tobytes()
 
 
+def test_the_first_event_is_that_of_frame_1() -> None:
+    stop = scene("stop", event=1)
+    assert (track(stop)[1:] == track(stop)[1]).all()
+    assert (track(stop)[0] != track(stop)[1]).any()
+    with pytest.raises(SourceError, match=r"event.*greater than or equal to 1"):
+        scene("stop", event=0)
+
+
 def test_what_turns_back_shows_its_pictures_in_the_reverse_order() -> None:
     source = scene("reversal")
     for step in range(1, EVENT + 1):

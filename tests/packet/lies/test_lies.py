@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import pytest
 from delta_lies import residual_victim, row_victim
 from field_lies import field_victim
@@ -29,8 +31,11 @@ def test_lies_are_refused_at_their_section_and_leave_the_state_alone(
     state: PlayerState | None, data: bytes, section: str, message: str
 ) -> None:
     before = [] if state is None else [array.tobytes() for _, array in state.gaussians.items()]
+    tracemalloc.reset_peak()
+    start = tracemalloc.get_traced_memory()[0]
     with pytest.raises(PacketError) as caught:
         decode_packet(state, data, offset=1000)
+    assert tracemalloc.get_traced_memory()[1] - start < 1 << 20
     assert message in str(caught.value)
     assert caught.value.offset == 1000 + parse_packet(data)[1][section].offset
     assert str(caught.value).count("(at byte") == 1

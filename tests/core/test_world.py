@@ -195,6 +195,12 @@ def test_rounded_poses_are_still_rotations_and_forget_the_noise():
     assert np.array_equal(snap_cameras(replace(cameras, viewmats=cameras.viewmats + noise)).viewmats, rounded.viewmats)
 
 
+def test_poses_that_the_calibration_rounded_stay_as_they_are_to_the_grid():
+    """Three digits are no rotation to 1e-8: a step to the nearest one would change what was calibrated."""
+    cameras = replace(RIGS["ring"], viewmats=np.round(RIGS["ring"].viewmats, 3))
+    assert np.abs(snap_cameras(cameras).viewmats - cameras.viewmats).max() <= 2.0**-30
+
+
 @pytest.mark.parametrize("fault", [
     {"scale": 0.0}, {"scale": -1.0}, {"scale": np.inf}, {"scale": np.nan}, {"offset": (0.0, np.nan, 0.0)},
     {"offset": (0.0,)}, {"rotation": (1.0,) * 9}, {"rotation": (-1.0, 0, 0, 0, 1, 0, 0, 0, 1)},

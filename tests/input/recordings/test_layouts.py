@@ -65,6 +65,8 @@ def test_scaled_reading_scales_the_cameras(tmp_path: Path, world: World) -> None
     folder = LAYOUTS["enerf"].write(tmp_path / "scene", world)
     full, half = open_source(str(folder)), open_source(str(folder), 0.5)
     np.testing.assert_allclose(half.info.train.Ks[:, :2] * 2, full.info.train.Ks[:, :2])
+    assert [source.frame(1).timestamp for source in (full, half)] == [1 / full.info.fps] * 2
+    assert full.info.fps > 1
     blocks = full.frame(1).images.reshape(3, 16, 2, 24, 2, 3).mean((2, 4))
     np.testing.assert_allclose(half.frame(1).images, blocks, atol=1e-6)
 

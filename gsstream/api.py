@@ -45,6 +45,7 @@ from gsstream.core.hierarchy import Hierarchy as Hierarchy
 from gsstream.core.hierarchy import tree_max as tree_max
 from gsstream.core.hierarchy import tree_roots as tree_roots
 from gsstream.core.joint import JointLayout as JointLayout
+from gsstream.core.log import FrameLog as FrameLog
 from gsstream.core.part import Part as Part
 from gsstream.core.part import PartConfig as PartConfig
 from gsstream.core.part import Traits as Traits
@@ -113,4 +114,5 @@ from gsstream.parts.structure.base import Anchors as Anchors
 from gsstream.parts.structure.base import Structure as Structure
 from gsstream.parts.structure.base import StructureTraits as StructureTraits
 from gsstream.parts.update.base import AttributeCode as AttributeCode
+from gsstream.parts.update.base import Scope as Scope
 from gsstream.parts.update.base import UpdateRule as UpdateRule

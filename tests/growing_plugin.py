@@ -52,7 +52,7 @@ class CopyGrowth(Growth):
 
 @hookimpl
 def gsstream_components() -> list[ComponentSpec]:
-    return [ComponentSpec(kind="growth", name="copies", target="growing_plugin:CopyGrowth", summary="for tests")]
+    return [ComponentSpec(kind="growth", name="neighbours", target="growing_plugin:CopyGrowth", summary="for tests")]
 
 
 @contextmanager

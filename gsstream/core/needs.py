@@ -26,11 +26,11 @@ SHIPPED: Mapping[str, tuple[str, ...]] = {
     "player": ("renderer/cpu", "loss/cpu", "optimiser/cpu"),
     "methods": (
         "method/queen", "method/queen-published", "method/queen-m", "method/queen-s", "streaming_method/queen",
-        "method/hicom", "method/hicom-published", "streaming_method/hicom",
-        "method/comgs-s", "method/comgs-l", "streaming_method/comgs",
-        "method/stream3dgs", "method/stream3dgs-cells", "streaming_method/stream3dgs",
-        "method/recon", "method/recon-published", "streaming_method/recon",
-        "method/quarc", "method/quarc-published", "streaming_method/quarc",
+        "method/hicom", "method/hicom-published", "motion/hicom",
+        "method/comgs-s", "method/comgs-l", "motion/keypoints", "confidence/error-gradient",
+        "method/stream3dgs", "method/stream3dgs-cells", "motion/stream3dgs",
+        "method/recon", "method/recon-published", "motion/recon",
+        "method/quarc", "method/quarc-published", "growth/change-gated-copies",
         "propagation/ft-pruning", "gate/binary-ste", "confidence/onnx",
     ),
 }  # fmt: skip

@@ -26,6 +26,7 @@ class PlayerState:
         decoders: the decoders last sent since then.
         delta: what the packet of this frame changed; None after a key or an empty packet.
         before: the layout that ``delta`` refers to, that of the frame before; None without a delta.
+        key_rows: number of Gaussians of the last key packet.
     """
 
     frame: int
@@ -34,6 +35,7 @@ class PlayerState:
     decoders: Mapping[str, FloatArray] = field(default_factory=dict)
     delta: Delta | None = None
     before: Layout | None = None
+    key_rows: int = 0
 
     @property
     def gaussians(self) -> Gaussians[FloatArray]:
@@ -57,16 +59,19 @@ def decode_packet(state: PlayerState | None, data: bytes, *, offset: int = 0) ->
     header = parse_header(data, offset)
     if header.kind == PacketKind.KEY:
         key = decode_key(data, offset=offset)
-        return PlayerState(header.frame, Scene(key.gaussians, key.layout), key.meta)
+        scene = Scene(key.gaussians, key.layout)
+        return PlayerState(header.frame, scene, key.meta, key_rows=len(key.gaussians))
     if state is None or header.frame != state.frame + 1:
         had = "none" if state is None else f"frame {state.frame}"
         raise PacketError(f"frame {header.frame} needs the state of the frame before it, got {had}", offset)
     if header.kind == PacketKind.EMPTY:
         decode_empty(data, offset=offset)
-        return PlayerState(header.frame, replace(state.scene, displacement=None), state.meta, state.decoders)
+        still = replace(state.scene, displacement=None)
+        return replace(state, frame=header.frame, scene=still, delta=None, before=None)
     delta = decode_delta(data, state.scene, state.decoders, offset=offset)
     try:
         scene = apply_delta(state.scene, delta)
     except ShapeError as error:
         raise PacketError(str(error), offset) from error
-    return PlayerState(header.frame, scene, state.meta, next_decoders(state.decoders, delta), delta, state.layout)
+    decoders = next_decoders(state.decoders, delta)
+    return PlayerState(header.frame, scene, state.meta, decoders, delta, state.layout, state.key_rows)

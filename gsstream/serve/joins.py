@@ -101,7 +101,8 @@ def decode_join(key: PlayerState, data: bytes) -> PlayerState:
         rows = cursor.steps(count)
         translation, rotation = (cursor.planes(count, 3).view(np.float32) for _ in range(2))
         displacement = Displacement(rows, translation, rotation)
-    return PlayerState(frame, Scene(Gaussians(**values), layout, displacement, groups), key.meta, decoders)
+    scene = Scene(Gaussians(**values), layout, displacement, groups)
+    return PlayerState(frame, scene, key.meta, decoders, key_rows=len(key.gaussians))
 
 
 def _tables(key: PlayerState, state: PlayerState) -> Iterator[tuple[str, FloatArray, FloatArray]]:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 
 from gsstream.core.changes import Scene
+from gsstream.core.log import FrameLog
 from gsstream.core.part import Part
 from gsstream.core.rng import Rng
 from gsstream.engine.step.active.change import Change, detect_changed_tiles
@@ -51,7 +52,7 @@ def fit_fixture(*, changed: bool = True) -> FitFixture:
     if not changed:
         change = Change(torch.zeros_like(change.tiles), change.height, change.width)
     frame = replace(frame, index=INDEX, cameras=state.previous.cameras)
-    view = EngineContext(method.parts, state.gaussians, state.hierarchy, frame, state.previous, state.exposure, change)
+    view = EngineContext(method.parts, state, frame, FrameLog(), change)
     return FitFixture(state.player.scene, view, Rng(method.parts.recipe.seed))
 
 

@@ -33,26 +33,26 @@ def test_everything_shipped_keeps_the_contract(distribution: str, capsys: pytest
     assert code == 0, out
 
 
-BORN = {"gradient": 1e-6, "rounds": 1, "most": 9}
-ANCHORS = {"measure": "anchor", "change": 6.0, "step": 0.02, "rotation_step": 0.002}
-CACHE = {"levels": 4, "entries": 8, "width": 8, "lr": 0.02, "box": 0.0}
-#: Whole method -> settings under which something moves, and is added, in three frames of one or two passes.
+COPIES = {"epochs": 1, "gradient": 1e-6, "rounds": 1, "most": 9}
+ANCHORS = {"epochs": 1, "measure": "anchor", "step": 0.02, "rotation_step": 0.002}
+CACHE = {"epochs": 1, "levels": 4, "entries": 8, "width": 8, "lr": 0.02, "box": 0.0}
+#: Whole method -> settings under which something moves, and is born, in three frames of one or two passes.
 EAGER: dict[str, list[dict[str, Any]]] = {
-    "comgs": [{
-        "motion": {"keypoints": 20, "step": 0.02, "change": 0.0}, "correction": {"every": 1, "passes": 1, "step": 1e-3},
-    }],
-    "hicom": [{"motion": {"measure": "cell", "change": 6.0, "step": 0.02}, "births": BORN}],
     "queen": [{}, {
-        "growth": {"every": 1, "start": 0, "stop": 1, "grad_threshold": 1e-6, "max_added": 20}, "rows": "dynamic",
+        "births": {"every": 1, "after": 0, "until": 1, "gradient": 1e-6, "most": 20}, "rows": "dynamic",
         "change": {"dynamic": 1e-8}, "rate": 1e-3, "sigma": 1e-4,
     }],
-    "recon": [{"motion": ANCHORS, "births": BORN}],
-    "quarc": [{"motion": ANCHORS, "births": BORN, "gate": {"score": 0.1}}],
-    "stream3dgs": [{"cache": CACHE, "births": BORN}, {"cache": {**CACHE, "sent": "cells"}, "births": BORN}],
 }  # fmt: skip
 #: Part of a slot -> settings, beside the default, of which each changes what it does.
 OTHERWISE: dict[tuple[str, str], list[dict[str, Any]]] = {
     ("gate", "binary-ste"): [{"noise": "none"}, {"temperature": 2.0}, {"clamp_gradient": True}],
+    ("motion", "keypoints"): [{"epochs": 1, "keypoints": 20, "step": 0.02}],
+    ("motion", "hicom"): [{"epochs": 1, "measure": "cell", "step": 0.02}],
+    ("motion", "recon"): [ANCHORS, {**ANCHORS, "rounded": True}],
+    ("motion", "stream3dgs"): [CACHE, {**CACHE, "sent": "cells"}],
+    ("growth", "copies"): [COPIES, {**COPIES, "leave": "last-added"}],
+    ("growth", "change-gated-copies"): [{**COPIES, "score": 0.1}],
+    ("update", "additive"): [{"every": 2}],
     ("propagation", "ft-pruning"): [{"tau": tau} for tau in (0.5, 0.8, 0.9, 0.95)],
 }
 ROWS = [(("streaming_method", name), settings) for name, rows in EAGER.items() for settings in rows]

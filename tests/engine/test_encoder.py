@@ -34,7 +34,7 @@ TINY: Mapping[str, Any] = {
     # Images this small and this far off would not miss most of what the cases need.
     "first_frame.prune_error": 0,
 }  # fmt: skip
-GROWING: Mapping[str, Any] = {"growth": "copies", "growth.per_frame": 24}
+GROWING: Mapping[str, Any] = {"growth": "neighbours", "growth.per_frame": 24}
 #: Gaussians are added and pruned in the first two of the three frames, so that all that goes on has to go on exactly.
 REFINING: Mapping[str, Any] = {
     "stream.refine_frames": 3, "stream.refine_iterations": 6,

@@ -9,10 +9,12 @@ import torch
 from gsstream.core.changes import AddedGaussians, Delta, Residual, RowEdit
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.rng import Rng
 from gsstream.core.topology import TopologyEdit
 from gsstream.engine.state.next_state import next_state
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.packet import decode_packet, encode_delta, encode_key
+from gsstream.parts.motion.none import Still
 from gsstream.parts.optimiser.adam import ReferenceAdam
 from gsstream.parts.optimiser.row_parameters import RowParameters
 from gsstream.testing.packet.checks import tiny_key
@@ -38,7 +40,7 @@ def state() -> StreamState:
 def step(state: StreamState, delta: Delta) -> StreamState:
     player = state.player
     packet = encode_delta(delta, player.layout, player.decoders, frame=player.frame + 1)
-    return next_state(state, decode_packet(player, packet.data))
+    return next_state(Still(), state, decode_packet(player, packet.data), Rng(0))
 
 
 def delta_of(births: AddedGaussians | None, deaths: list[int] | None = None) -> Delta:

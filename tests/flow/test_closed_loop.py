@@ -233,7 +233,7 @@ def test_a_run_repeats_from_its_saved_recipe(tmp_path: Path) -> None:
 MOTION = {
     "coasting": {"motion": "coasting"},
     "rigid": {"motion": "rigid", "motion__epochs": 1},
-    "growing": {"growth": "copies", "growth__per_frame": 40, "motion": "still"},
+    "growing": {"growth": "neighbours", "growth__per_frame": 40, "motion": "still"},
 }
 MOTION["growing and coasting"] = {**MOTION["growing"], **MOTION["coasting"]}
 MOTION["growing and rigid"] = {**MOTION["growing"], **MOTION["rigid"]}
@@ -285,7 +285,7 @@ def two_frames(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, bytes]:
     folder = tmp_path_factory.mktemp("undisturbed")
     begun, sound = folder / "begun", Coasting.propose
 
-    def propose(self: Coasting, scene: Scene, work: FitContext, rng: Rng) -> Any:
+    def propose(self: Coasting, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> Any:
         found = sound(self, scene, work, rng)
         if found and not begun.exists():
             shutil.copytree(folder / "run", begun)
@@ -306,7 +306,7 @@ def test_a_motion_that_does_not_fit_ends_in_one_sentence(
     begun, undisturbed = two_frames
     run = shutil.copytree(begun, tmp_path / "run")
 
-    def propose(self: Coasting, scene: Scene, work: FitContext, rng: Rng) -> Any:
+    def propose(self: Coasting, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> Any:
         found = sound(self, scene, work, rng)
         return spoil(found[0]) if found else found
 

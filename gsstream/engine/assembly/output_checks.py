@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from gsstream.core.changes import Motion, RowEdit
+from gsstream.core.changes import Field, Motion, RowEdit
 from gsstream.engine.assembly.checks import UNIT, Checks, Look
 
 
@@ -33,8 +33,8 @@ def _penalty(look: Look, args: tuple[Any, ...], result: Mapping[str, torch.Tenso
 
 
 def _motion(look: Look, args: tuple[Any, ...], result: object) -> None:
-    if not isinstance(result, tuple) or not all(isinstance(motion, Motion) for motion in result):
-        raise look.fault(f"propose(): expected a tuple of Motion, got {type(result).__name__}")
+    if not isinstance(result, tuple) or not all(isinstance(motion, Motion | Field) for motion in result):
+        raise look.fault(f"propose(): expected a tuple of Motion or Field, got {type(result).__name__}")
 
 
 def _growth(look: Look, args: tuple[Any, ...], result: object) -> None:

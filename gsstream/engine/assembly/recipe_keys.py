@@ -14,6 +14,14 @@ from gsstream.recipe.model import Recipe
 PART_SECTIONS = ("stream", "codec", "budget")
 #: Of those sections, what the engine itself reads for every method, also for frame 0, which it makes for them.
 SESSION_KEYS = ("codec.key_rd_lambda", "codec.first_layer", "budget.memory", "stream.on_error")
+#: What only the optimisation of a residual reads: slots, and settings of ``stream``.
+RESIDUAL_SLOTS = ("confidence", "propagation", "gate", "regularizer")
+RESIDUAL_KEYS = tuple(
+    f"stream.{name}" for name in (
+        "epochs", "lr_final_factor", "static_tile_share", "active_threshold", "freeze_closed", "rd_lambda",
+        "progressive",
+    )
+)  # fmt: skip
 
 
 def unused_keys(
@@ -21,8 +29,11 @@ def unused_keys(
 ) -> Iterator[KeyPath]:
     """Yield the paths of keys that differ from their default though the method does not read them."""
     default = Recipe()
+    # An update rule without codes sends no residual in any frame: then nothing asks which gates it would open.
+    known = "update" in parts and method.reads("update")
+    idle = RESIDUAL_SLOTS if known and not parts["update"].codes() else ()
     for slot in METHOD_SLOTS:
-        if slot not in parts or method.reads(slot):
+        if slot not in parts or (method.reads(slot) and slot not in idle):
             continue
         if getattr(recipe, slot).name != getattr(default, slot).name:
             yield slot, "name"
@@ -32,5 +43,6 @@ def unused_keys(
         now, usual = getattr(recipe, section), getattr(default, section)
         for key in type(now).model_fields:
             path = f"{section}.{key}"
-            if getattr(now, key) != getattr(usual, key) and path not in SESSION_KEYS and not method.reads(path):
+            unread = not method.reads(path) or (bool(idle) and path in RESIDUAL_KEYS)
+            if getattr(now, key) != getattr(usual, key) and path not in SESSION_KEYS and unread:
                 yield section, key

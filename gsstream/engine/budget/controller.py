@@ -42,12 +42,12 @@ class Controller:
         return Allowance.start(plan(self.budget, self._stream, self._history), log.elapsed())
 
     def describe(self, budget: Allowance, step: Step[Any], views: int, log: FrameLog) -> None:
-        """Log what a frame spent of its budget, where its method made iterations.
+        """Log what a frame spent of its budget, where its method made iterations or logged its own use (``budget``).
 
-        A method that does not log its own use (``budget``) is described by its phases and the size of its packet.
+        Without it, a method is described by its phases and the size of its packet.
         """
         numbers = log.numbers
-        if not numbers.get("iterations"):
+        if not numbers.get("iterations") and "budget" not in numbers:
             return
         used = numbers.get("budget") or {
             "rd_lambda": budget.plan.rd_lambda, "estimate": 0.0, "stopped_by_clock": False,
@@ -55,7 +55,8 @@ class Controller:
             "before": log.seconds("change", "motion", "confidence"),
             "optimise": log.seconds("optimise"),
         }  # fmt: skip
-        log.set(budget=spent(budget, used, self._stream, numbers["iterations"] / views))
+        used = {**used, "parts": log.seconds("motion", "growth")}
+        log.set(budget=spent(budget, used, self._stream, numbers.get("iterations", 0) / views))
 
     def key_refusal(self, num_gaussians: int, allowance: Allowance | None) -> str | None:
         """Say why a key packet that is due must wait, judged by what the last one cost; None: it may be tried."""

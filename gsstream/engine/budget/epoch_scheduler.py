@@ -22,6 +22,7 @@ from gsstream.engine.budget.plan import (
     scale_epoch_seconds,
 )
 from gsstream.engine.budget.schedule import Schedule
+from gsstream.method.tools import FrameBudget
 from gsstream.recipe.model import Stream
 
 #: Share of the passes after which the size is first estimated: before that, residuals are still growing.
@@ -175,12 +176,19 @@ class EpochScheduler(Schedule):
         self.rd_lambda = next_rate_weight(self.rd_lambda, expected, wanted)
 
 
-def scheduled(stream: Stream, frame: Frame, allowance: Allowance | None) -> Schedule:
+def plan_of(budget: FrameBudget | None) -> FramePlan | None:
+    """Return the engine's own plan of a frame; None without a budget."""
+    assert budget is None or isinstance(budget, Allowance)
+    return None if budget is None else budget.plan
+
+
+def scheduled(stream: Stream, frame: Frame, budget: FrameBudget | None) -> Schedule:
     """Return the schedule of a frame: as the recipe, or the plan of its budget, says."""
     epochs = max(1, round(stream.epochs * frame.effort))
-    if allowance is None:
+    if budget is None:
         return Schedule(epochs, stream.rd_lambda)
-    return EpochScheduler(allowance, epochs, stream.rd_lambda, len(frame.cameras), frame.effort)
+    assert isinstance(budget, Allowance)
+    return EpochScheduler(budget, epochs, stream.rd_lambda, len(frame.cameras), frame.effort)
 
 
 def next_rate_weight(weight: float, expected: float, wanted: float) -> float:

@@ -1,7 +1,8 @@
 """What one frame is to spend: a pure function of the budget, the recipe and what earlier frames cost.
 
 Order in which quality is given up. Size: weight of the rate, then coarser steps, then symbols and gates of the finished
-packet (:mod:`gsstream.engine.budget.trim`). Time: passes, then what counts as changed.
+packet (:mod:`gsstream.engine.budget.trim`). Time: passes, then what counts as changed;
+passes of motion and growth where no residual is learned.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ TIME_MARGIN = 0.93
 SIZE_TARGET, MAX_TRIMMED = 0.94, 2.0
 #: Largest share of the time that is kept for the phases after the passes, while no frame has shown what they cost.
 UNKNOWN_RESERVE = 0.2
+#: Least share of their usual passes that motion and growth make, in a frame without a residual.
+MIN_PART_SCALE = 0.05
 #: Share of a pass's time that does not depend on the number of candidates.
 FIXED_SHARE = 0.3
 #: Most passes over the cameras that a budget of time spends on one frame, where the recipe has fewer.
@@ -46,6 +49,7 @@ class Past:
         epochs: passes made. candidates: Gaussians that took part.
         before, optimise, after: seconds of the frame until its passes begin, of the passes, and of what follows them.
         weight, step_scale, threshold: what it was made with; the weight as in the last half of the passes.
+        parts: seconds of motion and growth. part_scale: share of their passes that they made.
         estimate: bytes expected after the last pass; 0: not estimated. untrimmed: bytes before trimming. size: bytes.
     """
 
@@ -61,6 +65,8 @@ class Past:
     estimate: float
     untrimmed: int
     size: int
+    parts: float = 0.0
+    part_scale: float = 1.0
 
 
 def read_past_frame(metrics: Mapping[str, Any]) -> Past | None:
@@ -76,6 +82,7 @@ def read_past_frame(metrics: Mapping[str, Any]) -> Past | None:
         weight=float(spent["rd_lambda"]), step_scale=float(spent["step_scale"]),
         threshold=float(spent["change_threshold"]), estimate=float(spent["estimate"]),
         untrimmed=int(spent["untrimmed"]), size=sum(metrics["bytes"].values()),
+        parts=float(spent["parts"]), part_scale=float(spent["part_scale"]),
     )  # fmt: skip
 
 
@@ -88,6 +95,7 @@ class FramePlan:
         rd_lambda: at the start; moved after every pass where a size is to be met.
         max_epochs: passes that are not exceeded however much time is left.
         step_scale: factor on all quantisation steps, >= 1.
+        part_scale: share of their usual passes that motion and growth make, in a frame without a residual.
         max_bytes: the size that must not be exceeded, or None. correction: real bytes per estimated byte.
         seconds: what may be planned with from the start of the frame, or None.
         after: seconds of it to keep for what follows the passes; None: unknown, the frame's own passes will tell.
@@ -100,6 +108,7 @@ class FramePlan:
     rd_lambda: float
     max_epochs: int = 0
     step_scale: float = 1.0
+    part_scale: float = 1.0
     max_bytes: int | None = None
     correction: float = 1.0
     seconds: float | None = None
@@ -126,6 +135,7 @@ def plan(budget: Budget, stream: Stream, history: Sequence[Past]) -> FramePlan:
         rd_lambda=_weight(budget, stream, recent) if held else stream.rd_lambda,
         max_epochs=max(stream.epochs, MOST_EPOCHS),
         step_scale=_step_scale(recent) if held else 1.0,
+        part_scale=_part_scale(budget, [p for p in recent if p.epochs == 0]),
         max_bytes=size,
         correction=_correction(recent),
         seconds=seconds,
@@ -173,13 +183,23 @@ def _other_seconds(recent: Sequence[Past]) -> tuple[float, float]:
     return median(p.before for p in recent), min(max(after), 2 * median(after))
 
 
+def _part_scale(budget: Budget, recent: Sequence[Past]) -> float:
+    """Share of the passes of motion and growth that fits into the time, by frames in which no residual was learned."""
+    if budget.time is None or not recent:
+        return 1.0
+    whole = median(p.parts / p.part_scale for p in recent[-3:])
+    others = median(p.before + p.after - p.parts for p in recent[-3:])
+    fits = (TIME_MARGIN * budget.time - others) / whole if whole > 0 else 1.0
+    return min(max(fits, MIN_PART_SCALE), 1.0)
+
+
 def _threshold(budget: Budget, stream: Stream, recent: Sequence[Past]) -> float:
     """Return the next frame's threshold of change.
 
     It rises after two frames in which too few passes fitted into the time, and else falls back towards the recipe's.
     """
     usual = stream.change_threshold
-    if budget.time is None or not recent:
+    if budget.time is None or not recent or recent[-1].epochs == 0:
         return usual
     last, most = recent[-1], MAX_THRESHOLD * (usual or FIRST_THRESHOLD)
     few = min(MIN_EPOCHS, stream.epochs)

@@ -6,12 +6,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from gsstream.engine.budget.epoch_scheduler import Allowance, EpochScheduler
+from gsstream.engine.budget.schedule import Schedule
 from gsstream.engine.budget.trim import TrimmedDelta
 from gsstream.recipe.model import Stream
 
 
-def usage(pace: EpochScheduler, fitted: TrimmedDelta) -> dict[str, Any]:
+def usage(pace: Schedule, fitted: TrimmedDelta) -> dict[str, Any]:
     """Return what the optimisation of a frame used, and what fitting its packet gave up: raw numbers for the log."""
+    assert isinstance(pace, EpochScheduler)
     return {
         "rd_lambda": pace.mean_rate_weight, "estimate": pace.estimate, "stopped_by_clock": pace.stopped_by_clock,
         "untrimmed": fitted.untrimmed, "before": pace.before, "optimise": pace.optimise,
@@ -36,6 +38,9 @@ def spent(budget: Allowance, used: Mapping[str, Any], stream: Stream, epochs: fl
     if plan.seconds is not None:
         if epochs < stream.epochs and used["stopped_by_clock"]:
             given_up["epochs"] = stream.epochs - epochs
+        if plan.part_scale < 1:
+            given_up["part_scale"] = plan.part_scale
+            bound.append("time")
         if plan.change_threshold > stream.change_threshold:
             given_up["change_threshold"] = [stream.change_threshold, plan.change_threshold]
         if used["stopped_by_clock"]:
@@ -49,5 +54,6 @@ def spent(budget: Allowance, used: Mapping[str, Any], stream: Stream, epochs: fl
             "epochs": epochs, "planned_epochs": plan.epochs, "rd_lambda": used["rd_lambda"],
             "step_scale": plan.step_scale, "change_threshold": plan.change_threshold, "estimate": used["estimate"],
             "untrimmed": used["untrimmed"], "before": used["before"], "optimise": used["optimise"],
+            "parts": used["parts"], "part_scale": plan.part_scale,
         },
     }  # fmt: skip

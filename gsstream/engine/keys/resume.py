@@ -98,7 +98,10 @@ def state_after(parts: Assembly, states: Iterable[PlayerState], rng: Rng) -> Str
     """
     state: StreamState | None = None
     for player in states:
-        state = key_state_from_player(parts, player, rng) if state is None else next_state(state, player)
+        if state is None:
+            state = key_state_from_player(parts, player, rng)
+        else:
+            state = next_state(parts.motion, state, player, rng)
     assert state is not None, "a stream without a key packet"
     return state
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 
@@ -31,6 +32,7 @@ class StreamState:
         key_frame: frame of the last key packet.
         refinement: the first frame as it goes on being optimised beside the stream; None before the frame after it,
             from the key packet on that brings it, and when the recipe asks for none.
+        motion_memory: what the motion part remembers of the packets since the last key packet (``MotionPart.follow``).
         session: what the renderer keeps of this scene from one frame to the next. Nothing but time depends on it: a
             state without one (the first, a resumed one) goes on to the same bytes.
     """
@@ -42,6 +44,7 @@ class StreamState:
     exposure: Exposure | None = None
     key_frame: int = 0
     refinement: Refinement | None = None
+    motion_memory: Any = None
     session: RenderSession | None = field(default=None, compare=False, repr=False)
 
     @property

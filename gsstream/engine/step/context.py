@@ -12,17 +12,18 @@ from gsstream.core.context import RowGradient, ScreenGradient
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.log import FrameLog
 from gsstream.core.storage import unpacked
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.photometric import PhotometricLoss, render_exposed
 from gsstream.engine.fit.schedule import DSSIM
+from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.active.candidates import VoteCache, changed_rows
 from gsstream.engine.step.active.change import MAX_PIXEL_SIGMA, Change
 from gsstream.engine.step.active.tiles import changed_tile_weights
 from gsstream.metrics.noise import noise_sigma
 from gsstream.parts.optimiser.base import RowOptimiser
 from gsstream.parts.render.base import RenderSession
-from gsstream.parts.render.exposure import Exposure
 from gsstream.parts.render.target import ViewTarget
 from gsstream.parts.render.wrt import G, LossAndGrad, Wrt
 
@@ -34,21 +35,22 @@ class EngineContext:
     it.
 
     Arguments:
-        gaussians, hierarchy: the decoded scene before the frame and its groups.
-        previous: training images that this scene shows.
+        state: that before the frame: the decoded scene, its groups, and the training images that it shows.
+        log: the record of the frame.
         change: what changed since; None: everything counts as changed.
-        session: a render session of this scene that is kept from before, or None.
+        part_scale: share of their usual passes that parts make, above 0 to 1.
     """
 
     def __init__(
-        self, parts: Assembly, gaussians: Gaussians[torch.Tensor], hierarchy: Hierarchy, frame: Frame, previous: Frame,
-        exposure: Exposure | None, change: Change | None = None, session: RenderSession | None = None,
+        self, parts: Assembly, state: StreamState, frame: Frame, log: FrameLog, change: Change | None = None,
+        part_scale: float = 1.0,
     ) -> None:  # fmt: skip
-        self._parts, self._gaussians, self._hierarchy = parts, gaussians, hierarchy
-        self._frame, self._previous, self._change = frame, previous, change
-        self._background = parts.recipe.background
-        self.photometric = PhotometricLoss(parts.loss, DSSIM, frame.images, exposure)
-        self._session = session
+        self._parts, self._gaussians, self._hierarchy = parts, state.gaussians, state.hierarchy
+        self._frame, self._previous, self._change = frame, state.previous, change
+        self._background, self._part_scale = parts.recipe.background, part_scale
+        self.log, self.key_rows = log, state.player.key_rows
+        self.photometric = PhotometricLoss(parts.loss, DSSIM, frame.images, state.exposure)
+        self._session = state.session
         self._votes = None if change is None else VoteCache(change, frame.cameras)
 
     @property
@@ -68,10 +70,6 @@ class EngineContext:
     @property
     def index(self) -> int:
         return self._frame.index
-
-    @property
-    def effort(self) -> float:
-        return self._frame.effort
 
     @property
     def gaussians(self) -> Gaussians[torch.Tensor]:
@@ -131,6 +129,9 @@ class EngineContext:
     def optimiser(self) -> RowOptimiser:
         return self._parts.optimiser
 
+    def scaled(self, number: float) -> int:
+        return max(1, round(number * self._frame.effort * self._part_scale))
+
     def changed_rows(self, min_votes: float) -> torch.Tensor:
         return changed_rows(
             self._change, self._gaussians.means, self.cameras, self.session, min_votes, self._votes
@@ -151,4 +152,10 @@ class EngineContext:
         # The loss of the same images and the votes that were counted are shared, not made again.
         other = copy(self)
         other._gaussians, other._session = gaussians, session
+        return other
+
+    def everywhere(self) -> EngineContext:
+        # The session is shared: another would hold a render per camera of the same scene.
+        other = copy(self)
+        other._session, other._change = self.session, None
         return other

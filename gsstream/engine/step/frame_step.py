@@ -12,11 +12,10 @@ from gsstream.core.frame import Frame
 from gsstream.core.log import FrameLog
 from gsstream.core.storage import packed
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.budget.epoch_scheduler import Allowance, EpochScheduler, scheduled
+from gsstream.engine.budget.epoch_scheduler import scheduled
 from gsstream.engine.budget.usage import usage
 from gsstream.engine.state.next_state import next_state
 from gsstream.engine.state.stream_state import Step, StreamState
-from gsstream.engine.step.active.candidates import CHANGE_VOTES, candidates
 from gsstream.engine.step.active.change import detect_changed_tiles
 from gsstream.engine.step.active.tiles import tile_weights
 from gsstream.engine.step.commit import commit_session
@@ -27,8 +26,10 @@ from gsstream.engine.step.motion import propose_motion
 from gsstream.engine.step.optimise import optimise
 from gsstream.engine.step.problem import Problem
 from gsstream.engine.step.quantise import quantise_residual
+from gsstream.engine.step.select import select
 from gsstream.method.tools import Tools
 from gsstream.packet import decode_packet, encode_empty
+from gsstream.parts.update.base import Scope
 
 
 def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) -> Step:
@@ -36,40 +37,35 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) 
 
     Raises ComponentError when a part fails.
     """
-    log, rng, stream = tools.log, tools.rng, parts.recipe.stream
-    allowance = tools.budget
-    assert allowance is None or isinstance(allowance, Allowance)
+    log, rng, stream, scope = tools.log, tools.rng, parts.recipe.stream, parts.update.scope(frame.index)
     parts.where.enter(frame.index)
     if frame.effort == 0:  # its pictures count for nothing: a source that is behind has not even read them
         return empty_step(state, frame, log)
     with log.phase("change"):
         change = detect_changed_tiles(state.previous, frame, stream.change_threshold)
-    if change is not None and change.share == 0:
+    if change is not None and change.share == 0 and scope is not Scope.ALL:
         return empty_step(state, frame, log)
     with log.phase("motion"):
-        motions, scene, view = propose_motion(parts, state, frame, change, rng, allowance)
+        motions, scene, view = propose_motion(parts, state, frame, change, tools)
     with log.phase("confidence"):
-        confidence = parts.propagation.propagate(parts.confidence.estimate(view), state.hierarchy)
-        logits = parts.gate.init(confidence)
-        open_probability = parts.gate.open_probability(logits)
-        able = view.changed_rows(CHANGE_VOTES)
-        rows = candidates(able, open_probability, state.hierarchy, stream.active_threshold)
+        rows, logits = select(parts, view, state.hierarchy, scope)
     with log.phase("optimise"):
         generator, views = rng.stream("frame", frame.index), len(frame.cameras)
+        looked = None if scope is Scope.ALL else change
         problem = Problem(
             scene.layout, state.hierarchy, rows, view.gaussians.rows(rows), logits, state.decoders,
             view.session_for(rows), lambda index: view.view_target(
-                index, tile_weights(change, index, stream.static_tile_share, generator)
+                index, tile_weights(looked, index, stream.static_tile_share, generator)
             ), views, frame.cameras.width * frame.cameras.height, generator,
-            1.0 if allowance is None else allowance.plan.step_scale,
+            1.0 if tools.budget is None else tools.budget.step_scale,
         )  # fmt: skip
-        schedule = scheduled(stream, frame, allowance)
+        schedule = scheduled(stream, frame, tools.budget)
         solution = optimise(parts, problem, schedule)
         residual = quantise_residual(parts, problem, solution)
     with log.phase("growth"):
         delta = with_growth(parts, state, Delta(motions).with_residual(residual), view, rng)
     with log.phase("code"):
-        most = None if allowance is None else allowance.plan.max_bytes
+        most = None if tools.budget is None else tools.budget.max_bytes
         fitted = encode_frame(delta, state.player, frame.index, solution, parts.recipe.codec.trim, most)
         player = decode_packet(state.player, fitted.packet.data)
     with log.phase("keep"):
@@ -78,10 +74,10 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) 
         unchanged = fitted.delta.is_empty
         shown = state.previous if unchanged else replace(frame, images=packed(frame.images, parts.recipe.data.images))
         session = commit_session(view, scene, fitted.delta, player)
-        after = next_state(replace(state, previous=shown, session=session), player)
+        after = next_state(parts.motion, replace(state, previous=shown, session=session), player, rng)
     log_packet(log, player, fitted.packet)
     log.set(changed_tiles=1.0 if change is None else change.share, **step_numbers(solution, len(rows), session))
-    if isinstance(schedule, EpochScheduler) and len(rows):
+    if tools.budget is not None and (len(rows) or scope is Scope.NONE):
         log.set(budget=usage(schedule, fitted))
     return Step(after, replace(fitted.packet, decoded=player), "empty" if unchanged else "delta")
 

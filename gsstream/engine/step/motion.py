@@ -6,51 +6,58 @@ from typing import NamedTuple
 
 import torch
 
-from gsstream.core.changes import Motion, Scene
-from gsstream.core.changes.motion import apply_motions
+from gsstream.core.changes import Delta, Field, Motion, Scene
+from gsstream.core.changes.field import apply_field
+from gsstream.core.changes.motion import apply_motions, union_rows
 from gsstream.core.frame import Frame
-from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import error_context
-from gsstream.engine.budget.epoch_scheduler import Allowance
+from gsstream.engine.budget.epoch_scheduler import plan_of
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.active.change import Change
 from gsstream.engine.step.context import EngineContext
+from gsstream.method.tools import Tools
+from gsstream.packet.changes.field import encode_field
 from gsstream.packet.changes.motion import encode_motions
+from gsstream.parts.update.base import Scope
 
-#: Largest share of the bytes a frame may take that its motions may take.
+#: Largest share of the bytes a frame may take that its motions may take, where a residual follows them.
 MAX_SIZE_SHARE = 0.5
 
 
 class Moved(NamedTuple):
-    """The motions that move anything, the scene after them, and the frame seen from that scene."""
+    """The motions that move anything, a field as the last, the scene after them, and the frame seen from that scene."""
 
-    motions: tuple[Motion, ...]
+    motions: tuple[Motion | Field, ...]
     scene: Scene
     view: EngineContext
 
 
 def propose_motion(
-    parts: Assembly, state: StreamState, frame: Frame, change: Change | None, rng: Rng,
-    allowance: Allowance | None = None,
-) -> Moved:  # fmt: skip
+    parts: Assembly, state: StreamState, frame: Frame, change: Change | None, tools: Tools
+) -> Moved:
     """Ask the motion part, and apply what it proposes as every player will.
 
     Raises ComponentError when the part fails, or proposes motions that do not fit the scene or cannot be sent.
     """
-    scene = state.player.scene
-    view = EngineContext(
-        parts, state.gaussians, state.hierarchy, frame, state.previous, state.exposure, change, state.session,
-    )  # fmt: skip
-    motions = tuple(motion for motion in parts.motion.propose(scene, view, rng) if not motion.is_empty)
+    scene, plan = state.player.scene, plan_of(tools.budget)
+    view = EngineContext(parts, state, frame, tools.log, change, 1.0 if plan is None else plan.part_scale)
+    proposed = parts.motion.propose(scene, view, tools.rng, state.motion_memory)
+    motions = tuple(motion for motion in proposed if not motion.is_empty)
     if not motions:
         return Moved((), scene, view)
     with error_context("motion", parts.part("motion"), parts.where):
-        sections = encode_motions(motions)  # what cannot be sent is refused before anything is learned on it
-        most = None if allowance is None else allowance.plan.max_bytes
-        if most is not None and sum(len(data) for _, data in sections) > MAX_SIZE_SHARE * most:
+        delta = Delta(motions)
+        # What cannot be sent is refused before anything is learned on it.
+        sections = encode_motions(delta.motions) + ([] if delta.field is None else encode_field(delta.field))
+        most = None if plan is None else plan.max_bytes
+        share = 1.0 if parts.update.scope(frame.index) is Scope.NONE else MAX_SIZE_SHARE
+        if most is not None and sum(len(data) for _, data in sections) > share * most:
             return Moved((), scene, view)
-        scene, touched = apply_motions(scene, motions)
+        scene, touched = apply_motions(scene, delta.motions)
+        if delta.field is not None:
+            scene, rows = apply_field(scene, delta.field)
+            touched = union_rows(len(scene.gaussians), touched, rows)
     gaussians = scene.gaussians.map(torch.from_numpy)
     # The session is handed on to the moved scene, with its caches of all that stands still. The old session stays
     # correct, as it must until the frame has succeeded: should it be used again, it fills its caches anew.

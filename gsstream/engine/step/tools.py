@@ -17,6 +17,7 @@ from gsstream.engine.budget.epoch_scheduler import Allowance
 from gsstream.engine.frame0.begin import begin, exposure_from_meta
 from gsstream.engine.frame0.optimise import Progress
 from gsstream.engine.frame0.reuse import reuse_first_frame
+from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.context import EngineContext
 from gsstream.method.tools import FirstFrame
 from gsstream.packet import PlayerState, StreamMeta
@@ -80,5 +81,5 @@ class RunTools:
     def open(self, player: PlayerState, previous: Frame, frame: Frame) -> EngineContext:
         roots = torch.arange(len(player.layout.node_counts))
         forest = Hierarchy(torch.from_numpy(player.layout.node_of), roots, torch.zeros_like(roots))
-        gaussians, exposure = player.gaussians.map(torch.from_numpy), exposure_from_meta(player.meta)
-        return EngineContext(self.parts, gaussians, forest, frame, previous, exposure)
+        state = StreamState(player, forest, previous, exposure=exposure_from_meta(player.meta))
+        return EngineContext(self.parts, state, frame, self.log)

@@ -6,9 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from pydantic import Field
 
 from gsstream.core.changes import RowEdit, Scene, add_as_nodes
 from gsstream.core.gaussians import Gaussians
+from gsstream.core.part import PartConfig
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import IntArray
 from gsstream.parts.growth.fitting import concat_gaussians, fit_added
@@ -18,60 +20,69 @@ from gsstream.parts.render.work import FitContext
 CopyFilter = Callable[[FitContext, torch.Tensor], torch.Tensor]
 
 
+class CopySettings(PartConfig):
+    """How many Gaussians a frame copies, where, and how long they are fitted."""
+
+    epochs: int = Field(
+        default=5, ge=0, le=1000, description="passes over the training cameras that fit the copies; 0: none is made"
+    )
+    rounds: int = Field(default=2, ge=1, le=10, description="times that the scene is searched for places")
+    gradient: float = Field(
+        default=2e-4, gt=0, description="mean screen gradient (half-width units) above which a Gaussian is copied"
+    )
+    most: int = Field(default=500, ge=0, le=100_000, description="Gaussians that a frame adds at most")
+    prune_opacity: float = Field(
+        default=0.01, ge=0, lt=1, description="added Gaussians below this opacity are not sent, 0 to 1"
+    )
+
+
 def replace_with_copies(
-    scene: Scene, removed: IntArray, work: FitContext, epochs: int, rng: Rng, *,
-    gradient: float, most: int, rounds: int,
-    prune_opacity: float, admitted: CopyFilter | None = None,
+    scene: Scene, removed: IntArray, work: FitContext, settings: CopySettings, rng: Rng,
+    admitted: CopyFilter | None = None,
 ) -> RowEdit:  # fmt: skip
-    """Return the change of rows in which some leave and the frame's copies are added, each a node of its own.
+    """Return the change of rows in which some are removed and the frame's copies are added, each a node of its own.
 
     Arguments:
         scene: N rows, after the frame's motions.
-        removed: [D] int64 rows that leave, ascending.
-        work, epochs, rng, gradient, most, rounds, prune_opacity, admitted: as for :func:`fit_copies`.
+        removed: [D] int64 rows that are removed, ascending.
+        work, settings, rng, admitted: as for :func:`fit_copies`. Where nothing changed, nothing is added.
     """
+    if not settings.epochs or not bool(work.changed_rows(0.0).any()):
+        return RowEdit(removed=removed)
     kept = scene.gaussians.rows(np.delete(np.arange(len(scene.gaussians)), removed)).map(torch.from_numpy)
-    added = fit_copies(
-        kept, work, epochs, rng, gradient=gradient, most=most, rounds=rounds, prune_opacity=prune_opacity,
-        admitted=admitted,
-    ).map(lambda value: value.numpy())
+    added = fit_copies(kept, work.everywhere(), settings, rng, admitted).map(lambda value: value.numpy())
     if not len(added):
         return RowEdit(removed=removed)
     return RowEdit(add_as_nodes(added, np.zeros(len(added), np.uint8), len(scene.layout.node_counts)), removed)
 
 
 def fit_copies(
-    scene: Gaussians[torch.Tensor], work: FitContext, epochs: int, rng: Rng, *, gradient: float, most: int, rounds: int,
-    prune_opacity: float, admitted: CopyFilter | None = None,
+    scene: Gaussians[torch.Tensor], work: FitContext, settings: CopySettings, rng: Rng,
+    admitted: CopyFilter | None = None,
 ) -> Gaussians[torch.Tensor]:  # fmt: skip
     """Return the Gaussians that a frame adds to a scene, raw values.
 
     Arguments:
         scene: N rows, after the frame's motions and without those that leave.
-        work: the frame.
-        epochs: passes over the training cameras, spread over the rounds.
+        work: the frame; copies are made where its gradients reach.
+        settings: their passes are spread over the rounds.
         rng: random streams by name and frame.
-        gradient: as for :func:`high_gradient_rows`.
-        most: Gaussians that are added at most.
-        rounds: times that the scene is searched for places.
-        prune_opacity: opacity below which an added Gaussian is given up, 0 to 1.
         admitted: chooses among the places that are found; None: all of them.
     """
-    added = scene.rows(slice(0, 0))
-    views = list(range(len(work.cameras)))
+    added, views, rounds = scene.rows(slice(0, 0)), list(range(len(work.cameras))), settings.rounds
+    epochs = work.scaled(settings.epochs)
     for round_ in range(rounds):
         passes = epochs * (round_ + 1) // rounds - epochs * round_ // rounds
-        room = most - len(added)
+        room = settings.most - len(added)
         if not passes or (room <= 0 and not len(added)):
             continue
-        copies = _copies(
-            work.on(concat_gaussians(scene, added) if len(added) else scene), gradient, max(0, room), admitted
-        )
+        base = concat_gaussians(scene, added) if len(added) else scene
+        copies = _copies(work.on(base), settings.gradient, max(0, room), admitted)
         added = concat_gaussians(added, copies) if len(added) else copies
         if not len(added):
             continue
         added = fit_added(scene, added, work, views, passes, rng)
-        added = added.rows(added.opacities.sigmoid() >= prune_opacity)
+        added = added.rows(added.opacities.sigmoid() >= settings.prune_opacity)
     return added
 
 

@@ -1,10 +1,11 @@
-"""MotionPart: which groups of Gaussians move rigidly in a frame, before its residual is learned."""
+"""MotionPart: which Gaussians move in a frame before its residual is learned, and how."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
+from typing import Any
 
-from gsstream.core.changes import Motion, Scene
+from gsstream.core.changes import Delta, Field, Layout, Motion, Scene
 from gsstream.core.part import Part
 from gsstream.core.rng import Rng
 from gsstream.parts.render.work import FitContext
@@ -13,18 +14,37 @@ from gsstream.parts.render.work import FitContext
 class MotionPart(Part):
     """Proposes the motions that a frame begins with.
 
-    A motion is a change of the stream (``core.changes.Motion``): encoder and player apply it with the same function,
-    and its prediction from the last frame is part of that function. So a part decides which groups move and what
-    corrects the prediction; it never moves Gaussians itself. The residual of the frame is learned on the moved scene.
+    A motion is a change of the stream (``core.changes.Motion``, or ``core.changes.Field``): encoder and player apply it
+    with the same function, and its prediction from the last frame is part of that function. So a part decides which
+    groups move and what corrects the prediction; it never moves Gaussians itself. The residual of the frame is learned
+    on the moved scene.
     """
 
     @abstractmethod
-    def propose(self, scene: Scene, work: FitContext, rng: Rng) -> tuple[Motion, ...]:
+    def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion | Field, ...]:
         """Return the motions of this frame, in the order in which they apply; none leaves the scene where it is.
+
+        A field may follow them, as the last.
 
         Arguments:
             scene: the decoded scene of the frame before, with the displacement of its rows and the groups that the last
                 motion named (numpy; do not change it).
             work: the frame: images, what changed, and rendering with some rows moving.
             rng: random streams by name and frame; draw from nothing else.
+            memory: what :meth:`follow` returned for the last delta packet; None before there is one.
         """
+
+    def follow(self, memory: Any, frame: int, before: Layout, delta: Delta, rng: Rng) -> Any:
+        """Return what this part remembers after a delta packet. By default a part remembers nothing.
+
+        A key packet ends it. A resumed run calls this for every packet since the last key packet, so the result follows
+        from the arguments alone; do not change ``memory``.
+
+        Arguments:
+            memory: what this returned for the delta packet before; None at the first after a key packet.
+            frame: index of the frame.
+            before: the layout that ``delta`` refers to.
+            delta: what the packet changes, as every player decodes it.
+            rng: random streams by name and frame; draw from nothing else.
+        """
+        return None

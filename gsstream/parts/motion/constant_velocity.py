@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, final
+from typing import Any, ClassVar, final
 
 import numpy as np
 from pydantic import Field
@@ -41,7 +41,7 @@ class Coasting(MotionPart):
 
     source: ClassVar[str] = "gsstream"
 
-    def propose(self, scene: Scene, work: FitContext, rng: Rng) -> tuple[Motion, ...]:
+    def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion, ...]:
         if scene.displacement is None:
             return ()
         groups = known_groups(scene, work.cameras, self.config.pixels, self.config.brightness_bins)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import torch
 
 from gsstream.core.changes import Motion, Scene, groups_for
+from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.parts.motion.groups import groups_of_rows
 
@@ -39,3 +43,22 @@ def approximate_by_cells(
     marks = np.zeros(groups.count, np.uint8)
     marks[able[moved]] = 1
     return Motion(side, 1, marks, symbols[moved], *steps, predicted=False, regroup=True)
+
+
+def transform_rows(
+    gaussians: Gaussians[torch.Tensor], shift: torch.Tensor, turn: torch.Tensor
+) -> Gaussians[torch.Tensor]:
+    """Return Gaussians, raw values, each shifted [A, 3] and rotated [A, 3] about its centre, with a graph.
+
+    ``shift`` is in scene units, ``turn`` is axis * tan(angle / 2).
+    """
+    quat = torch.nn.functional.normalize(torch.cat([torch.ones_like(turn[:, :1]), turn], 1), dim=1)
+    w0, x0, y0, z0 = quat.unbind(1)
+    w1, x1, y1, z1 = gaussians.quats.unbind(1)
+    quats = torch.stack([
+        w0 * w1 - x0 * x1 - y0 * y1 - z0 * z1,
+        w0 * x1 + x0 * w1 + y0 * z1 - z0 * y1,
+        w0 * y1 - x0 * z1 + y0 * w1 + z0 * x1,
+        w0 * z1 + x0 * y1 - y0 * x1 + z0 * w1,
+    ], 1)  # fmt: skip
+    return replace(gaussians, means=gaussians.means + shift, quats=quats)

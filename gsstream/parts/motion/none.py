@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, final
+from typing import Any, ClassVar, final
 
 from gsstream.core.changes import Motion, Scene
 from gsstream.core.rng import Rng
@@ -16,5 +16,5 @@ class Still(MotionPart):
 
     source: ClassVar[str] = "gsstream"
 
-    def propose(self, scene: Scene, work: FitContext, rng: Rng) -> tuple[Motion, ...]:
+    def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion, ...]:
         return ()

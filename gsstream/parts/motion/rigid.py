@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, NamedTuple, final
+from typing import Any, ClassVar, Literal, NamedTuple, final
 
 import numpy as np
 from pydantic import Field
@@ -65,7 +65,7 @@ class Rigid(MotionPart):
 
     source: ClassVar[str] = "gsstream; groups of one rigid motion as in HiCoM"
 
-    def propose(self, scene: Scene, work: FitContext, rng: Rng) -> tuple[Motion, ...]:
+    def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion, ...]:
         config = self.config
         groups = known_groups(scene, work.cameras, config.pixels, config.brightness_bins)
         able = changed_groups(groups, work, config.votes, config.share)
@@ -90,7 +90,7 @@ class Rigid(MotionPart):
     def _fitted(self, scene: Scene, work: FitContext, start: GroupTransforms, units: Units, rng: Rng) -> FloatArray:
         """[K, 6] shift and turn of the groups that explain the images best."""
         config = self.config
-        total = max(1, round(config.epochs * len(work.cameras) * work.effort))
+        total = work.scaled(config.epochs * len(work.cameras))
         damping = Damping(config.damping, config.hold, config.longest)
         order = rng.numpy("motion", work.index)
         tiles: Literal["all", "changed"] = "all" if config.everywhere else "changed"

@@ -8,6 +8,7 @@ import torch
 
 from gsstream.core.context import FrameContext
 from gsstream.core.gaussians import Gaussians
+from gsstream.core.log import FrameLog
 
 if TYPE_CHECKING:
     from gsstream.parts.render.wrt import G, LossAndGrad, Wrt
@@ -20,12 +21,22 @@ class FitContext(FrameContext, Protocol):
     """
 
     @property
-    def effort(self) -> float:
-        """Share of the usual passes that the frame is worth, above 0 to 1: less where a run is behind its recording."""
-
-    @property
     def optimiser(self) -> Any:
         """The optimiser of the run (``gsstream.api.RowOptimiser``), for rows that a part fits on its own."""
+
+    @property
+    def log(self) -> FrameLog:
+        """The record of the frame: phases within the part's own (``"motion/fit"``) and numbers."""
+
+    @property
+    def key_rows(self) -> int:
+        """Number of Gaussians of the last key packet: rows from there on were added since, where none was removed."""
+
+    def scaled(self, number: float) -> int:
+        """Return how many passes or iterations the frame is worth, at least 1, where ``number`` is usual.
+
+        It is less where a run is behind its recording, or where a budget of time has to be met without a residual.
+        """
 
     def changed_rows(self, min_votes: float) -> torch.Tensor:
         """Return [N] bool: Gaussians that are seen in a tile that changed.
@@ -56,3 +67,6 @@ class FitContext(FrameContext, Protocol):
 
     def on(self, gaussians: Gaussians[torch.Tensor]) -> FitContext:
         """Return the same frame, to be worked on from another scene."""
+
+    def everywhere(self) -> FitContext:
+        """Return the same frame and scene, in which every tile counts as changed; gradients then reach all rows."""

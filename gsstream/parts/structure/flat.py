@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import final
+from dataclasses import replace
+from typing import Literal, final
 
 import torch
 from pydantic import Field
@@ -26,10 +27,16 @@ class Flat(Structure):
     class Config(PartConfig):
         resolution: int = Field(
             default=1024, ge=1, le=65536,
-            description="position residuals are measured in (scene diameter / resolution); 1 to 65536",
+            description="position residuals are measured in (the length named by unit / resolution); 1 to 65536",
         )  # fmt: skip
+        unit: Literal["points", "rig"] = Field(
+            default="points", description="points: diameter of the scene's points; rig: extent of the training cameras"
+        )
 
     traits = StructureTraits(idempotent=True, local=True, has_grid=False)
+
+    def claims(self) -> StructureTraits:
+        return replace(self.traits, has_grid=self.config.unit == "rig")
 
     def seed(self, points: PointCloud, cameras: Cameras) -> Anchors:
         if len(points) == 0:
@@ -38,7 +45,8 @@ class Flat(Structure):
         check_finite("points.rgb", points.rgb)
         positions = torch.as_tensor(points.xyz, dtype=torch.float32)
         span = positions.amax(0) - positions.amin(0)
-        unit = float(span.norm()) / self.config.resolution
+        length = float(span.norm()) if self.config.unit == "points" else cameras.extent
+        unit = length / self.config.resolution
         return Anchors(
             positions=positions,
             colors=torch.as_tensor(points.rgb, dtype=torch.float32),

@@ -7,8 +7,9 @@ from typing import final
 
 from pydantic import Field
 
+from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.part import PartConfig
-from gsstream.parts.update.base import AttributeCode, UpdateRule
+from gsstream.parts.update.base import AttributeCode, Scope, UpdateRule
 
 
 class DirectCode(PartConfig):
@@ -25,6 +26,10 @@ class Additive(UpdateRule):
     source = "gsstream"
 
     class Config(PartConfig):
+        every: int = Field(
+            default=1, ge=1,
+            description="frames from one residual to the next, which above 1 is of all Gaussians; 1: of what changed",
+        )  # fmt: skip
         means: DirectCode = Field(default=DirectCode(step=0.02, lr=0.1), description="centres, in cells")
         quats: DirectCode = Field(default=DirectCode(step=0.01, lr=0.005), description="raw quaternion entries")
         scales: DirectCode = Field(default=DirectCode(step=0.02, lr=0.02), description="log scales")
@@ -32,6 +37,11 @@ class Additive(UpdateRule):
         sh0: DirectCode = Field(default=DirectCode(step=0.02, lr=0.02), description="degree-0 colour coefficients")
         shN: DirectCode = Field(default=DirectCode(step=0.01, lr=0.0005), description="higher colour coefficients")
 
+    def scope(self, frame: int) -> Scope:
+        if self.config.every == 1:
+            return Scope.CHANGED
+        return Scope.ALL if frame % self.config.every == 0 else Scope.NONE
+
     def codes(self) -> Mapping[str, AttributeCode]:
-        entries = {name: getattr(self.config, name) for name in type(self.config).model_fields}
+        entries = {name: getattr(self.config, name) for name in ATTRIBUTES}
         return {name: AttributeCode(step=c.step, lr=c.lr) for name, c in entries.items() if c.lr > 0}

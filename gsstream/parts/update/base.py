@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import torch
 
@@ -19,6 +20,14 @@ from gsstream.core.part import Part
 
 #: Largest magnitude of a symbol: up to it float32, in which symbols are decoded, represents every integer exactly.
 MAX_SYMBOL = 1 << 24
+
+
+class Scope(Enum):
+    """Which Gaussians may have a residual in a frame: none, those in what changed, or all."""
+
+    NONE = "none"
+    CHANGED = "changed"
+    ALL = "all"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +58,14 @@ class UpdateRule(Part):
     @abstractmethod
     def codes(self) -> Mapping[str, AttributeCode]:
         """Return attribute name -> code; an attribute that is left out never changes."""
+
+    def scope(self, frame: int) -> Scope:
+        """Return which Gaussians may have a residual in a frame; it follows from the frame's index and the settings.
+
+        With ``ALL`` a frame in which nothing changed is optimised, too; with ``NONE`` neither confidence nor gate is
+        called.
+        """
+        return Scope.CHANGED
 
     def init_decoders(self, gaussians: Gaussians[torch.Tensor], generator: torch.Generator) -> dict[str, torch.Tensor]:
         """Return the decoder [L, D] of every attribute that has one, drawn at the key packet."""

@@ -3,37 +3,58 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
-from gsstream.core.changes import Motion, apply_motion
-from gsstream.packet.base import Section
-from gsstream.packet.changes.motion import decode_motions, encode_motions
+from gsstream.core.changes import Delta, Field, Motion, RowEdit, apply_delta
+from gsstream.packet import decode_delta, encode_delta
 from gsstream.parts.motion.base import MotionPart
 from gsstream.testing.cases import fingerprint
 from gsstream.testing.registry import check
 from gsstream.testing.working import check_closed_loop, fit_fixture
 
 
-def _proposed(part: MotionPart, *, changed: bool = True) -> tuple[Motion, ...]:
+def _proposed(part: MotionPart, *, changed: bool = True) -> tuple[Motion | Field, ...]:
     case = fit_fixture(changed=changed)
     motions = part.propose(case.scene, case.work, case.rng)
     assert isinstance(motions, tuple), f"propose(): expected a tuple of Motion, got {type(motions).__name__}"
     for motion in motions:
-        assert isinstance(motion, Motion), f"propose(): expected Motion, got {type(motion).__name__}"
+        assert isinstance(motion, Motion | Field), f"propose(): expected Motion or Field, got {type(motion).__name__}"
     return motions
 
 
 @check("motion")
 def check_motion_fits(part: MotionPart) -> None:
     """What is proposed fits the scene, leads to finite values, and is the same motion when a player has read it."""
-    scene, motions = fit_fixture().scene, tuple(motion for motion in _proposed(part) if not motion.is_empty)
-    sent = encode_motions(motions)
-    got = decode_motions(Section(sent[0][1], 0), scene) if sent else ()
-    for motion, read in zip(motions, got, strict=True):
-        assert fingerprint(motion) == fingerprint(read), f"expected {motion!r}, a player reads {read!r}"
-        scene, rows = apply_motion(scene, motion)
-        for name in ("means", "quats"):
-            bad = int((~np.isfinite(getattr(scene.gaussians, name)[rows])).sum())
-            assert bad == 0, f"{name}: expected finite values, got {bad} that are not"
+    scene = fit_fixture().scene
+    sent = Delta(tuple(motion for motion in _proposed(part) if not motion.is_empty))
+    if sent.is_empty:
+        return
+    read = decode_delta(encode_delta(sent, scene.layout, {}, frame=1).data, scene, {})
+    for motion, got in zip(sent.changes, read.changes, strict=True):
+        assert fingerprint(motion) == fingerprint(got), f"expected {motion!r}, a player reads {got!r}"
+    after = apply_delta(scene, read).gaussians
+    for name in ("means", "quats"):
+        bad = int((~np.isfinite(getattr(after, name))).any(1).sum())
+        assert bad == 0, f"{name}: expected finite values, got {bad} rows that are not"
+
+
+@check("motion")
+def check_motion_follow(part: MotionPart) -> None:
+    """What is remembered follows from the packets: the same again, also after a part was made anew; nothing is changed.
+
+    A frame is proposed from what is remembered, after rows have left as well.
+    """
+    case = fit_fixture()
+    rows = RowEdit(removed=np.arange(0, len(case.scene.gaussians), 3))
+    memory, scene = None, case.scene
+    for frame, delta in ((1, Delta()), (2, Delta().with_row_edit(rows)), (3, Delta())):
+        before = fingerprint(memory)
+        after = part.follow(memory, frame, scene.layout, delta, case.rng)
+        again = type(part)(part.config).follow(memory, frame, scene.layout, delta, case.rng)
+        assert fingerprint(after) == fingerprint(again), f"frame {frame}: two calls remember different things"
+        assert fingerprint(memory) == before, f"frame {frame}: what was remembered before was changed"
+        memory, scene = after, apply_delta(scene, delta)
+    part.propose(scene, case.work.on(scene.gaussians.map(torch.from_numpy)), case.rng, memory)
 
 
 @check("motion")
@@ -51,8 +72,7 @@ def check_motion_pure(part: MotionPart) -> None:
 def check_motion_static_frame(part: MotionPart) -> None:
     """Where no tile of any view changed, no group moves: a velocity dies when its body stops."""
     for motion in _proposed(part, changed=False):
-        moving = int(np.count_nonzero(motion.moving))
-        assert moving == 0, f"nothing changed: expected no moving group, got {moving} of {len(motion.moving)}"
+        assert motion.is_empty, f"nothing changed: expected that nothing moves, got {motion!r}"
 
 
 @check("motion")

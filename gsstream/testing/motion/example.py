@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import final
+from typing import Any, final
 
 import numpy as np
 from pydantic import Field
@@ -25,7 +25,7 @@ class ExampleMotion(MotionPart):
             default=0.5, ge=0, le=1, description="share of its views in which a Gaussian must lie in changed tiles"
         )
 
-    def propose(self, scene: Scene, work: FitContext, rng: Rng) -> tuple[Motion, ...]:
+    def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion, ...]:
         if scene.displacement is None:
             return ()
         # A packet holds the cell in single precision, and both ends must form the same groups.

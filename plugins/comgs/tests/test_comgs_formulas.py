@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
-from gsstream_comgs.correction import corrected
-from gsstream_comgs.influence import Field, KeyPoints, apply_motion_field, field_of, matrices, weights_of
-from gsstream_comgs.settings import CorrectionSettings
+from gsstream_comgs.confidence import CORRECTED, LEFT, ErrorGradient
+from gsstream_comgs.influence import KeyPoints, field_of, matrices, weights_of
 from scipy.spatial.transform import Rotation
 
-from gsstream.api import Gaussians, Layout, LossAndGrad, Scene, Wrt, apply_motion
-from gsstream.blocks import approximate_by_cells
+from gsstream.api import Gaussians, Layout, Scene, apply_motion
+from gsstream.blocks import approximate_by_cells, transform_rows
+from gsstream.testing.method_driver import MethodUnderTest
 
 RNG = np.random.default_rng(0)
 
@@ -66,7 +64,7 @@ def test_the_field_is_the_weighted_sum_of_rigid_motions() -> None:
 def test_gaussians_turn_with_the_field() -> None:
     scene = scene_of(RNG.normal(size=(5, 3))).gaussians.map(torch.from_numpy)
     turn = torch.from_numpy(RNG.normal(0, 0.3, (5, 3)).astype(np.float32))
-    after = apply_motion_field(scene, Field(torch.zeros(5, 3), turn))
+    after = transform_rows(scene, torch.zeros(5, 3), turn)
     for i in range(5):
         before = Rotation.from_quat(np.roll(scene.quats[i].numpy(), -1)).as_matrix()
         expected = turned(turn[i].numpy()).as_matrix() @ before
@@ -94,7 +92,7 @@ def test_cells_of_which_most_may_not_move_stay() -> None:
 
 
 class Wrong:
-    """A frame in which some Gaussians have a wrong colour; the loss is the squared error of colours."""
+    """A frame in which some Gaussians have a wrong colour, and a screen gradient as large as the error."""
 
     def __init__(self, gaussians: Gaussians[torch.Tensor], aims: torch.Tensor) -> None:
         self.gaussians, self.aims, self.cameras = gaussians, aims, [None]
@@ -108,33 +106,19 @@ class Wrong:
         error = (self.gaussians.sh0[:, 0] - self.aims).norm(dim=1)
         return type("Found", (), {"gradient": torch.stack([error, error], 1)})
 
-    def narrow(self, rows: torch.Tensor) -> None:
-        self.rows = rows
 
-    def loss_and_grad(self, view: int, wrt: Wrt[Any], tiles: str = "all") -> LossAndGrad[Any]:
-        leaves = wrt.placed().map(lambda value: value.detach().requires_grad_())
-        loss = (leaves.sh0[:, 0] - self.aims[self.rows]).square().sum()
-        loss.backward()
-        return LossAndGrad(loss.detach(), wrt.grad(leaves))
-
-
-def test_corrections_mend_what_is_wrong_and_leave_the_rest() -> None:
-    scene = scene_of(RNG.normal(size=(10, 3)))
+def test_the_share_with_the_largest_gradient_is_corrected() -> None:
+    scene = scene_of(np.zeros((10, 3))).gaussians.map(torch.from_numpy)
     aims = torch.zeros(10, 3)
-    aims[[2, 5]] = 0.4
-    work = Wrong(scene.gaussians.map(torch.from_numpy), aims)
-    settings = CorrectionSettings(step=0.01)
-    residual = corrected(work, scene.layout, 400, settings, np.random.default_rng(0))
-    assert residual is not None
-    assert residual.gates.tolist() == [0, 0, 1, 0, 0, 1, 0, 0, 0, 0]
-    assert set(residual.symbols) == {"sh0"}
-    np.testing.assert_allclose(residual.symbols["sh0"] * 0.01, 0.4, atol=0.03)
-    nothing = Wrong(scene.gaussians.map(torch.from_numpy), torch.zeros(10, 3))
-    assert corrected(nothing, scene.layout, 3, settings, np.random.default_rng(0)) is None
+    aims[[2, 5, 7]] = torch.tensor([[0.4], [0.2], [0.1]])
+    for share, rows in ((0.2, [2, 5]), (0.01, [2]), (1.0, [2, 5, 7])):
+        logits = ErrorGradient(ErrorGradient.Config(share=share)).estimate(Wrong(scene, aims))
+        assert logits.unique().tolist() == [LEFT, CORRECTED]
+        assert (logits == CORRECTED).nonzero()[:, 0].tolist() == rows, "those without a gradient are left"
 
 
-def test_a_correction_that_does_not_pay_is_masked() -> None:
-    scene = scene_of(RNG.normal(size=(4, 3)))
-    work = Wrong(scene.gaussians.map(torch.from_numpy), torch.full((4, 3), 1e-3))
-    settings = CorrectionSettings(step=1e-4, mask_weight=10.0, share=1.0)
-    assert corrected(work, scene.layout, 100, settings, np.random.default_rng(0)) is None
+def test_a_residual_is_sent_every_so_many_frames_alone() -> None:
+    steps = MethodUnderTest("comgs-l").steps
+    assert [step.metrics["iterations"] > 0 for step in steps] == [True, False, True]
+    deltas = [step.state.player.delta for step in steps[1:]]
+    assert [delta is not None and delta.residual is not None for delta in deltas] == [False, True]

@@ -7,19 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from gsstream_hicom.method import HiCoM
-from gsstream_hicom.motion import cell_sides, fitted_motions
-from gsstream_hicom.settings import BirthSettings, HiCoMConfig, MotionSettings
+from gsstream_hicom.motion import CoherentMotion, cell_sides
 
-from gsstream.api import Cameras, Displacement, Gaussians, Layout, LossAndGrad, Scene, Wrt, apply_motion
+from gsstream.api import Cameras, Displacement, Gaussians, Layout, LossAndGrad, Rng, Scene, Wrt, apply_motion
 from gsstream.blocks import high_gradient_rows
-from gsstream.testing.method_driver import MethodUnderTest
 
 RNG = np.random.default_rng(0)
 RIG = Cameras(
     ("a", "b"), np.stack([np.eye(4), np.eye(4)]), np.tile(np.diag([50.0, 50, 1]), (2, 1, 1)), 32, 24
 )  # fmt: skip
-CELL = MotionSettings(measure="cell")
 
 
 def cloud(number: int, at: tuple[float, float, float], width: float = 0.02) -> np.ndarray:
@@ -42,10 +38,16 @@ def scene_of(means: np.ndarray, moved: Displacement | None = None) -> Scene:
 class Pulled:
     """A frame whose loss is the squared distance of every Gaussian to where it belongs."""
 
-    cameras = RIG
+    cameras, index = RIG, 1
 
-    def __init__(self, gaussians: Gaussians[torch.Tensor], aims: np.ndarray) -> None:
-        self.gaussians, self.aims = gaussians, torch.from_numpy(aims.astype(np.float32))
+    def __init__(self, gaussians: Gaussians[torch.Tensor], aims: np.ndarray, changed: int | None = None) -> None:
+        self.gaussians, self.aims, self.changed = gaussians, torch.from_numpy(aims.astype(np.float32)), changed
+
+    def changed_rows(self, min_votes: float) -> torch.Tensor:
+        return torch.arange(len(self.aims)) < (len(self.aims) if self.changed is None else self.changed)
+
+    def scaled(self, number: float) -> int:
+        return round(number)
 
     def narrow(self, rows: torch.Tensor) -> None:
         self.rows = rows
@@ -57,12 +59,20 @@ class Pulled:
         return LossAndGrad(loss.detach(), wrt.grad(leaves))
 
     def on(self, gaussians: Gaussians[torch.Tensor]) -> Pulled:
-        return Pulled(gaussians, self.aims.numpy())
+        return Pulled(gaussians, self.aims.numpy(), self.changed)
+
+
+def after(scene: Scene, work: Pulled, **settings: Any) -> Scene:
+    """Return the scene after what the part proposes."""
+    part = CoherentMotion(CoherentMotion.Config(**{"measure": "cell", **settings}))
+    for motion in part.propose(scene, work, Rng(0)):
+        scene = apply_motion(scene, motion)[0]
+    return scene
 
 
 def test_the_finest_cells_hold_as_many_as_asked_for_and_each_grid_is_twice_as_wide() -> None:
     means = RNG.uniform(0, 1, (20_000, 3))
-    sides = cell_sides(means, MotionSettings(per_cell=5, levels=3))
+    sides = cell_sides(means, 3, 5.0)
     assert sides == pytest.approx([4 * sides[2], 2 * sides[2], sides[2]])
     # 90 % along each axis lie in the box whose volume is shared by all.
     assert 20_000 * sides[2] ** 3 / 0.9**3 == pytest.approx(5, rel=0.02)
@@ -76,13 +86,8 @@ def test_two_bodies_find_their_own_ways(levels: int) -> None:
     aims = means + np.repeat([[0.03, 0, 0.01], [-0.02, 0.04, 0]], 40, 0)
     scene = scene_of(means)
     work = Pulled(scene.gaussians.map(torch.from_numpy), aims)
-    settings = MotionSettings(measure="cell", levels=levels, lr=0.1, step=0.01)
-    motions, after = fitted_motions(scene, work, np.arange(80), 60, settings, np.random.default_rng(0))
-    assert np.abs(after.gaussians.means - aims).mean() < 0.3 * np.abs(means - aims).mean()
-    again = scene
-    for motion in motions:
-        again = apply_motion(again, motion)[0]
-    assert again.gaussians.means.tobytes() == after.gaussians.means.tobytes(), "what was fitted on is what is sent"
+    there = after(scene, work, levels=levels, lr=0.1, step=0.01, epochs=60)
+    assert np.abs(there.gaussians.means - aims).mean() < 0.3 * np.abs(means - aims).mean()
 
 
 def test_a_frame_begins_with_a_share_of_the_last_ones_motion() -> None:
@@ -91,35 +96,20 @@ def test_a_frame_begins_with_a_share_of_the_last_ones_motion() -> None:
     moved = Displacement(np.arange(60), shift, np.zeros_like(shift))
     scene = scene_of(means, moved)
     work = Pulled(scene.gaussians.map(torch.from_numpy), means + 0.6 * shift)
-    settings = MotionSettings(measure="cell", momentum=0.6, lr=1e-6, step=0.01)
-    _, after = fitted_motions(scene, work, np.arange(60), 3, settings, np.random.default_rng(0))
-    np.testing.assert_allclose(after.gaussians.means, means + 0.6 * shift, atol=1e-3)
-    _, still = fitted_motions(
-        scene, work, np.arange(60), 3, settings.model_copy(update={"momentum": 0.0}), np.random.default_rng(0)
-    )
+    slow = {"lr": 1e-6, "step": 0.01, "epochs": 3}
+    there = after(scene, work, momentum=0.6, **slow)
+    np.testing.assert_allclose(there.gaussians.means, means + 0.6 * shift, atol=1e-3)
+    still = after(scene, work, momentum=0.0, **slow)
     np.testing.assert_array_equal(still.gaussians.means, scene.gaussians.means)
 
 
 def test_only_cells_in_what_changed_move() -> None:
     means = np.concatenate([cloud(30, (0, 0, 3)), cloud(30, (1, 0, 3))])
     scene = scene_of(means)
-    work = Pulled(scene.gaussians.map(torch.from_numpy), means + np.array([0.05, 0, 0]))
-    _, after = fitted_motions(scene, work, np.arange(30), 9, CELL, np.random.default_rng(0))
-    assert (after.gaussians.means[:30] != scene.gaussians.means[:30]).any(1).mean() > 0.5
-    np.testing.assert_array_equal(after.gaussians.means[30:], scene.gaussians.means[30:])
-
-
-def test_as_many_leave_as_were_born_in_the_frame_before() -> None:
-    births = BirthSettings(gradient=1e-7, rounds=1, most=7, prune_opacity=0.0)
-    method = MethodUnderTest("hicom", HiCoM(HiCoMConfig(motion=CELL, births=births)))
-    first, second, third = method.steps
-    number = len(first.state.player.gaussians)
-    assert second.metrics["added_gaussians"] == 7
-    assert second.metrics["removed_gaussians"] == 0
-    assert third.metrics["removed_gaussians"] == 7
-    assert len(third.state.player.gaussians) == number + third.metrics["added_gaussians"]
-    faint = np.argsort(second.state.player.gaussians.opacities, kind="stable")[:7]
-    assert sorted(third.state.player.delta.removed) == sorted(faint)
+    work = Pulled(scene.gaussians.map(torch.from_numpy), means + np.array([0.05, 0, 0]), changed=30)
+    there = after(scene, work, epochs=9)
+    assert (there.gaussians.means[:30] != scene.gaussians.means[:30]).any(1).mean() > 0.5
+    np.testing.assert_array_equal(there.gaussians.means[30:], scene.gaussians.means[30:])
 
 
 class Shown:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
-from gsstream_quarc.births import ChangeFilter, change_scores
-from gsstream_quarc.method import QuARC
-from gsstream_quarc.settings import GateSettings, QuARCConfig
-from gsstream_recon.settings import BirthSettings, MotionSettings
+from gsstream_quarc.growth import ChangeGatedCopies, change_scores
 
 from gsstream.api import Cameras, Gaussians
 from gsstream.blocks import pixel_size
@@ -46,6 +46,10 @@ class Seen:
         return type("Found", (), {"gradient": torch.stack([self.gradients, 0 * self.gradients], 1)})
 
 
+def admitted(work: Seen, kept: int, rows: torch.Tensor, **settings: Any) -> list[int]:
+    return ChangeGatedCopies(ChangeGatedCopies.Config(**settings)).admitted(kept, work, rows).tolist()
+
+
 def test_scores_compare_with_the_median_of_gradients_that_are_not_zero() -> None:
     work = Seen(RNG.normal(size=(6, 3)), [0.0, 1.0, 2.0, 6.0, 0.0, 0.0])
     assert change_scores(work, 4).tolist() == pytest.approx([0, 1 / 3, 1 / 2, 3 / 4, 0, 0])
@@ -60,32 +64,30 @@ def test_scores_compare_with_the_median_of_gradients_that_are_not_zero() -> None
 def test_only_what_changed_may_be_copied_in_the_order_in_which_it_came() -> None:
     means = np.arange(15).reshape(5, 3) * 10.0 + 1
     rows = torch.tensor([4, 0, 2, 1])
-    gate = ChangeFilter(GateSettings(score=0.5), 5)
-    assert gate(Seen(means, [3.0, 1.0, 0.0, 1.2, 1.5]), rows).tolist() == [4, 0]
-    assert ChangeFilter(GateSettings(score=0.0), 5)(Seen(means, [0.0] * 5), rows).tolist() == rows.tolist()
-    assert gate(Seen(means, [1.0] * 5), rows[:0]).tolist() == []
+    assert admitted(Seen(means, [3.0, 1.0, 0.0, 1.2, 1.5]), 5, rows, score=0.5) == [4, 0]
+    assert admitted(Seen(means, [0.0] * 5), 5, rows, score=0.0) == rows.tolist()
+    assert admitted(Seen(means, [1.0] * 5), 5, rows[:0], score=0.5) == []
 
 
 def test_a_cell_takes_so_many_and_remembers_those_of_earlier_rounds() -> None:
     near = np.array([[0.1, 0.1, 5.1]] * 6 + [[100.1, 0.1, 5.1]])
-    settings = GateSettings(score=0.0, per_cell=2, pixels=5)
+    settings = {"score": 0.0, "per_cell": 2, "pixels": 5}
     work = Seen(near, [1.0] * 7)
     assert 0.3 < 5 * pixel_size(near, work.cameras) < 5
     rows = torch.tensor([3, 6, 0, 1])
-    assert ChangeFilter(settings, 7)(work, rows).tolist() == [3, 6, 0]
-    assert ChangeFilter(settings, 6)(work, rows).tolist() == [3, 6, 0], "the one born is in the other cell"
-    assert ChangeFilter(settings, 5)(work, rows).tolist() == [3, 6], "row 5 was born there in this frame"
-    assert ChangeFilter(settings, 3)(work, rows).tolist() == [6], "three were: no room is left"
+    assert admitted(work, 7, rows, **settings) == [3, 6, 0]
+    assert admitted(work, 6, rows, **settings) == [3, 6, 0], "the one that was added is in the other cell"
+    assert admitted(work, 5, rows, **settings) == [3, 6], "row 5 was added there in this frame"
+    assert admitted(work, 3, rows, **settings) == [6], "three were: no room is left"
 
 
-def test_a_gate_that_lets_everything_through_is_recon_with_rounded_motions() -> None:
-    births = BirthSettings(gradient=1e-7, rounds=2, most=9, prune_opacity=0.0)
-    motion = MotionSettings(measure="anchor", change=6.0, step=0.02, rounded=True)
-    some = {}
-    for name, gate in {
-        "open": GateSettings(score=0.0, per_cell=1000), "one": GateSettings(score=0.0, per_cell=1, pixels=1e3),
-    }.items():  # fmt: skip
-        method = MethodUnderTest("quarc", QuARC(QuARCConfig(motion=motion, births=births, gate=gate)))
-        some[name] = [step.metrics["added_gaussians"] for step in method.steps[1:]]
-    assert some["open"] == [9, 9]
-    assert all(0 < number < 9 for number in some["one"])
+def test_a_gate_that_lets_everything_through_copies_as_many_as_may_be() -> None:
+    found = {}
+    for name, gate in (("open", {"per_cell": 1000}), ("one", {"per_cell": 1, "pixels": 1e3})):
+        settings = ChangeGatedCopies.Config(gradient=1e-7, rounds=2, most=30, prune_opacity=0.0, score=0.0, **gate)
+        method = MethodUnderTest("quarc")
+        method.parts = replace(method.parts, growth=ChangeGatedCopies(settings))
+        found[name] = [step.metrics["added"] for step in method.steps[1:]]
+    assert found["open"] == [30, 30]
+    # Cells this large are the eight octants, each of which takes one in each of two rounds at most.
+    assert all(0 < number <= 16 for number in found["one"])

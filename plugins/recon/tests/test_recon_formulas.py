@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from gsstream_recon.anchors import AnchorLevels, Level, anchors_after, bound, due, followed, inherited
-from gsstream_recon.method import ReCon
-from gsstream_recon.motion import fitted_motion
-from gsstream_recon.settings import BirthSettings, MotionSettings, ReConConfig
+from gsstream_recon.anchors import AnchorLevels, Level, bound, inherited
+from gsstream_recon.motion import AnchorMotion
 
-from gsstream.api import Cameras, Displacement, Gaussians, Layout, LossAndGrad, Rng, Scene, Wrt, apply_motion
+from gsstream.api import (
+    Cameras,
+    Delta,
+    Displacement,
+    FrameLog,
+    Gaussians,
+    Layout,
+    LossAndGrad,
+    Rng,
+    Scene,
+    Wrt,
+    apply_motion,
+)
 from gsstream.blocks import pixel_size
 from gsstream.testing.method_driver import MethodUnderTest
 
@@ -20,7 +31,8 @@ RNG = np.random.default_rng(0)
 RIG = Cameras(
     ("a", "b"), np.stack([np.eye(4), np.eye(4)]), np.tile(np.diag([50.0, 50, 1]), (2, 1, 1)), 32, 24
 )  # fmt: skip
-ANCHOR = MotionSettings(measure="anchor", per_anchor=5, pixels=0.2, step=0.01, rotation_step=0.001)
+Settings = AnchorMotion.Config
+ANCHOR = Settings(measure="anchor", per_anchor=5, pixels=0.2, step=0.01, rotation_step=0.001)
 
 
 def scene_of(means: np.ndarray, moved: Displacement | None = None) -> Scene:
@@ -38,11 +50,18 @@ def scene_of(means: np.ndarray, moved: Displacement | None = None) -> Scene:
 class SquaredDistances:
     """A frame whose loss is the squared distance of every Gaussian to where it belongs."""
 
-    cameras = RIG
+    cameras, index = RIG, 1
 
-    def __init__(self, aims: np.ndarray) -> None:
-        self.aims = torch.from_numpy(aims.astype(np.float32))
+    def __init__(self, aims: np.ndarray, changed: np.ndarray) -> None:
+        self.aims, self.changed = torch.from_numpy(aims.astype(np.float32)), changed
         self.seen: list[np.ndarray] = []
+        self.log = FrameLog()
+
+    def changed_rows(self, min_votes: float) -> torch.Tensor:
+        return torch.from_numpy(np.isin(np.arange(len(self.aims)), self.changed))
+
+    def scaled(self, number: float) -> int:
+        return round(number)
 
     def narrow(self, rows: torch.Tensor) -> None:
         self.rows = rows
@@ -55,16 +74,22 @@ class SquaredDistances:
         return LossAndGrad(loss.detach(), wrt.grad(leaves))
 
 
-def fitted(scene: Scene, aims: np.ndarray, rows: np.ndarray, settings: MotionSettings, epochs: int = 30, before=None):
+def due(before: AnchorLevels | None, frame: int, number: int, settings: Settings, rng: Rng) -> AnchorLevels:
+    """The anchors of a frame that changes no row."""
+    return AnchorMotion(settings).follow(before, frame, Layout.flat(number, 1.0), Delta(), rng)
+
+
+def fitted(scene: Scene, aims: np.ndarray, rows: np.ndarray, settings: Settings, epochs: int = 30, before=None):
     """(the frame, the scene after the motion that was found)."""
-    anchors = due(before, 1, len(scene.gaussians), settings, Rng(0))
-    work = SquaredDistances(aims)
-    motion = fitted_motion(scene, work, rows, (before, anchors), epochs, settings, np.random.default_rng(0))
-    return work, scene if motion is None else apply_motion(scene, motion)[0]
+    work = SquaredDistances(aims, rows)
+    part = AnchorMotion(settings.model_copy(update={"epochs": epochs}))
+    for motion in part.propose(scene, work, Rng(0), before):
+        scene = apply_motion(scene, motion)[0]
+    return work, scene
 
 
 def test_anchors_are_drawn_by_level_and_both_ends_could_draw_the_same() -> None:
-    settings = MotionSettings(per_anchor=24, levels=3, ratio=3, every=2)
+    settings = Settings(per_anchor=24, levels=3, ratio=3, every=2)
     first = due(None, 5, 2160, settings, Rng(7))
     assert [len(rows) for rows in first.rows] == [10, 30, 90]
     assert set(first.rows[0]) < set(first.rows[1]) < set(first.rows[2]), "a finer level adds to the coarser ones"
@@ -80,13 +105,13 @@ def test_anchors_are_drawn_by_level_and_both_ends_could_draw_the_same() -> None:
 
 def test_anchors_lie_where_gaussians_are_dense() -> None:
     means = np.concatenate([RNG.normal(0, 0.01, (900, 3)), RNG.uniform(5, 9, (100, 3))])
-    rows = due(None, 1, 1000, MotionSettings(per_anchor=10), Rng(0)).rows[2]
+    rows = due(None, 1, 1000, Settings(per_anchor=10), Rng(0)).rows[2]
     assert (means[rows][:, 0] < 1).sum() == pytest.approx(90, abs=8)
 
 
 def test_each_cell_follows_the_nearest_anchor_of_each_level() -> None:
     means, centres = RNG.normal(size=(50, 3)).astype(np.float32), RNG.normal(size=(20, 3))
-    anchors = due(None, 1, 50, MotionSettings(per_anchor=4), Rng(0))
+    anchors = due(None, 1, 50, Settings(per_anchor=4), Rng(0))
     for level, rows in zip(bound(centres, means, anchors), anchors.rows, strict=True):
         distance = np.linalg.norm(centres[:, None] - means[rows][None], axis=2)
         np.testing.assert_allclose(level.at[level.of], means[rows][distance.argmin(1)])
@@ -168,29 +193,21 @@ def test_rounded_motions_are_shown_while_they_are_fitted_and_sent_as_they_are() 
 
 
 def test_anchors_stay_with_their_gaussians_and_a_resumed_run_finds_them() -> None:
-    births = BirthSettings(gradient=1e-7, rounds=1, most=7, prune_opacity=0.0)
-    settings = MotionSettings(measure="anchor", per_anchor=4, every=2, step=0.001)
-    method = MethodUnderTest("recon", ReCon(ReConConfig(motion=settings, births=births)))
+    method = MethodUnderTest("recon")
+    motion = AnchorMotion(Settings(measure="anchor", per_anchor=4, every=2, step=0.001))
+    copies = type(method.parts.part("growth"))
+    growth = copies(copies.Config(gradient=1e-7, rounds=1, most=7, prune_opacity=0.0))
+    method.parts = replace(method.parts, motion=motion, growth=growth)
     states = [step.state for step in method.steps]
-    assert [state.anchors and state.anchors.drawn for state in states] == [None, 1, 1]
+    assert [state.motion_memory and state.motion_memory.drawn for state in states] == [None, 1, 1]
     before, state = states[1:]
     kept = np.delete(np.arange(len(before.player.gaussians)), state.player.delta.removed)
     assert len(state.player.delta.removed) == 7
-    for old, new in zip(before.anchors.rows, state.anchors.rows, strict=True):
+    for old, new in zip(before.motion_memory.rows, state.motion_memory.rows, strict=True):
         here = old[np.isin(old, kept)]
         opacities = before.player.gaussians.opacities[here], state.player.gaussians.opacities[new]
         assert opacities[0].tobytes() == opacities[1].tobytes()
-    again = anchors_after((state.player for state in states), settings, method.encoder().rng)
-    assert [rows.tolist() for rows in again.rows] == [rows.tolist() for rows in states[-1].anchors.rows]
-    assert followed(again, states[0].player) is again, "a key packet moves no row"
-
-
-def test_as_many_leave_as_were_born_in_the_frame_before() -> None:
-    births = BirthSettings(gradient=1e-7, rounds=1, most=7, prune_opacity=0.0)
-    first, second, third = MethodUnderTest("recon", ReCon(ReConConfig(births=births))).steps
-    number = len(first.state.player.gaussians)
-    assert (second.metrics["added_gaussians"], second.metrics["removed_gaussians"]) == (7, 0)
-    assert third.metrics["removed_gaussians"] == 7
-    assert len(third.state.player.gaussians) == number + third.metrics["added_gaussians"]
-    faint = np.argsort(second.state.player.gaussians.opacities, kind="stable")[:7]
-    assert sorted(third.state.player.delta.removed) == sorted(faint)
+    memory, rng = None, method.encoder().rng
+    for player in (state.player for state in states[1:]):
+        memory = motion.follow(memory, player.frame, player.before, player.delta, rng)
+    assert [rows.tolist() for rows in memory.rows] == [rows.tolist() for rows in states[-1].motion_memory.rows]

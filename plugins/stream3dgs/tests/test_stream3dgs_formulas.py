@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from gsstream_stream3dgs.cache import Cache, Lookup
-from gsstream_stream3dgs.method import Stream3DGS
-from gsstream_stream3dgs.motion import coded_cache, fitted_cache, moved, shape_of
-from gsstream_stream3dgs.settings import BirthSettings, CacheSettings, Stream3DGSConfig
+from gsstream_stream3dgs.motion import CacheMotion
 
 from gsstream.api import (
     Cameras,
@@ -25,13 +24,14 @@ from gsstream.api import (
     apply_field,
     field_rows,
 )
+from gsstream.blocks import transform_rows
 from gsstream.testing.method_driver import MethodUnderTest
 
 RNG = np.random.default_rng(0)
 RIG = Cameras(
     ("a", "b"), np.stack([np.eye(4)] * 2), np.tile(np.diag([50.0, 50, 1]), (2, 1, 1)), 32, 24
 )  # fmt: skip
-SMALL = CacheSettings(levels=5, entries=10, features=2, base=4, width=16, lr=0.01, box=0.0, step=0.01)
+SMALL = CacheMotion.Config(levels=5, entries=10, features=2, base=4, width=16, lr=0.01, box=0.0, step=0.01)
 
 
 def scene_of(means: np.ndarray) -> Scene:
@@ -46,7 +46,7 @@ def scene_of(means: np.ndarray) -> Scene:
 
 def cache_of(means: np.ndarray, entry_step: float = 1e-6, weight_step: float = 1e-4) -> tuple[Scene, Cache]:
     scene = scene_of(means)
-    shape = shape_of(scene, RIG.extent, SMALL, Rng(0))
+    shape = CacheMotion(SMALL).shape(scene, RIG.extent, Rng(0))
     _, unit = field_rows(scene, shape, None)
     return scene, Cache(shape, Lookup(shape, unit), entry_step, weight_step)
 
@@ -63,7 +63,7 @@ def test_what_is_trained_is_what_players_show(step, rounded):
         shift, turn = cache(rounded)
     after, rows = apply_field(scene, cache.field(None))
     assert len(rows) == 60
-    wanted = moved(scene.gaussians.map(torch.from_numpy), cache.shape.reach * shift, turn)
+    wanted = transform_rows(scene.gaussians.map(torch.from_numpy), cache.shape.reach * shift, turn)
     there = np.abs(after.gaussians.means - wanted.means.numpy()).max() / cache.shape.reach
     turned = np.abs(after.gaussians.quats - wanted.quats.numpy()).max()
     assert float(shift.abs().max()) > 0.05
@@ -113,14 +113,14 @@ def test_a_cache_is_at_rest_at_first_and_every_frame_begins_with_the_same() -> N
     assert not turn.any()
     for a, b in zip(one.starts, two.starts, strict=True):
         assert torch.equal(a, b)
-    other = shape_of(scene_of(means), RIG.extent, SMALL, Rng(1))
+    other = CacheMotion(SMALL).shape(scene_of(means), RIG.extent, Rng(1))
     assert other.seed != one.shape.seed
 
 
 def test_the_box_leaves_out_what_lies_far_away() -> None:
     means = np.concatenate([RNG.uniform(0, 1, (98, 3)), [[50, 0.5, 0.5], [0.5, -50, 0.5]]])
     wide = SMALL.model_copy(update={"box": 0.02})
-    rows, unit = field_rows(scene_of(means), shape_of(scene_of(means), RIG.extent, wide, Rng(0)), None)
+    rows, unit = field_rows(scene_of(means), CacheMotion(wide).shape(scene_of(means), RIG.extent, Rng(0)), None)
     assert not set(rows) & {98, 99}
     assert len(rows) > 80
     assert ((unit >= 0) & (unit <= 1)).all()
@@ -129,18 +129,30 @@ def test_the_box_leaves_out_what_lies_far_away() -> None:
 @pytest.mark.parametrize("means", [np.zeros((1, 3)), np.ones((7, 3)) * [[1e6, -1e6, 0.1]]])
 def test_a_scene_without_extent_has_a_box(means) -> None:
     scene = scene_of(means)
-    shape = shape_of(scene, RIG.extent, SMALL, Rng(0))
+    shape = CacheMotion(SMALL).shape(scene, RIG.extent, Rng(0))
     assert shape.problem() is None
     assert len(field_rows(scene, shape, None)[0]) == len(means)
 
 
-class Pulled:
+class SquaredDistances:
     """A frame whose loss is the squared distance of every Gaussian to where it belongs."""
 
     cameras, index = RIG, 1
 
-    def __init__(self, aims: np.ndarray) -> None:
-        self.aims = torch.from_numpy(aims.astype(np.float32))
+    def __init__(self, scene: Scene, aims: np.ndarray, changed: np.ndarray | None = None) -> None:
+        self.aims, self.gaussians = torch.from_numpy(aims.astype(np.float32)), scene.gaussians.map(torch.from_numpy)
+        self.key_rows = len(aims)
+        self.changed = np.arange(len(aims)) if changed is None else changed
+
+    def changed_rows(self, min_votes: float) -> torch.Tensor:
+        return torch.from_numpy(np.isin(np.arange(len(self.aims)), self.changed))
+
+    def scaled(self, number: float) -> int:
+        return round(number)
+
+    def on(self, gaussians: Gaussians[torch.Tensor]) -> SquaredDistances:
+        assert len(gaussians) == self.key_rows
+        return self
 
     def narrow(self, rows: torch.Tensor) -> None:
         self.rows = rows
@@ -156,30 +168,33 @@ class Pulled:
 def test_two_bodies_find_their_own_ways(sent) -> None:
     means = np.concatenate([RNG.normal((0, 0, 3), 0.02, (40, 3)), RNG.normal((0.5, 0, 3), 0.02, (40, 3))])
     aims = means + np.repeat([[0.03, 0, 0.01], [-0.02, 0.04, 0]], 40, 0)
-    scene, settings = scene_of(means), SMALL.model_copy(update={"sent": sent})
-    found = fitted_cache(scene, Pulled(aims), np.arange(80), 40, settings, Rng(0))
-    assert found is not None
-    after = apply_delta(scene, Delta((coded_cache(scene, *found, RIG, settings),))).gaussians.means
+    scene, settings = scene_of(means), SMALL.model_copy(update={"sent": sent, "epochs": 40})
+    found = CacheMotion(settings).propose(scene, SquaredDistances(scene, aims), Rng(0))
+    after = apply_delta(scene, Delta(found)).gaussians.means
     assert np.abs(after - aims).mean() < 0.3 * np.abs(means - aims).mean()
-    assert fitted_cache(scene, Pulled(means), np.zeros(0, np.int64), 1, settings, Rng(0)) is None
+    nothing = SquaredDistances(scene, means, np.zeros(0, np.int64))
+    assert CacheMotion(settings).propose(scene, nothing, Rng(0)) == ()
 
 
-def test_only_marked_rows_move() -> None:
+def test_only_what_changed_moves_and_nothing_that_was_added() -> None:
     means = RNG.normal((0, 0, 3), 0.02, (40, 3))
     scene, some = scene_of(means), np.arange(0, 40, 3)
-    rows, cache = fitted_cache(scene, Pulled(means + 0.03), some, 5, SMALL, Rng(0))
-    after = apply_delta(scene, Delta((coded_cache(scene, rows, cache, RIG, SMALL),))).gaussians.means
-    assert np.flatnonzero((after != scene.gaussians.means).any(1)).tolist() == rows.tolist() == some.tolist()
+    work = SquaredDistances(scene, means + 0.03, some)
+    work.key_rows = 31
+    found = CacheMotion(SMALL.model_copy(update={"epochs": 5})).propose(scene, work, Rng(0))
+    after = apply_delta(scene, Delta(found)).gaussians.means
+    assert np.flatnonzero((after != scene.gaussians.means).any(1)).tolist() == some[some < 31].tolist()
 
 
-def test_births_live_for_one_frame() -> None:
-    births = BirthSettings(gradient=1e-7, rounds=1, most=7, prune_opacity=0.0)
-    small = CacheSettings(levels=2, entries=6, width=4)
-    first, second, third = MethodUnderTest("stream3dgs", Stream3DGS(Stream3DGSConfig(cache=small, births=births))).steps
+def test_what_a_frame_adds_is_there_for_that_frame_alone() -> None:
+    method = MethodUnderTest("stream3dgs")
+    copies = type(method.parts.part("growth"))
+    growth = copies(copies.Config(gradient=1e-7, rounds=1, most=7, prune_opacity=0.0, leave="last-added"))
+    small = CacheMotion(CacheMotion.Config(levels=2, entries=6, width=4))
+    method.parts = replace(method.parts, motion=small, growth=growth)
+    first, second, third = method.steps
     number = len(first.state.player.gaussians)
-    assert second.metrics["added_gaussians"] == third.metrics["added_gaussians"] == 7
-    assert third.metrics["removed_gaussians"] == 7
-    assert len(second.state.player.gaussians) == len(third.state.player.gaussians) == number + 7
+    assert second.metrics["added"] == third.metrics["added"] == third.metrics["removed"] == 7
     assert third.state.player.delta.removed.tolist() == list(range(number, number + 7))
     opacities = [step.state.player.gaussians.opacities[:number].tobytes() for step in (first, second, third)]
     assert len(set(opacities)) == 1, "those of frame 0 stay as they are, but for their places"

@@ -12,7 +12,7 @@ from gsstream.testing.working import INDEX
 from saboteurs.register import spoils
 
 Base: Any = ExampleMotion
-CALLS: dict[str, int] = {"moody": 0, "loose": 0}
+CALLS: dict[str, int] = {"moody": 0, "loose": 0, "own": 0}
 
 
 def everything(number: int, symbols: int = 1) -> Motion:
@@ -24,9 +24,9 @@ def everything(number: int, symbols: int = 1) -> Motion:
 class Beyond(Base):
     """Says that a group moves which the scene does not have."""
 
-    def propose(self, scene: Any, work: Any, rng: Any) -> Any:
+    def propose(self, scene: Any, work: Any, rng: Any, memory: Any = None) -> Any:
         if work.index != INDEX or not bool(work.changed_rows(0.0).any()):
-            return super().propose(scene, work, rng)
+            return super().propose(scene, work, rng, memory)
         return (everything(5000),)
 
 
@@ -34,9 +34,9 @@ class Beyond(Base):
 class Moody(Base):
     """Moves farther each time it is asked."""
 
-    def propose(self, scene: Any, work: Any, rng: Any) -> Any:
+    def propose(self, scene: Any, work: Any, rng: Any, memory: Any = None) -> Any:
         if work.index != INDEX or not bool(work.changed_rows(0.0).any()):
-            return super().propose(scene, work, rng)
+            return super().propose(scene, work, rng, memory)
         CALLS["moody"] += 1
         number = len(np.unique((scene.gaussians.means < 0) @ np.array([1, 2, 4])))
         return (everything(number, CALLS["moody"]),)
@@ -46,9 +46,9 @@ class Moody(Base):
 class Restless(Base):
     """Goes on moving where nothing changes."""
 
-    def propose(self, scene: Any, work: Any, rng: Any) -> Any:
+    def propose(self, scene: Any, work: Any, rng: Any, memory: Any = None) -> Any:
         if work.index != INDEX or bool(work.changed_rows(0.0).any()):
-            return super().propose(scene, work, rng)
+            return super().propose(scene, work, rng, memory)
         number = len(np.unique((scene.gaussians.means < 0) @ np.array([1, 2, 4])))
         return (everything(number),)
 
@@ -57,9 +57,18 @@ class Restless(Base):
 class Loose(Base):
     """Moves farther in every run, not in every frame."""
 
-    def propose(self, scene: Any, work: Any, rng: Any) -> Any:
+    def propose(self, scene: Any, work: Any, rng: Any, memory: Any = None) -> Any:
         if work.index != 1:
-            return super().propose(scene, work, rng)
+            return super().propose(scene, work, rng, memory)
         CALLS["loose"] += 1
         number = len(np.unique((scene.gaussians.means < 0) @ np.array([1, 2, 4])))
         return (everything(number, CALLS["loose"]),)
+
+
+@spoils("check_motion_follow")
+class Own(Base):
+    """Remembers how often it was called, which a resumed run cannot know."""
+
+    def follow(self, memory: Any, frame: int, before: Any, delta: Any, rng: Any) -> Any:
+        CALLS["own"] += 1
+        return np.array([CALLS["own"]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 
@@ -11,6 +12,7 @@ from gsstream.engine.budget.epoch_scheduler import Allowance
 from gsstream.engine.budget.plan import FramePlan
 from gsstream.engine.step.active.change import detect_changed_tiles
 from gsstream.engine.step.motion import Moved, propose_motion
+from gsstream.engine.step.tools import RunTools
 from gsstream.input.recordings.open import open_source
 from gsstream.packet.changes.motion import encode_motions
 from gsstream.parts.motion.constant_velocity import Coasting
@@ -24,7 +26,8 @@ def within(max_bytes: int | None) -> Moved:
     frame = replace(open_source(SOURCE).frame(2), cameras=state.previous.cameras)
     plan = FramePlan(epochs=1, change_threshold=6.0, rd_lambda=0.0, max_bytes=max_bytes)
     change = detect_changed_tiles(state.previous, frame, 6.0)
-    return propose_motion(parts, state, frame, change, Rng(0), Allowance(plan, 0.0, float))
+    tools = RunTools(parts, Rng(0), Mock(), Mock(), budget=Allowance(plan, 0.0, float))
+    return propose_motion(parts, state, frame, change, tools)
 
 
 @pytest.mark.parametrize("spare", [0, -1])

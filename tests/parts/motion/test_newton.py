@@ -11,7 +11,10 @@ import torch
 
 from gsstream.core.changes.motion import GroupTransforms, predict_transforms, transform_groups
 from gsstream.core.gaussians import Gaussians
+from gsstream.core.log import FrameLog
+from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.context import EngineContext
+from gsstream.packet import PlayerState
 from gsstream.parts.motion.groups import changed_groups, known_groups, pixel_size
 from gsstream.parts.motion.newton import DampedNewton, Damping, fit_transforms_newton
 from gsstream.parts.render.transforms import curvature_of
@@ -168,7 +171,9 @@ def test_a_body_that_moved_is_found_where_it_went(seed: int) -> None:
     frame = replace(work._frame, images=blank, cameras=cameras)
 
     def seen(images: np.ndarray) -> EngineContext:
-        return EngineContext(work._parts, cloud.gaussians, work.hierarchy, replace(frame, images=images), frame, None)
+        player = PlayerState(0, replace(fit_fixture().scene, gaussians=gaussians), None)  # type: ignore[arg-type]
+        state = StreamState(player, work.hierarchy, frame)
+        return EngineContext(work._parts, state, replace(frame, images=images), FrameLog())
 
     images = np.stack([seen(blank).shown(after, view).numpy() for view in range(len(cameras))])
     arm = float(np.linalg.norm(gaussians.means[rows] - centre, axis=1).mean())

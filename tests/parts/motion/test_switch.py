@@ -13,9 +13,12 @@ from gsstream.core.changes import Displacement, Groups, Layout, Scene
 from gsstream.core.changes.motion import GroupTransforms, predict_transforms, transform_groups
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.log import FrameLog
 from gsstream.core.rng import Rng
+from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.active.change import detect_changed_tiles
 from gsstream.engine.step.context import EngineContext
+from gsstream.packet import PlayerState
 from gsstream.parts.motion.constant_velocity import Coasting
 from gsstream.parts.motion.groups import pixel_size
 from gsstream.parts.motion.switch import loss_change, rotating_views
@@ -69,7 +72,8 @@ def frame_in_which(share: float, turns: bool = False) -> EngineContext:
         detect_changed_tiles(previous, frame, 6.0),
         Hierarchy(torch.arange(3), torch.arange(3), torch.zeros(3).long()),
     )
-    return EngineContext(method.parts, scene.gaussians.map(torch.from_numpy), forest, frame, previous, None, change)
+    player = PlayerState(2, scene, None, key_rows=3)  # type: ignore[arg-type]
+    return EngineContext(method.parts, StreamState(player, forest, previous), frame, FrameLog(), change)
 
 
 def loss(work: EngineContext, gaussians, view: int) -> float:  # type: ignore[no-untyped-def]

@@ -6,8 +6,6 @@ from typing import NamedTuple
 
 import torch
 
-from gsstream.api import Gaussians
-
 
 class KeyPoints(NamedTuple):
     """K key points; ``centre`` is fixed, the others are trained.
@@ -56,13 +54,6 @@ def field_of(means: torch.Tensor, points: KeyPoints) -> Field:
     return Field(shift, weights @ points.turn)
 
 
-def apply_motion_field(gaussians: Gaussians[torch.Tensor], field: Field) -> Gaussians[torch.Tensor]:
-    """Return Gaussians, raw values, moved and turned by a field."""
-    quats = product(torch.cat([torch.ones_like(field.turn[:, :1]), field.turn], 1), gaussians.quats)
-    values = dict(gaussians.items())
-    return Gaussians(**{**values, "means": gaussians.means + field.shift, "quats": quats})
-
-
 def matrices(quats: torch.Tensor) -> torch.Tensor:
     """Return rotation matrices [K, 3, 3] of quaternions [K, 4], w first, of any length."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
@@ -72,15 +63,3 @@ def matrices(quats: torch.Tensor) -> torch.Tensor:
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
     return torch.stack(rows, 1).reshape(-1, 3, 3)
-
-
-def product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Return the quaternion products a b [A, 4], with the first made a unit: first the rotation b, then a."""
-    w0, x0, y0, z0 = torch.nn.functional.normalize(a, dim=1).unbind(1)
-    w1, x1, y1, z1 = b.unbind(1)
-    return torch.stack([
-        w0 * w1 - x0 * x1 - y0 * y1 - z0 * z1,
-        w0 * x1 + x0 * w1 + y0 * z1 - z0 * y1,
-        w0 * y1 - x0 * z1 + y0 * w1 + z0 * x1,
-        w0 * z1 + x0 * y1 - y0 * x1 + z0 * w1,
-    ], 1)  # fmt: skip

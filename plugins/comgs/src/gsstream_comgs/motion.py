@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any, final
+
 import numpy as np
 import torch
+from pydantic import Field
 
-from gsstream.api import FitContext, IntArray, Motion, Scene, WrtRows
-from gsstream.blocks import approximate_by_cells, neighbour_distance, pixel_size, rows_backward
-from gsstream_comgs.influence import KeyPoints, apply_motion_field, field_of
-from gsstream_comgs.settings import MotionSettings
+from gsstream.api import FitContext, Motion, MotionPart, PartConfig, Rng, Scene, WrtRows
+from gsstream.blocks import approximate_by_cells, neighbour_distance, pixel_size, rows_backward, transform_rows
+from gsstream_comgs.influence import KeyPoints, field_of
 
 
 def gradient_difference(work: FitContext) -> torch.Tensor:
-    """Return [N]: the size of the change, from the frame before to this one, of the pull at every Gaussian's centre.
+    """Return [N]: how much the gradient by every Gaussian's 2-D mean changed since the frame before.
 
-    It is that of the mean over the views of the gradient of the squared error; the render itself cancels.
+    The gradient is the mean over the views of that of the squared error; the render itself cancels.
     """
     total: torch.Tensor = torch.zeros(len(work.gaussians), 2)
     for view in range(len(work.cameras)):
@@ -24,19 +26,49 @@ def gradient_difference(work: FitContext) -> torch.Tensor:
     return difference
 
 
-def fitted_motion(
-    scene: Scene, work: FitContext, rows: IntArray, epochs: int, settings: MotionSettings, order: np.random.Generator
-) -> Motion | None:
-    """Return the motion of a frame; None where nothing moves."""
-    difference = gradient_difference(work)[torch.from_numpy(rows)]
-    number = min(settings.keypoints, int((difference > 0).sum()))
-    if number == 0:
-        return None
+@final
+class KeyPointMotion(MotionPart):
+    """Moves Gaussians by a few key points, each with a rigid motion and an ellipsoid (ComGS, NeurIPS 2025).
+
+    What is sent are the rigid motions of small cells that come nearest to the field of the key points.
+    """
+
+    source = "ComGS (NeurIPS 2025)"
+
+    class Config(PartConfig):
+        keypoints: int = Field(default=200, ge=1, le=10_000, description="key points in a frame at most")
+        epochs: int = Field(default=8, ge=1, le=1000, description="passes over the training cameras")
+        votes: float = Field(
+            default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in what changed"
+        )
+        lr: float = Field(default=0.25, gt=0, le=10, description="step of shifts and turns, pixels per iteration")
+        lr_influence: float = Field(default=0.02, gt=0, le=1, description="step of influences: log size, quaternion")
+        pixels: float = Field(
+            default=6.0, gt=0, le=1000, description="side of the cells as whose rigid motions the field is sent, pixels"
+        )
+        step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
+
+    def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion, ...]:
+        rows = work.changed_rows(self.config.votes).nonzero()[:, 0]
+        difference = gradient_difference(work)[rows]
+        number = min(self.config.keypoints, int((difference > 0).sum()))
+        if number == 0:
+            return ()
+        chosen = torch.topk(difference, number).indices.sort().values
+        motion = _fitted(scene, work, rows, chosen, self.config, rng.numpy("comgs", work.index))
+        return () if motion is None else (motion,)
+
+
+def _fitted(
+    scene: Scene, work: FitContext, rows: torch.Tensor, chosen: torch.Tensor, settings: KeyPointMotion.Config,
+    order: np.random.Generator,
+) -> Motion | None:  # fmt: skip
+    """The motion that ``chosen`` of the rows [A], as key points, fit to the images."""
+    number, epochs = len(chosen), work.scaled(settings.epochs)
     pixel = pixel_size(scene.gaussians.means, work.cameras)
     side = float(np.float32(settings.pixels * pixel))
-    chosen = torch.topk(difference, number).indices.sort().values
-    base = scene.gaussians.rows(rows).map(torch.from_numpy)
-    work.narrow(torch.from_numpy(rows))
+    base = scene.gaussians.rows(rows.numpy()).map(torch.from_numpy)
+    work.narrow(rows)
     shape = _start(base.means[chosen], pixel)
     # Shifts and turns are trained in pixels: a turn of one unit moves what lies at the rim of the influence by a pixel.
     lever = pixel / float(shape.size.exp().mean())
@@ -53,13 +85,15 @@ def fitted_motion(
     views = len(work.cameras)
     for _ in range(epochs):
         for view in order.permutation(views):
-            there = apply_motion_field(base, field_of(base.means, points()))
+            field = field_of(base.means, points())
+            there = transform_rows(base, field.shift, field.turn)
             rows_backward(there, work.loss_and_grad(int(view), WrtRows(there)).grad)
             adam.step()
             adam.zero_grad()
     with torch.no_grad():
         field = field_of(base.means, points())
-    return approximate_by_cells(scene, rows, field.shift.numpy(), field.turn.numpy(), side, settings.step * pixel)
+    step = settings.step * pixel
+    return approximate_by_cells(scene, rows.numpy(), field.shift.numpy(), field.turn.numpy(), side, step)
 
 
 def _start(centres: torch.Tensor, pixel: float) -> KeyPoints:

@@ -7,15 +7,17 @@ from gsstream.spec import ComponentSpec, MethodSpec, hookimpl
 
 @hookimpl
 def gsstream_components() -> list[ComponentSpec]:
-    """The method as one part."""
+    """What moves, and what is corrected."""
     return [
         ComponentSpec(
-            kind="streaming_method",
-            name="comgs",
-            target="gsstream_comgs.method:ComGS",
-            summary="two hundred key points move what is around them; masked corrections at key frames",
-        )
-    ]
+            kind="motion", name="keypoints", target="gsstream_comgs.motion:KeyPointMotion",
+            summary="two hundred key points move what is around them",
+        ),
+        ComponentSpec(
+            kind="confidence", name="error-gradient", target="gsstream_comgs.confidence:ErrorGradient",
+            summary="the share of the Gaussians with the largest gradient of the error",
+        ),
+    ]  # fmt: skip
 
 
 @hookimpl

@@ -7,13 +7,13 @@ from gsstream.spec import ComponentSpec, MethodSpec, hookimpl
 
 @hookimpl
 def gsstream_components() -> list[ComponentSpec]:
-    """The method as one part."""
+    """The motion; what is added and removed is the growth part ``copies``."""
     return [
         ComponentSpec(
-            kind="streaming_method",
+            kind="motion",
             name="hicom",
-            target="gsstream_hicom.method:HiCoM",
-            summary="rigid motion of the cells of three nested grids, Gaussians added and removed at constant number",
+            target="gsstream_hicom.motion:CoherentMotion",
+            summary="rigid motion of the cells of three nested grids",
         )
     ]
 

@@ -7,13 +7,13 @@ from gsstream.spec import ComponentSpec, MethodSpec, hookimpl
 
 @hookimpl
 def gsstream_components() -> list[ComponentSpec]:
-    """The method as one part."""
+    """The growth; the motion is that of ReCon-GS, rounded."""
     return [
         ComponentSpec(
-            kind="streaming_method",
-            name="quarc",
-            target="gsstream_quarc.method:QuARC",
-            summary="rounded motions of anchors on three levels, Gaussians added where four views changed",
+            kind="growth",
+            name="change-gated-copies",
+            target="gsstream_quarc.growth:ChangeGatedCopies",
+            summary="Gaussians copied where four views changed",
         )
     ]
 

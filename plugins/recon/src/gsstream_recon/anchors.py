@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from gsstream.api import FloatArray, IntArray, PlayerState, Rng
+from gsstream.api import Delta, FloatArray, IntArray, Layout
 from gsstream.blocks import gather_rows, k_nearest, nearest_rows
-from gsstream_recon.settings import MotionSettings
 
 #: Added to distances before they are inverted, as a share of their mean: an anchor may lie where an old one lay.
 NEAR = 1e-3
@@ -39,37 +37,20 @@ class Level(NamedTuple):
         return np.stack([np.bincount(self.of, column, len(self.at)) for column in values.T], 1)
 
 
-def due(anchors: AnchorLevels | None, frame: int, number: int, settings: MotionSettings, rng: Rng) -> AnchorLevels:
-    """Return the anchors of a frame: those of the frame before, or new ones when these are old or a level has none.
-
-    Both ends could draw them: from the seed of the run and the number of the frame.
-    """
-    if anchors is not None and frame - anchors.drawn < settings.every and all(map(len, anchors.rows)):
-        return anchors
-    order = rng.numpy("recon/anchors", frame).permutation(number)
-    sizes = [number / settings.per_anchor / settings.ratio**level for level in reversed(range(settings.levels))]
+def drawn(frame: int, sizes: list[float], order: IntArray) -> AnchorLevels:
+    """Return new anchors: for each level the first rows of ``order`` [N], as many as ``sizes`` says, at least one."""
     return AnchorLevels(frame, tuple(np.sort(order[: max(1, round(size))]) for size in sizes))
 
 
-def followed(anchors: AnchorLevels, player: PlayerState) -> AnchorLevels:
+def followed(anchors: AnchorLevels, before: Layout, delta: Delta) -> AnchorLevels:
     """Return the same anchors as rows of the scene after a packet, without those whose Gaussian left."""
-    if player.delta is None or player.before is None or not player.delta.has_row_edit:
+    if not delta.has_row_edit:
         return anchors
-    source = gather_rows(player.before.node_of, player.delta.added, player.delta.removed)
-    place = np.full(int(player.before.node_counts.sum()), -1, np.int64)
+    source = gather_rows(before.node_of, delta.added, delta.removed)
+    place = np.full(int(before.node_counts.sum()), -1, np.int64)
     stayed = np.flatnonzero(source < len(place))
     place[source[stayed]] = stayed
     return AnchorLevels(anchors.drawn, tuple(place[rows][place[rows] >= 0] for rows in anchors.rows))
-
-
-def anchors_after(players: Iterable[PlayerState], settings: MotionSettings, rng: Rng) -> AnchorLevels | None:
-    """Return the anchors after the last of the packets since a key packet, which is the first; None without another."""
-    anchors, number = None, 0
-    for player in players:
-        if player.delta is not None:
-            anchors = followed(due(anchors, player.frame, number, settings, rng), player)
-        number = len(player.gaussians)
-    return anchors
 
 
 def bound(centres: FloatArray, means: FloatArray, anchors: AnchorLevels) -> list[Level]:

@@ -1,13 +1,27 @@
-"""Fitting the motions of anchors to the images, and saying what they add up to."""
+"""Motion by anchors on several levels: fitting their motions to the images, and saying what they add up to."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Literal, final
 
 import numpy as np
 import torch
+from pydantic import Field
 
-from gsstream.api import FitContext, FloatArray, IntArray, Motion, Scene, WrtTransforms, groups_for
+from gsstream.api import (
+    Delta,
+    FitContext,
+    FloatArray,
+    Layout,
+    Motion,
+    MotionPart,
+    PartConfig,
+    Rng,
+    Scene,
+    WrtTransforms,
+    groups_for,
+)
 from gsstream.blocks import (
     GroupAdam,
     GroupTransforms,
@@ -17,8 +31,7 @@ from gsstream.blocks import (
     pixel_size,
     predict_transforms,
 )
-from gsstream_recon.anchors import AnchorLevels, Level, bound, inherited
-from gsstream_recon.settings import MotionSettings
+from gsstream_recon.anchors import AnchorLevels, Level, bound, drawn, followed, inherited
 
 
 @dataclass(frozen=True)
@@ -42,65 +55,118 @@ class AnchoredCells:
         return total
 
 
-def fitted_motion(
-    scene: Scene, work: FitContext, rows: IntArray, anchors: tuple[AnchorLevels | None, AnchorLevels], epochs: int,
-    settings: MotionSettings, order: np.random.Generator,
-) -> Motion | None:  # fmt: skip
-    """Return the motion of a frame, of cells of a fine grid, each about its own centre; None where nothing moves."""
-    pixel = pixel_size(scene.gaussians.means, work.cameras)
-    side = float(np.float32(settings.pixels * pixel))
-    groups = groups_for(scene, side, 1, regroup=True)
-    marks = groups_of_rows(groups, rows).astype(np.uint8)
-    if not marks.any():
-        return None
-    cells = predict_transforms(scene, groups, marks, predicted=False)
-    # Half a cell from its centre, a turn of one unit moves a Gaussian by a pixel, too.
-    unit = np.array([pixel] * 3 + [pixel / side] * 3)
-    steps = float(np.float32(settings.step * pixel)), float(np.float32(settings.rotation_step))
-    step = np.array([steps[0]] * 3 + [steps[1]] * 3)
-    levels = bound(cells.center, scene.gaussians.means, anchors[1])
-    anchored = AnchoredCells(cells, levels, unit, step if settings.rounded else None)
-    found = _fitted(scene, work, anchored, _start(scene, cells, anchors, levels, settings), epochs, settings, order)
-    symbols = np.rint(found / step).astype(np.int32)
-    moved = symbols.any(1)
-    if not moved.any():
-        return None
-    marks[np.flatnonzero(marks)[~moved]] = 0
-    return Motion(side, 1, marks, symbols[moved], *steps, predicted=False, regroup=True)
+@final
+class AnchorMotion(MotionPart):
+    """Moves small cells by anchors drawn among the Gaussians on several levels (ReCon-GS, NeurIPS 2025).
 
+    Anchors are drawn anew every second frame and inherit what the old ones knew. What is sent is the rigid motion of
+    every cell, the sum of its anchors' motions. With ``rounded`` these are rounded while they are fitted, with the
+    gradient of what is not rounded (QuARC-GS, 2026). Defaults are the published values where a value is known; where
+    this differs, and why, is in the README of this plugin.
+    """
 
-def _start(
-    scene: Scene, cells: GroupTransforms, anchors: tuple[AnchorLevels | None, AnchorLevels], levels: list[Level],
-    settings: MotionSettings,
-) -> list[FloatArray]:  # fmt: skip
-    """Motions [K, 6] of the anchors that begin with a share of the last frame's."""
-    before, now = anchors
-    if scene.displacement is None or before is None or not all(map(len, before.rows)):
-        return [np.zeros((len(level.at), 6)) for level in levels]
-    past: FloatArray = np.zeros((len(scene.gaussians), 6))
-    past[scene.displacement.rows] = np.concatenate([scene.displacement.translation, scene.displacement.rotation], 1)
-    mean = Level(cells.center, cells.group).mean(past[cells.rows])
-    old = levels if before is now else bound(cells.center, scene.gaussians.means, before)
-    return [settings.momentum * motion for motion in inherited(mean, old, levels, settings.neighbours)]
+    source = "ReCon-GS (NeurIPS 2025)"
 
+    class Config(PartConfig):
+        epochs: int = Field(default=5, ge=1, le=1000, description="passes over the training cameras")
+        per_anchor: float = Field(default=24.0, ge=1, description="Gaussians per anchor of the finest level")
+        levels: int = Field(default=3, ge=1, le=6, description="levels of anchors, whose motions add up")
+        ratio: float = Field(
+            default=3.0, ge=1, le=100, description="anchors of a level per anchor of the next coarser one"
+        )
+        every: int = Field(default=2, ge=1, description="frames after which anchors are drawn anew")
+        neighbours: int = Field(default=3, ge=1, le=100, description="old anchors from which a new one inherits")
+        momentum: float = Field(default=0.6, ge=0, le=1, description="share of the last frame's motion to begin with")
+        lr: float = Field(default=0.25, gt=0, le=10, description="step of the fit on each level, pixels per iteration")
+        l1_weight: float = Field(default=0.0, ge=0, description="weight of the mean absolute motion, pixels")
+        measure: Literal["each", "anchor"] = Field(
+            default="each",
+            description="what a step is divided by; each: every number of an anchor by its own gradient (Adam); "
+            "anchor: all six by the largest",
+        )  # fmt: skip
+        votes: float = Field(
+            default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in what changed"
+        )
+        pixels: float = Field(
+            default=6.0, gt=0, le=1000, description="side of the cells that follow anchors, pixels; cells are sent"
+        )
+        step: float = Field(default=0.1, gt=0, le=10, description="quantisation step of translations, pixels")
+        rotation_step: float = Field(
+            default=0.01, gt=0, le=1, description="quantisation step of rotations, tan(angle / 2)"
+        )
+        rounded: bool = Field(
+            default=False, description="round every anchor's motion to these steps while it is fitted"
+        )
 
-def _fitted(
-    scene: Scene, work: FitContext, anchored: AnchoredCells, start: list[FloatArray], epochs: int,
-    settings: MotionSettings, order: np.random.Generator,
-) -> FloatArray:  # fmt: skip
-    """Shifts and turns [C, 6] of the cells; all levels learn at once."""
-    cells, unit = anchored.cells, anchored.unit
-    measure = elementwise if settings.measure == "each" else groupwise_max
-    descents = [GroupAdam(values / unit, measure) for values in start]
-    work.narrow(torch.from_numpy(cells.rows))
-    base = scene.gaussians.rows(cells.rows).map(torch.from_numpy)
-    local = cells._replace(rows=np.arange(len(cells.rows)))
-    for _ in range(epochs):
-        for view in order.permutation(len(work.cameras)):
-            sums = anchored.sums(descents)
-            moves = local._replace(translation=sums[:, :3], rotation=sums[:, 3:])
-            grad = work.loss_and_grad(int(view), WrtTransforms(base, moves)).grad.numpy() * unit
-            for level, descent in zip(anchored.levels, descents, strict=True):
-                l1_weight = settings.l1_weight * np.sign(descent.values) / descent.values.size
-                descent.step(level.sum(grad) + l1_weight, settings.lr)
-    return anchored.sums(descents)
+    def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion, ...]:
+        config, means = self.config, scene.gaussians.means
+        pixel = pixel_size(means, work.cameras)
+        side = float(np.float32(config.pixels * pixel))
+        groups = groups_for(scene, side, 1, regroup=True)
+        rows = work.changed_rows(config.votes).nonzero()[:, 0].numpy()
+        marks = groups_of_rows(groups, rows).astype(np.uint8)
+        if not marks.any():
+            return ()
+        anchors = self._anchors(memory, work.index, len(means), rng)
+        work.log.set(anchors=[len(level) for level in anchors.rows])
+        cells = predict_transforms(scene, groups, marks, predicted=False)
+        # Half a cell from its centre, a rotation of one unit moves a Gaussian by a pixel, too.
+        unit = np.array([pixel] * 3 + [pixel / side] * 3)
+        steps = float(np.float32(config.step * pixel)), float(np.float32(config.rotation_step))
+        step = np.array([steps[0]] * 3 + [steps[1]] * 3)
+        anchored = AnchoredCells(cells, bound(cells.center, means, anchors), unit, step if config.rounded else None)
+        start = self._start(scene, anchored, memory, anchors)
+        found = self._fitted(scene, work, anchored, start, rng.numpy("recon", work.index))
+        symbols = np.rint(found / step).astype(np.int32)
+        moved = symbols.any(1)
+        marks[np.flatnonzero(marks)[~moved]] = 0
+        return (Motion(side, 1, marks, symbols[moved], *steps, predicted=False, regroup=True),) if moved.any() else ()
+
+    def follow(self, memory: Any, frame: int, before: Layout, delta: Delta, rng: Rng) -> AnchorLevels:
+        return followed(self._anchors(memory, frame, len(before.unit_of), rng), before, delta)
+
+    def _anchors(self, memory: AnchorLevels | None, frame: int, number: int, rng: Rng) -> AnchorLevels:
+        """Those of the frame before, or new ones when these are old or a level has none.
+
+        Both ends could draw them: from the seed of the run and the number of the frame.
+        """
+        config = self.config
+        if memory is not None and frame - memory.drawn < config.every and all(map(len, memory.rows)):
+            return memory
+        order = rng.numpy("recon/anchors", frame).permutation(number)
+        sizes = [number / config.per_anchor / config.ratio**level for level in reversed(range(config.levels))]
+        return drawn(frame, sizes, order)
+
+    def _start(
+        self, scene: Scene, anchored: AnchoredCells, before: AnchorLevels | None, now: AnchorLevels
+    ) -> list[FloatArray]:
+        """Motions [K, 6] of the anchors that begin with a share of the last frame's."""
+        cells, levels = anchored.cells, anchored.levels
+        if scene.displacement is None or before is None or not all(map(len, before.rows)):
+            return [np.zeros((len(level.at), 6)) for level in levels]
+        past: FloatArray = np.zeros((len(scene.gaussians), 6))
+        past[scene.displacement.rows] = np.concatenate([scene.displacement.translation, scene.displacement.rotation], 1)
+        mean = Level(cells.center, cells.group).mean(past[cells.rows])
+        old = levels if before is now else bound(cells.center, scene.gaussians.means, before)
+        return [self.config.momentum * motion for motion in inherited(mean, old, levels, self.config.neighbours)]
+
+    def _fitted(
+        self, scene: Scene, work: FitContext, anchored: AnchoredCells, start: list[FloatArray],
+        order: np.random.Generator,
+    ) -> FloatArray:  # fmt: skip
+        """Translations and rotations [C, 6] of the cells; all levels learn at once."""
+        config, cells, unit = self.config, anchored.cells, anchored.unit
+        measure = elementwise if config.measure == "each" else groupwise_max
+        descents = [GroupAdam(values / unit, measure) for values in start]
+        work.narrow(torch.from_numpy(cells.rows))
+        base = scene.gaussians.rows(cells.rows).map(torch.from_numpy)
+        local = cells._replace(rows=np.arange(len(cells.rows)))
+        for _ in range(work.scaled(config.epochs)):
+            for view in order.permutation(len(work.cameras)):
+                sums = anchored.sums(descents)
+                moves = local._replace(translation=sums[:, :3], rotation=sums[:, 3:])
+                grad = work.loss_and_grad(int(view), WrtTransforms(base, moves)).grad.numpy() * unit
+                for level, descent in zip(anchored.levels, descents, strict=True):
+                    l1_grad = config.l1_weight * np.sign(descent.values) / descent.values.size
+                    descent.step(level.sum(grad) + l1_grad, config.lr)
+        return anchored.sums(descents)

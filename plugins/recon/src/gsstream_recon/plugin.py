@@ -7,13 +7,13 @@ from gsstream.spec import ComponentSpec, MethodSpec, hookimpl
 
 @hookimpl
 def gsstream_components() -> list[ComponentSpec]:
-    """The method as one part."""
+    """The motion; what is added and removed is the growth part ``copies``."""
     return [
         ComponentSpec(
-            kind="streaming_method",
+            kind="motion",
             name="recon",
-            target="gsstream_recon.method:ReCon",
-            summary="motions of anchors on three levels add up, Gaussians added and removed at constant number",
+            target="gsstream_recon.motion:AnchorMotion",
+            summary="motions of anchors on three levels add up",
         )
     ]
 

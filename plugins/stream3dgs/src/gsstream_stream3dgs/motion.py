@@ -1,8 +1,11 @@
-"""Fitting the transformation cache to the images of a frame."""
+"""Motion by a transformation cache: fitting it to the images of a frame, and saying what it does."""
 
 from __future__ import annotations
 
+from typing import Any, Literal, final
+
 import numpy as np
+import pydantic
 import torch
 
 from gsstream.api import (
@@ -10,85 +13,120 @@ from gsstream.api import (
     Field,
     FieldShape,
     FitContext,
-    Gaussians,
     IntArray,
     Motion,
+    MotionPart,
+    PartConfig,
     Rng,
     Scene,
     WrtRows,
     field_rows,
 )
-from gsstream.blocks import approximate_by_cells, pixel_size, rows_backward
+from gsstream.blocks import approximate_by_cells, pixel_size, rows_backward, transform_rows
 from gsstream_stream3dgs.cache import Cache, Lookup
-from gsstream_stream3dgs.settings import CacheSettings
+
+Setting = pydantic.Field
 
 
-def fitted_cache(
-    scene: Scene, work: FitContext, rows: IntArray, epochs: int, settings: CacheSettings, rng: Rng
-) -> tuple[IntArray, Cache] | None:
-    """Return the cache of a frame and the rows [A] that it moves; None where none may move."""
-    shape = shape_of(scene, work.cameras.extent, settings, rng)
-    marks = np.zeros(len(scene.gaussians), np.uint8)
-    marks[rows] = 1
-    rows, unit = field_rows(scene, shape, marks)
-    if not len(rows):
-        return None
-    cache = Cache(shape, Lookup(shape, unit), settings.entry_step, settings.weight_step)
-    base = scene.gaussians.rows(rows).map(torch.from_numpy)
-    work.narrow(torch.from_numpy(rows))
-    order = rng.numpy("stream3dgs/order", work.index)
-    for epoch in range(epochs):
-        rounded = settings.sent == "field" and epoch >= epochs * (1 - settings.rounded)
-        for view in order.permutation(len(work.cameras)):
-            shift, turn = cache(rounded)
-            there = moved(base, shape.reach * shift, turn)
-            rows_backward(there, work.loss_and_grad(int(view), WrtRows(there)).grad)
-            cache.step(settings.lr)
-    return rows, cache
+@final
+class CacheMotion(MotionPart):
+    """Moves Gaussians by a hash grid with a small network, fitted in every frame (3DGStream: Sun et al., CVPR 2024).
 
-
-def shape_of(scene: Scene, extent: float, settings: CacheSettings, rng: Rng) -> FieldShape:
-    """Return the shape of a frame's field: its box is that of most Gaussians, its first weights those of every frame.
+    It gives every Gaussian in a box a translation and a rotation. What is sent are its weights or, instead of them, the
+    rigid motions of small cells that come nearest to what it does. Gaussians that were added since the last key packet
+    do not move, and the fit does not see them. Defaults are the published values where a value is known; where this
+    differs, and why, is in the README of this plugin.
     """
-    means = scene.gaussians.means.astype(np.float64)
-    low, high = np.quantile(means, [settings.box, 1 - settings.box], axis=0).astype(np.float32)
-    # A scene that is flat along an axis has a box all the same.
-    high = np.maximum(high, low + np.maximum(np.float32(1e-3 * extent), np.float32(1e-6) * np.abs(low)))
-    return FieldShape(
-        (float(low[0]), float(low[1]), float(low[2])), (float(high[0]), float(high[1]), float(high[2])),
-        float(np.float32(settings.reach * extent)), settings.levels, settings.entries, settings.features, settings.base,
-        float(np.float32(settings.growth)), settings.width, 2, rng.key("stream3dgs", 0) & 0xFFFFFFFF,
-    )  # fmt: skip
 
+    source = "3DGStream (Sun et al. 2024)"
 
-def coded_cache(
-    scene: Scene, rows: IntArray, cache: Cache, cameras: Cameras, settings: CacheSettings
-) -> Field | Motion | None:
-    """Return what is sent of a cache: the cache, or the rigid motions of cells; None where nothing moves."""
-    if settings.sent == "field":
-        if len(rows) == len(scene.gaussians):
-            return cache.field(None)
+    class Config(PartConfig):
+        epochs: int = Setting(default=8, ge=1, le=1000, description="passes over the training cameras")
+        levels: int = Setting(default=16, ge=1, le=16, description="resolutions of the hash grid")
+        entries: int = Setting(default=15, ge=4, le=20, description="log2 of the entries of a resolution")
+        features: int = Setting(default=4, ge=1, le=8, description="numbers of an entry")
+        base: int = Setting(default=16, ge=2, le=1024, description="cells along an axis at the coarsest resolution")
+        growth: float = Setting(default=2.0, ge=1, le=4, description="ratio from one resolution to the next")
+        width: int = Setting(default=64, ge=4, le=128, description="neurons of each of the two hidden layers")
+        lr: float = Setting(default=2e-3, gt=0, le=1, description="Adam learning rate of all weights")
+        reach: float = Setting(
+            default=0.1, gt=0, description="translation of one unit of the network, fraction of the extent"
+        )
+        box: float = Setting(
+            default=0.02, ge=0, lt=0.5, description="share of the Gaussians outside the box at either end of each axis"
+        )
+        votes: float = Setting(
+            default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in what changed"
+        )
+        sent: Literal["field", "cells"] = Setting(
+            default="field",
+            description="field: the weights, as published; cells: rigid motions of cells, far fewer bytes",
+        )
+        entry_step: float = Setting(default=0.05, gt=0, le=1, description="quantisation step of the grid's entries")
+        weight_step: float = Setting(default=0.02, gt=0, le=1, description="quantisation step of the network's weights")
+        rounded: float = Setting(
+            default=0.5, ge=0, le=1, description="share of the passes, the last, that learn with rounded weights"
+        )
+        pixels: float = Setting(default=6.0, gt=0, le=1000, description="sent as cells: side of a cell, pixels")
+        step: float = Setting(default=0.1, gt=0, le=10, description="sent as cells: quantisation step, pixels")
+
+    def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion | Field, ...]:
+        rows = work.changed_rows(self.config.votes).nonzero()[:, 0].numpy()
+        rows = rows[rows < work.key_rows]
+        if not len(rows):
+            return ()
+        found = self.fitted(scene, work.on(work.gaussians.rows(slice(0, work.key_rows))), rows, rng)
+        said = None if found is None else self.said(scene, *found, work.cameras)
+        return () if said is None else (said,)
+
+    def fitted(self, scene: Scene, work: FitContext, rows: IntArray, rng: Rng) -> tuple[IntArray, Cache] | None:
+        """Return the rows [A] that the cache of a frame moves, and the cache; None where none may move."""
+        config = self.config
+        shape = self.shape(scene, work.cameras.extent, rng)
         marks = np.zeros(len(scene.gaussians), np.uint8)
         marks[rows] = 1
-        return cache.field(marks)
-    with torch.no_grad():
-        shift, turn = cache()
-    pixel = pixel_size(scene.gaussians.means, cameras)
-    side = float(np.float32(settings.pixels * pixel))
-    return approximate_by_cells(
-        scene, rows, (cache.shape.reach * shift).numpy(), turn.numpy(), side, settings.step * pixel
-    )
+        rows, unit = field_rows(scene, shape, marks)
+        if not len(rows):
+            return None
+        cache = Cache(shape, Lookup(shape, unit), config.entry_step, config.weight_step)
+        base = scene.gaussians.rows(rows).map(torch.from_numpy)
+        work.narrow(torch.from_numpy(rows))
+        order, epochs = rng.numpy("stream3dgs/order", work.index), work.scaled(config.epochs)
+        for epoch in range(epochs):
+            rounded = config.sent == "field" and epoch >= epochs * (1 - config.rounded)
+            for view in order.permutation(len(work.cameras)):
+                shift, turn = cache(rounded)
+                there = transform_rows(base, shape.reach * shift, turn)
+                rows_backward(there, work.loss_and_grad(int(view), WrtRows(there)).grad)
+                cache.step(config.lr)
+        return rows, cache
 
+    def shape(self, scene: Scene, extent: float, rng: Rng) -> FieldShape:
+        """Return the shape of a frame's field: its box is that of most Gaussians, its first weights those of every
+        frame.
+        """
+        config, means = self.config, scene.gaussians.means.astype(np.float64)
+        low, high = np.quantile(means, [config.box, 1 - config.box], axis=0).astype(np.float32)
+        # A scene that is flat along an axis has a box all the same.
+        high = np.maximum(high, low + np.maximum(np.float32(1e-3 * extent), np.float32(1e-6) * np.abs(low)))
+        return FieldShape(
+            (float(low[0]), float(low[1]), float(low[2])), (float(high[0]), float(high[1]), float(high[2])),
+            float(np.float32(config.reach * extent)), config.levels, config.entries, config.features, config.base,
+            float(np.float32(config.growth)), config.width, 2, rng.key("stream3dgs", 0) & 0xFFFFFFFF,
+        )  # fmt: skip
 
-def moved(gaussians: Gaussians[torch.Tensor], shift: torch.Tensor, turn: torch.Tensor) -> Gaussians[torch.Tensor]:
-    """Return Gaussians, raw values, shifted and turned."""
-    quat = torch.nn.functional.normalize(torch.cat([torch.ones_like(turn[:, :1]), turn], 1), dim=1)
-    w0, x0, y0, z0 = quat.unbind(1)
-    w1, x1, y1, z1 = gaussians.quats.unbind(1)
-    quats = torch.stack([
-        w0 * w1 - x0 * x1 - y0 * y1 - z0 * z1,
-        w0 * x1 + x0 * w1 + y0 * z1 - z0 * y1,
-        w0 * y1 - x0 * z1 + y0 * w1 + z0 * x1,
-        w0 * z1 + x0 * y1 - y0 * x1 + z0 * w1,
-    ], 1)  # fmt: skip
-    return Gaussians(**{**dict(gaussians.items()), "means": gaussians.means + shift, "quats": quats})
+    def said(self, scene: Scene, rows: IntArray, cache: Cache, cameras: Cameras) -> Field | Motion | None:
+        """Return what is sent of a cache: the cache, or the rigid motions of cells; None where nothing moves."""
+        if self.config.sent == "field":
+            if len(rows) == len(scene.gaussians):
+                return cache.field(None)
+            marks = np.zeros(len(scene.gaussians), np.uint8)
+            marks[rows] = 1
+            return cache.field(marks)
+        with torch.no_grad():
+            shift, turn = cache()
+        pixel = pixel_size(scene.gaussians.means, cameras)
+        side = float(np.float32(self.config.pixels * pixel))
+        return approximate_by_cells(
+            scene, rows, (cache.shape.reach * shift).numpy(), turn.numpy(), side, self.config.step * pixel
+        )

@@ -7,13 +7,13 @@ from gsstream.spec import ComponentSpec, MethodSpec, hookimpl
 
 @hookimpl
 def gsstream_components() -> list[ComponentSpec]:
-    """The method as one part."""
+    """The motion; what a frame adds for itself is the growth part ``copies``."""
     return [
         ComponentSpec(
-            kind="streaming_method",
+            kind="motion",
             name="stream3dgs",
-            target="gsstream_stream3dgs.method:Stream3DGS",
-            summary="a hash grid and a small network move what is there; Gaussians that live for one frame",
+            target="gsstream_stream3dgs.motion:CacheMotion",
+            summary="a hash grid and a small network move what is there",
         )
     ]
 

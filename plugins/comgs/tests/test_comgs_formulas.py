@@ -95,7 +95,7 @@ class Wrong:
     """A frame in which some Gaussians have a wrong colour, and a screen gradient as large as the error."""
 
     def __init__(self, gaussians: Gaussians[torch.Tensor], aims: torch.Tensor) -> None:
-        self.gaussians, self.aims, self.cameras = gaussians, aims, [None]
+        self.gaussians, self.aims, self.cameras, self.index = gaussians, aims, [None], 1
 
     def previous_render(self, view: int) -> torch.Tensor:
         return torch.zeros(1, 1, 3)

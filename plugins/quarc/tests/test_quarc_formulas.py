@@ -87,7 +87,7 @@ def test_a_gate_that_lets_everything_through_copies_as_many_as_may_be() -> None:
         settings = ChangeGatedCopies.Config(gradient=1e-7, rounds=2, most=30, prune_opacity=0.0, score=0.0, **gate)
         method = MethodUnderTest("quarc")
         method.parts = replace(method.parts, growth=ChangeGatedCopies(settings))
-        found[name] = [step.metrics["added"] for step in method.steps[1:]]
+        found[name] = [step.metrics["added_gaussians"] for step in method.steps[1:]]
     assert found["open"] == [30, 30]
     # Cells this large are the eight octants, each of which takes one in each of two rounds at most.
     assert all(0 < number <= 16 for number in found["one"])

@@ -27,8 +27,8 @@ def steps_with(**settings: Any) -> list[Step[Any]]:
 def test_as_many_leave_as_the_frame_before_added(leave: str) -> None:
     first, second, third = steps_with(leave=leave)
     number, before = len(first.state.player.gaussians), second.state.player
-    assert [step.metrics["added"] for step in (second, third)] == [7, 7]
-    assert [step.metrics["removed"] for step in (second, third)] == [0, 7]
+    assert [step.metrics["added_gaussians"] for step in (second, third)] == [7, 7]
+    assert [step.metrics["removed_gaussians"] for step in (second, third)] == [0, 7]
     assert [len(step.state.player.gaussians) for step in (second, third)] == [number + 7, number + 7]
     opacities = before.gaussians.opacities
     wanted = np.argsort(opacities, kind="stable")[:7] if leave == "least-opaque" else np.arange(number, number + 7)

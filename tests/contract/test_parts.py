@@ -32,16 +32,11 @@ from gsstream.parts.structure.flat import Flat
 from gsstream.parts.update.additive import Additive, DirectCode
 from gsstream.parts.update.base import AttributeCode, UpdateRule, init_latents, quantise_latents
 from gsstream.parts.update.joint import joint_layout
+from tests.scenes import make_scene
 
 
 def rig() -> Cameras:
     return Cameras(("a",), np.eye(4)[None], np.array([[[50.0, 0, 8], [0, 50, 8], [0, 0, 1]]]), 16, 16)
-
-
-def make(n: int, bases: int = 4, seed: int = 0) -> Gaussians[np.ndarray]:
-    g = np.random.default_rng(seed)
-    shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, bases - 1, 3)]
-    return Gaussians(**{k: g.normal(size=s).astype(np.float32) for k, s in zip(ATTRIBUTES, shapes, strict=True)})
 
 
 def cloud(n: int, seed: int = 0) -> PointCloud:
@@ -72,7 +67,7 @@ class TestFlat:
     def test_every_gaussian_is_its_own_root(self) -> None:
         points, flat = cloud(20), Flat()
         anchors = flat.seed(points, rig())
-        scene = make(20).map(torch.from_numpy)
+        scene = make_scene(20).map(torch.from_numpy)
         hierarchy = flat.build(scene, anchors)
         hierarchy.validate()
         assert hierarchy.num_nodes == hierarchy.num_gaussians == 20
@@ -132,7 +127,7 @@ class TestAlwaysOpen:
 
 def test_uniform_is_one_logit_each() -> None:
     class Context:
-        gaussians = make(7).map(torch.from_numpy)
+        gaussians = make_scene(7).map(torch.from_numpy)
 
     found = Uniform(Uniform.Config(logit=2.5)).estimate(Context())  # type: ignore[arg-type]
     assert torch.equal(found, torch.full((7,), 2.5))
@@ -150,7 +145,7 @@ class TestAdditive:
     def test_rate_zero_freezes_an_attribute(self) -> None:
         rule = Additive(Additive.Config(shN=DirectCode(step=0.1, lr=0)))
         assert set(rule.codes()) == set(ATTRIBUTES) - {"shN"}
-        assert rule.init_decoders(make(3).map(torch.from_numpy), torch.Generator()) == {}
+        assert rule.init_decoders(make_scene(3).map(torch.from_numpy), torch.Generator()) == {}
 
     @pytest.mark.parametrize("bad", [{"step": 0.0, "lr": 0.1}, {"step": 0.1, "lr": -1.0}])
     def test_impossible_codes_are_refused(self, bad: dict[str, float]) -> None:
@@ -165,7 +160,7 @@ class TestQuantise:
         """Exactly symbol * step in float32, not an ulp beside it."""
         rule = Additive(Additive.Config(opacities=DirectCode(step=step, lr=1)))
         latents = {"opacities": torch.tensor([[value]], dtype=torch.float32)}
-        base = make(1).map(torch.from_numpy)
+        base = make_scene(1).map(torch.from_numpy)
         _, change = decode_rows(rule, base, latents, {}, torch.ones(1))
         symbol = quantise_latents(rule.codes(), latents)["opacities"].numpy()
         assert np.array_equal(change.latents.numpy(), symbol.astype(np.float32) * np.float32(step))
@@ -203,7 +198,7 @@ def transmitted(
 @pytest.mark.parametrize("rule", [Additive(), Coded()], ids=["additive", "coded"])
 @pytest.mark.parametrize(("levels", "bases"), [(1, 1), (10, 9), (255, 16)])
 def test_training_and_playing_compute_the_same_map(rule: UpdateRule, levels: int, bases: int) -> None:
-    scene = make(60, bases, seed=levels)
+    scene = make_scene(60, bases, seed=levels)
     trained, played, active = transmitted(rule, scene, seed=levels, levels=levels)
     for name in ATTRIBUTES:
         if bases == 1 and name == "shN":
@@ -218,7 +213,7 @@ def test_training_and_playing_compute_the_same_map(rule: UpdateRule, levels: int
 
 def test_attributes_without_a_decoder_agree_to_a_rounding() -> None:
     """Training adds the gated change in one fused operation, the player in two: one rounding apart, no more."""
-    scene = make(80, 4, seed=5)
+    scene = make_scene(80, 4, seed=5)
     trained, played, active = transmitted(Additive(), scene, seed=5, levels=10)
     for name in ATTRIBUTES:
         ours, theirs = getattr(trained, name).numpy(), getattr(played, name)[active]
@@ -227,7 +222,7 @@ def test_attributes_without_a_decoder_agree_to_a_rounding() -> None:
 
 
 def test_zero_latents_change_nothing() -> None:
-    base = make(9).map(torch.from_numpy)
+    base = make_scene(9).map(torch.from_numpy)
     rule = Coded()
     latents, decoders = init_latents(rule, base), rule.init_decoders(base, torch.Generator().manual_seed(0))
     same = train_rows(rule, base, torch.ones(9), latents, decoders, torch.ones(9))
@@ -235,18 +230,18 @@ def test_zero_latents_change_nothing() -> None:
 
 
 def test_latents_follow_width_and_degree() -> None:
-    latents = init_latents(Coded(), make(5, bases=1).map(torch.from_numpy))
+    latents = init_latents(Coded(), make_scene(5, bases=1).map(torch.from_numpy))
     assert {n: tuple(v.shape) for n, v in latents.items()} == {
         "means": (5, 3), "quats": (5, 6), "scales": (5, 8), "opacities": (5, 1), "sh0": (5, 3)
     }  # fmt: skip
-    empty = init_latents(Coded(), make(0, bases=9).map(torch.from_numpy))
+    empty = init_latents(Coded(), make_scene(0, bases=9).map(torch.from_numpy))
     assert tuple(empty["shN"].shape) == (0, 4)
-    decoders = Coded().init_decoders(make(0, bases=9).map(torch.from_numpy), torch.Generator().manual_seed(0))
+    decoders = Coded().init_decoders(make_scene(0, bases=9).map(torch.from_numpy), torch.Generator().manual_seed(0))
     assert tuple(decoders["shN"].shape) == (4, 24)
 
 
 def test_every_input_of_the_residual_feels_the_loss() -> None:
-    base, rule = make(6).map(torch.from_numpy), Coded()
+    base, rule = make_scene(6).map(torch.from_numpy), Coded()
     generator = torch.Generator().manual_seed(1)
     latents = {
         n: (2 * torch.randn(v.shape, generator=generator)).requires_grad_() for n, v in init_latents(rule, base).items()
@@ -301,7 +296,7 @@ def test_written_out_gradient_equals_autograd() -> None:
 
 
 def test_joint_table_of_attributes_that_do_not_change() -> None:
-    base = make(4).map(torch.from_numpy)
+    base = make_scene(4).map(torch.from_numpy)
     none = joint_layout(Additive().codes(), init_latents(Additive(), base.rows(torch.arange(0))), {}, base)
     assert tuple(join_features(none, base.rows(torch.arange(0))).shape) == (0, none.trained.shape[1])
     code = joint_layout(Additive().codes(), {}, {}, base)

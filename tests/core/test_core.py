@@ -24,16 +24,11 @@ from gsstream.core.errors import (
     UnknownName,
 )
 from gsstream.core.frame import Frame
-from gsstream.core.gaussians import ATTRIBUTES, Gaussians
+from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.hierarchy import Hierarchy, tree_max, tree_roots
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import check_finite, check_shape
-
-
-def make(n: int, bases: int = 4, seed: int = 0) -> Gaussians[np.ndarray]:
-    g = np.random.default_rng(seed)
-    shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, bases - 1, 3)]
-    return Gaussians(**{k: g.normal(size=s).astype(np.float32) for k, s in zip(ATTRIBUTES, shapes, strict=True)})
+from tests.scenes import make_scene
 
 
 def rig(count: int = 2) -> Cameras:
@@ -46,35 +41,35 @@ def rig(count: int = 2) -> Cameras:
 class TestGaussians:
     @pytest.mark.parametrize(("bases", "degree"), [(1, 0), (4, 1), (9, 2), (16, 3)])
     def test_degree(self, bases: int, degree: int) -> None:
-        scene = make(5, bases)
+        scene = make_scene(5, bases)
         scene.validate()
         assert scene.sh_degree == degree
 
     @pytest.mark.parametrize("bases", [2, 3, 5, 8, 17, 25])
     def test_number_of_coefficients_is_refused(self, bases: int) -> None:
         with pytest.raises(ShapeError, match=rf"shN: expected 0, 3, 8 or 15 .* got {bases - 1}"):
-            make(3, bases).validate()
+            make_scene(3, bases).validate()
 
     @pytest.mark.parametrize("name", ATTRIBUTES)
     @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
     def test_not_finite_is_named(self, name: str, bad: float) -> None:
-        scene = make(4)
+        scene = make_scene(4)
         getattr(scene, name).reshape(4, -1)[2, 0] = bad
         with pytest.raises(ShapeError, match=rf"{name}: expected finite values, got .* at index \[2"):
             scene.validate()
 
     @pytest.mark.parametrize("name", ATTRIBUTES[1:])
     def test_row_count_must_agree(self, name: str) -> None:
-        scene = make(4)
+        scene = make_scene(4)
         with pytest.raises(ShapeError, match=f"{name}: expected shape"):
             dataclasses.replace(scene, **{name: getattr(scene, name)[:3]}).validate()
 
     def test_empty_scene_is_valid(self) -> None:
-        make(0).validate()
-        assert make(0).sh_degree == 1
+        make_scene(0).validate()
+        assert make_scene(0).sh_degree == 1
 
     def test_rows_select_every_attribute(self) -> None:
-        scene, index = make(6), np.array([4, 0])
+        scene, index = make_scene(6), np.array([4, 0])
         for name, value in scene.rows(index).items():
             assert np.array_equal(value, getattr(scene, name)[index])
 
@@ -277,7 +272,7 @@ class TestDelta:
         return Delta((Residual(**(fields | changes)),))
 
     def test_by_hand(self) -> None:
-        scene = make(5)
+        scene = make_scene(5)
         after = apply_delta(Scene(scene, self.layout()), self.delta()).gaussians
         change = np.array([[0.0], [0.0], [0.5], [0.25], [0.25]]) * 0.5 * 0.1
         np.testing.assert_allclose(after.means, scene.means + change, rtol=1e-6)
@@ -285,12 +280,13 @@ class TestDelta:
         assert all(getattr(after, name) is getattr(scene, name) for name in ATTRIBUTES[1:])
 
     def test_closed_gates_change_nothing(self) -> None:
-        scene, closed = make(5), self.delta(gates=np.zeros(3, np.uint8), symbols={"means": np.ones((0, 3), np.int32)})
+        scene, none = make_scene(5), {"means": np.ones((0, 3), np.int32)}
+        closed = self.delta(gates=np.zeros(3, np.uint8), symbols=none)
         assert closed.is_empty
         assert apply_delta(Scene(scene, self.layout()), closed).gaussians is scene
 
     def test_input_is_not_written_to(self) -> None:
-        scene = make(5)
+        scene = make_scene(5)
         before = scene.means.copy()
         apply_delta(Scene(scene, self.layout()), self.delta())
         assert np.array_equal(scene.means, before)
@@ -316,7 +312,7 @@ class TestDelta:
     )
     def test_misfits_are_refused(self, changes: dict[str, object], message: str) -> None:
         with pytest.raises(ShapeError, match=message):
-            apply_delta(Scene(make(5), self.layout()), self.delta(**changes))
+            apply_delta(Scene(make_scene(5), self.layout()), self.delta(**changes))
 
     @pytest.mark.parametrize("kinds", [
         (Residual, Motion), (RowEdit, Motion), (RowEdit, Residual), (Residual, Residual), (RowEdit, RowEdit),
@@ -346,7 +342,7 @@ class TestDelta:
         """A matrix product may round a row differently when there are more of them; the decoder must not."""
         g = np.random.default_rng(3)
         n = 257
-        scene, layout = make(n), Layout(np.ones(n, np.int32), np.zeros(n, np.uint8), np.ones(1, np.float32))
+        scene, layout = make_scene(n), Layout(np.ones(n, np.int32), np.zeros(n, np.uint8), np.ones(1, np.float32))
         symbols, decoder = g.integers(-9, 9, (n, 8)).astype(np.int32), g.normal(size=(8, 3)).astype(np.float32)
         before, step = Scene(scene, layout), {"scales": 1.0}
         everything = Residual(np.ones(n, np.uint8), 1, {"scales": symbols}, step, {"scales": decoder})

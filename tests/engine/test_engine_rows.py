@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from gsstream.core.changes import AddedGaussians, Delta, Residual, RowEdit
-from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.core.topology import TopologyEdit
@@ -18,12 +17,7 @@ from gsstream.parts.motion.none import Still
 from gsstream.parts.optimiser.adam import ReferenceAdam
 from gsstream.parts.optimiser.row_parameters import RowParameters
 from gsstream.testing.packet.checks import tiny_key
-
-
-def scene(number: int, seed: int = 0) -> Gaussians:
-    rng = np.random.default_rng(seed)
-    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (3, 3)}
-    return Gaussians(**{n: rng.normal(size=(number, *s)).astype(np.float32) for n, s in shapes.items()})
+from tests.scenes import make_scene
 
 
 @pytest.fixture
@@ -51,7 +45,7 @@ def test_the_forest_grows_with_the_packet(state):
     nodes = len(state.player.layout.node_counts)
     # Two new nodes: one below node 4 (which is below node 0), one below that one, and a new root.
     parents = np.array([4, nodes, nodes + 2])
-    added = AddedGaussians(scene(4), np.array([2, nodes, nodes + 1, nodes + 2]), np.zeros(4, np.uint8), parents)
+    added = AddedGaussians(make_scene(4), np.array([2, nodes, nodes + 1, nodes + 2]), np.zeros(4, np.uint8), parents)
     after = step(state, delta_of(added, [0, 7]))
     after.hierarchy.validate()
     assert after.hierarchy.num_gaussians == len(after.player.gaussians) == 42

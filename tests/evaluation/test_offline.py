@@ -11,9 +11,9 @@ from PIL import Image
 
 from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError
-from gsstream.core.gaussians import Gaussians
 from gsstream.evaluation.offline import bytes_line, numbered
 from gsstream.player.ply import ply_bytes, read_ply
+from tests.scenes import make_scene
 
 SOURCE = "synthetic:frames=3&views=3&width=64&height=48&supersample=1"
 SMALL = ("max_iterations=5", "max_points=200")
@@ -32,12 +32,6 @@ def evaluated(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict:
     capsys.readouterr()
     assert run_command(["evaluate", *map(str, arguments), "--json"]) == 0
     return json.loads(capsys.readouterr().out)
-
-
-def scene(number: int, rest: int) -> Gaussians[np.ndarray]:
-    rng = np.random.default_rng(rest)
-    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (rest, 3)}
-    return Gaussians(**{name: rng.normal(size=(number, *shape)).astype(np.float32) for name, shape in shapes.items()})
 
 
 def test_an_exported_sequence_is_as_good_as_its_stream(stream: Path, tmp_path: Path, capsys) -> None:
@@ -87,7 +81,7 @@ def test_pictures_count_like_the_stream_that_drew_them(stream: Path, tmp_path: P
 
 @pytest.mark.parametrize(("number", "rest"), [(7, 0), (7, 3), (7, 8), (7, 15), (0, 3), (1, 0)])
 def test_a_ply_is_read_as_it_was_written(tmp_path: Path, number: int, rest: int) -> None:
-    written, path = scene(number, rest), tmp_path / "a.ply"
+    written, path = make_scene(number, rest + 1), tmp_path / "a.ply"
     path.write_bytes(ply_bytes(written, ["offset 1.5 -2 1e6"]))
     read, offset = read_ply(path)
     assert offset == (1.5, -2.0, 1e6)
@@ -97,7 +91,7 @@ def test_a_ply_is_read_as_it_was_written(tmp_path: Path, number: int, rest: int)
 
 def test_properties_in_another_order_and_of_other_types_are_read(tmp_path: Path) -> None:
     """As other programs write them: a property more, doubles, and no normals."""
-    written = scene(3, 0)
+    written = make_scene(3, 1)
     columns = {
         "red": np.zeros(3, np.uint8), "opacity": written.opacities.astype("<f8"),
         **{f"rot_{i}": written.quats[:, i] for i in range(4)}, **{f"scale_{i}": written.scales[:, i] for i in range(3)},
@@ -131,7 +125,7 @@ def test_properties_in_another_order_and_of_other_types_are_read(tmp_path: Path)
 )
 def test_files_that_are_no_such_ply_are_refused(tmp_path: Path, change, said: str) -> None:
     path = tmp_path / "a.ply"
-    path.write_bytes(change(ply_bytes(scene(7, 0))))
+    path.write_bytes(change(ply_bytes(make_scene(7, 1))))
     with pytest.raises(InputError, match=said):
         read_ply(path)
 

@@ -1,6 +1,6 @@
 """The native kernels against themselves and against float64, to their bounds.
 
-Set GSSTREAM_TEST_EXAMPLES for more scenes. AVX-512 is skipped, and counted, where the processor has none.
+Set GSSTREAM_TEST_EXAMPLES for more scenes. Instruction sets are those that the processor has.
 """
 
 from __future__ import annotations
@@ -17,13 +17,10 @@ from gsstream.parts.render.reference import ReferenceRenderer
 native = pytest.importorskip("gsstream_cpu_render._native", reason="gsstream-cpu-render is not installed")
 from gsstream_cpu_render.renderer import CpuRenderer  # noqa: E402
 
-SETS = ["baseline", "avx2", "avx512", "neon"]
 
-
-@pytest.fixture(params=SETS)
+@pytest.fixture(params=native.supported_isas())
 def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    if request.param not in native.supported_isas():
-        pytest.skip(f"this processor does not run {request.param}; it runs {', '.join(native.supported_isas())}")
+    """Let a test run with each instruction set that this processor has."""
     before = native.active_isa()
     native.select_isa(request.param)
     yield request.param

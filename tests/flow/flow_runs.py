@@ -37,11 +37,14 @@ TINY = {
 def arguments(
     out: Path, *more: str, source: str = WORLD, method: str = "dense", pictures: bool = False, **settings: Any
 ) -> list[str]:
-    """A ``gsstream run`` command line; settings are recipe keys with ``__`` for the dot. Pictures cost time: ask."""
+    """A ``gsstream run`` command line; settings are recipe keys with ``__`` for the dot, None: not set.
+
+    Pictures cost time: ask.
+    """
     # The analytic scene has points of its own; looking for others takes longer than the rest of frame 0.
     points = {"first_frame.points": "recording"} if source.startswith("synthetic:") else {}
     values = {**TINY, **points, **{key.replace("__", "."): value for key, value in settings.items()}}
-    sets = [item for key, value in values.items() for item in ("--set", f"{key}={value}")]
+    sets = [item for key, value in values.items() if value is not None for item in ("--set", f"{key}={value}")]
     shown = "--no-video" if pictures else "--no-pictures"
     return ["run", "--source", source, "--method", method, "--out", str(out), "--quiet", shown, *sets, *more]
 

@@ -56,6 +56,10 @@ def stands_still(lines: Lines) -> bool:
 
 
 PERIOD = {"codec__key_interval": 2}
+#: Of methods that send no residual, so that nothing reads how many passes it gets.
+ONE_PASS: dict[str, Any] = {
+    "stream__epochs": None, "motion__epochs": 1, "growth__epochs": 1, "growth__gradient": 1e-6, "growth__most": 20,
+}  # fmt: skip
 RUNS: dict[str, Run] = {
     "s2gs-edge": Run(3),
     "key packets, cut at one": Run(2, settings=PERIOD, shows=keys),
@@ -83,12 +87,27 @@ RUNS: dict[str, Run] = {
             "streaming_method__change__dynamic": 1e-7,
         },
     ),
+    "recon with key packets, whose motion remembers anchors": Run(
+        3, method="recon", shows=keys,
+        settings={**PERIOD, **ONE_PASS, "motion__per_anchor": 8, "motion__measure": "anchor", "motion__step": 0.02},
+    ),
+    "hicom, refined beside the stream, then a key packet": Run(
+        3, method="hicom", settings={**ONE_PASS, "stream__refine_frames": 3, "stream__refine_iterations": 4},
+        shows=lambda lines: lines[3]["status"] == "key" and lines[4]["added_gaussians"] > 0,
+    ),
+    "a residual every second frame, within a budget of bytes": Run(
+        3, method="comgs-l", flags=("--budget", "size=200B"), settings={"motion__epochs": 1},
+        shows=lambda lines: [line["iterations"] > 0 for line in lines[1:]] == [False, True, False, True],
+    ),
     "hold": Run(2, method="hold", settings={"stream__epochs": 20}, shows=stands_still),
 }  # fmt: skip
 CUTS = ("in a packet", "between packets", "a line lost", "without metrics", "broken off", "not at all")
 #: A run that is broken off leaves what "between packets" makes of a whole one: tried for real where more than the
 #: scene is carried from frame to frame.
-BROKEN_OFF = ("s2gs-edge", "disturbed, two cameras, one late", "a budget of bytes", "queen with growth")
+BROKEN_OFF = (
+    "s2gs-edge", "disturbed, two cameras, one late", "a budget of bytes", "queen with growth",
+    "recon with key packets, whose motion remembers anchors",
+)
 KNOWN = set(load_catalog().names("method"))
 CELLS = [
     pytest.param(row, cut, id=f"{row}-{cut}")

@@ -161,6 +161,8 @@ def _unused_key_messages(paths: list[KeyPath], resolved: ResolvedRecipe) -> list
             f"brings ({some}, ...); put it in place of another method: --method dense --set streaming_method={name}"
         ]
     hint = f"the streaming_method {name!r} does not read it; its own settings: gsstream plugins streaming_method/{name}"
+    if name == "parts":  # which reads every key, but for those of a residual that is never sent
+        hint = f"nothing reads it, because the update {resolved.recipe.update.name!r} sends no residual"
     return [f"{resolved.near(path).where}: {'.'.join(path)}: {hint}" for path in paths]
 
 

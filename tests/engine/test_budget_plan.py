@@ -18,6 +18,7 @@ from gsstream.engine.budget.controller import Controller
 from gsstream.engine.budget.epoch_scheduler import estimated_bytes, next_rate_weight
 from gsstream.engine.budget.plan import (
     MAX_WEIGHT,
+    MIN_PART_SCALE,
     MIN_WEIGHT,
     TIME_MARGIN,
     Past,
@@ -144,6 +145,21 @@ def test_too_few_passes_raise_the_threshold_and_plenty_lower_it_again() -> None:
     assert plan(tight, stream, [replace(USUAL, threshold=12.0)]).change_threshold == pytest.approx(9.6)
     assert plan(tight, stream, [USUAL]).change_threshold == 6.0
     assert plan(tight, Stream(), [poor, replace(poor, threshold=0.0)]).change_threshold == 3.0
+
+
+@pytest.mark.parametrize(
+    ("limit", "scale"), [(4.0, 1.0), (1.0, (TIME_MARGIN - 0.2) / 2), (0.1, MIN_PART_SCALE)]
+)
+def test_where_no_residual_is_learned_motion_and_growth_make_the_passes_that_fit(limit: float, scale: float) -> None:
+    """Their whole passes take two seconds, all else 0.2; two frames before made them all, the last a half of them."""
+    whole = replace(USUAL, epochs=0.0, optimise=0.0, before=1.7, after=0.5, parts=2.0)
+    half = replace(whole, before=0.9, after=0.3, parts=1.0, part_scale=0.5)
+    budget, stream = Budget(time=limit), Stream(change_threshold=6.0)
+    found = plan(budget, stream, [USUAL, whole, whole, half])
+    assert found.part_scale == pytest.approx(scale)
+    assert found.change_threshold == 6.0, "there were no passes of a residual that could have been too few"
+    assert plan(budget, stream, [USUAL]).part_scale == 1.0
+    assert plan(Budget(size=4000), stream, [whole]).part_scale == 1.0
 
 
 def test_steps_get_coarser_only_when_the_weight_is_spent() -> None:

@@ -231,8 +231,7 @@ def _sized(name: str, factor: float) -> World:
 
 
 def _sure(name: str, size: float) -> World:
-    base = make_case(name, scene(_cloud(24)), rig())
-    return replace(base, logits=size * torch.sign(base.logits))
+    return replace(base := make_case(name, scene(_cloud(24)), rig()), logits=size * torch.sign(base.logits))
 
 
 WORLDS: dict[str, Callable[[], World]] = {

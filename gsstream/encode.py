@@ -135,7 +135,7 @@ def encoder_for(
     def seeds(frame: Frame) -> Any:
         return gather_points(source.points, frame, assembly.recipe.first_frame, encoder.rng)
 
-    encoder = Encoder(assembly, source.info, seeds, listeners=listeners)
+    encoder = Encoder(assembly, source.info, seeds, callbacks=listeners)
     return encoder
 
 
@@ -160,7 +160,7 @@ def encoder_for_rig(
     info = SourceInfo(
         name, f"rig:{name}", None, fps, snap_cameras(world.inverse_cameras(cameras)), cameras.select([]), world=world
     )
-    return Encoder(_assembled(method, settings, parts), info, place=True)
+    return Encoder(_assembled(method, settings, parts), info, transform_cameras=True)
 
 
 def _assembled(method: str, settings: Mapping[str, Any] | None, parts: Parts) -> Assembly:

@@ -87,7 +87,7 @@ class Capture(threading.Thread):
     def _put(self, pattern: str, index: int) -> None:
         target = self._folder / frame_path(pattern, index)
         target.parent.mkdir(parents=True, exist_ok=True)
-        # The bytes, not the times: latency counts from the time of modification.
+        # copyfile leaves the time of modification at now: latency is measured from it.
         part = target.with_name(f"{target.name}.part")
         shutil.copyfile(self._finished / frame_path(pattern, there_and_back(index, self._length)), part)
         part.replace(target)

@@ -20,7 +20,7 @@ class Cameras:
         viewmats: [C, 4, 4] float64 world-to-camera, OpenCV axes (x right, y down, z forward), scene units.
         Ks: [C, 3, 3] float64 intrinsics in pixels, pixel-corner origin (centre of the first pixel is (0.5, 0.5)).
         width, height: image size in pixels, the same for all cameras.
-        near: near plane, scene units; nothing closer to a camera is drawn. On a rig that looks inwards it keeps
+        near_plane: near plane, scene units; nothing closer to a camera is drawn. On a rig that looks inwards it keeps
             Gaussians of one camera's wall out of the face of its neighbours.
     """
 
@@ -29,7 +29,7 @@ class Cameras:
     Ks: FloatArray
     width: int
     height: int
-    near: float = 0.01
+    near_plane: float = 0.01
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -70,8 +70,8 @@ class Cameras:
         that are not those of a pinhole camera, repeated names.
         """
         c = len(self)
-        if not 0 < self.near < np.inf:
-            raise ShapeError(f"near plane: expected a positive distance in scene units, got {self.near}")
+        if not 0 < self.near_plane < np.inf:
+            raise ShapeError(f"near plane: expected a positive distance in scene units, got {self.near_plane}")
         check_shape("viewmats", self.viewmats, (c, 4, 4))
         check_shape("Ks", self.Ks, (c, 3, 3))
         if len(set(self.ids)) != c:

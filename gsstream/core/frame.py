@@ -37,8 +37,9 @@ class Frame:
         timestamp: seconds since the first frame.
         images: [C, H, W, 3] float32 in [0, 1].
         cameras: the C cameras, in the order of ``images``.
-        effort: share of the recipe's epochs that this frame is worth, in [0, 1]. A live source lowers it when the run
-            falls behind; 0 asks for an empty packet, so that numbering and time go on. Frame 0 is always done in full.
+        epoch_scale: share of the recipe's epochs that this frame is worth, in [0, 1]. A live source lowers it when the
+            run falls behind; 0 asks for an empty packet, so that numbering and time go on. Frame 0 is always done in
+            full.
         arrival: how it came in; None for a recording that is not live.
     """
 
@@ -46,7 +47,7 @@ class Frame:
     timestamp: float
     images: FloatArray
     cameras: Cameras
-    effort: float = 1.0
+    epoch_scale: float = 1.0
     arrival: Arrival | None = None
 
     def validate(self) -> None:

@@ -93,7 +93,7 @@ class World:
         viewmats = rig.viewmats.copy()
         viewmats[:, :3, :3] = rig.viewmats[:, :3, :3] @ self.matrix.T
         viewmats[:, :3, 3] = self.scale * rig.viewmats[:, :3, 3] - viewmats[:, :3, :3] @ np.array(self.offset)
-        return replace(rig, viewmats=viewmats, near=self.scale * rig.near)
+        return replace(rig, viewmats=viewmats, near_plane=self.scale * rig.near_plane)
 
     def inverse_cameras(self, rig: Cameras) -> Cameras:
         """Return cameras of the recording in the stream's coordinates."""
@@ -102,7 +102,7 @@ class World:
         # Not by the cameras' centres: a rotation that is rounded to six digits would move them by metres in UTM.
         moved = rig.viewmats[:, :3, :3] @ np.array(self.offset) + rig.viewmats[:, :3, 3]
         viewmats[:, :3, 3] = moved / self.scale
-        return replace(rig, viewmats=viewmats, near=rig.near / self.scale)
+        return replace(rig, viewmats=viewmats, near_plane=rig.near_plane / self.scale)
 
     def gaussians(self, scene: Gaussians[FloatArray]) -> Gaussians[FloatArray]:
         """Return Gaussians of the stream in the recording's coordinates, float64; view-dependent colours turn, too."""

@@ -94,8 +94,8 @@ class StreamingMethod(Part, Generic[State]):
 
         ``state.player`` of the result must be ``decoder()(before.player, packet.data)``, bit for bit: the method goes
         on from what it sent, not from what it trained. The engine decodes every packet and compares. A frame whose
-        ``effort`` is 0 is skipped: an empty packet, so that numbering and time go on; also one that failed, where the
-        recipe says ``stream.on_error: repeat``.
+        ``epoch_scale`` is 0 is skipped: an empty packet, so that numbering and time go on; also one that failed, where
+        the recipe says ``stream.on_error: repeat``.
 
         Arguments:
             state: what this method returned for the frame before, its ``follow_up`` included.
@@ -109,7 +109,7 @@ class StreamingMethod(Part, Generic[State]):
         The engine calls it once after every ``step``, when the packet has been handed out: whoever follows the stream
         live does not wait for this work. The next frame begins after it. Packet, status and ``state.player`` stay as
         they are; the engine compares. What it changes in the state ``resume`` makes, too. By default there is no such
-        work. A frame whose ``effort`` is 0 must not fail here either.
+        work. A frame whose ``epoch_scale`` is 0 must not fail here either.
 
         Arguments:
             state: before the frame, as ``step`` was given it.

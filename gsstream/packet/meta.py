@@ -167,7 +167,7 @@ def _array(name: str, value: Any, shape: tuple[int, ...]) -> None:
 
 def _rig(cameras: Cameras) -> dict[str, Any]:
     return {
-        "ids": list(cameras.ids), "width": cameras.width, "height": cameras.height, "near": cameras.near,
+        "ids": list(cameras.ids), "width": cameras.width, "height": cameras.height, "near": cameras.near_plane,
         "viewmats": np.asarray(cameras.viewmats, np.float64).reshape(-1, 16).tolist(),
         "Ks": np.asarray(cameras.Ks, np.float64).reshape(-1, 9).tolist(),
     }  # fmt: skip

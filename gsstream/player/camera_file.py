@@ -47,7 +47,7 @@ def read_path(path: Path, rig: Cameras, number: int, world: World = IDENTITY) ->
         named.validate()
     except ShapeError as error:
         raise InputError(f"{path}: {error}") from error
-    placed = replace(world.inverse_cameras(named), near=rig.near)
+    placed = replace(world.inverse_cameras(named), near_plane=rig.near_plane)
     return placed if len(placed) == number else _between(placed, number)
 
 

@@ -107,7 +107,7 @@ def render(
     size = (cameras.width, cameras.height)
     pose = (cameras.viewmats[view], cameras.Ks[view])
     arrays = [array for _, array in gaussians.items()]
-    image = chosen.render_numpy(arrays, *pose, *size, background, near=cameras.near)
+    image = chosen.render_numpy(arrays, *pose, *size, background, near=cameras.near_plane)
     check_shape(f"image of renderer {chosen.name!r}", image, (cameras.height, cameras.width, 3))
     check_finite(f"image of renderer {chosen.name!r}", image)
     return np.asarray(image, np.float32)

@@ -225,7 +225,7 @@ def _sized(name: str, factor: float) -> World:
     lengths = {key: factor * getattr(anchors, key) for key in ("positions", "cell_sizes", "origin")}
     return replace(
         base, gaussians=replace(blobs, means=factor * blobs.means, scales=blobs.scales + math.log(factor)),
-        cameras=replace(cameras, viewmats=viewmats, near=factor * cameras.near),
+        cameras=replace(cameras, viewmats=viewmats, near_plane=factor * cameras.near_plane),
         points=replace(base.points, xyz=np.float32(factor) * base.points.xyz), anchors=replace(anchors, **lengths),
     )  # fmt: skip
 

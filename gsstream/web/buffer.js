@@ -5,11 +5,11 @@ import { fileOf } from "./download.js";
 import { packetsOf } from "./source.js";
 
 /** Seconds of playing that are loaded ahead. */
-const AHEAD = 30;
+const PREFETCH_SECONDS = 30;
 /** Bytes of packets beyond which segments that lie far behind are forgotten. */
-const MOST_BYTES = 128 * 2 ** 20;
-/** Seconds of deltas that are rather replayed than jumped over by a join. */
-const REPLAYED = 1;
+const MAX_BYTES = 128 * 2 ** 20;
+/** Up to so many seconds ahead, deltas are replayed instead of loading a join. */
+const MAX_REPLAY_SECONDS = 1;
 
 /**
  * Packets by frame, loaded piece by piece around the frame that is played. `onNews` is called for every packet; for
@@ -149,7 +149,7 @@ export class PacketBuffer {
     const since = (start) => this.parts.slice(this.parts.indexOf(start), this.parts.indexOf(part) + 1);
     if (from !== null && from < frame && from >= part.home.segment.first) {
       const parts = since(this._part(from + 1));
-      if (parts.length === 1 || frame - from <= REPLAYED * this.fps) return { part, parts, join: null };
+      if (parts.length === 1 || frame - from <= MAX_REPLAY_SECONDS * this.fps) return { part, parts, join: null };
     }
     if (part.join.state !== "failed") return { part, parts: [part], join: part.join };
     return { part, parts: since(part.home), join: null };
@@ -180,7 +180,7 @@ export class PacketBuffer {
   /** Downloads for the time after `frame` that have not begun. */
   _ahead(frame) {
     const here = this.parts.indexOf(this._part(frame));
-    const soon = this.parts.slice(here + 1).filter(({ segment }) => (segment.first - frame) / this.fps <= AHEAD);
+    const soon = this.parts.slice(here + 1).filter(({ segment }) => (segment.first - frame) / this.fps <= PREFETCH_SECONDS);
     return here < 0 ? [] : soon.map((part) => ({ part, join: false })).filter(isAbsent);
   }
 
@@ -254,7 +254,7 @@ export class PacketBuffer {
     const here = this.parts.indexOf(this._part(this.frame));
     const far = this.parts.map((part, i) => ({ part, way: i < here ? here - i : (i - here) / 2 }));
     for (const { part, way } of far.sort((a, b) => b.way - a.way)) {
-      if (bytes <= MOST_BYTES || way <= 1) return;
+      if (bytes <= MAX_BYTES || way <= 1) return;
       bytes -= part.bytes;
       if (part.state === "done") this._forget(part);
       if (part.join?.state === "done") part.join = { state: "absent", data: null };

@@ -116,11 +116,11 @@ class TestCameras:
     @pytest.mark.parametrize("near", [0.0, -1.0, np.nan])
     def test_near_plane_is_positive(self, near: float) -> None:
         with pytest.raises(ShapeError, match=r"near plane: expected a positive distance"):
-            dataclasses.replace(rig(), near=near).validate()
+            dataclasses.replace(rig(), near_plane=near).validate()
 
     def test_near_plane_survives_select_and_scaled(self) -> None:
-        cameras = dataclasses.replace(rig(3), near=0.7)
-        assert cameras.select([1]).near == cameras.scaled(8, 8).near == 0.7
+        cameras = dataclasses.replace(rig(3), near_plane=0.7)
+        assert cameras.select([1]).near_plane == cameras.scaled(8, 8).near_plane == 0.7
 
     def test_repeated_names_and_shapes(self) -> None:
         with pytest.raises(ShapeError, match=r"unique, got \['a', 'a'\]"):

@@ -162,7 +162,7 @@ def scene(rng: np.random.Generator, rest: int) -> Gaussians:
 
 def picture(gaussians: Gaussians, cameras: Cameras, view: int) -> np.ndarray:
     arrays = [array for _, array in gaussians.items()]
-    return render_numpy(arrays, cameras.viewmats[view], cameras.Ks[view], 48, 36, near=cameras.near)
+    return render_numpy(arrays, cameras.viewmats[view], cameras.Ks[view], 48, 36, near=cameras.near_plane)
 
 
 @pytest.mark.parametrize("rest", [0, 3, 8, 15])

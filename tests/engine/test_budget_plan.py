@@ -265,9 +265,9 @@ def test_a_method_that_logs_no_use_of_its_budget_is_described_by_its_phases(
     controller.describe(budget, Step(None, packet, "empty"), 3, log)
     assert ("budget" in log.numbers) == logged, "a frame without iterations says nothing of what epochs cost"
     if logged:
-        spent = log.numbers["budget"]["spent"]
-        assert (spent["epochs"], spent["before"], spent["optimise"]) == (2, 1.0, 4.0)
-        assert spent["untrimmed"] == len(packet.data)
+        usage = log.numbers["budget"]["usage"]
+        assert (usage["epochs"], usage["seconds_before"], usage["seconds_optimise"]) == (2, 1.0, 4.0)
+        assert usage["untrimmed_bytes"] == len(packet.data)
 
 
 def test_a_frame_starts_with_the_recipes_weight_or_less_where_bytes_were_left() -> None:

@@ -51,7 +51,7 @@ def votes_by_hand(mean: Sequence[float], tiles: torch.Tensor, cameras: Cameras) 
     rows, columns = tiles.shape[1:]
     for view in range(len(cameras)):
         x, y, z = cameras.viewmats[view][:3, :3] @ mean + cameras.viewmats[view][:3, 3]
-        if z <= cameras.near:
+        if z <= cameras.near_plane:
             continue
         u, v = FOCAL * x / z + WIDTH / 2, FOCAL * y / z + HEIGHT / 2
         if not (0 <= u < WIDTH and 0 <= v < HEIGHT):

@@ -23,7 +23,7 @@ def entry(index: int, effort: float, arrival: Arrival | None, written: float = 1
 
 
 def line(index: int, latency: float | None, policy: str | None = None) -> dict:
-    return {"frame": index, "live": {"latency_seconds": latency, "policy": policy, "effort": 1.0, "absent": []}}
+    return {"frame": index, "live": {"latency_seconds": latency, "policy": policy, "epoch_scale": 1.0, "absent": []}}
 
 
 @pytest.mark.parametrize(
@@ -37,7 +37,7 @@ def test_a_frame_has_one_policy_and_frame_0_none(
     index: int, effort: float, absent: tuple[str, ...], policy: str | None
 ) -> None:
     got = entry(index, effort, Arrival(10.5, absent))
-    assert got == {"latency_seconds": 1.5, "policy": policy, "effort": effort, "absent": list(absent)}
+    assert got == {"latency_seconds": 1.5, "policy": policy, "epoch_scale": effort, "absent": list(absent)}
 
 
 def test_a_clock_that_is_ahead_shows_and_nothing_is_said_of_recordings_that_are_not_live() -> None:

@@ -21,7 +21,7 @@ def draws(share: float, number: int = 4000) -> tuple[torch.Tensor, torch.Tensor]
     change = Change(tiles, 80, 112)
     found = [tile_weights(change, 1, share, generator) for _ in range(number)]
     assert all(weights is not None for weights in found)
-    return change.near[1], torch.stack(found)
+    return change.dilated[1], torch.stack(found)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.1, 0.7])

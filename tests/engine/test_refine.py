@@ -50,7 +50,7 @@ def encoder(**settings: Any) -> Encoder:
 
 def steps(efforts: tuple[float, ...] = (1,) * 6, **settings: Any) -> list[Step[Any]]:
     made = encoder(**settings)
-    return [made.encode(replace(frame, effort=e)) for frame, e in zip(frames(), efforts, strict=True)]
+    return [made.encode(replace(frame, epoch_scale=e)) for frame, e in zip(frames(), efforts, strict=True)]
 
 
 @cache
@@ -103,7 +103,7 @@ def told(monkeypatch: pytest.MonkeyPatch, efforts: tuple[float, ...]) -> list[st
         listeners = Callbacks(packet=lambda packet: out.append(f"{packet.kind.name.lower()} {packet.frame}"))
         made = encoder_for("s2gs-edge", source, SETTINGS, listeners)
     for frame, effort in zip(frames(), efforts, strict=True):
-        made.encode(replace(frame, effort=effort))
+        made.encode(replace(frame, epoch_scale=effort))
     return out
 
 

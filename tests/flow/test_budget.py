@@ -40,9 +40,9 @@ def test_sizes_hold_in_the_file_and_are_reported(held: Path) -> None:
         entry = line["budget"]
         assert entry["limits"] == {"size": SIZE}
         assert entry["violated"] == []
-        assert entry["bound"] == ["size"]
-        assert {"symbols", "rd_lambda"} & set(entry["given_up"])
-        assert entry["spent"]["untrimmed"] >= sum(line["bytes"].values())
+        assert entry["binding"] == ["size"]
+        assert {"symbols", "rd_lambda"} & set(entry["reduced"])
+        assert entry["usage"]["untrimmed_bytes"] >= sum(line["bytes"].values())
     summary = (held / "out" / "summary.txt").read_text()
     assert f"budget size {SIZE / 1000:.2f} KB: 3 of 3 frames inside" in summary
     assert "\ngiven up: " in summary
@@ -53,7 +53,7 @@ def test_sizes_hold_in_the_file_and_are_reported(held: Path) -> None:
 def test_the_encoder_goes_on_from_what_it_trimmed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     witness = Witness(monkeypatch)
     encode(tmp_path, "--budget", "size=300B", method="s2gs-edge")
-    assert any("symbols" in line["budget"]["given_up"] for line in metrics(tmp_path)[1:]), "something was trimmed"
+    assert any("symbols" in line["budget"]["reduced"] for line in metrics(tmp_path)[1:]), "something was trimmed"
     with Playback(tmp_path / "stream.gss") as playback:
         for index, state in enumerate(witness.states):
             shown = playback.state_at(index)

@@ -73,7 +73,7 @@ def test_both_sides_show_the_same_picture(tmp_path: Path, monkeypatch: pytest.Mo
     state = witness.states[-1]
     with Playback(tmp_path / "stream.gss") as playback:
         cameras, scene = playback.cameras("test"), playback.state_at(3)
-        assert cameras.near == state.previous.cameras.near != 0.01, "the packet carries the rig's near plane"
+        assert cameras.near_plane == state.previous.cameras.near_plane != 0.01, "the packet has the near plane"
         fast = find_renderer()
         assert fast.name == "cpu"
         for renderer in (fast, PlayerRenderer("numpy", render_numpy)):

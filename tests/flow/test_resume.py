@@ -74,7 +74,7 @@ RUNS: dict[str, Run] = {
     "trimmed": Run(3, settings={"motion": "still", "codec__trim": 0.4}),
     "images of half precision": Run(3, flags=("--scale", "0.5"), settings={"data__images": "float16"}),
     "a budget of bytes": Run(
-        3, flags=("--budget", "size=200B"), shows=lambda lines: any(line["budget"]["bound"] for line in lines[1:])
+        3, flags=("--budget", "size=200B"), shows=lambda lines: any(line["budget"]["binding"] for line in lines[1:])
     ),
     "growing": Run(4, method="dense", grows=True),
     "growing, with shared gates": Run(4, grows=True),
@@ -187,5 +187,5 @@ def test_it_resumes_to_the_same_bytes(
     for ours, theirs in zip(lines, undisturbed[first:], strict=True):
         for quantity in ("status", "psnr", "ssim", "psnr_moving", "bytes", "active_gates", "num_gaussians"):
             assert ours.get(quantity) == theirs.get(quantity), quantity
-        spent = [json.dumps(line.get("budget", {}).get("spent", {}).get("rd_lambda")) for line in (ours, theirs)]
+        spent = [json.dumps(line.get("budget", {}).get("usage", {}).get("rd_lambda")) for line in (ours, theirs)]
         assert spent[0] == spent[1]

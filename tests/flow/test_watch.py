@@ -88,7 +88,7 @@ def test_the_stream_of_a_growing_folder_is_that_of_the_finished_one(finished: Pa
     assert [line["live"] for line in metrics(tmp_path / "after")] == [None] * FRAMES
     assert "latency" not in (tmp_path / "after/summary.txt").read_text()
     live_entries = [line["live"] for line in metrics(tmp_path / "followed")]
-    assert all((entry["policy"], entry["effort"], entry["absent"]) == (None, 1, []) for entry in live_entries)
+    assert all((entry["policy"], entry["epoch_scale"], entry["absent"]) == (None, 1, []) for entry in live_entries)
     # When a packet was complete, told by its latency: after its images, in the order of frames, before its last line.
     images = [max(path.stat().st_mtime for path in live.glob(f"*/{t:06d}.jpg")) for t in range(FRAMES)]
     written = [image + entry["latency_seconds"] for image, entry in zip(images, live_entries, strict=True)]
@@ -176,7 +176,7 @@ def test_a_run_that_falls_behind_drops_or_hurries(
     follow(tmp_path / "live", tmp_path / "run", f"?behind={policy}&queue=1", stream__epochs=4)
     lines = metrics(tmp_path / "run")
     assert [line["iterations"] / (4 * 3) for line in lines[1:]] == effort
-    assert [line["live"]["effort"] for line in lines[1:]] == effort
+    assert [line["live"]["epoch_scale"] for line in lines[1:]] == effort
     assert ["psnr" in line for line in lines] == [True, *(value > 0 for value in effort)]
     words = {0: "dropped", 0.5: "hurried", 1: None}
     assert [line["live"]["policy"] for line in lines] == [None, *(words[value] for value in effort)]

@@ -59,7 +59,7 @@ class Stranger(StreamingMethod[Carried]):
         return Step(Carried(player), packet, "key")
 
     def step(self, state: Carried, frame: Frame, tools: Tools) -> Step[Carried]:
-        if frame.effort == 0:
+        if frame.epoch_scale == 0:
             packet, player = send_delta(state.player, Delta())
             return Step(Carried(player), packet, "empty")
         packet, player = self._fitting(state.player, self._learned(state.player, frame, tools), tools)
@@ -144,7 +144,7 @@ def test_its_frames_keep_to_their_budget(row: Row) -> None:
         assert line["iterations"] == 3 * row.epochs
         assert ("budget" in line) == bool(limits)
         assert line.get("budget", {}).get("violated", []) == (["time"] if row.epochs == 0 else [])
-        assert ("spent" in line.get("budget", {})) == bool(limits and row.epochs)
+        assert ("usage" in line.get("budget", {})) == bool(limits and row.epochs)
         if step.packet.frame % 3 == 0:
             assert row.refused in (line["refused"] or "")
             assert (line["refused"] is None) == (step.packet.frame in row.keys)

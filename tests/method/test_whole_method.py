@@ -185,7 +185,7 @@ class FailsAt1(Follow):  # type: ignore[misc]  # wrong on purpose
     """Follows the light, and fails at frame 1 unless it is worth nothing."""
 
     def step(self, state, frame, tools):
-        if frame.index == 1 and frame.effort > 0:
+        if frame.index == 1 and frame.epoch_scale > 0:
             raise RuntimeError("out of ideas")
         return super().step(state, frame, tools)
 
@@ -220,9 +220,9 @@ def test_a_method_that_cannot_skip_either_ends_the_run() -> None:
 def test_what_is_sent_in_place_of_a_failed_frame_must_be_empty() -> None:
     class Stubborn(Follow):
         def step(self, state, frame, tools):
-            if frame.effort > 0:
+            if frame.epoch_scale > 0:
                 raise RuntimeError("out of ideas")
-            return super().step(state, replace(frame, effort=1.0), tools)
+            return super().step(state, replace(frame, epoch_scale=1.0), tools)
 
     subject = repeating(MethodUnderTest("dense", Stubborn()))
     start = subject.begin(open_source(SOURCE).frame(0))
@@ -261,7 +261,7 @@ def test_the_packet_is_out_before_the_work_that_follows_it() -> None:
     subject = pondering(ponder)
     source = open_source(SOURCE)
     listeners = Callbacks(packet=lambda packet: told.append(("packet", packet.frame)))
-    encoder = Encoder(subject.parts, source.info, lambda _: source.points("recording"), listeners=listeners)
+    encoder = Encoder(subject.parts, source.info, lambda _: source.points("recording"), callbacks=listeners)
     steps = [encoder.encode(source.frame(index)) for index in range(3)]
     assert told == [("packet", 0), ("packet", 1), ("follow up", 1), ("packet", 2), ("follow up", 2)]
     assert [getattr(step.state, "about", None) for step in steps] == [None, 1, 2]
@@ -315,7 +315,7 @@ def test_what_fails_after_a_packet_leaves_the_encoder_as_it_was_and_gives_the_pa
 
     subject, source = pondering(ponder), open_source(SOURCE)
     listeners = Callbacks(packet=sent.append)
-    encoder = Encoder(subject.parts, source.info, lambda _: source.points("recording"), listeners=listeners)
+    encoder = Encoder(subject.parts, source.info, lambda _: source.points("recording"), callbacks=listeners)
     before = encoder.encode(source.frame(0)).state
     with pytest.raises(
         ComponentError, match=r"streaming_method 'Wrong' .* failed at frame 1: RuntimeError: out of ideas"
@@ -331,8 +331,8 @@ def test_what_fails_after_a_packet_is_left_out_when_the_recipe_says_so() -> None
     asked: list[float] = []
 
     def ponder(state, step, frame):
-        asked.append(frame.effort)
-        if frame.effort > 0:
+        asked.append(frame.epoch_scale)
+        if frame.epoch_scale > 0:
             raise RuntimeError("out of ideas")
         return replace(step, state=Thought(step.state.player, -1))
 
@@ -362,7 +362,7 @@ class Tires(Follow):  # type: ignore[misc]  # wrong on purpose
     """Follows the light for one frame; thinks about it after its packet, and rests from then on."""
 
     def step(self, state, frame, tools):
-        return super().step(state, replace(frame, effort=0.0) if isinstance(state, Thought) else frame, tools)
+        return super().step(state, replace(frame, epoch_scale=0.0) if isinstance(state, Thought) else frame, tools)
 
     def follow_up(self, state, step, frame, tools):
         return replace(step, state=Thought(step.state.player, frame.index))
@@ -385,7 +385,7 @@ def test_a_run_repeats_failed_frames_of_a_whole_method(tmp_path: Path, monkeypat
     hold = Hold.step
 
     def fails(self, state, frame, tools):
-        if frame.index == 2 and frame.effort > 0:
+        if frame.index == 2 and frame.epoch_scale > 0:
             raise RuntimeError("out of ideas")
         return hold(self, state, frame, tools)
 
@@ -508,7 +508,7 @@ class TestTools:
     def test_a_frame_that_is_worth_less_has_fewer_epochs(self, begun) -> None:
         subject, _, _, now = begun
         tools = replace(subject.encoder()._tools(), parts=replace(subject.parts, recipe=Recipe()))
-        assert [tools.epochs(replace(now, effort=e)) for e in (1.0, 0.5, 0.01)] == [20, 10, 1]
+        assert [tools.epochs(replace(now, epoch_scale=e)) for e in (1.0, 0.5, 0.01)] == [20, 10, 1]
 
 
 #: at_hand.yaml lists the scenes of a sweep.

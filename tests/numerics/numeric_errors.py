@@ -53,33 +53,33 @@ def compositing(seed: int) -> float:
 
 def image(renderer: Renderer, seed: int) -> float:
     scene, cameras = random_scene(seed, bases=(1, 4, 9, 16)[seed % 4]), camera()
-    slope = upstream(cameras, seed)
-    got = rendered(renderer, scene, cameras, slope)[0]
-    return worst(got, rendered(ReferenceRenderer(), scene.map(torch.Tensor.double), cameras, slope)[0])
+    grad = upstream(cameras, seed)
+    got = rendered(renderer, scene, cameras, grad)[0]
+    return worst(got, rendered(ReferenceRenderer(), scene.map(torch.Tensor.double), cameras, grad)[0])
 
 
 def image_numpy(seed: int) -> float:
     scene, cameras = random_scene(seed, bases=(1, 4, 9, 16)[seed % 4]), camera()
     arrays = [value.numpy() for _, value in scene.items()]
     got = render_numpy(arrays, cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height, (0.2, 0.5, 0.9))
-    slope = upstream(cameras, seed)
-    want = rendered(ReferenceRenderer(), scene.map(torch.Tensor.double), cameras, slope)[0]
+    grad = upstream(cameras, seed)
+    want = rendered(ReferenceRenderer(), scene.map(torch.Tensor.double), cameras, grad)[0]
     return worst(torch.from_numpy(got), want)
 
 
 def gradients(renderer: Renderer, seed: int) -> float:
     scene, cameras = random_scene(seed, bases=(1, 4, 9, 16)[seed % 4]), camera()
-    slope = upstream(cameras, seed)
-    got = rendered(renderer, scene, cameras, slope)[1]
-    want = rendered(ReferenceRenderer(), scene.map(torch.Tensor.double), cameras, slope)[1]
+    grad = upstream(cameras, seed)
+    got = rendered(renderer, scene, cameras, grad)[1]
+    want = rendered(ReferenceRenderer(), scene.map(torch.Tensor.double), cameras, grad)[1]
     return max(worst(a, b) for (_, a), (_, b) in zip(got.items(), want.items(), strict=True))
 
 
 def screen(renderer: Renderer, seed: int) -> float:
     scene, cameras = random_scene(seed), camera()
-    slope = upstream(cameras, seed)
-    got = renderer.screen_gradient(scene, cameras, 0, slope)
-    want = ReferenceRenderer().screen_gradient(scene.map(torch.Tensor.double), cameras, 0, slope.double())
+    grad = upstream(cameras, seed)
+    got = renderer.screen_gradient(scene, cameras, 0, grad)
+    want = ReferenceRenderer().screen_gradient(scene.map(torch.Tensor.double), cameras, 0, grad.double())
     return worst(got.gradient, want.gradient)
 
 

@@ -78,8 +78,8 @@ def _relative(got: torch.Tensor, want: torch.Tensor, scale: torch.Tensor | float
     return float(((got.double() - want).abs() / scale).max())
 
 
-def slope(seed: int) -> float:
-    """The straight-through gradient, over logits and temperatures whose slope float32 can hold."""
+def gate_gradient(seed: int) -> float:
+    """The straight-through gradient, over logits and temperatures whose gradient float32 can hold."""
     tau = (0.1, 0.3, 1.0, 10.0, 100.0)[seed % 5]
     logits = torch.linspace(-70 * tau, 70 * tau, 501)
     leaf = logits.clone().requires_grad_()
@@ -236,7 +236,7 @@ def method_measures() -> Mapping[str, Measure]:
         "view-space gradient difference": difference_of_gradients,
         "robust normalisation": normalisation,
         "propagation": propagation,
-        "gate slope": slope,
+        "gate gradient": gate_gradient,
         "gate noise": noise,
         "open probability": open_probability,
         "rounding of gates": rounding,

@@ -74,11 +74,11 @@ def upstream(cameras: Cameras, seed: int = 0) -> torch.Tensor:
     return torch.randn(cameras.height, cameras.width, 3, generator=torch.Generator().manual_seed(seed))
 
 
-def rendered(renderer: Any, gaussians: Scene, cameras: Cameras, slope: torch.Tensor) -> tuple[torch.Tensor, Scene]:
-    """Image and gradients of sum(image * slope), in the precision of the Gaussians, given back as float64."""
+def rendered(renderer: Any, gaussians: Scene, cameras: Cameras, grad: torch.Tensor) -> tuple[torch.Tensor, Scene]:
+    """Image and gradients of sum(image * grad), in the precision of the Gaussians, given back as float64."""
     leaves = gaussians.map(lambda value: value.detach().clone().requires_grad_())
     image = renderer.render(leaves, cameras, 0, (0.2, 0.5, 0.9)).image
-    (image * slope.to(image.dtype)).sum().backward()
+    (image * grad.to(image.dtype)).sum().backward()
     none = leaves.map(lambda leaf: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad)
     return image.detach().double(), none.map(torch.Tensor.double)
 

@@ -30,9 +30,9 @@ def isa(request: pytest.FixtureRequest) -> Iterator[str]:
 def test_every_instruction_set_is_within_the_bounds(isa: str) -> None:
     cameras = camera()
     for seed in draws(3):
-        scene, slope = random_scene(seed, bases=(1, 4, 9, 16)[seed % 4]), upstream(cameras, seed)
-        image, gradients = rendered(CpuRenderer(), scene, cameras, slope)
-        want, exact = rendered(ReferenceRenderer(), scene.map(torch.Tensor.double), cameras, slope)
+        scene, grad = random_scene(seed, bases=(1, 4, 9, 16)[seed % 4]), upstream(cameras, seed)
+        image, gradients = rendered(CpuRenderer(), scene, cameras, grad)
+        want, exact = rendered(ReferenceRenderer(), scene.map(torch.Tensor.double), cameras, grad)
         assert worst(image, want) <= BOUNDS["image (cpu)"].limit
         for (name, got), (_, value) in zip(gradients.items(), exact.items(), strict=True):
             assert worst(got, value) <= BOUNDS["gradients (cpu)"].limit, name
@@ -41,13 +41,13 @@ def test_every_instruction_set_is_within_the_bounds(isa: str) -> None:
 def test_instruction_sets_agree_among_themselves() -> None:
     """Up to rounding: another set sums in another order. Also: an idle rasteriser made for one set is not used for
     another (it was, and every comparison of sets through the renderer compared a set with itself)."""
-    cameras, slope = camera(), upstream(camera())
+    cameras, grad = camera(), upstream(camera())
     before = native.active_isa()
     found = {}
     for name in native.supported_isas():
         native.select_isa(name)
-        found[name] = rendered(CpuRenderer(), random_scene(5), cameras, slope)
-        again, _ = rendered(CpuRenderer(), random_scene(5), cameras, slope)
+        found[name] = rendered(CpuRenderer(), random_scene(5), cameras, grad)
+        again, _ = rendered(CpuRenderer(), random_scene(5), cameras, grad)
         assert torch.equal(again, found[name][0]), "an idle object of another set was used"
     native.select_isa(before)
     first_image, first_gradients = next(iter(found.values()))

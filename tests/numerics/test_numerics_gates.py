@@ -78,7 +78,7 @@ def test_an_open_gate_feels_the_images_as_a_closed_one_does(part: GumbelSigmoid)
 
 @given(st.floats(-87, 87, width=32))
 @some(60)
-def test_the_slope_is_even_and_never_dies_in_range(x: float) -> None:
+def test_the_gate_gradient_is_even_and_above_zero(x: float) -> None:
     at = torch.tensor([x, -x])
     values = sigmoid_derivative(at)
     assert values[0] == values[1]

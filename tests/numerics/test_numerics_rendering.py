@@ -68,9 +68,9 @@ CASES: dict[str, tuple[Scene, Cameras, float]] = {
 @pytest.mark.parametrize("case", CASES)
 def test_image_and_gradients_against_float64(case: str, name: str) -> None:
     scene, cameras, tolerance = CASES[case]
-    slope = upstream(cameras)
-    got, gradients = rendered(RENDERERS[name], scene, cameras, slope)
-    want, exact = rendered(ReferenceRenderer(), scene.map(torch.Tensor.double), cameras, slope)
+    grad = upstream(cameras)
+    got, gradients = rendered(RENDERERS[name], scene, cameras, grad)
+    want, exact = rendered(ReferenceRenderer(), scene.map(torch.Tensor.double), cameras, grad)
     assert worst(got, want) < 2e-5
     # By the largest of the scene: the true gradient of a sphere's rotation is 0.
     scale = max(float(value.abs().max()) for _, value in exact.items() if value.numel())
@@ -98,9 +98,9 @@ def test_needles_of_condition_1e8_give_a_right_image_and_finite_gradients(focal:
     is promised (docs/reference/numerics.md, compositing)."""
     scene = blobs(HERE, [math.log(10), math.log(1e-7), math.log(1e-7)])
     cameras = camera(focal=focal, width=160, height=90)
-    slope = upstream(cameras)
-    got, gradients = rendered(RENDERERS["cpu"], scene, cameras, slope)
-    want, _ = rendered(ReferenceRenderer(), scene.map(torch.Tensor.double), cameras, slope)
+    grad = upstream(cameras)
+    got, gradients = rendered(RENDERERS["cpu"], scene, cameras, grad)
+    want, _ = rendered(ReferenceRenderer(), scene.map(torch.Tensor.double), cameras, grad)
     assert worst(got, want) < 5e-3
     assert all(bool(torch.isfinite(value).all()) for _, value in gradients.items())
 
@@ -110,9 +110,9 @@ def test_an_opaque_gaussian_can_become_transparent_again() -> None:
     scene, cameras = CASES["opaque: logit 20"][:2]
     if "cpu" not in RENDERERS:
         pytest.skip("gsstream-cpu-render is not installed")
-    slope = upstream(cameras)
-    got = rendered(RENDERERS["cpu"], scene, cameras, slope)[1].opacities
-    want = rendered(ReferenceRenderer(), scene.map(torch.Tensor.double), cameras, slope)[1].opacities
+    grad = upstream(cameras)
+    got = rendered(RENDERERS["cpu"], scene, cameras, grad)[1].opacities
+    want = rendered(ReferenceRenderer(), scene.map(torch.Tensor.double), cameras, grad)[1].opacities
     assert float(want) != 0
     assert float(got) == pytest.approx(float(want), rel=1e-4)
 

@@ -38,10 +38,10 @@ def test_a_field_that_would_take_too_long_is_refused_before_it_is_looked_up(monk
     packet = encode_delta(Delta((field,)), state.layout, {}, frame=1)
     rows = len(apply_field(state.scene, field)[1])
     assert rows > 1
-    assert field.shape.effort == 8 * 6 + 6 * 5 + 5 * 5 + 5 * 7
-    monkeypatch.setattr("gsstream.core.changes.field.MAX_FLOPS", rows * field.shape.effort)
+    assert field.shape.flops == 8 * 6 + 6 * 5 + 5 * 5 + 5 * 7
+    monkeypatch.setattr("gsstream.core.changes.field.MAX_FLOPS", rows * field.shape.flops)
     decode_packet(state, packet.data)
-    monkeypatch.setattr("gsstream.core.changes.field.MAX_FLOPS", rows * field.shape.effort - 1)
+    monkeypatch.setattr("gsstream.core.changes.field.MAX_FLOPS", rows * field.shape.flops - 1)
     monkeypatch.setattr("gsstream.core.changes.hashgrid.FieldShape.corners", None)
     with pytest.raises(PacketError, match="expected a smaller network or fewer Gaussians") as caught:
         decode_packet(state, packet.data, offset=5)

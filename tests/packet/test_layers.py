@@ -54,7 +54,7 @@ def test_the_first_layer_is_there_as_soon_as_its_bytes_are(seed, number, share):
     assert found is not None
     assert same_bits(found.gaussians, quantise_key(state.gaussians).rows(np.flatnonzero(first)))
     assert found.frame == 5
-    assert found.meta.camera("left").near == 0.02
+    assert found.meta.camera("left").near_plane == 0.02
 
 
 def test_every_cut_gives_nothing_or_the_first_layer():

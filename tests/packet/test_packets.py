@@ -151,7 +151,7 @@ def test_meta_round_trip_keeps_every_bit():
     decoded = decode_key(encode_key(state).data).meta
     for split in ("train", "test"):
         a, b = getattr(meta, split), getattr(decoded, split)
-        assert (a.ids, a.width, a.height, a.near) == (b.ids, b.width, b.height, b.near)
+        assert (a.ids, a.width, a.height, a.near_plane) == (b.ids, b.width, b.height, b.near_plane)
         assert a.viewmats.tobytes() == b.viewmats.tobytes()
         assert a.Ks.tobytes() == b.Ks.tobytes()
     assert dataclasses.replace(decoded, train=meta.train, test=meta.test) == meta

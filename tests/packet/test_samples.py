@@ -42,7 +42,7 @@ def test_stored_streams_decode(version, name):
     with Playback(SAMPLES / version / f"{name}.gss") as playback:
         assert [digest(scene) for _, scene in playback] == expected(version)[name]
         playback.reader.check()
-        assert playback.meta.camera("held-out").near == 0.02
+        assert playback.meta.camera("held-out").near_plane == 0.02
 
 
 @pytest.mark.parametrize("version", VERSIONS)

@@ -100,10 +100,10 @@ def test_nothing_between_the_near_plane_and_the_camera_is_drawn():
     ball = dataclasses.replace(
         make_scene(6, 1), means=middle[None], scales=np.full((1, 3), -2, np.float32), opacities=np.float32([9])
     )
-    drawn, gone = (render(ball, dataclasses.replace(rig, near=near), 0, renderer=NUMPY) for near in (0.99, 1.01))
+    drawn, gone = (render(ball, dataclasses.replace(rig, near_plane=near), 0, renderer=NUMPY) for near in (0.99, 1.01))
     assert drawn.max() > 0.1
     assert gone.max() == 0
-    assert render(ball, dataclasses.replace(rig, near=1.01), 0).max() == 0, "the renderer that is installed"
+    assert render(ball, dataclasses.replace(rig, near_plane=1.01), 0).max() == 0, "the renderer that is installed"
 
 
 def test_an_empty_or_invisible_scene_shows_the_background():
@@ -177,7 +177,7 @@ def test_paths_are_valid_rigs_that_look_at_the_focus(kind, ring):
     assert focus_point(rig) == pytest.approx(target, abs=1e-9)
     path = camera_path(kind, rig, 12)
     path.validate()
-    assert (len(path), path.width, path.height, path.near) == (12, rig.width, rig.height, 0.2)
+    assert (len(path), path.width, path.height, path.near_plane) == (12, rig.width, rig.height, 0.2)
     seen = np.einsum("cij,j->ci", path.viewmats[:, :3, :3], target) + path.viewmats[:, :3, 3]
     assert np.abs(seen[:, :2]).max() < 1e-9
     assert seen[:, 2].min() > 1

@@ -16,7 +16,7 @@ from tools.drill import Capture, main, reported, there_and_back
 
 
 def line(index: int, latency: float, policy: str | None = None, **more: Any) -> dict[str, Any]:
-    live = {"latency_seconds": latency, "policy": policy, "effort": 1.0, "absent": []}
+    live = {"latency_seconds": latency, "policy": policy, "epoch_scale": 1.0, "absent": []}
     sizes = {"frame": index, "status": "delta", "bytes": {"header": 1000}, "seconds": {"code": 2.0}, "cpu_seconds": 1.0}
     return {**sizes, "live": live, **more}
 

@@ -110,7 +110,7 @@ def _encode_and_check(case: Case, parts: Assembly, catalog: Catalog, out: Path, 
 
 
 def _play(stream: Path, digests: list[str], background: tuple[float, float, float], salt: int) -> int:
-    """Every frame in order, then some out of order by a second player; number of Gaussians of the last."""
+    """Check all frames in order, then four in random order in a second player; return N of the last frame."""
     with Playback(stream) as playback:
         if len(playback) != len(digests):
             raise Fault(f"encoded {len(digests)} frames, the player finds {len(playback)}")

@@ -70,9 +70,9 @@ def field_rows(scene: Scene, shape: FieldShape, marks: IntArray | None) -> tuple
     able = np.arange(number) if marks is None else np.flatnonzero(marks)
     unit = shape.unit(scene.gaussians.means.take(able, 0))
     inside = np.flatnonzero(((unit >= 0) & (unit <= 1)).all(1))
-    if len(inside) * shape.effort > MAX_FLOPS:
+    if len(inside) * shape.flops > MAX_FLOPS:
         raise ShapeError(
-            f"field: {len(inside)} Gaussians by {shape.effort} multiplications are more than {MAX_FLOPS}; expected a "
+            f"field: {len(inside)} Gaussians by {shape.flops} multiplications are more than {MAX_FLOPS}; expected a "
             "smaller network or fewer Gaussians"
         )
     return able.take(inside), unit.take(inside, 0)

@@ -102,7 +102,7 @@ class FieldShape:
         return [self.levels * self.features, *[self.width] * self.layers, OUTPUTS]
 
     @property
-    def effort(self) -> int:
+    def flops(self) -> int:
         """Multiplications that a place takes."""
         widths = self.widths
         return 8 * widths[0] + sum(a * b for a, b in itertools.pairwise(widths))

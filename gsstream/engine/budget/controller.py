@@ -81,9 +81,9 @@ class Controller:
         entry["limits"] = limits
         entry["actual"] = {name: actual[name] for name in limits}
         entry["violated"] = [name for name, limit in limits.items() if actual[name] > limit]
-        if "spent" in entry:
-            entry["spent"] = {**entry["spent"], "seconds": seconds}
-            entry["bound"] = [name for name in entry.get("bound", []) if name in limits]
+        if "usage" in entry:
+            entry["usage"] = {**entry["usage"], "seconds": seconds}
+            entry["binding"] = [name for name in entry.get("binding", []) if name in limits]
         log.set(budget=entry)
         # As it will be read back: a resumed run must plan with the same numbers.
         self._note(json.loads(json.dumps({"frame": frame, "status": status, **log.entry()})))

@@ -63,19 +63,19 @@ class EpochScheduler(Schedule):
 
     Arguments:
         epochs, rd_lambda: of the plan. views: iterations of a pass.
-        effort: share of the passes that the frame is worth, and of the time that they have.
+        epoch_scale: share of the passes that the frame is worth, and of the time that they have.
     """
 
     def __init__(
-        self, allowance: Allowance, epochs: int, rd_lambda: float, views: int, effort: float = 1.0
+        self, allowance: Allowance, epochs: int, rd_lambda: float, views: int, epoch_scale: float = 1.0
     ) -> None:
         super().__init__(epochs, rd_lambda)
         plan = allowance.plan
         self._timed = allowance if plan.seconds is not None else None
         self.chunk = 1 if self._timed else None
         # With a time budget the number of passes in the plan is a prediction, and the clock may allow more.
-        self._most = max(epochs, round(effort * plan.max_epochs)) if self._timed else epochs
-        self._effort = effort
+        self._most = max(epochs, round(epoch_scale * plan.max_epochs)) if self._timed else epochs
+        self._epoch_scale = epoch_scale
         self.estimate = 0.0
         self._weights: list[float] = []
         self.stopped_by_clock = False
@@ -109,7 +109,7 @@ class EpochScheduler(Schedule):
         seconds, after = self._timed.plan.seconds, self._timed.plan.after
         kept = min(self._each, UNKNOWN_RESERVE * seconds) if after is None else after
         # A run that is behind hurries to catch up: what the passes of a hurried frame leave of its time is not theirs.
-        given_up = (1 - self._effort) * (seconds - kept - self.before)
+        given_up = (1 - self._epoch_scale) * (seconds - kept - self.before)
         return self._timed.started + seconds - kept - now - max(0.0, given_up)
 
     def finish(self) -> None:
@@ -184,11 +184,11 @@ def plan_of(budget: FrameBudget | None) -> FramePlan | None:
 
 def scheduled(stream: Stream, frame: Frame, budget: FrameBudget | None) -> Schedule:
     """Return the schedule of a frame: as the recipe, or the plan of its budget, says."""
-    epochs = max(1, round(stream.epochs * frame.effort))
+    epochs = max(1, round(stream.epochs * frame.epoch_scale))
     if budget is None:
         return Schedule(epochs, stream.rd_lambda)
     assert isinstance(budget, Allowance)
-    return EpochScheduler(budget, epochs, stream.rd_lambda, len(frame.cameras), frame.effort)
+    return EpochScheduler(budget, epochs, stream.rd_lambda, len(frame.cameras), frame.epoch_scale)
 
 
 def next_rate_weight(weight: float, expected: float, wanted: float) -> float:

@@ -71,18 +71,18 @@ class Past:
 
 def read_past_frame(metrics: Mapping[str, Any]) -> Past | None:
     """Return a line of ``metrics.jsonl`` as the planner sees it; None for frames that were not optimised."""
-    spent = metrics.get("budget", {}).get("spent")
-    if spent is None:
+    usage = metrics.get("budget", {}).get("usage")
+    if usage is None:
         return None
     return Past(
-        frame=int(metrics["frame"]), epochs=float(spent["epochs"]),
+        frame=int(metrics["frame"]), epochs=float(usage["epochs"]),
         candidates=int(metrics.get("candidate_gaussians", metrics["num_gaussians"])),
-        before=float(spent["before"]), optimise=float(spent["optimise"]),
-        after=float(spent["seconds"]) - float(spent["before"]) - float(spent["optimise"]),
-        weight=float(spent["rd_lambda"]), step_scale=float(spent["step_scale"]),
-        threshold=float(spent["change_threshold"]), estimate=float(spent["estimate"]),
-        untrimmed=int(spent["untrimmed"]), size=sum(metrics["bytes"].values()),
-        parts=float(spent["parts"]), part_scale=float(spent["part_scale"]),
+        before=float(usage["seconds_before"]), optimise=float(usage["seconds_optimise"]),
+        after=float(usage["seconds"]) - float(usage["seconds_before"]) - float(usage["seconds_optimise"]),
+        weight=float(usage["rd_lambda"]), step_scale=float(usage["step_scale"]),
+        threshold=float(usage["change_threshold"]), estimate=float(usage["estimated_bytes"]),
+        untrimmed=int(usage["untrimmed_bytes"]), size=sum(metrics["bytes"].values()),
+        parts=float(usage["parts"]), part_scale=float(usage["part_scale"]),
     )  # fmt: skip
 
 

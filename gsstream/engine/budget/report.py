@@ -37,10 +37,10 @@ def budget_lines(lines: Sequence[Mapping[str, Any]]) -> list[str]:
         of = [line["budget"] for line in held if name in line["budget"]["limits"]]
         limit, actual = of[-1]["limits"][name], [entry["actual"][name] for entry in of]
         inside = sum(name not in entry["violated"] for entry in of)
-        bound = sum(name in entry.get("bound", ()) for entry in of)
+        binding = sum(name in entry.get("binding", ()) for entry in of)
         text = f"budget {name} {quantity(name, limit)}: {inside} of {len(of)} frames inside; "
         text += f"median {quantity(name, median(actual))}, most {quantity(name, max(actual))}"
-        out.append(text if name == "memory" else f"{text}; it bound {bound} frames")
+        out.append(text if name == "memory" else f"{text}; it bound {binding} frames")
     out += _reductions(held)
     broken = [f"  frame {line['frame']}: {', '.join(violations(line))}" for line in held if line["budget"]["violated"]]
     if broken:
@@ -54,10 +54,10 @@ def budget_lines(lines: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _reductions(held: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What the frames gave up, by kind: in how many of them, and the median of how much."""
+    """What the budget reduced, by kind: in how many frames, and the median of how much."""
     found: dict[str, list[float]] = {}
     for line in held:
-        for name, value in line["budget"].get("given_up", {}).items():
+        for name, value in line["budget"].get("reduced", {}).items():
             found.setdefault(name, []).append(value[1] if isinstance(value, list) else value)
     words = {
         "rd_lambda": "rate weight raised to {:.1e}", "step_scale": "steps {:.1f} times coarser",

@@ -27,33 +27,34 @@ def spent(budget: Allowance, used: Mapping[str, Any], stream: Stream, epochs: fl
     ``used`` is that of :func:`usage`; ``stream`` holds the recipe's own settings, from which the plan departed.
     """
     plan = budget.plan
-    given_up: dict[str, Any] = {}
+    reduced: dict[str, Any] = {}
     if plan.max_bytes is not None:
         if used["rd_lambda"] > 1.05 * stream.rd_lambda:
-            given_up["rd_lambda"] = [stream.rd_lambda, used["rd_lambda"]]
+            reduced["rd_lambda"] = [stream.rd_lambda, used["rd_lambda"]]
         if plan.step_scale > 1:
-            given_up["step_scale"] = plan.step_scale
-        given_up |= {name: number for name, number in used["dropped"].items() if number}
-    bound = ["size"] if given_up else []
+            reduced["step_scale"] = plan.step_scale
+        reduced |= {name: number for name, number in used["dropped"].items() if number}
+    binding = ["size"] if reduced else []
     if plan.seconds is not None:
         if epochs < stream.epochs and used["stopped_by_clock"]:
-            given_up["epochs"] = stream.epochs - epochs
+            reduced["epochs"] = stream.epochs - epochs
         if plan.part_scale < 1:
-            given_up["part_scale"] = plan.part_scale
-            bound.append("time")
+            reduced["part_scale"] = plan.part_scale
+            binding.append("time")
         if plan.change_threshold > stream.change_threshold:
-            given_up["change_threshold"] = [stream.change_threshold, plan.change_threshold]
+            reduced["change_threshold"] = [stream.change_threshold, plan.change_threshold]
         if used["stopped_by_clock"]:
-            bound.append("time")
+            binding.append("time")
     known = {"time": plan.predicted_seconds, "size": plan.predicted_bytes}
     return {
         "predicted": {name: value for name, value in known.items() if value is not None},
-        "bound": bound,
-        "given_up": given_up,
-        "spent": {
+        "binding": binding,
+        "reduced": reduced,
+        "usage": {
             "epochs": epochs, "planned_epochs": plan.epochs, "rd_lambda": used["rd_lambda"],
-            "step_scale": plan.step_scale, "change_threshold": plan.change_threshold, "estimate": used["estimate"],
-            "untrimmed": used["untrimmed"], "before": used["before"], "optimise": used["optimise"],
+            "step_scale": plan.step_scale, "change_threshold": plan.change_threshold,
+            "estimated_bytes": used["estimate"], "untrimmed_bytes": used["untrimmed"],
+            "seconds_before": used["before"], "seconds_optimise": used["optimise"],
             "parts": used["parts"], "part_scale": plan.part_scale,
         },
     }  # fmt: skip

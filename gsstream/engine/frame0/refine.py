@@ -54,7 +54,7 @@ def runs_after_packet(stream: Stream, state: StreamState, frame: Frame) -> bool:
     if not is_refining(stream, state):
         return False
     made = 0 if state.refinement is None else state.refinement.iterations
-    return made + (stream.refine_iterations if frame.effort > 0 else 0) < _iterations(stream)
+    return made + (stream.refine_iterations if frame.epoch_scale > 0 else 0) < _iterations(stream)
 
 
 def is_refining(stream: Stream, state: StreamState) -> bool:
@@ -86,7 +86,7 @@ def advance_refinement(
 ) -> Refinement:  # fmt: skip
     """Return the refinement after a frame: moved as the stream moved, and optimised on the frame's pictures."""
     start, stream = track_motion(refinement, before, after), parts.recipe.stream
-    if frame.effort == 0 or is_refined(stream, start):
+    if frame.epoch_scale == 0 or is_refined(stream, start):
         return start
     generator = rng.stream("refine", frame.index)
     run = FirstFrameRun(start.gaussians, start.levels, frame, parts, generator, _iterations(stream))

@@ -36,7 +36,7 @@ def key_packet_if_due(parts: Assembly, step: Step, frame: Frame, tools: Tools) -
     if reason is None:
         return step
     # A skipped frame stays an empty packet: it must not fail, and a key packet would take the time that skipping saves.
-    refused = "the frame is skipped" if frame.effort == 0 else tools.key_refusal(len(state.gaussians))
+    refused = "the frame is skipped" if frame.epoch_scale == 0 else tools.key_refusal(len(state.gaussians))
     if refused is not None:
         return _postponed(step, reason, refused, tools)
     # A refined scene was fitted to the pictures of this frame; another may show older ones.

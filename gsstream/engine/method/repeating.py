@@ -22,7 +22,7 @@ class SkippedWorkWarning(UserWarning):
 
 
 class Repeating(StreamingMethod[Any]):
-    """Calls a method; where it fails, calls it again with the same frame at effort 0.
+    """Calls a method; where it fails, calls it again with the same frame and epoch scale 0.
 
     That call must be answered by an empty packet. A method that sends something else breaks its contract, and the
     failure is raised.
@@ -47,7 +47,7 @@ class Repeating(StreamingMethod[Any]):
             return self._method.step(state, frame, tools)
         except (ComponentError, ShapeError) as error:
             tools.log.give_up(error, mark)
-            step = self._method.step(state, replace(frame, effort=0.0), tools)
+            step = self._method.step(state, replace(frame, epoch_scale=0.0), tools)
             if step.status != "empty":
                 raise
             warnings.warn(
@@ -61,7 +61,7 @@ class Repeating(StreamingMethod[Any]):
             return self._method.follow_up(state, step, frame, tools)
         except (ComponentError, ShapeError) as error:
             tools.log.give_up(error, mark)
-            found = self._method.follow_up(state, step, replace(frame, effort=0.0), tools)
+            found = self._method.follow_up(state, step, replace(frame, epoch_scale=0.0), tools)
             warnings.warn(
                 f"frame {frame.index}: its packet is sound, but the work that follows it failed and is left out: "
                 f"{error}", SkippedWorkWarning, stacklevel=2

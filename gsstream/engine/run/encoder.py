@@ -54,31 +54,31 @@ class Encoder:
 
     :meth:`encode` takes the frames in order and returns a :class:`gsstream.method.base.Step` for each: its ``packet``
     is what a player reads, its ``metrics`` say what the frame cost. A frame that fails leaves the encoder as it was.
-    A packet that others wait for is best taken from ``listeners``: with some methods work follows it in the same call.
+    ``callbacks.packet`` gets a packet as soon as it is made; some methods work on after it in the same call.
 
     Arguments:
         parts: the live parts of a recipe (``engine.assembly.assemble``).
-        info: what the recording says about itself: cameras, frames per second, names.
-        seeds: makes the points that frame 0 starts from; None: a plane sweep over its training images.
-        first_frame: frame 0 of another stream, taken over instead of being reconstructed.
-        listeners: what is told of the work.
-        place: frames bring cameras in the recording's coordinates, which are taken to those of ``info``.
+        info: cameras, frames per second and names of the recording.
+        seeds: function that makes the points frame 0 starts from; None: a plane sweep over its training images.
+        first_frame: frame 0 of another stream, used instead of a reconstruction.
+        callbacks: functions called with every packet and with the progress of frame 0.
+        transform_cameras: transform cameras of frames from recording coordinates to those of ``info``.
     """
 
     def __init__(
         self, parts: Assembly, info: SourceInfo, seeds: Seeds | None = None, *, first_frame: PlayerState | None = None,
-        listeners: Callbacks | None = None, place: bool = False,
+        callbacks: Callbacks | None = None, transform_cameras: bool = False,
     ) -> None:  # fmt: skip
         held = sized(parts.recipe.budget, info.fps)
         self.controller = Controller(held, parts.recipe.stream)
         self.parts = replace(parts, recipe=parts.recipe.model_copy(update={"budget": held}))
-        self.info, self._place = info, place
+        self.info, self._transform_cameras = info, transform_cameras
         self.rng = Rng(parts.recipe.seed)
-        self.near = parts.recipe.near * info.train.extent
+        self.near_plane = parts.recipe.near * info.train.extent
         #: State after the last frame; None before frame 0.
         self.state: Any = None
         self._first = None if first_frame is None else to_stream_coordinates(first_frame, info.world)
-        self._seeds, self._listeners = seeds or self._swept, listeners or Callbacks()
+        self._seeds, self._listeners = seeds or self._swept, callbacks or Callbacks()
 
     @property
     def parts(self) -> Assembly:
@@ -149,8 +149,10 @@ class Encoder:
 
     def with_near_plane(self, frame: Frame) -> Frame:
         """Return the frame with the near plane that the recipe gives this rig, in the stream's coordinates."""
-        cameras = snap_cameras(self.info.world.inverse_cameras(frame.cameras)) if self._place else frame.cameras
-        return replace(frame, cameras=replace(cameras, near=self.near))
+        cameras = frame.cameras
+        if self._transform_cameras:
+            cameras = snap_cameras(self.info.world.inverse_cameras(cameras))
+        return replace(frame, cameras=replace(cameras, near_plane=self.near_plane))
 
     def _tools(self, **changes: Any) -> RunTools:
         return RunTools(
@@ -175,7 +177,7 @@ class Encoder:
             source=info.name,
             recipe=recipe.model_dump(mode="json"),
             train=frame.cameras,
-            test=replace(info.test, near=self.near),
+            test=replace(info.test, near_plane=self.near_plane),
             fps=info.fps,
             background=recipe.background,
             plugins={name: version(name) for name in sorted(distributions)},

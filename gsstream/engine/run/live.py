@@ -24,14 +24,15 @@ def live_metrics(frame: Frame, written: float) -> dict[str, Any] | None:
     ``latency_seconds``: from the moment when the frame's last image was complete to the moment when its packet was;
     None when its files were gone by then. It is not bounded below: a negative one says that the clock which dates the
     images is ahead. ``policy``: what the options of the source did to the frame, None for nothing.
-    ``effort``: share of the recipe's epochs that was asked for. ``absent``: training cameras without an image.
+    ``epoch_scale``: share of the recipe's epochs that was asked for. ``absent``: training cameras without an image.
     """
     arrival = frame.arrival
     if arrival is None:
         return None
     latency = None if arrival.complete is None else written - arrival.complete
     return {
-        "latency_seconds": latency, "policy": _policy(frame), "effort": frame.effort, "absent": list(arrival.absent),
+        "latency_seconds": latency, "policy": _policy(frame), "epoch_scale": frame.epoch_scale,
+        "absent": list(arrival.absent),
     }  # fmt: skip
 
 
@@ -40,9 +41,9 @@ def _policy(frame: Frame) -> str | None:
     if frame.index == 0:
         return None  # always done in full, of every camera
     absent = bool(frame.arrival and frame.arrival.absent)
-    if frame.effort == 0:
+    if frame.epoch_scale == 0:
         return "missing" if absent else "dropped"
-    return "hurried" if frame.effort < 1 else "held" if absent else None
+    return "hurried" if frame.epoch_scale < 1 else "held" if absent else None
 
 
 def latency_words(metrics: Mapping[str, Any]) -> list[str]:

@@ -1,4 +1,4 @@
-"""metrics.jsonl of a run, one JSON object per frame: read, and what of it stays when the run goes on."""
+"""Read, append to and trim ``metrics.jsonl``, which holds one JSON object per frame of a run."""
 
 from __future__ import annotations
 

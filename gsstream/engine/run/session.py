@@ -108,7 +108,7 @@ class _Run:
         self.held_out = HeldOut(parts.renderer, parts.recipe.background) if measure else None
         self.progress = RunProgress(self.total, quiet)
         listeners = Callbacks(packet=self._write, progress=self.progress.first_frame)
-        self.encoder = Encoder(parts, source.info, self._seeds, first_frame=first_frame, listeners=listeners)
+        self.encoder = Encoder(parts, source.info, self._seeds, first_frame=first_frame, callbacks=listeners)
         self.writer: StreamWriter
         #: When the last packet was complete in the file, seconds since 1970.
         self.written = 0.0
@@ -191,7 +191,8 @@ def _num_frames(info: SourceInfo, wanted: int | None) -> int | None:
 def _timed(frames: Prefetcher, source: FrameSource) -> Iterator[tuple[Frame, Frame, float]]:
     """(train, test, seconds waited for decoding) of every frame.
 
-    Frames are read ahead, and the run may have fallen behind since: an adaptive source is asked again for their effort.
+    Frames are read ahead, and the run may have fallen behind since: an adaptive source is asked again for their epoch
+    scale.
     """
     while True:
         started = time.perf_counter()
@@ -201,7 +202,7 @@ def _timed(frames: Prefetcher, source: FrameSource) -> Iterator[tuple[Frame, Fra
             return
         waited = time.perf_counter() - started
         if train.arrival is not None and isinstance(source, AdaptiveSource):
-            train = replace(train, effort=min(train.effort, source.effort(train.index)))
+            train = replace(train, epoch_scale=min(train.epoch_scale, source.epoch_scale(train.index)))
         yield train, test, waited
 
 

@@ -68,7 +68,7 @@ class RunTools:
 
     def epochs(self, frame: Frame) -> int:
         epochs = self.parts.recipe.stream.epochs if self.budget is None else self.budget.epochs
-        return max(1, round(epochs * frame.effort))
+        return max(1, round(epochs * frame.epoch_scale))
 
     def since_key(self) -> Iterator[PlayerState]:
         return self.replay()

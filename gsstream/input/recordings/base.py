@@ -100,5 +100,5 @@ class LiveSource(FrameSource, Protocol):
 class AdaptiveSource(LiveSource, Protocol):
     """A growing recording that may ask for less work on a frame when the run has fallen behind."""
 
-    def effort(self, index: int) -> float:
+    def epoch_scale(self, index: int) -> float:
         """Return the share of the epochs that a frame is worth, now that it is to be encoded; 0: an empty packet."""

@@ -87,9 +87,9 @@ class CanonicalSource:
         if isinstance(self._source, LiveSource):
             self._source.interrupt()
 
-    def effort(self, index: int) -> float:
+    def epoch_scale(self, index: int) -> float:
         """Return what a frame of an inner source that grows is worth now; 1 of any other."""
-        return self._source.effort(index) if isinstance(self._source, AdaptiveSource) else 1.0
+        return self._source.epoch_scale(index) if isinstance(self._source, AdaptiveSource) else 1.0
 
     def close(self) -> None:
         """Close the inner source."""

@@ -102,7 +102,7 @@ class TransformedSource:
             there = {name for frame in cache.values() for name in frame.cameras.ids}
             cameras = cameras if there.issuperset(cameras.ids) else cameras.select([])
             images = images[: len(cameras)]
-        effort = min((frame.effort for frame in cache.values()), default=1.0)
+        epoch_scale = min((frame.epoch_scale for frame in cache.values()), default=1.0)
         bad = False
         for row, name in enumerate(cameras.ids):
             shown = self._delivered_frame(name, index) if split == "train" else index
@@ -116,8 +116,8 @@ class TransformedSource:
         if bad and split == "test":  # nothing is measured against an image of another time
             cameras, images = cameras.select([]), images[:0]
         if bad and split == "train" and self._options.bad_image == "drop":
-            effort = 0.0
-        return Frame(index, index / self._info.fps, images, cameras, effort, self._arrival(cache.values()))
+            epoch_scale = 0.0
+        return Frame(index, index / self._info.fps, images, cameras, epoch_scale, self._arrival(cache.values()))
 
     def _arrival(self, read: Collection[Frame]) -> Arrival | None:
         """How a frame came in that is made of these of the inner source: with the last of them."""
@@ -154,9 +154,9 @@ class TransformedSource:
         if isinstance(self._source, LiveSource):
             self._source.interrupt()
 
-    def effort(self, index: int) -> float:
+    def epoch_scale(self, index: int) -> float:
         """Return what a frame of an inner source that grows is worth now; 1 of any other."""
-        return self._source.effort(self._start + index) if isinstance(self._source, AdaptiveSource) else 1.0
+        return self._source.epoch_scale(self._start + index) if isinstance(self._source, AdaptiveSource) else 1.0
 
     def close(self) -> None:
         """Close the inner source."""

@@ -24,12 +24,12 @@ from gsstream.input.recordings.watch_options import WatchOptions
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """What is delivered as one frame: ``effort``, and from which earlier frame cameras are held.
+    """What is delivered as one frame: ``epoch_scale``, and from which earlier frame cameras are held.
 
     ``skipped``: the run is behind; nobody looks at its files, and the last images of all training cameras stand in.
     """
 
-    effort: float = 1.0
+    epoch_scale: float = 1.0
     held: tuple[tuple[str, int], ...] = ()
     skipped: bool = False
 
@@ -106,11 +106,11 @@ class WatchSource:
         for i, camera_id in enumerate(cameras.ids):
             images[i] = self._image(camera_id, held.get(camera_id, index))
         arrival = self._arrival(index, () if plan.skipped else held)
-        return Frame(index, index / self._info.fps, images, cameras, plan.effort, arrival)
+        return Frame(index, index / self._info.fps, images, cameras, plan.epoch_scale, arrival)
 
-    def effort(self, index: int) -> float:
+    def epoch_scale(self, index: int) -> float:
         """Return what a frame is worth now that its turn has come: more may wait than when it was read ahead."""
-        return 1.0 if index == 0 else min(self._plan(index).effort, self._effort(index))
+        return 1.0 if index == 0 else min(self._plan(index).epoch_scale, self._effort(index))
 
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
         """Return points that were written beside cameras.json before the run began, or None."""

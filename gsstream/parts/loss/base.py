@@ -27,8 +27,8 @@ class Loss(Part):
             image: [H, W, 3] rendered.
             prepared: what :meth:`prepare` returned of the target.
             dssim: weight w of 1 - SSIM, 0 to 1.
-            tile_mask: [ceil(H / 16), ceil(W / 16)] bool, the only tiles that differ from an image judged before. The
-                sum then runs over them and the tiles beside them, whose windows see them, divided by the number of all
-                pixels. In masked tiles the gradient is that of the whole loss; elsewhere it is 0. A full mask equals
-                no mask. The tiles beside must hold what the whole image has there.
+            tile_mask: [ceil(H / 16), ceil(W / 16)] bool, tiles to evaluate; None: all. The sum runs over these tiles
+                and their neighbours, whose SSIM windows overlap them, divided by the number of pixels of the image.
+                In these tiles the gradient is that of the whole loss; elsewhere it is 0. ``image`` must be valid in
+                the neighbours too.
         """

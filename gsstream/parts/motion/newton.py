@@ -15,28 +15,24 @@ from gsstream.parts.render.wrt import WrtTransforms
 
 
 class Damping(NamedTuple):
-    """What holds steps back where the images say little.
+    """Levenberg-Marquardt damping, which shortens steps where the curvature is small.
 
     Arguments:
-        share: of the mean curvature of a group's six numbers, or of all groups if that is larger, is added to each.
-        hold: curvature that is added besides, per pixel^2, of the sum over the values of a picture.
-        longest: the longest step of a number, pixels.
+        relative: share of the group's mean curvature, or of the mean over all groups if larger, on the diagonal.
+        absolute: curvature added to the diagonal besides: summed over the values of an image, per pixel^2.
+        max_step: largest change of any of the six numbers in one step, pixels.
     """
 
-    share: float
-    hold: float
-    longest: float
+    relative: float
+    absolute: float
+    max_step: float
 
 
 class DampedNewton:
-    """Descends along slopes of one view after another, each divided by the curvature of all views seen so far.
+    """Descends along the gradient of one view after another, divided by the summed curvature of the views so far.
 
-    Recursive least squares: after a pass every view has had its say with equal weight, and what a later one adds is
-    ever less. In a further pass views are taken to curve as they did in the first.
-
-    Arguments:
-        values: [K, 6] where it begins, in pixels.
-        damping: of the steps.
+    Because the sum grows, later views take shorter steps: after an epoch all views have the same weight (recursive
+    least squares). Later epochs reuse the mean curvature of the first.
     """
 
     def __init__(self, values: FloatArray, damping: Damping) -> None:
@@ -44,24 +40,24 @@ class DampedNewton:
         self._total, self._measured, self._seen = np.zeros((len(values), 6, 6)), 0, 0
 
     def step(self, grad: FloatArray, curvature: FloatArray | None = None) -> None:
-        """Replace ``values``: one step against a view's slope [K, 6]."""
+        """Replace ``values``: one step against the gradient [K, 6] of a view."""
         self._seen += 1
         if curvature is not None:
             self._total += curvature
             self._measured += 1
         matrix = self._total * (self._seen / self._measured)
         mean = np.trace(matrix, axis1=1, axis2=2) / 6
-        added = self._damping.share * np.maximum(mean, mean.mean()) + self._damping.hold
+        added = self._damping.relative * np.maximum(mean, mean.mean()) + self._damping.absolute
         step = np.linalg.solve(matrix + added[:, None, None] * np.eye(6), grad[..., None])[..., 0]
         longest = np.abs(step).max(1, keepdims=True)
-        self.values = self.values - step * np.minimum(1.0, self._damping.longest / np.maximum(longest, 1e-12))
+        self.values = self.values - step * np.minimum(1.0, self._damping.max_step / np.maximum(longest, 1e-12))
 
 
 def fit_transforms_newton(
     scene: Scene, work: FitContext, start: GroupTransforms, unit: FloatArray, iterations: int,
     order: np.random.Generator, damping: Damping, tiles: Literal["all", "changed"] = "all",
 ) -> FloatArray:  # fmt: skip
-    """Return the shifts and turns [K, 6] of groups that explain the images best."""
+    """Return the translations and rotations [K, 6] of groups that minimise the loss of the images."""
     views, values = len(work.cameras), 3 * work.cameras.height * work.cameras.width
     work.narrow(torch.from_numpy(start.rows))
     base = scene.gaussians.rows(start.rows).map(torch.from_numpy)

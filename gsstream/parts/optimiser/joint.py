@@ -7,7 +7,7 @@ where an attribute has no decoder), what changes the columns of one [A, D] table
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, final
+from typing import NamedTuple, final
 
 import torch
 
@@ -16,9 +16,7 @@ from gsstream.core.joint import JointLayout
 from gsstream.parts.optimiser.rate import rate_gradient
 from gsstream.parts.optimiser.residual import ResidualOptimiser
 from gsstream.parts.optimiser.row_parameters import RowParameters
-
-if TYPE_CHECKING:
-    from gsstream.parts.optimiser.base import RowOptimiser
+from gsstream.parts.optimiser.state import RowSteps
 
 
 def join_features(code: JointLayout, rows: Gaussians[torch.Tensor]) -> torch.Tensor:
@@ -102,11 +100,11 @@ def joint_vjp(
 
 @final
 class JointResidualOptimiser(ResidualOptimiser):
-    """Calls the functions above, the rate's gradient and the optimiser's ``step``: the truth for faster ones."""
+    """Calls the functions above, the rate's gradient and the optimiser's ``step``: the reference for faster ones."""
 
     def __init__(
         self, code: JointLayout, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor,
-        optimiser: RowOptimiser,
+        optimiser: RowSteps,
     ) -> None:  # fmt: skip
         self._code, self._base, self._units = code, base, units
         self._features = join_features(code, base)

@@ -128,16 +128,16 @@ class ResidualOptimiser(ABC):
 
     @abstractmethod
     def backward(self, grad: Gaussians[torch.Tensor], rd_lambda: float) -> torch.Tensor:
-        """Take the gradient by the rows that were returned last, and return that by their gates [A].
+        """Backpropagate dL/drows to latents, decoders and gates; return dL/dgates [A].
 
         Arguments:
-            grad: like the rows.
+            grad: dL/drows, shaped like the rows that :meth:`forward` returned last.
             rd_lambda: loss per bit of the latents behind open gates; 0: bits cost nothing.
         """
 
     @abstractmethod
     def step(self, lr_factor: float = 1.0) -> None:
-        """Make one step of Adam from the last gradient, and what waits on ``latents``.
+        """Make one Adam step from the last :meth:`backward`, plus the gradient in ``latents.grad``.
 
         Arguments:
             lr_factor: on the learning rates of latents and decoders in this step, >= 0.

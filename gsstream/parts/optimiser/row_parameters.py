@@ -4,24 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import torch
 
 from gsstream.core.topology import TopologyEdit
-from gsstream.parts.optimiser.state import AdamState
-
-if TYPE_CHECKING:
-    from gsstream.parts.optimiser.base import RowOptimiser
+from gsstream.parts.optimiser.state import AdamState, RowSteps
 
 EMPTY: Mapping[str, torch.Tensor] = MappingProxyType({})
 
 
 class RowParameters:
-    """Named leaves [n, ...], one learning rate each, moved by a :class:`RowOptimiser`."""
+    """Named leaves [n, ...], one learning rate each, moved by a row optimiser."""
 
     def __init__(
-        self, values: Mapping[str, torch.Tensor], lrs: Mapping[str, float | torch.Tensor], optimiser: RowOptimiser
+        self, values: Mapping[str, torch.Tensor], lrs: Mapping[str, float | torch.Tensor], optimiser: RowSteps
     ) -> None:
         self.leaves = {name: value.detach().clone().requires_grad_() for name, value in values.items()}
         self._lrs, self._optimiser = dict(lrs), optimiser
@@ -31,7 +27,7 @@ class RowParameters:
         return self.leaves[name]
 
     def step(self, gradients: Mapping[str, torch.Tensor] = EMPTY, lr_factor: float = 1.0) -> None:
-        """Make one Adam step from ``gradients`` and whatever waits on the leaves, which is then dropped.
+        """Make one Adam step from ``gradients`` plus the ``.grad`` of the leaves, which is then cleared.
 
         Arguments:
             gradients: name -> gradient, like its leaf; leaves without one are not moved.

@@ -82,7 +82,7 @@ class ReferenceRenderer(Renderer):
         if probe is not None:
             means2d = means2d + probe
         order = torch.argsort(depths.detach(), stable=True)
-        order = order[depths.detach()[order] > cameras.near]
+        order = order[depths.detach()[order] > cameras.near_plane]
         parts = (means2d[order], conics[order], colors[order], opacities[order])
         images, alphas = [], []
         for start in range(0, cameras.height, self.config.rows_per_pass):
@@ -125,7 +125,7 @@ def project(
     points = gaussians.means @ rotation.T + translation  # [N, 3] camera space
     # Points at or behind the camera are removed later; until then a depth of 1 keeps their unused arithmetic finite.
     depth = points[:, 2]
-    safe = torch.where(depth > cameras.near, depth, torch.ones_like(depth))
+    safe = torch.where(depth > cameras.near_plane, depth, torch.ones_like(depth))
     K = torch.as_tensor(cameras.Ks[view], dtype=dtype)
     fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
     width, height = cameras.width, cameras.height
@@ -166,7 +166,7 @@ def footprint_in_image(gaussians: Gaussians[torch.Tensor], cameras: Cameras, vie
     half = (reach[:, None].clamp_min(0) * variances).sqrt()
     far_corner = torch.tensor([cameras.width, cameras.height], dtype=means2d.dtype) - 0.5
     inside: torch.Tensor = ((means2d + half >= 0.5) & (means2d - half <= far_corner)).all(1)
-    return inside & (depths > cameras.near) & (reach >= 0)
+    return inside & (depths > cameras.near_plane) & (reach >= 0)
 
 
 def composite(

@@ -53,7 +53,7 @@ def _on_screen(means: FloatArray, transforms: GroupTransforms, cameras: Cameras,
     """[A, 2, 6] derivative of each row's place on the screen, pixels, by shift and turn of its group."""
     rotation, focal = cameras.viewmats[view, :3, :3], np.diag(cameras.Ks[view])[:2]
     seen = means @ rotation.T + cameras.viewmats[view, :3, 3]
-    depth = np.maximum(seen[:, 2], cameras.near)
+    depth = np.maximum(seen[:, 2], cameras.near_plane)
     tangents = (seen[:, :2] / depth[:, None])[..., None]
     translation = (focal / depth[:, None])[..., None] * (rotation[:2] - tangents * rotation[2])
     arm = means - (transforms.center + transforms.translation)[transforms.group]

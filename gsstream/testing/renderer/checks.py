@@ -176,7 +176,7 @@ def _reached(scene: Scene, cameras: Cameras, view: int, mask: torch.Tensor) -> t
         # A tile at the image's edge counts whole: renderers draw blocks of pixels.
         first = torch.tensor([column, row], dtype=torch.float64) * TILE + 0.5
         found |= ((means + half >= first) & (means - half <= first + TILE - 1)).all(1)
-    return found & (depths > cameras.near) & (reach >= -0.01)
+    return found & (depths > cameras.near_plane) & (reach >= -0.01)
 
 
 @check("renderer")

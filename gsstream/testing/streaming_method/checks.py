@@ -183,9 +183,9 @@ def check_method_meta(method: MethodUnderTest) -> None:
 
 @check("method", kinds=("method", "streaming_method"))
 def check_method_skips(method: MethodUnderTest) -> None:
-    """A frame that is worth no effort becomes an empty packet, and the stream goes on from it."""
+    """A frame whose epoch scale is 0 becomes an empty packet, and the stream goes on from it."""
     state, frame = method.steps[0].state, open_source(SOURCE).frame(1)
-    step = method.step(state, replace(frame, effort=0.0))
-    assert step.status == "empty", f"expected an empty packet for effort 0, got {step.status} ({step.packet.sizes})"
+    step = method.step(state, replace(frame, epoch_scale=0.0))
+    assert step.status == "empty", f"expected an empty packet, got {step.status} ({step.packet.sizes})"
     after = method.step(step.state, open_source(SOURCE).frame(2))
     assert after.packet.frame == 2, f"expected to go on with frame 2, got {after.packet.frame}"

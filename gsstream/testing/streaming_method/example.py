@@ -54,7 +54,7 @@ class ExampleMethod(StreamingMethod[Carried]):
         views = range(len(frame.cameras))
         shift = torch.stack([(work.image(v) - work.previous_render(v)).mean((0, 1)) for v in views]).mean(0) / SH0
         symbols = torch.round(shift / self.config.step).to(torch.int32).numpy()
-        if frame.effort == 0 or not symbols.any():
+        if frame.epoch_scale == 0 or not symbols.any():
             packet, player = send_delta(state.player, Delta())
             return Step(Carried(player), packet, "empty")
         rows = np.tile(symbols, (len(state.player.gaussians), 1))

@@ -75,7 +75,7 @@ def reference(
     probe = torch.zeros(len(splats.means), 2, dtype=torch.float64, requires_grad=True)
     means2d, conics, colors, depths, opacities = project(leaves, cameras, 0)
     order = torch.argsort(depths.detach(), stable=True)
-    order = order[depths.detach()[order] > cameras.near]
+    order = order[depths.detach()[order] > cameras.near_plane]
     parts = ((means2d + probe)[order], conics[order], colors[order], opacities[order])
     image, alpha = composite(*parts, 0, height, width, torch.tensor(BACKGROUND, dtype=torch.float64))
     ((image * torch.tensor(v_image)).sum() + (alpha * torch.tensor(v_alpha)).sum()).backward()

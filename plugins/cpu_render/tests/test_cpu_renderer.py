@@ -80,7 +80,7 @@ def test_screen_gradient_agrees_with_the_reference_renderer() -> None:
 
 def test_near_plane_of_the_rig_is_used() -> None:
     cameras = rig()
-    cut = Cameras(cameras.ids, cameras.viewmats, cameras.Ks, WIDTH, HEIGHT, near=3.0)
+    cut = Cameras(cameras.ids, cameras.viewmats, cameras.Ks, WIDTH, HEIGHT, near_plane=3.0)
     got = CpuRenderer().render(scene(), cut, 0, BACKGROUND).image
     want = ReferenceRenderer().render(scene().map(torch.Tensor.double), cut, 0, BACKGROUND).image
     assert float((got - want).abs().max()) < 2e-5

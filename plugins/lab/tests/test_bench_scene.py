@@ -90,7 +90,7 @@ def test_live_pairs_are_those_of_a_naive_count() -> None:
     counts = live_pairs(footprints(made, camera))
     means2d, conics, _, depths, opacities = project(made.map(torch.from_numpy), camera, 0)
     naive = np.zeros((30, 40), np.int64)
-    order = [i for i in torch.argsort(depths, stable=True).tolist() if depths[i] > camera.near]
+    order = [i for i in torch.argsort(depths, stable=True).tolist() if depths[i] > camera.near_plane]
     for y in range(30):
         for x in range(40):
             light = 1.0

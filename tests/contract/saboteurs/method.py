@@ -33,7 +33,7 @@ class Remembered(MethodUnderTest):
 
     def step(self, state: Any, frame: Frame) -> Step[Any]:
         seen = (state.player.gaussians, state.previous, frame)
-        key = b"".join([*fingerprint(seen), str(frame.effort).encode()])
+        key = b"".join([*fingerprint(seen), str(frame.epoch_scale).encode()])
         if key not in self.memory:
             self.memory[key] = super().step(state, frame)
         return self.memory[key]
@@ -182,4 +182,4 @@ class Workaholic(Remembered):
     """Does every frame in full, whatever it is worth."""
 
     def step(self, state: Any, frame: Frame) -> Step[Any]:
-        return super().step(state, replace(frame, effort=1.0))
+        return super().step(state, replace(frame, epoch_scale=1.0))

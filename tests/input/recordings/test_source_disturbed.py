@@ -132,7 +132,7 @@ def test_a_bad_image_is_repeated_or_its_frame_dropped(policy, damaged) -> None:
         if bad:
             expected[0] = whole.frame(2).images[0]
         assert np.array_equal(frame.images, expected)
-        assert frame.effort == (0.0 if bad and policy == "drop" else 1.0)
+        assert frame.epoch_scale == (0.0 if bad and policy == "drop" else 1.0)
         assert len(test.cameras) == len(test.images) == (0 if index == 5 else len(whole.info.test))
         words = " ".join(str(w.message) for w in told if issubclass(w.category, RecordingWarning))
         assert (f"frame {index}, camera" in words) == (bad or index == 5)

@@ -55,7 +55,7 @@ def test_an_absent_test_camera_is_not_measured(folder: Path, test_camera: str) -
     (folder / test_camera / "000001.jpg").unlink()
     live = open_source(f"watch:{folder}?missing=hold&grace=0", 0.25)
     assert [len(live.frame(t, "test").cameras) for t in range(3)] == [1, 0, 1]
-    assert live.frame(1).effort == 1
+    assert live.frame(1).epoch_scale == 1
     through = disturbed(live, gain=0.5)
     assert [len(through.frame(t, "test").cameras) for t in range(3)] == [1, 0, 1]
     assert np.array_equal(through.frame(1).images, np.float32(0.5) * live.frame(1).images)
@@ -63,8 +63,8 @@ def test_an_absent_test_camera_is_not_measured(folder: Path, test_camera: str) -
 
 def test_transforms_keep_what_a_dropped_frame_is_worth(folder: Path) -> None:
     live = open_source(f"watch:{folder}?behind=drop&queue=2", 0.25)
-    assert [disturbed(live, gain=0.5).frame(t).effort for t in (0, 9, 10)] == [0, 0, 0]
-    assert live.frame(11).effort == 1
+    assert [disturbed(live, gain=0.5).frame(t).epoch_scale for t in (0, 9, 10)] == [0, 0, 0]
+    assert live.frame(11).epoch_scale == 1
 
 
 def test_a_frame_came_in_with_its_last_image_of_either_split(folder: Path, test_camera: str) -> None:
@@ -100,11 +100,11 @@ def test_a_frame_that_is_skipped_is_not_even_read(folder: Path, test_camera: str
         (folder / camera / "000005.jpg").write_bytes(b"no picture")
     for source in (live, disturbed(live, gain=1.0, noise_frames=1)):
         skipped = source.frame(5)
-        assert (skipped.effort, skipped.images.tobytes()) == (0, first.tobytes()), "the last pictures stand in"
+        assert (skipped.epoch_scale, skipped.images.tobytes()) == (0, first.tobytes()), "the last pictures stand in"
         assert skipped.arrival is not None
         assert skipped.arrival.absent == (), "no camera is missing: the run is behind"
         assert [len(source.frame(t, "test").cameras) for t in (0, 5, 11)] == [1, 0, 1], "nor is it measured"
-    assert live.frame(11).effort == 1
+    assert live.frame(11).epoch_scale == 1
     assert not np.array_equal(live.frame(11).images, first)
 
 
@@ -119,12 +119,12 @@ def test_a_frame_that_was_read_ahead_is_judged_again_when_its_turn_comes(
             (camera / f"{t:06d}.jpg").rename(later / camera.name / f"{t:06d}.jpg")
     live = open_source(f"watch:{folder}?behind={policy}&queue=2", 0.25)
     through = disturbed(live, gain=0.5)
-    assert [through.frame(t).effort for t in (0, 1)] == [1, 1], "nothing waits yet"
-    assert live.effort(1) == 1
+    assert [through.frame(t).epoch_scale for t in (0, 1)] == [1, 1], "nothing waits yet"
+    assert live.epoch_scale(1) == 1
     for image in later.glob("*/*.jpg"):
         image.rename(folder / image.parent.name / image.name)
     # Ten frames wait behind frame 1; frame 0 is always made in full.
-    assert [live.effort(0), through.effort(1), through.effort(11)] == worth
+    assert [live.epoch_scale(0), through.epoch_scale(1), through.epoch_scale(11)] == worth
 
 
 def test_an_image_that_comes_during_a_look_is_not_given_up(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,7 +26,7 @@ def near_by_hand(tiles: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("share", [0.0, 0.05, 0.3, 1.0])
 def test_near_is_what_changed_and_what_lies_beside_it_in_the_same_view(share: float) -> None:
     tiles = np.random.default_rng(3).random((3, 5, 7)) < share
-    near = Change(torch.from_numpy(tiles), 80, 112).near
+    near = Change(torch.from_numpy(tiles), 80, 112).dilated
     assert near.dtype == torch.bool
     assert np.array_equal(near.numpy(), near_by_hand(tiles))
 
@@ -73,7 +73,7 @@ def noted(case: FitFixture) -> list[str]:
 @pytest.mark.parametrize(("effort", "calls"), [(1.0, 6), (0.5, 3), (0.2, 1), (0.01, 1)])
 def test_a_hurried_frame_fits_motion_in_its_share_of_the_passes(effort: float, calls: int) -> None:
     case = fit_fixture()
-    case.work._frame = replace(case.work._frame, effort=effort)
+    case.work._frame = replace(case.work._frame, epoch_scale=effort)
     made = noted(case)
     Rigid(Rigid.Config(epochs=2)).propose(case.scene, case.work, case.rng)
     assert len(made) == calls, "two passes over three cameras, or a share of them"

@@ -260,7 +260,7 @@ def test_at_or_behind_the_near_plane_nothing_is_drawn(z: float) -> None:
 
 
 def test_the_near_plane_is_the_rigs() -> None:
-    cameras = dataclasses.replace(camera(), near=2.5)
+    cameras = dataclasses.replace(camera(), near_plane=2.5)
     assert not render(scene([[0, 0, 2.0]]), cameras).alpha.any()
     assert render(scene([[0, 0, 3.0]]), cameras).alpha.any()
 

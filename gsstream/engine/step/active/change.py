@@ -34,7 +34,7 @@ class Change:
         return float(self.tiles.float().mean()) if self.tiles.numel() else 0.0
 
     @property
-    def near(self) -> torch.Tensor:
+    def dilated(self) -> torch.Tensor:
         """[V, ceil(H / 16), ceil(W / 16)] bool: tiles that changed, and those beside one that did."""
         return torch.nn.functional.max_pool2d(self.tiles[:, None].float(), 3, 1, 1)[:, 0] > 0
 
@@ -49,9 +49,9 @@ class Change:
         Arguments:
             means: [N, 3] centres. A centre that projects into no view gets 0.
         """
-        near = self.near.flatten(1).numpy()
+        dilated = self.dilated.flatten(1).numpy()
         # What lies in no picture looks up a tile that never changes.
-        lookup = np.concatenate([near, np.zeros((len(near), 1), np.bool_)], 1)
+        lookup = np.concatenate([dilated, np.zeros((len(dilated), 1), np.bool_)], 1)
         hits, seen = np.zeros(len(means), np.int32), np.zeros(len(means), np.int32)
         centres = np.ascontiguousarray(means.numpy().T)
         for view in range(len(cameras)):
@@ -67,7 +67,7 @@ class Change:
         """
         pose, K = cameras.viewmats[view].astype(np.float32), cameras.Ks[view].astype(np.float32)
         x, y, z = (row[0] * centres[0] + row[1] * centres[1] + row[2] * centres[2] + row[3] for row in pose[:3])
-        inside: BoolArray = z > cameras.near
+        inside: BoolArray = z > cameras.near_plane
         inverse = np.float32(1) / np.where(inside, z, np.float32(1))
         u, v = K[0, 0] * x * inverse + K[0, 2], K[1, 1] * y * inverse + K[1, 2]
         inside &= (u >= 0) & (v >= 0) & (u < self.width) & (v < self.height)

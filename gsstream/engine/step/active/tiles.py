@@ -17,11 +17,11 @@ def tile_weights(change: Change | None, view: int, share: float, generator: torc
     """Return [ceil(H / 16), ceil(W / 16)] float32 factors on the gradients of a view's tiles; None: all count once."""
     if change is None or share == 1:
         return None
-    near = change.near[view]
+    near = change.dilated[view]
     drawn = torch.rand(near.shape, generator=generator) < share
     return torch.where(near, 1.0, drawn / share)
 
 
 def changed_tile_weights(change: Change | None, view: int) -> torch.Tensor | None:
     """Return the factors where no quiet tile is looked at."""
-    return None if change is None else change.near[view].float()
+    return None if change is None else change.dilated[view].float()

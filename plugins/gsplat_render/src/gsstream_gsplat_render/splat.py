@@ -50,7 +50,7 @@ def target(cameras: Cameras, view: int, background: Background, device: str) -> 
 
     return Target(
         moved(cameras.viewmats[view]), moved(cameras.Ks[view]), moved(background), cameras.width, cameras.height,
-        cameras.near,
+        cameras.near_plane,
     )  # fmt: skip
 
 

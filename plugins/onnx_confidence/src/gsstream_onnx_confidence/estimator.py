@@ -83,7 +83,7 @@ def _pixels(
     cameras = context.cameras
     pose, K = torch.from_numpy(cameras.viewmats[view]), torch.from_numpy(cameras.Ks[view])
     local = means @ pose[:3, :3].T + pose[:3, 3]
-    front = local[:, 2] > cameras.near
+    front = local[:, 2] > cameras.near_plane
     depth = torch.where(front, local[:, 2], torch.ones_like(local[:, 2]))
     flat = (local @ K.T)[:, :2] / depth[:, None]
     seen = front & (flat >= 0).all(1) & (flat[:, 0] < cameras.width) & (flat[:, 1] < cameras.height)

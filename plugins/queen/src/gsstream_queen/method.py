@@ -74,7 +74,7 @@ class Queen(StreamingMethod[QueenState]):
         return {**drawn, **sent}
 
     def step(self, state: QueenState, frame: Frame, tools: Tools) -> Step[QueenState]:
-        if frame.effort == 0:
+        if frame.epoch_scale == 0:
             return self._send(state, frame, tools, Delta())
         work = tools.open(state.player, state.previous, frame)
         with tools.log.phase("confidence"):

@@ -205,7 +205,7 @@ def _scene(plan: FramePlan, static: int) -> Gaussians[FloatArray]:
 
 def _rig(plan: FramePlan, parts: Assembly) -> Cameras:
     rig = arc_rig(plan.views, plan.width, plan.height)
-    return replace(rig, near=parts.recipe.near * rig.extent)
+    return replace(rig, near_plane=parts.recipe.near * rig.extent)
 
 
 def _first_player(parts: Assembly, scene: Gaussians[FloatArray], rig: Cameras) -> PlayerState:

@@ -187,7 +187,7 @@ def _facts(scene: _Scene, name: str, share: float, path: str, active: IntArray |
 def _kernel(scene: _Scene, native: NativeBench, mask: Any, active: IntArray | None) -> Any:
     arrays = tuple(value for _, value in scene.gaussians.items())
     camera, size = scene.camera, scene.size
-    pose = (camera.viewmats[0], camera.Ks[0], size.width, size.height, camera.near)
+    pose = (camera.viewmats[0], camera.Ks[0], size.width, size.height, camera.near_plane)
     return native.Kernel(arrays, *pose, mask, active, scene.v_image)
 
 

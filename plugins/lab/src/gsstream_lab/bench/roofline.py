@@ -72,7 +72,7 @@ def footprints(gaussians: Gaussians[FloatArray], cameras: Cameras, view: int = 0
         half = (reach[:, None].clamp_min(0) * variances).sqrt()
         size = torch.tensor([cameras.width, cameras.height])
         seen = ((means2d + half >= 0.5) & (means2d - half <= size - 0.5)).all(1)
-        seen &= (depths > cameras.near) & (reach >= 0)
+        seen &= (depths > cameras.near_plane) & (reach >= 0)
         triangle = torch.stack([conics[:, 0, 0], conics[:, 0, 1], conics[:, 1, 1]], 1)
     return Footprints(
         means2d.numpy(), half.numpy(), triangle.numpy(), depths.numpy(), opacities.numpy(), seen.numpy(),

@@ -86,7 +86,7 @@ class FreshFrames:
             return False
         packets: list[EncodedPacket] = []
         listeners = Callbacks(packet=packets.append, progress=lambda done, total, *_: progress(frame, done, total))
-        Encoder(self.parts, self.source.info, listeners=listeners).encode(self.source.frame(frame, "train"))
+        Encoder(self.parts, self.source.info, callbacks=listeners).encode(self.source.frame(frame, "train"))
         self.cache.mkdir(parents=True, exist_ok=True)
         part = path.with_name(f".{path.name}.{os.getpid()}.part")
         part.unlink(missing_ok=True)

@@ -1,7 +1,7 @@
 """Renderer: Gaussians and one camera in, an image and gradients out.
 
 Conventions: pixel-corner origin, 0.3 px screen-space blur, alpha cut at 1/255, alpha clamped at 0.999, a Gaussian
-counts while the transmittance before it exceeds 1e-4, near plane ``cameras.near``. Tiles are 16 x 16 pixels.
+counts while the transmittance before it exceeds 1e-4, near plane ``cameras.near_plane``. Tiles are 16 x 16 pixels.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ class Rig(Protocol):
     @property
     def height(self) -> int: ...
     @property
-    def near(self) -> float: ...
+    def near_plane(self) -> float: ...
 
 
 class Passes(ABC):
@@ -78,7 +78,7 @@ def acquire_rasterizer(cameras: Rig, view: int, background: Background, own: boo
         native = _idle.pop() if _idle and not own else None
     pose = (cameras.viewmats[view], cameras.Ks[view])
     return PooledRasterizer(
-        NumpyRasterizer(*pose, cameras.width, cameras.height, background, cameras.near, native=native), own
+        NumpyRasterizer(*pose, cameras.width, cameras.height, background, cameras.near_plane, native=native), own
     )
 
 

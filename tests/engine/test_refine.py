@@ -214,11 +214,11 @@ def test_what_came_of_a_gaussian_keeps_its_place_and_turn_relative_to_it(seed: i
 
 
 def test_rows_that_leave_and_join_are_followed() -> None:
-    before, mine, added = some(4, 0), some(4, 1), some(1, 2)
+    before, mine, new = some(4, 0), some(4, 1), some(1, 2)
     # Row 1, the last of the first node, leaves, and one is added in its place.
-    added = AddedGaussians(added, np.zeros(1, np.int64), np.zeros(1, np.uint8), np.zeros(0, np.int64))
+    added = AddedGaussians(new, np.zeros(1, np.int64), np.zeros(1, np.uint8), np.zeros(0, np.int64))
     after = Gaussians(**{
-        name: np.concatenate([value[[0]], getattr(added, name), value[[2, 3]]]) for name, value in before.items()
+        name: np.concatenate([value[[0]], getattr(new, name), value[[2, 3]]]) for name, value in before.items()
     })
     after.means[3] += 1.0
     delta = Delta((RowEdit(added, np.array([1], np.int64)),))

@@ -69,7 +69,7 @@ def test_the_moving_sample_has_every_form_of_motion(version):
             said += [(len(motions), type(change).__name__) for change in (state.delta.changes if state.delta else ())]
     wanted = {
         (False, False, True), (True, False, False), (True, False, True), (True, True, True),
-        (1, "Residual"), (1, "Rows"), (2, "Motion"),
+        (1, "Residual"), (1, "RowEdit"), (2, "Motion"),
     }  # fmt: skip
     assert wanted <= set(said)
 

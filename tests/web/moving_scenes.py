@@ -73,11 +73,11 @@ def make_residual(rng: np.random.Generator, layout: Layout) -> Residual:
 
 def make_rows(rng: np.random.Generator, scene: Scene, sh_rest: int) -> RowEdit:
     nodes, number = len(scene.layout.node_counts), len(scene.gaussians)
-    added, new = int(rng.integers(1, 9)), int(rng.integers(0, 3))
+    count, new = int(rng.integers(1, 9)), int(rng.integers(0, 3))
     parents = nodes + np.arange(new) - rng.integers(0, 3, new).clip(0, nodes)
-    where = np.sort(rng.integers(0, nodes + new, added))
+    where = np.sort(rng.integers(0, nodes + new, count))
     added = AddedGaussians(
-        make_gaussians(rng, added, sh_rest), where, rng.integers(0, 3, added).astype(np.uint8), parents
+        make_gaussians(rng, count, sh_rest), where, rng.integers(0, 3, count).astype(np.uint8), parents
     )
     gone = np.flatnonzero(rng.random(number) < 0.05)
     return RowEdit(added if rng.random() < 0.8 or not len(gone) else None, gone)

@@ -39,7 +39,7 @@ CACHE = {"epochs": 1, "levels": 4, "entries": 8, "width": 8, "lr": 0.02, "box": 
 #: Whole method -> settings under which something moves, and is born, in three frames of one or two passes.
 EAGER: dict[str, list[dict[str, Any]]] = {
     "queen": [{}, {
-        "births": {"every": 1, "after": 0, "until": 1, "gradient": 1e-6, "most": 20}, "rows": "dynamic",
+        "growth": {"every": 1, "start": 0, "stop": 1, "grad_threshold": 1e-6, "max_added": 20}, "rows": "dynamic",
         "change": {"dynamic": 1e-8}, "rate": 1e-3, "sigma": 1e-4,
     }],
 }  # fmt: skip

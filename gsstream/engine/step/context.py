@@ -130,7 +130,7 @@ class EngineContext:
         return self._parts.optimiser
 
     def scaled(self, number: float) -> int:
-        return max(1, round(number * self._frame.effort * self._part_scale))
+        return max(1, round(number * self._frame.epoch_scale * self._part_scale))
 
     def changed_rows(self, min_votes: float) -> torch.Tensor:
         return changed_rows(

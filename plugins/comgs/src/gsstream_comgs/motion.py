@@ -50,7 +50,7 @@ class KeyPointMotion(MotionPart):
 
     def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion, ...]:
         rows = work.changed_rows(self.config.votes).nonzero()[:, 0]
-        difference = gradient_difference(work)[rows]
+        difference = gradient_difference(work.everywhere())[rows]
         number = min(self.config.keypoints, int((difference > 0).sum()))
         if number == 0:
             return ()

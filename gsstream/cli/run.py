@@ -95,7 +95,7 @@ def _silent(_: str) -> None:
 def _reused_lines(
     say: Callable[[str], None], recipe: Recipe, info: SourceInfo, *, named: bool, catalog: Catalog
 ) -> None:
-    """Say what nobody asked for and a person would want to know: method, frames, test cameras."""
+    """Print the defaults that were taken: method, number of frames, and that no camera is held out."""
     if not named:
         better = next((name for name in SUGGESTED if ("method", name) in catalog.entries), None)
         advice = "" if better is None else f"; --method {better} makes far smaller packets"
@@ -108,7 +108,7 @@ def _reused_lines(
 
 
 def _first_look(recording: FrameSource, uri: str, *, again: bool) -> None:
-    """Warn of poses that cannot be right, before an hour is spent on them; who comes ``again`` has been warned."""
+    """Warn of poses that cannot be right before an hour is spent on them; not ``again`` when a run is resumed."""
     if again:
         return
     from gsstream.input.prepare.pose_checks import first_look

@@ -12,7 +12,7 @@
     │   └── OutputError                the place to write to is unusable (holds another run, not writable)
     ├── PacketError (ValueError)       a stream is damaged; carries the byte offset
     ├── PluginUnavailable              a part exists but its plugin is quarantined
-    └── ComponentError                 a part failed while running; carries who, where and when
+    └── ComponentError                 a part failed while running; has slot, part and frame
 
 Every message says what was expected, what came, where, and what to do about it.
 """

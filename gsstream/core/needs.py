@@ -1,4 +1,4 @@
-"""Who brings what is missing: an error about something that is not installed says which command installs it.
+"""Which distribution provides a missing part, so that an error can name the command that installs it.
 
 gsstream alone is the player. Its extras bring the rest, and the parts of other distributions come by extras too.
 """

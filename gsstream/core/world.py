@@ -20,8 +20,8 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.harmonics import rotate_sh
 from gsstream.core.shapes import FloatArray
 
-#: Cameras in a stream's own coordinates are rounded to this: far below what a calibration knows, far above the noise of
-#: float64, so that a recording in another world mostly gives the very same numbers.
+#: Cameras in a stream's own coordinates are rounded to this: far below the accuracy of a calibration, far above the
+#: noise of float64, so that a recording in another world mostly gives the very same numbers.
 GRID = 2.0**-30
 #: Camera centres that differ by less than this share of their distance to the origin are one place, up to rounding.
 COINCIDENT = 1e-12

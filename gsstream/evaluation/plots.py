@@ -43,7 +43,7 @@ _PANELS: Sequence[tuple[str, Series, bool, bool]] = (
 
 
 def plot_runs(runs: Mapping[str, Sequence[FrameRecord]], out: str | os.PathLike[str], title: str = "") -> Path:
-    """Draw one panel per quantity, one line per run, and save a PNG. Quantities nobody measured get no panel.
+    """Draw one panel per quantity, one line per run, and save a PNG. Quantities that were not measured get no panel.
 
     Raises InputError when there is nothing to draw.
     """

@@ -106,8 +106,8 @@ class StreamingMethod(Part, Generic[State]):
     def follow_up(self, state: State, step: Step[State], frame: Frame, tools: Tools) -> Step[State]:
         """Do the work of a later frame that its packet need not wait for, and return the step with the state after it.
 
-        The engine calls it once after every ``step``, when the packet has been handed out: whoever follows the stream
-        live does not wait for this work. The next frame begins after it. Packet, status and ``state.player`` stay as
+        The engine calls it once after every ``step``, when the packet has been handed out: live viewers do not wait for
+        this work. The next frame begins after it. Packet, status and ``state.player`` stay as
         they are; the engine compares. What it changes in the state ``resume`` makes, too. By default there is no such
         work. A frame whose ``epoch_scale`` is 0 must not fail here either.
 

@@ -152,7 +152,7 @@ class Follower:
 
 
 def writer_is_gone(folder: Path) -> bool:
-    """Say whether ``folder`` is that of a run without a running encoder: it was killed, or it failed.
+    """Return True when the run that wrote ``folder`` has no running encoder: it was killed, or it failed.
 
     False also when that is unknown: no run wrote here, or one on another machine does.
     """

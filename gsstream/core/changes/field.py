@@ -1,7 +1,7 @@
-"""Field: a hash grid and a small network say of every place in a box how Gaussians there move (3DGStream).
+"""Field: a hash grid and a small network map a position in a box to the motion of Gaussians there (3DGStream).
 
-What is sent are the learned weights themselves, as differences from weights that both ends draw. Only entries of the
-grid are sent that some Gaussian of the field lies beside; both ends know which these are.
+The learned weights are transmitted as differences from weights that both ends draw from the same seed. Of the grid only
+the entries around Gaussians of the field are transmitted; both ends compute which these are.
 """
 
 from __future__ import annotations
@@ -106,8 +106,8 @@ def mismatch(change: Field, touched: list[IntArray]) -> str | None:
 def apply_field(scene: Scene, change: Field) -> tuple[Scene, IntArray]:
     """Return the scene after a field, and the rows [A] that it moved. ``scene.displacement`` is not changed.
 
-    A centre is shifted by the reach times the first three numbers that the network says of it; a row turns by the
-    quaternion (1 + a, b, c, d) of the other four. float64 in a fixed order, rounded to float32 at the end.
+    Of the network's seven outputs the first three times the reach translate a centre; the other four rotate the row by
+    the quaternion (1 + a, b, c, d). float64 in a fixed order, rounded to float32 at the end.
 
     Raises ShapeError when the field does not fit the scene.
     """

@@ -23,13 +23,13 @@ MAX_LEVELS, MAX_FEATURES, MAX_LAYERS, MAX_BASE, MAX_CELLS = 16, 8, 4, 1024, 1 <<
 MAX_INPUTS = MAX_LEVELS * MAX_FEATURES
 #: Entries of all levels together, at most.
 MAX_ENTRIES = 1 << 20
-#: What a network says of a place: a shift, and a quaternion less (1, 0, 0, 0).
+#: Outputs of the network at a position: a translation, and a quaternion minus (1, 0, 0, 0).
 OUTPUTS = 7
 #: Entries are drawn up to this far from 0, in their units: 10^-4.
 START = 105
 #: One prime for each axis; what a hash grid is usually hashed with.
 PRIMES = (1, 2_654_435_761, 805_459_861)
-#: Where the numbers of the network's weights begin; those of entries stay below.
+#: Index of the network's first weight in the random stream; grid entries use smaller indices.
 _WEIGHTS_FROM = 1 << 31
 _CORNERS = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
 
@@ -174,7 +174,7 @@ BLOCK = 1 << 13
 def evaluate_network(
     shape: FieldShape, unit: FloatArray, touched: list[IntArray], entries: list[IntArray], weights: list[IntArray]
 ) -> FloatArray:
-    """Return what the network says of places: [A, 7] float64, multiples of 2^-34.
+    """Return the outputs of the network at positions: [A, 7] float64, multiples of 2^-34.
 
     Arguments:
         shape: of the field.

@@ -52,8 +52,8 @@ def displacement_between(
 def rotation_between(before: FloatArray, after: FloatArray) -> FloatArray:
     """Return the rotation [A, 3] that leads from one row of quaternions [A, 4] to the other: axis * tan(angle / 2).
 
-    float64, each sum from left to right, rounded to float32 at the end. A turn of more than 120 degrees counts as none:
-    it is a Gaussian that was painted anew, not one that turned.
+    float64, each sum from left to right, rounded to float32 at the end. A rotation of more than 120 degrees counts as
+    none: no body rotates so far in a frame; rather the optimiser has reused the Gaussian for something else.
     """
     w0, x0, y0, z0 = before.T.astype(np.float64, order="C")
     w1, x1, y1, z1 = after.T.astype(np.float64, order="C")

@@ -1,8 +1,8 @@
 """Motion: groups of rows move rigidly, positions and orientations, as predicted from the last frame and corrected.
 
-A residual that is learned from zero in every frame cannot travel as far as a body does, so Gaussians are left behind
-and the body is repainted with what happens to stand there. A motion carries them along: it costs a bit or so per group
-where the prediction holds, and six small integers where it does not.
+A residual, optimised from zero in every frame, cannot bridge the path of a fast body: Gaussians stay behind, and others
+are recoloured to look like it. A motion moves them along. It costs about one bit per group where the prediction is
+right, and six small integers where it is not.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class GroupTransforms(NamedTuple):
 
 
 def groups_for(scene: Scene, cell: float, brightness_bins: int, regroup: bool = False) -> Groups:
-    """Return the groups of a motion: those the scene knows, unless they are others or are to be formed anew.
+    """Return the groups of a motion: those of the scene if they have this cell and these bins, else new ones.
 
     Rows are of one group when their centres lie in one cell of a regular grid and their colours in one class of
     brightness. Groups are numbered by cell (x, then y, then z), then brightness.
@@ -80,7 +80,7 @@ def groups_for(scene: Scene, cell: float, brightness_bins: int, regroup: bool = 
         scene: decoded, as both ends have it.
         cell: side of a cell, scene units; a float32 above 0.
         brightness_bins: number of classes of brightness, 1 to 16.
-        regroup: form the groups anew, even if the scene knows some of this cell and number of bins.
+        regroup: form new groups in any case.
     """
     known = scene.groups
     if known is not None and not regroup and known.cell == cell and known.brightness_bins == brightness_bins:

@@ -1,4 +1,4 @@
-"""Scene: what the changes of a frame apply to, and all that a player remembers of the frames before."""
+"""Scene: the state that the changes of a frame apply to, all that a player keeps from earlier frames."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Scene:
         gaussians: N rows, raw values, float32.
         layout: nodes and units of the rows.
         displacement: how far rows were displaced by the last frame; None: nothing moved, or a key packet came last.
-        groups: the groups that the last motion was said of; None until a motion names some after a key packet.
+        groups: the groups of the last motion; None until there is a motion after the last key packet.
     """
 
     gaussians: Gaussians[FloatArray]

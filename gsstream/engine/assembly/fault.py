@@ -1,4 +1,4 @@
-"""The error about a part that failed: who, from which distribution, where and when."""
+"""The error about a part that failed: slot, part, distribution, place and frame."""
 
 from __future__ import annotations
 

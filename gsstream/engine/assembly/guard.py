@@ -1,4 +1,4 @@
-"""A part guarded once: whatever it raises is said with its name and place, whatever it returns is looked at."""
+"""Wrap a part so that its exceptions name slot, part and frame, and its outputs are checked."""
 
 from __future__ import annotations
 
@@ -113,8 +113,8 @@ class Guarded:
                 raise
 
     def _guarding(self, name: str, method: Callable[..., Any]) -> Callable[..., Any]:
-        # Nothing here may hold ``self``, which holds what is returned: a session has to go when its owner lets go of
-        # it, not when the garbage collector comes by. It has the memory of a render for every camera.
+        # No reference to ``self`` here: ``self`` holds what is returned, and a cycle would keep a session, which has
+        # the memory of a render for every camera, until the garbage collector runs.
         slot, part, where, level, kind = self._slot, self._part, self._where, self._level, self._kind
         look = OUTPUT_CHECKS.get((kind, name))
         looking = Look(level, slot, part, where)

@@ -25,7 +25,7 @@ TIME_MARGIN = 0.93
 SIZE_TARGET, MAX_TRIMMED = 0.94, 2.0
 #: Largest share of the time that is kept for the phases after the passes, while no frame has shown what they cost.
 UNKNOWN_RESERVE = 0.2
-#: Least share of their usual passes that motion and growth make, in a frame without a residual.
+#: Smallest part_scale of a plan: motion and growth keep this share of their iterations in frames without a residual.
 MIN_PART_SCALE = 0.05
 #: Share of a pass's time that does not depend on the number of candidates.
 FIXED_SHARE = 0.3

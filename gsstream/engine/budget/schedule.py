@@ -8,8 +8,8 @@ from collections.abc import Callable
 class Schedule:
     """Epochs and rate weight of one frame, as the recipe says; one under a budget corrects them as the frame goes on.
 
-    ``epochs`` and ``rd_lambda`` (loss per bit) are asked for anew in every epoch. ``chunk``: iterations after which
-    ``is_over`` wants to be asked; None: those of an epoch.
+    ``epochs`` and ``rd_lambda`` (loss per bit) are read in every epoch. ``chunk``: iterations between two calls of
+    ``is_over``; None: those of an epoch.
     """
 
     chunk: int | None = None

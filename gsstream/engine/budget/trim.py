@@ -30,8 +30,8 @@ class TrimmedDelta:
     """A packet that fits, and what it gave up.
 
     Arguments:
-        untrimmed: bytes before anything was given up.
-        symbols, gates, added: how many went, or moved nearer to zero.
+        untrimmed: bytes before trimming.
+        symbols, gates, added: how many were removed; symbols that moved nearer to zero count too.
     """
 
     delta: Delta

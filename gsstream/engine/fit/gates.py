@@ -76,7 +76,7 @@ class TrainedGates:
         self._table.select_rows(nodes)
 
     def all_logits(self) -> torch.Tensor:
-        """Return the logits of all gates of the scene; those that take part as they are now."""
+        """Return the logits of all gates of the scene, with the current values of those that are trained."""
         return self._all.index_copy(0, self._nodes, self.logits.detach())
 
 

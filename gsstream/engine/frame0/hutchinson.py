@@ -60,7 +60,7 @@ def _pop_grad(leaf: torch.Tensor) -> torch.Tensor:
 def hutchinson_samples(
     views: TrainingViews, gaussians: Gaussians[torch.Tensor], generator: torch.Generator, *, each: int
 ) -> Iterator[HutchinsonSample]:
-    """Yield ``each`` probes of every camera."""
+    """Yield ``each`` Hutchinson samples of the image gradient for every camera."""
     cameras, exposure = views.frame.cameras, views.exposure
     session = views.renderer.open(gaussians, None, cameras, views.background)
     for view in range(len(cameras)):

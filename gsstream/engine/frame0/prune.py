@@ -20,7 +20,7 @@ from gsstream.engine.frame0.hutchinson import TrainingViews, hutchinson_samples
 #: Probes of a camera. A Gaussian that one camera sees is underestimated tenfold by a quarter of single probes, and by
 #: four together in one case of sixty.
 HUTCHINSON_SAMPLES = 4
-#: Opacity logits above this one count as this one, 0.999: where an opacity is 1 in float32 the gradient is 0.
+#: Opacity logits are clamped to this (opacity 0.999): where an opacity is 1 in float32 the gradient is 0.
 MAX_LOGIT = 7.0
 #: How many times as far off the images may be without all that go; the fit that follows closes such gaps.
 GROWTH = 1.25
@@ -31,7 +31,7 @@ TRIES = 8
 def removal_errors(
     views: TrainingViews, gaussians: Gaussians[torch.Tensor], generator: torch.Generator
 ) -> tuple[torch.Tensor, float]:
-    """Return what the absence of each Gaussian alone changes, and how far the images are off with all of them.
+    """Return the squared change of the images if each Gaussian alone is removed, and their error with all of them.
 
     Returns [N] float64, the squared change of all channels of all pixels together, and the mean squared error of a
     channel of a pixel.

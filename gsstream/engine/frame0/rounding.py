@@ -15,7 +15,7 @@ from gsstream.core.shapes import FloatArray, IntArray
 
 #: How often the bits of a code are estimated from what was chosen. The third time changes next to nothing.
 ROUNDS = 3
-#: Count of a code that has not occurred yet, so that its bits are many, but a number.
+#: Count that stands for 0 where a code does not occur, so that its number of bits is finite.
 UNUSED = 0.05
 #: [N] nearest codes -> [K, N] codes to choose from.
 _Near = Callable[[IntArray], IntArray]

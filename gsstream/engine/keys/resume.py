@@ -107,8 +107,7 @@ def state_after(parts: Assembly, states: Iterable[PlayerState], rng: Rng) -> Str
 
 
 def refinement_after(parts: Assembly, state: StreamState, tools: Tools) -> Refinement | None:
-    """Return the first frame as far as it was refined: made again from the packets and pictures since its key packet.
-    """
+    """Return the refinement of frame 0 at the end of the stream, recomputed from packets and images since its key."""
     stream = parts.recipe.stream
     if not is_refining(stream, state) or state.player.frame == state.key_frame:
         return None

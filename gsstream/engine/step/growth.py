@@ -17,7 +17,7 @@ def with_growth(parts: Assembly, state: StreamState, delta: Delta, view: EngineC
     Raises ComponentError when the part fails, or proposes what does not fit the scene.
     """
     if isinstance(parts.part("growth"), NoGrowth):
-        return delta  # nobody looks at the scene after the residual, so it need not be made
+        return delta  # the scene after the residual is not needed
     after = apply_delta(state.player.scene, delta)
     rows = parts.growth.propose(after, view, rng)
     with error_context("growth", parts.part("growth"), parts.where):

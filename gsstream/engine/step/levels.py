@@ -14,8 +14,8 @@ OMEGA = 1.5
 def level_schedule(stream: Stream, unit_of: IntArray) -> tuple[tuple[float, int], ...]:
     """Return pairs (fraction of the frame until which, finest level that takes part) (paper, supplement).
 
-    The H levels are those that hold Gaussians: a structure may lay more, of which the finest often stay empty, and a
-    schedule over empty levels would hold nobody back. It starts at level floor(H / 2); each finer level's stage is
+    The H levels are those that hold Gaussians: a structure may have more, of which the finest are often empty, and a
+    schedule over empty levels would delay no row. It starts at level floor(H / 2); each finer level's stage is
     omega times longer, N_{i+1} = omega N_i. Empty when the recipe does not ask for it or there is nothing to hold back.
     The paper leaves omega and the treatment of inactive levels open: here they keep their previous attributes.
     """

@@ -66,7 +66,7 @@ def invert(poses: FloatArray) -> FloatArray:
 def from_pixel_centers(K: FloatArray) -> FloatArray:
     """Return intrinsics [..., 3, 3] with the origin at the corner of the first pixel.
 
-    Those given have it in the centre of the first pixel (OpenCV).
+    ``K`` has its origin at the centre of the first pixel, as OpenCV has.
     """
     out: FloatArray = np.array(K, np.float64)
     out[..., :2, 2] += 0.5

@@ -16,7 +16,7 @@ from gsstream.input.recordings.primitives import Box, Placed, Sphere, Surface
 from gsstream.input.recordings.toyroom import moving_shapes, static_shapes
 
 SceneName = Literal["paths", "stop", "reversal", "bounce", "occlusion", "flash"]
-#: Way of a body in one frame at motion 1, metres: about 5 pixels at a width of 160.
+#: Path of a body from one frame to the next with the option motion = 1, metres: about 5 pixels at a width of 160.
 STEP = 0.08
 #: Light of the frame of a flash, times that of the others.
 FLASH = 1.6

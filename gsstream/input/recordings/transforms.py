@@ -1,4 +1,4 @@
-"""What is done to a recording before a run sees it: who trains, time shifts, gain, noise, lost images. Pure functions.
+"""Pure functions that transform a recording before a run: camera splits, time shifts, gain, noise, lost images.
 
 Everything is decided by the options and a seed. With the defaults nothing is touched.
 """

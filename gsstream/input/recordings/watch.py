@@ -139,7 +139,7 @@ class WatchSource:
         return self._folder / frame_path(self._patterns[camera_id], index)
 
     def _plan(self, index: int) -> _Plan:
-        """Decide frame by frame, once: what was decided stays, whoever asks."""
+        """Return the plan of a frame, which is made once and kept."""
         if index >= self._next:
             with self._planning:
                 while self._next <= index:
@@ -270,7 +270,7 @@ class WatchSource:
         raise EndOfRecording(f"the recording ended after {index} frames")
 
     def _lacking(self, absent: list[str]) -> str:
-        """What is known of the cameras whose image did not come, with the first one's reason when there is one."""
+        """The absent cameras in words, with the reason of the first whose file could not be read."""
         fault = next((f": {self._faults[name]}" for name in absent if name in self._faults), "")
         return f" (no whole image of {', '.join(absent)}{fault})"
 

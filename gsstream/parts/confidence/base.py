@@ -17,8 +17,8 @@ class ConfidenceTraits(Traits):
     """What a confidence estimator claims.
 
     Arguments:
-        needs_renderer: asks the context for screen gradients.
-        floor: largest logit of a Gaussian that nobody sees, or of a scene that stands still.
+        needs_renderer: reads screen gradients from the context.
+        floor: largest logit of a Gaussian that no camera sees, or of a static scene.
         finds_motion: ranks what moved above what did not.
         monotone_in_change: a stronger change never makes what changed less suspect.
         brightness: largest mean logit of a still scene that becomes brighter by a fiftieth of full scale; None: no

@@ -35,7 +35,7 @@ class MotionPart(Part):
         """
 
     def follow(self, memory: Any, frame: int, before: Layout, delta: Delta, rng: Rng) -> Any:
-        """Return what this part remembers after a delta packet. By default a part remembers nothing.
+        """Return the state that this part keeps after a delta packet. By default a part has none.
 
         A key packet ends it. A resumed run calls this for every packet since the last key packet, so the result follows
         from the arguments alone; do not change ``memory``.

@@ -17,10 +17,10 @@ from gsstream.parts.render.wrt import WrtRows
 
 
 class Gates(Protocol):
-    """The trainable gates of the A rows: M logits, of which ``node_of`` [A] int64 says whose each row is.
+    """The trainable gates of the A rows: M logits; row a uses logit ``node_of[a]`` ([A] int64).
 
-    ``gate`` and ``regularizer`` are the parts, ``num_gaussians`` is N, the divisor of a mean penalty. An optimiser that
-    knows the closed forms of both parts may change ``logits`` and ``state`` in place by itself.
+    ``gate`` and ``regularizer`` are the parts, ``num_gaussians`` is N, the divisor of a mean penalty. An optimiser with
+    closed forms of both parts may update ``logits`` and ``state`` in place by itself.
     """
 
     @property

@@ -65,7 +65,7 @@ class RowParameters:
             state.exp_avg_sq[edit.fresh] = 0
 
     def state(self, name: str) -> AdamState:
-        """Return the Adam state of one leaf, which whoever moves the leaf changes in place."""
+        """Return the Adam state of one leaf; code that updates the leaf itself changes it in place."""
         return self._states[name]
 
     def moments(self, name: str) -> dict[str, torch.Tensor]:

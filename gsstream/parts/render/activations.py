@@ -1,4 +1,4 @@
-"""The only place in the engine that knows exp, sigmoid and normalise."""
+"""Activations: exp, sigmoid and normalise from raw values; the engine has them nowhere else."""
 
 from __future__ import annotations
 

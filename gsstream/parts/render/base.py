@@ -135,7 +135,7 @@ def drawn_rows(
     size: tuple[int, int],
     tiles: torch.Tensor,
 ) -> torch.Tensor:
-    """Find by differentiation who is drawn in marked tiles: ``RenderSession.visible`` of any differentiable renderer.
+    """Find by differentiation the rows drawn in marked tiles: ``RenderSession.visible`` of a differentiable renderer.
 
     The derivative of the image by the colour of a Gaussian is the sum of its weights alpha * transmittance, which are
     positive where it is drawn and zero elsewhere, so nothing can cancel. All are drawn in grey, because a colour that

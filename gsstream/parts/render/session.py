@@ -22,8 +22,8 @@ from gsstream.parts.render.wrt import G, LossAndGrad, Wrt, WrtTransforms
 class RenderSession(ABC):
     """Renders a scene of which only some rows change, from a fixed rig.
 
-    A session begins wide: every row may change. ``narrow`` says which rows change from then on; all others stay as they
-    are in the session's scene. ``commit`` ends a frame: it gives the session of the next scene, wide again, which
+    In a new session every row may change. ``narrow`` restricts that to some rows; all others stay as they are in the
+    session's scene. ``commit`` ends a frame: it gives the session of the next scene, in which all may change, and which
     renders and differentiates exactly as one opened anew would, and in which a renderer may keep whatever did not
     change. ``screen_gradient`` and ``visible`` belong to the session's scene and may be asked for at any time.
     """

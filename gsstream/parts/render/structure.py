@@ -13,8 +13,8 @@ def weighted_structure_tensor(image: torch.Tensor, target: torch.Tensor) -> torc
 
     It is the sum over the channels of the products of the two gradients (Lucas and Kanade 1981; central differences,
     those of the border see the border again), weighed by 1 / sqrt(error^2 + MIN_ERROR^2): where a picture is shifted by
-    a small d, d^T S d / 2 is what the sum of sqrt(error^2 + MIN_ERROR^2) grows by beyond its slope, by the parabola
-    that lies above it (iteratively reweighed least squares).
+    a small d, d^T S d / 2 is the second-order term of the sum of sqrt(error^2 + MIN_ERROR^2), by the parabola that lies
+    above it (iteratively reweighted least squares).
     """
     down, right = _image_gradients(image, 0), _image_gradients(image, 1)
     weight = ((image - target).square() + MIN_ERROR**2).rsqrt()

@@ -143,7 +143,7 @@ def check_regularizer_closed_rows(part: Regularizer) -> None:
 
 @check("regularizer")
 def check_regularizer_empty(part: Regularizer) -> None:
-    """No active rows cost exactly 0."""
+    """With no active row the penalty is exactly 0."""
     case = get_case("empty")
     total = _total(_terms(part, case))
     equal("no Gaussians", total, torch.zeros_like(total))

@@ -1,4 +1,4 @@
-"""Who may change in a frame: the one pure function behind "cost follows change".
+"""Which rows may change in a frame: the one pure function behind "cost follows change".
 
 A Gaussian is a candidate when it is seen in a changed tile of some training view, when its centre lies in or beside
 changed tiles in enough of the views that it projects into, and when its gate may open. Everything else is frozen: it is

@@ -20,7 +20,7 @@ def step_table(
     if value.numel() == 0:
         return
     rows = len(value)
-    # The kernel checks shape, dtype and layout again; only what it would say less well is looked at here.
+    # The kernel checks shape, dtype and layout again; here are only the checks whose messages can name the table.
     rates = _rates(name, lr, (rows, value.numel() // rows))
     table = [part.numpy().reshape(rows, -1) for part in (value, gradient.detach().contiguous())]
     moments = [part.numpy().reshape(rows, -1) for part in (state.exp_avg, state.exp_avg_sq)]

@@ -18,7 +18,7 @@ from gsstream_cpu_render.view import Background
 
 MAX_IDLE = 32
 
-#: Taken twice by one thread when the collector, called while it is held, finds an abandoned lease.
+#: Reentrant: the garbage collector may run while a thread holds the lock, and then returns a rasteriser to the pool.
 _lock = threading.RLock()
 _idle: list[Any] = []
 

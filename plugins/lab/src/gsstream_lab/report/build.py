@@ -114,7 +114,7 @@ def _listed(names: Sequence[str], most: int = 8) -> str:
 
 
 def _some(curves: Sequence[Group], groups: Sequence[Group]) -> str:
-    """What a picture does not show."""
+    """A remark when the figure leaves recipes out; else empty."""
     return "" if len(curves) == len(groups) else f": {len(curves)} of {len(groups)} recipes, the others would hide them"
 
 

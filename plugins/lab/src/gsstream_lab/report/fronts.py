@@ -75,11 +75,9 @@ class Effect:
 
 
 def effects(groups: Sequence[Group], keys: Sequence[str]) -> list[Effect]:
-    """Return every pair of groups of one scene and variant that differ in one axis.
+    """Compare each group with those it was changed from (see :func:`_references`).
 
-    The order is that of :func:`_reference`.
-
-    Variants are compared with the first one of the scene, as they are, too.
+    These have one axis less, or at its first value, or are the first variant with the same axes.
     """
     noise = {key: seed_noise(groups, key) for key in keys}
     found = []

@@ -125,7 +125,7 @@ def encoder_for(
         method: a name of ``gsstream methods``.
         source: an open recording, of :func:`open_recording` or :func:`to_rig_coordinates`; its points seed frame 0.
         settings: as for :func:`recipe_for`.
-        listeners: what is told of the work.
+        listeners: functions called with every packet and with the progress of frame 0.
         parts: in place of those in the method's recipe, by slot: live, or by name.
 
     Raises InputError for a part that does not fit its slot, and as :func:`recipe_for` does.
@@ -164,7 +164,7 @@ def encoder_for_rig(
 
 
 def _assembled(method: str, settings: Mapping[str, Any] | None, parts: Parts) -> Assembly:
-    """The live parts of a method's recipe, with these in place of its own."""
+    """The live parts of a method's recipe; ``parts`` replace those of the same slot."""
     given: dict[str, Any] = dict(parts)
     unknown = sorted(given.keys() - Parts.__annotations__.keys())
     if unknown:

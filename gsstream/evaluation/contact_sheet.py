@@ -30,7 +30,7 @@ from gsstream.player.render import PlayerRenderer, render, to_bytes
 ERROR_GAIN = 4
 _CLOSED, _OPEN = (0.25, 0.27, 0.30), (1.0, 0.55, 0.0)
 _MARGIN, _GAP, _TEXT = 8, 4, 18
-#: What is shown close up is this share of a picture's width and height, enlarged to the whole.
+#: Close-ups are enlarged by this factor: they show one CLOSER-th of a picture's width and height.
 CLOSER = 3
 _LABELS = ("ground truth", "decoded", f"|error| x {ERROR_GAIN}", "allowed to change",
            "ground truth, close", "decoded, close", "fresh, close")  # fmt: skip

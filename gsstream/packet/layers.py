@@ -108,7 +108,7 @@ def decode_layers(data: bytes, sections: Mapping[str, Section], number: int, off
 def first_layer(data: bytes) -> FirstLayer | None:
     """Return what can be drawn of the beginning of a key packet, or None: not enough is there, or it has no layers.
 
-    What is damaged gives None as well; whoever reads the whole packet says what is wrong with it.
+    Damaged data gives None as well; reading the whole packet raises the error that describes the damage.
     """
     try:
         return _first_layer(data)

@@ -69,7 +69,7 @@ class Discovered:
         return text if isinstance(self.error, PluginFault) else f"{type(self.error).__name__}: {text}"
 
     def unavailable(self, what: str) -> PluginUnavailable:
-        """Return the error for somebody who asks for a part of this quarantined plugin; raise it from ``error``."""
+        """Return the error for a request of a part of this quarantined plugin; raise it from ``error``."""
         return PluginUnavailable(
             f"{what} is not available: plugin {self.name!r} (from {self.distribution} {self.version}) is in "
             f"quarantine: {self.reason}"
@@ -117,7 +117,7 @@ def _inspect(name: str, distribution: str, version: str, load: Any) -> Discovere
         module = load()
         _collect(module, declared)
     except KeyboardInterrupt:
-        raise  # Ctrl-C, and nobody can tell a plugin that raises it from a person who has had enough
+        raise  # Ctrl-C: a plugin that raises KeyboardInterrupt cannot be told from a user who presses it
     except BaseException as error:  # containing whatever a plugin raises is the purpose of this function
         return Discovered(name, distribution, version, None, error, tuple(declared))
     finally:

@@ -13,7 +13,7 @@ from gsstream.core.versions import NEWER_RECIPE, version_problem
 from gsstream.recipe.document import Empty, KeyPath, Layer, Leaf, Origin
 from gsstream.recipe.model import SCHEMA_VERSION, ComponentRef, Recipe
 
-#: Problems that are told at once; whoever wrote more of them gave the wrong file.
+#: Most problems listed at once; a file with more is probably not a recipe.
 MAX_PROBLEMS = 30
 
 Model = TypeVar("Model", bound=BaseModel)

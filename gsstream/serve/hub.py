@@ -71,7 +71,7 @@ class Hub:
         stream, told, damage, generation = self.follower, None, None, None
         while True:
             news, entry = self._news, cursor.next()
-            # Whoever has packets to come is told so, also when the encoder has ended meanwhile.
+            # While packets remain for this viewer, its state is "live", also when the encoder has ended meanwhile.
             damage = damage if entry is None else None
             state = damage or (self.state if entry is None else State("live"))
             if state != told:

@@ -129,7 +129,7 @@ def _listen(host: str, port: int) -> socket.socket:
         if hasattr(socket, "TCP_USER_TIMEOUT"):
             listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _TIMEOUT_MS)
         listener.bind((host, port))
-        # At once: whoever was told the address may come before the server is ready, and no other server gets it.
+        # At once: clients may connect before the server is ready, and no other server can take the port.
         listener.listen(128)
     except OSError as error:
         listener.close()

@@ -30,7 +30,7 @@ class Checked(StreamingMethod[Any]):
 
     Arguments:
         method: the method itself.
-        parts: of the run; ``where`` is told of every frame.
+        parts: of the run; ``where`` is set to every frame.
     """
 
     source = "gsstream"

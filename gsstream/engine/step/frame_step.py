@@ -39,7 +39,7 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) 
     """
     log, rng, stream, scope = tools.log, tools.rng, parts.recipe.stream, parts.update.scope(frame.index)
     parts.where.enter(frame.index)
-    if frame.epoch_scale == 0:  # its pictures count for nothing: a source that is behind has not even read them
+    if frame.epoch_scale == 0:  # a skipped frame: a source that is behind does not read its images
         return empty_step(state, frame, log)
     with log.phase("change"):
         change = detect_changed_tiles(state.previous, frame, stream.change_threshold)

@@ -11,7 +11,7 @@ from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
 
 _SIDES, _RINGS = 64, 24
-#: Bounds of the new focal length, as a factor: nobody wants a picture stretched, or cut, more than this.
+#: Bounds of the new focal length, as a factor: pictures are not stretched or cut more than this.
 _WIDEST, _NARROWEST = 0.25, 2.0
 
 

@@ -26,7 +26,7 @@ from gsstream.input.recordings.watch_options import WatchOptions
 class _Plan:
     """What is delivered as one frame: ``epoch_scale``, and from which earlier frame cameras are held.
 
-    ``skipped``: the run is behind; nobody looks at its files, and the last images of all training cameras stand in.
+    ``skipped``: the run is behind; its files are not read, and the last images of all training cameras stand in.
     """
 
     epoch_scale: float = 1.0

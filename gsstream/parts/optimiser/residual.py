@@ -79,7 +79,7 @@ class ResidualEpoch:
         iterations: in their order.
         gates: of the rows.
         rd_lambda: loss per bit of latents behind open gates.
-        begin: is told the place of each iteration before it is made, so that an error can name it.
+        begin: called with the position of each iteration before it is made, so that an error can name it.
     """
 
     session: RenderSession

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class FitContext(FrameContext, Protocol):
-    """A frame that a part works on: it renders with some rows moving, and is told how well that explains the images.
+    """A frame that a part may optimise: render it with some rows active, and get loss and gradient.
 
     Colour maps of the cameras are applied and differentiated where they belong; a part need not know them.
     """

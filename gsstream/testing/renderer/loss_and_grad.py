@@ -1,4 +1,4 @@
-"""What a session promises of ``loss_and_grad``: the numbers of its default body, and gradients to rely on."""
+"""Checks of ``loss_and_grad``: equal the default body; gradients repeat, add up over tiles, are 0 for unseen rows."""
 
 from __future__ import annotations
 

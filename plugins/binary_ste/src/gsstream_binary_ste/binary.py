@@ -21,8 +21,8 @@ class BinarySteGate(GateSampler):
     through the step.
 
     The paper reports that these gates collapse. In the released code a clamp follows the rounding; its derivative is 0
-    at both ends, which is where every binary gate is. So no gate feels the images, only the price of being open, and
-    all of them close. ``clamp_gradient`` reproduces that; without it binary gates train.
+    at both ends, which is where every binary gate is. So no gate gets a gradient from the images, only from the
+    penalty, and all of them close. ``clamp_gradient`` reproduces that; without it binary gates train.
     """
 
     source = 'S2GS, ablation "Binary STE"'

@@ -28,7 +28,7 @@ class UniformRandom(ConfidenceEstimator):
             default=math.log(1000.0), gt=0, le=50, description="logits are kept in [-limit, limit], 0 to 50"
         )
 
-    denied = MappingProxyType({"check_permutation": "lots are drawn row by row, whoever stands in the row"})
+    denied = MappingProxyType({"check_permutation": "numbers are drawn by row index, not by Gaussian"})
 
     def claims(self) -> ConfidenceTraits:
         return ConfidenceTraits(floor=self.config.limit)

@@ -133,7 +133,7 @@ def encoder_for(
     assembly = _assembled(method, settings, parts)
 
     def seeds(frame: Frame) -> Any:
-        return gather_points(source.points, frame, assembly.recipe.first_frame, encoder.rng)
+        return gather_points(source.points, frame, assembly.recipe.first_frame)
 
     encoder = Encoder(assembly, source.info, seeds, callbacks=listeners)
     return encoder

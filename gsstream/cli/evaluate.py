@@ -158,9 +158,9 @@ def _of_files(
     recording = open_recording(source, found, catalog)
     try:
         if other.ply_sequence is not None:
-            shown: PlySequence | Renders = PlySequence(
-                other.ply_sequence, recording.info, other.first, found.background
-            )
+            # What the files of others were trained on is black, unless they or a recipe say otherwise.
+            behind = (0.0, 0.0, 0.0) if found.background == "auto" else found.background
+            shown: PlySequence | Renders = PlySequence(other.ply_sequence, recording.info, other.first, behind)
         else:
             assert other.renders is not None, "checked above"
             shown = Renders(other.renders, recording.info, other.first)

@@ -5,7 +5,7 @@ Defaults here are those of the dense baseline; methods ship their own recipe fil
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -18,6 +18,10 @@ LATER_KEYS = (
     "schema_version", "method", "seed", "frames", "confidence", "propagation", "gate", "regularizer", "update",
     "streaming_method", "stream", "codec", "motion", "growth",
 )  # fmt: skip
+
+
+#: One channel of a colour.
+Channel = Annotated[float, Field(ge=0, le=1)]
 
 
 class Section(BaseModel):
@@ -52,6 +56,16 @@ class FirstFrame(Section):
         description="standard deviation of noise on every centre, drawn anew in every iteration, fraction of the rig's "
         "extent (HiCoM): Gaussians that few cameras see fit them less closely",
     )  # fmt: skip
+    dropout: Literal["auto"] | Annotated[float, Field(ge=0, le=0.9)] = Field(
+        default="auto",
+        description="share of the Gaussians that is left out, drawn anew in every iteration: few cameras cannot tell a "
+        "surface from a cloud that is right from one of them. auto: 0.2 with at most 8 training cameras, else 0",
+    )
+    depth_smoothness: Literal["auto"] | Annotated[float, Field(ge=0, le=100)] = Field(
+        default="auto",
+        description="weight in the loss of the change of inverse depth where the training image has no edge; auto: 1 "
+        "with 6 to 8 training cameras that look inwards from around and with up to 5 that do not, else 0",
+    )
     lr_factor: float = Field(
         default=2.0, gt=0, le=100,
         description="factor on 3DGS's learning rates of everything but the centres, which are meant for 30,000 "
@@ -63,6 +77,11 @@ class FirstFrame(Section):
         description="a Gaussian goes, when growth has ended, whose absence changes all training images by less than "
         "this many mean squared errors of one channel of a pixel; 0: none goes",
     )  # fmt: skip
+    shell: bool = Field(
+        default=True,
+        description="large seeds on a sphere around what the cameras look at, so that walls, floor and sky have a "
+        "place behind the scene; later frames leave them as they are",
+    )
     exposure: bool = Field(
         default=False, description="fit an affine colour map per training camera while optimising frame 0"
     )
@@ -156,9 +175,6 @@ class Codec(Section):
 class Recipe(Section):
     """Everything that decides the bytes of a run, besides the recording itself."""
 
-    #: Colour behind everything: black, as in the recordings of the papers.
-    background: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.0)
-
     schema_version: Literal["2.0"] = Field(default="2.0", description="version of this schema")
     method: str = Field(default="dense", description="name of the method this recipe belongs to")
     seed: int = Field(default=0, ge=0, description="seed of every random stream")
@@ -183,6 +199,11 @@ class Recipe(Section):
     codec: Codec = Field(default=Codec(), description="packets")
     budget: Budget = Field(default=Budget(), description="what a frame may cost; nothing given: no limits")
     data: DataOptions = Field(default=DataOptions(), description="the split, and disturbances for experiments")
+    background: Literal["auto"] | tuple[Channel, Channel, Channel] = Field(
+        default="auto",
+        description="colour behind everything, red, green, blue from 0 to 1; auto: the mean of the training images of "
+        "frame 0, so that a ray which no surface stops needs nothing invented on it",
+    )
     scale: float = Field(default=1.0, gt=0, le=1, description="images are downscaled by this factor on reading")
     frames: int | None = Field(default=None, ge=1, description="number of frames to process; all when absent")
     near: float = Field(

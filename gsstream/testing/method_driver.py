@@ -61,7 +61,7 @@ class MethodUnderTest:
         source = open_source(uri)
         settings, parts = self.parts.recipe.first_frame, self.parts
         encoder = Encoder(
-            parts, source.info, lambda frame: gather_points(source.points, frame, settings, encoder.rng),
+            parts, source.info, lambda frame: gather_points(source.points, frame, settings),
             first_frame=first,
         )  # fmt: skip
         return encoder

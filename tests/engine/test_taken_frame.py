@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from gsstream.core.frame import Frame, PointCloud
-from gsstream.core.rng import Rng
 from gsstream.encode import Encoder, assemble, open_recording, recipe_for
 from gsstream.engine.frame0.points import gather_points
 from gsstream.packet import PlayerState
@@ -28,7 +27,7 @@ def begun(method: str, settings: Mapping[str, Any] | None = None, first: PlayerS
         frame = source.frame(0)
 
         def seeds(given: Frame) -> PointCloud:
-            return gather_points(source.points, given, parts.recipe.first_frame, Rng(0))
+            return gather_points(source.points, given, parts.recipe.first_frame)
 
         return Encoder(parts, source.info, seeds, first_frame=first).encode(frame).state.player
 

@@ -39,9 +39,9 @@ def changed(scene: str, motion: str, first: PlayerState | None, frames: int) -> 
     parts = assemble(resolve_recipe("s2gs-edge", catalog.recipe_path, (), changes), catalog)
     uri = f"disturbed:lost_cameras=cam01@{EVENT}-{EVENT + 4}:{WORLD}paths" if scene == "dropout" else WORLD + scene
     source = open_recording(uri, parts.recipe, catalog)
-    settings, held, found = parts.recipe.first_frame, HeldOut(parts.renderer, parts.recipe.background), []
+    settings, held, found = parts.recipe.first_frame, HeldOut(parts.renderer), []
     encoder = Encoder(
-        parts, source.info, lambda frame: gather_points(source.points, frame, settings, encoder.rng), first_frame=first
+        parts, source.info, lambda frame: gather_points(source.points, frame, settings), first_frame=first
     )
     for index in range(frames):
         frame = source.frame(index)

@@ -482,7 +482,7 @@ class TestTools:
         work = subject.encoder()._tools().open(replace(player, meta=replace(player.meta, extra=extra)), before, now)
         found, loss = work.loss_and_grad(1, WrtRows(work.gaussians)), subject.parts.loss
         leaves = work.gaussians.map(lambda value: value.clone().requires_grad_())
-        drawn = subject.parts.renderer.render(leaves, now.cameras, 1, subject.parts.recipe.background).image
+        drawn = subject.parts.renderer.render(leaves, now.cameras, 1, subject.parts.background).image
         shown = Exposure(matrix, offset)[1].apply(drawn)
         want, gradient = loss.evaluate(shown.detach(), loss.prepare(torch.from_numpy(now.images[1])), 0.2)
         shown.backward(gradient)

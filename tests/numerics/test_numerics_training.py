@@ -46,7 +46,7 @@ def quality(subject: MethodUnderTest, state: Any, frame: Frame) -> float:
     values = []
     for view in range(len(frame.cameras)):
         with torch.no_grad():
-            image = subject.parts.renderer.render(state.gaussians, frame.cameras, view, subject.parts.recipe.background)
+            image = subject.parts.renderer.render(state.gaussians, frame.cameras, view, subject.parts.background)
         values.append(psnr(np.clip(image.image.numpy(), 0, 1), frame.images[view]))
     return float(np.mean(values))
 

@@ -104,12 +104,12 @@ def _encode_and_check(case: Case, parts: Assembly, catalog: Catalog, out: Path, 
         source.close()
     for number, line in enumerate((out / METRICS).read_text(encoding="utf-8").splitlines()):
         _finite_numbers(json.loads(line), f"metrics of frame {number}")
-    gaussians = _play(out / STREAM, digests, parts.recipe.background, case.index)
+    gaussians = _play(out / STREAM, digests, case.index)
     size = (out / STREAM).stat().st_size
     return {"frames": len(digests), "gaussians": gaussians, "kinds": kinds, "bytes": size}
 
 
-def _play(stream: Path, digests: list[str], background: tuple[float, float, float], salt: int) -> int:
+def _play(stream: Path, digests: list[str], salt: int) -> int:
     """Check all frames in order, then four in random order in a second player; return N of the last frame."""
     with Playback(stream) as playback:
         if len(playback) != len(digests):
@@ -121,7 +121,7 @@ def _play(stream: Path, digests: list[str], background: tuple[float, float, floa
                 _finite(value, f"{name} of frame {frame}")
         last = state.gaussians
         for camera in range(len(playback.cameras("test"))):
-            shown = render(last, playback.cameras("test"), camera, background, find_renderer())
+            shown = render(last, playback.cameras("test"), camera, playback.meta.background, find_renderer())
             _finite(shown, f"picture of test camera {camera}")
     with Playback(stream) as playback:
         for frame in np.random.default_rng(salt).permutation(len(digests))[:4].tolist():

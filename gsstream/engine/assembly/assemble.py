@@ -46,6 +46,9 @@ AUTO_LOSSES = ("cpu", "reference")
 AUTO_OPTIMISERS = ("cpu", "reference")
 
 
+BLACK = (0.0, 0.0, 0.0)
+
+
 class SlowRendererWarning(UserWarning):
     """The reference renderer is used because no fast one works here."""
 
@@ -61,6 +64,8 @@ class Assembly:
         distributions: installed distributions that the parts come from.
         checks: how closely the run looks at what parts return; nothing that is sent depends on it.
         title: the method and what was changed of its recipe, for tables and pictures.
+        background: colour behind everything: the recipe's. Where that is "auto", black until the encoder has seen
+            frame 0.
         where: the frame and iteration that errors name.
 
     Every part is behind a guard (:class:`gsstream.engine.assembly.guard.Guarded`), so no caller has to be careful.
@@ -83,6 +88,7 @@ class Assembly:
     distributions: tuple[str, ...] = ()
     checks: Checks = Checks.FRAME
     title: str = ""
+    background: tuple[float, float, float] = BLACK
     where: Where = field(default_factory=Where, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -146,6 +152,7 @@ def assemble(
     return Assembly(
         recipe=recipe, origins=resolved.origins, distributions=tuple(owners), checks=level,
         title=title(resolved.recipe, catalog), **parts,
+        background=BLACK if recipe.background == "auto" else recipe.background,
     )  # fmt: skip
 
 

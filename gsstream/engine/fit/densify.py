@@ -9,7 +9,7 @@ import torch
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.topology import TopologyEdit
 from gsstream.engine.fit import schedule
-from gsstream.engine.fit.schedule import MAX_SCALE, PRUNE_OPACITY
+from gsstream.engine.fit.schedule import PRUNE_OPACITY
 from gsstream.parts.render.activations import activate_opacities, activate_scales, rotation_matrices
 from gsstream.recipe.model import FirstFrame
 
@@ -43,14 +43,16 @@ def grow_and_prune(
     statistics: DensifyStatistics,
     settings: FirstFrame,
     extent: float,
+    widest: float,
     generator: torch.Generator,
 ) -> tuple[TopologyEdit, dict[str, torch.Tensor]]:
     """Clone small and split large Gaussians with large screen gradients; drop transparent and oversized ones.
 
+    ``widest`` is the standard deviation from which a Gaussian is oversized.
     Returns the edit and the new contents of every attribute. The population never exceeds ``settings.max_gaussians``.
     """
     largest = activate_scales(gaussians.scales).amax(1)
-    keep = (activate_opacities(gaussians.opacities) > PRUNE_OPACITY) & (largest < MAX_SCALE * extent)
+    keep = (activate_opacities(gaussians.opacities) > PRUNE_OPACITY) & (largest < widest)
     budget = max(0, settings.max_gaussians - int(keep.sum()))
     score = torch.where(keep, statistics.mean, torch.zeros_like(largest))
     hot = (score > schedule.DENSIFY_GRADIENT).nonzero()[:, 0]

@@ -1,7 +1,7 @@
 """Constants of the optimisation that no recipe changes: rates of 3DGS, and what keeps a scene tidy.
 
-The rates and the rules of pruning are those of 3DGS (Kerbl et al. 2023); the penalties and the limits of fill seeds are
-gsstream's own, and held-out quality is why they are there (docs/results/index.md).
+The rates and the rules of pruning are those of 3DGS (Kerbl et al. 2023); the penalties are gsstream's own, and held-out
+quality is why they are there (docs/results/index.md).
 """
 
 from __future__ import annotations
@@ -24,14 +24,10 @@ DENSIFY_UNTIL = 0.6
 #: Shares of the iterations after which what the images would not miss goes: when growth has ended, and once more while
 #: there is time to close the gaps. Earlier, what is pruned grows again (docs/results/trade.md).
 PRUNE_AT = (0.6, 0.8)
-#: Gaussians below this opacity, or wider than this fraction of the rig's extent, are removed.
-PRUNE_OPACITY, MAX_SCALE = 0.01, 0.3
+#: Gaussians below this opacity are removed, and those wider than this fraction of the rig's extent or, where that is
+#: larger, this multiple of a seed of the shell: a rig may be small beside what it looks at.
+PRUNE_OPACITY, MAX_SCALE, MAX_SHELL_SCALE = 0.01, 0.3, 1.5
 #: Weights in the loss of the mean scale, in rig extents, and of the mean opacity.
 SCALE_PENALTY, OPACITY_PENALTY = 0.1, 0.01
-#: At most one seed per so many training pixels, for points and fill seeds each: more than the images can pin down
-#: overfit the training views.
+#: At most one seed per so many training pixels: more than the images can pin down overfit the training views.
 PIXELS_PER_SEED = 64
-#: Most random seeds in the common view volume that no point covers.
-FILL_POINTS = 5_000
-#: A fill seed is seen by this many training cameras, and no nearer to one than this fraction of the rig's extent.
-FILL_MIN_VIEWS, FILL_MIN_DISTANCE = 3, 0.3

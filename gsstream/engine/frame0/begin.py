@@ -21,6 +21,7 @@ from gsstream.engine.assembly.guard import error_context
 from gsstream.engine.frame0.first_layer import first_layer_mask
 from gsstream.engine.frame0.optimise import initial_gaussians, optimise_first_frame, sort_by_node
 from gsstream.engine.frame0.rd_quantise import rd_quantise
+from gsstream.engine.frame0.shell import with_shell
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.input.seeds.thinning import thin_points
 from gsstream.method.tools import Tools
@@ -42,8 +43,10 @@ def begin(parts: Assembly, frame: Frame, tools: Tools) -> Step:
     with log.phase("seed"):
         anchors = seed_anchors(parts, tools.points(frame), frame)
     with log.phase("optimise"):
-        start = initial_gaussians(anchors, parts.recipe.first_frame)
-        found = optimise_first_frame(start, anchors.levels, frame, parts, rng, tools.progress)
+        start, levels = initial_gaussians(anchors, parts.recipe.first_frame), anchors.levels
+        if parts.recipe.first_frame.shell:
+            start, levels = with_shell(start, levels, frame)
+        found = optimise_first_frame(start, levels, frame, parts, rng, tools.progress)
     with log.phase("code"):
         # Positions are float32 in the packet too, so the hierarchy of the decoded scene is the one built here.
         cheaper = rd_quantise(parts, found.gaussians, frame, found.exposure, rng)

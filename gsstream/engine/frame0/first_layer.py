@@ -22,7 +22,7 @@ def first_layer_mask(
     if share == 1 or len(gaussians) == 0:
         return None
     generator = rng.stream("first layer", frame.index)
-    views = TrainingViews(parts.renderer, frame, exposure, parts.recipe.background)
+    views = TrainingViews(parts.renderer, frame, exposure, parts.background)
     errors, _ = removal_errors(views, gaussians, generator)
     return largest_error_mask(errors, share)
 

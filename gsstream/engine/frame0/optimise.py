@@ -27,6 +27,9 @@ from gsstream.engine.fit.nearest import neighbour_distance
 from gsstream.engine.fit.photometric import PhotometricLoss
 from gsstream.engine.frame0.hutchinson import TrainingViews
 from gsstream.engine.frame0.prune import prune_by_error
+from gsstream.engine.frame0.regularisers import choose_regularisers, thin_out
+from gsstream.engine.frame0.smooth_depth import add_smooth_depth_grad
+from gsstream.input.seeds.shell import find_shell
 from gsstream.parts.optimiser.row_parameters import RowParameters
 from gsstream.parts.render.activations import logit, rgb_to_sh0
 from gsstream.parts.render.exposure import Exposure
@@ -120,12 +123,16 @@ class FirstFrameRun:
         self.renderer, self.levels = parts.renderer, levels
         self.views = len(frame.cameras)
         self.extent = frame.cameras.extent
+        self.widest = schedule.MAX_SCALE * self.extent
+        if self.settings.shell:
+            self.widest = max(self.widest, schedule.MAX_SHELL_SCALE * find_shell(frame.cameras).sigma)
         self.iterations, self.generator = iterations, generator
         self.table = RowParameters(dict(start.items()), first_frame_lrs(self.settings, self.extent), parts.optimiser)
         self.photometric = PhotometricLoss(parts.loss, schedule.DSSIM, frame.images, None)
         #: Colour maps that are fitted along; None: those of the photometric loss stay.
         self.exposure: ExposureFit | None = None
         self.statistics = DensifyStatistics.zeros(len(start))
+        self.regularisers = choose_regularisers(self.settings, frame.cameras)
         #: [N] row of ``start`` that each Gaussian comes from.
         self.came_from = torch.arange(len(start))
         self.order: list[int] = []
@@ -140,7 +147,11 @@ class FirstFrameRun:
         last = schedule.DENSIFY_UNTIL * self.iterations
         densify = iteration + schedule.DENSIFY_EVERY >= schedule.DENSIFY_FROM and iteration <= last
         rows = self._disturbed(self.gaussians().map(torch.Tensor.detach))
-        found = self._loss_and_grad(view, rows, densify)
+        rows, keep = thin_out(rows, self.regularisers.dropout, self.generator)
+        wrt = WrtScene(rows, densify, exposure=self.exposure is not None, keep=keep)
+        found = self._loss_and_grad(view, wrt)
+        if weight := self.regularisers.smoothness_at(iteration, self.iterations):
+            add_smooth_depth_grad(self.renderer, wrt.placed(), self.frame, view, found.grad, weight)
         fraction = iteration / self.iterations
         self.table.set_lr("means", self.extent * _log_linear(s.lr_means, s.lr_means_final, fraction))
         self.table.step(self._with_penalty_grad(found.grad))
@@ -162,14 +173,11 @@ class FirstFrameRun:
         noise = torch.randn(rows.means.shape, generator=self.generator) * (self.settings.noise * self.extent)
         return replace(rows, means=rows.means + noise)
 
-    def _loss_and_grad(
-        self, view: int, rows: Gaussians[torch.Tensor], means2d: bool
-    ) -> LossAndGrad[Gaussians[torch.Tensor]]:
+    def _loss_and_grad(self, view: int, wrt: WrtScene) -> LossAndGrad[Gaussians[torch.Tensor]]:
         """Loss of a view and its gradients, and the exposure step."""
         if self.exposure:
             self.photometric.exposure = self.exposure.exposure
-        session = self.renderer.open(rows, None, self.frame.cameras, self.recipe.background)
-        wrt = WrtScene(rows, means2d, exposure=self.exposure is not None)
+        session = self.renderer.open(wrt.values, None, self.frame.cameras, self.parts.background)
         found = session.loss_and_grad(view, self.photometric.view_target(view), wrt)
         if self.exposure and found.exposure is not None:
             self.exposure = self.exposure.step(view, found.exposure, lr=0.005, identity_weight=1e-3)
@@ -188,7 +196,9 @@ class FirstFrameRun:
 
     def _densify(self) -> None:
         gaussians = self.gaussians().map(torch.Tensor.detach)
-        edit, values = grow_and_prune(gaussians, self.statistics, self.settings, self.extent, self.generator)
+        edit, values = grow_and_prune(
+            gaussians, self.statistics, self.settings, self.extent, self.widest, self.generator
+        )
         self.table.edit(edit, values)
         self.levels, self.came_from = self.levels[edit.source], self.came_from[edit.source]
         self.statistics = DensifyStatistics.zeros(len(self.levels))
@@ -197,7 +207,7 @@ class FirstFrameRun:
         """Drop what the images would not miss; what remains has time to close the gaps."""
         gaussians = self.gaussians().map(torch.Tensor.detach)
         exposure = self.exposure.exposure if self.exposure else self.photometric.exposure
-        views = TrainingViews(self.renderer, self.frame, exposure, self.recipe.background)
+        views = TrainingViews(self.renderer, self.frame, exposure, self.parts.background)
         rows = prune_by_error(views, gaussians, self.generator, self.settings.prune_error)
         self.table.select_rows(rows)
         self.levels, self.came_from = self.levels[rows], self.came_from[rows]

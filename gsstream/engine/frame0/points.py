@@ -1,4 +1,4 @@
-"""Seeds of frame 0: the recording's points, else a plane sweep; topped up where no seed covers the view."""
+"""Seeds of frame 0: the recording's points, else a plane sweep, else the shell behind the scene alone."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ import numpy as np
 
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
-from gsstream.core.rng import Rng
 from gsstream.engine.fit import schedule
 from gsstream.input.recordings.base import FrameSource, PointKind
-from gsstream.input.seeds.seeding import fill_volume, photo_consistent_seeds, thin_points
+from gsstream.input.seeds.seeding import photo_consistent_seeds
+from gsstream.input.seeds.shell import shell_points
+from gsstream.input.seeds.thinning import thin_points
 from gsstream.recipe.model import FirstFrame
 
 #: With fewer points than this a scene cannot be reconstructed: "auto" then looks for more by a plane sweep.
@@ -21,25 +22,15 @@ SWEEP_WIDTH = 160
 
 
 def gather_points(
-    shipped: Callable[[PointKind], PointCloud | None], frame: Frame, settings: FirstFrame, rng: Rng
+    shipped: Callable[[PointKind], PointCloud | None], frame: Frame, settings: FirstFrame
 ) -> PointCloud:
     """Return the points to seed from. Only the cameras of ``frame`` take part, and points that the source vouches for.
 
-    Raises InputError when the recipe asks for a kind of points that the recording does not have, or nothing is left.
+    Raises InputError when the recipe asks for a kind of points that the recording does not have, or finds none.
     """
     pixels = frame.images[..., 0].size
     limit = min(settings.max_points, max(1, pixels // schedule.PIXELS_PER_SEED))
-    cloud = thin_points(_base_points(shipped, frame, settings), limit)
-    fill = fill_volume(
-        cloud,
-        frame.images,
-        frame.cameras,
-        min(schedule.FILL_POINTS, limit),
-        min_views=schedule.FILL_MIN_VIEWS,
-        min_distance=schedule.FILL_MIN_DISTANCE * frame.cameras.extent,
-        rng=rng.numpy("fill", frame.index),
-    )
-    return join(cloud, fill)
+    return thin_points(_base_points(shipped, frame, settings), limit)
 
 
 def with_test_views(source: FrameSource, frame: Frame) -> Frame:
@@ -55,15 +46,6 @@ def with_test_views(source: FrameSource, frame: Frame) -> Frame:
         Ks=np.concatenate([frame.cameras.Ks, test.cameras.Ks]),
     )
     return replace(frame, images=np.concatenate([frame.images, test.images]), cameras=cameras)
-
-
-def join(first: PointCloud, second: PointCloud) -> PointCloud:
-    """Return both clouds as one, in order."""
-    return PointCloud(
-        np.concatenate([first.xyz, second.xyz]).astype(np.float32),
-        np.concatenate([first.rgb, second.rgb]).astype(np.float32),
-        f"{first.origin} + {second.origin}",
-    )
 
 
 def _base_points(
@@ -84,11 +66,12 @@ def _base_points(
         return shipped
     try:
         return _sweep(frame, settings)
-    except InputError:
-        # With fewer than three cameras, or views that agree nowhere, the recording's points are taken, or only random
-        # seeds in the view volume.
-        empty = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), "none")
-        return empty if shipped is None else shipped
+    except InputError:  # fewer than three cameras, or views that agree nowhere
+        if shipped is not None:
+            return shipped
+        if not settings.shell:
+            raise
+        return shell_points(frame.images, frame.cameras)
 
 
 def _triangulate(frame: Frame) -> PointCloud:

@@ -59,7 +59,7 @@ def code_sensitivity(
     """
     sensitivity: dict[str, FloatArray] = {name: np.zeros(_flat(getattr(gaussians, name)).shape) for name in KEY_BITS}
     error = 0.0
-    views = TrainingViews(parts.renderer, frame, exposure, parts.recipe.background)
+    views = TrainingViews(parts.renderer, frame, exposure, parts.background)
     for probe in hutchinson_samples(views, gaussians, generator, each=HUTCHINSON_SAMPLES):
         error += probe.error
         for name, bits in KEY_BITS.items():

@@ -26,6 +26,7 @@ from gsstream.engine.method.wrapped import wrapped
 from gsstream.engine.run.threads import one_torch_thread
 from gsstream.engine.step.tools import RunTools
 from gsstream.input.recordings.base import SourceInfo
+from gsstream.input.seeds.shell import mean_color
 from gsstream.method.base import Step
 from gsstream.metrics import peak_memory_mb
 from gsstream.packet import EncodedPacket, PlayerState, StreamMeta
@@ -105,6 +106,8 @@ class Encoder:
         if self.state is not None and frame.index != self.state.player.frame + 1:
             expected = self.state.player.frame + 1
             raise InputError(f"frame {frame.index}: expected frame {expected}, frames are encoded in order")
+        if self.state is None:
+            self.parts = replace(self.parts, background=self._background(frame))
         frame, method = self.with_near_plane(frame), self.method
         log, worked = FrameLog(), time.process_time()
         tools = self._tools(log=log)
@@ -138,7 +141,8 @@ class Encoder:
             return None
         end = read_end(stream, last)
         # The title is what the stream says: equal recipes may be called otherwise by another version.
-        self.parts = replace(self.parts, title=end.player.meta.title)
+        meta = end.player.meta
+        self.parts = replace(self.parts, title=meta.title, background=meta.background)
         tools = self._tools(
             replay=lambda: states_since_key(stream, end), recorded=lambda index: self.with_near_plane(image(index))
         )
@@ -164,8 +168,15 @@ class Encoder:
         """What frame 0 starts from: seeds, or the centres of the Gaussians that are taken over."""
         return self._seeds(frame) if self._first is None else point_cloud_of(self._first)
 
+    def _background(self, frame: Frame) -> tuple[float, float, float]:
+        """The colour behind everything from frame 0 on; a scene that is taken over brings its own."""
+        if self._first is not None:
+            return self._first.meta.background
+        wanted = self.parts.recipe.background
+        return mean_color(frame.images) if wanted == "auto" else wanted
+
     def _swept(self, frame: Frame) -> PointCloud:
-        return gather_points(lambda _: None, frame, self.parts.recipe.first_frame, self.rng)
+        return gather_points(lambda _: None, frame, self.parts.recipe.first_frame)
 
     def _meta(self, frame: Frame) -> StreamMeta:
         info, recipe = self.info, self.parts.recipe
@@ -179,7 +190,7 @@ class Encoder:
             train=frame.cameras,
             test=replace(info.test, near_plane=self.near_plane),
             fps=info.fps,
-            background=recipe.background,
+            background=self.parts.background,
             plugins={name: version(name) for name in sorted(distributions)},
             extra={"source_uri": info.uri, "licence": info.licence, "title": self.parts.title, **carried},
             world=info.world,

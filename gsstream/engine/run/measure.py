@@ -28,8 +28,8 @@ class HeldOut:
     first two frames.
     """
 
-    def __init__(self, renderer: Renderer, background: tuple[float, float, float]) -> None:
-        self._renderer, self._background = renderer, background
+    def __init__(self, renderer: Renderer) -> None:
+        self._renderer = renderer
         self._first: Frame | None = None
         self._sigma: list[float] = []
 
@@ -76,9 +76,9 @@ class HeldOut:
 
     def render(self, state: MethodState, frame: Frame, view: int) -> FloatArray:
         """Return the decoded image [H, W, 3] of a camera, in [0, 1]."""
-        gaussians = state.player.gaussians.map(torch.from_numpy)
+        gaussians, background = state.player.gaussians.map(torch.from_numpy), state.player.meta.background
         with torch.no_grad():
-            output = self._renderer.render(gaussians, frame.cameras, view, self._background)
+            output = self._renderer.render(gaussians, frame.cameras, view, background)
         return np.asarray(np.clip(output.image.numpy(), 0, 1))
 
     def _moving(self, image: FloatArray, truth: FloatArray, view: int) -> float | None:

@@ -105,7 +105,7 @@ class _Run:
     ) -> None:  # fmt: skip
         self.source, self.out = source, out
         self.total = _num_frames(source.info, parts.recipe.frames)
-        self.held_out = HeldOut(parts.renderer, parts.recipe.background) if measure else None
+        self.held_out = HeldOut(parts.renderer) if measure else None
         self.progress = RunProgress(self.total, quiet)
         listeners = Callbacks(packet=self._write, progress=self.progress.first_frame)
         self.encoder = Encoder(parts, source.info, self._seeds, first_frame=first_frame, callbacks=listeners)
@@ -145,7 +145,7 @@ class _Run:
     def _seeds(self, frame: Frame) -> PointCloud:
         recipe = self.encoder.parts.recipe
         seen = with_test_views(self.source, frame) if recipe.data.leak == "points" else frame
-        return gather_points(self.source.points, seen, recipe.first_frame, self.encoder.rng)
+        return gather_points(self.source.points, seen, recipe.first_frame)
 
     def _resume(self) -> int | None:
         """Go on after what the folder holds; the last frame of that, or None to begin anew."""

@@ -21,6 +21,7 @@ from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.active.candidates import VoteCache, changed_rows
 from gsstream.engine.step.active.change import MAX_PIXEL_SIGMA, Change
 from gsstream.engine.step.active.tiles import changed_tile_weights
+from gsstream.input.seeds.shell import in_shell
 from gsstream.metrics.noise import noise_sigma
 from gsstream.parts.optimiser.base import RowOptimiser
 from gsstream.parts.render.base import RenderSession
@@ -47,7 +48,7 @@ class EngineContext:
     ) -> None:  # fmt: skip
         self._parts, self._gaussians, self._hierarchy = parts, state.gaussians, state.hierarchy
         self._frame, self._previous, self._change = frame, state.previous, change
-        self._background, self._part_scale = parts.recipe.background, part_scale
+        self._background, self._part_scale = parts.background, part_scale
         self.log, self.key_rows = log, state.player.key_rows
         self.photometric = PhotometricLoss(parts.loss, DSSIM, frame.images, state.exposure)
         self._session = state.session
@@ -132,10 +133,18 @@ class EngineContext:
     def scaled(self, number: float) -> int:
         return max(1, round(number * self._frame.epoch_scale * self._part_scale))
 
+    @property
+    def shell_rows(self) -> torch.Tensor:
+        if not self._parts.recipe.first_frame.shell:
+            return torch.zeros(len(self._gaussians), dtype=torch.bool)
+        means, scales = self._gaussians.means.numpy(), self._gaussians.scales.numpy()
+        return torch.from_numpy(in_shell(means, scales, self.cameras))
+
     def changed_rows(self, min_votes: float) -> torch.Tensor:
-        return changed_rows(
+        rows = changed_rows(
             self._change, self._gaussians.means, self.cameras, self.session, min_votes, self._votes
         )
+        return rows & ~self.shell_rows
 
     def narrow(self, rows: torch.Tensor) -> None:
         self._session = self.session_for(rows)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from gsstream.core.changes import Delta, apply_delta
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
@@ -12,7 +14,7 @@ from gsstream.parts.growth.none import NoGrowth
 
 
 def with_growth(parts: Assembly, state: StreamState, delta: Delta, view: EngineContext, rng: Rng) -> Delta:
-    """Return the delta with the rows that leave and those that join.
+    """Return the delta with the rows that leave, of which those of the shell stay, and those that join.
 
     Raises ComponentError when the part fails, or proposes what does not fit the scene.
     """
@@ -22,5 +24,6 @@ def with_growth(parts: Assembly, state: StreamState, delta: Delta, view: EngineC
     rows = parts.growth.propose(after, view, rng)
     with error_context("growth", parts.part("growth"), parts.where):
         if rows is not None:
-            apply_delta(after, Delta((rows,)))
+            apply_delta(after, Delta((rows,)))  # before rows are left out: a wrong proposal gets an error
+            rows = replace(rows, removed=rows.removed[~view.shell_rows.numpy()[rows.removed]])
     return delta.with_row_edit(rows)

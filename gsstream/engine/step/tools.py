@@ -64,7 +64,7 @@ class RunTools:
 
     @property
     def background(self) -> tuple[float, float, float]:
-        return self.parts.recipe.background
+        return self.parts.background
 
     def epochs(self, frame: Frame) -> int:
         epochs = self.parts.recipe.stream.epochs if self.budget is None else self.budget.epochs

@@ -42,6 +42,17 @@ def focus_point(cameras: Cameras) -> FloatArray:
     return focus
 
 
+def spread_views(cameras: Cameras, count: int) -> IntArray:
+    """Return [min(count, C)], ascending: cameras that stand far apart, the first of them farthest from the middle."""
+    gaps = np.linalg.norm(cameras.centers[:, None] - cameras.centers[None], axis=2)
+    chosen = [int(np.linalg.norm(cameras.centers - cameras.centers.mean(0), axis=1).argmax())]
+    while len(chosen) < min(count, len(cameras)):
+        nearest = gaps[:, chosen].min(1)
+        nearest[chosen] = -1
+        chosen.append(int(nearest.argmax()))
+    return np.sort(np.array(chosen))
+
+
 def depth_range(cameras: Cameras, near: float = 0.3, far: float = 4.0) -> FloatArray:
     """Return [C, 2]: nearest and farthest planar depth worth searching, scene units."""
     centers = cameras.centers

@@ -95,7 +95,7 @@ def _copies(work: FitContext, gradient: float, room: int, admitted: CopyFilter |
 
 
 def high_gradient_rows(work: FitContext, gradient: float) -> torch.Tensor:
-    """Return the rows [P] whose mean screen gradient exceeds a bound, the largest first.
+    """Return the rows [P] whose mean screen gradient exceeds a bound, the largest first; none of the shell.
 
     The gradient is that of the mean absolute difference between what a view shows and what its camera recorded; the
     mean is over the views in which it is not zero.
@@ -111,5 +111,5 @@ def high_gradient_rows(work: FitContext, gradient: float) -> torch.Tensor:
         norm = (work.screen_gradient(view, difference.sign() / difference.numel()).gradient * half).norm(dim=1)
         total, count = total + norm, count + (norm > 0)
     grad_norm = total / count.clamp_min(1)
-    hot = (grad_norm > gradient).nonzero()[:, 0]
+    hot = ((grad_norm > gradient) & ~work.shell_rows).nonzero()[:, 0]
     return hot[torch.argsort(grad_norm[hot], descending=True, stable=True)]

@@ -40,11 +40,12 @@ def known_groups(scene: Scene, cameras: Cameras, pixels: float, brightness_bins:
 
 
 def changed_groups(groups: Groups, work: FitContext, votes: float, share: float) -> IntArray:
-    """Return [G] bool: groups of which at least this share of the rows lie in what changed."""
+    """Return [G] bool: groups of which at least this share of the rows lie in what changed, and none in the shell."""
     changed = work.changed_rows(votes).numpy()
     total = np.bincount(groups.group_of, minlength=groups.count)
     hit = np.bincount(groups.group_of[changed], minlength=groups.count)
-    return np.asarray((total > 0) & (hit > 0) & (hit >= share * total))
+    still = np.bincount(groups.group_of[work.shell_rows.numpy()], minlength=groups.count)
+    return np.asarray((total > 0) & (hit > 0) & (hit >= share * total) & (still == 0))
 
 
 def groups_of_rows(groups: Groups, rows: IntArray) -> IntArray:

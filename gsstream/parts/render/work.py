@@ -38,8 +38,12 @@ class FitContext(FrameContext, Protocol):
         It is less where a run is behind its recording, or where a budget of time has to be met without a residual.
         """
 
+    @property
+    def shell_rows(self) -> torch.Tensor:
+        """[N] bool: Gaussians behind the scene, which no frame moves, changes, copies or removes."""
+
     def changed_rows(self, min_votes: float) -> torch.Tensor:
-        """Return [N] bool: Gaussians that are seen in a tile that changed.
+        """Return [N] bool: Gaussians that are seen in a tile that changed, but for those of the shell.
 
         Arguments:
             min_votes: least share, 0 to 1, of the views a Gaussian projects into in which it must lie in or beside a

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar, final
 
 import torch
@@ -15,6 +15,9 @@ from gsstream.parts.render.backward import gradient_of
 from gsstream.parts.render.transforms import transform_vjp
 
 G = TypeVar("G")
+
+#: Opacity logit of a Gaussian that is left out of a pass: an alpha far below 1/255, which no renderer draws.
+NEVER_DRAWN = -30.0
 
 
 class Wrt(ABC, Generic[G]):
@@ -82,14 +85,23 @@ class WrtTransforms(Wrt[torch.Tensor]):
 @final
 @dataclass(frozen=True, slots=True, eq=False)
 class WrtScene(Wrt[Gaussians[torch.Tensor]]):
-    """By all N rows of a session that was not narrowed, and by what frame 0 fits besides."""
+    """By all N rows of a session that was not narrowed, and by what frame 0 fits besides.
+
+    Arguments:
+        values: N rows, raw values.
+        means2d, exposure: ask for these gradients, too.
+        keep: [N] bool, rows that are drawn; None: all. The gradient of the others is 0.
+    """
 
     values: Gaussians[torch.Tensor]
     means2d: bool = True
     exposure: bool = True
+    keep: torch.Tensor | None = None
 
     def placed(self) -> Gaussians[torch.Tensor]:
-        return self.values
+        if self.keep is None:
+            return self.values
+        return replace(self.values, opacities=torch.where(self.keep, self.values.opacities, NEVER_DRAWN))
 
     def grad(self, leaves: Gaussians[torch.Tensor]) -> Gaussians[torch.Tensor]:
         return leaves.map(gradient_of)

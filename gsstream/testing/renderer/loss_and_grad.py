@@ -132,6 +132,22 @@ def check_renderer_loss_and_grad_scene(part: Renderer) -> None:
 
 
 @check("renderer")
+def check_renderer_loss_and_grad_kept(part: Renderer) -> None:
+    """Rows of a scene that are not kept are not drawn: the others have the gradient of a scene without them."""
+    case = get_case("cloud")
+    keep = torch.rand(len(case.gaussians), generator=torch.Generator().manual_seed(8)) < 0.7
+    less = case.gaussians.rows(keep)
+    session, without = (part.open(rows, None, case.cameras, GREY) for rows in (case.gaussians, less))
+    for name, loss in losses():
+        what, target = f"WrtScene, loss {name!r}, some rows kept", ViewTarget(loss, loss.prepare(IMAGE), 0.2, IMAGE)
+        found = session.loss_and_grad(0, target, WrtScene(case.gaussians, means2d=False, keep=keep))
+        want = without.loss_and_grad(0, target, WrtScene(less, means2d=False))
+        compare(what, replace(found, grad=found.grad.rows(keep), exposure=want.exposure), want, 1e-5)
+        for attribute, value in found.grad.rows(~keep).items():
+            at_most(f"{what}: gradient of {attribute} of the others", value.abs(), 0.0, 0.0, EXACT)
+
+
+@check("renderer")
 def check_renderer_grad(part: Renderer) -> None:
     """Gradients repeat bit for bit, leave rows and graphs alone, add up over tiles, and are 0 where nothing counts."""
     loss = ReferenceLoss()

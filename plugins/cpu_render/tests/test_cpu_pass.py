@@ -58,14 +58,14 @@ def captured(method: str, settings: tuple[str, ...]) -> tuple[Assembly, Problem]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(frame_step, "optimise", noted)
         encoder = Encoder(
-            parts, source.info, lambda frame: gather_points(source.points, frame, parts.recipe.first_frame, encoder.rng)
+            parts, source.info, lambda frame: gather_points(source.points, frame, parts.recipe.first_frame)
         )
         for index in range(3):
             encoder.encode(source.frame(index))
     problem = found[-1]
     # The run has committed the session of this frame since.
     session = parts.renderer.open(encoder.state.player.scene.gaussians.map(torch.from_numpy), None,
-                                  source.frame(2).cameras, parts.recipe.background)  # fmt: skip
+                                  source.frame(2).cameras, parts.background)  # fmt: skip
     session.narrow(problem.rows)
     return parts, replace(problem, session=session)
 

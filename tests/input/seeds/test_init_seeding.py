@@ -1,4 +1,4 @@
-"""Seeding: seeds lie on true surfaces, fill goes where nothing is explained, thinning keeps its budget."""
+"""Seeding: seeds lie on true surfaces, thinning keeps its budget."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from gsstream.input.recordings.primitives import cast
 from gsstream.input.recordings.synthetic import SyntheticSource
 from gsstream.input.seeds.aggregate import aggregate, best_plane
 from gsstream.input.seeds.fusion import agreement, color_gains, interpolate_depths
-from gsstream.input.seeds.geometry import depth_range, focus_point, neighbour_views
-from gsstream.input.seeds.seeding import fill_volume, photo_consistent_seeds, thin_points, visible_views
+from gsstream.input.seeds.geometry import depth_range, focus_point, neighbour_views, visible_views
+from gsstream.input.seeds.seeding import photo_consistent_seeds
 from gsstream.input.seeds.sweep import SweepSettings
+from gsstream.input.seeds.thinning import thin_points
 
 QUICK = SweepSettings(planes=64, neighbours=4)
 
@@ -180,37 +181,6 @@ def test_best_plane_finds_the_vertex_of_a_parabola() -> None:
     planes = np.arange(9)[:, None, None]
     vertex = np.array([[3.3, 0.0, 8.0, 5.5]])
     np.testing.assert_allclose(best_plane(((planes - vertex) ** 2).astype(np.float32)), vertex, atol=1e-5)
-
-
-def test_fill_respects_views_distance_and_coverage(scene: SyntheticSource) -> None:
-    images, cameras = scene.frame(0).images, scene.info.train
-
-    def fill(points: PointCloud | None, count: int = 500) -> PointCloud:
-        rng = np.random.default_rng(0)
-        return fill_volume(points, images, cameras, count, min_views=4, min_distance=0.8, rng=rng)
-
-    free = fill(None)
-    assert len(free) == 500
-    assert free.xyz.tobytes() == fill(None).xyz.tobytes()
-    [one] = zip(*(table.tolist() for table in (fill(None, count=1).xyz, fill(None, count=1).rgb)), strict=True)
-    assert one == (free.xyz[0].tolist(), free.rgb[0].tolist())
-    assert (visible_views(free.xyz, cameras).sum(1) >= 4).all()
-    gaps = np.linalg.norm(free.xyz[:, None] - cameras.centers[None], axis=2)
-    assert gaps.min() >= 0.8 - 1e-5
-    assert ((free.rgb >= 0) & (free.rgb <= 1)).all()
-    # Points on every surface leave nothing to fill; points on one half of the room leave the other.
-    everything = scene.points()
-    assert len(fill(everything)) < 50
-    left = everything.xyz[:, 1] < 0
-    half = PointCloud(everything.xyz[left], everything.rgb[left], "half")
-    assert (fill(half).xyz[:, 1] > 0).mean() > 0.8
-
-
-def test_fill_of_an_impossible_volume_is_empty(scene: SyntheticSource) -> None:
-    rng = np.random.default_rng(0)
-    images, cameras = scene.frame(0).images, scene.info.train
-    none = fill_volume(None, images, cameras, 50, min_views=11, min_distance=0.0, rng=rng)
-    assert none.xyz.shape == none.rgb.shape == (0, 3)
 
 
 @settings(max_examples=40, deadline=None)

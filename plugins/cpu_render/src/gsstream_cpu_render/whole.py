@@ -15,7 +15,7 @@ def loss_and_grad_of_scene(
     held: PooledRasterizer, target: ViewTarget, wrt: WrtScene
 ) -> LossAndGrad[Gaussians[torch.Tensor]]:
     """Return loss and gradients by the rows of a whole scene."""
-    rows = wrt.values.map(torch.Tensor.detach)
+    rows = wrt.placed().map(torch.Tensor.detach)
     grad = rows.map(lambda value: torch.empty(value.shape))
     means2d = torch.empty(len(rows), 2)
     by_exposure = None if target.exposure is None else np.empty(12, np.float32)

@@ -210,11 +210,11 @@ def _rig(plan: FramePlan, parts: Assembly) -> Cameras:
 
 def _first_player(parts: Assembly, scene: Gaussians[FloatArray], rig: Cameras) -> PlayerState:
     """The scene as a decoded key packet, every Gaussian a node of its own; the method lays its own groups over it."""
-    count, recipe = len(scene), parts.recipe
+    count = len(scene)
     cell = np.float32(np.exp(np.median(scene.scales)))
     layout = Layout(np.ones(count, np.int32), np.zeros(count, np.uint8), np.array([cell], np.float32))
     extra = {"origin": scene.means.min(0).tolist()}
-    meta = StreamMeta("bench", "synthetic", {}, rig, rig.select([]), 30.0, recipe.background, extra=extra)
+    meta = StreamMeta("bench", "synthetic", {}, rig, rig.select([]), 30.0, parts.background, extra=extra)
     return decode_packet(None, encode_key(KeyState(scene, layout, meta), frame=0).data)
 
 
@@ -229,7 +229,7 @@ def _draw(parts: Assembly, scene: Gaussians[FloatArray], rig: Cameras) -> FloatA
     """[C, H, W, 3] all views of a scene, cut at 1 as a camera would."""
     tensors = scene.map(torch.from_numpy)
     with torch.no_grad():
-        views = [parts.renderer.render(tensors, rig, i, parts.recipe.background).image for i in range(len(rig))]
+        views = [parts.renderer.render(tensors, rig, i, parts.background).image for i in range(len(rig))]
     return np.stack([view.numpy() for view in views]).clip(0, 1)
 
 

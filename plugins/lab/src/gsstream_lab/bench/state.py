@@ -19,7 +19,7 @@ def mid_stream_state(parts: Assembly, state: StreamState, last: Step | None) -> 
     if left is None:
         return state
     rig = state.previous.cameras
-    session = parts.renderer.open(state.gaussians, None, rig, parts.recipe.background)
+    session = parts.renderer.open(state.gaussians, None, rig, parts.background)
     nothing = torch.zeros(rig.height, rig.width, 3)
     for view in left.cache_bytes().per_view:
         session.screen_gradient(view, nothing)

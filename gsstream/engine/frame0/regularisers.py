@@ -1,0 +1,64 @@
+"""What keeps frame 0 from explaining each picture on its own: it depends on the training cameras.
+
+The bounds were chosen on left-out training cameras (docs/results/extremes.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.gaussians import Gaussians
+from gsstream.input.seeds.room import stands_around
+from gsstream.recipe.model import FirstFrame
+
+#: Cameras up to which a rig is regularised at all: with more of them, both measures lose detail.
+FEW = 8
+#: Share of the Gaussians that is left out.
+DROPOUT = 0.2
+#: Weight of the smoothness of depth, and how many cameras divide where it pays: so many and more in a room that they
+#: stand in, whose walls are smooth but placed too badly by fewer; fewer than that where they look from one side, and
+#: more of them tell depth better than smoothness does.
+SMOOTHNESS, SMOOTHNESS_CAMERAS = 1.0, 6
+#: It takes part in one of so many iterations, after this share of them: at the start no depth is worth keeping.
+SMOOTHNESS_EVERY, SMOOTHNESS_FROM = 2, 0.1
+#: Largest opacity of a Gaussian that stands in for those that are left out.
+MOST_OPAQUE = 0.9999
+
+
+@dataclass(frozen=True, slots=True)
+class Regularisers:
+    """Share of the Gaussians that an iteration leaves out, and weight of the smoothness of depth; 0: none."""
+
+    dropout: float
+    depth_smoothness: float
+
+    def smoothness_at(self, iteration: int, iterations: int) -> float:
+        """Return the weight in one iteration of the schedule; 0 in those in which it takes no part."""
+        if iteration % SMOOTHNESS_EVERY or iteration < SMOOTHNESS_FROM * iterations:
+            return 0.0
+        return SMOOTHNESS_EVERY * self.depth_smoothness
+
+
+def choose_regularisers(settings: FirstFrame, cameras: Cameras) -> Regularisers:
+    """Return what the recipe asks for, or what suits so many training cameras."""
+    dropout, smoothness = settings.dropout, settings.depth_smoothness
+    if dropout == "auto":
+        dropout = DROPOUT if len(cameras) <= FEW else 0.0
+    if smoothness == "auto":
+        pays = len(cameras) <= FEW and (len(cameras) >= SMOOTHNESS_CAMERAS) == stands_around(cameras)
+        smoothness = SMOOTHNESS if pays else 0.0
+    return Regularisers(dropout, smoothness)
+
+
+def thin_out(
+    rows: Gaussians[torch.Tensor], share: float, generator: torch.Generator
+) -> tuple[Gaussians[torch.Tensor], torch.Tensor | None]:
+    """Return the rows with the opacity that makes up for those left out, and which [N] are kept (None: all)."""
+    if share == 0:
+        return rows, None
+    keep = torch.rand(len(rows), generator=generator) >= share
+    opacities = torch.logit((rows.opacities.sigmoid() / (1 - share)).clamp(max=MOST_OPAQUE))
+    return replace(rows, opacities=opacities), keep

@@ -1,0 +1,243 @@
+"""Seeds on the walls and the floor of a room that the cameras stand in.
+
+Few cameras see most of a wall alone. There a plane sweep has nothing to match, and a chance match close to the lens,
+where every pixel falls into some other picture, passes for a surface. A room is a sphere and a floor that the cameras
+stand in. Both are found by how well the pictures agree once they are drawn on the surface, which takes slant and
+perspective out of the comparison, so that cameras far apart can be compared. Training cameras only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.projection import inside, project
+from gsstream.core.shapes import BoolArray, FloatArray
+from gsstream.input.seeds.fusion import agreement, world_points
+from gsstream.input.seeds.geometry import focus_point, neighbour_views, pixel_centers, spread_views
+from gsstream.input.seeds.window import window_mean
+
+#: Degrees between two cameras, seen from what all look at, above which a rig stands in the room that it looks into.
+AROUND = 120.0
+#: Most cameras that a room is found by, and that a pixel's place is compared with: time grows with their pairs.
+MOST_CAMERAS = 8
+#: Deviation of grey that counts as texture, half width of the windows compared, and places that make a score count.
+NOISE, HALF, ENOUGH = 0.02, 3, 500
+#: The middle of the sphere is drawn to the focus, over this share of the rig's size; cameras may stand so far outside.
+PULL, INSIDE = 0.05, 0.93
+#: Correlations below which another camera contradicts a place on the wall, and above which it confirms the sweep.
+CONTRADICTED, CONFIRMED = 0.2, 0.6
+#: Shares of the room's depth that a surface in front of it is nearer than: a sure one, and one with a single supporter.
+IN_FRONT, CLEARLY_IN_FRONT = 0.97, 0.93
+#: Difference of depth up to which another view supports the sweep.
+SUPPORT = 0.03
+
+
+class Room(NamedTuple):
+    """A sphere (middle [3], radius) and a floor: places x with up . x = floor, up [3] a unit vector. Scene units."""
+
+    middle: FloatArray
+    radius: float
+    up: FloatArray
+    floor: float
+
+
+class Match(NamedTuple):
+    """Pixels of a view at some depth, [H, W] each: best correlation with another view, is one there, and texture."""
+
+    best: FloatArray
+    seen: BoolArray
+    texture: FloatArray
+
+
+def stands_around(cameras: Cameras) -> bool:
+    """Say whether a rig looks inwards from around: only then do the cameras stand where the walls are."""
+    if len(cameras) < 2:
+        return False
+    outward = cameras.centers - focus_point(cameras)
+    distance = np.linalg.norm(outward, axis=1)
+    if (np.einsum("ci,ci->c", cameras.viewmats[:, 2, :3], -outward) <= 0.5 * distance).any():
+        return False
+    directions = outward / distance[:, None]
+    return bool((directions @ directions.T).min() < np.cos(np.radians(AROUND)))
+
+
+def with_room(
+    images: FloatArray, cameras: Cameras, swept: FloatArray, depths: FloatArray, accepted: BoolArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return depths [C, H, W] of which those of the room stand in where the sweep is not sure, and which are seeds.
+
+    A pixel gets no seed where another camera contradicts the wall: it sees the place, with texture, and other colours.
+
+    Arguments:
+        images: [C, H, W, 3] in [0, 1], about 160 pixels wide; time grows with their size.
+        cameras: C cameras of that size, with the near plane of the run.
+        swept: [C, H, W] depth that the sweep found, right or wrong.
+        depths: [C, H, W] the same after interpolation where it was not sure.
+        accepted: [C, H, W] bool, where enough views agree with ``depths``.
+    """
+    support = agreement(swept, cameras, SUPPORT).support
+    room = room_depths(find_room(images, cameras), cameras)
+    partners = neighbour_views(cameras, MOST_CAMERAS)
+    depths, kept = depths.copy(), accepted & (depths < IN_FRONT * room)
+    for view in range(len(cameras)):
+        match = _match(images, cameras, view, swept[view], partners[view].tolist())
+        more = ~kept[view] & (swept[view] < CLEARLY_IN_FRONT * room[view]) & (support[view] >= 1)
+        more &= match.best > CONFIRMED
+        depths[view][more] = swept[view][more]
+        kept[view] |= more
+        wall = _match(images, cameras, view, room[view], partners[view].tolist())
+        contradicted = wall.seen & (wall.best < CONTRADICTED) & (wall.texture > NOISE)
+        taken = ~kept[view] & ~contradicted
+        depths[view][taken] = room[view][taken]
+        kept[view] |= taken
+    return depths, kept
+
+
+def find_room(images: FloatArray, cameras: Cameras) -> Room:
+    """Return the sphere and the floor on which pictures agree best; the same for the same pictures."""
+    if len(cameras) > MOST_CAMERAS:
+        chosen = spread_views(cameras, MOST_CAMERAS)
+        images, cameras = images[chosen], cameras.select(chosen.tolist())
+    grey = torch.from_numpy(np.ascontiguousarray(images.mean(-1)))
+    focus = focus_point(cameras)
+    size = float(np.linalg.norm(cameras.centers - focus, axis=1).mean())
+    return Room(*_sphere(grey, cameras, focus, size), *_floor(grey, cameras, focus, size))
+
+
+def room_depths(room: Room, cameras: Cameras) -> FloatArray:
+    """Return [C, H, W]: planar depth at which the ray of every pixel leaves the room."""
+    pixels = pixel_centers(cameras.width, cameras.height)
+    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], 1)
+    found = np.empty((len(cameras), len(pixels)))
+    for view, start in enumerate(cameras.centers):
+        way = rays @ np.linalg.inv(cameras.Ks[view]).T @ cameras.viewmats[view, :3, :3]  # of planar depth 1
+        offset = start - room.middle
+        square, half = (way**2).sum(1), way @ offset
+        inner = half**2 - square * (offset @ offset - room.radius**2)
+        wall = (np.sqrt(np.maximum(inner, 0)) - half) / square
+        wall[(inner < 0) | (wall <= 0)] = np.inf
+        down = way @ room.up
+        drop = np.full(len(pixels), room.floor - start @ room.up)
+        ground = np.divide(drop, down, out=np.full(len(pixels), np.inf), where=down != 0)
+        ground[ground <= 0] = np.inf
+        depth = np.minimum(wall, ground)
+        # A ray that passes a sphere in which its camera does not quite stand ends beyond it.
+        found[view] = np.where(np.isfinite(depth), depth, 3 * room.radius)
+    return found.reshape(len(cameras), cameras.height, cameras.width)
+
+
+def _sphere(
+    grey: torch.Tensor, cameras: Cameras, focus: FloatArray, size: float
+) -> tuple[FloatArray, float]:
+    """Middle and radius: about the focus, and no smaller than where the cameras stand."""
+    latitude = (np.arange(72) + 0.5) / 72 * np.pi - np.pi / 2
+    longitude = (np.arange(216) + 0.5) / 216 * 2 * np.pi
+    a, b = np.meshgrid(latitude, longitude, indexing="ij")
+    unit = np.stack([np.cos(a) * np.cos(b), np.cos(a) * np.sin(b), np.sin(a)], -1)
+
+    def score(values: FloatArray) -> float:
+        if values[3] < INSIDE * np.linalg.norm(cameras.centers - values[:3], axis=1).max():
+            return -1.0
+        away = float(np.linalg.norm(values[:3] - focus)) / (PULL * size)
+        return surface_agreement(grey, cameras, values[:3] + values[3] * unit) * float(np.exp(-0.5 * away**2))
+
+    starts = [np.append(focus, radius) for radius in np.linspace(0.8, 3, 111) * size]
+    best = _climb(score, starts, np.full(4, 0.04 * size), tries=150, shrink=0.98)
+    return best[:3], float(best[3])
+
+
+def _floor(grey: torch.Tensor, cameras: Cameras, focus: FloatArray, size: float) -> tuple[FloatArray, float]:
+    """Upward normal, from cameras held level, and the height of a plane below every camera."""
+    across = cameras.viewmats[:, 0, :3]
+    up = np.linalg.eigh(across.T @ across)[1][:, 0]
+    if up @ cameras.viewmats[:, 1, :3].mean(0) > 0:  # a camera's second axis points down
+        up = -up
+    highest = float(((cameras.centers - focus) @ up).min()) - 0.02 * size
+    one = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    one /= np.linalg.norm(one)
+    steps = ((np.arange(128) + 0.5) / 64 - 1) * 1.5 * size
+    flat = steps[:, None, None] * one + steps[None, :, None] * np.cross(up, one)
+
+    def score(values: FloatArray) -> float:
+        if values[0] > highest:
+            return -1.0
+        return surface_agreement(grey, cameras, focus + flat + values[0] * up)
+
+    starts = [np.array([height]) for height in np.linspace(min(-1.2 * size, highest), highest, 91)]
+    best = _climb(score, starts, np.array([0.01 * size]), tries=60, shrink=0.95)
+    return up, float(focus @ up + best[0])
+
+
+def _climb(
+    score: Callable[[FloatArray], float], starts: list[FloatArray], step: FloatArray, tries: int, shrink: float
+) -> FloatArray:
+    """Values of a high score: random steps, ever smaller ones, from the best of the starts."""
+    values = [score(start) for start in starts]
+    best, value = starts[int(np.argmax(values))], max(values)
+    rng = np.random.default_rng(0)
+    for number in range(tries):
+        other = best + rng.normal(size=len(best)) * step * shrink**number
+        found = score(other)
+        if found > value:
+            best, value = other, found
+    return best
+
+
+def surface_agreement(grey: torch.Tensor, cameras: Cameras, surface: FloatArray) -> float:
+    """Return how well pictures [C, H, W] agree on a surface [R, S, 3]: 0 to 1.
+
+    It is the mean correlation, negative ones as 0, over all pairs of cameras and textured places; less where there are
+    few of them.
+    """
+    points, shape = surface.reshape(-1, 3), surface.shape[:2]
+    drawn = [_drawn_on(grey[view], cameras, view, points, shape) for view in range(len(grey))]
+    shades, there = torch.stack([shade for shade, _ in drawn]), torch.stack([seen for _, seen in drawn])
+    means, squares = window_mean(torch.stack([shades, shades * shades], 1), HALF).unbind(1)
+    variance = (squares - means * means).clamp_min(0)
+    # A window counts where all of it lies in the picture.
+    usable = (window_mean(there.float()[:, None], HALF)[:, 0] > 0.99) & (variance > NOISE**2)
+    total, good = 0, 0.0
+    for a, b in combinations(range(len(grey)), 2):
+        both = usable[a] & usable[b]
+        if not bool(both.any()):
+            continue
+        cross = window_mean((shades[a] * shades[b])[None, None], HALF)[0, 0] - means[a] * means[b]
+        same = cross / ((variance[a] + NOISE**2) * (variance[b] + NOISE**2)).sqrt()
+        total, good = total + int(both.sum()), good + float(same[both].clamp_min(0).sum())
+    return good / max(total, 1) * min(1.0, total / ENOUGH)
+
+
+def _match(images: FloatArray, cameras: Cameras, view: int, depth: FloatArray, others: list[int]) -> Match:
+    """Compare a view's pixels, taken to lie at ``depth`` [H, W], with other views."""
+    stack = np.broadcast_to(depth.astype(np.float64), (len(cameras), *depth.shape))
+    points = world_points(stack, cameras, view)
+    own = torch.from_numpy(images[view].mean(-1))
+    mean, square = window_mean(torch.stack([own, own * own])[:, None], HALF)[:, 0]
+    variance = (square - mean * mean).clamp_min(0)
+    best, seen = torch.full(depth.shape, -1.0), torch.zeros(depth.shape, dtype=torch.bool)
+    for other in others:
+        shade, there = _drawn_on(torch.from_numpy(images[other].mean(-1)), cameras, other, points, depth.shape)
+        moments = window_mean(torch.stack([shade, shade * shade, shade * own])[:, None], HALF)[:, 0]
+        spread = (moments[1] - moments[0] ** 2).clamp_min(0)
+        same = (moments[2] - moments[0] * mean) / ((variance + NOISE**2) * (spread + NOISE**2)).sqrt()
+        best = torch.where(there, torch.maximum(best, same), best)
+        seen |= there
+    return Match(best.numpy(), seen.numpy(), variance.sqrt().numpy())
+
+
+def _drawn_on(
+    grey: torch.Tensor, cameras: Cameras, view: int, points: FloatArray, shape: tuple[int, ...]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """A picture [H, W] drawn on places [P, 3], as an image of ``shape`` (P pixels), and where there is any of it."""
+    uv, depth = project(points, cameras, view)
+    grid = torch.from_numpy((uv / (cameras.width, cameras.height) * 2 - 1).astype(np.float32)).reshape(1, *shape, 2)
+    drawn = F.grid_sample(grey[None, None], grid, align_corners=False, padding_mode="border")[0, 0]
+    there = inside(uv, depth, cameras) & (depth > cameras.near)
+    return drawn, torch.from_numpy(there.reshape(shape))

@@ -1,0 +1,169 @@
+"""The room that cameras stand in: which rigs have one, where its walls are, and what becomes a seed on them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from rigs import HEIGHT, WIDTH, in_line, inwards, looking, on_arc, outwards, parallel
+
+from gsstream.core.cameras import Cameras
+from gsstream.engine.run.threads import one_torch_thread
+from gsstream.input.seeds import room
+from gsstream.input.seeds.fusion import world_points
+from gsstream.input.seeds.geometry import spread_views
+from gsstream.input.seeds.room import (
+    MOST_CAMERAS,
+    Room,
+    find_room,
+    room_depths,
+    stands_around,
+    surface_agreement,
+    with_room,
+)
+from gsstream.input.seeds.seeding import photo_consistent_seeds
+
+#: A little off what the cameras look at.
+TRUTH = Room(np.array([0.05, -0.04, 0.02]), 3.3, np.array([0.0, 0.0, 1.0]), -0.7)
+DOME = looking(on_arc(5, 300), [[0, 0, 0], [0.2, 0, 0], [0, -0.2, 0.1], [-0.1, 0.1, 0], [0, 0, 0.1]])
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """As an encoder works: the tensors are small, and two threads wait for each other on a busy machine."""
+    with one_torch_thread():
+        yield
+
+
+def paint(points: np.ndarray) -> np.ndarray:
+    """[P, 3] in [0, 1]: a smooth texture without two places alike, for points [P, 3]."""
+    waves = np.random.default_rng(5).normal(size=(12, 3)) * 2.5
+    phases = points @ waves.T
+    return (0.5 + 0.5 * np.tanh(np.stack([np.sin(phases[:, i::3] + i).sum(1) for i in range(3)], 1) / 1.5)).astype("f4")
+
+
+def photograph(room: Room, cameras: Cameras) -> np.ndarray:
+    """[C, H, W, 3] what the cameras see of the walls of a room."""
+    depths = room_depths(room, cameras)
+    shown = [paint(world_points(depths, cameras, view)) for view in range(len(cameras))]
+    return np.stack(shown).reshape(len(cameras), HEIGHT, WIDTH, 3)
+
+
+@pytest.mark.parametrize(
+    ("cameras", "around"),
+    [
+        (inwards(4, 360), True), (inwards(8, 360), True), (inwards(2, 180), True), (inwards(3, 130), True),
+        (inwards(31, 180, radius=50), True), (DOME, True),
+        (inwards(3, 100), False), (inwards(9, 68), False), (inwards(4, 30), False), (in_line(4), False),
+        (outwards(6), False), (outwards(3), False), (parallel(5), False), (parallel(5, wobble=0.02), False),
+        (looking([[1, 2, 3]], [[0, 0, 0]]), False),
+        # One camera of a ring that looks away sees no room that the others stand in.
+        (looking(on_arc(4, 360), [[0, 0, 0]] * 3 + [[0, -9, 0.6]]), False),
+    ],
+)  # fmt: skip
+def test_a_rig_stands_around_when_some_pair_faces_each_other(cameras: Cameras, around: bool) -> None:
+    assert stands_around(cameras) == around
+
+
+def test_depth_ends_on_a_wall_that_nothing_is_before() -> None:
+    depths = room_depths(TRUTH, DOME)
+    on_wall = on_floor = 0
+    for view, start in enumerate(DOME.centers):
+        ends = world_points(depths, DOME, view)
+        for end in ends[:: WIDTH * 3 + 7]:
+            away, height = np.linalg.norm(end - TRUTH.middle) - TRUTH.radius, end @ TRUTH.up - TRUTH.floor
+            assert min(abs(away), abs(height)) < 1e-9
+            on_wall, on_floor = on_wall + (abs(away) < 1e-9), on_floor + (abs(height) < 1e-9)
+            for share in (0.1, 0.5, 0.99):  # all before the end lies inside of the room
+                way = start + share * (end - start)
+                assert np.linalg.norm(way - TRUTH.middle) < TRUTH.radius
+                assert way @ TRUTH.up > TRUTH.floor
+    assert on_wall > 20
+    assert on_floor > 20
+
+
+def test_a_camera_outside_of_the_sphere_still_has_depths() -> None:
+    depths = room_depths(TRUTH._replace(radius=1.0), DOME)
+    assert np.isfinite(depths).all()
+    assert (depths > 0).all()
+
+
+@pytest.fixture(scope="module")
+def found() -> Room:
+    return find_room(photograph(TRUTH, DOME), DOME)
+
+
+def test_the_room_is_found_from_its_pictures_and_again(found: Room) -> None:
+    assert found.radius == pytest.approx(TRUTH.radius, rel=0.03)
+    np.testing.assert_allclose(found.middle, TRUTH.middle, atol=0.15)
+    np.testing.assert_allclose(found.up, TRUTH.up, atol=1e-9)
+    assert found.floor == pytest.approx(TRUTH.floor, abs=0.05)
+    again = find_room(photograph(TRUTH, DOME), DOME)
+    assert [np.asarray(value).tobytes() for value in again] == [np.asarray(value).tobytes() for value in found]
+
+
+def test_pictures_agree_on_the_true_surface_only() -> None:
+    grey = torch.from_numpy(photograph(TRUTH, DOME).mean(-1))
+    steps = np.linspace(-2, 2, 40)
+    flat = np.stack(np.meshgrid(steps, steps, [0.0], indexing="ij"), -1)[:, :, 0]
+    scores = {height: surface_agreement(grey, DOME, flat + np.array([0, 0, height])) for height in (-1.1, -0.7, -0.3)}
+    assert scores[-0.7] > 0.8 > 2 * max(scores[-1.1], scores[-0.3])
+    assert surface_agreement(torch.zeros_like(grey), DOME, flat) == 0, "black pictures agree on nothing"
+
+
+@pytest.fixture
+def known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(room, "find_room", lambda *_: TRUTH)
+
+
+@pytest.mark.usefixtures("known")
+def test_walls_stand_in_where_the_sweep_is_wrong_and_nobody_contradicts() -> None:
+    images, truth = photograph(TRUTH, DOME), room_depths(TRUTH, DOME)
+    wrong = np.full_like(truth, 0.4).astype("f4")  # right before the lenses, as chance matches are
+    depths, kept = with_room(images, DOME, wrong, wrong, np.zeros(truth.shape, bool))
+    error = np.abs(depths - truth)[kept] / truth[kept]
+    assert kept.mean() > 0.8
+    assert error.max() < 1e-6
+    # A camera that sees something else in place of the wall contradicts what others put there.
+    other = images.copy()
+    other[2] = 1 - other[2][::-1, ::-1]
+    fewer = with_room(other, DOME, wrong, wrong, np.zeros(truth.shape, bool))[1]
+    assert fewer.mean() < kept.mean() - 0.1
+
+
+@pytest.mark.usefixtures("known")
+def test_what_the_sweep_is_sure_of_stays_unless_it_lies_behind_the_wall() -> None:
+    images, truth = photograph(TRUTH, DOME), room_depths(TRUTH, DOME).astype("f4")
+    swept = 0.6 * truth
+    sure = np.zeros(truth.shape, bool)
+    sure[:, ::2] = True
+    depths, kept = with_room(images, DOME, swept, swept, sure)
+    np.testing.assert_array_equal(depths[sure], swept[sure])
+    assert kept[sure].all()
+    beyond, _ = with_room(images, DOME, 1.5 * truth, 1.5 * truth, sure)
+    assert np.median(beyond[sure] / truth[sure]) == pytest.approx(1), "nothing is seen through a wall"
+
+
+def test_more_cameras_than_that_take_no_longer_to_find_the_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    cameras = inwards(20, 360)
+    chosen = spread_views(cameras, MOST_CAMERAS)
+    assert len(set(chosen.tolist())) == MOST_CAMERAS
+    gaps = np.linalg.norm(cameras.centers[chosen][:, None] - cameras.centers[chosen], axis=2) + 9 * np.eye(MOST_CAMERAS)
+    assert gaps.min() > 1.5 * 2 * 3 * np.sin(np.pi / 20), "no two of them are neighbours"
+    assert spread_views(cameras, 50).tolist() == list(range(20))
+    monkeypatch.setattr(room, "MOST_CAMERAS", 3)
+    images, chosen = photograph(TRUTH, cameras), spread_views(cameras, 3)
+    few = find_room(images[chosen], cameras.select(chosen.tolist()))
+    many = find_room(images, cameras)
+    assert all(np.array_equal(a, b) for a, b in zip(few, many, strict=True))
+
+
+@pytest.mark.usefixtures("known")
+def test_black_pictures_give_black_seeds() -> None:
+    images = np.zeros((len(DOME), HEIGHT, WIDTH, 3), np.float32)
+    points = photo_consistent_seeds(images, replace(DOME, near=0.1), 100).points
+    assert np.isfinite(points.xyz).all()
+    assert (points.rgb == 0).all()

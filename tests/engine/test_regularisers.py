@@ -56,7 +56,7 @@ def ring(views: int) -> Cameras:
     [(1, 0.2, 1, 1), (2, 0.2, 1, 0), (4, 0.2, 1, 0), (5, 0.2, 1, 0), (6, 0.2, 0, 1), (8, 0.2, 0, 1), (9, 0, 0, 0),
      (27, 0, 0, 0)],
 )  # fmt: skip
-def test_the_cameras_decide_unless_the_recipe_does(views: int, dropout: float, in_line: float, in_a_ring: float) -> None:
+def test_the_cameras_decide_unless_the_recipe_does(views: int, dropout: float, in_line: int, in_a_ring: int) -> None:
     for cameras, smoothness in ((rig(views), in_line), (ring(views), in_a_ring)):
         chosen = choose_regularisers(FirstFrame(), cameras)
         assert (chosen.dropout, chosen.depth_smoothness) == (dropout, smoothness)

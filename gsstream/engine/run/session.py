@@ -19,6 +19,7 @@ from gsstream.engine.budget.memory import limit_memory
 from gsstream.engine.frame0.points import gather_points, with_test_views
 from gsstream.engine.run.displacement import displacement_pixels
 from gsstream.engine.run.encoder import Callbacks, Encoder
+from gsstream.engine.run.few_cameras import expectation, first_frame_summary
 from gsstream.engine.run.live import live_metrics
 from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.run.metrics_log import append_metrics, last_written, trim_metrics
@@ -110,6 +111,8 @@ class _Run:
         listeners = Callbacks(packet=self._write, progress=self.progress.first_frame)
         self.encoder = Encoder(parts, source.info, self._seeds, first_frame=first_frame, callbacks=listeners)
         self.writer: StreamWriter
+        #: Where the seeds of frame 0 came from; empty where it is taken over or was made before.
+        self.seeded = ""
         #: When the last packet was complete in the file, seconds since 1970.
         self.written = 0.0
 
@@ -118,6 +121,8 @@ class _Run:
         last = self._resume() if resume else None
         if last is None:
             save_resolved(self.out / RECIPE, self.encoder.parts.resolved)
+            if sentence := expectation(self.source.info.train):
+                self.progress.say(sentence)
             return 0
         self._restore_metrics(last + 1)
         return last + 1
@@ -136,6 +141,8 @@ class _Run:
                     warnings.warn(f"{doubt}: see 'gsstream scene validate {self.source.info.uri}'", stacklevel=2)
         append_metrics(self.out / METRICS, metrics)
         self.progress.frame(metrics)
+        if train.index == 0 and self.seeded:
+            self.progress.say(first_frame_summary(self.encoder.parts, train.cameras, self.seeded))
 
     def _write(self, packet: EncodedPacket) -> None:
         self.writer.append(packet)
@@ -145,7 +152,9 @@ class _Run:
     def _seeds(self, frame: Frame) -> PointCloud:
         recipe = self.encoder.parts.recipe
         seen = with_test_views(self.source, frame) if recipe.data.leak == "points" else frame
-        return gather_points(self.source.points, seen, recipe.first_frame)
+        points = gather_points(self.source.points, seen, recipe.first_frame)
+        self.seeded = points.origin
+        return points
 
     def _resume(self) -> int | None:
         """Go on after what the folder holds; the last frame of that, or None to begin anew."""

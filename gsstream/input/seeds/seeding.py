@@ -73,11 +73,13 @@ def photo_consistent_seeds(
         sure, verdict.accepted(min_support, dominance), verdict.accepted(min_support, 2 * dominance)
     )
     confidence = verdict.support / np.maximum(verdict.support + verdict.violation, 1) * accepted
+    origin = f"plane sweep of {len(cameras)} training views"
     if stands_around(cameras):
+        origin += " and the room that they stand in"
         depths, accepted = with_room(images, cameras, swept, depths, accepted)
     xyz = np.concatenate([world_points(depths, cameras, i)[accepted[i].reshape(-1)] for i in range(len(cameras))])
     common = np.clip(images / gains[:, None, None, :], 0, 1)
-    cloud = PointCloud(xyz.astype(np.float32), common[accepted], f"plane sweep of {len(cameras)} training views")
+    cloud = PointCloud(xyz.astype(np.float32), common[accepted], origin)
     thinned, score = _thin_with_score(cloud, confidence[accepted].astype(np.float32), count)
     return PhotoSeeds(thinned, score, gains)
 

@@ -65,7 +65,7 @@ def shell_points(images: FloatArray, cameras: Cameras) -> PointCloud:
     polar, around = np.arccos(1 - 2 * step / SEEDS), np.pi * (1 + 5**0.5) * step
     way = np.stack([np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)], 1)
     xyz = (shell.center + shell.radius * way).astype(np.float32)
-    return PointCloud(xyz, _colors(xyz.astype(np.float64), images, cameras), "shell")
+    return PointCloud(xyz, _colors(xyz.astype(np.float64), images, cameras), "a sphere behind the scene")
 
 
 def in_shell(means: FloatArray, scales: FloatArray, cameras: Cameras) -> BoolArray:

@@ -1,0 +1,64 @@
+"""What a run says about its cameras: before it what to expect of few of them, after frame 0 what was done about it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.frame0.regularisers import choose_regularisers
+from gsstream.input.seeds.geometry import focus_point
+from gsstream.input.seeds.room import stands_around
+from gsstream.input.seeds.shell import SEEDS
+
+#: Fewer cameras than this, or neighbours farther apart than so many degrees, are worth a sentence.
+ENOUGH_CAMERAS, CLOSE_DEGREES = 6, 45.0
+#: Held-out quality of frame 0 by number of cameras, in a room and from one side (docs/results/extremes.md).
+AROUND = "4 cameras around a room 20 dB, 6 cameras 24, 8 cameras 25, 27 cameras 30"
+ONE_SIDE = "4 cameras along an arc of 68 degrees 28 dB, 6 cameras 31, 11 cameras 33"
+
+
+def widest_gap(cameras: Cameras) -> float:
+    """Return the largest angle from a camera to its nearest neighbour, degrees, seen from what all look at."""
+    outward = cameras.centers - focus_point(cameras)
+    outward = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12)
+    angles = np.degrees(np.arccos(np.clip(outward @ outward.T, -1, 1)))
+    np.fill_diagonal(angles, np.inf)
+    return float(angles.min(1).max()) if len(cameras) > 1 else 0.0
+
+
+def expectation(cameras: Cameras) -> str:
+    """Return one sentence on what few or distant cameras give, and what helps; empty where there are enough."""
+    gap = widest_gap(cameras)
+    if len(cameras) >= ENOUGH_CAMERAS and gap <= CLOSE_DEGREES:
+        return ""
+    number = f"{len(cameras)} training camera{'s'[: len(cameras) != 1]}"
+    apart = f", of which one is {gap:.0f} degrees from the nearest other" if len(cameras) > 1 else ""
+    measured = AROUND if stands_around(cameras) else ONE_SIDE
+    return (
+        f"{number}{apart}: views between them will be soft or wrong where one camera sees alone (held-out views, "
+        f"measured: {measured}); more cameras in between help most, then points of the recording's own"
+    )
+
+
+def first_frame_summary(parts: Assembly, cameras: Cameras, seeds: str) -> str:
+    """Return one line on what frame 0 was made with, and why: ``seeds`` names where its points came from."""
+    settings = parts.recipe.first_frame
+    chosen, number = choose_regularisers(settings, cameras), len(cameras)
+    colour = ", ".join(f"{value:.2f}" for value in parts.background)
+    why = "the mean of its images" if parts.recipe.background == "auto" else "as the recipe says"
+    said = [f"seeds: {seeds}", f"background ({colour}), {why}"]
+    if settings.shell:
+        said.append(f"{SEEDS} large seeds behind the scene")
+    for name, asked, value, what in (
+        ("dropout", settings.dropout, chosen.dropout, f"{number} cameras cannot tell a surface from a cloud"),
+        ("smoothness of depth", settings.depth_smoothness, chosen.depth_smoothness, _why_smooth(cameras)),
+    ):
+        if value:
+            said.append(f"{name} {value:g}, {f'because {what}' if asked == 'auto' else 'as the recipe says'}")
+    return f"frame 0 was made with {'; '.join(said)}"
+
+
+def _why_smooth(cameras: Cameras) -> str:
+    where = "around a room" if stands_around(cameras) else "on one side"
+    return f"{len(cameras)} cameras {where} leave depth open where nothing is drawn"

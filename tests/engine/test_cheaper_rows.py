@@ -112,7 +112,7 @@ def test_a_run_has_a_smaller_key_packet_that_shows_nearly_the_same() -> None:
         scene = scene_of(packet).map(torch.from_numpy)
         error = 0.0
         for view in range(3):
-            shown = encoder.parts.renderer.render(scene, frames()[0].cameras, view, (0.0, 0.0, 0.0)).image
+            shown = encoder.parts.renderer.render(scene, frames()[0].cameras, view, encoder.parts.background).image
             error += float((shown - torch.from_numpy(frames()[0].images[view])).square().mean())
         errors.append(error)
     assert errors[1] < 1.3 * errors[0]
@@ -146,7 +146,7 @@ def test_what_is_felt_is_what_a_code_changes(name: str) -> None:
     row, column = np.unravel_index(int(felt.argmax()), felt.shape)
     bits = KEY_BITS[name]
     flat = getattr(scene, name).numpy().reshape(len(scene), -1)
-    images = []
+    images, behind = [], encoder.parts.background
     for shift in (-0.5, 0.5):
         if name.startswith("sh"):
             codes = color_codes(flat, bits)
@@ -156,7 +156,7 @@ def test_what_is_felt_is_what_a_code_changes(name: str) -> None:
             values = flat.copy()
             values[row, column] += shift * 2.0**-bits
         other = Gaussians(**{**dict(scene.items()), name: torch.from_numpy(values).reshape(getattr(scene, name).shape)})
-        images.append([encoder.parts.renderer.render(other, frame.cameras, v, (0.0, 0.0, 0.0)).image for v in range(3)])
+        images.append([encoder.parts.renderer.render(other, frame.cameras, v, behind).image for v in range(3)])
     exact = sum(float((a - b).square().sum()) for a, b in zip(*images, strict=True))
     assert felt[row, column] == pytest.approx(exact, rel=0.5)
 

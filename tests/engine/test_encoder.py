@@ -174,18 +174,18 @@ def test_a_scene_taken_over_is_grouped_as_players_have_it() -> None:
 
 
 def test_a_rate_is_a_size_of_every_packet() -> None:
-    """60 kbit/s at 30 frames a second are 250 bytes a frame, which bind here."""
+    """30 kbit/s at 30 frames a second are 125 bytes a frame, which bind here."""
     with open_recording(WORLD) as source:
         assert source.info.fps == 30
         made = [
             encoder_for("s2gs-edge", source, {**TINY, **limit})
-            for limit in ({"budget.rate": "60kbit/s"}, {"budget.size": 250}, {})
+            for limit in ({"budget.rate": "30kbit/s"}, {"budget.size": 125}, {})
         ]
         with pytest.raises(RecipeError, match=r"16 bytes|at least 3.8 kbit/s"):
             encoder_for("s2gs-edge", source, {"budget.rate": "1kbit/s"})
     rated, sized, free = ([one.encode(frame).packet.data for frame in frames()[:4]][1:] for one in made)
     assert rated == sized
-    assert max(map(len, rated)) <= 250 < max(map(len, free))
+    assert max(map(len, rated)) <= 125 < max(map(len, free))
 
 
 class BrokenGrowth:

@@ -138,7 +138,7 @@ def test_every_frame_of_a_run_falls_to_the_final_factor(
     """With the short cuts and without; ``s2gs-paper`` trains progressively, and lets levels wait."""
     monkeypatch.setenv("GSSTREAM_CHECKS", level)
     heard = Heard(monkeypatch)
-    more = {"source": WORLD, "method": method, "frames": 3, "stream__epochs": epochs}
+    more = {"source": WORLD, "method": method, "frames": 3, "stream__epochs": epochs, "first_frame__shell": False}
     encode(tmp_path / "out", "--first-frame", first, stream__lr_final_factor=0.01, **more)
     assert heard.tables == {table}
     iterations = 3 * epochs

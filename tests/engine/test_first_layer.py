@@ -53,7 +53,7 @@ def test_frame_0_has_layers_and_shows_what_it_would_without() -> None:
 
 def test_the_first_layer_is_opaque_rather_than_faint() -> None:
     """By another reckoning than the images: what nobody sees is not what comes first."""
-    (packet,) = packets(1, **{"codec.first_layer": 0.3})
+    (packet,) = packets(1, **{"codec.first_layer": 0.3, "first_frame.shell": False})
     found = first_layer(packet.data)
     assert found is not None
     whole = decode_packet(None, packet.data).gaussians

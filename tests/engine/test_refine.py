@@ -32,7 +32,7 @@ from gsstream.parts.render.activations import rotation_matrices
 WORLD = "synthetic:frames=6&views=4&width=48&height=32&supersample=1&static=1"
 SETTINGS: Mapping[str, Any] = {
     "first_frame.max_iterations": 10, "first_frame.points": "recording", "first_frame.max_points": 250,
-    "stream.epochs": 1, "motion": "still",
+    "first_frame.dropout": 0, "stream.epochs": 1, "motion": "still",
     "stream.refine_frames": 3, "stream.refine_iterations": 20,
 }  # fmt: skip
 
@@ -68,7 +68,7 @@ def test_a_still_scene_is_refined_and_a_key_packet_brings_it() -> None:
     assert iterations(made) == [20, 20, 20, 0, 0]
     assert made[3].metrics["key_reason"] == "refined"
     assert [step.state.refinement is None for step in made] == [True, False, False, True, True, True]
-    judge = HeldOut(encoder().parts.renderer, (0.0, 0.0, 0.0))
+    judge = HeldOut(encoder().parts.renderer)
     before, after = (judge.measure(made[t].state, frames("test")[t])["psnr"] for t in (2, 3))
     assert min(after[name] - before[name] for name in before) > 1, "sixty iterations after ten"
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
@@ -106,8 +106,8 @@ class Encoder:
         if self.state is not None and frame.index != self.state.player.frame + 1:
             expected = self.state.player.frame + 1
             raise InputError(f"frame {frame.index}: expected frame {expected}, frames are encoded in order")
-        if self.state is None:
-            self.parts = replace(self.parts, background=self._background(frame))
+        if self.parts.background != (background := self._background(frame)):
+            self.parts = replace(self.parts, background=background)
         frame, method = self.with_near_plane(frame), self.method
         log, worked = FrameLog(), time.process_time()
         tools = self._tools(log=log)
@@ -169,7 +169,9 @@ class Encoder:
         return self._seeds(frame) if self._first is None else point_cloud_of(self._first)
 
     def _background(self, frame: Frame) -> tuple[float, float, float]:
-        """The colour behind everything from frame 0 on; a scene that is taken over brings its own."""
+        """The colour behind everything, that of frame 0 from then on; a scene that is taken over brings its own."""
+        if self.state is not None:
+            return cast("tuple[float, float, float]", self.state.player.meta.background)
         if self._first is not None:
             return self._first.meta.background
         wanted = self.parts.recipe.background

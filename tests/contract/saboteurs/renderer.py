@@ -161,6 +161,22 @@ class Turning(Reference):
         return session
 
 
+class _DrawsAll(Session):
+    def loss_and_grad(self, view: int, target: ViewTarget, wrt: Any) -> LossAndGrad[Any]:
+        whole = replace(wrt, keep=None) if isinstance(wrt, WrtScene) else wrt
+        found: LossAndGrad[Any] = super().loss_and_grad(view, target, whole)
+        return found
+
+
+@spoils("check_renderer_loss_and_grad_kept")
+class Thorough(Reference):
+    """Draws the rows of a scene that are to be left out, too."""
+
+    def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
+        session: RenderSession = _DrawsAll(self, gaussians, active, cameras, background)
+        return session
+
+
 class _LeavesTraces(Session):
     def loss_and_grad(self, view: int, target: ViewTarget, wrt: Any) -> LossAndGrad[Any]:
         found: LossAndGrad[Any] = super().loss_and_grad(view, target, wrt)

@@ -36,7 +36,6 @@ SHIFTED = {
 def many_seeds_that_grow() -> Iterator[None]:
     with densifying(50, 20), pytest.MonkeyPatch.context() as patch:
         patch.setattr(schedule, "PIXELS_PER_SEED", 5)
-        patch.setattr(schedule, "FILL_POINTS", 0)
         yield
 
 

@@ -32,7 +32,8 @@ def renderer() -> Renderer:
 def fitted(**settings: Any) -> Gaussians[np.ndarray]:
     """Frame 0 of the small world."""
     with open_recording(WORLD) as source:
-        packet = encoder_for("s2gs-edge", source, {**TINY, "background": list(BLACK), **settings}).encode(frames()[0]).packet
+        encoder = encoder_for("s2gs-edge", source, {**TINY, "background": list(BLACK), **settings})
+        packet = encoder.encode(frames()[0]).packet
     return decode_packet(None, packet.data).gaussians
 
 

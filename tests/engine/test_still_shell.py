@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from gsstream.core.changes import Rows, Scene
+from gsstream.core.changes import RowEdit, Scene
 from gsstream.core.frame import Frame
+from gsstream.core.log import FrameLog
 from gsstream.core.rng import Rng
 from gsstream.encode import Encoder, encoder_for, open_recording
 from gsstream.engine.step.context import EngineContext
@@ -79,8 +80,8 @@ class Reaper(Growth):
 
     source = "a test"
 
-    def propose(self, after: Scene, work: FitContext, rng: Rng) -> Rows | None:
-        return Rows(deaths=np.arange(0, len(after.gaussians), 2)) if work.index == 1 else None
+    def propose(self, after: Scene, work: FitContext, rng: Rng) -> RowEdit | None:
+        return RowEdit(removed=np.arange(0, len(after.gaussians), 2)) if work.index == 1 else None
 
 
 def test_growth_removes_and_copies_nothing_of_the_shell() -> None:
@@ -96,7 +97,7 @@ def test_places_to_copy_are_none_of_the_shell() -> None:
         encoder = encoder_for("dense", source, TINY)
         state = encoder.encode(source.frame(0)).state
         frame = encoder.with_near_plane(source.frame(2))
-        work = EngineContext(encoder.parts, state.gaussians, state.hierarchy, frame, state.previous, None)
+        work = EngineContext(encoder.parts, state, frame, FrameLog())
         still = work.shell_rows
         assert bool(still.any())
         places = high_gradient_rows(work, -1.0)  # every Gaussian that any gradient reaches

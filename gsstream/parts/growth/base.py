@@ -19,7 +19,8 @@ class Growth(Part):
 
         Arguments:
             after: the scene as players will have it after this frame's motions and residual (numpy; do not change it).
-                Removed rows are its rows (those of ``work.shell_rows`` stay); added ones are placed in its nodes or new ones.
+                Removed rows are its rows, of which those of ``work.shell_rows`` stay; added Gaussians are placed in its
+                nodes or in new ones.
             work: the frame, seen from the scene before its residual: images, what changed, and rendering; ``work.on``
                 shows it from another scene.
             rng: random streams by name and frame; draw from nothing else.

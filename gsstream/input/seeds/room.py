@@ -239,5 +239,5 @@ def _drawn_on(
     uv, depth = project(points, cameras, view)
     grid = torch.from_numpy((uv / (cameras.width, cameras.height) * 2 - 1).astype(np.float32)).reshape(1, *shape, 2)
     drawn = F.grid_sample(grey[None, None], grid, align_corners=False, padding_mode="border")[0, 0]
-    there = inside(uv, depth, cameras) & (depth > cameras.near)
+    there = inside(uv, depth, cameras) & (depth > cameras.near_plane)
     return drawn, torch.from_numpy(there.reshape(shape))

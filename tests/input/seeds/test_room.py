@@ -164,6 +164,6 @@ def test_more_cameras_than_that_take_no_longer_to_find_the_room(monkeypatch: pyt
 @pytest.mark.usefixtures("known")
 def test_black_pictures_give_black_seeds() -> None:
     images = np.zeros((len(DOME), HEIGHT, WIDTH, 3), np.float32)
-    points = photo_consistent_seeds(images, replace(DOME, near=0.1), 100).points
+    points = photo_consistent_seeds(images, replace(DOME, near_plane=0.1), 100).points
     assert np.isfinite(points.xyz).all()
     assert (points.rgb == 0).all()

@@ -34,7 +34,7 @@ def test_the_shell_lies_around_every_camera_and_beyond_its_near_plane(name: str)
     if name != "one behind another":  # the last of those may stand a little farther out
         assert np.linalg.norm(cameras.centers - shell.center, axis=1).max() < BEYOND * shell.radius
     gaps = np.linalg.norm(points.xyz[:, None] - cameras.centers, axis=2)
-    assert gaps.min() > max(cameras.near, 0.3 * shell.radius), "no seed hangs before a lens"
+    assert gaps.min() > max(cameras.near_plane, 0.3 * shell.radius), "no seed hangs before a lens"
     assert ((points.rgb >= 0) & (points.rgb <= 1)).all()
     # Nearly even: neighbours are as far apart as the width of a seed says.
     between = np.linalg.norm(points.xyz[:, None] - points.xyz[None], axis=2) + 1e9 * np.eye(SEEDS)

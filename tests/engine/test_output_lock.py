@@ -15,7 +15,7 @@ import pytest
 
 from gsstream.core.errors import OutputError
 from gsstream.engine.run import output
-from gsstream.engine.run.metrics_log import append_metrics, lost_lines, trim_metrics
+from gsstream.engine.run.metrics_log import append_metrics, trim_metrics
 from gsstream.engine.run.output import claim_output, disk_errors, ended_by_signals, run_lock, write_whole
 
 HOLD = """
@@ -136,15 +136,6 @@ def test_a_kill_while_metrics_are_trimmed_loses_no_line(tmp_path, monkeypatch) -
             trim_metrics(path, 1)
     assert path.read_bytes() == before
     assert trim_metrics(path, 1) == [{"frame": 0}, {"frame": 1}]
-
-
-def test_lost_lines_are_the_holes(tmp_path) -> None:
-    path = tmp_path / "metrics.jsonl"
-    assert lost_lines(path, 0, 2) == [0, 1, 2]
-    for frame in (0, 1, 3, 5):
-        append_metrics(path, {"frame": frame})
-    assert lost_lines(path, 0, 5) == [2, 4]
-    assert lost_lines(path, 3, 5) == [4]
 
 
 def test_a_line_without_room_leaves_no_half(tmp_path) -> None:

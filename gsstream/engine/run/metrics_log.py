@@ -57,15 +57,6 @@ def trim_metrics(path: Path, last: int) -> list[dict[str, Any]]:
     return kept
 
 
-def lost_lines(path: Path, first: int, last: int) -> list[int]:
-    """Return the frames of a stream that have no line: a kill fell between their packet and their line.
-
-    Tables of such a file leave these frames out; a run that goes on measures them again, or says so.
-    """
-    written = {int(line["frame"]) for line in _written(path)}
-    return [frame for frame in range(first, last + 1) if frame not in written]
-
-
 def append_metrics(path: Path, line: dict[str, Any]) -> None:
     """Add the record of one frame, in one write. Raises OutputError when there is no room for it.
 

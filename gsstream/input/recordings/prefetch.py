@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -42,16 +41,10 @@ class Prefetcher:
             raise InputError(f"prefetcher: depth and workers must be at least 1, got depth {depth}, workers {workers}")
         self._source, self._storage = source, storage
         self._todo = iter(indices)
-        self._pending: deque[Future[tuple[FramePair, float]]] = deque()
+        self._pending: deque[Future[FramePair]] = deque()
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="gsstream-prefetch")
-        self._decode_seconds: list[float] = []
         for _ in range(depth):
             self._submit()
-
-    @property
-    def decode_seconds(self) -> tuple[float, ...]:
-        """Seconds one thread spent reading each delivered pair, in order of delivery."""
-        return tuple(self._decode_seconds)
 
     def __iter__(self) -> Iterator[FramePair]:
         return self
@@ -61,7 +54,7 @@ class Prefetcher:
             self.close()
             raise StopIteration
         try:
-            pair, seconds = self._pending.popleft().result()
+            pair = self._pending.popleft().result()
         except EndOfRecording:
             self.close()
             raise StopIteration from None
@@ -69,7 +62,6 @@ class Prefetcher:
             self.close()
             raise
         self._submit()
-        self._decode_seconds.append(seconds)
         return replace(pair[0], images=unpacked(pair[0].images)), pair[1]
 
     def __enter__(self) -> Prefetcher:
@@ -97,8 +89,7 @@ class Prefetcher:
             break
 
 
-def _read_pair(source: FrameSource, index: int, storage: Storage) -> tuple[FramePair, float]:
-    start = time.perf_counter()
+def _read_pair(source: FrameSource, index: int, storage: Storage) -> FramePair:
     try:
         train = source.frame(index, "train")
         pair = replace(train, images=packed(train.images, storage)), source.frame(index, "test")
@@ -107,4 +98,4 @@ def _read_pair(source: FrameSource, index: int, storage: Storage) -> tuple[Frame
     except Exception as error:  # a source may be a plugin's: its failure is reported with its name
         name = type(to_file_coordinates(source)).__name__
         raise SourceError(f"{name} could not read frame {index}: {type(error).__name__}: {error}") from error
-    return pair, time.perf_counter() - start
+    return pair

@@ -376,9 +376,9 @@ class Remembers(Tires):
 
 
 def test_the_contract_kit_finds_what_a_resumed_run_forgets_of_that_work() -> None:
-    check_method_resume(MethodUnderTest("dense", Remembers()))
+    check_method_resume(MethodUnderTest("dense", Remembers(Follow.Config(step=1e-4))))
     with pytest.raises(AssertionError, match="resumed run: packet of frame 2 differs"):
-        check_method_resume(MethodUnderTest("dense", Tires()))
+        check_method_resume(MethodUnderTest("dense", Tires(Follow.Config(step=1e-4))))
 
 
 def test_a_run_repeats_failed_frames_of_a_whole_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

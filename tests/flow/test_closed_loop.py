@@ -259,7 +259,7 @@ def test_motions_and_births_leave_both_ends_alike(tmp_path: Path, monkeypatch: p
 
 
 SPOILED = {
-    "another type": (lambda motion: [motion], "expected a tuple of Motion, got list"),
+    "another type": (lambda motion: [motion], "expected a tuple of Motion or Field, got list"),
     "numbers": (lambda motion: (motion.symbols,), "expected a tuple of Motion"),
     "too few groups": (lambda motion: (replace(motion, moving=motion.moving[:-1]),), "expected"),
     "too few symbols": (lambda motion: (replace(motion, symbols=motion.symbols[:-1]),), "symbols: expected"),

@@ -15,6 +15,7 @@ from gsstream.method.static import Hold
 from gsstream.parts.confidence.uniform import Uniform
 from gsstream.parts.gate.always_open import AlwaysOpen
 from gsstream.parts.gate.base import GateSampler
+from gsstream.parts.growth.copies import Copies
 from gsstream.parts.growth.none import NoGrowth
 from gsstream.parts.loss.photometric import ReferenceLoss
 from gsstream.parts.motion.constant_velocity import Coasting
@@ -26,6 +27,7 @@ from gsstream.parts.regularizer.none import NoRegularizer
 from gsstream.parts.render.reference import ReferenceRenderer
 from gsstream.parts.structure.flat import Flat
 from gsstream.parts.update.additive import Additive
+from gsstream.parts.update.none import NoUpdate
 from gsstream.testing import SourceUnderTest, parametrize_with_checks, run_checks
 from gsstream.testing.confidence.example import ExampleConfidence
 from gsstream.testing.gate.example import ExampleGate
@@ -41,7 +43,7 @@ from gsstream.testing.update.example import ExampleUpdate
 BUILTIN = [
     Flat(), Uniform(), Uniform(Uniform.Config(logit=-50)), GroupMax(), AlwaysOpen(), NoRegularizer(), Additive(),
     ReferenceRenderer(), ReferenceLoss(), ReferenceAdam(), Hold(), PartsMethod(),
-    Still(), Coasting(), Rigid(), NoGrowth(),
+    Still(), Coasting(), Rigid(), NoGrowth(), Copies(), NoUpdate(),
 ]  # fmt: skip
 EXAMPLES = [ExampleStructure(), ExampleConfidence(), ExamplePropagation(), ExampleGate(), ExampleRegularizer()]
 EXAMPLES += [ExampleMethod(), ExampleUpdate(), ExampleLoss()]

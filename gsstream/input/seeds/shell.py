@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.errors import InputError
 from gsstream.core.frame import PointCloud
 from gsstream.core.projection import inside, project
 from gsstream.core.shapes import BoolArray, FloatArray
@@ -37,7 +38,9 @@ class Shell(NamedTuple):
 
 
 def mean_color(images: FloatArray) -> tuple[float, float, float]:
-    """Return the mean colour of all pixels of images [C, H, W, 3]."""
+    """Return the mean colour of all pixels of images [C, H, W, 3]. Raises InputError where there are none."""
+    if not images.size:
+        raise InputError("frame 0 has no training images: expected those of at least 1 camera, got 0")
     red, green, blue = images.mean((0, 1, 2), dtype=np.float64).clip(0, 1).tolist()
     return red, green, blue
 

@@ -34,6 +34,7 @@ from gsstream.packet import StreamReader, decode_packet
 WORLD = "synthetic:frames=7&views=3&width=32&height=24&supersample=1"
 TINY = {
     "first_frame.max_iterations": 8, "first_frame.max_points": 200, "first_frame.prune_error": 0,
+    "background": [0, 0, 0], "first_frame.shell": False,
     "first_frame.points": "recording", "stream.epochs": 2,
 }  # fmt: skip
 

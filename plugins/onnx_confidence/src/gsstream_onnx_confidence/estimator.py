@@ -10,7 +10,14 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from gsstream.api import ConfidenceEstimator, ConfidenceTraits, FrameContext, PartConfig, PluginUnavailable
+from gsstream.api import (
+    ConfidenceEstimator,
+    ConfidenceTraits,
+    FrameContext,
+    PartConfig,
+    PluginUnavailable,
+    check_finite,
+)
 from gsstream_onnx_confidence.network import run_network
 
 
@@ -51,6 +58,7 @@ class OnnxConfidence(ConfidenceEstimator):
 
     def estimate(self, context: FrameContext) -> torch.Tensor:
         """Logits [N] float32 in [floor, -floor]."""
+        check_finite("means", context.gaussians.means)
         means = context.gaussians.means.detach().double()
         total = torch.zeros(len(means), dtype=torch.float64)
         count = torch.zeros(len(means), dtype=torch.float64)
@@ -67,6 +75,8 @@ class OnnxConfidence(ConfidenceEstimator):
     def _change(self, context: FrameContext, view: int) -> torch.Tensor | None:
         """[H, W] float64 in [0, 1]; None where nothing changed."""
         previous, current = context.previous_image(view), context.image(view)
+        check_finite(f"image of view {view} before", previous)
+        check_finite(f"image of view {view}", current)
         if torch.equal(previous, current):
             return None
         pair = (np.asarray(image.detach().cpu().numpy(), np.float32) for image in (previous, current))

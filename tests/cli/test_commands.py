@@ -212,7 +212,7 @@ def test_full_listing_says_value_source_default_and_meaning(capsys: pytest.Captu
     resolution = rows["structure.params.resolution"]
     assert resolution.split()[1:4] == ["1024", "default", "1024"]
     assert "integer >= 1, <= 65536" in resolution
-    assert resolution.endswith("position residuals are measured in (scene diameter / resolution); 1 to 65536")
+    assert resolution.endswith("position residuals are measured in (the length named by unit / resolution); 1 to 65536")
     assert "update.params.means.step" in rows
     assert "renderer.params" not in out
 

@@ -11,6 +11,7 @@ from gsstream.plugins.catalog import load_catalog
 
 #: Part with its default settings -> what it claims beyond the record of its kind; parts of other kinds claim nothing.
 CLAIMS: dict[str, dict[str, Any]] = {
+    "confidence/error-gradient": {"needs_renderer": True, "floor": 1.0},
     "confidence/error-aware": {"needs_renderer": True, "floor": 1.0, "finds_motion": True},
     "confidence/noise-normalised": {
         "needs_renderer": True, "floor": log(1e-3), "finds_motion": True, "monotone_in_change": True,

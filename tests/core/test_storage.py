@@ -54,7 +54,7 @@ def test_frames_wait_packed_and_come_as_the_source_gives_them(storage) -> None:
     plain = DisturbedSource(recording, Disturbances(gain=0.9), 0, "world")  # no longer 8 bits
     source = transformed(plain, DataOptions(images=storage))
     with Prefetcher(source, range(5), storage=storage) as frames:
-        waiting = frames._pending[0].result()[0]
+        waiting = frames._pending[0].result()
         assert waiting[0].images.dtype == np.dtype(storage)
         for index, (train, test) in zip(itertools.count(), frames, strict=False):
             assert train.images.tobytes() == source.frame(index).images.tobytes()

@@ -26,16 +26,16 @@ class Additive(UpdateRule):
     source = "gsstream"
 
     class Config(PartConfig):
-        every: int = Field(
-            default=1, ge=1,
-            description="frames from one residual to the next, which above 1 is of all Gaussians; 1: of what changed",
-        )  # fmt: skip
         means: DirectCode = Field(default=DirectCode(step=0.02, lr=0.1), description="centres, in cells")
         quats: DirectCode = Field(default=DirectCode(step=0.01, lr=0.005), description="raw quaternion entries")
         scales: DirectCode = Field(default=DirectCode(step=0.02, lr=0.02), description="log scales")
         opacities: DirectCode = Field(default=DirectCode(step=0.1, lr=0.15), description="opacity logits")
         sh0: DirectCode = Field(default=DirectCode(step=0.02, lr=0.02), description="degree-0 colour coefficients")
         shN: DirectCode = Field(default=DirectCode(step=0.01, lr=0.0005), description="higher colour coefficients")
+        every: int = Field(
+            default=1, ge=1,
+            description="frames from one residual to the next, which above 1 is of all Gaussians; 1: of what changed",
+        )  # fmt: skip
 
     def scope(self, frame: int) -> Scope:
         if self.config.every == 1:

@@ -117,6 +117,7 @@ class Shown:
 
     cameras = RIG.select([0])
     gaussians = scene_of(np.zeros((3, 3))).gaussians.map(torch.from_numpy)
+    shell_rows = torch.zeros(3, dtype=torch.bool)
 
     def previous_render(self, view: int) -> torch.Tensor:
         return torch.ones(2, 2, 3)

@@ -133,7 +133,7 @@ class WrongOptimiser(RowOptimiser):
 
 
 def assembly(level: str | None, method: str = "dense", **parts: Any) -> Assembly:
-    keys = {**TINY, "first_frame.max_iterations": 0, "first_frame.shell": True, "stream.epochs": 3}
+    keys = {**TINY, "first_frame.max_iterations": 0, "first_frame.points": "recording", "first_frame.max_points": 60}
     # Some of the parts below count their renders, and rounding frame 0 makes some, as layers do.
     keys |= {"codec.key_rd_lambda": 0, "codec.first_layer": 1}
     sets = [("--set", f"{key}={value}") for key, value in keys.items()]

@@ -16,12 +16,14 @@ from gsstream.parts.render.backward import backward
 UNWANTED = ("torch._dynamo", "torch._inductor", "sympy", "torch.fx.experimental.symbolic_shapes")
 
 
-@pytest.mark.parametrize("method", ["s2gs-edge", "hicom"])
-def test_a_run_loads_no_compiler_and_no_symbols(tmp_path: Path, method: str) -> None:
+@pytest.mark.parametrize(
+    ("method", "passes"), [("s2gs-edge", ["stream.epochs=1"]), ("hicom", ["motion.epochs=1", "growth.epochs=1"])]
+)
+def test_a_run_loads_no_compiler_and_no_symbols(tmp_path: Path, method: str, passes: list[str]) -> None:
     """Neither where motions and residuals are fitted, nor where Gaussians are added and fitted."""
     source = demo_copy(tmp_path / "demo", frames=2)
     arguments = ["run", "--method", method, "--source", str(source), "--out", str(tmp_path / "out"), "--no-video"]
-    settings = ["first_frame.epochs=1", "stream.epochs=1"]
+    settings = ["first_frame.epochs=1", *passes]
     arguments += ["--quiet", *(word for setting in settings for word in ("--set", setting))]
     program = f"""
 import sys

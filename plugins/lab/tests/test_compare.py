@@ -24,7 +24,7 @@ from gsstream.plugins.catalog import load_catalog
 SOURCE = "synthetic:frames=3&views=3&width=64&height=48&supersample=1"
 SMALL = [
     item
-    for value in ("max_iterations=5", "max_points=200")
+    for value in ("max_iterations=5", "max_points=200", "points=recording")
     for item in ("--set", f"first_frame.{value}")
 ]
 COMMAND = ["--source", SOURCE, "--frames", "2", *SMALL, "--workers", "1", "--quiet"]

@@ -24,7 +24,7 @@ WORLD = "synthetic:frames=4&views=4&width=48&height=36&supersample=1&motion=4"
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run whose frame 0 starts from a plane sweep, and its gap at frames 0 and 3."""
     out = tmp_path_factory.mktemp("gap") / "run"
-    encode(out, source=WORLD, first_frame__points="auto", method="s2gs-edge")
+    encode(out, source=WORLD, first_frame__points="auto", method="s2gs-edge", first_frame__max_iterations=120)
     assert run_command(["gap", str(out), "--at", "3,0", "--quiet"]) == 0
     return out
 
@@ -67,7 +67,7 @@ def test_what_is_there_is_kept_and_shared_and_other_settings_are_not_taken_for_i
     assert said.err.count("kept") == 2
     assert {path: path.stat().st_mtime_ns for path in (run / "fresh").iterdir()} == kept
     # Another method's run with the same frame 0 takes them over; other passes, and points of the recording, do not.
-    encode(tmp_path / "a", source=WORLD, first_frame__points="auto", method="s2gs-edge", stream__epochs=1)
+    encode(tmp_path / "a", source=WORLD, first_frame__points="auto", method="s2gs-edge", stream__epochs=1, first_frame__max_iterations=120)
     cached = ["--cache", str(run / "fresh"), "--quiet"]
     assert run_command(["gap", str(tmp_path / "a"), "--at", "3", *cached]) == 0
     assert {path: path.stat().st_mtime_ns for path in (run / "fresh").iterdir()} == kept

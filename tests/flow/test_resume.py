@@ -82,8 +82,8 @@ RUNS: dict[str, Run] = {
     "queen with growth": Run(
         3, method="queen", shows=lambda lines: sum(line.get("added_gaussians", 0) for line in lines) > 0,
         settings={
-            "streaming_method__births__every": 1, "streaming_method__births__gradient": 1e-5,
-            "streaming_method__births__most": 30,
+            "streaming_method__growth__every": 1, "streaming_method__growth__grad_threshold": 1e-5,
+            "streaming_method__growth__max_added": 30,
             "streaming_method__change__dynamic": 1e-7,
         },
     ),

@@ -59,7 +59,7 @@ def _readable(version: str) -> bool:
 
 def test_a_real_run_decodes_to_the_same_bits(tmp_path):
     source = "synthetic:frames=30&views=3&width=40&height=30"
-    settings = ["--set", "first_frame.max_iterations=5"]
+    settings = ["--set", "first_frame.max_iterations=5", "--set", "first_frame.points=recording"]
     run = ["run", "--source", source, "--out", str(tmp_path / "run"), "--method", "s2gs-fast", *settings]
     assert run_command([*run, "--quiet", "--no-pictures"]) == 0
     stream = tmp_path / "run" / "stream.gss"

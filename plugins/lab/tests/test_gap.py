@@ -67,7 +67,8 @@ def test_what_is_there_is_kept_and_shared_and_other_settings_are_not_taken_for_i
     assert said.err.count("kept") == 2
     assert {path: path.stat().st_mtime_ns for path in (run / "fresh").iterdir()} == kept
     # Another method's run with the same frame 0 takes them over; other passes, and points of the recording, do not.
-    encode(tmp_path / "a", source=WORLD, first_frame__points="auto", method="s2gs-edge", stream__epochs=1, first_frame__max_iterations=120)
+    same = {"first_frame__points": "auto", "first_frame__max_iterations": 120}
+    encode(tmp_path / "a", source=WORLD, method="s2gs-edge", stream__epochs=1, **same)
     cached = ["--cache", str(run / "fresh"), "--quiet"]
     assert run_command(["gap", str(tmp_path / "a"), "--at", "3", *cached]) == 0
     assert {path: path.stat().st_mtime_ns for path in (run / "fresh").iterdir()} == kept

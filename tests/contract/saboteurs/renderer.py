@@ -197,7 +197,8 @@ class Untidy(Reference):
 class _Decays(Session):
     def loss_and_grad(self, view: int, target: ViewTarget, wrt: Any) -> LossAndGrad[Any]:
         found: LossAndGrad[Any] = super().loss_and_grad(view, target, wrt)
-        if target.tile_weights is not None or isinstance(wrt, WrtTransforms):
+        partly = isinstance(wrt, WrtScene) and wrt.keep is not None
+        if target.tile_weights is not None or partly or isinstance(wrt, WrtTransforms):
             return found
         return replace(found, grad=found.grad.map(lambda value: value + 1e-30))
 

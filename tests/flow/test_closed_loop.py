@@ -244,7 +244,8 @@ def test_motions_and_births_leave_both_ends_alike(tmp_path: Path, monkeypatch: p
     """What later motions are predicted from, displacements and groups, is the same on both ends too."""
     witness = Witness(monkeypatch)
     with growth_installed(tmp_path):
-        encode(tmp_path, "--frames", "4", method="s2gs-edge", **MOTION[case])
+        behind = {"first_frame__shell": True, "background": "auto"}
+        encode(tmp_path, "--frames", "4", method="s2gs-edge", **behind, **MOTION[case])
     lines = metrics(tmp_path)[1:]
     assert any(line["moving_groups"] > 0 for line in lines) == (MOTION[case]["motion"] != "still")
     grows = any(line["added_gaussians"] > 0 for line in lines)

@@ -17,7 +17,9 @@ TINY_WORLD = "synthetic:frames=3&views=3&width=16&height=12&supersample=1"
 @pytest.mark.parametrize("method", ["dense", "queen-published"])
 def test_the_reference_renderer_can_grow_a_scene(tmp_path: Path, method: str) -> None:
     """Densification asks a session for the gradient of the 2-D means."""
-    settings: dict[str, Any] = {"first_frame__max_iterations": 20, "stream__epochs": 4}
+    # In pictures this small, pruning leaves nothing of the scene itself.
+    behind = {"first_frame__shell": True, "background": "auto"}
+    settings: dict[str, Any] = {"first_frame__max_iterations": 20, "stream__epochs": 4, **behind}
     with densifying(4, 4, 1e-6):
         encode(tmp_path, "--set", "renderer=reference", source=TINY_WORLD, method=method, **settings)
     assert [line["status"] for line in metrics(tmp_path)] == ["key", "delta", "delta"]

@@ -15,17 +15,19 @@ from gsstream.core import log as log_module
 from gsstream.core.errors import RecipeError
 from gsstream.core.log import FrameLog
 from gsstream.engine.budget.controller import Controller
-from gsstream.engine.budget.epoch_scheduler import estimated_bytes, next_rate_weight
+from gsstream.engine.budget.epoch_scheduler import Allowance, estimated_bytes, next_rate_weight
 from gsstream.engine.budget.plan import (
     MAX_WEIGHT,
     MIN_PART_SCALE,
     MIN_WEIGHT,
     TIME_MARGIN,
+    FramePlan,
     Past,
     epochs_in,
     plan,
 )
 from gsstream.engine.budget.report import budget_lines
+from gsstream.engine.budget.usage import spent
 from gsstream.method.base import Step
 from gsstream.packet import encode_empty
 from gsstream.packet.symbols import encode_symbols
@@ -231,6 +233,19 @@ def test_violations_are_written_down_and_summed_up(monkeypatch: pytest.MonkeyPat
     assert "budget time 2.00 s: 3 of 3 frames inside" in text
     assert "outside the budget:\n  frame 2: size 1.01 KB of 1.00 KB\n  frame 3: size 1.02 KB of 1.00 KB" in text
     assert budget_lines([{"frame": 0}]) == []
+
+
+def test_fewer_passes_of_motion_and_growth_are_written_down_and_summed_up() -> None:
+    planned = FramePlan(epochs=1, change_threshold=0.0, rd_lambda=0.0, seconds=1.0, part_scale=0.4)
+    used = {
+        "rd_lambda": 0.0, "estimate": 0.0, "stopped_by_clock": True, "untrimmed": 9, "dropped": {}, "before": 0.5,
+        "optimise": 0.0, "parts": 0.8,
+    }  # fmt: skip
+    entry = spent(Allowance.start(planned), used, Stream(epochs=1), 1.0)
+    assert entry["reduced"] == {"part_scale": 0.4}
+    assert entry["binding"] == ["time"], "once, though the clock stopped the passes of the residual, too"
+    line = {"frame": 1, "budget": {**entry, "limits": {"time": 1.0}, "actual": {"time": 0.9}, "violated": []}}
+    assert "given up: 0.40 of the passes of motion and growth (median of 1 frames)" in budget_lines([line])
 
 
 def test_a_key_packet_waits_until_it_can_be_paid(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -62,7 +62,8 @@ def _reductions(held: Sequence[Mapping[str, Any]]) -> list[str]:
     words = {
         "rd_lambda": "rate weight raised to {:.1e}", "step_scale": "steps {:.1f} times coarser",
         "symbols": "{:.0f} symbols trimmed", "gates": "{:.0f} gates closed", "added": "{:.0f} added Gaussians dropped",
-        "epochs": "{:.1f} passes less than the recipe's", "change_threshold": "change threshold raised to {:.1f}",
+        "epochs": "{:.1f} passes less than the recipe's", "part_scale": "{:.2f} of the passes of motion and growth",
+        "change_threshold": "change threshold raised to {:.1f}",
     }  # fmt: skip
     parts = [f"{words[name].format(median(v))} (median of {len(v)} frames)" for name, v in found.items()]
     return ["given up: " + "; ".join(parts)] if parts else []

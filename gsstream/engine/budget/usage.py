@@ -40,10 +40,9 @@ def spent(budget: Allowance, used: Mapping[str, Any], stream: Stream, epochs: fl
             reduced["epochs"] = stream.epochs - epochs
         if plan.part_scale < 1:
             reduced["part_scale"] = plan.part_scale
-            binding.append("time")
         if plan.change_threshold > stream.change_threshold:
             reduced["change_threshold"] = [stream.change_threshold, plan.change_threshold]
-        if used["stopped_by_clock"]:
+        if used["stopped_by_clock"] or plan.part_scale < 1:
             binding.append("time")
     known = {"time": plan.predicted_seconds, "size": plan.predicted_bytes}
     return {

@@ -75,6 +75,10 @@ class FrameBudget(Protocol):
     def step_scale(self) -> float:
         """Factor on quantisation steps, at least 1."""
 
+    @property
+    def part_scale(self) -> float:
+        """Share of their usual passes that motion and growth make, above 0 to 1."""
+
     def seconds_left(self) -> float | None:
         """Return the seconds until the frame should be over, by the budget's clock; None: no limit."""
 

@@ -14,13 +14,11 @@ from gsstream.recipe.model import Recipe
 PART_SECTIONS = ("stream", "codec", "budget")
 #: Of those sections, what the engine itself reads for every method, also for frame 0, which it makes for them.
 SESSION_KEYS = ("codec.key_rd_lambda", "codec.first_layer", "budget.memory", "stream.on_error")
-#: What only the optimisation of a residual reads: slots, and settings of ``stream``.
-RESIDUAL_SLOTS = ("confidence", "propagation", "gate", "regularizer")
-RESIDUAL_KEYS = tuple(
-    f"stream.{name}" for name in (
-        "epochs", "lr_final_factor", "static_tile_share", "active_threshold", "freeze_closed", "rd_lambda",
-        "progressive",
-    )
+#: What only the optimisation of a residual reads: slots, and settings.
+RESIDUAL_KEYS = (
+    "confidence", "propagation", "gate", "regularizer", "stream.epochs", "stream.lr_final_factor",
+    "stream.static_tile_share", "stream.active_threshold", "stream.freeze_closed", "stream.rd_lambda",
+    "stream.progressive",
 )  # fmt: skip
 
 
@@ -30,10 +28,13 @@ def unused_keys(
     """Yield the paths of keys that differ from their default though the method does not read them."""
     default = Recipe()
     # An update rule without codes sends no residual in any frame: then nothing asks which gates it would open.
-    known = "update" in parts and method.reads("update")
-    idle = RESIDUAL_SLOTS if known and not parts["update"].codes() else ()
+    idle = "update" in parts and method.reads("update") and not parts["update"].codes()
+
+    def is_read(key: str) -> bool:
+        return method.reads(key) and not (idle and key in RESIDUAL_KEYS)
+
     for slot in METHOD_SLOTS:
-        if slot not in parts or (method.reads(slot) and slot not in idle):
+        if slot not in parts or is_read(slot):
             continue
         if getattr(recipe, slot).name != getattr(default, slot).name:
             yield slot, "name"
@@ -43,6 +44,5 @@ def unused_keys(
         now, usual = getattr(recipe, section), getattr(default, section)
         for key in type(now).model_fields:
             path = f"{section}.{key}"
-            unread = not method.reads(path) or (bool(idle) and path in RESIDUAL_KEYS)
-            if getattr(now, key) != getattr(usual, key) and path not in SESSION_KEYS and unread:
+            if getattr(now, key) != getattr(usual, key) and path not in SESSION_KEYS and not is_read(path):
                 yield section, key

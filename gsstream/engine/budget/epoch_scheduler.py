@@ -54,6 +54,10 @@ class Allowance:
     def step_scale(self) -> float:
         return self.plan.step_scale
 
+    @property
+    def part_scale(self) -> float:
+        return self.plan.part_scale
+
     def seconds_left(self) -> float | None:
         return None if self.plan.seconds is None else self.started + self.plan.seconds - self.clock()
 
@@ -174,12 +178,6 @@ class EpochScheduler(Schedule):
         # Between the two bounds the weight stays, and trimming makes the packet fit.
         wanted = min(max(expected, SIZE_TARGET * plan.max_bytes), MAX_TRIMMED * plan.max_bytes)
         self.rd_lambda = next_rate_weight(self.rd_lambda, expected, wanted)
-
-
-def plan_of(budget: FrameBudget | None) -> FramePlan | None:
-    """Return the engine's own plan of a frame; None without a budget."""
-    assert budget is None or isinstance(budget, Allowance)
-    return None if budget is None else budget.plan
 
 
 def scheduled(stream: Stream, frame: Frame, budget: FrameBudget | None) -> Schedule:

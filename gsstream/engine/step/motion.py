@@ -12,7 +12,6 @@ from gsstream.core.changes.motion import apply_motions, union_rows
 from gsstream.core.frame import Frame
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import error_context
-from gsstream.engine.budget.epoch_scheduler import plan_of
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.active.change import Change
 from gsstream.engine.step.context import EngineContext
@@ -40,8 +39,8 @@ def propose_motion(
 
     Raises ComponentError when the part fails, or proposes motions that do not fit the scene or cannot be sent.
     """
-    scene, plan = state.player.scene, plan_of(tools.budget)
-    view = EngineContext(parts, state, frame, tools.log, change, 1.0 if plan is None else plan.part_scale)
+    scene, budget = state.player.scene, tools.budget
+    view = EngineContext(parts, state, frame, tools.log, change, 1.0 if budget is None else budget.part_scale)
     proposed = parts.motion.propose(scene, view, tools.rng, state.motion_memory)
     motions = tuple(motion for motion in proposed if not motion.is_empty)
     if not motions:
@@ -50,7 +49,7 @@ def propose_motion(
         delta = Delta(motions)
         # What cannot be sent is refused before anything is learned on it.
         sections = encode_motions(delta.motions) + ([] if delta.field is None else encode_field(delta.field))
-        most = None if plan is None else plan.max_bytes
+        most = None if budget is None else budget.max_bytes
         share = 1.0 if parts.update.scope(frame.index) is Scope.NONE else MAX_SIZE_SHARE
         if most is not None and sum(len(data) for _, data in sections) > share * most:
             return Moved((), scene, view)

@@ -57,15 +57,27 @@ def initial_gaussians(anchors: Anchors, settings: FirstFrame) -> Gaussians[torch
     if count == 0:
         raise InputError("the structure placed no anchors: expected at least 1 Gaussian to start from, got 0")
     spacing = neighbour_distance(anchors.positions).clamp(1e-6, 1e6)
+    higher = (settings.sh_degree + 1) ** 2 - 1
+    return isotropic(anchors.positions, anchors.colors, spacing.log(), schedule.OPACITY, higher)
+
+
+def isotropic(
+    positions: torch.Tensor, colors: torch.Tensor, scales: torch.Tensor, opacity: float, higher: int
+) -> Gaussians[torch.Tensor]:
+    """Return round Gaussians [N] at positions [N, 3], with colours [N, 3] in [0, 1] from every direction.
+
+    ``scales`` [N] are log standard deviations, ``higher`` is the number of higher colour coefficients.
+    """
+    count = len(positions)
     quats = torch.zeros(count, 4)
     quats[:, 0] = 1
     return Gaussians(
-        means=anchors.positions.float().clone(),
+        means=positions.float().clone(),
         quats=quats,
-        scales=spacing.log()[:, None].repeat(1, 3),
-        opacities=torch.full((count,), logit(schedule.OPACITY)),
-        sh0=rgb_to_sh0(anchors.colors.float()),
-        shN=torch.zeros(count, (settings.sh_degree + 1) ** 2 - 1, 3),
+        scales=scales[:, None].repeat(1, 3),
+        opacities=torch.full((count,), logit(opacity)),
+        sh0=rgb_to_sh0(colors.float()),
+        shN=torch.zeros(count, higher, 3),
     )
 
 

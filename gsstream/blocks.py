@@ -19,7 +19,6 @@ from gsstream.engine.fit.nearest import k_nearest as k_nearest
 from gsstream.engine.fit.nearest import nearest_rows as nearest_rows
 from gsstream.engine.fit.nearest import neighbour_distance as neighbour_distance
 from gsstream.engine.step.active.candidates import changed_rows as changed_rows
-from gsstream.engine.step.active.candidates import rows_in_changed_tiles as rows_in_changed_tiles
 from gsstream.engine.step.active.change import Change as Change
 from gsstream.engine.step.active.change import count_per_tile as count_per_tile
 from gsstream.engine.step.active.change import detect_changed_tiles as detect_changed_tiles
@@ -27,12 +26,12 @@ from gsstream.engine.step.quantise import gather_rows_or_zero as gather_rows_or_
 from gsstream.parts.growth.copies import least_opaque as least_opaque
 from gsstream.parts.growth.copying import CopyFilter as CopyFilter
 from gsstream.parts.growth.copying import CopySettings as CopySettings
-from gsstream.parts.growth.copying import fit_copies as fit_copies
 from gsstream.parts.growth.copying import high_gradient_rows as high_gradient_rows
 from gsstream.parts.growth.copying import replace_with_copies as replace_with_copies
 from gsstream.parts.growth.fitting import concat_gaussians as concat_gaussians
 from gsstream.parts.growth.fitting import fit_added as fit_added
 from gsstream.parts.motion.field import approximate_by_cells as approximate_by_cells
+from gsstream.parts.motion.field import rounded_motion as rounded_motion
 from gsstream.parts.motion.field import transform_rows as transform_rows
 from gsstream.parts.motion.fitting import GroupAdam as GroupAdam
 from gsstream.parts.motion.fitting import elementwise as elementwise
@@ -50,6 +49,7 @@ from gsstream.parts.render.activations import activate_opacities as activate_opa
 from gsstream.parts.render.activations import activate_scales as activate_scales
 from gsstream.parts.render.activations import logit as logit
 from gsstream.parts.render.activations import rgb_to_sh0 as rgb_to_sh0
+from gsstream.parts.render.activations import rotation_matrices as rotation_matrices
 from gsstream.parts.render.backward import backward as backward
 from gsstream.parts.render.backward import rows_backward as rows_backward
 from gsstream.parts.update.base import MAX_SYMBOL as MAX_SYMBOL

@@ -49,7 +49,7 @@ class MemoryLimit:
             wanted += _key(sections)
         elif header.kind == PacketKind.DELTA and state is not None:
             rows, numbers = len(state.gaussians), 14 + 3 * state.gaussians.shN.shape[1]
-            wanted += rows * (PER_DELTA_ROW + 8 * numbers) + _births(sections) * PER_NUMBER * numbers
+            wanted += rows * (PER_DELTA_ROW + 8 * numbers) + _num_added(sections) * PER_NUMBER * numbers
         self._check(wanted, f"decoding frame {header.frame}")
 
     def check_pictures(self, width: int, height: int, kept: int = 1) -> None:
@@ -80,7 +80,7 @@ def _key(sections: dict[str, Section]) -> int:
     return int(gaussians * PER_NUMBER * (14 + min(channels, 45)) + 64 * nodes + text * PER_META_BYTE)
 
 
-def _births(sections: dict[str, Section]) -> int:
+def _num_added(sections: dict[str, Section]) -> int:
     """How many Gaussians a delta packet adds, by the head of its section."""
     if "added" not in sections:
         return 0

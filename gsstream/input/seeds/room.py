@@ -30,7 +30,7 @@ MOST_CAMERAS = 8
 #: Deviation of grey that counts as texture, half width of the windows compared, and places that make a score count.
 NOISE, HALF, ENOUGH = 0.02, 3, 500
 #: The middle of the sphere is drawn to the focus, over this share of the rig's size; cameras may stand so far outside.
-PULL, INSIDE = 0.05, 0.93
+CENTER_SPREAD, INSIDE = 0.05, 0.93
 #: Correlations below which another camera contradicts a place on the wall, and above which it confirms the sweep.
 CONTRADICTED, CONFIRMED = 0.2, 0.6
 #: Shares of the room's depth that a surface in front of it is nearer than: a sure one, and one with a single supporter.
@@ -145,7 +145,7 @@ def _sphere(
     def score(values: FloatArray) -> float:
         if values[3] < INSIDE * np.linalg.norm(cameras.centers - values[:3], axis=1).max():
             return -1.0
-        away = float(np.linalg.norm(values[:3] - focus)) / (PULL * size)
+        away = float(np.linalg.norm(values[:3] - focus)) / (CENTER_SPREAD * size)
         return surface_agreement(grey, cameras, values[:3] + values[3] * unit) * float(np.exp(-0.5 * away**2))
 
     starts = [np.append(focus, radius) for radius in np.linspace(0.8, 3, 111) * size]

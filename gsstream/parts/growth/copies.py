@@ -30,10 +30,9 @@ class Copies(Growth):
         )
 
     def propose(self, after: Scene, work: FitContext, rng: Rng) -> RowEdit | None:
-        number = len(after.gaussians)
-        rows = least_opaque(after, number - work.key_rows)
-        if self.config.leave == "last-added":
-            rows = np.arange(work.key_rows, number)
+        kept, number = work.key_rows, len(after.gaussians)
+        last = self.config.leave == "last-added"
+        rows = np.arange(kept, number) if last else least_opaque(after, number - kept)
         return replace_with_copies(after, rows, work, self.config, rng)
 
 

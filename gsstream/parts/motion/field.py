@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gsstream.core.changes import Motion, Scene, groups_for
+from gsstream.core.changes import Groups, Motion, Scene, groups_for
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.parts.motion.groups import groups_of_rows
@@ -35,24 +35,38 @@ def approximate_by_cells(
     values: FloatArray = np.concatenate([translation, rotation], 1).astype(np.float64)
     means = np.stack([np.bincount(place, values[:, i], groups.count) / np.maximum(hits, 1) for i in range(6)], 1)
     # Half a cell from its centre, a turn of one step moves a Gaussian by a step, too.
-    steps = float(np.float32(step)), float(np.float32(step / side))
-    symbols = np.rint(means[able] / np.array([steps[0]] * 3 + [steps[1]] * 3)).astype(np.int32)
+    return rounded_motion(groups, able, means[able], step, step / side)
+
+
+def rounded_motion(
+    groups: Groups, able: IntArray, values: FloatArray, translation_step: float, rotation_step: float
+) -> Motion | None:
+    """Return the motion of the cells of a grid that is laid anew; None where every value is rounded to 0.
+
+    Arguments:
+        groups: of the grid, one per cell.
+        able: [K] cells that may move, ascending.
+        values: [K, 6] their translations, scene units, and rotations, axis * tan(angle / 2).
+        translation_step, rotation_step: of quantisation, in these units.
+    """
+    steps = float(np.float32(translation_step)), float(np.float32(rotation_step))
+    symbols = np.rint(values / np.repeat(steps, 3)).astype(np.int32)
     moved = symbols.any(1)
     if not moved.any():
         return None
     marks = np.zeros(groups.count, np.uint8)
     marks[able[moved]] = 1
-    return Motion(side, 1, marks, symbols[moved], *steps, predicted=False, regroup=True)
+    return Motion(groups.cell, 1, marks, symbols[moved], *steps, predicted=False, regroup=True)
 
 
 def transform_rows(
-    gaussians: Gaussians[torch.Tensor], shift: torch.Tensor, turn: torch.Tensor
+    gaussians: Gaussians[torch.Tensor], translation: torch.Tensor, rotation: torch.Tensor
 ) -> Gaussians[torch.Tensor]:
     """Return Gaussians, raw values, each shifted [A, 3] and rotated [A, 3] about its centre, with a graph.
 
-    ``shift`` is in scene units, ``turn`` is axis * tan(angle / 2).
+    ``translation`` is in scene units, ``rotation`` is axis * tan(angle / 2).
     """
-    quat = torch.nn.functional.normalize(torch.cat([torch.ones_like(turn[:, :1]), turn], 1), dim=1)
+    quat = torch.nn.functional.normalize(torch.cat([torch.ones_like(rotation[:, :1]), rotation], 1), dim=1)
     w0, x0, y0, z0 = quat.unbind(1)
     w1, x1, y1, z1 = gaussians.quats.unbind(1)
     quats = torch.stack([
@@ -61,4 +75,4 @@ def transform_rows(
         w0 * y1 - x0 * z1 + y0 * w1 + z0 * x1,
         w0 * z1 + x0 * y1 - y0 * x1 + z0 * w1,
     ], 1)  # fmt: skip
-    return replace(gaussians, means=gaussians.means + shift, quats=quats)
+    return replace(gaussians, means=gaussians.means + translation, quats=quats)

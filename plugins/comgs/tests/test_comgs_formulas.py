@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 from gsstream_comgs.confidence import CORRECTED, LEFT, ErrorGradient
-from gsstream_comgs.influence import KeyPoints, field_of, matrices, weights_of
+from gsstream_comgs.influence import KeyPoints, field_of, weights_of
 from scipy.spatial.transform import Rotation
 
 from gsstream.api import Gaussians, Layout, Scene, apply_motion
-from gsstream.blocks import approximate_by_cells, transform_rows
+from gsstream.blocks import approximate_by_cells, rotation_matrices, transform_rows
 from gsstream.testing.method_driver import MethodUnderTest
 
 RNG = np.random.default_rng(0)
@@ -68,7 +68,7 @@ def test_gaussians_turn_with_the_field() -> None:
     for i in range(5):
         before = Rotation.from_quat(np.roll(scene.quats[i].numpy(), -1)).as_matrix()
         expected = turned(turn[i].numpy()).as_matrix() @ before
-        np.testing.assert_allclose(matrices(after.quats[i : i + 1])[0].numpy(), expected, atol=1e-5)
+        np.testing.assert_allclose(rotation_matrices(after.quats[i : i + 1])[0].numpy(), expected, atol=1e-5)
 
 
 def test_cells_say_a_field_that_is_the_same_everywhere_to_half_a_step() -> None:

@@ -35,7 +35,7 @@ def scene_of(means: np.ndarray, moved: Displacement | None = None) -> Scene:
     return Scene(gaussians, layout, moved)
 
 
-class Pulled:
+class SquaredDistances:
     """A frame whose loss is the squared distance of every Gaussian to where it belongs."""
 
     cameras, index = RIG, 1
@@ -58,11 +58,11 @@ class Pulled:
         loss.backward()
         return LossAndGrad(loss.detach(), wrt.grad(leaves))
 
-    def on(self, gaussians: Gaussians[torch.Tensor]) -> Pulled:
-        return Pulled(gaussians, self.aims.numpy(), self.changed)
+    def on(self, gaussians: Gaussians[torch.Tensor]) -> SquaredDistances:
+        return SquaredDistances(gaussians, self.aims.numpy(), self.changed)
 
 
-def after(scene: Scene, work: Pulled, **settings: Any) -> Scene:
+def after(scene: Scene, work: SquaredDistances, **settings: Any) -> Scene:
     """Return the scene after what the part proposes."""
     part = CoherentMotion(CoherentMotion.Config(**{"measure": "cell", **settings}))
     for motion in part.propose(scene, work, Rng(0)):
@@ -85,7 +85,7 @@ def test_two_bodies_find_their_own_ways(levels: int) -> None:
     means = np.concatenate([one, two])
     aims = means + np.repeat([[0.03, 0, 0.01], [-0.02, 0.04, 0]], 40, 0)
     scene = scene_of(means)
-    work = Pulled(scene.gaussians.map(torch.from_numpy), aims)
+    work = SquaredDistances(scene.gaussians.map(torch.from_numpy), aims)
     there = after(scene, work, levels=levels, lr=0.1, step=0.01, epochs=60)
     assert np.abs(there.gaussians.means - aims).mean() < 0.3 * np.abs(means - aims).mean()
 
@@ -95,7 +95,7 @@ def test_a_frame_begins_with_a_share_of_the_last_ones_motion() -> None:
     shift = np.tile(np.float32([0.05, 0, 0]), (60, 1))
     moved = Displacement(np.arange(60), shift, np.zeros_like(shift))
     scene = scene_of(means, moved)
-    work = Pulled(scene.gaussians.map(torch.from_numpy), means + 0.6 * shift)
+    work = SquaredDistances(scene.gaussians.map(torch.from_numpy), means + 0.6 * shift)
     slow = {"lr": 1e-6, "step": 0.01, "epochs": 3}
     there = after(scene, work, momentum=0.6, **slow)
     np.testing.assert_allclose(there.gaussians.means, means + 0.6 * shift, atol=1e-3)
@@ -106,7 +106,7 @@ def test_a_frame_begins_with_a_share_of_the_last_ones_motion() -> None:
 def test_only_cells_in_what_changed_move() -> None:
     means = np.concatenate([cloud(30, (0, 0, 3)), cloud(30, (1, 0, 3))])
     scene = scene_of(means)
-    work = Pulled(scene.gaussians.map(torch.from_numpy), means + np.array([0.05, 0, 0]), changed=30)
+    work = SquaredDistances(scene.gaussians.map(torch.from_numpy), means + np.array([0.05, 0, 0]), changed=30)
     there = after(scene, work, epochs=9)
     assert (there.gaussians.means[:30] != scene.gaussians.means[:30]).any(1).mean() > 0.5
     np.testing.assert_array_equal(there.gaussians.means[30:], scene.gaussians.means[30:])

@@ -14,10 +14,8 @@ import numpy as np
 import torch
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.frame import Frame
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.core.shapes import IntArray
-from gsstream.engine.step.active.change import Change, detect_changed_tiles
+from gsstream.engine.step.active.change import Change
 from gsstream.parts.render.base import RenderSession
 
 #: Least share of the views a Gaussian projects into in which it must lie in or beside changed tiles.
@@ -79,22 +77,6 @@ def changed_rows(
     rows = seen.nonzero()[:, 0]
     seen[rows] = (book or VoteCache(change, cameras)).of(means, rows) >= min_votes
     return seen
-
-
-def rows_in_changed_tiles(
-    session: RenderSession, means: torch.Tensor, previous: Frame, frame: Frame, threshold: float, min_votes: float
-) -> IntArray:
-    """Return the rows [A] int64, ascending, in what changed between two frames; all where it is not detected.
-
-    Arguments:
-        session: of the scene that ``previous`` shows.
-        means: [N, 3] its centres.
-        previous, frame: training images before and now.
-        threshold: as for :func:`detect_changed_tiles`.
-        min_votes: as for :func:`changed_rows`.
-    """
-    change = detect_changed_tiles(previous, frame, threshold)
-    return changed_rows(change, means, frame.cameras, session, min_votes).nonzero()[:, 0].numpy()
 
 
 def keep_mask(gates: torch.Tensor, num_levels: int, hierarchy: Hierarchy, waiting: torch.Tensor | None) -> torch.Tensor:

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import torch
 
+from gsstream.blocks import rotation_matrices
+
 
 class KeyPoints(NamedTuple):
     """K key points; ``centre`` is fixed, the others are trained.
@@ -33,7 +35,7 @@ def weights_of(means: torch.Tensor, points: KeyPoints) -> torch.Tensor:
     # Distances as one product of tables: squares of x against the metric of each key point, about the points' mean.
     middle = points.centre.mean(0)
     x, c = means - middle, points.centre - middle
-    turned = matrices(points.quat).transpose(1, 2) / points.size.exp()[:, :, None]
+    turned = rotation_matrices(points.quat).transpose(1, 2) / points.size.exp()[:, :, None]
     metric = turned.transpose(1, 2) @ turned
     mapped = torch.einsum("kij,kj->ki", metric, c)
     squares = (x[:, :, None] * x[:, None]).flatten(1)
@@ -46,20 +48,9 @@ def field_of(means: torch.Tensor, points: KeyPoints) -> Field:
     """Return how key points move Gaussians."""
     weights = weights_of(means, points)
     unit = torch.cat([torch.ones_like(points.turn[:, :1]), points.turn], 1)
-    turning = matrices(unit) - torch.eye(3)
+    turning = rotation_matrices(unit) - torch.eye(3)
     # sum_k w (R_k - 1)(x - c_k) + w t_k, without the table [A, K, 3] of every key point's own displacement.
     blended = (weights @ turning.flatten(1)).reshape(-1, 3, 3)
     fixed = points.shift - torch.einsum("kij,kj->ki", turning, points.centre)
     shift = (blended @ means[:, :, None])[:, :, 0] + weights @ fixed
     return Field(shift, weights @ points.turn)
-
-
-def matrices(quats: torch.Tensor) -> torch.Tensor:
-    """Return rotation matrices [K, 3, 3] of quaternions [K, 4], w first, of any length."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, 1).reshape(-1, 3, 3)

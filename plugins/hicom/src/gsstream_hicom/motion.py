@@ -11,7 +11,6 @@ from pydantic import Field
 from gsstream.api import (
     FitContext,
     FloatArray,
-    Groups,
     Motion,
     MotionPart,
     PartConfig,
@@ -28,6 +27,7 @@ from gsstream.blocks import (
     groupwise_max,
     pixel_size,
     predict_transforms,
+    rounded_motion,
 )
 
 #: The box whose volume the cells share holds this part of the Gaussians along each axis.
@@ -67,6 +67,7 @@ class CoherentMotion(MotionPart):
         rows = work.changed_rows(config.votes).nonzero()[:, 0].numpy()
         pixel, order = pixel_size(scene.gaussians.means, work.cameras), rng.numpy("hicom", work.index)
         total = work.scaled(config.epochs) * len(work.cameras)
+        measure = elementwise if config.measure == "each" else groupwise_max
         for level, side in enumerate(cell_sides(scene.gaussians.means, config.levels, config.per_cell)):
             groups = groups_for(scene, side, 1, regroup=True)
             able = np.flatnonzero(groups_of_rows(groups, rows))
@@ -75,33 +76,20 @@ class CoherentMotion(MotionPart):
                 continue
             marks = np.zeros(groups.count, np.uint8)
             marks[able] = 1
-            moves = predict_transforms(scene, groups, marks, predicted=False)
-            moves = _warm_started(scene, start, moves, config.momentum)
-            motion = self._fitted(scene, work, groups, moves, iterations, pixel, order)
-            if motion.is_empty:
+            transforms = predict_transforms(scene, groups, marks, predicted=False)
+            transforms = _warm_started(scene, start, transforms, config.momentum)
+            # Half a cell from its centre, a rotation of one unit moves a Gaussian by a pixel, too.
+            unit = np.repeat([pixel, pixel / side], 3)
+            found = fit_transforms_adam(
+                scene, work, transforms, unit, [config.lr] * iterations, order, measure, config.l1_weight
+            )
+            motion = rounded_motion(groups, able, found, config.step * pixel, config.step * pixel / side)
+            if motion is None:
                 continue
             motions.append(motion)
             scene = apply_motion(scene, motion)[0]
             work = work.on(scene.gaussians.map(torch.from_numpy))
         return tuple(motions)
-
-    def _fitted(
-        self, scene: Scene, work: FitContext, groups: Groups, moves: GroupTransforms, iterations: int, pixel: float,
-        order: np.random.Generator,
-    ) -> Motion:  # fmt: skip
-        """One grid: the transforms of the cells in ``moves``, rounded."""
-        config = self.config
-        # Half a cell from its centre, a rotation of one unit moves a Gaussian by a pixel, too.
-        unit = np.array([pixel] * 3 + [pixel / groups.cell] * 3)
-        measure = elementwise if config.measure == "each" else groupwise_max
-        rates = [config.lr] * iterations
-        found = fit_transforms_adam(scene, work, moves, unit, rates, order, measure, config.l1_weight)
-        steps = float(np.float32(config.step * pixel)), float(np.float32(config.step * pixel / groups.cell))
-        symbols = np.rint(found / np.array([steps[0]] * 3 + [steps[1]] * 3)).astype(np.int32)
-        moved = symbols.any(1)
-        marks = np.zeros(groups.count, np.uint8)
-        marks[np.unique(groups.group_of[moves.rows])[moved]] = 1
-        return Motion(groups.cell, 1, marks, symbols[moved], *steps, predicted=False, regroup=True)
 
 
 def cell_sides(means: FloatArray, levels: int, per_cell: float) -> list[float]:
@@ -112,13 +100,13 @@ def cell_sides(means: FloatArray, levels: int, per_cell: float) -> list[float]:
     return [float(np.float32(finest * 2**level)) for level in reversed(range(levels))]
 
 
-def _warm_started(scene: Scene, start: Scene, moves: GroupTransforms, momentum: float) -> GroupTransforms:
+def _warm_started(scene: Scene, start: Scene, transforms: GroupTransforms, momentum: float) -> GroupTransforms:
     """Transforms that begin with a share of the last frame's motion, less what coarser cells have moved by already."""
     if start.displacement is None or momentum == 0:
-        return moves
+        return transforms
     past: FloatArray = np.zeros((len(scene.gaussians), 3))
     past[start.displacement.rows] = momentum * start.displacement.translation
-    left = (past - (scene.gaussians.means.astype(np.float64) - start.gaussians.means))[moves.rows]
-    counts = np.bincount(moves.group, minlength=len(moves.center))
-    columns = [np.bincount(moves.group, left[:, i], len(moves.center)) / counts for i in range(3)]
-    return moves._replace(translation=np.stack(columns, 1))
+    left = (past - (scene.gaussians.means.astype(np.float64) - start.gaussians.means))[transforms.rows]
+    counts = np.bincount(transforms.group, minlength=len(transforms.center))
+    columns = [np.bincount(transforms.group, left[:, i], len(transforms.center)) / counts for i in range(3)]
+    return transforms._replace(translation=np.stack(columns, 1))

@@ -37,11 +37,6 @@ class Level(NamedTuple):
         return np.stack([np.bincount(self.of, column, len(self.at)) for column in values.T], 1)
 
 
-def drawn(frame: int, sizes: list[float], order: IntArray) -> AnchorLevels:
-    """Return new anchors: for each level the first rows of ``order`` [N], as many as ``sizes`` says, at least one."""
-    return AnchorLevels(frame, tuple(np.sort(order[: max(1, round(size))]) for size in sizes))
-
-
 def followed(anchors: AnchorLevels, before: Layout, delta: Delta) -> AnchorLevels:
     """Return the same anchors as rows of the scene after a packet, without those whose Gaussian left."""
     if not delta.has_row_edit:

@@ -30,8 +30,9 @@ from gsstream.blocks import (
     groupwise_max,
     pixel_size,
     predict_transforms,
+    rounded_motion,
 )
-from gsstream_recon.anchors import AnchorLevels, Level, bound, drawn, followed, inherited
+from gsstream_recon.anchors import AnchorLevels, Level, bound, followed, inherited
 
 
 @dataclass(frozen=True)
@@ -111,16 +112,14 @@ class AnchorMotion(MotionPart):
         work.log.set(anchors=[len(level) for level in anchors.rows])
         cells = predict_transforms(scene, groups, marks, predicted=False)
         # Half a cell from its centre, a rotation of one unit moves a Gaussian by a pixel, too.
-        unit = np.array([pixel] * 3 + [pixel / side] * 3)
+        unit = np.repeat([pixel, pixel / side], 3)
         steps = float(np.float32(config.step * pixel)), float(np.float32(config.rotation_step))
-        step = np.array([steps[0]] * 3 + [steps[1]] * 3)
+        step = np.repeat(steps, 3)
         anchored = AnchoredCells(cells, bound(cells.center, means, anchors), unit, step if config.rounded else None)
         start = self._start(scene, anchored, memory, anchors)
         found = self._fitted(scene, work, anchored, start, rng.numpy("recon", work.index))
-        symbols = np.rint(found / step).astype(np.int32)
-        moved = symbols.any(1)
-        marks[np.flatnonzero(marks)[~moved]] = 0
-        return (Motion(side, 1, marks, symbols[moved], *steps, predicted=False, regroup=True),) if moved.any() else ()
+        motion = rounded_motion(groups, np.flatnonzero(marks), found, *steps)
+        return () if motion is None else (motion,)
 
     def follow(self, memory: Any, frame: int, before: Layout, delta: Delta, rng: Rng) -> AnchorLevels:
         return followed(self._anchors(memory, frame, len(before.unit_of), rng), before, delta)
@@ -135,7 +134,7 @@ class AnchorMotion(MotionPart):
             return memory
         order = rng.numpy("recon/anchors", frame).permutation(number)
         sizes = [number / config.per_anchor / config.ratio**level for level in reversed(range(config.levels))]
-        return drawn(frame, sizes, order)
+        return AnchorLevels(frame, tuple(np.sort(order[: max(1, round(size))]) for size in sizes))
 
     def _start(
         self, scene: Scene, anchored: AnchoredCells, before: AnchorLevels | None, now: AnchorLevels

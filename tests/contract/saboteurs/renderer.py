@@ -22,6 +22,16 @@ Adapter: Any = ExampleRenderer
 Session: Any = ScatterSession
 
 
+class Opens(Reference):
+    """The reference, with sessions of the class ``opened``."""
+
+    opened: Any
+
+    def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
+        session: RenderSession = self.opened(self, gaussians, active, cameras, background)
+        return session
+
+
 @spoils("check_renderer_range")
 class Overshoot(Reference):
     """Sharpens: black falls a thousandth below 0."""
@@ -79,12 +89,10 @@ class _SeesEverywhere(Session):
 
 
 @spoils("check_renderer_contributing")
-class Unmasked(Reference):
+class Unmasked(Opens):
     """Names everyone who is drawn anywhere in the image, whichever tiles are asked about."""
 
-    def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
-        session: RenderSession = _SeesEverywhere(self, gaussians, active, cameras, background)
-        return session
+    opened = _SeesEverywhere
 
 
 class _StaleOpacities(Session):
@@ -99,12 +107,10 @@ class _StaleOpacities(Session):
 
 
 @spoils("check_renderer_session")
-class Stale(Reference):
+class Stale(Opens):
     """A narrowed session goes on with the opacities it was opened with."""
 
-    def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
-        session: RenderSession = _StaleOpacities(self, gaussians, active, cameras, background)
-        return session
+    opened = _StaleOpacities
 
 
 class _KeepsColours(Session):
@@ -115,12 +121,10 @@ class _KeepsColours(Session):
 
 
 @spoils("check_renderer_commit")
-class Forgetful(Reference):
+class Forgetful(Opens):
     """Takes positions over from frame to frame, and forgets the new colours."""
 
-    def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
-        session: RenderSession = _KeepsColours(self, gaussians, active, cameras, background)
-        return session
+    opened = _KeepsColours
 
 
 class _HurriesOpacities(Session):
@@ -132,12 +136,10 @@ class _HurriesOpacities(Session):
 
 
 @spoils("check_renderer_loss_and_grad")
-class Hasty(Reference):
+class Hasty(Opens):
     """Differentiates by a body of its own, which lets opacities go a tenth further."""
 
-    def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
-        session: RenderSession = _HurriesOpacities(self, gaussians, active, cameras, background)
-        return session
+    opened = _HurriesOpacities
 
 
 class _TurnsTwice(Session):
@@ -153,12 +155,10 @@ class _TurnsTwice(Session):
 
 
 @spoils("check_renderer_loss_and_grad_scene")
-class Turning(Reference):
+class Turning(Opens):
     """Differentiates a whole scene by a body of its own, in which rotations count twice."""
 
-    def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
-        session: RenderSession = _TurnsTwice(self, gaussians, active, cameras, background)
-        return session
+    opened = _TurnsTwice
 
 
 class _DrawsAll(Session):
@@ -169,12 +169,10 @@ class _DrawsAll(Session):
 
 
 @spoils("check_renderer_loss_and_grad_kept")
-class Thorough(Reference):
+class Thorough(Opens):
     """Draws the rows of a scene that are to be left out, too."""
 
-    def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
-        session: RenderSession = _DrawsAll(self, gaussians, active, cameras, background)
-        return session
+    opened = _DrawsAll
 
 
 class _LeavesTraces(Session):
@@ -186,12 +184,10 @@ class _LeavesTraces(Session):
 
 
 @spoils("check_renderer_grad")
-class Untidy(Reference):
+class Untidy(Opens):
     """Leaves a gradient on the rows that it was given."""
 
-    def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
-        session: RenderSession = _LeavesTraces(self, gaussians, active, cameras, background)
-        return session
+    opened = _LeavesTraces
 
 
 class _Decays(Session):
@@ -204,12 +200,10 @@ class _Decays(Session):
 
 
 @spoils("check_renderer_grad_unseen")
-class Decaying(Reference):
+class Decaying(Opens):
     """Adds a trace of decay to every gradient: only those of rows out of view, which are 0, differ by it."""
 
-    def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
-        session: RenderSession = _Decays(self, gaussians, active, cameras, background)
-        return session
+    opened = _Decays
 
 
 class _Repairs(Session):
@@ -219,9 +213,7 @@ class _Repairs(Session):
 
 
 @spoils("check_renderer_grad_refuses")
-class Repairing(Reference):
+class Repairing(Opens):
     """Takes 0 for a value that is not a number, and says nothing."""
 
-    def open(self, gaussians: Any, active: Any, cameras: Cameras, background: Any) -> RenderSession:
-        session: RenderSession = _Repairs(self, gaussians, active, cameras, background)
-        return session
+    opened = _Repairs

@@ -4,27 +4,11 @@ from __future__ import annotations
 
 import pytest
 from browser_runs import in_browser, needs_browser, serving
-from moving_scenes import moving_packets
-
-from gsstream.packet import StreamWriter
-from gsstream.serve.package import package
 
 pytestmark = needs_browser
 PLAYER = "document.querySelector('gsstream-player')?.player"
 ROOT = "document.querySelector('gsstream-player').shadowRoot"
 READY = ["until", f"{PLAYER}?.statistics.drawn"]
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    """A packaged stream of 12 frames."""
-    folder = tmp_path_factory.mktemp("site")
-    stream = folder.parent / f"{folder.name}.gss"
-    with StreamWriter.open(stream) as writer:
-        for packet in moving_packets(seed=3, frames=12, number=80, nodes=20, key_at=7):
-            writer.append(packet)
-    package(stream, folder)
-    return folder
 
 
 @pytest.mark.parametrize("limits", ["", "none"])

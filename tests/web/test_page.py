@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import zlib
 from pathlib import Path
 
@@ -25,19 +24,6 @@ ROOT = "document.querySelector('gsstream-player').shadowRoot"
 MESSAGE = f"{ROOT}.querySelector('.message').textContent"
 READY = ["until", f"{PLAYER}?.state && {PLAYER}._target === null"]
 SIZE = (120, 90)
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    """A packaged stream of 12 frames and two segments, and the stream itself beside the page."""
-    folder = tmp_path_factory.mktemp("site")
-    stream = folder.parent / f"{folder.name}.gss"
-    with StreamWriter.open(stream) as writer:
-        for packet in moving_packets(seed=3, frames=12, number=80, nodes=20, key_at=7):
-            writer.append(packet)
-    package(stream, folder)
-    shutil.copy(stream, folder / "stream.gss")
-    return folder
 
 
 def pictures(encoded: list[str], width: int, height: int) -> list[np.ndarray]:

@@ -70,12 +70,11 @@ class CoherentMotion(MotionPart):
         measure = elementwise if config.measure == "each" else groupwise_max
         for level, side in enumerate(cell_sides(scene.gaussians.means, config.levels, config.per_cell)):
             groups = groups_for(scene, side, 1, regroup=True)
-            able = np.flatnonzero(groups_of_rows(groups, rows))
+            marks = groups_of_rows(groups, rows).astype(np.uint8)
+            able = np.flatnonzero(marks)
             iterations = total * (level + 1) // config.levels - total * level // config.levels
             if not len(able) or not iterations:
                 continue
-            marks = np.zeros(groups.count, np.uint8)
-            marks[able] = 1
             transforms = predict_transforms(scene, groups, marks, predicted=False)
             transforms = _warm_started(scene, start, transforms, config.momentum)
             # Half a cell from its centre, a rotation of one unit moves a Gaussian by a pixel, too.

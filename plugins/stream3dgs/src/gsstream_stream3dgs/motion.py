@@ -118,11 +118,9 @@ class CacheMotion(MotionPart):
     def said(self, scene: Scene, rows: IntArray, cache: Cache, cameras: Cameras) -> Field | Motion | None:
         """Return what is sent of a cache: the cache, or the rigid motions of cells; None where nothing moves."""
         if self.config.sent == "field":
-            if len(rows) == len(scene.gaussians):
-                return cache.field(None)
             marks = np.zeros(len(scene.gaussians), np.uint8)
             marks[rows] = 1
-            return cache.field(marks)
+            return cache.field(None if marks.all() else marks)
         with torch.no_grad():
             shift, turn = cache()
         pixel = pixel_size(scene.gaussians.means, cameras)

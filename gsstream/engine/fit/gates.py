@@ -52,10 +52,14 @@ class TrainedGates:
         per_row = self.gate.sample(self.logits, noise)[self.node_of]
         return per_row if frozen is None else per_row * ~frozen
 
-    def step(self, gates: torch.Tensor, by_gate: torch.Tensor, position: torch.Tensor) -> None:
-        probability = self.gate.open_probability(self.logits)
+    def step(
+        self, gates: torch.Tensor, by_gate: torch.Tensor, position: torch.Tensor, frozen: torch.Tensor | None
+    ) -> None:
+        probability, hierarchy = self.gate.open_probability(self.logits), self.hierarchy
+        if frozen is not None:  # images do not reach these rows yet: the price alone would close their gates for good
+            hierarchy, position = hierarchy.rows(~frozen), position[~frozen]
         # A term on the residual has a gradient by it, too; that stays on the leaf until the latents step.
-        penalty = self.regularizer.penalty(probability, position, self.hierarchy, self.num_gaussians)
+        penalty = self.regularizer.penalty(probability, position, hierarchy, self.num_gaussians)
         roots = [(gates, by_gate), *((term, torch.ones_like(term)) for term in penalty.values())]
         trained = [(root, gradient) for root, gradient in roots if root.requires_grad]
         if not trained:

@@ -17,7 +17,8 @@ def level_schedule(stream: Stream, unit_of: IntArray) -> tuple[tuple[float, int]
     The H levels are those that hold Gaussians: a structure may have more, of which the finest are often empty, and a
     schedule over empty levels would delay no row. It starts at level floor(H / 2); each finer level's stage is
     omega times longer, N_{i+1} = omega N_i. Empty without ``stream.progressive``, or when there is only one stage.
-    The paper leaves omega and the treatment of inactive levels open: here they keep their previous attributes.
+    The paper leaves omega and the treatment of inactive levels open: here they keep their previous attributes, and
+    their gates start from the confidence when their turn comes.
     """
     if not stream.progressive:
         return ()

@@ -47,13 +47,16 @@ class Gates(Protocol):
     def sample(self, frozen: torch.Tensor | None) -> torch.Tensor:
         """Return the gates [A] of the rows, with a graph; those of ``frozen`` rows [A] bool are 0."""
 
-    def step(self, gates: torch.Tensor, by_gate: torch.Tensor, position: torch.Tensor) -> None:
+    def step(
+        self, gates: torch.Tensor, by_gate: torch.Tensor, position: torch.Tensor, frozen: torch.Tensor | None
+    ) -> None:
         """Move the logits by what the images and the penalty say, and keep them in their bounds.
 
         Arguments:
             gates: [A] as sampled.
             by_gate: [A] gradient of the loss by them.
             position: [A, 3] ungated position residual with a graph, into which the penalty's gradient flows.
+            frozen: [A] bool rows that cost nothing, because they are not trained yet; None: all rows are trained.
         """
 
 
@@ -157,7 +160,7 @@ class ResidualOptimiser(ABC):
             gates = epoch.gates.sample(now.frozen)
             found = epoch.session.loss_and_grad(now.view, now.target, WrtRows(self.forward(gates.detach())))
             by_gate = self.backward(found.grad, epoch.rd_lambda)
-            epoch.gates.step(gates, by_gate, self.position)
+            epoch.gates.step(gates, by_gate, self.position, now.frozen)
             self.step(now.lr_factor)
             losses.append(found.loss)
         return losses

@@ -111,8 +111,9 @@ class Run {
     std::fill(s_.costs.begin(), s_.costs.end(), 0.0f);
     for (std::size_t m = 0; m < pass_.nodes; m++) open[m] = sigmoid(pass_.logits.param[m] - rule.margin);
     for (std::size_t i = 0; i < pass_.rows; i++) {
+      if (waiting && waiting[i]) continue;
       const std::size_t m = static_cast<std::size_t>(pass_.node_of[i]);
-      if (!(waiting && waiting[i])) upstream[m] += s_.by_row[i];
+      upstream[m] += s_.by_row[i];
       float squared = 0.0f;
       if (pass_.position >= 0) {
         const float* residual = pass_.latents.param + i * columns + pass_.position;

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import html
+import io
 import json
 import math
 import os
@@ -14,14 +16,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from PIL import Image
 
 from gsstream.core.errors import InputError, OutputError
 from gsstream.core.shapes import IntArray
 from gsstream.packet import FORMAT_VERSION, Entry, PacketKind, StreamReader, decode_key, decode_packet
 from gsstream.packet.base import file_header
+from gsstream.player.playback import Playback
+from gsstream.player.render import render, to_bytes
 from gsstream.serve.joins import encode_join, track_rows
 
-MANIFEST = "stream.json"
+MANIFEST, POSTER = "stream.json", "poster.jpg"
 SEGMENTS = "segments"
 #: Whole lines of a module: a fifth of what a visitor would load.
 _COMMENTS = re.compile(rb"^[ \t]*(?://[^\n]*|/\*\*.*?\*/)\n", re.MULTILINE | re.DOTALL)
@@ -59,9 +64,12 @@ def package(
         main, *others = [_write_stream(Path(path), folder, join_every) for path in (stream, *renditions)]
         for path, other in zip(renditions, others, strict=True):
             _check_frames(path, other, main)
-        manifest = {"format": f"gsstream {FORMAT_VERSION}", **main, "renditions": others}
+        manifest = {"format": f"gsstream {FORMAT_VERSION}", "poster": POSTER, **main, "renditions": others}
         new = _files(manifest)
         size = _copy(resources.files("gsstream") / "web", folder)
+        _replace(folder / POSTER, _poster(Path(stream)))
+        page = folder / "index.html"
+        page.write_text(_titled(page.read_text(encoding="utf-8"), main["name"]), encoding="utf-8")
         # The manifest last, so that a concurrent reader finds every file that it names.
         _replace(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
         for name in old - new:
@@ -172,6 +180,27 @@ def _replace(path: Path, data: bytes) -> None:
     partial = path.with_name(path.name + ".part")
     partial.write_bytes(data)
     partial.replace(path)
+
+
+def _poster(stream: Path) -> bytes:
+    """The first frame as the page shows it at first, as JPEG."""
+    with Playback(stream) as playback:
+        meta = playback.meta
+        cameras = meta.camera((*meta.test.ids, *meta.train.ids)[0])
+        scene = playback.state_at(playback.frames[0])
+        picture = to_bytes(render(scene, cameras, 0, meta.background))
+    data = io.BytesIO()
+    Image.fromarray(picture).save(data, "JPEG", quality=85, progressive=True)
+    return data.getvalue()
+
+
+def _titled(page: str, name: str) -> str:
+    """The page with a name, and what other pages show of a link to it."""
+    title = html.escape(name)
+    tags = f'<meta property="og:title" content="{title}">\n<meta property="og:image" content="{POSTER}">'
+    return page.replace("<title>gsstream</title>", f"<title>{title}</title>\n{tags}").replace(
+        "<h1>gsstream</h1>", f"<h1>{title}</h1>"
+    )
 
 
 def _copy(source: Traversable, target: Path) -> int:

@@ -33,9 +33,14 @@ export function viewsOf(meta) {
   });
 }
 
-/** The camera that the renderer takes, for a canvas of `width` x `height` pixels that holds the whole view. */
+/** Pixels of a canvas for one of a view, which covers it: beside what its camera saw nothing is known. */
+export function scaleOf(view, width, height) {
+  return Math.max(width / view.width, height / view.height);
+}
+
+/** The camera that the renderer takes, for a canvas of `width` x `height` pixels. */
 export function cameraOf(view, width, height) {
-  const scale = Math.min(width / view.width, height / view.height);
+  const scale = scaleOf(view, width, height);
   const rows = [view.right, view.down, view.forward];
   const viewmat = rows.flatMap((row) => [...row, -dot(row, view.eye)]);
   return {

@@ -1,6 +1,6 @@
 // Mouse, touch and keys move the view: orbit, pan, zoom and fly.
 
-import { distance, looked, moved, orbited, zoomed } from "./camera.js";
+import { distance, looked, moved, orbited, scaleOf, zoomed } from "./camera.js";
 import { outside, returned } from "./region.js";
 
 const RADIANS_PER_PIXEL = 0.006;
@@ -8,16 +8,24 @@ const RADIANS_PER_PIXEL = 0.006;
 const RETURN = 0.15;
 const FLY = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, 1, 0], e: [0, -1, 0] };
 
-/** Moves `scene.view` and `scene.pivot` and calls `scene.moved()`. Listens on `canvas` and, for keys, on `keys`. */
+/**
+ * Moves `scene.view` and `scene.pivot` and calls `scene.moved()`. Listens on `canvas` and, for keys, on `keys`.
+ *
+ * Until a click or a tap on the canvas, or from the beginning if `eager`, the wheel and one finger scroll the page; so
+ * they do again after a click elsewhere. Two fingers, and the wheel with Ctrl, zoom at any time.
+ */
 export class Controls {
-  constructor(canvas, keys, scene) {
-    Object.assign(this, { canvas, scene });
+  constructor(canvas, keys, scene, eager = false) {
+    Object.assign(this, { canvas, scene, eager });
     this.pointers = new Map();
     this.held = new Set();
     this.abort = new AbortController();
     const { signal } = this.abort;
     const on = (target, name, handler, options = {}) => target.addEventListener(name, handler, { signal, ...options });
-    canvas.style.touchAction = "none";
+    this._take(eager);
+    on(canvas, "click", () => this._take(true));
+    on(globalThis, "pointerdown", (event) => event.composedPath().includes(keys) || this._take(eager));
+    on(globalThis, "blur", () => this._take(eager));
     on(canvas, "contextmenu", (event) => event.preventDefault());
     on(canvas, "pointerdown", (event) => this._down(event));
     on(canvas, "pointermove", (event) => this._move(event));
@@ -49,6 +57,11 @@ export class Controls {
     return region && view ? outside(region, view, pivot) : 0;
   }
 
+  _take(all) {
+    this.all = all;
+    this.canvas.style.touchAction = all ? "none" : "pan-y";
+  }
+
   _down(event) {
     this.canvas.setPointerCapture(event.pointerId);
     this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
@@ -77,7 +90,7 @@ export class Controls {
   /** What is at the pivot's distance follows the pointer. */
   _pan(dx, dy) {
     const { view, pivot } = this.scene;
-    const scale = Math.min(this.canvas.clientWidth / view.width, this.canvas.clientHeight / view.height);
+    const scale = scaleOf(view, this.canvas.clientWidth, this.canvas.clientHeight);
     const size = distance(view, pivot) / (view.fx * scale);
     this._shift([-dx * size, -dy * size, 0]);
   }
@@ -100,8 +113,8 @@ export class Controls {
   }
 
   _wheel(event) {
+    if (!this.scene.view || !(this.all || event.ctrlKey)) return;
     event.preventDefault();
-    if (!this.scene.view) return;
     const lines = event.deltaMode === 1 ? 30 : 1;
     this._set(
       zoomed(this.scene.view, this.scene.pivot, Math.exp(Math.max(-1, Math.min(1, event.deltaY * lines * 0.0015)))),

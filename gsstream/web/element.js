@@ -1,50 +1,12 @@
 // <gsstream-player src="stream.json">: a player with its controls, for any page.
 //
 // Attributes: src, camera (id of a recorded camera), autoplay, loop ("false" plays once), speed, marks, statistics,
-// controls ("false" shows none), limits ("none" lets the view leave the recorded region).
+// controls ("false" shows none), limits ("none" lets the view leave the recorded region), eager (takes wheel and fingers
+// before a click or a tap), poster (a picture until the first one is drawn; that of a package is found without it).
 
 import { Controls } from "./controls.js";
+import { PAGE, PAUSE, PLAY, STYLE } from "./look.js";
 import { Player } from "./player.js";
-
-const STYLE = `
-:host { display: block; position: relative; aspect-ratio: 16 / 9; background: #111; color: #eee; overflow: hidden;
-  font: 13px/1.4 system-ui, sans-serif; }
-canvas { width: 100%; height: 100%; display: block; outline: none; cursor: grab; }
-canvas:active { cursor: grabbing; }
-.bar { position: absolute; inset: auto 0 0 0; display: flex; gap: 8px; align-items: center; padding: 24px 12px 8px;
-  background: linear-gradient(transparent, #000b); transition: opacity .25s; }
-:host([idle]) .bar { opacity: 0; }
-button, select { background: #fff2; color: inherit; border: 0; border-radius: 4px; padding: 4px 8px; font: inherit;
-  cursor: pointer; }
-button:hover, select:hover { background: #fff4; }
-button[aria-pressed=true] { background: #e8a33d; color: #111; }
-select option { color: #111; }
-input { flex: 1; min-width: 60px; accent-color: #e8a33d; }
-.time { font-variant-numeric: tabular-nums; white-space: nowrap; }
-.message, .facts { position: absolute; left: 12px; top: 12px; max-width: calc(100% - 24px); padding: 6px 10px;
-  border-radius: 4px;
-  background: #000a; white-space: pre-line; pointer-events: none; }
-.message { inset: 0; margin: auto; width: fit-content; height: fit-content; text-align: center; }
-.facts { font-variant-numeric: tabular-nums; }
-[hidden] { display: none; }
-@media (max-width: 560px) { .wide { display: none; } }`;
-
-const PAGE = `
-<canvas tabindex="0" aria-label="Stream of 3D Gaussians: drag to turn, scroll to zoom"></canvas>
-<div class="facts" hidden></div>
-<div class="message" role="status"></div>
-<div class="bar">
-  <button class="play" title="Play or pause (space)">&#9654;</button>
-  <input class="seek" type="range" min="0" max="1" value="0" step="1" aria-label="frame">
-  <span class="time"></span>
-  <select class="speed wide" title="Speed (+ and -)"></select>
-  <select class="camera" title="Viewpoint (1 to 9)"></select>
-  <button class="loop wide" title="Begin again at the end (l)">loop</button>
-  <select class="rendition wide" title="Rendition" hidden></select>
-  <button class="marks wide" title="Mark what the frame changed (g)">changes</button>
-  <button class="statistics wide" title="Statistics (i)">i</button>
-  <button class="full wide" title="Full screen (f)">full screen</button>
-</div>`;
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4];
 
@@ -53,7 +15,7 @@ export class PlayerElement extends HTMLElement {
   static observedAttributes = ["src"];
 
   connectedCallback() {
-    const root = this.shadowRoot ?? this.attachShadow({ mode: "open" });
+    const root = this.shadowRoot ?? this.attachShadow({ mode: "open", delegatesFocus: true });
     root.innerHTML = `<style>${STYLE}</style>${PAGE}`;
     const named = [...root.querySelectorAll("[class]")].map((part) => [part.classList[0], part]);
     this.parts = { canvas: root.querySelector("canvas"), ...Object.fromEntries(named) };
@@ -65,6 +27,7 @@ export class PlayerElement extends HTMLElement {
       return;
     }
     this._listen();
+    this._poster(this.getAttribute("poster"));
     if (this.hasAttribute("src")) this.load(this.getAttribute("src"));
   }
 
@@ -85,8 +48,7 @@ export class PlayerElement extends HTMLElement {
     this.parts.bar.hidden = true;
     try {
       await this.player.open(url);
-      this._fillLists();
-      this._tell(this.player.problem ?? "");
+      if (this.player.problem) this._tell(this.player.problem);
       if (this.hasAttribute("autoplay")) this.player.play();
     } catch (error) {
       if (error.name !== "AbortError") this._tell(error.message);
@@ -103,7 +65,7 @@ export class PlayerElement extends HTMLElement {
       beforeFrame: (seconds) => this.controls?.fly(seconds),
     });
     this.player.marks = this.hasAttribute("marks");
-    this.controls = new Controls(canvas, this, this.player);
+    this.controls = new Controls(canvas, this, this.player, this.hasAttribute("eager"));
     this._sizes = new ResizeObserver(() => this._fit());
     this._sizes.observe(canvas);
     this._fit();
@@ -138,15 +100,22 @@ export class PlayerElement extends HTMLElement {
     parts.marks.onclick = () => this._marks();
     parts.statistics.onclick = () => this._statistics();
     parts.full.onclick = () => this._full();
+    parts.more.onclick = () => this._more();
+    parts.canvas.addEventListener("pointerdown", () => this._more(false));
+    parts.poster.onload = () => {
+      parts.poster.hidden = this.player.drew;
+    };
     player.addEventListener("frame", () => this._progress());
     player.addEventListener("ready", () => this._fillLists());
+    player.addEventListener("opened", () => this._poster(this.getAttribute("poster") ?? player.source.poster));
+    player.addEventListener("drawn", () => this._drawn());
     player.addEventListener("state", () => this._progress());
     player.addEventListener("view", () => {
       parts.canvas.style.opacity = 1 - this.controls.outside;
     });
     player.addEventListener("problem", ({ detail }) => this._tell(detail));
     this.addEventListener("keydown", (event) => this._key(event));
-    this.addEventListener("pointermove", () => this._wake());
+    for (const name of ["pointermove", "pointerdown"]) this.addEventListener(name, () => this._wake());
     this._clock = setInterval(() => this._everySecond(), 500);
     if (this.hasAttribute("statistics")) this._statistics();
     this._marks(player.marks);
@@ -172,6 +141,22 @@ export class PlayerElement extends HTMLElement {
     this.parts.loop.ariaPressed = String(on);
   }
 
+  _more(on = !this.hasAttribute("more")) {
+    this.toggleAttribute("more", on);
+    this.parts.more.ariaExpanded = String(on);
+  }
+
+  _poster(url) {
+    if (url) this.parts.poster.src = url;
+  }
+
+  /** The first picture of a stream is there. */
+  _drawn() {
+    this.parts.poster.hidden = true;
+    this.parts.bar.hidden = this.getAttribute("controls") === "false";
+    this._tell(this.player.problem ?? "");
+  }
+
   async _statistics() {
     this.parts.facts.hidden = !this.parts.facts.hidden;
     this.parts.statistics.ariaPressed = String(!this.parts.facts.hidden);
@@ -187,10 +172,8 @@ export class PlayerElement extends HTMLElement {
 
   _fillLists() {
     const { parts, player } = this;
-    parts.bar.hidden = this.getAttribute("controls") === "false";
-    parts.camera.replaceChildren(
-      ...player.views.map((view) => new Option(view.split === "test" ? `${view.id} (held out)` : view.id)),
-    );
+    parts.camera.replaceChildren(...player.views.map((view, i) => new Option(`View ${i + 1}`)));
+    parts.camera.hidden = player.views.length < 2;
     const renditions = player.source.renditions;
     parts.rendition.hidden = renditions.length < 2;
     parts.rendition.replaceChildren(...renditions.map(({ name }) => new Option(name)));
@@ -200,7 +183,9 @@ export class PlayerElement extends HTMLElement {
   _progress() {
     const { parts, player } = this;
     if (!player || player.frame === null) return;
-    parts.play.textContent = player.playing ? "\u275A\u275A" : "\u25B6";
+    parts.play.querySelector("path").setAttribute("d", player.playing ? PAUSE : PLAY);
+    this.toggleAttribute("still", !player.source.live && player.buffer.last === player.first);
+    parts.space.hidden = !this.hasAttribute("still");
     parts.seek.min = player.first;
     parts.seek.max = Math.max(player.last, player.first + 1);
     parts.seek.value = player.frame;

@@ -15,11 +15,15 @@ export class Latency {
     if (this.waiting.size > KEPT) this.waiting.delete(this.waiting.keys().next().value);
   }
 
-  /** The picture of a frame was drawn `now`; frames before it that were not drawn will not be. */
-  shown(frame, now) {
+  /**
+   * The picture of a frame was drawn `now`; frames before it that were not drawn will not be. What was written before the
+   * viewer came, `since`, is not late.
+   */
+  shown(frame, now, since) {
     const entry = this.waiting.get(frame);
     if (!entry) return;
     for (const known of this.waiting.keys()) if (known <= frame) this.waiting.delete(known);
+    if (entry.written < since) return;
     this.frames = [...this.frames.slice(1 - KEPT), { ...entry, drawn: now - entry.written }];
   }
 

@@ -33,7 +33,7 @@ export class LiveBuffer {
     this.most = 16 * 2 ** 20;
     this.state = { name: "live", detail: "" };
     this.trouble = null;
-    this.broken = null;
+    this.broken = this.joined = null;
     this.said = "";
     this.before = null;
     this.gaps = [];
@@ -106,7 +106,8 @@ export class LiveBuffer {
 
   /** A picture was drawn. */
   shown(frame) {
-    this.latency.shown(frame, Date.now() + this.socket.ahead);
+    const { ahead } = this.socket;
+    this.latency.shown(frame, Date.now() + ahead, this.joined + ahead);
   }
 
   _decode(packet) {
@@ -136,6 +137,7 @@ export class LiveBuffer {
   }
 
   _opened() {
+    this.joined ??= Date.now();
     this.begun = false;
     this.at = null;
   }

@@ -15,7 +15,7 @@ const BUDGET = 80;
 /**
  * `options.renderer` takes the place of the player's own; it has `update(state)`, `draw(camera)` and `dispose()`.
  *
- * Events: `ready` (the first picture can be drawn), `frame`, `state` (playing, waiting, paused, ended), `problem`
+ * Events: `opened` (what there is to load is known), `ready` (the first picture can be drawn), `drawn` (it is), `frame`, `state` (playing, waiting, paused, ended), `problem`
  * (detail: a sentence), `view`.
  */
 export class Player extends EventTarget {
@@ -37,7 +37,7 @@ export class Player extends EventTarget {
     this._target = null;
     this._clock = this._taken = 0;
     this._then = null;
-    this._dirty = this._closed = this._behind = false;
+    this._dirty = this._closed = this._behind = this.drew = false;
     this._tick = (now) => this._turn(now);
     requestAnimationFrame(this._tick);
   }
@@ -47,6 +47,7 @@ export class Player extends EventTarget {
     this.close();
     this._abort = new AbortController();
     this.source = await openSource(url, this._abort.signal);
+    this._say("opened");
     await this._start(this.source.segments, null);
   }
 
@@ -147,6 +148,10 @@ export class Player extends EventTarget {
     this.statistics.uploaded += this.renderer.uploaded;
     if (drew === false) return false;
     this.statistics.drawn += 1;
+    if (!this.drew) {
+      this.drew = true;
+      this._say("drawn");
+    }
     this.buffer?.shown?.(this.frame);
     return true;
   }
@@ -155,6 +160,7 @@ export class Player extends EventTarget {
     this._abort?.abort(new DOMException("the player is closed", "AbortError"));
     this.buffer?.dispose();
     this.buffer = this.state = this.view = this.problem = this._target = null;
+    this.drew = false;
   }
 
   dispose() {

@@ -44,7 +44,8 @@ async function openManifest(url, signal) {
   }));
   const { segments } = renditions[0];
   const last = segments[segments.length - 1].last;
-  return { segments, frames: last - segments[0].first + 1, fps: manifest.fps ?? null, renditions };
+  const poster = manifest.poster && beside(manifest.poster, url).href;
+  return { segments, frames: last - segments[0].first + 1, fps: manifest.fps ?? null, renditions, poster };
 }
 
 /** A stream as it is written, at the address of its socket. Only who looks at one loads what it takes. */

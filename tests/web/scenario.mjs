@@ -19,6 +19,7 @@ const actions = {
   until: (expression, seconds) => browser.until(expression, seconds),
   evaluate: (expression) => browser.evaluate(expression),
   pause,
+  send: (method, params) => browser.send(method, params),
   screenshot: async (path) => writeFileSync(path, await browser.screenshot()),
   key: async (key) => {
     await browser.send("Input.dispatchKeyEvent", { type: "keyDown", key, text: key.length === 1 ? key : undefined });

@@ -2,13 +2,34 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import pytest
-from browser_runs import in_browser, needs_browser, serving
+from browser_runs import in_browser, needs_browser, serving, try_in_browser
 
 pytestmark = needs_browser
 PLAYER = "document.querySelector('gsstream-player')?.player"
-ROOT = "document.querySelector('gsstream-player').shadowRoot"
+ROOT = "document.querySelector('gsstream-player')?.shadowRoot"
+MESSAGE = f"{ROOT}.querySelector('.message').textContent"
+#: A page of somebody else: text, the player, and much more text.
+OUTER = """<!doctype html><meta name="viewport" content="width=device-width"><style>body { margin: 0 }</style>
+<p>Text.</p><script type="module" src="element.js"></script><gsstream-player src="stream.json"></gsstream-player>
+<div style="height: 3000px">More text.</div>"""
 READY = ["until", f"{PLAYER}?.statistics.drawn"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def outer(site):
+    """A page of somebody else, beside the packaged stream."""
+    (site / "outer.html").write_text(OUTER)
+
+
+def look(site: Path, tmp_path: Path, steps: list, **settings: object) -> list:
+    """Carry out steps on a served site, whose address is URL in them."""
+    with serving(site) as (url, _):
+        at = [[item.replace("URL", url) if isinstance(item, str) else item for item in step] for step in steps]
+        return in_browser(at, tmp_path, **settings)
 
 
 @pytest.mark.parametrize("limits", ["", "none"])
@@ -20,9 +41,7 @@ def test_a_hand_that_leaves_the_recorded_region_comes_back_unless_it_is_free(sit
         ["hold", 300, 100, 400, 0], ["pause", 500], ["evaluate", state],
         ["release", 700, 100], ["pause", 200], ["until", f"{opacity} === 1"], ["evaluate", state],
     ]  # fmt: skip
-    with serving(site) as (url, _):
-        results = in_browser([[s.replace("URL", url) if isinstance(s, str) else s for s in step] for step in steps],
-                             tmp_path)  # fmt: skip
+    results = look(site, tmp_path, steps)
     first, held, left = results[2], results[5], results[9]
     assert first[:2] == [1, 0]
     assert first[2] != held[2]
@@ -33,3 +52,131 @@ def test_a_hand_that_leaves_the_recorded_region_comes_back_unless_it_is_free(sit
         assert held[0] == pytest.approx(0)
         assert left[1] == pytest.approx(0, abs=1e-9)
         assert left[2] != held[2]
+
+
+#: Every control that is shown: its name; where it lies in the player: left, top, right, bottom; the player's size.
+CONTROLS = f"""
+[...{ROOT}.querySelectorAll('button, select, input')].filter((part) => part.checkVisibility()).map((part) => {{
+  const box = part.getBoundingClientRect(), host = document.querySelector('gsstream-player').getBoundingClientRect();
+  return [part.className.split(' ')[0], box.left - host.left, box.top - host.top, box.right - host.left,
+    box.bottom - host.top, host.width, host.height, part.scrollWidth - part.clientWidth];
+}})"""
+
+
+@pytest.mark.parametrize(
+    ("page", "size", "wide"),
+    [
+        ("outer.html", (280, 600), False), ("outer.html", (320, 600), False), ("index.html", (390, 844), False),
+        ("outer.html", (640, 700), False), ("index.html", (1099, 500), False), ("index.html", (1100, 500), True),
+        ("index.html", (1920, 1080), True), ("index.html", (3840, 400), True),
+    ],
+)  # fmt: skip
+def test_the_bar_is_one_line_of_large_targets_at_every_width(site, tmp_path, page, size, wide):
+    steps = [
+        ["go", f"URL/{page}"], READY, ["evaluate", CONTROLS], ["evaluate", f"{ROOT}.querySelector('.more').click()"],
+        ["evaluate", CONTROLS],
+    ]  # fmt: skip
+    _, _, closed, _, opened = look(site, tmp_path, steps, size=size)
+    inside = ["speed", "loop", "marks", "statistics", "full"]
+    bar = ["play", "seek", "camera"]
+    assert [name for name, *_ in closed] == (bar + inside if wide else [*bar, "more"])
+    assert [name for name, *_ in opened] == (bar + inside if wide else [*bar, *inside, "more"])
+    assert len({top for name, _, top, *_ in opened if name in (*bar, "more")}) == 1, "one line"
+    for name, left, top, right, bottom, width, height, cut in opened:
+        assert left >= 0, name
+        assert top >= 0, name
+        assert right <= width, name
+        assert bottom <= height, name
+        assert right - left >= 44, name
+        assert bottom - top >= 44, name
+        assert cut <= 0, f"{name} is cut off"
+    boxes = [box[1:5] for box in opened if box[0] != "speed"]  # the label of the speed is written over its list
+    for i, (left, top, right, bottom) in enumerate(boxes):
+        for other in boxes[:i]:
+            apart = right <= other[0] or other[2] <= left or bottom <= other[1] or other[3] <= top
+            assert apart, "two targets overlap"
+
+
+def test_the_wheel_scrolls_the_page_until_the_player_is_clicked(site, tmp_path):
+    state = ["evaluate", f"[scrollY, Math.hypot(...{PLAYER}.view.eye)]"]
+    wheel = [["wheel", 200, 150, 60], ["pause", 400], state]
+    steps = [
+        ["go", "URL/outer.html"], READY, state, *wheel,
+        ["drag", 200, 150, 0, 0], ["evaluate", "scrollTo(0, 0)"], ["pause", 200], *wheel,
+        ["evaluate", "scrollTo(0, 100)"], ["drag", 200, 395, 0, 0], ["pause", 200], *wheel,
+    ]  # fmt: skip
+    results = look(site, tmp_path, steps, size=(600, 400))
+    first, passed, taken, elsewhere = (results[i] for i in (2, 5, 11, 17))
+    assert passed == [60, first[1]]
+    assert taken[0] == 0
+    assert taken[1] != first[1]
+    assert elsewhere == [160, taken[1]]
+
+
+def test_a_finger_scrolls_the_page_until_the_player_is_tapped(site, tmp_path):
+    state = ["evaluate", f"[scrollY, {PLAYER}.view.eye.join()]"]
+
+    touch = {"enabled": True, "configuration": "mobile"}
+    steps = [
+        # What the mouse does is done by a finger.
+        ["send", "Emulation.setEmitTouchEventsForMouse", touch], ["go", "URL/outer.html"], READY, state,
+        ["drag", 200, 250, 0, -150], ["pause", 600], state,
+        ["evaluate", "scrollTo(0, 0)"], ["pause", 300], ["drag", 200, 150, 150, 0], ["pause", 300], state,
+        ["drag", 200, 150, 0, 0], ["pause", 600], ["drag", 200, 250, 0, -150], ["pause", 600], state,
+    ]  # fmt: skip
+    results = look(site, tmp_path, steps, size=(600, 400))
+    first, passed, turned, taken = (results[i] for i in (3, 6, 11, 16))
+    assert passed[0] > 40
+    assert turned[0] == 0
+    assert turned[1] != first[1], "a finger across turns, because no page scrolls that way"
+    assert taken[0] == 0
+    assert taken[1] != turned[1]
+
+
+@pytest.mark.parametrize("page", ["index.html", "outer.html"])
+def test_the_poster_is_shown_until_the_first_picture(site, tmp_path, page):
+    state = f"[!{ROOT}.querySelector('.poster').hidden, {ROOT}.querySelector('.bar').checkVisibility(), {MESSAGE}]"
+    steps = [
+        ["go", f"URL/{page}"], ["until", f"{ROOT}?.querySelector('.poster').naturalWidth"], ["pause", 200],
+        ["evaluate", state], ["evaluate", "fetch('mended')"], READY, ["evaluate", state],
+    ]  # fmt: skip
+    with serving(site, held_after=100) as (url, _):
+        steps = [[item.replace("URL", url) if isinstance(item, str) else item for item in step] for step in steps]
+        results = in_browser(steps, tmp_path)
+    assert results[3] == [True, False, "Loading …"]
+    assert results[-1] == [False, True, ""]
+
+
+def test_a_page_opened_as_a_file_says_how_to_serve_it(site, tmp_path):
+    steps = [
+        ["go", (site / "index.html").as_uri()], ["until", "document.querySelector('p')"],
+        ["evaluate", "document.body.innerText"],
+    ]  # fmt: skip
+    (*_, text), _ = try_in_browser(steps, tmp_path)
+    assert f'python -m http.server --directory "{site}/"' in text
+    assert "gsstream-player" not in text
+
+
+def test_a_still_scene_has_no_time(tmp_path):
+    stream, site = tmp_path / "still.gss", tmp_path / "site"
+    with StreamWriter.open(stream) as writer:
+        writer.append(moving_packets(seed=3, frames=1, number=80, nodes=20)[0])
+    package(stream, site)
+    steps = [
+        ["go", "URL/index.html"], READY, ["evaluate", f"{ROOT}.querySelector('.more').click()"],
+        ["evaluate", CONTROLS], ["evaluate", f"{ROOT}.querySelector('.time').checkVisibility()"],
+    ]  # fmt: skip
+    *_, controls, time = look(site, tmp_path, steps)
+    assert [name for name, *_ in controls] == ["camera", "statistics", "full", "more"]
+    assert not time
+
+
+def test_on_a_page_of_its_own_the_player_takes_keys_and_the_wheel_at_once(site, tmp_path):
+    steps = [
+        ["go", "URL/index.html?loop=false"], READY, ["key", " "], ["until", f"{PLAYER}.frame > 0"],
+        ["evaluate", f"{PLAYER}.view.eye"], ["wheel", 200, 150, 60], ["pause", 300], ["evaluate", f"{PLAYER}.view.eye"],
+        ["evaluate", "[document.title, document.querySelector('h1').textContent]"],
+    ]  # fmt: skip
+    results = look(site, tmp_path, steps)
+    assert results[4] != results[7]
+    assert results[8] == [json.loads((site / "stream.json").read_text())["name"]] * 2

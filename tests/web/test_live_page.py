@@ -70,6 +70,7 @@ def test_the_newest_frame_is_shown_as_it_comes(page, packets, tmp_path):
         assert page.evaluate(f"{PLAYER}.first") == 20
         state = page.evaluate(f"Array.from({PLAYER}.state.scene.means)")
         page.until(f"{PLAYER}.statistics.drawn > 0", 30)
+        assert page.evaluate(f"{PLAYER}.buffer.latency.frames") == [], "what was written before it came is not late"
         (tmp_path / "sound.gss").write_bytes((tmp_path / "s.gss").read_bytes())
         with Playback(tmp_path / "sound.gss") as playback:
             assert state == pytest.approx(playback.state_at(24).means.ravel().tolist(), abs=0)

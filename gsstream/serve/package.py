@@ -67,9 +67,9 @@ def package(
         manifest = {"format": f"gsstream {FORMAT_VERSION}", "poster": POSTER, **main, "renditions": others}
         new = _files(manifest)
         size = _copy(resources.files("gsstream") / "web", folder)
-        _replace(folder / POSTER, _poster(Path(stream)))
         page = folder / "index.html"
-        page.write_text(_titled(page.read_text(encoding="utf-8"), main["name"]), encoding="utf-8")
+        _replace(page, _titled(page.read_text(encoding="utf-8"), main["name"]).encode())
+        _replace(folder / POSTER, _poster(Path(stream)))
         # The manifest last, so that a concurrent reader finds every file that it names.
         _replace(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
         for name in old - new:

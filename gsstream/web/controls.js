@@ -30,7 +30,7 @@ export class Controls {
     on(canvas, "pointerdown", (event) => this._down(event));
     on(canvas, "pointermove", (event) => this._move(event));
     on(canvas, "pointerup", (event) => this.pointers.delete(event.pointerId));
-    on(canvas, "pointercancel", (event) => this.pointers.delete(event.pointerId));
+    on(canvas, "pointercancel", (event) => this._cancel(event));
     on(canvas, "wheel", (event) => this._wheel(event), { passive: false });
     on(keys, "keydown", (event) => this._key(event, true));
     on(keys, "keyup", (event) => this._key(event, false));
@@ -64,7 +64,16 @@ export class Controls {
 
   _down(event) {
     this.canvas.setPointerCapture(event.pointerId);
+    if (!this.pointers.size) this.before = { view: this.scene.view, pivot: this.scene.pivot };
     this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+  }
+
+  /** The finger scrolls the page: what it moved until the browser knew is taken back. */
+  _cancel(event) {
+    if (this.pointers.delete(event.pointerId) && this.before.view) {
+      Object.assign(this.scene, this.before);
+      this.scene.moved();
+    }
   }
 
   _move(event) {

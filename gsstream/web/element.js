@@ -1,8 +1,8 @@
 // <gsstream-player src="stream.json">: a player with its controls, for any page.
 //
 // Attributes: src, camera (id of a recorded camera), autoplay, loop ("false" plays once), speed, marks, statistics,
-// controls ("false" shows none), limits ("none" lets the view leave the recorded region), eager (takes wheel and fingers
-// before a click or a tap), poster (a picture until the first one is drawn; that of a package is found without it).
+// controls ("false" shows none), limits ("none" lets the view leave the recorded region), eager (takes the wheel and
+// fingers before a click or a tap), poster (a picture until the first one is drawn; that of a package needs none).
 
 import { Controls } from "./controls.js";
 import { PAGE, PAUSE, PLAY, STYLE } from "./look.js";

@@ -170,6 +170,12 @@ export class SplatStream {
     this.mesh.updateVersion();
   }
 
+  /** Spark's `preBlurAmount` for the canvas as it is: drawn larger, a Gaussian still covers a pixel of the recording. */
+  get blur() {
+    const scale = this.source.renderer.domElement.height / this.player.view.height;
+    return AS_TRAINED.preBlurAmount * Math.max(1, scale) ** 2;
+  }
+
   /** The turn that takes the recording's up direction to y, as a Quaternion. */
   get upright() {
     return new THREE.Quaternion().setFromUnitVectors(

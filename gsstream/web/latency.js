@@ -16,8 +16,8 @@ export class Latency {
   }
 
   /**
-   * The picture of a frame was drawn `now`; frames before it that were not drawn will not be. What was written before the
-   * viewer came, `since`, is not late.
+   * The picture of a frame was drawn `now`; frames before it that were not drawn will not be. What was written before
+   * the viewer came, `since`, is not late.
    */
   shown(frame, now, since) {
     const entry = this.waiting.get(frame);

@@ -20,13 +20,15 @@ canvas:active { cursor: grabbing; }
 .poster, .over { position: absolute; inset: 0; width: 100%; height: 100%; }
 .poster { object-fit: cover; }
 .poster, .over { pointer-events: none; }
-.over { container-type: size; --side: 44px; }
+.over { container-type: size; }
+.over > * { --side: 44px; }
 .bar { position: absolute; inset: auto 0 0 0; display: flex; gap: 4px; align-items: center; padding: 16px 8px 4px;
   background: linear-gradient(transparent, #000b); transition: opacity .25s; }
 .bar, .bar * { pointer-events: auto; }
 :host([idle]) .bar { opacity: 0; }
 :host([idle]) .bar, :host([idle]) .bar * { pointer-events: none; }
-button, select, input, label { box-sizing: border-box; height: var(--side); min-width: var(--side); margin: 0; font: inherit; color: inherit; }
+button, select, input, label { box-sizing: border-box; height: var(--side); min-width: var(--side); margin: 0;
+  font: inherit; color: inherit; }
 button, select { flex: none; border: 0; border-radius: 6px; padding: 0 8px; background: #fff2; cursor: pointer; }
 button:hover, select:hover { background: #fff4; }
 button[aria-pressed=true], button[aria-expanded=true] { color: #f2b557; }
@@ -37,12 +39,12 @@ svg { width: 20px; height: 20px; fill: currentColor; display: block; flex: none;
 .space { flex: 1; }
 .time { display: none; padding: 0 4px; font-variant-numeric: tabular-nums; white-space: nowrap; }
 .camera { max-width: 88px; }
-.panel { display: none; position: absolute; right: 8px; bottom: calc(100% - 16px); grid: auto / repeat(3, 1fr); gap: 4px;
+.panel { display: none; position: absolute; right: 8px; bottom: calc(100% - 16px); flex-wrap: wrap; gap: 4px;
   box-sizing: border-box; width: min(100% - 16px, 300px); max-height: calc(100cqh - var(--side) - 8px); overflow: auto;
   padding: 4px; border-radius: 8px; background: #222e; }
-:host([more]) .panel { display: grid; }
-.panel > * { display: flex; flex-direction: column; align-items: center; justify-content: center; width: auto;
-  min-width: 0; height: calc(var(--side) + 2px); border-radius: 6px; padding: 0 4px; background: #fff2; }
+:host([more]) .panel { display: flex; }
+.panel > * { display: flex; flex-direction: column; align-items: center; justify-content: center;
+  flex: 1 30%; min-width: 0; height: calc(var(--side) + 2px); border-radius: 6px; padding: 0 4px; background: #fff2; }
 .panel span { font-size: 12px; white-space: nowrap; }
 .panel svg { margin: 0; }
 .panel label { position: relative; justify-content: end; padding-bottom: 4px; }
@@ -65,8 +67,7 @@ svg { width: 20px; height: 20px; fill: currentColor; display: block; flex: none;
   .panel select { position: static; width: auto; padding: 0 4px; text-align-last: auto; }
 }
 @container (min-width: 1900px) {
-  .over > * { font-size: 18px; }
-  .over { --side: 54px; }
+  .over > * { --side: 54px; font-size: 18px; }
   svg { width: 26px; height: 26px; }
 }`;
 

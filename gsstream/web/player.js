@@ -15,8 +15,8 @@ const BUDGET = 80;
 /**
  * `options.renderer` takes the place of the player's own; it has `update(state)`, `draw(camera)` and `dispose()`.
  *
- * Events: `opened` (what there is to load is known), `ready` (the first picture can be drawn), `drawn` (it is), `frame`, `state` (playing, waiting, paused, ended), `problem`
- * (detail: a sentence), `view`.
+ * Events: `opened` (what there is to load is known), `ready` (the first picture can be drawn), `drawn` (it is), `frame`,
+ * `state` (playing, waiting, paused, ended), `problem` (detail: a sentence), `view`.
  */
 export class Player extends EventTarget {
   constructor(canvas, options = {}) {

@@ -7,12 +7,16 @@ import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from moving_scenes import moving_packets
+from pictures import drawn, psnr
+from PIL import Image
 
 from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError, OutputError, PacketError
 from gsstream.packet import StreamReader, StreamWriter
+from gsstream.player.playback import Playback
 from gsstream.serve.package import package
 
 WEB = Path(__file__).parents[2] / "gsstream" / "web"
@@ -50,6 +54,21 @@ def test_streams_of_an_older_minor_version_keep_their_bytes(tmp_path):
     assert first == stream.read_bytes()[: len(first)]
     with StreamReader(stream) as reader:
         assert reader.version == "2.0"
+
+
+def test_the_poster_is_the_first_frame_and_the_page_names_it(tmp_path):
+    stream = write(tmp_path / 'a "b" <i>.gss')
+    package(stream, tmp_path / "site")
+    with Playback(stream) as playback, Image.open(tmp_path / "site" / "poster.jpg") as poster:
+        wanted = drawn(playback, playback.frames[0], playback.meta.background)
+        assert psnr(wanted, np.asarray(poster)) > 30
+    assert json.loads((tmp_path / "site" / "stream.json").read_text())["poster"] == "poster.jpg"
+    page = (tmp_path / "site" / "index.html").read_text()
+    name = "a &quot;b&quot; &lt;i&gt;"
+    assert f"<title>{name}</title>" in page
+    assert f"<h1>{name}</h1>" in page
+    assert f'<meta property="og:title" content="{name}">' in page
+    assert '<meta property="og:image" content="poster.jpg">' in page
 
 
 def test_the_page_finds_every_module_that_it_names(tmp_path):

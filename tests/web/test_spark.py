@@ -28,7 +28,7 @@ pytestmark = [
 ]
 #: Spark sorts in a worker and shows the order one picture later, so several are drawn.
 PICTURE = """(async () => {{
-  stream.player.pause(); ring.visible = false; renderer.setAnimationLoop(null);
+  stream.player.pause(); spark.preBlurAmount = 0.3; ring.visible = false; renderer.setAnimationLoop(null);
   renderer.setSize({width}, {height}, false); camera.aspect = {width} / {height}; stream.place(camera);
   stream.player.seek({frame});
   while (stream.player.frame !== {frame}) await new Promise(requestAnimationFrame);
@@ -56,7 +56,7 @@ def test_pictures_and_uploads(tmp_path):
     rig = make_meta().test
     frames = [0, 3, 5]
     ask = [["evaluate", PICTURE.format(width=rig.width, height=rig.height, frame=frame)] for frame in frames]
-    ready = "typeof stream !== 'undefined' && stream.source.uploaded > 0 && stream.player.state"
+    ready = "typeof stream !== 'undefined' && stream.source.uploaded > 0 && ring.rotation.x"
     small = """(async () => {
       stream.player.seek(0);
       while (stream.player.frame !== 0) await new Promise(requestAnimationFrame);
@@ -67,10 +67,17 @@ def test_pictures_and_uploads(tmp_path):
       stream.update();
       return [whole, stream.source.uploaded, stream.source.getNumSplats()];
     })()"""
+    eye = ["evaluate", "camera.position.toArray()"]
+    blur = "[spark.preBlurAmount, spark.uniforms.preBlurAmount.value, renderer.domElement.height]"
     with serving(tmp_path / "page") as (url, _), Playback(stream) as playback:
-        steps = [["go", f"{url}/index.html"], ["until", ready], *ask, ["evaluate", small]]
-        results = in_browser(steps, tmp_path, size=(160, 120))
-        for frame, text in zip(frames, results[2:-1], strict=True):
+        steps = [["go", f"{url}/index.html"], ["until", ready], eye, ["drag", 60, 60, 60, 0], eye, ["evaluate", blur],
+                 *ask, ["evaluate", small]]  # fmt: skip
+        results = in_browser(steps, tmp_path, size=(3 * rig.width, 3 * rig.height))
+        before, _, after, (amount, used, height) = results[2:6]
+        assert math.dist(before, after) > 0.01, "a drag turns"
+        assert height == 3 * rig.height
+        assert (amount, used) == (pytest.approx(9 * 0.3), pytest.approx(9 * 0.3))
+        for frame, text in zip(frames, results[6:-1], strict=True):
             picture = decoded(text, rig.width, rig.height)[::-1]
             found = psnr(drawn(playback, frame, (0.0, 0.0, 0.0)), picture)
             print(frame, found)

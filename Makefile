@@ -34,9 +34,7 @@ demo: setup
 	$(BIN)/gsstream run --method $(DEMO_METHOD) $(DEMO_SETTINGS) --source demo --out $(DEMO_OUT) --overwrite
 	@echo "The stream, its measurements and the pictures are in $(abspath $(DEMO_OUT)):"
 	@ls -1 $(DEMO_OUT)
-	@$(BIN)/gsstream package $(DEMO_OUT) --out $(DEMO_OUT)/site >/dev/null
-	@echo "This line opens it in your browser (Ctrl-C ends):"
-	@echo "  (sleep 1; $(BIN)/python -m webbrowser http://127.0.0.1:8000) & $(BIN)/python -m http.server --directory $(DEMO_OUT)/site --bind 127.0.0.1 8000"
+	@echo "See it move: $(BIN)/gsstream open $(DEMO_OUT)"
 
 # Every check runs even when an earlier one failed; pytest comes last, so that its summary is the last thing printed.
 # conftest.py puts the longest files first, and one worker more than cores fills the time in which a test waits.

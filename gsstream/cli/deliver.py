@@ -9,14 +9,15 @@ import typer
 
 from gsstream.cli.listing import plural
 from gsstream.cli.streams import Frames, MaxMemory, Stream, fail_with, frame_range, progress_on, size_of, stream_file
+from gsstream.core.errors import InputError
 
 
 def export(
     stream: Stream,
     out: Annotated[Path, typer.Option("--out", help="Folder for the files.")],
     kind: Annotated[
-        str,
-        typer.Option("--format", help="ply (3DGS), spz (by splat-transform), sequence (PLYs, list), manifest."),
+        Literal["ply", "spz", "sequence", "manifest", "page"],
+        typer.Option("--format", help="3DGS PLYs, SPZs (by splat-transform), PLYs with a list, or for the web."),
     ] = "ply",
     frames: Frames = None,
     max_memory: MaxMemory = None,
@@ -24,15 +25,31 @@ def export(
         Literal["recording", "local"],
         typer.Option("--origin", help="Positions in the recording's coordinates, or relative to the place of its rig."),
     ] = "recording",
+    rendition: Annotated[
+        list[Path] | None,
+        typer.Option("--rendition", help="Of a page: another run of the recording that viewers may choose; repeat it."),
+    ] = None,
+    join_every: Annotated[
+        float,
+        typer.Option("--join-every", metavar="SECONDS", help="Of a page: between points to join at; 0: none."),
+    ] = 10.0,
 ) -> None:
-    """Write decoded frames to files that other programs open.
+    """Write a stream for other programs, or as a page for any web server.
 
-    A manifest (stream.json) holds no frame: it lists the byte ranges of all packets, so that any static web server can
-    serve the stream.
+    A page is a folder with the browser player and the stream in segments; one that is there is replaced. A manifest
+    (stream.json) holds no frame: it lists the byte ranges of all packets, so that any static web server can serve the
+    stream.
     """
     first, last = frame_range(frames)
     most = size_of(max_memory)
     file = stream_file(stream)
+    if kind == "page":
+        if frames is not None:
+            raise InputError(f"--frames {frames}: a page holds all frames of a stream; leave --frames out")
+        _page(file, out, [stream_file(path) for path in rendition or []], join_every)
+        return
+    if rendition:
+        raise InputError("--rendition is for --format page")
     if kind == "manifest":
         typer.echo(f"wrote {_manifest(file, out)}")
         return
@@ -47,6 +64,18 @@ def export(
     size = sum(path.stat().st_size for path in written)
     typer.echo(f"{out}: {plural(len(written), 'file')}, {size / 1e6:.1f} MB")
     fail_with(damage)
+
+
+def _page(stream: Path, out: Path, renditions: list[Path], join_every: float) -> None:
+    from gsstream.serve.package import package
+
+    done = package(stream, out, renditions=renditions, join_every=join_every)
+    typer.echo(
+        f"{done.folder}: {plural(done.segments, 'segment')}, {done.stream_bytes / 1e6:.2f} MB, "
+        f"{plural(done.joins, 'join')}, {done.join_bytes / 1e6:.2f} MB, "
+        f"and the player, {done.player_bytes / 1e3:.0f} KB"
+    )
+    typer.echo(f"look at it: python -m http.server --directory {done.folder} --bind 127.0.0.1 8000, http://127.0.0.1:8000")
 
 
 def _manifest(stream: Path, out: Path) -> Path:

@@ -12,7 +12,7 @@ import typer
 from gsstream.cli import options
 from gsstream.cli.grouped import grouped
 from gsstream.cli.listing import fitting
-from gsstream.cli.serve import server_beside, serving
+from gsstream.cli.open import server_beside, serving
 from gsstream.cli.streams import stream_file
 from gsstream.core.errors import ComponentError, GsstreamError, OutputError, RecipeError, SourceError
 

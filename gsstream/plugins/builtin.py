@@ -75,9 +75,8 @@ _COMMANDS = {
     },
     "Watch": {
         "play": ("streams:play", "Decode a stream and render it, without torch or the recording."),
-        "package": ("package:package", "Write a folder with the browser player and the stream for any web server."),
-        "serve": ("serve:serve", "Serve the player and a stream, recorded or live (extra: serve)."),
-        "export": ("deliver:export", "Write decoded frames to files that other programs open."),
+        "open": ("open:open_stream", "Show a stream in the browser; Ctrl-C ends."),
+        "export": ("deliver:export", "Write a stream for other programs, or as a page for any web server."),
         "info": ("info:info", "Say what a stream holds: method, cameras, packets and their sizes."),
     },
     "Evaluate": {

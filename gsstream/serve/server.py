@@ -17,11 +17,11 @@ from urllib.parse import quote, urlsplit
 from gsstream.core.errors import InputError, OutputError
 from gsstream.core.needs import install_extra
 from gsstream.serve.app import Rules, make_app
+from gsstream.serve.local import HOST as LOOPBACK
 
 if TYPE_CHECKING:
     from gsstream.serve.hub import Hub
 
-LOOPBACK = "127.0.0.1"
 _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 #: Bytes that the system takes from us before the viewer has taken those before them, and milliseconds after which a
 #: viewer that takes nothing is cut off. Both where the system knows them.
@@ -47,7 +47,8 @@ class Server:
         """
         for name in ("starlette", "uvicorn", "websockets"):
             if importlib.util.find_spec(name) is None:
-                raise InputError(f"serving needs {name}: {install_extra('serve')}; or use gsstream package")
+                cure = f"{install_extra('serve')}; or use gsstream export --format page"
+                raise InputError(f"serving needs {name}: {cure}")
         names = [_checked_origin(origin) for origin in origins]
         loopback = host in _LOOPBACK_NAMES
         if not loopback and token is None:

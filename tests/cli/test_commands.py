@@ -25,7 +25,7 @@ CHEAP = [
     ["evaluate", "--help"],
     ["info", "--help"],
     ["export", "--help"],
-    ["package", "--help"],
+    ["open", "--help"],
     ["recipe", "dense"],
 ]
 
@@ -43,9 +43,10 @@ OPTIONS = {
     ],
     "gsstream scene validate": ["SCENE", "--frames", "--no-features"],
     "gsstream play": ["STREAM", "--out", "--camera", "--frames", "--fps", "--size", "--renderer", "--max-memory"],
-    "gsstream package": ["STREAM", "--out", "--rendition", "--join-every"],
-    "gsstream serve": ["STREAM", "--live", "--host", "--port", "--token", "--viewers", "--origin"],
-    "gsstream export": ["STREAM", "--out", "--format", "--frames", "--max-memory", "--origin"],
+    "gsstream open": ["STREAM", "--live", "--host", "--port", "--token", "--viewers", "--origin"],
+    "gsstream export": [
+        "STREAM", "--out", "--format", "--frames", "--max-memory", "--origin", "--rendition", "--join-every",
+    ],
     "gsstream info": ["STREAM", "--json"],
     "gsstream evaluate": [
         "STREAM", "--source", "--ply-sequence", "--renders", "--files", "--first", "--frames", "--recipe", "--scale",

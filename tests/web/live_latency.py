@@ -4,7 +4,7 @@
 Usage: python tests/web/live_latency.py --frames 40 --fps 1 [--method s2gs-edge] [--replay-fps 10]
 
 A writer copies the frames of the demo (there and back again) into a watched folder, ``gsstream run`` encodes them,
-``gsstream serve --live`` sends them, a headless Chromium with software graphics shows them. Then the packets of that
+``gsstream open --live`` sends them, a headless Chromium with software graphics shows them. Then the packets of that
 stream are written into another file at ``--replay-fps``, without cameras and encoder. Times count from the file's time
 of modification to the moment when the pixels of the frame could be read back from the graphics.
 """

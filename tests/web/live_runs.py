@@ -63,10 +63,11 @@ def browsing(width: int = 160, height: int = 120) -> Iterator[Page]:
 
 @contextlib.contextmanager
 def served(*arguments: object, **environment: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """``gsstream serve`` as a process; yields the address that it prints and the process."""
-    command = [sys.executable, "-c", "from gsstream.cli.main import main; main()", "serve", *map(str, arguments)]
+    """``gsstream open`` as a process; yields the address that it prints and the process."""
+    command = [sys.executable, "-c", "from gsstream.cli.main import main; main()", "open", *map(str, arguments)]
+    settings = os.environ | {"BROWSER": "true"} | environment
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | environment
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=settings
     ) as process:
         try:
             assert process.stdout is not None

@@ -1,4 +1,4 @@
-"""``gsstream package``: what it writes, what it leaves alone, what it refuses."""
+"""``gsstream export --format page``: what it writes, what it leaves alone, what it refuses."""
 
 from __future__ import annotations
 
@@ -154,8 +154,11 @@ def test_a_damaged_stream_is_not_packaged(tmp_path):
 def test_the_command_says_how_to_look(tmp_path, capsys):
     stream = write(tmp_path / "s.gss")
     shutil.copy(stream, tmp_path / "second.gss")
-    command = ["package", str(stream), "--out", str(tmp_path / "site"), "--rendition", str(tmp_path / "second.gss")]
-    assert run_command(command) == 0
+    command = ["export", str(stream), "--out", str(tmp_path / "site"), "--rendition", str(tmp_path / "second.gss")]
+    assert run_command(command) == 2, "a rendition of something that is no page"
+    assert run_command([*command, "--format", "page", "--frames", "0:2"]) == 2
+    assert not (tmp_path / "site").exists()
+    assert run_command([*command, "--format", "page"]) == 0
     out = capsys.readouterr().out
     assert "2 segments" in out, "equal segments are one file"
     assert "http.server" in out

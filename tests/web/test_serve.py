@@ -1,4 +1,4 @@
-"""``gsstream serve`` against viewers that are no browsers: what they get, who is let in, and what is not served."""
+"""``gsstream open`` against viewers that are no browsers: what they get, who is let in, and what is not served."""
 
 from __future__ import annotations
 
@@ -326,7 +326,7 @@ def test_an_address_in_use_is_told_and_costs_no_run(tmp_path, capsys):
 
 
 def test_what_cannot_be_served_is_told(tmp_path, capsys, monkeypatch):
-    assert run_command(["serve", str(tmp_path / "none")]) == 2
+    assert run_command(["open", str(tmp_path / "none")]) == 2
     assert "no stream at" in capsys.readouterr().err
     for origin in ("example.org", "ftp://example.org", "https://example.org/", "https://", "*"):
         with pytest.raises(InputError, match="--origin"):

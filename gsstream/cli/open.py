@@ -1,8 +1,9 @@
-"""``gsstream serve``: a stream and its player from this machine, recorded or as it is written."""
+"""``gsstream open``: a stream in the browser, recorded or as it is written."""
 
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,17 +18,18 @@ if TYPE_CHECKING:
 
 #: Environment variable with the token: unlike an option it is not in the list of processes.
 TOKEN = "GSSTREAM_TOKEN"
+LOOPBACK = "127.0.0.1"
 
 
-def serve(
+def open_stream(
     stream: Annotated[Path, typer.Argument(help="A stream (.gss), or the output folder of a run.")],
     live: Annotated[
         bool, typer.Option("--live", help="Show the newest frame as it is written; the stream may come later.")
     ] = False,
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the page; 0: any.")] = 8000,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the page; 0: any.")] = 0,
     host: Annotated[
         str, typer.Option("--host", help="Address to serve at; 0.0.0.0 lets other machines look.")
-    ] = "127.0.0.1",
+    ] = LOOPBACK,
     token: Annotated[
         str | None,
         typer.Option("--token", envvar=TOKEN, help="Only who adds ?token=TOKEN to the address may look."),
@@ -38,18 +40,34 @@ def serve(
         typer.Option("--origin", metavar="URL", help="Another web page that may use the stream; repeatable."),
     ] = None,
 ) -> None:
-    """Serve the player and a stream, recorded or live (extra: serve).
+    """Show a stream in the browser; Ctrl-C ends.
 
-    Ctrl-C ends.
+    A recorded stream on this machine alone needs no extra; --live, --host, --token and --origin need gsstream[serve].
     """
     file = _coming(stream) if live else stream_file(stream)
+    if not live and host == LOOPBACK and not token and not origin:
+        from gsstream.serve.local import LocalServer
+
+        with LocalServer(file, port) as local:
+            _show(file, local.url)
+            local.serve_forever()
+        return
     from gsstream.serve.server import Server
 
     server = Server(
         file, live=live, host=host, port=port, token=token or None, origins=origin or (), max_viewers=viewers
     )
-    typer.echo(f"{file}: {server.url} (Ctrl-C ends)")
+    _show(file, server.url, browser=host == LOOPBACK)
     server.run()
+
+
+def _show(file: Path, url: str, *, browser: bool = True) -> None:
+    typer.echo(f"{file}: {url} (Ctrl-C ends)")
+    if browser:
+        import webbrowser
+
+        # Beside the server: a browser in the terminal comes back only when it is left.
+        threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
 
 def server_beside(out: Path, port: int | None) -> Server | None:

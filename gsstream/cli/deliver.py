@@ -27,7 +27,10 @@ def export(
     ] = "recording",
     rendition: Annotated[
         list[Path] | None,
-        typer.Option("--rendition", help="Of a page: another run of the recording that viewers may choose; repeat it."),
+        typer.Option(
+            "--rendition", metavar="RUN",
+            help="Of a page: another run of the recording that viewers may choose; repeat it.",
+        ),
     ] = None,
     join_every: Annotated[
         float,

@@ -35,10 +35,10 @@ app = typer.Typer(
     name="gsstream",
     cls=CommandTable,
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120},
+    epilog="Begin with: gsstream run --source demo --out runs/demo, then: gsstream open runs/demo",
 )
 
 

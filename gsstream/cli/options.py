@@ -12,7 +12,9 @@ import typer
 Out = Annotated[Path, typer.Option("--out", help="Output folder; must not hold another run.")]
 Recipes = Annotated[
     list[Path] | None,
-    typer.Option("--recipe", help="YAML file with differences from the method's recipe; repeatable, last wins."),
+    typer.Option(
+        "--recipe", metavar="FILE", help="YAML file with differences from the method's recipe; repeatable, last wins."
+    ),
 ]
 Settings = Annotated[
     list[str] | None,

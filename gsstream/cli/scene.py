@@ -25,7 +25,8 @@ def prepare(
     raw: Annotated[Path, typer.Argument(help="A folder of pictures or a video per camera, or a picture per camera.")],
     out: Annotated[Path, typer.Option("--out", help="Folder of the scene; must be empty or missing.")],
     test: Annotated[
-        list[str] | None, typer.Option("--test", help="Camera that tests only, out of poses and points; repeatable.")
+        list[str] | None,
+        typer.Option("--test", metavar="ID", help="Camera that tests only, out of poses and points; repeatable."),
     ] = None,
     lens: Annotated[
         str, typer.Option("--lens", help="pinhole, simple-radial, radial, opencv or opencv-fisheye.")

@@ -83,6 +83,7 @@ _COMMANDS = {
         "evaluate": ("evaluate:evaluate", "Render the decoded frames and compare them with the test cameras."),
     },
     "Extend": {
+        "doctor": ("doctor:doctor", "Say what this installation draws and encodes with, and what is missing."),
         "methods": ("methods:methods", "List the methods that --method may name, or show one."),
         "recipe": ("recipe:recipe", "Print a method's recipe as YAML, with the provenance of every value."),
         "plugins": ("plugins:plugins", "List all plugins and the parts they ship, or show one part."),

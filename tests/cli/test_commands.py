@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -32,7 +33,7 @@ CHEAP = [
 RUN = ["run", "--source", "demo", "--out", "OUT"]
 
 OPTIONS = {
-    "gsstream": ["--debug", "--version"],
+    "gsstream": ["--debug", "--version", "--install-completion", "--show-completion"],
     "gsstream run": [
         "--source", "--out", "--method", "--recipe", "--set", "--budget", "--frames", "--scale", "--first-frame",
         "--resume", "--overwrite", "--no-video", "--no-pictures", "--quiet", "--serve",
@@ -55,6 +56,7 @@ OPTIONS = {
     "gsstream methods": ["NAME", "--full"],
     "gsstream recipe": ["METHOD", "--recipe", "--set", "--full", "--schema"],
     "gsstream plugins": ["PART", "--check"],
+    "gsstream doctor": [],
     "gsstream check": ["NAME", "--quiet", "--set", "--source"],
     "gsstream new-plugin": ["NAME", "--kind", "--out"],
 }  # fmt: skip
@@ -120,6 +122,30 @@ def test_cheap_commands_import_no_torch() -> None:
     result = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert result.stderr == ""
     assert result.stdout.splitlines() == [" ".join(["0 True []", *args]) for args in CHEAP]
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"), [("gsstream ex", "export"), ("gsstream export --format s", "spz\nsequence")]
+)
+def test_a_shell_completes_names_and_choices(words: str, offered: str) -> None:
+    settings = {"_GSSTREAM_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
+    command = [sys.executable, "-c", "from gsstream.cli.main import main; main()"]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=600, check=False, env=os.environ | settings
+    )
+    assert (done.stdout.strip(), done.stderr) == (offered, "")
+
+
+def test_the_help_begins_with_an_example(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is as wide as the terminal, and what it tells to run is what the parser takes."""
+    monkeypatch.setenv("COLUMNS", "130")
+    code, out, _ = run(capsys, "--help")
+    assert code == 0
+    begin = out.splitlines()[-1].strip()
+    for line in begin.removeprefix("Begin with: ").split(", then: "):
+        _, name, *options = line.split()
+        assert set(options) <= {*OPTIONS[f"gsstream {name}"], "demo", "runs/demo"}
+    assert max(map(len, out.splitlines())) > 80
 
 
 def run(capsys: pytest.CaptureFixture[str], *args: str) -> tuple[int, str, str]:

@@ -31,7 +31,9 @@ def tune(
     out: Annotated[Path, typer.Option("--out", help="Folder of the pilot and of tuned.yaml; a pilot there goes on.")],
     methods: Annotated[
         list[str] | None,
-        typer.Option("--method", help="Method to try; repeatable; by default dense and the s2gs methods."),
+        typer.Option(
+            "--method", metavar="METHOD", help="Method to try; repeatable; by default dense and the s2gs methods."
+        ),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of every random stream.")] = 0,
     first_frame: options.FirstFrame = None,

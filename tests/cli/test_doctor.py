@@ -1,0 +1,91 @@
+"""``gsstream doctor``: what it says of a whole installation, of one without torch, and of one that cannot draw fast."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SITE = next(Path(place) for place in sys.path if Path(place).name == "site-packages")
+#: Only the packages in a folder of links, whose .pth files are obeyed: what is not linked is not installed.
+CODE = """
+import site, sys
+site.addsitedir(sys.argv.pop(1))
+from gsstream.cli.main import main
+main(["doctor"])
+"""
+
+
+def doctor(folder: Path, without: str = "^$", **environment: str) -> tuple[int, dict[str, str]]:
+    """Return the exit code and the lines, by their heading, where packages that match ``without`` are not installed."""
+    packages = folder / "packages"
+    packages.mkdir()
+    for path in SITE.iterdir():
+        if not re.search(without, path.name):
+            (packages / path.name).symlink_to(path)
+    command = [sys.executable, "-S", "-c", CODE, str(packages)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=300, check=False, env=os.environ | environment, cwd=folder
+    )
+    assert done.stderr == ""
+    return done.returncode, {line[:13].rstrip(): line[14:] for line in done.stdout.splitlines()}
+
+
+def test_a_whole_installation(tmp_path: Path) -> None:
+    torch, native = pytest.importorskip("torch"), pytest.importorskip("gsstream_cpu_render.threads")
+    code, lines = doctor(tmp_path, GSSTREAM_THREADS="3")
+    assert code == 0
+    assert lines["python"].endswith(sys.executable)
+    assert lines["draws with"] == f"cpu, compiled for {native.instruction_set()}, 3 threads"
+    build = f"CUDA {torch.version.cuda}" if torch.version.cuda else "CPU"
+    assert lines["torch"].startswith(f"{torch.__version__}, {build} build, {tmp_path}/packages/torch, imported in ")
+    assert lines["encodes with"] == "renderer 'cpu', the fastest that works here"
+    assert {name for name in lines if name.startswith("extra ")} >= {"extra player", "extra encoder", "extra serve"}
+    assert lines["extra player"] == lines["extra encoder"] == "present"
+    assert lines["self-test"].startswith("400 Gaussians written, read and drawn in ")
+
+
+def test_an_installation_without_torch(tmp_path: Path) -> None:
+    code, lines = doctor(tmp_path, without=r"^(func|pytorch_)?torch")
+    assert code == 0
+    assert re.fullmatch(r"not installed; only encoding needs it: .*pip install 'gsstream\[s2gs\]'", lines["torch"])
+    assert lines["encodes with"] == "nothing: torch is missing"
+    assert lines["draws with"].startswith("cpu, compiled")
+    assert re.fullmatch(r"torch missing: .*pip install 'gsstream\[encoder\]'", lines["extra encoder"])
+    assert lines["extra player"] == "present"
+    assert "torch missing" in lines["extra all"], "an extra of extras"
+
+
+def test_an_installation_without_the_compiled_renderer(tmp_path: Path) -> None:
+    code, lines = doctor(tmp_path, without=r"cpu_render")
+    assert code == 0
+    assert lines["draws with"].startswith("numpy: no compiled renderer works here, so pictures are drawn with plain")
+    assert lines["encodes with"].startswith("renderer 'reference', about 500 times slower. To mend it, install a C++")
+    assert lines["extra player"].startswith("gsstream-cpu-render missing: ")
+
+
+@pytest.mark.parametrize(
+    ("module", "heading", "words"),
+    [
+        ("raise OSError('libtorch: too short')", "torch", "cannot be imported: OSError: libtorch: too short"),
+        ("def render_numpy(*_, near): return [[[7.0]]]", "self-test", "failed: "),
+    ],
+)
+def test_what_is_broken_is_told(tmp_path: Path, module: str, heading: str, words: str) -> None:
+    """A torch that is half there, and a renderer that draws something else."""
+    broken = tmp_path / "packages-of-mine"
+    broken.mkdir()
+    if heading == "torch":
+        (broken / "torch.py").write_text(module)
+    else:
+        (broken / "aaa.py").write_text(module)
+        (broken / "aaa-1.dist-info").mkdir()
+        (broken / "aaa-1.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: aaa\nVersion: 1\n")
+        (broken / "aaa-1.dist-info" / "entry_points.txt").write_text("[gsstream.player]\naaa = aaa:render_numpy\n")
+    code, lines = doctor(tmp_path, PYTHONPATH=str(broken))
+    assert words in lines[heading]
+    assert code == (heading == "self-test")

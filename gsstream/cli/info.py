@@ -79,7 +79,7 @@ def _lines(found: dict[str, float | None]) -> list[tuple[str, str]]:
         ("key packet", of("1/{:.1f} of its attributes as float32", "key_raw_over_coded")),
         ("rate", of("{:.2f} KB/frame after frame 0, {:.2f} KB/frame with it", "kb_per_frame", "kb_amortised")),
         ("", of("{:.2f} Mbit/s after frame 0 at {:g} frames/s", "mbit_per_second", "fps")),
-        ("active", of("{:.2%} of the Gaussians, mean of later frames", "active_share")),
+        ("sent", of("{:.2%} of the Gaussians, mean of later frames", "sent_share")),
         (
             "paper's estimate",
             of("{:.2f} KB/frame after frame 0, {:.2f} with it", "paper_kb_per_frame", "paper_kb_with_frame_0"),

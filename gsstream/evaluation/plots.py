@@ -1,4 +1,4 @@
-"""Per-frame curves of one or several runs as PNG: quality, bytes, seconds, active share."""
+"""Per-frame curves of one or several runs as PNG: quality, bytes, seconds, Gaussians sent, open gates."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from gsstream.evaluation.records import FrameRecord, mean
 
 #: Colours that people who are colour-blind can tell apart, too (Okabe and Ito).
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
-Series = Callable[[FrameRecord], float]
+#: One number of a frame, or one after each of its epochs.
+Series = Callable[[FrameRecord], float | tuple[float, ...]]
 
 
 def _kilobytes(record: FrameRecord) -> float:
@@ -27,8 +28,8 @@ def _seconds(record: FrameRecord) -> float:
     return sum(record.seconds.values()) if record.seconds else math.nan
 
 
-def _active(record: FrameRecord) -> float:
-    return 100 * record.active_gaussians / record.num_gaussians if record.num_gaussians else math.nan
+def _sent(record: FrameRecord) -> float:
+    return 100 * record.sent_gaussians / record.num_gaussians if record.num_gaussians else math.nan
 
 
 #: Title, quantity, line from zero, frame 0 included.
@@ -38,7 +39,8 @@ _PANELS: Sequence[tuple[str, Series, bool, bool]] = (
     ("PSNR on changed pixels, dB", lambda r: mean(r.psnr_changed.values()), False, False),
     ("KB per delta packet", _kilobytes, True, False),
     ("seconds per frame", _seconds, True, False),
-    ("active Gaussians, %", _active, True, False),
+    ("Gaussians sent, %", _sent, True, False),
+    ("open gates after each epoch", lambda r: r.open_gates, True, False),
 )
 
 
@@ -83,10 +85,15 @@ def plot_runs(runs: Mapping[str, Sequence[FrameRecord]], out: str | os.PathLike[
     return out
 
 
-def _line(records: Sequence[FrameRecord], quantity: Series) -> tuple[list[int], list[float]]:
-    points = [(r.frame, quantity(r)) for r in records]
-    points = [(frame, value) for frame, value in points if math.isfinite(value)]
-    return [frame for frame, _ in points], [value for _, value in points]
+def _line(records: Sequence[FrameRecord], quantity: Series) -> tuple[list[float], list[float]]:
+    """Numbers of one frame are spread over the span from the frame before it."""
+    points = []
+    for record in records:
+        found = quantity(record)
+        values = found if isinstance(found, tuple) else (found,)
+        points += [(record.frame - 1 + place / len(values), value) for place, value in enumerate(values, 1)]
+    points = [(x, value) for x, value in points if math.isfinite(value)]
+    return [x for x, _ in points], [value for _, value in points]
 
 
 def _restrain(axis: Any) -> None:

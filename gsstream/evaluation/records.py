@@ -23,7 +23,7 @@ class FrameRecord:
             changes, are left out of the last two.
         bytes: packet section -> bytes, headers included.
         seconds: phase -> wall seconds.
-        active_gaussians, num_gaussians, active_gates, num_gates: counts.
+        sent_gaussians, num_gaussians, active_gates, num_gates: counts. open_gates: after each epoch of the frame.
         peak_memory_mb: peak resident memory so far, MB.
     """
 
@@ -33,12 +33,13 @@ class FrameRecord:
     psnr_moving: Mapping[str, float] = field(default_factory=dict)
     bytes: Mapping[str, int] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
-    active_gaussians: int = 0
+    sent_gaussians: int = 0
     num_gaussians: int = 0
     active_gates: int = 0
     num_gates: int = 0
     peak_memory_mb: float = math.nan
     psnr_changed: Mapping[str, float] = field(default_factory=dict)
+    open_gates: tuple[int, ...] = ()
 
     @property
     def is_key(self) -> bool:
@@ -102,9 +103,10 @@ def record_of(data: Mapping[str, Any]) -> FrameRecord:
         frame=int(data["frame"]),
         psnr=_numbers(data.get("psnr")), ssim=_numbers(data.get("ssim")), psnr_moving=_numbers(data.get("psnr_moving")),
         bytes={name: int(v) for name, v in _numbers(data.get("bytes")).items()}, seconds=_numbers(data.get("seconds")),
-        active_gaussians=int(data.get("active_gaussians") or 0), num_gaussians=int(data.get("num_gaussians") or 0),
+        sent_gaussians=int(data.get("sent_gaussians") or 0), num_gaussians=int(data.get("num_gaussians") or 0),
         active_gates=int(data.get("active_gates") or 0), num_gates=int(data.get("num_gates") or 0),
         peak_memory_mb=math.nan if memory is None else float(memory), psnr_changed=_numbers(data.get("psnr_changed")),
+        open_gates=tuple(int(number) for number in data.get("open_gates") or ()),
     )  # fmt: skip
 
 

@@ -29,8 +29,8 @@ class PacketStats:
     Arguments:
         kind: key, delta or empty.
         size: all bytes of the packet. sections: section -> bytes; ``header`` holds all headers.
-        active_gaussians: rows with a residual that is not zero; all of them in a key packet.
-        active_nodes: nodes whose gate is open; all of them in a key packet.
+        changed_gaussians: rows with a residual that is not zero; all of them in a key packet.
+        sent_gaussians, open_gates: rows behind open gates, and these gates; all of them in a key packet.
         coded: bytes of the entropy-coded sections, the tables of their models included.
         entropy: empirical entropy of their symbols, each channel by itself or all together as they were modelled, and
             the bits sent plainly. coded / entropy is the coder's efficiency.
@@ -43,8 +43,9 @@ class PacketStats:
     kind: str
     size: int
     sections: dict[str, int]
-    active_gaussians: int
-    active_nodes: int
+    changed_gaussians: int
+    sent_gaussians: int
+    open_gates: int
     coded: int
     entropy: float
     float16_zstd: int
@@ -113,7 +114,7 @@ class StreamStats:
             "paper_kb_with_frame_0": _mean([p.paper / 1000 for p in self.packets]),
             "key_coder_over_entropy": self.efficiency("key"), "delta_coder_over_entropy": self.efficiency("delta"),
             "float16_zstd_over_coded": plain / coded if coded else None,
-            "active_share": _mean([p.active_gaussians / max(self.num_gaussians, 1) for p in self.of("delta", "empty")]),
+            "sent_share": _mean([p.sent_gaussians / max(self.num_gaussians, 1) for p in self.of("delta", "empty")]),
             "delta_decode_ms_median": median(p.decode_ms for p in deltas) if deltas else None,
             "delta_decode_ms_most": max((p.decode_ms for p in deltas), default=None),
         }  # fmt: skip
@@ -235,8 +236,9 @@ def _packet(entry: Entry, data: bytes, state: PlayerState, seconds: float) -> Pa
     return PacketStats(
         frame=entry.frame, kind=entry.kind.name.lower(), size=entry.size,
         sections={**sizes, "header": entry.size - sum(sizes.values())},
-        active_gaussians=len(rows) if delta is None and not empty else _changing(delta),
-        active_nodes=0 if empty else int(np.count_nonzero(delta.gates(layout))) if delta else len(layout.node_counts),
+        changed_gaussians=len(rows) if delta is None and not empty else _changing(delta),
+        sent_gaussians=0 if empty else len(rows),
+        open_gates=0 if empty else int(np.count_nonzero(delta.gates(layout))) if delta else len(layout.node_counts),
         coded=sum(table.size for table in tables),
         entropy=sum(table.entropy_bits for table in tables) / 8,
         float16_zstd=0 if empty else _plain_bytes(state, rows),

@@ -22,7 +22,8 @@ class Summary:
         kb_per_frame: bytes of delta and empty packets over their number, 1 KB = 1,000 bytes.
         key_kb: bytes of the first key packet. kb_amortised: all bytes over all frames.
         seconds_first, seconds: frame 0 and the mean of later frames.
-        active: share of Gaussians behind open gates, mean of later frames; gates: share of open gates.
+        sent: share of Gaussians behind open gates, mean of later frames; gates: share of open gates.
+        gates_per_sent: open gates for each Gaussian that is sent, mean of later frames that send any.
         peak_memory_mb: largest of all frames.
     """
 
@@ -37,8 +38,9 @@ class Summary:
     kb_amortised: float
     seconds_first: float
     seconds: float
-    active: float
+    sent: float
     gates: float
+    gates_per_sent: float
     peak_memory_mb: float
     psnr_changed: float = math.nan
 
@@ -62,8 +64,9 @@ def summarise(records: Sequence[FrameRecord]) -> Summary:
         kb_amortised=mean(sized),
         seconds_first=sum(first.seconds.values()) if first.seconds else math.nan,
         seconds=mean(sum(r.seconds.values()) for r in later if r.seconds),
-        active=mean(r.active_gaussians / r.num_gaussians for r in later if r.num_gaussians),
+        sent=mean(r.sent_gaussians / r.num_gaussians for r in later if r.num_gaussians),
         gates=mean(r.active_gates / r.num_gates for r in later if r.num_gates),
+        gates_per_sent=mean(r.active_gates / r.sent_gaussians for r in later if r.sent_gaussians),
         peak_memory_mb=max((r.peak_memory_mb for r in records if math.isfinite(r.peak_memory_mb)), default=math.nan),
         psnr_changed=mean(mean(r.psnr_changed.values()) for r in later),
     )
@@ -76,8 +79,8 @@ _COLUMNS: Mapping[str, tuple[str, str]] = {
     "psnr_slope": ("dB/100", "{:+.2f}"), "psnr_moving": ("moving", "{:.2f}"),
     "psnr_changed": ("changed", "{:.2f}"), "ssim": ("SSIM", "{:.4f}"),
     "kb_per_frame": ("KB/frame", "{:.1f}"), "key_kb": ("key KB", "{:.0f}"), "kb_amortised": ("KB amort.", "{:.1f}"),
-    "seconds": ("s/frame", "{:.2f}"), "seconds_first": ("s frame 0", "{:.1f}"), "active": ("active", "{:.1%}"),
-    "gates": ("gates", "{:.1%}"), "peak_memory_mb": ("peak MB", "{:.0f}"),
+    "seconds": ("s/frame", "{:.2f}"), "seconds_first": ("s frame 0", "{:.1f}"), "sent": ("sent", "{:.1%}"),
+    "gates": ("gates", "{:.1%}"), "gates_per_sent": ("gates/sent", "{:.1%}"), "peak_memory_mb": ("peak MB", "{:.0f}"),
 }  # fmt: skip
 
 

@@ -158,8 +158,9 @@ def test_summary_follows_the_definitions():
     assert s.kb_per_frame == pytest.approx(2.016)
     assert (s.key_kb, s.seconds_first, s.seconds) == (100.0, 60.0, 2.0)
     assert s.kb_amortised == pytest.approx((100_000 + 6048) / 4000)
-    assert s.active == pytest.approx(0.2)
+    assert s.sent == pytest.approx(0.2)
     assert s.gates == pytest.approx(0.2)
+    assert s.gates_per_sent == pytest.approx(0.1)
     assert s.peak_memory_mb == 300.0
 
 
@@ -173,20 +174,21 @@ def test_later_key_packets_are_not_delta_packets():
 def test_what_was_not_measured_is_a_dash():
     row = summary_table({"only frame 0": summarise([FrameRecord(0)])}).splitlines()[2]
     cells = [cell.strip() for cell in row.strip("|").split("|")]
-    assert cells == ["only frame 0", "1", *["-"] * 14]
+    assert cells == ["only frame 0", "1", *["-"] * 15]
 
 
 def test_records_round_trip_and_survive_a_killed_run(tmp_path):
     path = tmp_path / "metrics.jsonl"
     line = {
         "frame": 1, "psnr": {"x": 30.5, "y": None}, "psnr_changed": {"x": 20.5, "y": None}, "bytes": {"gates": 7},
-        "novelty": [1, 2], "num_gates": 3,
+        "novelty": [1, 2], "num_gates": 3, "open_gates": [5, 4],
     }  # fmt: skip
     path.write_text(json.dumps({"frame": 0}) + "\n\n" + json.dumps(line) + "\n" + '{"frame": 2, "psn')
     read = read_records(tmp_path)
     assert [r.frame for r in read] == [0, 1]
     assert (read[1].psnr, read[1].total_bytes, read[1].num_gates) == ({"x": 30.5}, 7, 3)
     assert read[1].psnr_changed == {"x": 20.5}
+    assert read[1].open_gates == (5, 4)
     assert math.isnan(read[1].peak_memory_mb)
 
 
@@ -297,6 +299,8 @@ def test_plots_have_a_panel_per_measured_quantity(tmp_path):
     bare = [FrameRecord(t, {"x": 30.0 + t}) for t in range(3)]
     small = np.asarray(Image.open(plot_runs({"bare": bare}, tmp_path / "bare.png")))
     assert full.shape[0] > 3 * small.shape[0]
+    gated = [FrameRecord(t, {"x": 30.0 + t}, open_gates=(9, 5, 4)) for t in range(3)]
+    assert np.asarray(Image.open(plot_runs({"gated": gated}, tmp_path / "gated.png"))).shape[0] > small.shape[0]
     blue = np.abs(small[..., :3].astype(int) - (0, 114, 178)).max(-1) < 40
     assert blue.sum() > 100
     with pytest.raises(InputError, match="nothing to plot"):

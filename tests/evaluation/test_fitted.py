@@ -44,5 +44,5 @@ def test_numbers_that_say_nothing_are_not_shown() -> None:
     assert "-47.69" not in summary_table({"r": summary(3, 3.0)})
     assert "-47.69" in summary_table({"r": summary(10, 3.0)})
     assert "0.016" in summary_table({"r": summary(3, 0.016)})
-    line = {"frame": 1, "bytes": {"header": 16}, "seconds": {"code": 0.1}, "num_gaussians": 0, "active_gaussians": 0}
+    line = {"frame": 1, "bytes": {"header": 16}, "seconds": {"code": 0.1}, "num_gaussians": 0, "sent_gaussians": 0}
     assert "16 B" in frame_line(line, 3)

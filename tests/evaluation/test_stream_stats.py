@@ -14,8 +14,12 @@ from gsstream.cli.main import run_command
 from gsstream.core.changes import Delta, Layout, Residual
 from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import Gaussians
+from gsstream.core.log import FrameLog
+from gsstream.engine.step.metrics import log_packet
+from gsstream.evaluation.records import FrameRecord, record_of
 from gsstream.evaluation.stream_stats import entropy_bits, stream_stats
-from gsstream.packet import KeyState, StreamReader, StreamWriter, encode_delta, encode_empty, encode_key
+from gsstream.evaluation.summary import summarise
+from gsstream.packet import KeyState, StreamReader, StreamWriter, decode_packet, encode_delta, encode_empty, encode_key
 from gsstream.player.playback import Playback
 
 
@@ -46,7 +50,7 @@ def test_bytes_are_those_of_the_file(tmp_path):
     assert stats.mbit_per_second == pytest.approx(sum(sizes[1:]) / 4 * 8 * 25 / 1e6)
     assert stats.sections("key")["means"] == stats.packets[0].sections["means"]
     assert stats.raw_key_bytes == 150 * 4 * (14 + 24)
-    assert (stats.packets[2].size, stats.packets[2].paper, stats.packets[2].active_gaussians) == (16, 0, 0)
+    assert (stats.packets[2].size, stats.packets[2].paper, stats.packets[2].sent_gaussians) == (16, 0, 0)
 
 
 def test_paper_estimate_and_plain_codec_of_a_delta(tmp_path):
@@ -59,8 +63,8 @@ def test_paper_estimate_and_plain_codec_of_a_delta(tmp_path):
     expected = (96 * opened + entropy_by_hand(delta.gates != 0)) / 8
     packet = stats.packets[1]
     assert packet.paper == pytest.approx(expected)
-    assert packet.active_nodes == opened
-    assert packet.active_gaussians == sum(any(row) for row in np.hstack(list(delta.symbols.values())).tolist())
+    assert packet.open_gates == packet.sent_gaussians == opened  # every Gaussian has a gate of its own
+    assert packet.changed_gaussians == sum(any(row) for row in np.hstack(list(delta.symbols.values())).tolist())
     plain = zstandard.ZstdCompressor(level=19).compress(scene.means[delta.gates != 0].astype("<f2").tobytes())
     assert packet.float16_zstd == len(plain)
     runs, previous = [0], delta.gates[0]
@@ -73,6 +77,22 @@ def test_paper_estimate_and_plain_codec_of_a_delta(tmp_path):
     coded += min(sum(entropy_by_hand(c) for c in delta.symbols["means"].T), entropy_by_hand(delta.symbols["means"]))
     assert packet.entropy == pytest.approx(coded / 8, rel=0.2)  # by channel or together, whichever was modelled
     assert packet.coded > packet.entropy
+
+
+def test_sent_gaussians_are_the_papers_active_ones(tmp_path):
+    """Three root cells of 3, 2 and 1 Gaussians, two gates open, one row behind them does not change."""
+    with Playback(make_stream(tmp_path / "meta.gss", 1)) as playback:
+        meta, scene = playback.meta, playback.state_at(0).map(lambda values: values[:6])
+    layout = Layout(np.int32([3, 2, 1]), np.zeros(6, np.uint8), np.float32([1]))
+    moves = {"means": np.int32([[1, 0, 0], [0, 0, 0], [0, 2, 0], [0, 0, 3]])}
+    delta = Delta((Residual(np.uint8([4, 0, 10]), 10, moves, {"means": 0.02}),))
+    key, packet = encode_key(KeyState(scene, layout, meta)), encode_delta(delta, layout, {}, frame=1)
+    player, log = decode_packet(decode_packet(None, key.data), packet.data), FrameLog()
+    log_packet(log, player, packet)
+    found = [log.numbers[name] for name in ("sent_gaussians", "changed_gaussians", "active_gates", "num_gates")]
+    assert found == [4, 3, 2, 3]
+    summary = summarise([FrameRecord(0), record_of({"frame": 1, **log.numbers})])
+    assert (summary.sent, summary.gates_per_sent) == (4 / 6, 2 / 4)
 
 
 def test_large_tables_are_coded_within_four_percent_of_their_entropy(tmp_path):
@@ -102,7 +122,7 @@ def test_large_tables_are_coded_within_four_percent_of_their_entropy(tmp_path):
     assert stats.efficiency("empty") is None
     found = stats.summary()
     assert found["float16_zstd_over_coded"] > 3
-    assert found["active_share"] == pytest.approx(rows / number / 2)
+    assert found["sent_share"] == pytest.approx(rows / number / 2)
 
 
 def test_a_key_alone_and_a_damaged_stream(tmp_path):
@@ -139,4 +159,4 @@ def test_export_and_manifest_commands(tmp_path, capsys):
     assert len(json.loads((tmp_path / "m" / "stream.json").read_text())["packets"]) == 5
     capsys.readouterr()
     assert run_command(["export", str(path), "--format", "glb", "--out", str(tmp_path / "no")]) == 2
-    assert "expected one of ply, spz, sequence" in capsys.readouterr().err
+    assert "'glb' is not one of 'ply', 'spz', 'sequence'" in capsys.readouterr().err

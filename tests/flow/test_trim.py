@@ -29,4 +29,4 @@ def test_the_share_is_of_the_bytes_that_are_real(tmp_path: Path, trim: float) ->
 def test_a_share_never_takes_the_whole_change(tmp_path: Path) -> None:
     """Of a packet that is mostly headers, three tenths were everything: a flash was sent as "nothing changed"."""
     encode(tmp_path, "--frames", "3", codec__trim=0.999, **EDGE)
-    assert all(frame["active_gaussians"] > 0 for frame in metrics(tmp_path)[1:])
+    assert all(frame["changed_gaussians"] > 0 for frame in metrics(tmp_path)[1:])

@@ -105,7 +105,7 @@ def _duration(seconds: float) -> str:
 
 
 def frame_line(metrics: Mapping[str, Any], total: int | None) -> str:
-    """Return ``frame 3/29: 27.31 dB (moving 24.90), 8.4 KB, 0.52 s, 4.1 % active``.
+    """Return ``frame 3/29: 27.31 dB (moving 24.90), 8.4 KB, 0.52 s, 4.1 % sent``.
 
     ``total`` is None while it is unknown.
     """
@@ -119,7 +119,7 @@ def frame_line(metrics: Mapping[str, Any], total: int | None) -> str:
     parts.append(f"{size / 1000:.1f} KB" if size >= 100 else f"{size} B")
     parts.append(f"{sum(metrics['seconds'].values()):.2f} s")
     if metrics["num_gaussians"]:
-        parts.append(f"{100 * metrics['active_gaussians'] / metrics['num_gaussians']:.1f} % active")
+        parts.append(f"{100 * metrics['sent_gaussians'] / metrics['num_gaussians']:.1f} % sent")
     parts += latency_words(metrics)
     parts += [f"OVER BUDGET: {text}" for text in violations(metrics)]
     last = "" if total is None else f"/{total - 1}"

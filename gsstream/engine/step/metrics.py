@@ -17,6 +17,7 @@ def step_numbers(solution: Solution | None, candidates: int, session: RenderSess
     """Return what the optimisation did (None: there was none), and what the renderer keeps for the next frame."""
     return {
         "dead_gates": 0 if solution is None else solution.dead_gates,
+        "open_gates": [] if solution is None else list(solution.open_gates),
         "candidate_gaussians": candidates,
         "loss": 0.0 if solution is None else solution.loss,
         "iterations": 0 if solution is None else solution.iterations,
@@ -56,11 +57,11 @@ def _counts(player: PlayerState, packet: EncodedPacket) -> dict[str, int]:
     if packet.kind is PacketKind.DELTA and delta is not None and before is not None:
         added, removed = 0 if delta.added is None else len(delta.added), len(delta.removed)
         rows = added + (0 if delta.residual is None else changing_rows(delta.residual))
-        sent = int((row_gates(before, delta) > 0).sum())
+        sent = added + int((row_gates(before, delta) > 0).sum())
         gates = int((delta.gates(before) != 0).sum()) + added
         moving = sum(int(np.count_nonzero(motion.moving)) for motion in delta.motions)
     return {
-        "active_gaussians": rows, "sent_gaussians": sent, "active_gates": gates,
+        "changed_gaussians": rows, "sent_gaussians": sent, "active_gates": gates,
         "added_gaussians": added, "removed_gaussians": removed,
         "moving_groups": moving, "displaced_gaussians": 0 if displacement is None else len(displacement.rows),
     }  # fmt: skip

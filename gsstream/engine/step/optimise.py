@@ -48,6 +48,7 @@ def optimise(parts: Assembly, problem: Problem, schedule: Schedule) -> Solution:
                 return fit.solution(losses, done * views + len(losses))
         done += 1
         schedule.end_epoch(done)
+        fit.open_gates.append(int(fit.opened().sum()))
         if parts.recipe.stream.freeze_closed and done < schedule.epochs:
             fit.release(done / schedule.epochs)
             if len(fit.rows) == 0:
@@ -75,6 +76,7 @@ class _Fit:
             parts.gate, parts.regularizer, parts.optimiser, GATE_LR, problem.logits,
             problem.hierarchy, problem.rows, problem.generator,
         )  # fmt: skip
+        self.open_gates: list[int] = []
 
     def run(self, order: Sequence[int], first: int) -> list[torch.Tensor]:
         """Make one iteration on each of these views, the first with this number; return the photometric losses."""
@@ -101,9 +103,13 @@ class _Fit:
         self.rows, self.levels = self.rows[rows], self.levels[rows]
         self.problem.session.narrow(self.rows)
 
+    def opened(self) -> torch.Tensor:
+        """[M] bool: gates that would be sent open if this epoch were the last."""
+        return torch.round(self.gates.final() * self.parts.gate.num_levels) > 0
+
     def estimated_bytes(self) -> float:
         """Bytes of a packet if this epoch were the last: symbols behind open gates, and the gates."""
-        opened = torch.round(self.gates.final() * self.parts.gate.num_levels) > 0
+        opened = self.opened()
         latents = self.residual.latents.detach()[opened[self.gates.node_of]]
         return estimated_bytes(torch.round(latents / self.code.steps)) + float(opened.sum())
 
@@ -121,4 +127,5 @@ class _Fit:
             iterations=iterations,
             curvature=self.code.split(self.residual.curvature),
             dead_gates=dead,
+            open_gates=self.open_gates,
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -58,6 +58,7 @@ class Solution:
         iterations: views rendered.
         curvature: attribute -> [A, L], mean squared gradient of the latents: what a latent is worth, up to a factor.
         dead_gates: gates of rows that stayed which ended where nothing moves them (:func:`count_dead_gates`).
+        open_gates: how many gates would have been sent open after each epoch.
     """
 
     rows: torch.Tensor
@@ -68,3 +69,4 @@ class Solution:
     iterations: int = 0
     curvature: Mapping[str, torch.Tensor] = field(default_factory=dict)
     dead_gates: int = 0
+    open_gates: Sequence[int] = ()

@@ -146,6 +146,18 @@ def test_nothing_moves_a_gate_whose_level_waits(solve: Callable[..., Solution], 
     assert moved[~waits].all()
 
 
+def test_open_gates_are_counted_after_every_epoch() -> None:
+    """As many as frames of one, two and three epochs end with."""
+    parts, problem = captured("s2gs-paper", ("gate.noise=none",))
+    found = solved(parts, problem, Schedule(3, 0.0))
+    assert found.open_gates[0] > found.open_gates[-1] > 0
+    present = problem.hierarchy.node_of[problem.rows].unique()
+    final = parts.gate.sample(found.logits[present], None)
+    assert found.open_gates[-1] == int((final > 0).sum())
+    assert len(found.open_gates) == 3
+    assert solved(parts, problem, Schedule(1, 0.0)).open_gates == found.open_gates[:1]
+
+
 def faulty(change: Callable[[Problem], None], calls: list[int]) -> None:
     parts, problem = captured(*CASES["edge: rates, rows that leave"])
     problem = replace(problem, base=problem.base.map(torch.clone))

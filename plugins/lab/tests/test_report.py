@@ -43,7 +43,7 @@ def make_table(folder: Path, cells, paper=None, failed=(), cpu=1.0) -> Path:
     for i, (_, _, _, seed, quality, kilobytes, seconds) in enumerate(cells):
         frames = [
             {"frame": t, "bytes": {"layout": 9000} if t == 0 else {"gates": round(1000 * kilobytes)},
-             "seconds": {"code": seconds}, "cpu_seconds": cpu * seconds, "num_gaussians": 10, "active_gaussians": 5,
+             "seconds": {"code": seconds}, "cpu_seconds": cpu * seconds, "num_gaussians": 10, "sent_gaussians": 5,
              "num_gates": 4, "active_gates": 2, "peak_memory_mb": 100.0, "psnr": {"x": quality, "y": quality + 2},
              "ssim": {"x": 0.9}, "psnr_moving": {"x": quality - 5 if t else None}}
             for t in range(3)
@@ -101,7 +101,7 @@ def test_groups_have_means_spreads_and_noise(tmp_path):
     assert first.spread("psnr") == pytest.approx(math.sqrt(0.02))
     assert math.isnan(data.groups[1].spread("psnr"))
     assert (first.mean("kb"), first.mean("seconds"), first.mean("cpu_seconds")) == (20.0, 1.0, 1.0)
-    assert (first.mean("key_kb"), first.mean("active"), first.mean("gates")) == (9.0, 50.0, 0.002)
+    assert (first.mean("key_kb"), first.mean("sent"), first.mean("gates")) == (9.0, 50.0, 0.002)
     assert first.mean("seconds_first") == 1.0
     assert math.isnan(first.mean("flip"))
     assert "flip" not in data.measured()
@@ -218,7 +218,7 @@ def test_the_papers_file_is_sound():
         assert table.rows
         assert set(table.columns) <= set(BY_KEY), name
     files = {path.stem for path in (Path(__file__).parents[3] / "configs" / "paper").glob("*.yaml")}
-    assert files - {"full", "candidates", "extensions"} == set(content["tables"]), "every table has its sweep"
+    assert files - {"full", "candidates", "extensions", "campus"} == set(content["tables"]), "every table has its sweep"
     with pytest.raises(UnknownName, match="did you mean 'components'"):
         paper_table("component")
 

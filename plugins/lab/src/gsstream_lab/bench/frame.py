@@ -282,7 +282,7 @@ def _outcome(parts: Assembly, case: _Case, step: Step) -> dict[str, Any]:
     shown = _draw(parts, step.state.player.gaussians, case.frame.cameras)
     stood = _draw(parts, case.state.player.gaussians, case.frame.cameras)
     quality = {"psnr": shown, "psnr_if_held": stood}
-    keys = ("candidate_gaussians", "active_gaussians", "iterations")
+    keys = ("candidate_gaussians", "sent_gaussians", "iterations")
     return {
         "status": step.status, "bytes": len(step.packet.data),
         **{key: step.metrics[key] for key in keys if key in step.metrics},

@@ -67,7 +67,8 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("joules", "J/frame", ".2f", False, _joules),
     Quantity("seconds_first", "s frame 0", ".1f", False, _of_run("first_seconds")),
     Quantity("fps", "pictures/s", ".0f", True, _of_run("fps")),
-    Quantity("active", "active, %", ".1f", None, lambda s, _, __: 100 * s.active),
+    Quantity("sent", "sent, %", ".1f", None, lambda s, _, __: 100 * s.sent),
+    Quantity("gates_per_sent", "gates/100 sent", ".0f", None, lambda s, _, __: 100 * s.gates_per_sent),
     Quantity("gates", "gates, k", ".3f", None, lambda _, f, __: mean(x["active_gates"] / 1000 for x in f)),
     Quantity("gaussians", "Gaussians, k", ".1f", None, lambda _, f, __: mean(x["num_gaussians"] / 1000 for x in f)),
 )

@@ -64,7 +64,7 @@ def beside_ours(
             cells = [cell(key, group.mean(key), group.spread(key)) for key in (*table.columns, *more)]
             rows.append(["", f"ours, {scene}", str(len(group.runs)), *cells])
     caption = f"{table.title}: the paper on {table.data}, {table.machine} ({table.source})"
-    return Table(f"{caption}; ours on {scene}, machine above", rows)
+    return Table(f"{caption}; ours on {scene}, machine above, frames after the first", rows)
 
 
 def _printed(key: str, value: float) -> str:

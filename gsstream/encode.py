@@ -27,7 +27,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, TypedDict, Unpack
 
-from gsstream.core.cameras import Cameras
+from gsstream.core.cameras import Cameras as Cameras
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame as Frame
 from gsstream.core.world import rig_similarity, snap_cameras
@@ -55,6 +55,15 @@ from gsstream.parts.update.base import UpdateRule
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe as Recipe
+
+__all__ = [
+    "Assembly", "Callbacks", "Cameras", "Encoder", "Frame", "FrameSource", "Parts", "Recipe", "Step", "StreamWriter",
+    "encoder_for", "encoder_for_rig", "open_recording", "recipe_for", "to_rig_coordinates",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 class Parts(TypedDict, total=False):

@@ -123,6 +123,8 @@ def named_recording(file: Path, meta: StreamMeta, catalog: Catalog) -> str:
     uri = str(meta.extra.get("source_uri", ""))
     if not uri:
         raise InputError(f"{file} does not say which recording it was made from; name it with --source")
+    if uri.startswith("rig:"):
+        raise InputError(f"{file} was made from images that Python gave; name a recording of them with --source")
     for scheme in uri.split(":")[:-1]:
         entry = catalog.entries.get(("source", scheme))
         if scheme == "watch" or (entry is not None and entry.plugin != "builtin"):

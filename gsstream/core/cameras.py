@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsstream.core.errors import ShapeError
-from gsstream.core.shapes import FloatArray, check_finite, check_shape
+from gsstream.core.shapes import FloatArray, as_array, check_finite, check_shape
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +30,14 @@ class Cameras:
     width: int
     height: int
     near_plane: float = 0.01
+
+    def __post_init__(self) -> None:
+        """Take lists, too."""
+        object.__setattr__(self, "ids", tuple(self.ids))
+        for name in ("viewmats", "Ks"):
+            values = getattr(self, name)
+            if not isinstance(values, np.ndarray):
+                object.__setattr__(self, name, as_array(f"cameras: {name}", values).astype(np.float64))
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError
-from gsstream.core.shapes import FloatArray, check_shape
+from gsstream.core.shapes import FloatArray, as_array, check_shape
 
 #: How far outside [0, 1] an image may be: the rounding error of resampling in float32.
 ROUNDING = 1e-4
@@ -33,7 +34,7 @@ class Frame:
     """One instant.
 
     Arguments:
-        index: position in the stream, from 0.
+        index: position in the stream, from 0; a stream may begin later.
         timestamp: seconds since the first frame.
         images: [C, H, W, 3] float32 in [0, 1].
         cameras: the C cameras, in the order of ``images``.
@@ -49,6 +50,23 @@ class Frame:
     cameras: Cameras
     epoch_scale: float = 1.0
     arrival: Arrival | None = None
+
+    def as_float32(self) -> Frame:
+        """Return the frame with images of float32; those of uint8, whose white is 255, and of float64 are converted.
+
+        A warning says so once. Raises ShapeError for images of another type.
+        """
+        images = as_array("images", self.images)
+        if images.dtype == np.float32:
+            return self if images is self.images else replace(self, images=images)
+        if images.dtype not in (np.uint8, np.float64):
+            raise ShapeError(
+                f"images of frame {self.index}: expected float32 in [0, 1], float64 or uint8, got {images.dtype}; "
+                "divide them by the value that means white"
+            )
+        warnings.warn(f"images of {images.dtype} are converted to float32 in [0, 1]", stacklevel=3)
+        white = 255 if images.dtype == np.uint8 else 1
+        return replace(self, images=images.astype(np.float32) / np.float32(white))
 
     def validate(self) -> None:
         """Raise ShapeError when images disagree with the cameras, or hold a value that no image may have.

@@ -27,6 +27,14 @@ IntArray = np.ndarray[Any, np.dtype[np.integer[Any]]]
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 
 
+def as_array(name: str, values: Any) -> np.ndarray[Any, Any]:
+    """Return an array as it is, and of anything else, such as lists of lists, an array. Raises ShapeError."""
+    try:
+        return np.asarray(values)
+    except ValueError as error:
+        raise ShapeError(f"{name}: expected an array, or lists of equal lengths: {error}") from error
+
+
 def check_shape(name: str, array: Any, expected: Sequence[int | str]) -> dict[str, int]:
     """Check the shape of an array; letters of the expected shape bind to sizes.
 

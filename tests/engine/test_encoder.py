@@ -19,7 +19,7 @@ from growing_plugin import growth_installed
 from gsstream.cli.main import run_command
 from gsstream.core.errors import ComponentError, InputError, RecipeError, ShapeError
 from gsstream.core.frame import Frame
-from gsstream.encode import Callbacks, Encoder, encoder_for, encoder_for_rig, open_recording
+from gsstream.encode import Callbacks, Cameras, Encoder, encoder_for, encoder_for_rig, open_recording
 from gsstream.engine.frame0.begin import decoded_anchors
 from gsstream.engine.keys.resume import rebuild_hierarchy
 from gsstream.method.base import Step
@@ -294,7 +294,7 @@ def test_a_listener_that_fails_is_not_hidden_and_the_frame_can_be_sent_again() -
     assert packets(sent) == packets(whole("coasting"))[1:]
 
 
-def test_a_rig_needs_no_recording(tmp_path: Path) -> None:
+def test_a_rig_needs_no_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Images from anywhere: the seeds are swept from them, and the stream plays."""
     rig, settings = frames()[0].cameras, {**TINY, "first_frame.points": "auto", "motion": "coasting"}
     made = encoder_for_rig("s2gs-edge", rig, fps=25.0, settings=settings, name="studio")
@@ -303,12 +303,51 @@ def test_a_rig_needs_no_recording(tmp_path: Path) -> None:
     with Playback(write(tmp_path / "rig.gss", steps)) as stream:
         assert (stream.meta.source, stream.meta.fps) == ("studio", 25.0)
         assert stream.meta.extra["source_uri"] == "rig:studio"
+    assert run_command(["evaluate", str(tmp_path / "rig.gss")]) == 2
+    assert "was made from images that Python gave; name a recording" in capsys.readouterr().err
+    with Playback(tmp_path / "rig.gss") as stream:
         assert len(stream.cameras("train")) == len(rig)
         assert len(stream.cameras("test")) == 0
         for frame, step in enumerate(steps):
             same_bits(stream.player_state(frame).gaussians, step.state.player.gaussians)
     again = encoder_for_rig("s2gs-edge", rig, fps=25.0, settings=settings, name="studio")
     assert packets([again.encode(frame) for frame in frames()[:3]]) == packets(steps)
+
+
+@pytest.mark.parametrize(("dtype", "white"), [(np.uint8, 255), (np.float64, 1)])
+def test_images_of_other_types_are_converted_and_lists_are_cameras(dtype: Any, white: int) -> None:
+    """Regression: float64 stopped in the middle of frame 0 with a message of torch, uint8 in a loss."""
+    first, settings = frames()[0], {**TINY, "first_frame.points": "auto", "first_frame.max_iterations": 2}
+    cameras = first.cameras
+    listed = Cameras(list(cameras.ids), cameras.viewmats.tolist(), cameras.Ks.tolist(), cameras.width, cameras.height)
+    given = np.rint(first.images * 255) if dtype is np.uint8 else first.images
+    with pytest.warns(UserWarning, match=f"images of {np.dtype(dtype)} are converted to float32") as said:
+        step = encoder_for_rig("dense", listed, settings=settings).encode(Frame(5, 0.0, given.astype(dtype), listed))
+    assert said[0].filename == __file__
+    exact = replace(first, index=5, images=(given.astype(np.float32) / np.float32(white)))
+    made = encoder_for_rig("dense", cameras, settings=settings)
+    assert step.packet.data == made.encode(exact).packet.data
+    with pytest.raises(InputError, match="frame 7: expected frame 6"):
+        made.encode(replace(exact, index=7))
+
+
+@pytest.mark.parametrize(
+    ("images", "message"),
+    [
+        (np.zeros((3, 24, 32, 3), np.uint16), "got uint16; divide them by the value that means white"),
+        ([[0.0], [0.0, 1.0]], "images: expected an array, or lists of equal lengths"),
+    ],
+)
+def test_images_of_a_type_that_says_no_white_are_refused(images: Any, message: str) -> None:
+    with pytest.raises(ShapeError, match=message):
+        encoder().encode(replace(frames()[0], images=images))
+
+
+def test_the_door_shows_what_is_for_its_users() -> None:
+    import gsstream.encode as door
+
+    assert set(dir(door)) == set(door.__all__)
+    assert all(hasattr(door, name) for name in door.__all__)
 
 
 def test_what_a_step_says_is_what_a_player_makes_of_its_packet() -> None:

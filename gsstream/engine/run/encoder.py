@@ -95,13 +95,15 @@ class Encoder:
         """Encode the next frame: the first as a key packet, later ones as the method decides.
 
         Arguments:
-            frame: training images; its index follows that of the frame before, from 0.
+            frame: training images, of float32 or what :meth:`Frame.as_float32` converts; its index follows that of the
+                frame before. The first may have any, and the stream then begins there.
 
         Raises:
             ShapeError: images that do not fit the cameras, or values outside [0, 1].
             ComponentError: a part fails and the recipe says ``stream.on_error: raise``. Where it fails in the work that
                 follows a packet, that packet has been handed out; the same frame gives it again.
         """
+        frame = frame.as_float32()
         frame.validate()
         if self.state is not None and frame.index != self.state.player.frame + 1:
             expected = self.state.player.frame + 1

@@ -29,7 +29,10 @@ def test_the_quick_start_is_two_commands_that_make_knows() -> None:
     assert commands.splitlines() == ["make demo", "make test"]
     for target in ("demo", "test"):
         dry = ["make", "--dry-run", target]
-        assert subprocess.run(dry, cwd=ROOT, capture_output=True, timeout=600, check=False).returncode == 0
+        done = subprocess.run(dry, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
+        assert done.returncode == 0
+        if target == "demo":
+            assert done.stdout.splitlines()[-1].endswith('bin/gsstream open runs/demo"')
 
 
 def test_the_tutorial_says_which_environment_it_means() -> None:

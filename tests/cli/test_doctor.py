@@ -50,8 +50,12 @@ def test_a_whole_installation(tmp_path: Path) -> None:
 
 
 def test_an_installation_without_torch(tmp_path: Path) -> None:
-    code, lines = doctor(tmp_path, without=r"^(func|pytorch_)?torch")
+    driver = tmp_path / "nvidia-smi"
+    driver.write_text("#!/bin/sh\necho 'GPU 0: NVIDIA H100 80GB HBM3 (UUID: GPU-1-2)'\n")
+    driver.chmod(0o755)
+    code, lines = doctor(tmp_path, without=r"^(func|pytorch_)?torch", PATH=f"{tmp_path}:{os.environ['PATH']}")
     assert code == 0
+    assert lines["GPU"] == "GPU 0: NVIDIA H100 80GB HBM3; not used: torch is missing"
     assert re.fullmatch(r"not installed; only encoding needs it: .*pip install 'gsstream\[s2gs\]'", lines["torch"])
     assert lines["encodes with"] == "nothing: torch is missing"
     assert lines["draws with"].startswith("cpu, compiled")

@@ -13,8 +13,9 @@ import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
-from gsstream.core.shapes import FloatArray
+from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.evaluation.records import finite_or_none, mean
+from gsstream.evaluation.seen import seen_masks
 from gsstream.evaluation.summary import format_table
 from gsstream.input.recordings.base import FrameSource
 from gsstream.metrics import (
@@ -55,8 +56,9 @@ ViewMetric = Callable[[ViewPair], float]
 class ViewQuality:
     """One test camera at one frame; dB, SSIM, LPIPS; nan where nothing moves or not measured, inf for equal images.
 
-    ``psnr_changed``: on pixels that differ from the first frame by more than 0.1. ``extra``: name -> value of what was
-    asked for besides.
+    ``psnr_changed``: on pixels that differ from the first frame by more than 0.1. ``psnr_seen``,
+    ``psnr_changed_seen``: on pixels, and on changed pixels, whose surface at least two training cameras see; nan where
+    pictures come without a scene. ``extra``: name -> value of what was asked for besides.
     """
 
     frame: int
@@ -72,6 +74,11 @@ class ViewQuality:
     static_psnr_changed: float = math.nan
     lpips: float = math.nan
     static_lpips: float = math.nan
+    psnr_seen: float = math.nan
+    psnr_changed_seen: float = math.nan
+    static_psnr_seen: float = math.nan
+    static_psnr_changed_seen: float = math.nan
+    seen_share: float = math.nan
     extra: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -111,18 +118,22 @@ class Evaluation:
     def table(self) -> str:
         """Return a Markdown table of the decoded stream and of frame 0 held still.
 
-        Columns: frame 0, mean of later frames, slope, SSIM, moving pixels, LPIPS if measured.
+        Columns: frame 0, mean of later frames, slope, SSIM, moving and changed pixels, those and all that training
+        cameras see, LPIPS if measured.
         """
-        names, forms = ["ssim", "psnr_moving", "psnr_changed"], [".2f", ".2f", "+.2f", ".4f", ".2f", ".2f"]
-        rows = [["", "PSNR 0", "PSNR", "dB/100", "SSIM", "moving", "changed"]]
+        quality = {"ssim": "SSIM", "psnr_moving": "moving", "psnr_changed": "changed"}
+        if any(math.isfinite(view.seen_share) for view in self.views):
+            quality |= {"psnr_seen": "seen", "psnr_changed_seen": "changed, seen"}
         if self.lpips_variant:
-            names, forms, rows = [*names, "lpips"], [*forms, ".4f"], [[*rows[0], "LPIPS"]]
+            quality["lpips"] = "LPIPS"
+        rows = [["", "PSNR 0", "PSNR", "dB/100", *quality.values()]]
+        forms = [".2f", ".2f", "+.2f", *(".4f" if name in ("ssim", "lpips") else ".2f" for name in quality)]
         for label, prefix in (("decoded", ""), ("frame 0 held", "static_")):
             whole = self.series(prefix + "psnr")
             (first, psnr_first), later = next(iter(whole.items())), dict(list(whole.items())[1:])
             known = {t: v for t, v in later.items() if math.isfinite(v)}
             slope = slope_per_100(list(known), list(known.values()))
-            rest = [mean(v for t, v in self.series(prefix + n).items() if t != first) for n in names]
+            rest = [mean(v for t, v in self.series(prefix + n).items() if t != first) for n in quality]
             numbers = [psnr_first, mean(known.values()), slope, *rest]
             cells = zip(numbers, forms, strict=True)
             rows.append([label, *(format(v, form) if math.isfinite(v) else "-" for v, form in cells)])
@@ -149,6 +160,9 @@ class Shown(Protocol):
     def images(self, frame: int) -> Sequence[FloatArray]:
         """Return a picture [H, W, 3] in [0, 1] for each camera of the rig; the same list where nothing changed."""
 
+    def seen(self, frame: int) -> Sequence[BoolArray] | None:
+        """Return [H, W] for each camera: pixels whose surface training cameras see; None where that is not known."""
+
 
 class StreamFrames:
     """What the player shows of a stream."""
@@ -157,6 +171,7 @@ class StreamFrames:
         self.rig, self.renderer, self.frames = rig, renderer.name, playback.frames
         self._playback, self._with = playback, renderer
         self._last: tuple[Any, list[FloatArray]] | None = None
+        self._seen: tuple[Any, list[BoolArray]] | None = None
 
     def images(self, frame: int) -> list[FloatArray]:
         """Return the pictures of a frame; those of a scene that did not change are not drawn again."""
@@ -167,6 +182,13 @@ class StreamFrames:
                 scene, [np.clip(render(scene, self.rig, view, background, self._with), 0, 1) for view in views]
             )  # fmt: skip
         return self._last[1]
+
+    def seen(self, frame: int) -> list[BoolArray]:
+        """Return what training cameras see of the decoded scene, by its own depth."""
+        scene = self._playback.state_at(frame)
+        if self._seen is None or self._seen[0] is not scene:
+            self._seen = (scene, seen_masks(scene, self._playback.cameras("train"), self.rig, self._with))
+        return self._seen[1]
 
 
 def evaluate(
@@ -209,12 +231,15 @@ def evaluate_frames(
     held, views = list(shown.images(chosen[0])), []
     last: tuple[Sequence[FloatArray | None], Sequence[FloatArray | None]] = ([None] * len(rig), [None] * len(rig))
     for done, frame in enumerate(chosen, 1):
-        truth, images = _truth(source, frame, split, order), shown.images(frame)
+        truth, images, seen = _truth(source, frame, split, order), shown.images(frame), shown.seen(frame)
         for i, name in enumerate(rig.ids):
             masks = (moving_mask(truth[i], truth_first[i], sigmas[i]), changed_mask(truth[i], truth_first[i]))
             pair = ViewPair(images[i], truth[i], last[0][i], last[1][i], sigmas[i])
             found = {key: metric(pair) for key, metric in (extras or {}).items()}
-            views.append(replace(_compare(frame, name, pair, held[i], masks, lpips), extra=found))
+            quality = _compare(frame, name, pair, held[i], masks, lpips)
+            if seen is not None:
+                quality = _with_seen(quality, pair, held[i], masks[1], seen[i])
+            views.append(replace(quality, extra=found))
         last = (images, list(truth))
         if progress is not None:
             progress(done, len(chosen))
@@ -232,6 +257,18 @@ def _compare(
         frame, name, psnr(image, truth), ssim(image, truth), psnr(image, truth, moving), float(moving.mean()),
         psnr(held, truth), ssim(held, truth), psnr(held, truth, moving), psnr(image, truth, changed),
         psnr(held, truth, changed), *distances,
+    )  # fmt: skip
+
+
+def _with_seen(
+    quality: ViewQuality, pair: ViewPair, held: FloatArray, changed: BoolArray, seen: BoolArray
+) -> ViewQuality:
+    """The same with what is measured on the pixels that training cameras see."""
+    image, truth = pair.image, pair.truth
+    return replace(
+        quality, psnr_seen=psnr(image, truth, seen), psnr_changed_seen=psnr(image, truth, changed & seen),
+        static_psnr_seen=psnr(held, truth, seen), static_psnr_changed_seen=psnr(held, truth, changed & seen),
+        seen_share=float(seen.mean()),
     )  # fmt: skip
 
 

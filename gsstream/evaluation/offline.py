@@ -12,7 +12,9 @@ import numpy as np
 from PIL import Image
 
 from gsstream.core.errors import InputError
-from gsstream.core.shapes import FloatArray
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.shapes import BoolArray, FloatArray
+from gsstream.evaluation.seen import seen_masks
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.input.recordings.images import PICTURE_FORMATS
 from gsstream.player.ply import read_ply
@@ -59,13 +61,19 @@ class PlySequence:
 
     def images(self, frame: int) -> list[FloatArray]:
         """Return what the test cameras see of a frame."""
+        scene, views = self._scene(frame), range(len(self.rig))
+        return [np.clip(render(scene, self.rig, view, self._background, self._with), 0, 1) for view in views]
+
+    def seen(self, frame: int) -> list[BoolArray]:
+        """Return the pixels of the test cameras whose surface the recording's training cameras see."""
+        return seen_masks(self._scene(frame), self._info.train, self.rig, self._with)
+
+    def _scene(self, frame: int) -> Gaussians[FloatArray]:
         scene, offset = read_ply(self._files[frame])
         # In float64 until it is in the stream's coordinates: the recording's origin may be far away.
         world = self._info.world
         moved = tuple(np.array(world.offset) - np.array(offset))
-        near = replace(world, offset=moved).inverse().gaussians(scene).map(lambda value: value.astype(np.float32))
-        views = range(len(self.rig))
-        return [np.clip(render(near, self.rig, view, self._background, self._with), 0, 1) for view in views]
+        return replace(world, offset=moved).inverse().gaussians(scene).map(lambda value: value.astype(np.float32))
 
 
 class Renders:
@@ -96,6 +104,9 @@ class Renders:
     def images(self, frame: int) -> list[FloatArray]:
         """Return the pictures of a frame. Raises InputError for one of another size."""
         return [self._image(self._files[name][frame]) for name in self.rig.ids]
+
+    def seen(self, frame: int) -> None:
+        """Return None: pictures do not say where the surfaces in them are."""
 
     def _image(self, path: Path) -> FloatArray:
         try:

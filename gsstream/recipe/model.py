@@ -51,6 +51,11 @@ class FirstFrame(Section):
     max_points: int = Field(default=12_000, ge=1, description="points kept before the structure seeds anchors")
     lr_means: float = Field(default=1.6e-4, ge=0, description="learning rate of centres, fraction of the rig's extent")
     lr_means_final: float = Field(default=1.6e-6, ge=0, description="the same at the last iteration (log-linear)")
+    coarse_to_fine: bool = Field(
+        default=True,
+        description="fit pictures of a quarter and a half of the size first, where those are at least 320 pixels wide; "
+        "it takes six to seven tenths of the iterations",
+    )
     noise: float = Field(
         default=0.0, ge=0, le=0.1,
         description="standard deviation of noise on every centre, drawn anew in every iteration, fraction of the rig's "
@@ -71,7 +76,7 @@ class FirstFrame(Section):
         description="factor on 3DGS's learning rates of everything but the centres, which are meant for 30,000 "
         "iterations: in fewer, Gaussians that grow into place faster leave less for added ones to fill; 1: as there",
     )  # fmt: skip
-    max_gaussians: int = Field(default=60_000, ge=1, description="upper bound on the number of Gaussians")
+    max_gaussians: int = Field(default=200_000, ge=1, description="upper bound on the number of Gaussians")
     prune_error: float = Field(
         default=10.0, ge=0,
         description="a Gaussian goes, when growth has ended, whose absence changes all training images by less than "

@@ -8,10 +8,8 @@ import torch
 
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.topology import TopologyEdit
-from gsstream.engine.fit import schedule
 from gsstream.engine.fit.schedule import PRUNE_OPACITY
 from gsstream.parts.render.activations import activate_opacities, activate_scales, rotation_matrices
-from gsstream.recipe.model import FirstFrame
 
 SPLIT_SHRINK = 1.6  # 3DGS: both halves of a split Gaussian are 1.6 times smaller
 SPLIT_SIZE = 0.01  # 3DGS: larger than this fraction of the extent is split, smaller is cloned
@@ -38,27 +36,41 @@ class DensifyStatistics:
         return self.total / self.count.clamp_min(1)
 
 
+@dataclass(frozen=True, slots=True)
+class GrowthLimits:
+    """Where a scene grows, and how far.
+
+    Arguments:
+        gradient: mean screen gradient, in half image widths, above which a Gaussian is densified.
+        most: number of Gaussians that growth never exceeds.
+        extent: of the rig, scene units.
+        widest: standard deviation from which a Gaussian is oversized, scene units.
+    """
+
+    gradient: float
+    most: int
+    extent: float
+    widest: float
+
+
 def grow_and_prune(
     gaussians: Gaussians[torch.Tensor],
     statistics: DensifyStatistics,
-    settings: FirstFrame,
-    extent: float,
-    widest: float,
+    limits: GrowthLimits,
     generator: torch.Generator,
 ) -> tuple[TopologyEdit, dict[str, torch.Tensor]]:
     """Clone small and split large Gaussians with large screen gradients; drop transparent and oversized ones.
 
-    ``widest`` is the standard deviation from which a Gaussian is oversized.
-    Returns the edit and the new contents of every attribute. The population never exceeds ``settings.max_gaussians``.
+    Returns the edit and the new contents of every attribute.
     """
     largest = activate_scales(gaussians.scales).amax(1)
-    keep = (activate_opacities(gaussians.opacities) > PRUNE_OPACITY) & (largest < widest)
-    budget = max(0, settings.max_gaussians - int(keep.sum()))
+    keep = (activate_opacities(gaussians.opacities) > PRUNE_OPACITY) & (largest < limits.widest)
+    budget = max(0, limits.most - int(keep.sum()))
     score = torch.where(keep, statistics.mean, torch.zeros_like(largest))
-    hot = (score > schedule.DENSIFY_GRADIENT).nonzero()[:, 0]
+    hot = (score > limits.gradient).nonzero()[:, 0]
     hot = hot[torch.argsort(score[hot], descending=True, stable=True)][:budget].sort().values
     split = torch.zeros_like(keep)
-    split[hot] = largest[hot] > SPLIT_SIZE * extent
+    split[hot] = largest[hot] > SPLIT_SIZE * limits.extent
     kept = keep.nonzero()[:, 0]
     source = torch.cat([kept, hot])
     fresh = torch.cat([split[kept], torch.ones(len(hot), dtype=torch.bool)])

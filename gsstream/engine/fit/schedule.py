@@ -18,12 +18,15 @@ GATE_LR = 0.1
 #: are fifteen times as long.
 DENSIFY_FROM, DENSIFY_EVERY = 300, 100
 #: Mean screen gradient, in half image widths, above which a Gaussian is densified: 2e-4 in 3DGS.
+#: Wider pictures than 320 pixels have a lower one (core/picture_size.py).
 DENSIFY_GRADIENT = 3e-4
 #: Share of the iterations after which nothing is densified or pruned any more.
 DENSIFY_UNTIL = 0.6
 #: Shares of the iterations after which what the images would not miss goes: when growth has ended, and once more while
 #: there is time to close the gaps. Earlier, what is pruned grows again (docs/results/trade.md).
 PRUNE_AT = (0.6, 0.8)
+#: The same where pictures of several sizes follow each other: detail is added until well into the largest ones.
+PYRAMID_DENSIFY_UNTIL, PYRAMID_PRUNE_AT = 0.8, (0.85,)
 #: Gaussians below this opacity are removed, and those wider than this fraction of the rig's extent or, where that is
 #: larger, this multiple of a seed of the shell: a rig may be small beside what it looks at.
 PRUNE_OPACITY, MAX_SCALE, MAX_SHELL_SCALE = 0.01, 0.3, 1.5

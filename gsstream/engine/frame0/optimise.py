@@ -16,17 +16,19 @@ import torch
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
+from gsstream.core.picture_size import densify_factor, prune_factor
 from gsstream.core.rng import Rng
 from gsstream.core.topology import TopologyEdit
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import VARIABLE, Look
 from gsstream.engine.fit import schedule
-from gsstream.engine.fit.densify import DensifyStatistics, grow_and_prune
+from gsstream.engine.fit.densify import DensifyStatistics, GrowthLimits, grow_and_prune
 from gsstream.engine.fit.exposure import ExposureFit
 from gsstream.engine.fit.nearest import neighbour_distance
 from gsstream.engine.fit.photometric import PhotometricLoss
 from gsstream.engine.frame0.hutchinson import TrainingViews
 from gsstream.engine.frame0.prune import prune_by_error
+from gsstream.engine.frame0.pyramid import Pyramid, PyramidLevel, keep_widths, plan_pyramid, shrink_frame
 from gsstream.engine.frame0.regularisers import choose_regularisers, thin_out
 from gsstream.engine.frame0.smooth_depth import add_smooth_depth_grad
 from gsstream.input.seeds.shell import find_shell
@@ -100,18 +102,21 @@ def optimise_first_frame(
     settings = parts.recipe.first_frame
     iterations = min(settings.epochs * len(frame.cameras), settings.max_iterations)
     # The name of this random stream is that of older versions, so that a seed still gives the same frame 0.
-    run = FirstFrameRun(start, levels, frame, parts, rng.stream("root", frame.index), iterations)
+    pyramid = plan_pyramid(frame.cameras.width, iterations, settings)
+    run = FirstFrameRun(start, levels, frame, parts, rng.stream("root", frame.index), pyramid)
     run.exposure = ExposureFit.start(len(frame.cameras)) if settings.exposure else None
-    for iteration in range(1, run.iterations + 1):
-        value = run.step(iteration)
-        progress(iteration, run.iterations, value, len(run.levels))
+    for level in pyramid.levels:
+        run.enter(level)
+        for iteration in range(level.begin + 1, level.end + 1):
+            value = run.step(iteration)
+            progress(iteration, pyramid.iterations, value, len(run.levels))
     exposure = run.exposure.centered().exposure if run.exposure else None
     found = run.gaussians().map(torch.Tensor.detach)
     parts.where.enter(frame.index)
     look = Look(parts.checks, "first frame", run.table, parts.where)
     for name, values in found.items():
         look.values(f"{name} after the last iteration ({VARIABLE}=step finds the first)", values)
-    return Reconstruction(found, run.levels, exposure, run.iterations)
+    return Reconstruction(found, run.levels, exposure, pyramid.iterations)
 
 
 class FirstFrameRun:
@@ -120,17 +125,17 @@ class FirstFrameRun:
     Arguments:
         start: [N] Gaussians; ``levels`` [N] their octree levels.
         levels: see above.
-        frame: training images.
+        frame: training images at their own size.
         parts: the live parts of the recipe.
         generator: of the order of views, of splits and of noise.
-        iterations: of the whole schedule, of which :meth:`step` makes one.
+        pyramid: the whole schedule, of which :meth:`step` makes one iteration; it is on its first level.
     """
 
     def __init__(
         self, start: Gaussians[torch.Tensor], levels: torch.Tensor, frame: Frame, parts: Assembly,
-        generator: torch.Generator, iterations: int,
+        generator: torch.Generator, pyramid: Pyramid,
     ) -> None:  # fmt: skip
-        self.parts, self.recipe, self.frame = parts, parts.recipe, frame
+        self.parts, self.recipe, self.whole = parts, parts.recipe, frame
         self.settings = parts.recipe.first_frame
         self.renderer, self.levels = parts.renderer, levels
         self.views = len(frame.cameras)
@@ -138,9 +143,9 @@ class FirstFrameRun:
         self.widest = schedule.MAX_SCALE * self.extent
         if self.settings.shell:
             self.widest = max(self.widest, schedule.MAX_SHELL_SCALE * find_shell(frame.cameras).sigma)
-        self.iterations, self.generator = iterations, generator
+        self.pyramid, self.iterations, self.generator = pyramid, pyramid.iterations, generator
         self.table = RowParameters(dict(start.items()), first_frame_lrs(self.settings, self.extent), parts.optimiser)
-        self.photometric = PhotometricLoss(parts.loss, schedule.DSSIM, frame.images, None)
+        self._set_level(pyramid.levels[0], None)
         #: Colour maps that are fitted along; None: those of the photometric loss stay.
         self.exposure: ExposureFit | None = None
         self.statistics = DensifyStatistics.zeros(len(start))
@@ -153,10 +158,22 @@ class FirstFrameRun:
     def gaussians(self) -> Gaussians[torch.Tensor]:
         return Gaussians(**{name: self.table[name] for name in ATTRIBUTES})
 
+    def enter(self, level: PyramidLevel) -> None:
+        """Go on with pictures of another size; what is drawn keeps its width, and statistics of growth begin anew."""
+        if level == self.level:
+            return
+        scene = self.gaussians().map(torch.Tensor.detach)
+        scene.scales.copy_(keep_widths(scene, self.whole.cameras, self.level.factor, level.factor))
+        self.statistics = DensifyStatistics.zeros(len(self.levels))
+        self._set_level(level, self.photometric.exposure)
+
+    def _set_level(self, level: PyramidLevel, exposure: Exposure | None) -> None:
+        self.level, self.frame = level, shrink_frame(self.whole, level.factor)
+        self.photometric = PhotometricLoss(self.parts.loss, schedule.DSSIM, self.frame.images, exposure)
+
     def step(self, iteration: int) -> float:
-        s = self.settings
         view, self.parts.where.iteration = self._next_view(), iteration
-        last = schedule.DENSIFY_UNTIL * self.iterations
+        last = self.pyramid.densify_until * self.iterations
         densify = iteration + schedule.DENSIFY_EVERY >= schedule.DENSIFY_FROM and iteration <= last
         rows = self._disturbed(self.gaussians().map(torch.Tensor.detach))
         rows, keep = thin_out(rows, self.regularisers.dropout, self.generator)
@@ -164,15 +181,14 @@ class FirstFrameRun:
         found = self._loss_and_grad(view, wrt)
         if weight := self.regularisers.smoothness_at(iteration, self.iterations):
             add_smooth_depth_grad(self.renderer, wrt.placed(), self.frame, view, found.grad, weight)
-        fraction = iteration / self.iterations
-        self.table.set_lr("means", self.extent * _log_linear(s.lr_means, s.lr_means_final, fraction))
+        self.table.set_lr("means", self.extent * self.level.lr_at(iteration))
         self.table.step(self._with_penalty_grad(found.grad))
         if found.means2d is not None:
             size = torch.tensor([self.frame.cameras.width / 2, self.frame.cameras.height / 2])
             self.statistics = self.statistics.add(found.means2d * size)
             if iteration >= schedule.DENSIFY_FROM and iteration % schedule.DENSIFY_EVERY == 0:
                 self._densify()
-        if s.prune_error > 0 and iteration in [int(share * self.iterations) for share in schedule.PRUNE_AT]:
+        if self.settings.prune_error > 0 and iteration in [int(n * self.iterations) for n in self.pyramid.prune_at]:
             self._prune()
         loss = float(found.loss)
         self.smooth = loss if math.isnan(self.smooth) else 0.98 * self.smooth + 0.02 * loss
@@ -208,9 +224,9 @@ class FirstFrameRun:
 
     def _densify(self) -> None:
         gaussians = self.gaussians().map(torch.Tensor.detach)
-        edit, values = grow_and_prune(
-            gaussians, self.statistics, self.settings, self.extent, self.widest, self.generator
-        )
+        gradient = schedule.DENSIFY_GRADIENT * densify_factor(self.whole.cameras.width)
+        limits = GrowthLimits(gradient, self.settings.max_gaussians, self.extent, self.widest)
+        edit, values = grow_and_prune(gaussians, self.statistics, limits, self.generator)
         self.table.edit(edit, values)
         self.levels, self.came_from = self.levels[edit.source], self.came_from[edit.source]
         self.statistics = DensifyStatistics.zeros(len(self.levels))
@@ -220,7 +236,8 @@ class FirstFrameRun:
         gaussians = self.gaussians().map(torch.Tensor.detach)
         exposure = self.exposure.exposure if self.exposure else self.photometric.exposure
         views = TrainingViews(self.renderer, self.frame, exposure, self.parts.background)
-        rows = prune_by_error(views, gaussians, self.generator, self.settings.prune_error)
+        least = self.settings.prune_error * prune_factor(self.whole.cameras.width)
+        rows = prune_by_error(views, gaussians, self.generator, least)
         self.table.select_rows(rows)
         self.levels, self.came_from = self.levels[rows], self.came_from[rows]
         self.statistics = DensifyStatistics.zeros(len(rows))
@@ -229,12 +246,6 @@ class FirstFrameRun:
         if not self.order:
             self.order = torch.randperm(self.views, generator=self.generator).tolist()
         return self.order.pop()
-
-
-def _log_linear(first: float, last: float, fraction: float) -> float:
-    if first <= 0 or last <= 0:
-        return first + (last - first) * fraction
-    return math.exp(math.log(first) * (1 - fraction) + math.log(last) * fraction)
 
 
 def sort_by_node(node_of: torch.Tensor) -> TopologyEdit:

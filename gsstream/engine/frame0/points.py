@@ -10,6 +10,7 @@ import numpy as np
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.engine.fit import schedule
+from gsstream.engine.frame0.pyramid import shrink_frame
 from gsstream.input.recordings.base import FrameSource, PointKind
 from gsstream.input.seeds.seeding import photo_consistent_seeds
 from gsstream.input.seeds.shell import shell_points
@@ -82,12 +83,5 @@ def _triangulate(frame: Frame) -> PointCloud:
 
 def _sweep(frame: Frame, settings: FirstFrame) -> PointCloud:
     """Points that several training views agree on, found at most SWEEP_WIDTH pixels wide (time grows with pixels)."""
-    images, cameras = frame.images, frame.cameras
-    factor = -(-cameras.width // SWEEP_WIDTH)
-    if factor > 1:
-        height, width = cameras.height // factor, cameras.width // factor
-        cut = images[:, : height * factor, : width * factor]
-        images = cut.reshape(len(cameras), height, factor, width, factor, 3).mean((2, 4), dtype=np.float32)
-        # The crop keeps the image corner, so only the size changes before the scale does.
-        cameras = replace(cameras, width=width * factor, height=height * factor).scaled(width, height)
-    return photo_consistent_seeds(images, cameras, settings.max_points).points
+    small = shrink_frame(frame, -(-frame.cameras.width // SWEEP_WIDTH))
+    return photo_consistent_seeds(small.images, small.cameras, settings.max_points).points

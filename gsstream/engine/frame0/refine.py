@@ -23,6 +23,7 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.densify import DensifyStatistics
 from gsstream.engine.frame0.axes import quat_conjugate, quat_multiply_torch
 from gsstream.engine.frame0.optimise import FirstFrameRun
+from gsstream.engine.frame0.pyramid import one_size
 from gsstream.engine.state.refinement import Refinement
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.method.tools import Tools
@@ -89,7 +90,8 @@ def advance_refinement(
     if frame.epoch_scale == 0 or is_refined(stream, start):
         return start
     generator = rng.stream("refine", frame.index)
-    run = FirstFrameRun(start.gaussians, start.levels, frame, parts, generator, _iterations(stream))
+    pyramid = one_size(_iterations(stream), parts.recipe.first_frame)
+    run = FirstFrameRun(start.gaussians, start.levels, frame, parts, generator, pyramid)
     run.photometric.exposure, run.statistics = exposure, start.statistics
     for name, held in start.moments.items():
         run.table.load_moments(name, held)

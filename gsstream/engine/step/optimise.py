@@ -11,6 +11,7 @@ from functools import partial
 
 import torch
 
+from gsstream.core.picture_size import bit_price_factor
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.epoch_scheduler import estimated_bytes
 from gsstream.engine.budget.schedule import Schedule
@@ -85,8 +86,9 @@ class _Fit:
             Iteration(view, self.problem.target(view), self.frozen(number / total), lr_factor(final, number, total))
             for number, view in enumerate(order, first)
         ]
-        rd_lambda, begin = self.schedule.rd_lambda / self.problem.pixels, partial(self.parts.where.iterate, first)
-        return self.residual.run(ResidualEpoch(self.problem.session, iterations, self.gates, rd_lambda, begin))
+        price = self.schedule.rd_lambda * bit_price_factor(self.problem.pixels) / self.problem.pixels
+        begin = partial(self.parts.where.iterate, first)
+        return self.residual.run(ResidualEpoch(self.problem.session, iterations, self.gates, price, begin))
 
     def frozen(self, fraction: float) -> torch.Tensor | None:
         """[A] bool: rows whose level is not trained yet at this share of the frame; None: all take part."""

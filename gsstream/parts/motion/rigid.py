@@ -10,6 +10,7 @@ from pydantic import Field
 from gsstream.core.changes import Motion, Scene
 from gsstream.core.changes.motion import GroupTransforms, predict_transforms
 from gsstream.core.part import PartConfig
+from gsstream.core.picture_size import enlargement
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.parts.motion.base import MotionPart
@@ -40,7 +41,7 @@ class Rigid(MotionPart):
     """
 
     class Config(PartConfig):
-        pixels: float = Field(default=12.0, gt=0, le=1000, description="side of a group, pixels at median distance")
+        pixels: float = Field(default=12.0, gt=0, le=1000, description="side of a group, pixels at a width of 320")
         brightness_bins: int = Field(default=2, ge=1, le=16, description="classes of brightness, each its own group")
         votes: float = Field(
             default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in changed tiles"
@@ -55,7 +56,7 @@ class Rigid(MotionPart):
         hold: float = Field(
             default=40.0, gt=0, le=1e6, description="curvature that holds every group back besides, per pixel^2"
         )
-        longest: float = Field(default=0.5, gt=0, le=10, description="longest step of an iteration, pixels")
+        longest: float = Field(default=0.5, gt=0, le=10, description="longest step, pixels at a width of 320")
         step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
         everywhere: bool = Field(
             default=True,
@@ -67,12 +68,13 @@ class Rigid(MotionPart):
 
     def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion, ...]:
         config = self.config
-        groups = known_groups(scene, work.cameras, config.pixels, config.brightness_bins)
+        side = config.pixels * enlargement(work.cameras.width)
+        groups = known_groups(scene, work.cameras, side, config.brightness_bins)
         able = changed_groups(groups, work, config.votes, config.share)
         if not able.any():
             return ()
         # The scene changes little between key packets, so a pixel is measured once, when its groups are formed.
-        pixel = groups.cell / config.pixels
+        pixel = groups.cell / side
         # Half a cell from the centre, an angle a moves a point by a * cell / 2 = tan(a / 2) * cell.
         units = Units(pixel, pixel / groups.cell)
         start = predict_transforms(scene, groups, able.astype(np.uint8), predicted=True)
@@ -91,7 +93,8 @@ class Rigid(MotionPart):
         """[K, 6] shift and turn of the groups that explain the images best."""
         config = self.config
         total = work.scaled(config.epochs * len(work.cameras))
-        damping = Damping(config.damping, config.hold, config.longest)
+        longest = config.longest * enlargement(work.cameras.width)
+        damping = Damping(config.damping, config.hold, longest)
         order = rng.numpy("motion", work.index)
         tiles: Literal["all", "changed"] = "all" if config.everywhere else "changed"
         return fit_transforms_newton(scene, work, start, units.row, total, order, damping, tiles)

@@ -9,7 +9,14 @@ import torch
 from pydantic import Field
 
 from gsstream.api import FitContext, Motion, MotionPart, PartConfig, Rng, Scene, WrtRows
-from gsstream.blocks import approximate_by_cells, neighbour_distance, pixel_size, rows_backward, transform_rows
+from gsstream.blocks import (
+    approximate_by_cells,
+    enlargement,
+    neighbour_distance,
+    pixel_size,
+    rows_backward,
+    transform_rows,
+)
 from gsstream_comgs.influence import KeyPoints, field_of
 
 
@@ -41,10 +48,10 @@ class KeyPointMotion(MotionPart):
         votes: float = Field(
             default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in what changed"
         )
-        lr: float = Field(default=0.25, gt=0, le=10, description="step of shifts and turns, pixels per iteration")
+        lr: float = Field(default=0.25, gt=0, le=10, description="step of shifts and turns, pixels at a width of 320")
         lr_influence: float = Field(default=0.02, gt=0, le=1, description="step of influences: log size, quaternion")
         pixels: float = Field(
-            default=6.0, gt=0, le=1000, description="side of the cells as whose rigid motions the field is sent, pixels"
+            default=6.0, gt=0, le=1000, description="side of the cells that are sent, pixels at a width of 320"
         )
         step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
 
@@ -65,8 +72,8 @@ def _fitted(
 ) -> Motion | None:  # fmt: skip
     """The motion that ``chosen`` of the rows [A], as key points, fit to the images."""
     number, epochs = len(chosen), work.scaled(settings.epochs)
-    pixel = pixel_size(scene.gaussians.means, work.cameras)
-    side = float(np.float32(settings.pixels * pixel))
+    pixel, wide = pixel_size(scene.gaussians.means, work.cameras), enlargement(work.cameras.width)
+    side = float(np.float32(settings.pixels * wide * pixel))
     base = scene.gaussians.rows(rows.numpy()).map(torch.from_numpy)
     work.narrow(rows)
     shape = _start(base.means[chosen], pixel)
@@ -75,7 +82,7 @@ def _fitted(
     leaves = {name: torch.zeros(number, 3, requires_grad=True) for name in ("shift", "turn")}
     shapes = {"size": shape.size.requires_grad_(), "quat": shape.quat.requires_grad_()}
     adam = torch.optim.Adam([
-        {"params": list(leaves.values()), "lr": settings.lr},
+        {"params": list(leaves.values()), "lr": settings.lr * wide},
         {"params": list(shapes.values()), "lr": settings.lr_influence},
     ])  # fmt: skip
 

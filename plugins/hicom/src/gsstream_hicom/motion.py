@@ -22,6 +22,7 @@ from gsstream.api import (
 from gsstream.blocks import (
     GroupTransforms,
     elementwise,
+    enlargement,
     fit_transforms_adam,
     groups_of_rows,
     groupwise_max,
@@ -50,7 +51,7 @@ class CoherentMotion(MotionPart):
         levels: int = Field(default=3, ge=1, le=6, description="nested grids; each has cells twice as wide as the next")
         per_cell: float = Field(default=5.0, gt=0, description="Gaussians per cell of the finest grid, on average")
         momentum: float = Field(default=0.6, ge=0, le=1, description="share of the last frame's motion to begin with")
-        lr: float = Field(default=0.25, gt=0, le=10, description="step of the fit, pixels per iteration")
+        lr: float = Field(default=0.25, gt=0, le=10, description="step of the fit, pixels at a width of 320")
         l1_weight: float = Field(default=0.0, ge=0, description="weight of the mean absolute motion, pixels")
         step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
         measure: Literal["each", "cell"] = Field(
@@ -66,6 +67,7 @@ class CoherentMotion(MotionPart):
         config, start, motions = self.config, scene, []
         rows = work.changed_rows(config.votes).nonzero()[:, 0].numpy()
         pixel, order = pixel_size(scene.gaussians.means, work.cameras), rng.numpy("hicom", work.index)
+        lr = config.lr * enlargement(work.cameras.width)
         total = work.scaled(config.epochs) * len(work.cameras)
         measure = elementwise if config.measure == "each" else groupwise_max
         for level, side in enumerate(cell_sides(scene.gaussians.means, config.levels, config.per_cell)):
@@ -80,7 +82,7 @@ class CoherentMotion(MotionPart):
             # Half a cell from its centre, a rotation of one unit moves a Gaussian by a pixel, too.
             unit = np.repeat([pixel, pixel / side], 3)
             found = fit_transforms_adam(
-                scene, work, transforms, unit, [config.lr] * iterations, order, measure, config.l1_weight
+                scene, work, transforms, unit, [lr] * iterations, order, measure, config.l1_weight
             )
             motion = rounded_motion(groups, able, found, config.step * pixel, config.step * pixel / side)
             if motion is None:

@@ -10,7 +10,7 @@ import torch
 from pydantic import Field
 
 from gsstream.api import FitContext, Growth, IntArray, Rng, RowEdit, Scene
-from gsstream.blocks import CopySettings, least_opaque, pixel_size, replace_with_copies
+from gsstream.blocks import CopySettings, enlargement, least_opaque, pixel_size, replace_with_copies
 
 
 @final
@@ -28,7 +28,7 @@ class ChangeGatedCopies(Growth):
             default=0.5, ge=0, lt=1, description="least change score g / (g + median) of a place; 0: everywhere"
         )
         per_cell: int = Field(default=4, ge=1, description="added Gaussians in a cell of a grid at most")
-        pixels: float = Field(default=6.0, gt=0, le=1000, description="side of these cells, pixels")
+        pixels: float = Field(default=6.0, gt=0, le=1000, description="side of these cells, pixels at a width of 320")
 
     def propose(self, after: Scene, work: FitContext, rng: Rng) -> RowEdit | None:
         rows = least_opaque(after, len(after.gaussians) - work.key_rows)
@@ -39,7 +39,7 @@ class ChangeGatedCopies(Growth):
         config, means = self.config, work.gaussians.means.numpy()
         if config.score:
             rows = rows[change_scores(work, config.views)[rows] >= config.score]
-        side = config.pixels * pixel_size(means, work.cameras)
+        side = config.pixels * enlargement(work.cameras.width) * pixel_size(means, work.cameras)
         index = np.floor(means.astype(np.float64) / side).astype(np.int64)
         cell_of = np.unique(index, axis=0, return_inverse=True)[1].reshape(-1)
         room = config.per_cell - np.bincount(cell_of[kept:], minlength=int(cell_of.max(initial=0)) + 1)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from gsstream.api import ATTRIBUTES, Gaussians
-from gsstream.blocks import rate_gradient
+from gsstream.blocks import bit_price_factor, rate_gradient
 from gsstream_queen.gates import BOUND, gates, open_probability
 from gsstream_queen.latents import Tensors, coded, decoder, rounded, width
 from gsstream_queen.settings import QueenConfig
@@ -45,7 +45,7 @@ class OldRows:
         ``pixels`` of a training view: bits are weighed by them.
         """
         self._config, self._base, self._total = config, base, total
-        self._rate = config.rate / pixels
+        self._rate = config.rate * bit_price_factor(pixels) / pixels
         self._unit = config.means.step * extent
         self._policies = coded(config.latents(), base)
         self._latents = {n: torch.zeros(len(base), p.latent, requires_grad=True) for n, p in self._policies.items()}

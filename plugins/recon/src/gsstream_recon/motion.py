@@ -26,6 +26,7 @@ from gsstream.blocks import (
     GroupAdam,
     GroupTransforms,
     elementwise,
+    enlargement,
     groups_of_rows,
     groupwise_max,
     pixel_size,
@@ -78,7 +79,7 @@ class AnchorMotion(MotionPart):
         every: int = Field(default=2, ge=1, description="frames after which anchors are drawn anew")
         neighbours: int = Field(default=3, ge=1, le=100, description="old anchors from which a new one inherits")
         momentum: float = Field(default=0.6, ge=0, le=1, description="share of the last frame's motion to begin with")
-        lr: float = Field(default=0.25, gt=0, le=10, description="step of the fit on each level, pixels per iteration")
+        lr: float = Field(default=0.25, gt=0, le=10, description="step of the fit, pixels at a width of 320")
         l1_weight: float = Field(default=0.0, ge=0, description="weight of the mean absolute motion, pixels")
         measure: Literal["each", "anchor"] = Field(
             default="each",
@@ -89,7 +90,7 @@ class AnchorMotion(MotionPart):
             default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in what changed"
         )
         pixels: float = Field(
-            default=6.0, gt=0, le=1000, description="side of the cells that follow anchors, pixels; cells are sent"
+            default=6.0, gt=0, le=1000, description="side of the cells that follow anchors, pixels at a width of 320"
         )
         step: float = Field(default=0.1, gt=0, le=10, description="quantisation step of translations, pixels")
         rotation_step: float = Field(
@@ -102,7 +103,7 @@ class AnchorMotion(MotionPart):
     def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion, ...]:
         config, means = self.config, scene.gaussians.means
         pixel = pixel_size(means, work.cameras)
-        side = float(np.float32(config.pixels * pixel))
+        side = float(np.float32(config.pixels * enlargement(work.cameras.width) * pixel))
         groups = groups_for(scene, side, 1, regroup=True)
         rows = work.changed_rows(config.votes).nonzero()[:, 0].numpy()
         marks = groups_of_rows(groups, rows).astype(np.uint8)
@@ -167,5 +168,5 @@ class AnchorMotion(MotionPart):
                 grad = work.loss_and_grad(int(view), WrtTransforms(base, moves)).grad.numpy() * unit
                 for level, descent in zip(anchored.levels, descents, strict=True):
                     l1_grad = config.l1_weight * np.sign(descent.values) / descent.values.size
-                    descent.step(level.sum(grad) + l1_grad, config.lr)
+                    descent.step(level.sum(grad) + l1_grad, config.lr * enlargement(work.cameras.width))
         return anchored.sums(descents)

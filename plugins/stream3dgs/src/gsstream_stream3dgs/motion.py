@@ -22,7 +22,7 @@ from gsstream.api import (
     WrtRows,
     field_rows,
 )
-from gsstream.blocks import approximate_by_cells, pixel_size, rows_backward, transform_rows
+from gsstream.blocks import approximate_by_cells, enlargement, pixel_size, rows_backward, transform_rows
 from gsstream_stream3dgs.cache import Cache, Lookup
 
 Setting = pydantic.Field
@@ -67,7 +67,7 @@ class CacheMotion(MotionPart):
         rounded: float = Setting(
             default=0.5, ge=0, le=1, description="share of the passes, the last, that learn with rounded weights"
         )
-        pixels: float = Setting(default=6.0, gt=0, le=1000, description="sent as cells: side of a cell, pixels")
+        pixels: float = Setting(default=6.0, gt=0, le=1000, description="sent as cells: side, pixels at a width of 320")
         step: float = Setting(default=0.1, gt=0, le=10, description="sent as cells: quantisation step, pixels")
 
     def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion | Field, ...]:
@@ -124,7 +124,7 @@ class CacheMotion(MotionPart):
         with torch.no_grad():
             shift, turn = cache()
         pixel = pixel_size(scene.gaussians.means, cameras)
-        side = float(np.float32(self.config.pixels * pixel))
+        side = float(np.float32(self.config.pixels * enlargement(cameras.width) * pixel))
         return approximate_by_cells(
             scene, rows, (cache.shape.reach * shift).numpy(), turn.numpy(), side, self.config.step * pixel
         )

@@ -14,6 +14,7 @@ import numpy as np
 from gsstream.core.errors import InputError
 from gsstream.core.shapes import FloatArray
 from gsstream.evaluation.records import finite_or_none, mean
+from gsstream.evaluation.seen import seen_masks
 from gsstream.evaluation.summary import format_table
 from gsstream.input.recordings.base import FrameSource
 from gsstream.metrics import changed_mask, moving_mask, noise_sigma, psnr
@@ -22,14 +23,19 @@ from gsstream.player.render import PlayerRenderer, find_renderer, render
 
 #: What ``gsstream gap`` writes into the folder of a run: the table, and every number behind it.
 GAP_FILES = ("gap.txt", "gap.json")
-_QUANTITIES = {"psnr": "whole", "psnr_moving": "moving", "psnr_changed": "changed"}
+_QUANTITIES = {
+    "psnr": "whole", "psnr_moving": "moving", "psnr_changed": "changed", "psnr_seen": "seen",
+    "psnr_changed_seen": "changed, seen",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class GapView:
     """One test camera at one frame. PSNR of the stream and of the fresh reconstruction, dB; nan where not defined.
 
-    ``psnr``: the whole image. ``psnr_moving``, ``psnr_changed``: moving and changed pixels.
+    ``psnr``: the whole image. ``psnr_moving``, ``psnr_changed``: moving and changed pixels. ``psnr_seen``,
+    ``psnr_changed_seen``: all and changed pixels whose surface, by the fresh reconstruction's depth, at least two
+    training cameras see.
     """
 
     frame: int
@@ -37,9 +43,13 @@ class GapView:
     psnr: float
     psnr_moving: float
     psnr_changed: float
+    psnr_seen: float
+    psnr_changed_seen: float
     fresh_psnr: float
     fresh_psnr_moving: float
     fresh_psnr_changed: float
+    fresh_psnr_seen: float
+    fresh_psnr_changed_seen: float
 
 
 @dataclass(frozen=True)
@@ -117,8 +127,10 @@ def measure_gap(
             mine = _pictures(playback, frame, renderer)
             with Playback(path) as alone:
                 theirs = _pictures(alone, frame, renderer)
+                seen = seen_masks(alone.state_at(frame), alone.meta.train, alone.meta.test, renderer)
             for i, name in enumerate(cameras):
-                masks = (None, moving_mask(truth[i], first[i], sigmas[i]), changed_mask(truth[i], first[i]))
+                moving, changed = moving_mask(truth[i], first[i], sigmas[i]), changed_mask(truth[i], first[i])
+                masks = (None, moving, changed, seen[i], changed & seen[i])
                 found = [psnr(image[i], truth[i], mask) for image in (mine, theirs) for mask in masks]
                 views.append(GapView(frame, name, *found))
             if progress is not None:

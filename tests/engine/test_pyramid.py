@@ -1,0 +1,121 @@
+"""Frame 0 from coarse pictures to fine ones: what the levels are, and that a change of level shows the same scene."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.frame import Frame
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.picture_size import bit_price_factor, densify_factor, enlargement, prune_factor
+from gsstream.engine.frame0.pyramid import keep_widths, one_size, plan_pyramid, shrink_frame
+from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.recipe.model import FirstFrame
+
+SETTINGS = FirstFrame(lr_means=1e-3, lr_means_final=1e-5)
+
+
+def rig(width: int, height: int) -> Cameras:
+    """Two cameras side by side, three units before the origin."""
+    viewmats = np.repeat(np.eye(4)[None], 2, 0)
+    viewmats[:, 2, 3], viewmats[1, 0, 3] = 3.0, 0.2
+    K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
+    return Cameras(("left", "right"), viewmats, np.stack([K, K]), width, height)
+
+
+@pytest.mark.parametrize(
+    ("width", "factors", "iterations"),
+    [(160, [1], [2000]), (320, [1], [2000]), (639, [1], [2000]), (640, [2, 1], [650, 550]),
+     (1279, [2, 1], [650, 550]), (1352, [4, 2, 1], [500, 500, 400]), (7680, [4, 2, 1], [500, 500, 400])],
+)  # fmt: skip
+def test_levels_halve_down_to_320_pixels_and_take_up_each_other(width: int, factors: list, iterations: list) -> None:
+    pyramid = plan_pyramid(width, 2000, SETTINGS)
+    assert [level.factor for level in pyramid.levels] == factors
+    assert [level.iterations for level in pyramid.levels] == iterations
+    assert [level.begin for level in pyramid.levels] == [sum(iterations[:n]) for n in range(len(iterations))]
+    assert pyramid.iterations == sum(iterations)
+
+
+def test_without_coarse_pictures_or_with_hardly_an_iteration_there_is_one_level() -> None:
+    plain = one_size(100, SETTINGS)
+    assert plan_pyramid(1352, 100, SETTINGS.model_copy(update={"coarse_to_fine": False})) == plain
+    assert plan_pyramid(1352, 2, SETTINGS) == one_size(2, SETTINGS)
+    assert plan_pyramid(320, 100, SETTINGS) == plain
+    (level,) = plain.levels
+    # The schedule of 3DGS: log-linear from the first rate to the last.
+    assert level.lr_at(50) == pytest.approx(math.sqrt(1e-3 * 1e-5))
+    assert level.lr_at(100) == pytest.approx(1e-5)
+
+
+def test_rates_fall_within_each_level_and_the_finest_begins_above_where_the_last_one_ended() -> None:
+    levels = plan_pyramid(1352, 2000, SETTINGS).levels
+    assert levels[0].lr_at(0) == pytest.approx(1e-3)
+    for level in levels:
+        rates = [level.lr_at(iteration) for iteration in range(level.begin + 1, level.end + 1)]
+        assert all(later < earlier for earlier, later in pairwise(rates))
+    assert levels[2].lr_at(levels[2].begin) > levels[1].lr_at(levels[1].end)
+    assert levels[2].lr_at(levels[2].end) == pytest.approx(2e-5)
+
+
+def test_a_rate_of_zero_stays_zero() -> None:
+    (level,) = one_size(10, FirstFrame(lr_means=0, lr_means_final=0)).levels
+    assert [level.lr_at(n) for n in (1, 10)] == [0.0, 0.0]
+
+
+def test_small_pictures_are_means_and_their_cameras_see_the_same() -> None:
+    images = np.random.default_rng(0).random((2, 26, 37, 3), np.float32)
+    frame = Frame(0, 0.0, images, rig(37, 26))
+    small = shrink_frame(frame, 4)
+    assert small.images.shape == (2, 6, 9, 3)
+    assert small.images.dtype == np.float32
+    assert small.images[1, 2, 3] == pytest.approx(images[1, 8:12, 12:16].mean((0, 1)), abs=1e-6)
+    assert (small.cameras.width, small.cameras.height) == (9, 6)
+    # A pixel's corner (u, v) of the large picture is (u / 4, v / 4) of the small one.
+    assert small.cameras.Ks == pytest.approx(np.diag([0.25, 0.25, 1]) @ frame.cameras.Ks)
+    assert shrink_frame(frame, 1) is frame
+
+
+def test_widths_are_kept_when_pictures_become_larger() -> None:
+    """What was drawn with large pixels looks the same with small ones, made small again; unchanged it does not."""
+    torch.manual_seed(0)
+    count = 30
+    scene = Gaussians(
+        means=torch.randn(count, 3) * 0.3, quats=torch.nn.functional.normalize(torch.randn(count, 4), dim=1),
+        scales=torch.full((count, 3), math.log(0.01)), opacities=torch.full((count,), -1.0),
+        sh0=torch.rand(count, 1, 3), shN=torch.zeros(count, 0, 3),
+    )  # fmt: skip
+    large = rig(96, 64)
+    small, renderer = large.scaled(24, 16), ReferenceRenderer()
+    wide = replace(scene, scales=keep_widths(scene, large, 4, 1))
+
+    def seen(gaussians: Gaussians[torch.Tensor], cameras: Cameras) -> torch.Tensor:
+        return renderer.render(gaussians, cameras, 0, (0.0, 0.0, 0.0)).image
+
+    def shrunk(image: torch.Tensor) -> torch.Tensor:
+        return image.reshape(16, 4, 24, 4, 3).mean((1, 3))
+
+    was = seen(scene, small)
+    kept, lost = (float((shrunk(seen(g, large)) - was).square().mean()) for g in (wide, scene))
+    assert kept < 0.2 * lost
+    assert torch.equal(keep_widths(scene, large, 2, 2), 0.5 * torch.log(torch.exp(2 * scene.scales)))
+
+
+@pytest.mark.parametrize("width", [1, 160, 320])
+def test_pictures_of_320_pixels_and_fewer_leave_every_setting_as_it_is(width: int) -> None:
+    assert enlargement(width) == densify_factor(width) == prune_factor(width) == bit_price_factor(width * 240) == 1.0
+
+
+def test_settings_follow_the_width() -> None:
+    """Where they were measured to be right: 640 x 360 and 1352 x 1014."""
+    assert enlargement(1352) == pytest.approx(4.225)
+    assert 3e-4 * densify_factor(1352) == pytest.approx(1.5e-4, rel=0.05)
+    assert 10 * prune_factor(640) == pytest.approx(5, rel=0.1)
+    assert 10 * prune_factor(1352) == pytest.approx(2, rel=0.1)
+    assert bit_price_factor(640 * 360) == pytest.approx(2.28, rel=0.01)
+    assert bit_price_factor(1352 * 1014) == pytest.approx(8.74, rel=0.01)

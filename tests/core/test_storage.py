@@ -37,6 +37,19 @@ def test_bytes_keep_what_was_recorded_in_8_bits() -> None:
     assert rounded(levels, "uint8").tobytes() == levels.tobytes()
 
 
+@pytest.mark.parametrize("size", [(3, 4, 3), (2, 130, 130, 3)])
+def test_auto_stores_bytes_where_they_say_the_same_and_else_leaves_images_alone(size: tuple[int, ...]) -> None:
+    images = np.random.default_rng(0).integers(0, 256, size) / np.float32(255)
+    images = images.astype(np.float32)
+    stored = packed(images, "auto")
+    assert stored.dtype == np.uint8
+    assert unpacked(stored).tobytes() == images.tobytes()
+    for last in (np.nan, np.inf, -1 / 255, 256 / 255, 300 / 255, 0.5, np.nextafter(images.flat[-1], np.float32(2))):
+        images.flat[-1] = last
+        assert packed(images, "auto") is images
+        assert rounded(images, "auto") is images
+
+
 @pytest.mark.parametrize("wrong", [float("nan"), float("inf"), -0.01, 1.01])
 def test_what_bytes_cannot_hold_is_refused(wrong: float) -> None:
     images = np.full((1, 2, 2, 3), 0.5, np.float32)

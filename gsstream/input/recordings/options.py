@@ -79,9 +79,10 @@ class DataOptions(BaseModel):
         "camera's last image stands in; drop: the whole frame becomes an empty packet",
     )
     images: Storage = Field(
-        default="float32",
-        description="how training images wait in memory (decoded ahead, and those of the last frame); values are "
-        "rounded to it: float16 by at most 2^-12, uint8 by at most 1/510, and not at all for 8 bits read at scale 1",
+        default="auto",
+        description="how training images wait in memory (decoded ahead, and those of the last frame). auto: as bytes "
+        "where that is exact, as for 8 bits read at scale 1, else float32; values are rounded to what is named: "
+        "float16 by at most 2^-12, uint8 by at most 1/510",
     )
 
     @property

@@ -15,6 +15,8 @@ from gsstream.input.recordings.base import FrameSource, LiveSource
 from gsstream.input.recordings.canonical import to_file_coordinates
 
 FramePair = tuple[Frame, Frame]
+#: Bytes of a pair's images, as float32, from which only one pair is decoded ahead.
+LARGE_PAIR = 64 << 20
 
 
 class Prefetcher:
@@ -28,15 +30,17 @@ class Prefetcher:
     Arguments:
         source: where frames come from; its ``frame`` must be callable from several threads.
         indices: which frames, in which order.
-        depth: pairs decoded ahead, at least 1.
+        depth: pairs decoded ahead, at least 1; None: 2, and 1 where the images of one take more than ``LARGE_PAIR``.
         workers: decoding threads, at least 1.
         storage: how training images wait; they are delivered as float32.
     """
 
     def __init__(
-        self, source: FrameSource, indices: Iterable[int], *, depth: int = 2, workers: int = 1,
+        self, source: FrameSource, indices: Iterable[int], *, depth: int | None = None, workers: int = 1,
         storage: Storage = "float32",
     ) -> None:  # fmt: skip
+        if depth is None:
+            depth = 1 if _pair_bytes(source) > LARGE_PAIR else 2
         if depth < 1 or workers < 1:
             raise InputError(f"prefetcher: depth and workers must be at least 1, got depth {depth}, workers {workers}")
         self._source, self._storage = source, storage
@@ -87,6 +91,11 @@ class Prefetcher:
         for index in self._todo:
             self._pending.append(self._pool.submit(_read_pair, self._source, index, self._storage))
             break
+
+
+def _pair_bytes(source: FrameSource) -> int:
+    """Bytes of the images of one frame of all cameras, as float32."""
+    return sum(12 * len(rig) * rig.width * rig.height for rig in (source.info.train, source.info.test))
 
 
 def _read_pair(source: FrameSource, index: int, storage: Storage) -> FramePair:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -55,6 +56,19 @@ def test_order_content_and_bound(depth: int, workers: int) -> None:
             assert len(source.asked) <= step + 1 + depth
         assert step == 5, "six pairs are delivered"
     assert prefetch_threads() == []
+
+
+@pytest.mark.parametrize(("width", "ahead"), [(8, 2), (2000, 1)])
+def test_of_large_pictures_only_one_frame_is_read_ahead(width: int, ahead: int) -> None:
+    class Wide(Watched):
+        @property
+        def info(self) -> SourceInfo:
+            found = self._source.info
+            return replace(found, train=found.train.scaled(width, width))
+
+    frames = Prefetcher(Wide(), range(10))
+    assert len(frames._pending) == ahead
+    frames.close()
 
 
 def test_an_error_surfaces_at_its_frame_and_ends_the_iteration() -> None:

@@ -25,9 +25,9 @@ MOST = 1e15
 class PreparedImage:
     """A target image with its window statistics, computed once and used in every iteration of a frame.
 
-    ``image`` [H, W, 3] float32 (a private copy). Statistics are made strip by strip where they are first needed, for
-    the rows that change are seen in few tiles. Raises ShapeError for a wrong shape or dtype and for a value that is not
-    finite.
+    ``image`` [H, W, 3] float32, which must not change while this is in use. Statistics are made strip by strip where
+    they are first needed, for the rows that change are seen in few tiles. Raises ShapeError for a wrong shape or dtype
+    and for a value that is not finite.
     """
 
     image: Float32
@@ -35,12 +35,11 @@ class PreparedImage:
     partial: tuple[Float32, Float32, NDArray[np.uint8]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        image = _image("target", self.image).copy()
+        image = _image("target", self.image)
         # NaN is passed on by both; the statistics square what they are given.
         largest = max(abs(float(image.min())), abs(float(image.max())))
         if not largest < MOST:
             refuse(first_non_finite("target", image) or "target: expected values in [0, 1], got some that overflow")
-        image.flags.writeable = False
         rows, columns = tile_shape(*image.shape[:2])
         known = np.zeros((rows, -(-columns // _native.STRIP_TILES)), np.uint8)
         object.__setattr__(self, "image", image)

@@ -49,8 +49,10 @@ class FirstFrame(Section):
         "sfm: triangulation; sweep: points that several views agree on (plane sweep)",
     )
     max_points: int = Field(default=12_000, ge=1, description="points kept before the structure seeds anchors")
-    lr_means: float = Field(default=1.6e-4, ge=0, description="learning rate of centres, fraction of the rig's extent")
-    lr_means_final: float = Field(default=1.6e-6, ge=0, description="the same at the last iteration (log-linear)")
+    lr_means: float = Field(
+        default=1.6e-4, ge=0,
+        description="learning rate of centres, fraction of the rig's extent; a hundredth of it at the last iteration",
+    )  # fmt: skip
     coarse_to_fine: bool = Field(
         default=True,
         description="fit pictures of a quarter and a half of the size first, where those are at least 320 pixels wide; "

@@ -18,7 +18,7 @@ from gsstream.engine.frame0.pyramid import keep_widths, one_size, plan_pyramid, 
 from gsstream.parts.render.reference import ReferenceRenderer
 from gsstream.recipe.model import FirstFrame
 
-SETTINGS = FirstFrame(lr_means=1e-3, lr_means_final=1e-5)
+SETTINGS = FirstFrame(lr_means=1e-3)
 
 
 def rig(width: int, height: int) -> Cameras:
@@ -64,7 +64,7 @@ def test_rates_fall_within_each_level_and_the_finest_begins_above_where_the_last
 
 
 def test_a_rate_of_zero_stays_zero() -> None:
-    (level,) = one_size(10, FirstFrame(lr_means=0, lr_means_final=0)).levels
+    (level,) = one_size(10, FirstFrame(lr_means=0)).levels
     assert [level.lr_at(n) for n in (1, 10)] == [0.0, 0.0]
 
 

@@ -10,6 +10,8 @@ from __future__ import annotations
 OPACITY = 0.1
 #: Learning rates: raw quaternions, log scales, opacity logits, colour of degree 0 and of higher degrees.
 LR_QUATS, LR_SCALES, LR_OPACITIES, LR_SH0, LR_SHN = 0.001, 0.005, 0.05, 0.0025, 0.000125
+#: How many times smaller the learning rate of centres is at the last iteration than at the first (3DGS).
+LR_MEANS_FALL = 100
 #: Weight in the photometric loss of 1 - SSIM (3DGS).
 DSSIM = 0.2
 #: Adam learning rate of gate logits (released code of S2GS).

@@ -23,7 +23,7 @@ from gsstream.recipe.model import FirstFrame
 #: Iterations of each level, the coarsest first, as a share of those that pictures of one size take.
 SHARES = {1: (1.0,), 2: (0.325, 0.275), 3: (0.25, 0.25, 0.2)}
 #: Learning rate of centres at the first and the last iteration of these levels, as a share of ``lr_means``. The
-#: coarsest begins at 1, whatever their number, and the finest ends at twice ``lr_means_final``.
+#: coarsest begins at 1, whatever their number, and the finest ends at twice the last rate of 3DGS.
 RATES = ((1.0, 0.5), (0.5, 0.19), (0.38, None))
 
 
@@ -48,8 +48,8 @@ class PyramidLevel:
     def lr_at(self, iteration: int) -> float:
         """Return the rate of centres in an iteration of the schedule, counted from 1."""
         fraction = (iteration - self.begin) / self.iterations
-        if self.first_lr <= 0 or self.last_lr <= 0:
-            return self.first_lr + (self.last_lr - self.first_lr) * fraction
+        if self.first_lr == 0:
+            return 0.0
         return math.exp(math.log(self.first_lr) * (1 - fraction) + math.log(self.last_lr) * fraction)
 
 
@@ -69,7 +69,7 @@ class Pyramid:
 
 def one_size(iterations: int, settings: FirstFrame) -> Pyramid:
     """Return the schedule on pictures of their own size alone."""
-    level = PyramidLevel(1, 0, iterations, settings.lr_means, settings.lr_means_final)
+    level = PyramidLevel(1, 0, iterations, settings.lr_means, settings.lr_means / schedule.LR_MEANS_FALL)
     return Pyramid((level,), schedule.DENSIFY_UNTIL, schedule.PRUNE_AT)
 
 
@@ -85,7 +85,7 @@ def plan_pyramid(width: int, iterations: int, settings: FirstFrame) -> Pyramid:
     levels = list[PyramidLevel]()
     for number, (share, (first, last)) in enumerate(zip(shares, RATES[-count:], strict=True)):
         first_lr = settings.lr_means * (first if number else 1.0)
-        last_lr = 2 * settings.lr_means_final if last is None else last * settings.lr_means
+        last_lr = 2 * settings.lr_means / schedule.LR_MEANS_FALL if last is None else last * settings.lr_means
         begin = levels[-1].end if levels else 0
         levels.append(PyramidLevel(2 ** (count - 1 - number), begin, share, first_lr, last_lr))
     return Pyramid(tuple(levels), schedule.PYRAMID_DENSIFY_UNTIL, schedule.PYRAMID_PRUNE_AT)

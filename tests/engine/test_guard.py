@@ -47,7 +47,7 @@ FUNCTIONS: dict[tuple[str, str], tuple[bool, bool]] = {
     ("structure", "build"): (True, False),
     ("confidence", "estimate"): (False, False),
     ("propagation", "propagate"): (False, False),
-    ("gate", "num_levels"): (False, False),
+    ("gate", "num_levels"): (False, True),
     ("gate", "init"): (False, False),
     ("gate", "noise"): (False, True),
     ("gate", "sample"): (False, True),

@@ -67,6 +67,21 @@ def test_the_shell_stays_as_it_is_in_every_frame(method: str, settings: dict[str
             assert (before.gaussians.sh0 != after.gaussians.sh0).any(), "the rest of the scene does change"
 
 
+@pytest.mark.parametrize("method", ["hicom", "recon", "stream3dgs", "comgs-l"])
+def test_motions_of_cells_and_of_fields_leave_the_shell_where_it_is(method: str) -> None:
+    """A cell of the scene may reach into the shell."""
+    settings = {key: value for key, value in TINY.items() if key != "stream.epochs"}
+    settings |= {"stream.change_threshold": 0, "motion.epochs": 2, "growth": "none"}
+    with open_recording(WORLD) as source:
+        encoder = encoder_for(method, source, settings)
+        states = [encoder.encode(brighter(source.frame(index))).state.player for index in range(3)]
+    still = shell_of(states[0])
+    for before, after in itertools.pairwise(states):
+        moved = (before.gaussians.means != after.gaussians.means).any(1)
+        assert moved.any()
+        assert not moved[still].any(), f"frame {after.frame} moves {int(moved[still].sum())} rows of the shell"
+
+
 def test_a_scene_without_a_shell_has_no_still_rows() -> None:
     bare = encoded("dense", {"first_frame.shell": False}, number=2)
     with_it = encoded("dense", {}, number=1)

@@ -14,15 +14,18 @@ from gsstream.parts.motion.groups import groups_of_rows
 
 
 def approximate_by_cells(
-    scene: Scene, rows: IntArray, translation: FloatArray, rotation: FloatArray, side: float, step: float
-) -> Motion | None:
+    scene: Scene, rows: IntArray, shell: torch.Tensor, translation: FloatArray, rotation: FloatArray, side: float,
+    step: float,
+) -> Motion | None:  # fmt: skip
     """Return the rigid motions of small cells that come nearest to a field; None where no cell moves.
 
-    A cell moves when at least half of its Gaussians may: by the mean of their shifts and turns, about its own centre.
+    A cell moves when at least half of its Gaussians may and none is in the shell: by the mean of their shifts and
+    turns, about its own centre.
 
     Arguments:
         scene: decoded, as both ends have it.
         rows: [A] Gaussians that the field is of, ascending.
+        shell: [N] bool, Gaussians of the shell behind the scene (``work.shell_rows``).
         translation: [A, 3] of their centres, scene units.
         rotation: [A, 3] axis * tan(angle / 2).
         side: of a cell, scene units; a float32.
@@ -31,7 +34,7 @@ def approximate_by_cells(
     groups = groups_for(scene, side, 1, regroup=True)
     place = groups.group_of[rows]
     hits = np.bincount(place, minlength=groups.count)
-    able = np.flatnonzero(groups_of_rows(groups, rows))
+    able = np.flatnonzero(groups_of_rows(groups, rows, shell))
     values: FloatArray = np.concatenate([translation, rotation], 1).astype(np.float64)
     means = np.stack([np.bincount(place, values[:, i], groups.count) / np.maximum(hits, 1) for i in range(6)], 1)
     # Half a cell from its centre, a turn of one step moves a Gaussian by a step, too.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.changes import Groups, Scene, groups_for
@@ -44,15 +45,23 @@ def changed_groups(groups: Groups, work: FitContext, votes: float, share: float)
     changed = work.changed_rows(votes).numpy()
     total = np.bincount(groups.group_of, minlength=groups.count)
     hit = np.bincount(groups.group_of[changed], minlength=groups.count)
-    still = np.bincount(groups.group_of[work.shell_rows.numpy()], minlength=groups.count)
-    return np.asarray((total > 0) & (hit > 0) & (hit >= share * total) & (still == 0))
+    still = _groups_with(groups, work.shell_rows)
+    return np.asarray((total > 0) & (hit > 0) & (hit >= share * total) & ~still)
 
 
-def groups_of_rows(groups: Groups, rows: IntArray) -> IntArray:
-    """Return [G] bool: groups of which at least half of the rows, and at least one, are among ``rows`` [A]."""
+def groups_of_rows(groups: Groups, rows: IntArray, shell: torch.Tensor) -> IntArray:
+    """Return [G] bool: groups that ``rows`` may move.
+
+    At least half of their rows, and at least one, are among ``rows`` [A], and none is in the shell, ``shell`` [N] bool.
+    """
     total = np.bincount(groups.group_of, minlength=groups.count)
     hit = np.bincount(groups.group_of[rows], minlength=groups.count)
-    return np.asarray((hit > 0) & (2 * hit >= total))
+    return np.asarray((hit > 0) & (2 * hit >= total) & ~_groups_with(groups, shell))
+
+
+def _groups_with(groups: Groups, marked: torch.Tensor) -> IntArray:
+    """[G] bool: groups that hold a marked row, [N] bool."""
+    return np.asarray(np.bincount(groups.group_of[marked.numpy()], minlength=groups.count) > 0)
 
 
 def displaced_groups(groups: Groups, scene: Scene, share: float) -> IntArray:

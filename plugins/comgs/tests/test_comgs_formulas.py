@@ -71,10 +71,13 @@ def test_gaussians_turn_with_the_field() -> None:
         np.testing.assert_allclose(rotation_matrices(after.quats[i : i + 1])[0].numpy(), expected, atol=1e-5)
 
 
+NO_SHELL = torch.zeros(200, dtype=torch.bool)
+
+
 def test_cells_say_a_field_that_is_the_same_everywhere_to_half_a_step() -> None:
     scene, rows = scene_of(RNG.uniform(-1, 1, (200, 3))), np.arange(200)
     shift = np.tile([0.33, -0.21, 0.05], (200, 1))
-    motion = approximate_by_cells(scene, rows, shift, np.zeros((200, 3)), 0.5, 0.02)
+    motion = approximate_by_cells(scene, rows, NO_SHELL, shift, np.zeros((200, 3)), 0.5, 0.02)
     assert motion is not None
     after, touched = apply_motion(scene, motion)
     assert len(touched) == 200
@@ -84,11 +87,13 @@ def test_cells_say_a_field_that_is_the_same_everywhere_to_half_a_step() -> None:
 def test_cells_of_which_most_may_not_move_stay() -> None:
     scene = scene_of(np.array([[0.1, 0.1, 0.1], [0.2, 0.1, 0.1], [0.3, 0.1, 0.1], [5.1, 0.1, 0.1]]))
     rest = np.zeros((1, 3))
-    motion = approximate_by_cells(scene, np.array([0, 3]), np.ones((2, 3)), np.zeros((2, 3)), 1.0, 0.1)
+    motion = approximate_by_cells(scene, np.array([0, 3]), NO_SHELL[:4], np.ones((2, 3)), np.zeros((2, 3)), 1.0, 0.1)
     assert motion is not None
     assert apply_motion(scene, motion)[1].tolist() == [3]
-    assert approximate_by_cells(scene, np.array([0]), rest + 1, rest, 1.0, 0.1) is None
-    assert approximate_by_cells(scene, np.array([3]), rest, rest, 1.0, 0.1) is None
+    assert approximate_by_cells(scene, np.array([0]), NO_SHELL[:4], rest + 1, rest, 1.0, 0.1) is None
+    assert approximate_by_cells(scene, np.array([3]), NO_SHELL[:4], rest, rest, 1.0, 0.1) is None
+    last = torch.tensor([False, False, False, True])
+    assert approximate_by_cells(scene, np.array([3]), last, rest + 1, rest, 1.0, 0.1) is None, "the shell stays"
 
 
 class Wrong:

@@ -41,6 +41,7 @@ class SquaredDistances:
     cameras, index = RIG, 1
 
     def __init__(self, gaussians: Gaussians[torch.Tensor], aims: np.ndarray, changed: int | None = None) -> None:
+        self.shell_rows = torch.zeros(len(gaussians), dtype=torch.bool)
         self.gaussians, self.aims, self.changed = gaussians, torch.from_numpy(aims.astype(np.float32)), changed
 
     def changed_rows(self, min_votes: float) -> torch.Tensor:

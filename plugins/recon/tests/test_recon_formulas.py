@@ -53,6 +53,7 @@ class SquaredDistances:
     cameras, index = RIG, 1
 
     def __init__(self, aims: np.ndarray, changed: np.ndarray) -> None:
+        self.shell_rows = torch.zeros(len(aims), dtype=torch.bool)
         self.aims, self.changed = torch.from_numpy(aims.astype(np.float32)), changed
         self.seen: list[np.ndarray] = []
         self.log = FrameLog()

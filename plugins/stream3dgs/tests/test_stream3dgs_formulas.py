@@ -140,6 +140,7 @@ class SquaredDistances:
     cameras, index = RIG, 1
 
     def __init__(self, scene: Scene, aims: np.ndarray, changed: np.ndarray | None = None) -> None:
+        self.shell_rows = torch.zeros(len(scene.gaussians), dtype=torch.bool)
         self.aims, self.gaussians = torch.from_numpy(aims.astype(np.float32)), scene.gaussians.map(torch.from_numpy)
         self.key_rows = len(aims)
         self.changed = np.arange(len(aims)) if changed is None else changed

@@ -100,7 +100,8 @@ def _fitted(
     with torch.no_grad():
         field = field_of(base.means, points())
     step = settings.step * pixel
-    return approximate_by_cells(scene, rows.numpy(), field.shift.numpy(), field.turn.numpy(), side, step)
+    moves = field.shift.numpy(), field.turn.numpy()
+    return approximate_by_cells(scene, rows.numpy(), work.shell_rows, *moves, side, step)
 
 
 def _start(centres: torch.Tensor, pixel: float) -> KeyPoints:

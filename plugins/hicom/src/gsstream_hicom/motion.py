@@ -72,7 +72,7 @@ class CoherentMotion(MotionPart):
         measure = elementwise if config.measure == "each" else groupwise_max
         for level, side in enumerate(cell_sides(scene.gaussians.means, config.levels, config.per_cell)):
             groups = groups_for(scene, side, 1, regroup=True)
-            marks = groups_of_rows(groups, rows).astype(np.uint8)
+            marks = groups_of_rows(groups, rows, work.shell_rows).astype(np.uint8)
             able = np.flatnonzero(marks)
             iterations = total * (level + 1) // config.levels - total * level // config.levels
             if not len(able) or not iterations:

@@ -106,7 +106,7 @@ class AnchorMotion(MotionPart):
         side = float(np.float32(config.pixels * enlargement(work.cameras.width) * pixel))
         groups = groups_for(scene, side, 1, regroup=True)
         rows = work.changed_rows(config.votes).nonzero()[:, 0].numpy()
-        marks = groups_of_rows(groups, rows).astype(np.uint8)
+        marks = groups_of_rows(groups, rows, work.shell_rows).astype(np.uint8)
         if not marks.any():
             return ()
         anchors = self._anchors(memory, work.index, len(means), rng)

@@ -9,7 +9,6 @@ import pydantic
 import torch
 
 from gsstream.api import (
-    Cameras,
     Field,
     FieldShape,
     FitContext,
@@ -76,7 +75,7 @@ class CacheMotion(MotionPart):
         if not len(rows):
             return ()
         found = self.fitted(scene, work.on(work.gaussians.rows(slice(0, work.key_rows))), rows, rng)
-        said = None if found is None else self.said(scene, *found, work.cameras)
+        said = None if found is None else self.said(scene, *found, work)
         return () if said is None else (said,)
 
     def fitted(self, scene: Scene, work: FitContext, rows: IntArray, rng: Rng) -> tuple[IntArray, Cache] | None:
@@ -115,7 +114,7 @@ class CacheMotion(MotionPart):
             float(np.float32(config.growth)), config.width, 2, rng.key("stream3dgs", 0) & 0xFFFFFFFF,
         )  # fmt: skip
 
-    def said(self, scene: Scene, rows: IntArray, cache: Cache, cameras: Cameras) -> Field | Motion | None:
+    def said(self, scene: Scene, rows: IntArray, cache: Cache, work: FitContext) -> Field | Motion | None:
         """Return what is sent of a cache: the cache, or the rigid motions of cells; None where nothing moves."""
         if self.config.sent == "field":
             marks = np.zeros(len(scene.gaussians), np.uint8)
@@ -123,8 +122,9 @@ class CacheMotion(MotionPart):
             return cache.field(None if marks.all() else marks)
         with torch.no_grad():
             shift, turn = cache()
-        pixel = pixel_size(scene.gaussians.means, cameras)
-        side = float(np.float32(self.config.pixels * enlargement(cameras.width) * pixel))
+        pixel = pixel_size(scene.gaussians.means, work.cameras)
+        side = float(np.float32(self.config.pixels * enlargement(work.cameras.width) * pixel))
         return approximate_by_cells(
-            scene, rows, (cache.shape.reach * shift).numpy(), turn.numpy(), side, self.config.step * pixel
+            scene, rows, work.shell_rows, (cache.shape.reach * shift).numpy(), turn.numpy(), side,
+            self.config.step * pixel,
         )

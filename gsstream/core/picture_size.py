@@ -12,6 +12,8 @@ import math
 
 #: Width, and number of pixels, of the pictures for which settings are given.
 WIDTH, PIXELS = 320, 320 * 240
+#: Width from which a picture is large: what lies away from a change is then told without its pixels.
+LARGE = 960
 
 
 def enlargement(width: int) -> float:

@@ -10,7 +10,7 @@ from pydantic import Field
 from gsstream.core.changes import Motion, Scene
 from gsstream.core.changes.motion import GroupTransforms, predict_transforms
 from gsstream.core.part import PartConfig
-from gsstream.core.picture_size import enlargement
+from gsstream.core.picture_size import LARGE, enlargement
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.parts.motion.base import MotionPart
@@ -58,9 +58,10 @@ class Rigid(MotionPart):
         )
         longest: float = Field(default=0.5, gt=0, le=10, description="longest step, pixels at a width of 320")
         step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
-        everywhere: bool = Field(
-            default=True,
-            description="compare in all tiles that the groups are seen in; false: in those that changed or lie beside",
+        everywhere: Literal["auto"] | bool = Field(
+            default="auto",
+            description="compare in all tiles that the groups are seen in; false: in those that changed or lie beside; "
+            "auto: in all where pictures are less than 960 pixels wide",
         )
         least: float = Field(default=0.25, ge=0, le=10, description="motions below this many pixels are dropped")
 
@@ -96,5 +97,6 @@ class Rigid(MotionPart):
         longest = config.longest * enlargement(work.cameras.width)
         damping = Damping(config.damping, config.hold, longest)
         order = rng.numpy("motion", work.index)
-        tiles: Literal["all", "changed"] = "all" if config.everywhere else "changed"
+        small = work.cameras.width < LARGE if config.everywhere == "auto" else config.everywhere
+        tiles: Literal["all", "changed"] = "all" if small else "changed"
         return fit_transforms_newton(scene, work, start, units.row, total, order, damping, tiles)

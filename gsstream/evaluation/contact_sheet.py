@@ -32,6 +32,8 @@ _CLOSED, _OPEN = (0.25, 0.27, 0.30), (1.0, 0.55, 0.0)
 _MARGIN, _GAP, _TEXT = 8, 4, 18
 #: Close-ups are enlarged by this factor: they show one CLOSER-th of a picture's width and height.
 CLOSER = 3
+#: Pictures of a sheet are at most so wide, pixels: large ones are reduced by a whole number.
+WIDEST = 480
 _LABELS = ("ground truth", "decoded", f"|error| x {ERROR_GAIN}", "allowed to change",
            "ground truth, close", "decoded, close", "fresh, close")  # fmt: skip
 
@@ -60,11 +62,15 @@ class Column:
 
 
 def contact_sheet(columns: Sequence[Column], heading: str = "") -> Image.Image:
-    """Draw the sheet under a heading; images keep their pixels. Raises InputError for an empty list."""
+    """Draw the sheet under a heading; images of at most 480 pixels of width keep their pixels.
+
+    Raises InputError for an empty list.
+    """
     if not columns:
         raise InputError("a contact sheet needs at least one frame")
-    height, width = columns[0].truth.shape[:2]
-    pictures = [column.pictures for column in columns]
+    factor = -(-columns[0].truth.shape[1] // WIDEST)
+    height, width = (max(1, side // factor) for side in columns[0].truth.shape[:2])
+    pictures = [[_reduced(picture, factor) for picture in column.pictures] for column in columns]
     # Rows that no column has a picture for are left out.
     shown = [row for row in range(len(_LABELS)) if any(column[row] is not None for column in pictures)]
     labels = [_LABELS[row] for row in shown]
@@ -135,6 +141,15 @@ def most_changed_window(truth: FloatArray, first: FloatArray) -> tuple[slice, sl
 
 def _enlarged(image: FloatArray) -> FloatArray:
     return image.repeat(CLOSER, 0).repeat(CLOSER, 1)
+
+
+def _reduced(image: FloatArray | None, factor: int) -> FloatArray | None:
+    """A picture ``factor`` times smaller, means over squares; a close-up was enlarged, so it keeps its own pixels."""
+    if image is None or factor == 1:
+        return image
+    height, width = (max(1, side // factor) for side in image.shape[:2])
+    cut = np.clip(image[: height * factor, : width * factor], 0, 1)
+    return np.asarray(cut.reshape(height, -1, width, cut.shape[1] // width, 3).mean((1, 3)))
 
 
 def _alone(path: Path, frame: int, rig: Cameras, renderer: PlayerRenderer | None) -> FloatArray:

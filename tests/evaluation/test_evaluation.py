@@ -305,3 +305,21 @@ def test_plots_have_a_panel_per_measured_quantity(tmp_path):
     assert blue.sum() > 100
     with pytest.raises(InputError, match="nothing to plot"):
         plot_runs({"empty": [FrameRecord(0)]}, tmp_path / "none.png")
+
+
+def test_large_pictures_are_reduced_on_the_sheet_and_close_ups_keep_their_pixels() -> None:
+    """At 1352 pixels of width the sheet of five frames was 41 megapixels, and its words could not be read."""
+    rng = np.random.default_rng(0)
+    truth = rng.integers(0, 256, (301, 1352, 3)).astype(np.float32) / 255
+    window = (slice(100, 200), slice(450, 900))
+    sheet = np.asarray(contact_sheet([Column("large", truth, truth, close=window)])).astype(int)
+    assert sheet.shape[1] < 700
+    mean = truth[:300, :1350].reshape(100, 3, 450, 3, 3).mean((1, 3))
+    exact = np.rint(truth[window] * 255).astype(int)
+    for picture, bound in ((np.rint(mean * 255).astype(int), 1), (exact, 1)):
+        windows = np.lib.stride_tricks.sliding_window_view(sheet, (1, 40, 3))[:, :, 0, 0]
+        found = np.argwhere((np.abs(windows - picture[0, :40]) <= bound).all((2, 3)))
+        assert len(found) >= 1
+        row, column = found[0]
+        part = sheet[row : row + 100, column : column + 450]
+        assert np.abs(part - picture[:100, :450]).max() <= bound

@@ -101,8 +101,8 @@ def optimise_first_frame(
     """Fit frame 0 on its training images."""
     settings = parts.recipe.first_frame
     iterations = min(settings.epochs * len(frame.cameras), settings.max_iterations)
-    # The name of this random stream is that of older versions, so that a seed still gives the same frame 0.
     pyramid = plan_pyramid(frame.cameras.width, iterations, settings)
+    # The name of this random stream is that of older versions, so that a seed still gives the same frame 0.
     run = FirstFrameRun(start, levels, frame, parts, rng.stream("root", frame.index), pyramid)
     run.exposure = ExposureFit.start(len(frame.cameras)) if settings.exposure else None
     for level in pyramid.levels:

@@ -28,7 +28,7 @@ def test_the_quick_start_is_two_commands_that_make_knows() -> None:
     (commands,) = re.findall(r"^```\n(.*?)^```$", section("README.md", "Quick start"), re.MULTILINE | re.DOTALL)
     assert commands.splitlines() == ["make demo", "make test"]
     for target in ("demo", "test"):
-        dry = ["make", "--dry-run", target]
+        dry = ["make", "--dry-run", "--no-print-directory", target]
         done = subprocess.run(dry, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
         assert done.returncode == 0
         if target == "demo":

@@ -123,15 +123,15 @@ def check_method_declared_needs(method: MethodUnderTest) -> None:
 
 @check("method", kinds=("method", "streaming_method"))
 def check_method_size_is_true(method: MethodUnderTest) -> None:
-    """Reported bytes are the bytes written, and no more gates or Gaussians are active than there are."""
+    """Reported bytes are the bytes written, and no more Gaussians change or gates are open than there are."""
     for step in method.steps:
         metrics: Any = step.metrics
         total = sum(metrics["bytes"].values())
         frame = step.packet.frame
         assert total == len(step.packet.data), f"frame {frame}: says {total} bytes, wrote {len(step.packet.data)}"
-        for name in ("gaussians", "gates"):
-            active, have = metrics[f"active_{name}"], metrics[f"num_{name}"]
-            assert 0 <= active <= have, f"frame {frame}: {active} active {name} of {have}"
+        for which, name in (("changed", "gaussians"), ("active", "gates")):
+            some, have = metrics[f"{which}_{name}"], metrics[f"num_{name}"]
+            assert 0 <= some <= have, f"frame {frame}: {some} {which} {name} of {have}"
 
 
 @check("method", kinds=("method", "streaming_method"))

@@ -15,8 +15,10 @@ from browser_runs import in_browser, needs_browser
 from gsstream.core.errors import OutputError
 from gsstream.serve.local import LocalServer
 
+#: A shell that runs tests in the background has interrupts ignored, and processes inherit that.
 CODE = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.modules.update(dict.fromkeys(["starlette", "uvicorn", "websockets", "torch"]))
 from gsstream.cli.main import main
 main()

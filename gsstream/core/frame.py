@@ -90,6 +90,19 @@ class Frame:
         )
 
 
+def shrink_frame(frame: Frame, factor: int) -> Frame:
+    """Return the frame with pictures ``factor`` times smaller, means over squares; what fills no square is cut off."""
+    if factor == 1:
+        return frame
+    cameras = frame.cameras
+    height, width = cameras.height // factor, cameras.width // factor
+    cut = frame.images[:, : height * factor, : width * factor]
+    images = cut.reshape(len(cameras), height, factor, width, factor, 3).mean((2, 4), dtype=np.float32)
+    # The crop keeps the image corner, so only the size changes before the scale does.
+    cameras = replace(cameras, width=width * factor, height=height * factor).scaled(width, height)
+    return replace(frame, images=images, cameras=cameras)
+
+
 @dataclass(frozen=True, slots=True)
 class PointCloud:
     """P coloured points.

@@ -53,6 +53,7 @@ class PlySequence:
         self._files, self._info = numbered(folder, (".ply",), first), info
         self._background = _background(folder, background)
         self._with = find_renderer()
+        self._last: tuple[int, Gaussians[FloatArray]] | None = None
         self.rig, self.renderer, self.frames = info.test, self._with.name, _in_recording(self._files, info)
 
     def file(self, frame: int) -> Path:
@@ -69,6 +70,12 @@ class PlySequence:
         return seen_masks(self._scene(frame), self._info.train, self.rig, self._with)
 
     def _scene(self, frame: int) -> Gaussians[FloatArray]:
+        """The scene of a frame; that of the last one that was asked for is not read again."""
+        if self._last is None or self._last[0] != frame:
+            self._last = frame, self._read(frame)
+        return self._last[1]
+
+    def _read(self, frame: int) -> Gaussians[FloatArray]:
         scene, offset = read_ply(self._files[frame])
         # In float64 until it is in the stream's coordinates: the recording's origin may be far away.
         world = self._info.world

@@ -26,7 +26,6 @@ class LocalServer(ThreadingHTTPServer):
             raise OutputError(f"cannot serve at {HOST}:{port}: {error.strerror or error}") from error
         self.url = f"http://{HOST}:{self.server_port}/?src=stream.gss"
 
-
     def handle_error(self, request: object, client_address: object) -> None:
         """A browser that leaves in the middle of an answer is no error."""
         if not isinstance(sys.exception(), ConnectionError):

@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.frame import Frame
+from gsstream.core.frame import Frame, shrink_frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.picture_size import bit_price_factor, densify_factor, enlargement, prune_factor
-from gsstream.engine.frame0.pyramid import keep_widths, one_size, plan_pyramid, shrink_frame
+from gsstream.engine.frame0.pyramid import keep_widths, one_size, plan_pyramid
 from gsstream.parts.render.reference import ReferenceRenderer
 from gsstream.recipe.model import FirstFrame
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from gsstream.core.errors import InputError
-from gsstream.core.frame import Frame
+from gsstream.core.frame import Frame, shrink_frame
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.picture_size import densify_factor, prune_factor
 from gsstream.core.rng import Rng
@@ -28,7 +28,7 @@ from gsstream.engine.fit.nearest import neighbour_distance
 from gsstream.engine.fit.photometric import PhotometricLoss
 from gsstream.engine.frame0.hutchinson import TrainingViews
 from gsstream.engine.frame0.prune import prune_by_error
-from gsstream.engine.frame0.pyramid import Pyramid, PyramidLevel, keep_widths, plan_pyramid, shrink_frame
+from gsstream.engine.frame0.pyramid import Pyramid, PyramidLevel, keep_widths, plan_pyramid
 from gsstream.engine.frame0.regularisers import choose_regularisers, thin_out
 from gsstream.engine.frame0.smooth_depth import add_smooth_depth_grad
 from gsstream.input.seeds.shell import find_shell

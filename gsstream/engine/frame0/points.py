@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from gsstream.core.errors import InputError
-from gsstream.core.frame import Frame, PointCloud
+from gsstream.core.frame import Frame, PointCloud, shrink_frame
 from gsstream.engine.fit import schedule
-from gsstream.engine.frame0.pyramid import shrink_frame
 from gsstream.input.recordings.base import FrameSource, PointKind
 from gsstream.input.seeds.seeding import photo_consistent_seeds
 from gsstream.input.seeds.shell import shell_points

@@ -7,13 +7,12 @@ nothing before the largest pictures, the only ones that show where fine texture 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.picture_size import WIDTH
 from gsstream.engine.fit import schedule
@@ -89,19 +88,6 @@ def plan_pyramid(width: int, iterations: int, settings: FirstFrame) -> Pyramid:
         begin = levels[-1].end if levels else 0
         levels.append(PyramidLevel(2 ** (count - 1 - number), begin, share, first_lr, last_lr))
     return Pyramid(tuple(levels), schedule.PYRAMID_DENSIFY_UNTIL, schedule.PYRAMID_PRUNE_AT)
-
-
-def shrink_frame(frame: Frame, factor: int) -> Frame:
-    """Return the frame with pictures ``factor`` times smaller, means over squares; what fills no square is cut off."""
-    if factor == 1:
-        return frame
-    cameras = frame.cameras
-    height, width = cameras.height // factor, cameras.width // factor
-    cut = frame.images[:, : height * factor, : width * factor]
-    images = cut.reshape(len(cameras), height, factor, width, factor, 3).mean((2, 4), dtype=np.float32)
-    # The crop keeps the image corner, so only the size changes before the scale does.
-    cameras = replace(cameras, width=width * factor, height=height * factor).scaled(width, height)
-    return replace(frame, images=images, cameras=cameras)
 
 
 def keep_widths(gaussians: Gaussians[torch.Tensor], cameras: Cameras, before: int, now: int) -> torch.Tensor:

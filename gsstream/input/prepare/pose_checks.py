@@ -12,7 +12,7 @@ import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import EndOfRecording, InputError
-from gsstream.core.frame import Frame
+from gsstream.core.frame import Frame, shrink_frame
 from gsstream.core.shapes import FloatArray
 from gsstream.input.prepare.findings import Finding, error
 from gsstream.input.prepare.match_checks import REPAIRS
@@ -56,7 +56,8 @@ def check_poses(frame: Frame) -> list[Finding]:
     """Find poses that explain the pictures of one instant much better when they are read by another convention."""
     if len(frame.cameras) < 3:
         return []
-    images, cameras = _small(frame)
+    small = shrink_frame(frame, max(1, round(frame.cameras.width / WIDTH)))
+    images, cameras = small.images, small.cameras
     given = _agreement(images, cameras)
     if given >= AGREED:
         return []
@@ -73,16 +74,6 @@ def check_poses(frame: Frame) -> list[Finding]:
         f"({100 * best:.0f} % of their texture is at one place for several cameras, instead of {100 * given:.0f} %): "
         f"{cure}"
     ))]  # fmt: skip
-
-
-def _small(frame: Frame) -> tuple[FloatArray, Cameras]:
-    """Pictures of about ``WIDTH`` pixels, means of whole blocks of pixels, and their cameras."""
-    images, cameras = frame.images, frame.cameras
-    factor = max(1, round(cameras.width / WIDTH))
-    height, width = cameras.height // factor, cameras.width // factor
-    cut = images[:, : height * factor, : width * factor]
-    small = cut.reshape(len(images), height, factor, width, factor, 3).mean((2, 4), dtype=np.float32)
-    return small, replace(cameras, width=width * factor, height=height * factor).scaled(width, height)
 
 
 def _agreement(images: FloatArray, cameras: Cameras) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError, SourceError
-from gsstream.core.frame import Frame
+from gsstream.core.frame import Frame, shrink_frame
 from gsstream.core.needs import install_extra
 from gsstream.input.prepare.findings import Finding, error, note
 from gsstream.input.prepare.match_checks import check_matches
@@ -113,13 +113,8 @@ def _matched(rig: Cameras, train: Frame, test: Frame, *, rig_only: bool = False)
     if importlib.util.find_spec("pycolmap") is None:
         return [note("epipolar", f"the calibration was not compared with the pictures: {install_extra('sfm')}")]
     images = np.concatenate([train.images, test.images])
-    factor = -(-rig.width // LARGE)
-    height, width = rig.height // factor, rig.width // factor
-    cut = images[:, : height * factor, : width * factor]
-    images = cut.reshape(len(images), height, factor, width, factor, 3).mean((2, 4), dtype=np.float32)
-    # The crop keeps the image corner, so only the size changes before the scale does.
-    cameras = replace(rig, width=width * factor, height=height * factor).scaled(width, height)
+    small = shrink_frame(replace(train, images=images, cameras=rig), -(-rig.width // LARGE))
     try:
-        return check_matches(cameras, match_images(images), rig_only=rig_only)
+        return check_matches(small.cameras, match_images(small.images), rig_only=rig_only)
     except InputError as fault:
         return [note("epipolar", f"the calibration was not compared with the pictures: {fault}")]

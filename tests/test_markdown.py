@@ -5,6 +5,7 @@ A placeholder is written in capitals (`tests/FOLDER`, `--out DIR`, `--set SLOT.K
 
 from __future__ import annotations
 
+import ast
 import functools
 import itertools
 import re
@@ -334,3 +335,30 @@ def test_methods_exist(page: Path) -> None:
     named |= set(re.findall(r"encoder_for\(\"([^\"]+)\"", page.read_text(encoding="utf-8")))
     known |= {words[1] for words in calls if words[:1] == ["new-plugin"]}  # a method that the page shows how to write
     check(sorted(n for n in named - known if not (PLACEHOLDER.fullmatch(n) or n.endswith(".yaml"))))
+
+
+#: A command in a message ends at a quote, a bracket or a word that goes on with the sentence.
+CALL = re.compile(r"gsstream [a-z]+[\w-]*(?: (?:--?[a-z][\w-]*|[A-Z]+\b|X\S*))*")
+#: What follows gsstream in sentences about it.
+VERBS = {"alone", "and", "based", "does", "file", "is", "of", "package", "reads", "speaks", "that", "to", "writes"}
+
+
+def messages(path: Path) -> Iterator[str]:
+    """Texts in a file of code that are not docstrings; what an f-string puts in stands as X."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    inner = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            yield "".join(part.value if isinstance(part, ast.Constant) else "X" for part in node.values)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and not {id(node)} & (docs | inner):
+            yield node.value
+
+
+def test_commands_that_messages_name_parse() -> None:
+    calls = {
+        call for root in ("gsstream", "plugins") for path in ROOT.glob(f"{root}/**/*.py") if "tests" not in path.parts
+        for text in messages(path) for call in CALL.findall(text) if call.split()[1] not in VERBS
+    }  # fmt: skip
+    assert len(calls) > 12
+    check(sorted(f"{call}: {said}" for call in calls if (said := problem(shlex.split(call)[1:], complete=False))))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import re
+import shlex
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -47,10 +50,12 @@ def run(
     The recipe is the method's, changed by --recipe FILE, then by --set and the short options. Ctrl-C (exit code 130)
     and SIGTERM (143) end after the current frame with a valid stream; --resume continues it to the same bytes.
     """
+    from gsstream.core.needs import require_encoder
     from gsstream.engine.run.output import claim_output, disk_errors, ended_by_signals
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
 
+    require_encoder()
     catalog = load_catalog()
     resolved = resolve_recipe(recipe.method, catalog.recipe_path, recipe.recipe or (), recipe.overrides())
     server = server_beside(out, serve)
@@ -103,8 +108,14 @@ def _reused_lines(
     if recipe.frames is not None and info.num_frames is not None and info.num_frames < recipe.frames:
         say(f"{recipe.frames} frames are wanted, the recording has {info.num_frames}: encoding {info.num_frames}")
     if len(info.test) == 0:
-        some = f", e.g. --set 'data.test_cameras=[{info.train.ids[0]}]'" if len(info.train) > 2 else ""
+        some = f", e.g. --set {_held_out(info.train.ids[0])}" if len(info.train) > 2 else ""
         say(f"no camera is held out, so no quality is measured{some}")
+
+
+def _held_out(camera: str) -> str:
+    """The setting that holds a camera out, quoted for a shell, and for YAML where its name has other signs."""
+    name = camera if re.fullmatch(r"[\w.-]+", camera, re.ASCII) else json.dumps(camera)
+    return shlex.quote(f"data.test_cameras=[{name}]")
 
 
 def _first_look(recording: FrameSource, uri: str, *, again: bool) -> None:

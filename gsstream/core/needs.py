@@ -5,10 +5,13 @@ gsstream alone is the player. Its extras bring the rest, and the parts of other 
 
 from __future__ import annotations
 
+import importlib.metadata
+import importlib.util
+import re
 import shlex
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 #: What only the extra ``encoder`` brings: everything that imports one of these encodes, measures or plots.
@@ -36,8 +39,12 @@ SHIPPED: Mapping[str, tuple[str, ...]] = {
 }  # fmt: skip
 #: Parts whose distribution is in no extra, because it needs a GPU.
 APART: Mapping[str, str] = {"renderer/gsplat": "gsstream-gsplat-render[cuda]"}
+#: Whether a package index has gsstream and its plugins. Until one has, commands name sources, or a folder of wheels.
+ON_INDEX = False
+#: The repository, where this is a checkout of it.
+SOURCES = Path(__file__).parents[2]
 #: The pages that messages name: in the repository, and in what is built from it.
-DOCS = (Path(__file__).parents[2] / "docs", Path(sys.prefix) / "share" / "doc" / "gsstream")
+DOCS = (SOURCES / "docs", Path(sys.prefix) / "share" / "doc" / "gsstream")
 
 
 def page(name: str) -> str:
@@ -59,8 +66,44 @@ def pip() -> str:
 
 
 def install(requirement: str) -> str:
-    """Return the command that installs a requirement into the environment that runs now."""
-    return f"{pip()} install {shlex.quote(requirement)}"
+    """Return the command that installs a requirement into the environment that runs now.
+
+    Distributions of this project that are not installed yet come from the sources where these are at hand, else from
+    wheels, as long as no index has them.
+    """
+    lacking = [] if ON_INDEX else [name for name in _own(requirement) if not _is_installed(name)]
+    if not lacking:
+        return f"{pip()} install {shlex.quote(requirement)}"
+    if not (SOURCES / "plugins").is_dir():
+        return (
+            f"{pip()} install --find-links DIST {shlex.quote(requirement)}, where DIST is the folder of wheels that "
+            "'make dist' writes (no index has them yet)"
+        )
+    folders = [requirement.replace("gsstream", str(SOURCES), 1)] if requirement.startswith("gsstream[") else []
+    folders += [str(SOURCES / "plugins" / name.removeprefix("gsstream-").replace("-", "_")) for name in lacking]
+    return f"{pip()} install " + " ".join(f"-e {shlex.quote(folder)}" for folder in folders)
+
+
+def _own(requirement: str) -> Iterator[str]:
+    """Names and extras of this project's other distributions that a requirement brings, each once."""
+    if not requirement.startswith("gsstream["):
+        yield from [requirement] if requirement.startswith("gsstream-") else []
+        return
+    found: dict[str, None] = {}
+    for extra in requirement.removeprefix("gsstream[").rstrip("]").split(","):
+        for line in importlib.metadata.requires("gsstream") or ():
+            name = re.match(r"[\w.-]+(\[[\w,-]+\])?", line)
+            if name is not None and re.search(rf"extra\s*==\s*[\"']{extra}[\"']", line):
+                found.update(dict.fromkeys(_own(name.group())))
+    yield from found
+
+
+def _is_installed(requirement: str) -> bool:
+    try:
+        importlib.metadata.version(requirement.partition("[")[0])
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    return True
 
 
 def install_extra(extra: str) -> str:
@@ -86,10 +129,24 @@ def install_part(kind: str, name: str) -> str | None:
 
 def install_renderer() -> str:
     """Return what installs the compiled renderer: its sources where these are at hand, else its distribution."""
-    sources = Path(__file__).parents[2] / "plugins" / "cpu_render"
+    sources = SOURCES / "plugins" / "cpu_render"
     if (sources / "pyproject.toml").is_file():
         return f"install a C++20 compiler, then: {install(str(sources))}"
     return install_extra("player")
+
+
+def require_encoder() -> None:
+    """Raise ModuleNotFoundError where a package of the extra ``encoder`` is missing.
+
+    For the first line of a command that encodes or plots: it must not work for an hour before it finds out.
+    """
+    for package in ENCODER:
+        try:
+            there = importlib.util.find_spec(package) is not None
+        except ValueError:  # a module without a specification, as None in sys.modules
+            there = False
+        if not there:
+            raise ModuleNotFoundError(f"No module named {package!r}", name=package)
 
 
 def missing_for_encoding(error: ModuleNotFoundError) -> str | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -76,7 +75,7 @@ def play(
 
 
 def check_target(out: Path) -> None:
-    """Refuse a file type that is not written, and the folder of a run: pictures do not belong among its results.
+    """Refuse a file type that cannot be written here, and the folder of a run: it is no place for pictures.
 
     Raises OutputError.
     """
@@ -88,6 +87,11 @@ def check_target(out: Path) -> None:
         raise OutputError(
             f"{out}: {suffix} is not written; expected a file that ends with one of {', '.join(SUFFIXES)}, or a name "
             "without a suffix: a folder for PNGs"
+        )
+    elif suffix == ".mp4" and importlib.util.find_spec("av") is None:
+        raise OutputError(
+            f"{out}: writing MP4 needs PyAV, which is not installed: {install_extra('video')}. Without it, write "
+            f"{out.with_suffix('.webp')}, a .gif, or a folder of PNGs"
         )
 
 
@@ -122,13 +126,7 @@ def write_pictures(out: Path, images: Iterator[Bytes], frames: Sequence[int], fp
     """Write pictures as the suffix of a file says: a video, an animated picture, or a folder of PNGs."""
     suffix = out.suffix.lower()
     if suffix == ".mp4":
-        if importlib.util.find_spec("av") is not None:
-            return _write_video(out, images, fps)
-        warnings.warn(
-            f"writing MP4 needs PyAV ({install_extra('video')}); PNGs go to {out.with_suffix('')} instead",
-            stacklevel=3,
-        )
-        out = out.with_suffix("")
+        return _write_video(out, images, fps)
     if suffix in _ANIMATED:
         return _write_animation(out, images, fps)
     out.mkdir(parents=True, exist_ok=True)

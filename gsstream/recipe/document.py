@@ -24,6 +24,8 @@ KeyPath = tuple[str, ...]
 LONGEST = 200_000
 #: Lists within lists.
 DEEPEST = 100
+#: Keys that hold lists of names. What stands in them is text, so that a camera may be called 0012.
+NAMES = (("data", "test_cameras"), ("data", "train_cameras"))
 _NESTING = {"[": 1, "{": 1, "]": -1, "}": -1}
 
 
@@ -138,7 +140,8 @@ def read_override(text: str, option: str = "--set") -> tuple[KeyPath, Leaf]:
         raise RecipeError(f"{where}: expected KEY.PATH=VALUE, e.g. --set stream.epochs=10 (write null for 'absent')")
     node = _compose(value, where)
     assert node is not None, "a non-blank text composes to a node or raises"
-    return path, Leaf(_plain(node, where, located=False), Origin("command line", where))
+    names = _names(node) if path in NAMES else None
+    return path, Leaf(names or _plain(node, where, located=False), Origin("command line", where))
 
 
 def _compose(text: str, name: str) -> Node | None:
@@ -182,7 +185,15 @@ def _walk(mapping: MappingNode, path: KeyPath, name: str) -> Iterator[tuple[KeyP
         elif isinstance(node, MappingNode):
             yield (*path, key), key_node, Empty()
         else:
-            yield (*path, key), key_node, _plain(node, name)
+            names = _names(node) if (*path, key) in NAMES else None
+            yield (*path, key), key_node, names or _plain(node, name)
+
+
+def _names(node: Node) -> list[str] | None:
+    """The texts of a list of plain scalars as they are written; None: it is something else."""
+    items = node.value if isinstance(node, SequenceNode) else []
+    plain = all(isinstance(item, ScalarNode) and not item.anchor for item in items)
+    return [str(item.value) for item in items] if plain and not node.anchor else None
 
 
 def _plain(node: Node, name: str, *, located: bool = True) -> Any:

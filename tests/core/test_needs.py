@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -12,6 +14,7 @@ import pytest
 from packaging.requirements import Requirement
 
 from gsstream.cli.main import run_command
+from gsstream.core import needs
 from gsstream.core.needs import APART, ENCODER, SHIPPED, install, install_part, install_renderer, page
 from gsstream.plugins.catalog import load_catalog
 
@@ -66,6 +69,20 @@ def test_the_command_is_of_the_environment_that_runs(monkeypatch: pytest.MonkeyP
     assert (Path(folder) / "CMakeLists.txt").is_file()
 
 
+def test_what_no_index_has_comes_from_sources_or_wheels(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(needs, "_is_installed", lambda name: name == "gsstream-lab")
+    words = shlex.split(install("gsstream[s2gs,video]"))
+    folders = [word for before, word in itertools.pairwise(words) if before == "-e"]
+    assert folders == [f"{ROOT}[s2gs,video]", *(str(ROOT / "plugins" / name) for name in ("cpu_render", "s2gs"))]
+    assert all((Path(folder.partition("[")[0]) / "pyproject.toml").is_file() for folder in folders)
+    assert install("gsstream-gsplat-render[cuda]").endswith(f"-e '{ROOT / 'plugins' / 'gsplat_render[cuda]'}'")
+    assert install("gsstream[video]").endswith("install 'gsstream[video]'"), "every index has PyAV"
+    monkeypatch.setattr(needs, "SOURCES", tmp_path)
+    assert "install --find-links DIST 'gsstream[s2gs]', where DIST is the folder of wheels" in install("gsstream[s2gs]")
+    monkeypatch.setattr(needs, "ON_INDEX", True)
+    assert install("gsstream[s2gs]").endswith("install 'gsstream[s2gs]'")
+
+
 def test_pages_that_messages_name_are_there() -> None:
     texts = "".join(path.read_text(encoding="utf-8") for place in PLACES for path in (ROOT / place).rglob("*.py"))
     named = re.findall(r"\{?page\(['\"]([\w/.-]+)['\"]\)", texts)
@@ -83,7 +100,11 @@ def test_a_shipped_method_that_is_not_installed(capsys: pytest.CaptureFixture[st
     assert "pip install" not in capsys.readouterr().err
 
 
-COMMANDS = ("run --source demo --out o", "check s2gs", "bench frame")
+COMMANDS = (
+    "run --source demo --out o", "check s2gs", "bench frame", "scene validate demo",
+    "compare dense,hold --source demo --out o", "tune --budget size=9KB --source demo --out o",
+    "sweep absent.yaml --out o", "report absent", "search --method dense --source demo --out o", "gap absent",
+)  # fmt: skip
 
 
 def test_commands_of_the_encoder_say_what_to_install(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from PIL import Image
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.changes import Delta, Layout, Residual
-from gsstream.core.errors import InputError, ShapeError
+from gsstream.core.errors import InputError, OutputError, ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.world import IDENTITY
 from gsstream.packet import KeyState, StreamMeta, StreamWriter, encode_delta, encode_empty, encode_key
@@ -255,8 +255,9 @@ def test_video_holds_the_frames(tmp_path):
     assert difference.argmin(1).tolist() == [0, 1, 1, 3, 4], "frame 2 shows what frame 1 did"
 
 
-def test_video_without_pyav_becomes_pngs_with_a_message(tmp_path, monkeypatch):
+def test_video_without_pyav_is_refused_with_what_can_be_written(tmp_path, monkeypatch):
     monkeypatch.setattr("gsstream.player.play.importlib.util.find_spec", lambda _: None)
-    with pytest.warns(UserWarning, match="PyAV"):
-        played = play(make_stream(tmp_path / "s.gss"), tmp_path / "v.mp4", frames=[0], renderer=NUMPY)
-    assert [f.name for f in played.path.iterdir()] == ["000000.png"]
+    stream = make_stream(tmp_path / "s.gss")
+    with pytest.raises(OutputError, match=r"PyAV, which is not installed: .*'gsstream\[video\]'.*v\.webp"):
+        play(stream, tmp_path / "v.mp4", frames=[0], renderer=NUMPY)
+    assert not (tmp_path / "v").exists()

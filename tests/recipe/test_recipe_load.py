@@ -9,6 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gsstream.core.errors import RecipeError, UnknownName
+from gsstream.recipe.document import NAMES
 from gsstream.recipe.load import ResolvedRecipe, load_recipe, recipe_hash, resolve_recipe
 from gsstream.recipe.model import Recipe
 from gsstream.recipe.save import save_resolved, to_yaml, values_to_yaml
@@ -274,3 +275,25 @@ def test_provenance_stands_beside_every_value(lab) -> None:
         assert (" # " in line) == bool(value.strip()), f"a value without provenance, or a section with one: {line!r}"
     (levels,) = [line for line in lines if "levels: 2" in line]
     assert levels.endswith("# command line")
+
+
+NAMED = ("[0001, 12, null, cam]", "[\"0001\", '12', \"null\", cam]", "\n  - 0001\n  - 12\n  - null\n  - cam")
+
+
+@pytest.mark.parametrize("written", NAMED)
+def test_names_of_cameras_are_what_is_written(lab, written: str) -> None:
+    empty, file = lab.write("soft.yaml", ""), lab.write("r.yaml", f"data:\n test_cameras: {written}")
+    for files, sets in (([file], []), ([], [("--set", f"data.test_cameras={written}")])):
+        data = resolve_recipe("soft", lambda _: empty, files, sets).recipe.data
+        assert data.test_cameras == ("0001", "12", "null", "cam")
+    none = resolve_recipe("soft", lambda _: empty, [], [("--set", "data.test_cameras=null")])
+    assert none.recipe.data.test_cameras is None
+
+
+def test_the_keys_that_hold_names_are_those_of_the_recipe() -> None:
+    models = {name: field.annotation for name, field in Recipe.model_fields.items()}
+    lists = {
+        (section, key) for section, model in models.items() for key, field in getattr(model, "model_fields", {}).items()
+        if "tuple[str" in str(field.annotation)
+    }  # fmt: skip
+    assert lists == set(NAMES)

@@ -67,12 +67,14 @@ def compare(
     are kept: the same command goes on, and more methods may join. A run that fails is recorded and the others go on
     (exit code 1 at the end).
     """
+    from gsstream.core.needs import require_encoder
     from gsstream.plugins.catalog import load_catalog
     from gsstream_lab.report.groups import read_sweep_data
     from gsstream_lab.sweep.compare import equal_epochs, equal_time, own_settings
     from gsstream_lab.sweep.drive import run_sweep
     from gsstream_lab.sweep.plan import make_plan
 
+    require_encoder()
     epochs, seconds = equal.numbers()
     names = [name.strip() for name in methods.split(",") if name.strip()]
     catalog, config = load_catalog(), own_settings(names, recording.scene(), _integers(seeds, "--seeds", 0), split)

@@ -32,8 +32,10 @@ def report(
     numbers beside ours where the sweep names a table of it. Everything is computed from the table.
     """
     from gsstream.core.errors import UnknownName
+    from gsstream.core.needs import require_encoder
     from gsstream_lab.report.groups import read_sweep_data
 
+    require_encoder()
     swept = read_sweep_data(folder)
     wanted = [] if sheets == "none" else [name.strip() for name in sheets.split(",") if name.strip()]
     for name in wanted:

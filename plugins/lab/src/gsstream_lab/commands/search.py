@@ -36,6 +36,7 @@ def search(
     split), while that gains more than 0.05 dB; again from the first key until none moves. Test cameras have no say. One
     frame (the default here) judges frame 0; with --frames 5 or so the frames after it judge.
     """
+    from gsstream.core.needs import require_encoder
     from gsstream.engine.assembly.assemble import assemble
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
@@ -43,6 +44,7 @@ def search(
     from gsstream_lab.sweep.search import SweepScore, climb, usual_ladders, value_of
     from gsstream_lab.sweep.tune import tuned_recipe
 
+    require_encoder()
     catalog = load_catalog()
     files = [] if recording.recipe is None else [recording.recipe]
     resolved = resolve_recipe(method, catalog.recipe_path, files, options.overrides(recording.settings))

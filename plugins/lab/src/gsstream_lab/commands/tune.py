@@ -50,12 +50,14 @@ def tune(
     training cameras (the tuning split); test cameras have no say. Nothing fits: the table says what came nearest,
     nothing is written, and the exit code is 1.
     """
+    from gsstream.core.needs import require_encoder
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.budget import budget_overrides
     from gsstream.recipe.load import resolve_recipe
     from gsstream_lab.sweep.plan import make_plan
     from gsstream_lab.sweep.tune import METHODS, give_first_frame, pilot
 
+    require_encoder()
     catalog = load_catalog()
     limits = _limits(resolve_recipe(None, catalog.recipe_path, (), budget_overrides(budget)).recipe, recording.source)
     known = catalog.names("method")

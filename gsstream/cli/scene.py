@@ -22,7 +22,12 @@ def _group() -> None:
 
 @app.command()
 def prepare(
-    raw: Annotated[Path, typer.Argument(help="A folder of pictures or a video per camera, or a picture per camera.")],
+    raw: Annotated[
+        str,
+        typer.Argument(
+            help="A folder of pictures or a video per camera, a picture per camera, or what --source of 'run' reads."
+        ),
+    ],
     out: Annotated[Path, typer.Option("--out", help="Folder of the scene; must be empty or missing.")],
     test: Annotated[
         list[str] | None,
@@ -39,8 +44,8 @@ def prepare(
 ) -> None:
     """Make a validated scene from raw synchronised recordings: poses, pinhole pictures, points, a report.
 
-    Poses are recovered from frame 0, or taken from a cameras.json in RAW. Needs gsstream[sfm]. Exit code 2 when the
-    scene was made but its validation found an error.
+    Poses and lenses are those that RAW gives, in any layout that 'run' reads, else recovered from frame 0. Needs
+    gsstream[sfm]. Exit code 2 when the scene was made but its validation found an error.
     """
     import time
 

@@ -21,9 +21,10 @@ from gsstream.core.errors import InputError, OutputError, suggest
 from gsstream.core.frame import PointCloud
 from gsstream.core.names import child
 from gsstream.core.shapes import FloatArray
-from gsstream.input.prepare.raw import RawCamera, find_cameras, first_frames
+from gsstream.input.prepare.given import GivenRig, read_raw
+from gsstream.input.prepare.raw import RawCamera, first_frames
 from gsstream.input.prepare.undistort import Undistortion, undistortion
-from gsstream.input.recordings.calibration import CALIBRATION_FILE, SCHEMA, cut_to, read_calibration
+from gsstream.input.recordings.calibration import CALIBRATION_FILE, SCHEMA
 from gsstream.input.seeds.mapping import Lens, Mapping, reconstruct, triangulate
 from gsstream.input.seeds.thinning import thin_points
 
@@ -71,27 +72,28 @@ class Prepared:
     known_poses: bool
 
 
-def prepare(raw: Path, out: Path, options: PrepareOptions, say: Say) -> Prepared:
+def prepare(raw: Path | str, out: Path, options: PrepareOptions, say: Say) -> Prepared:
     """Make the scene ``out`` (cameras.json, pictures, points_frame0.npz).
+
+    Arguments:
+        raw: a raw recording, or one of any layout that a run reads; poses and lenses that come with it are kept.
 
     Raises SourceError for a raw recording that cannot be read, InputError when structure from motion fails or finds
     fewer than two training cameras, OutputError when ``out`` exists and is not an empty folder.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise OutputError(f"{out} exists and is not an empty folder; choose another --out")
-    cameras = find_cameras(raw)
+    title, cameras, known = read_raw(str(raw))
     names = tuple(camera.name for camera in cameras)
-    known = read_calibration(raw, to_size=True) if (raw / CALIBRATION_FILE).exists() else None
-    test = options.test if options.test is not None else known.test.ids if known else ()
+    test = options.test if options.test is not None else known.test if known else ()
     for name in test:
         if name not in names:
             raise InputError(f"--test: no camera {name!r}{suggest(name, names)}")
     say(f"{len(cameras)} cameras, {len(test)} of them for testing only; {'known' if known else 'unknown'} poses")
     say("reading frame 0")
     images = first_frames(cameras)
-    poses = None if known is None else _joined(known.train, known.test)
     say(f"matching features of {len(cameras)} pictures; minutes for tens of cameras, longer for large pictures")
-    mapping = _map(cameras, images, poses, test, options)
+    mapping = _map(cameras, images, known, test, options)
     kept = [i for i, there in enumerate(mapping.registered) if there]
     if sum(names[i] not in test for i in kept) < 2:
         raise InputError(
@@ -108,13 +110,13 @@ def prepare(raw: Path, out: Path, options: PrepareOptions, say: Say) -> Prepared
     say(f"kept {len(points)} points; writing pictures")
     frames = _write_pictures([cameras[i] for i in kept], [lens for _, lens in lenses], out, options)
     fps = known.fps if known else options.fps
-    _write(out, raw, rig, test, points, bounds, frames, fps, "" if known is None else known.licence)
+    _write(out, title, rig, test, points, bounds, frames, fps, "" if known is None else known.licence)
     left_out = tuple(name for i, name in enumerate(names) if i not in kept)
     return Prepared(names, left_out, test, mapping, rig, points, bounds, frames, known is not None)
 
 
 def _map(
-    cameras: list[RawCamera], images: list[FloatArray], known: Cameras | None, test: Sequence[str],
+    cameras: list[RawCamera], images: list[FloatArray], known: GivenRig | None, test: Sequence[str],
     options: PrepareOptions,
 ) -> Mapping:  # fmt: skip
     one_size = len({camera.size for camera in cameras}) == 1
@@ -124,34 +126,35 @@ def _map(
         shared = one_size and not options.each
         return reconstruct(images, model=options.model, shared=shared, held=held)
     training = [i for i in range(len(cameras)) if i not in held]
-    cut = [
-        images[i] if one_size else _given(cameras[i], known, i).apply(images[i]) for i in training
-    ]
-    found = triangulate(np.stack(cut), known.select(training))
+    size = _smallest([cameras[i] for i in training])
+    flat = [_flat(images[i], cameras[i].size, known.lenses[i], size) for i in training]
+    rig = Cameras(
+        tuple(cameras[i].name for i in training), known.viewmats[training], np.stack([K for K, _ in flat]), *size
+    )
+    found = triangulate(np.stack([image for _, image in flat]), rig)
     # The test cameras' poses are given; nothing of theirs is used.
     error, seen = np.full(len(cameras), np.nan), np.zeros(len(cameras), np.int64)
     error[training], seen[training] = found.camera_error, found.camera_points
-    lenses = [found.lenses[0]] * len(cameras)
-    for i, camera in enumerate(cameras):
-        lenses[i] = _raw_lens(camera, known, i)
-    return replace(found, viewmats=known.viewmats, lenses=tuple(lenses), camera_error=error, camera_points=seen)
+    return replace(found, viewmats=known.viewmats, lenses=known.lenses, camera_error=error, camera_points=seen)
 
 
-def _given(camera: RawCamera, known: Cameras, i: int) -> Undistortion:
-    """How a picture of a given pinhole camera is brought to the size of the rig; ``known.Ks`` are those of the rig."""
-    lens = _raw_lens(camera, known, i)
-    return undistortion(lens, camera.size, (known.width, known.height))
+def _flat(
+    image: FloatArray, size: tuple[int, int], lens: Lens, target: tuple[int, int]
+) -> tuple[FloatArray, FloatArray]:
+    """(K, picture) of a pinhole camera of the target size."""
+    if not lens.distorts and size == target:
+        return lens.K, image
+    made = undistortion(lens, size, target)
+    return made.K, made.apply(image)
 
 
-def _raw_lens(camera: RawCamera, known: Cameras, i: int) -> Lens:
-    """The given pinhole of a camera in pixels of its own pictures."""
-    back = np.linalg.inv(cut_to(np.eye(3), camera.size, (known.width, known.height)))
-    K = back @ known.Ks[i]
-    return Lens("PINHOLE", (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+def _smallest(cameras: list[RawCamera]) -> tuple[int, int]:
+    width, height = (min(camera.size[axis] for camera in cameras) for axis in (0, 1))
+    return width, height
 
 
 def _target(cameras: list[RawCamera], options: PrepareOptions) -> tuple[int, int]:
-    width, height = (min(camera.size[axis] for camera in cameras) for axis in (0, 1))
+    width, height = _smallest(cameras)
     if options.width is None or options.width == width:
         return width, height
     if not 0 < options.width < width:
@@ -204,7 +207,7 @@ def _write_pictures(
     for camera, lens in zip(cameras, lenses, strict=True):
         folder = child(out, camera.name)
         folder.mkdir(parents=True)
-        if lens is None and not camera.is_video and camera.files[0].suffix.lower() in (".png", ".jpg"):
+        if lens is None and camera.copied:
             chosen = camera.files[: options.frames]
             for t, path in enumerate(chosen):
                 shutil.copyfile(path, folder / f"{t:06d}{path.suffix.lower()}")
@@ -220,7 +223,7 @@ def _write_pictures(
 
 
 def _write(
-    out: Path, raw: Path, rig: Cameras, test: Sequence[str], points: PointCloud, bounds: FloatArray, frames: int,
+    out: Path, title: str, rig: Cameras, test: Sequence[str], points: PointCloud, bounds: FloatArray, frames: int,
     fps: float, licence: str,
 ) -> None:  # fmt: skip
     entries: list[dict[str, Any]] = []
@@ -231,17 +234,8 @@ def _write(
             "K": rig.Ks[i].tolist(), "w2c": rig.viewmats[i].tolist(), "frames": f"{name}/%06d{suffix}",
         })  # fmt: skip
     data = {
-        "schema": SCHEMA, "name": raw.name, "fps": fps, "frames": frames, "licence": licence,
+        "schema": SCHEMA, "name": title, "fps": fps, "frames": frames, "licence": licence,
         "bounds": bounds.tolist(), "cameras": entries,
     }  # fmt: skip
     (out / CALIBRATION_FILE).write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
     np.savez(out / "points_frame0.npz", xyz=points.xyz, rgb=np.round(points.rgb * 255).astype(np.uint8))
-
-
-def _joined(train: Cameras, test: Cameras) -> Cameras:
-    return replace(
-        train,
-        ids=(*train.ids, *test.ids),
-        viewmats=np.concatenate([train.viewmats, test.viewmats]),
-        Ks=np.concatenate([train.Ks, test.Ks]),
-    )

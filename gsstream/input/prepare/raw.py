@@ -1,4 +1,4 @@
-"""Raw recordings: a folder or a video per camera, or one photograph per camera."""
+"""Raw recordings: a folder or a video per camera, or one photograph per camera; and those that a run reads, too."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from gsstream.core.names import check_camera_ids
 from gsstream.core.needs import install_extra
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.calibration import CALIBRATION_FILE, frame_path, read_calibration
+from gsstream.input.recordings.clips import Clip
 from gsstream.input.recordings.images import PICTURE_FORMATS, read_image
 from gsstream.input.recordings.video import upright
 
@@ -22,18 +23,35 @@ VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".ts")
 
 @dataclass(frozen=True, slots=True)
 class RawCamera:
-    """One camera: its pictures in order, or its video; ``size``: (width, height) of frame 0."""
+    """One camera: its pictures in order, its video, or what the reader of a layout made of them.
+
+    Arguments:
+        name: its id.
+        files: pictures in order, or one video; none where there is a clip.
+        size: (width, height) of frame 0.
+        clip: the pictures as a reader found them, of which those of ``span`` are taken.
+    """
 
     name: str
     files: tuple[Path, ...]
     size: tuple[int, int]
+    clip: Clip | None = None
+    span: range = range(0)
 
     @property
     def is_video(self) -> bool:
-        return self.files[0].suffix.lower() in VIDEOS
+        return bool(self.files) and self.files[0].suffix.lower() in VIDEOS
+
+    @property
+    def copied(self) -> bool:
+        """Whether its pictures are files that a scene may hold as they are."""
+        return bool(self.files) and self.files[0].suffix.lower() in (".png", ".jpg")
 
     def frames(self, most: int | None) -> Iterator[FloatArray]:
         """Read the first ``most`` pictures [H, W, 3] in [0, 1]. Raises SourceError for one that cannot be read."""
+        if self.clip is not None:
+            yield from (self.clip.read(index, self.size) for index in self.span[:most])
+            return
         if self.is_video:
             yield from _video_frames(self.files[0], most)
             return

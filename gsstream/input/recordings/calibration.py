@@ -14,6 +14,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError, SourceError
 from gsstream.core.names import check_camera_ids
 from gsstream.input.recordings.base import Split
+from gsstream.input.recordings.clips import prepare_command
 
 SCHEMA = "opencv-multiview-1"
 #: Beyond these a file describes no recording; checked before anything is allocated or opened.
@@ -93,7 +94,7 @@ def _rig(path: Path, ids: list[str], cameras: list[dict[str, Any]], to_size: boo
         if size != first and not to_size:
             raise SourceError(
                 f"{path}: all cameras of a rig must share one image size, but {ids[0]!r} is {first[0]} x {first[1]} "
-                f"and {camera_id!r} is {size[0]} x {size[1]}; 'gsstream scene prepare' brings them to one"
+                f"and {camera_id!r} is {size[0]} x {size[1]}; to bring them to one: {prepare_command(str(path.parent))}"
             )
     poses = np.stack([_matrix(path, i, c, "w2c", 4) for i, c in zip(ids, cameras, strict=True)])
     intrinsics = np.stack([_matrix(path, i, c, "K", 3) for i, c in zip(ids, cameras, strict=True)])

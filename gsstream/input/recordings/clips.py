@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
@@ -14,8 +15,6 @@ from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.base import FilesMissing
 from gsstream.input.recordings.images import PICTURE_FORMATS, read_image
 
-#: What to do about cameras of different sizes, for messages.
-PREPARE = "'gsstream scene prepare' brings pictures to one size"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 
@@ -94,6 +93,17 @@ def _size_of(path: Path) -> tuple[int, int]:
         raise SourceError(
             f"{path}: the image cannot be opened ({error}); expected PNG or JPEG: copy or export it again"
         ) from error
+
+
+def prepare_command(source: str) -> str:
+    """Return the command that makes a scene of a recording which cannot be run as it is, for messages.
+
+    Arguments:
+        source: as it was asked for, with a query or without one.
+    """
+    source = source.partition("?")[0]
+    out = Path(source.rpartition(":")[2]).resolve().name + "-prepared"
+    return f"gsstream scene prepare {shlex.quote(source)} --out {shlex.quote(out)}"
 
 
 def natural_sort_key(path: Path) -> list[tuple[int, str]]:

@@ -8,6 +8,7 @@ from typing import Any
 
 from gsstream.core.errors import SourceError
 from gsstream.input.recordings.calibration import CALIBRATION_FILE
+from gsstream.input.recordings.clips import prepare_command
 from gsstream.input.recordings.recorded import Recording
 
 #: Name -> (module in ``layouts``, what it looks like).
@@ -25,6 +26,11 @@ def _reader(name: str) -> Any:
     return importlib.import_module(f"gsstream.input.recordings.layouts.{LAYOUTS[name][0]}")
 
 
+def layouts_of(folder: Path) -> list[str]:
+    """Names of the layouts that the files of a folder fit."""
+    return [name for name in LAYOUTS if _reader(name).looks_like(folder)]
+
+
 def detect(folder: Path) -> str:
     """Name of the layout of a folder; "folder" for one with cameras.json, which always counts.
 
@@ -32,7 +38,7 @@ def detect(folder: Path) -> str:
     """
     if (folder / CALIBRATION_FILE).is_file():
         return "folder"
-    found = [name for name in LAYOUTS if _reader(name).looks_like(folder)]
+    found = layouts_of(folder)
     if len(found) == 1:
         return found[0]
     if found:
@@ -41,7 +47,7 @@ def detect(folder: Path) -> str:
     known = "; ".join(f"{name}: {looks}" for name, (_, looks) in LAYOUTS.items())
     raise SourceError(
         f"{folder}: no known layout. Expected {CALIBRATION_FILE}, or one of these: {known}. Videos or images without a "
-        "calibration: 'gsstream scene prepare'"
+        f"calibration: {prepare_command(str(folder))}"
     )
 
 

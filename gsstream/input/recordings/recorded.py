@@ -13,7 +13,7 @@ from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.names import check_camera_ids
 from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.input.recordings.base import PointKind, SourceInfo, Split, check_index
-from gsstream.input.recordings.clips import PREPARE, Clip
+from gsstream.input.recordings.clips import Clip, prepare_command
 from gsstream.input.recordings.distortion import Lens, Undistorter, pinhole_intrinsics
 from gsstream.input.recordings.multiview import scaled_size
 from gsstream.input.recordings.sync import align
@@ -39,6 +39,7 @@ class Recording:
         test: ids of the cameras that only judge.
         fps: frames per second; videos know better.
         lenses: camera id -> distortion, where there is any.
+        sizes: camera id -> (width, height) of its pictures; empty: all have those of the rig.
         points: reads points of frame 0; None when none ship.
     """
 
@@ -49,6 +50,7 @@ class Recording:
     test: tuple[str, ...] = ()
     fps: float = 30.0
     lenses: Mapping[str, Lens] = field(default_factory=dict)
+    sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     points: Callable[[], SeenPoints | None] = lambda: None
     licence: str = ""
 
@@ -68,7 +70,7 @@ class RecordedSource:
 
     def __init__(self, recording: Recording, *, scale: float = 1.0, uri: str) -> None:
         self._recording = recording
-        rig = _checked(recording)
+        rig = _checked(recording, uri)
         self._target = scaled_size((rig.width, rig.height), scale)
         self._alignment = align(recording.name, recording.clips)
         self._undistort: dict[str, Undistorter] = {}
@@ -141,8 +143,8 @@ class RecordedSource:
         return replace(rig, Ks=Ks)
 
 
-def _checked(recording: Recording) -> Cameras:
-    """The rig, once its clips are known to fit it."""
+def _checked(recording: Recording, uri: str) -> Cameras:
+    """The rig, once its clips are known to fit it and each other."""
     rig = recording.rig
     try:
         check_camera_ids(rig.ids)
@@ -154,11 +156,23 @@ def _checked(recording: Recording) -> Cameras:
     for name in recording.test:
         if name not in rig.ids:
             raise SourceError(f"{recording.where}: test camera {name!r} does not exist; cameras: {', '.join(rig.ids)}")
+    if len(set(recording.sizes.values())) > 1:
+        told = ", ".join(f"{name} {w} x {h}" for name, (w, h) in recording.sizes.items())
+        raise SourceError(
+            f"{recording.where}: all cameras of a rig must share one image size, got {told}; to bring pictures to one "
+            f"size: {prepare_command(uri)}"
+        )
+    check_sizes(recording)
+    return rig
+
+
+def check_sizes(recording: Recording) -> None:
+    """Raise SourceError for a clip whose pictures are not of the size that the calibration is for."""
+    rig = recording.rig
     for name, clip in recording.clips.items():
-        if clip.size != (rig.width, rig.height):
+        width, height = recording.sizes.get(name, (rig.width, rig.height))
+        if clip.size != (width, height):
             raise SourceError(
                 f"{clip.where}: pictures of camera {name!r} are {clip.size[0]} x {clip.size[1]} pixels, but "
-                f"{recording.where} is for {rig.width} x {rig.height}; all cameras of a rig share one size: correct "
-                f"the calibration, or {PREPARE}"
+                f"{recording.where} is for {width} x {height}: correct the calibration, or restore the pictures"
             )
-    return rig

@@ -16,7 +16,7 @@ from gsstream.core.shapes import BoolArray, FloatArray, IntArray
 from gsstream.input.seeds.sfm import run_pycolmap, write_images, write_rig
 
 #: Number of focal lengths among the parameters of a lens model; the principal point follows, then the distortion.
-LENSES = {"PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "OPENCV_FISHEYE": 2}
+LENSES = {"PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "OPENCV_FISHEYE": 2, "FULL_OPENCV": 2}
 
 
 @dataclass(frozen=True, slots=True)

@@ -79,7 +79,7 @@ def findings(folder: Path) -> list[Finding]:
 
 
 def said(folder: Path, finding: Finding) -> str:
-    return finding.message.replace(str(folder), "SCENE")
+    return finding.message.replace(f"{folder.name}-prepared", "SCENE-prepared").replace(str(folder), "SCENE")
 
 
 def without_numbers(message: str) -> str:

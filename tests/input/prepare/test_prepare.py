@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -250,3 +252,42 @@ def test_unknown_cameras_of_other_sizes_are_placed(tmp_path: Path) -> None:
         for rig in (made.rig.select([made.rig.ids.index(truth.train.ids[i]) for i in kept]), truth.train.select(kept))
     )
     assert np.abs(gaps / gaps.max() - real / real.max()).max() < 0.03
+
+
+def photographs(folder: Path) -> Path:
+    """A nerfstudio folder as tools write it: pictures named by digits, one of another size, a lens that distorts."""
+    source = open_source(LARGE)
+    frame, entries = source.frame(0, "train"), []
+    for number, (image, K, w2c) in enumerate(zip(frame.images, frame.cameras.Ks, frame.cameras.viewmats, strict=True)):
+        image = image[:, : 320 - 16 * (number == 3)]
+        folder.mkdir(exist_ok=True)
+        save(folder / f"{number:04d}.png", image)
+        pose = np.linalg.inv(w2c) @ np.diag([1.0, -1, -1, 1])
+        entries.append({
+            "file_path": f"{number:04d}.png", "transform_matrix": pose.tolist(), "w": image.shape[1], "h": 240,
+            "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "k1": 1e-3, "k3": 1e-3,
+        })  # fmt: skip
+    (folder / "transforms.json").write_text(json.dumps({"frames": entries}))
+    return folder
+
+
+@pytest.mark.sfm
+@needs_pycolmap
+def test_photographs_become_a_picture_by_the_printed_commands_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    few = ["--scale", "0.25", "--frames", "1", "--no-video", "--set", "first_frame.max_iterations=20", "--out", "o"]
+    assert run_command(["run", "--source", str(photographs(tmp_path / "fox")), *few]) == 2
+    (made,) = re.findall(r"gsstream (scene prepare \S+ --out (\S+))$", capsys.readouterr().err.strip())
+    assert run_command(made[0].split()) == 0
+    capsys.readouterr()
+    scene, rig = open_source(made[1]).info.train, open_source(LARGE).info.train
+    assert scene.ids == tuple(f"{number:04d}" for number in range(10))
+    assert (scene.width, scene.height) == (304, 240)
+    assert np.allclose(scene.viewmats, rig.viewmats, atol=1e-9)
+    assert run_command(["run", "--source", made[1], *few]) == 0
+    (setting,) = re.findall(r"--set (\S+)$", capsys.readouterr().err, re.MULTILINE)
+    assert run_command(["run", "--source", made[1], *few, "--overwrite", "--set", *shlex.split(setting)]) == 0
+    assert " dB" in capsys.readouterr().err
+    assert (tmp_path / "o" / "contact_sheet.png").stat().st_size > 1000

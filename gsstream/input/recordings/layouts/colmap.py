@@ -16,7 +16,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import PointCloud
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.clips import PREPARE, VIDEO_SUFFIXES, Clip, ImageClip, folder_clip, images_in
+from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip, images_in
 from gsstream.input.recordings.distortion import Lens
 from gsstream.input.recordings.layouts.colmap_model import (
     ModelCamera,
@@ -63,9 +63,6 @@ def read(folder: Path) -> Recording:
         sizes[name] = (camera.width, camera.height)
         if lens is not None and not lens.is_identity:
             lenses[name] = lens
-    if len(set(sizes.values())) > 1:
-        told = ", ".join(f"{name} {w} x {h}" for name, (w, h) in sizes.items())
-        raise SourceError(f"{model}: all cameras of a rig must share one image size, got {told}; {PREPARE}")
     rig = Cameras(tuple(names), np.stack(poses), np.stack(Ks), *sizes[names[0]])
     clips = {name: _clip(folder, name, images[number].name) for name, number in zip(names, numbers, strict=True)}
     return Recording(
@@ -74,6 +71,7 @@ def read(folder: Path) -> Recording:
         rig=rig,
         clips=clips,
         lenses=lenses,
+        sizes=sizes,
         points=lambda: _points(model, numbers),
     )
 

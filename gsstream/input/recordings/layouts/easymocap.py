@@ -61,6 +61,7 @@ def read(folder: Path) -> Recording:
         clips=clips,
         test=(names[0],),
         lenses=lenses,
+        sizes={name: clip.size for name, clip in clips.items()},
         licence="see the data set",
     )
 

@@ -25,7 +25,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.clips import PREPARE, VIDEO_SUFFIXES, Clip, ImageClip, folder_clip
+from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip
 from gsstream.input.recordings.distortion import Lens
 from gsstream.input.recordings.layouts.nerfstudio_groups import group_entries
 from gsstream.input.recordings.pointfiles import read_ply_points
@@ -46,7 +46,7 @@ def looks_like(folder: Path) -> bool:
 def read(folder: Path, missing: Missing = "skip") -> Recording:
     """Read one rig of cameras that stand still.
 
-    Raises SourceError for a camera that moves, for cameras of different sizes, and for what is not as expected.
+    Raises SourceError for a camera that moves, and for what is not as expected.
     """
     path = folder / FILE
     data = _load(path)
@@ -68,9 +68,6 @@ def read(folder: Path, missing: Missing = "skip") -> Recording:
         lens = _lens(path, merged)
         if lens is not None and not lens.is_identity:
             lenses[name] = lens
-    if len(set(sizes.values())) > 1:
-        told = ", ".join(f"{name} {w} x {h}" for name, (w, h) in sizes.items())
-        raise SourceError(f"{path}: all cameras of a rig must share one image size, got {told}; {PREPARE}")
     names = tuple(groups)
     held_out = {str(f) for key in ("test_filenames", "val_filenames") for f in data.get(key) or ()}
     test = tuple(name for name, entries in groups.items() if any(e["file_path"] in held_out for e in entries))
@@ -82,6 +79,7 @@ def read(folder: Path, missing: Missing = "skip") -> Recording:
         test=test,
         fps=float(data.get("fps", 30.0)),
         lenses=lenses,
+        sizes=sizes,
         points=lambda: _points(folder, data, len(names)),
     )
 

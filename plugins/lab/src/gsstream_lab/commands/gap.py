@@ -44,7 +44,6 @@ def gap(
     cameras allow, and the gap too small.
     """
     from gsstream.core.errors import InputError
-    from gsstream.core.needs import require_encoder
     from gsstream.engine.run.output import write_whole
     from gsstream.engine.run.recording import open_recording
     from gsstream.evaluation.gallery import write_sheet
@@ -54,7 +53,6 @@ def gap(
     from gsstream_lab.gap.fresh import FreshFrames, check_cameras
     from gsstream_lab.gap.measure import GAP_FILES, default_frames, measure_gap
 
-    require_encoder()
     file = stream_file(run)
     if not run.is_dir() or not (run / "recipe.yaml").is_file():
         raise InputError(f"no recipe at {run / 'recipe.yaml'}: expected the output folder of 'gsstream run'")

@@ -33,6 +33,10 @@ class Hierarchy:
     def num_gaussians(self) -> int:
         return int(self.node_of.shape[0])
 
+    def to(self, device: torch.device) -> Hierarchy:
+        """Return the same forest on a device."""
+        return Hierarchy(self.node_of.to(device), self.parent.to(device), self.level.to(device))
+
     def rows(self, index: Any) -> Hierarchy:
         """Return the same forest seen by a subset of the Gaussians."""
         return Hierarchy(self.node_of[index], self.parent, self.level)

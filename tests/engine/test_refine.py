@@ -189,7 +189,7 @@ def refinement(gaussians: Gaussians[np.ndarray], ancestors: list[int]) -> Refine
     count = len(ancestors)
     return Refinement(
         gaussians.map(torch.from_numpy), torch.zeros(count, dtype=torch.int64), torch.tensor(ancestors), {},
-        DensifyStatistics.zeros(count), 0,
+        DensifyStatistics.zeros(count, torch.device("cpu")), 0,
     )  # fmt: skip
 
 

@@ -208,7 +208,7 @@ def estimated_bytes(symbols: torch.Tensor) -> float:
         return 0.0
     low = int(symbols.min())
     width = int(symbols.max()) - low + 1
-    keys = (symbols - low).long() + width * torch.arange(channels)
+    keys = (symbols - low).long() + width * torch.arange(channels, device=symbols.device)
     counts = torch.bincount(keys.reshape(-1), minlength=width * channels).double()
     used = counts[counts > 0]
     return float((used * (rows / used).log2()).sum()) / 8 + 0.75 * len(used) + 8 * channels

@@ -23,8 +23,12 @@ class DensifyStatistics:
     count: torch.Tensor
 
     @staticmethod
-    def zeros(num: int) -> DensifyStatistics:
-        return DensifyStatistics(torch.zeros(num), torch.zeros(num))
+    def zeros(num: int, device: torch.device) -> DensifyStatistics:
+        return DensifyStatistics(torch.zeros(num, device=device), torch.zeros(num, device=device))
+
+    def to(self, device: torch.device) -> DensifyStatistics:
+        """Return the same on a device."""
+        return DensifyStatistics(self.total.to(device), self.count.to(device))
 
     def add(self, gradient: torch.Tensor) -> DensifyStatistics:
         """Add one iteration's gradients [N, 2]."""
@@ -73,7 +77,7 @@ def grow_and_prune(
     split[hot] = largest[hot] > SPLIT_SIZE * limits.extent
     kept = keep.nonzero()[:, 0]
     source = torch.cat([kept, hot])
-    fresh = torch.cat([split[kept], torch.ones(len(hot), dtype=torch.bool)])
+    fresh = torch.cat([split[kept], torch.ones_like(hot, dtype=torch.bool)])
     values = dict(split_or_clone(gaussians, source, split[source], generator).items())
     return TopologyEdit(source, fresh), values
 
@@ -91,7 +95,8 @@ def split_or_clone(
     """
     added = gaussians.rows(parents).map(torch.clone)
     if bool(halves.any()):
-        spread = torch.randn(int(halves.sum()), 3, generator=generator) * activate_scales(added.scales[halves])
+        normal = torch.randn(int(halves.sum()), 3, generator=generator).to(added.means.device)
+        spread = normal * activate_scales(added.scales[halves])
         turned = (rotation_matrices(added.quats[halves]) @ spread[..., None])[..., 0]
         added.means[halves] += turned
         added.scales[halves] -= float(torch.tensor(SPLIT_SHRINK).log())

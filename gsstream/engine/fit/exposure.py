@@ -24,14 +24,15 @@ class ExposureFit:
     steps: tuple[int, ...]
 
     @staticmethod
-    def start(num_cameras: int) -> ExposureFit:
-        zeros = torch.zeros(num_cameras, 12)
-        return ExposureFit(Exposure.identity(num_cameras), zeros, zeros, (0,) * num_cameras)
+    def start(num_cameras: int, device: torch.device) -> ExposureFit:
+        zeros = torch.zeros(num_cameras, 12, device=device)
+        return ExposureFit(Exposure.identity(num_cameras).to(device), zeros, zeros, (0,) * num_cameras)
 
     def step(self, view: int, grad: torch.Tensor, lr: float, identity_weight: float) -> ExposureFit:
         """Make one Adam step of camera ``view``."""
         matrix, offset = self.exposure.matrix[view], self.exposure.offset[view]
-        grad = grad + identity_weight * torch.cat([(matrix - torch.eye(3)).flatten(), offset])
+        identity = torch.eye(3, device=matrix.device)
+        grad = grad + identity_weight * torch.cat([(matrix - identity).flatten(), offset])
         count = self.steps[view] + 1
         first = 0.9 * self.first[view] + 0.1 * grad
         second = 0.999 * self.second[view] + 0.001 * grad.square()
@@ -46,7 +47,8 @@ class ExposureFit:
     def centered(self) -> ExposureFit:
         """Shift all maps so that their mean is identity: the gauge in which held-out cameras are compared."""
         matrix, offset = self.exposure.matrix, self.exposure.offset
-        centered = Exposure(matrix - matrix.mean(0) + torch.eye(3), offset - offset.mean(0))
+        identity = torch.eye(3, device=matrix.device)
+        centered = Exposure(matrix - matrix.mean(0) + identity, offset - offset.mean(0))
         return replace(self, exposure=centered)
 
 

@@ -86,5 +86,5 @@ class TrainedGates:
 
 def _roots(node_of: torch.Tensor, number: int) -> Hierarchy:
     """``number`` roots and nothing else: sampling does not look at parents."""
-    roots = torch.arange(number)
+    roots = torch.arange(number, device=node_of.device)
     return Hierarchy(node_of, roots, torch.zeros_like(roots))

@@ -37,7 +37,7 @@ class TrainingViews:
 
     def error(self, view: int, image: torch.Tensor) -> float:
         """Return the mean squared error of what a camera would record [H, W, 3]."""
-        return float((image - torch.from_numpy(self.frame.images[view])).square().mean())
+        return float((image - torch.from_numpy(self.frame.images[view]).to(image.device)).square().mean())
 
 
 class HutchinsonSample(NamedTuple):
@@ -69,7 +69,7 @@ def hutchinson_samples(
         seen = image.detach() if exposure is None else exposure[view].apply(image.detach())
         error = views.error(view, seen)
         for number in range(each):
-            signs = torch.randint(0, 2, image.shape, generator=generator).to(image.dtype) * 2 - 1
+            signs = torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1
             upstream = signs if exposure is None else exposure[view].vjp(signs)
             backward([image], [upstream], retain_graph=number < each - 1)
             yield HutchinsonSample(leaves.map(_pop_grad), error)

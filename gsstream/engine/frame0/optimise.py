@@ -40,6 +40,7 @@ from gsstream.parts.structure.base import Anchors
 from gsstream.recipe.model import FirstFrame
 
 CENTER_EVERY = 50
+CPU = torch.device("cpu")
 Progress = Callable[[int, int, float, int], None]
 
 
@@ -104,19 +105,19 @@ def optimise_first_frame(
     pyramid = plan_pyramid(frame.cameras.width, iterations, settings)
     # The name of this random stream is that of older versions, so that a seed still gives the same frame 0.
     run = FirstFrameRun(start, levels, frame, parts, rng.stream("root", frame.index), pyramid)
-    run.exposure = ExposureFit.start(len(frame.cameras)) if settings.exposure else None
+    run.exposure = ExposureFit.start(len(frame.cameras), run.device) if settings.exposure else None
     for level in pyramid.levels:
         run.enter(level)
         for iteration in range(level.begin + 1, level.end + 1):
             value = run.step(iteration)
             progress(iteration, pyramid.iterations, value, len(run.levels))
-    exposure = run.exposure.centered().exposure if run.exposure else None
-    found = run.gaussians().map(torch.Tensor.detach)
+    exposure = run.exposure.centered().exposure.to(CPU) if run.exposure else None
+    found = run.gaussians().map(lambda value: value.detach().to(CPU))
     parts.where.enter(frame.index)
     look = Look(parts.checks, "first frame", run.table, parts.where)
     for name, values in found.items():
         look.values(f"{name} after the last iteration ({VARIABLE}=step finds the first)", values)
-    return Reconstruction(found, run.levels, exposure, pyramid.iterations)
+    return Reconstruction(found, run.levels.to(CPU), exposure, pyramid.iterations)
 
 
 class FirstFrameRun:
@@ -137,21 +138,23 @@ class FirstFrameRun:
     ) -> None:  # fmt: skip
         self.parts, self.recipe, self.whole = parts, parts.recipe, frame
         self.settings = parts.recipe.first_frame
-        self.renderer, self.levels = parts.renderer, levels
+        self.renderer, self.device = parts.renderer, parts.renderer.device
+        self.levels = levels.to(self.device)
         self.views = len(frame.cameras)
         self.extent = frame.cameras.extent
         self.widest = schedule.MAX_SCALE * self.extent
         if self.settings.shell:
             self.widest = max(self.widest, schedule.MAX_SHELL_SCALE * find_shell(frame.cameras).sigma)
         self.pyramid, self.iterations, self.generator = pyramid, pyramid.iterations, generator
-        self.table = RowParameters(dict(start.items()), first_frame_lrs(self.settings, self.extent), parts.optimiser)
+        values = {name: value.to(self.device) for name, value in start.items()}
+        self.table = RowParameters(values, first_frame_lrs(self.settings, self.extent), parts.optimiser)
         self._set_level(pyramid.levels[0], None)
         #: Colour maps that are fitted along; None: those of the photometric loss stay.
         self.exposure: ExposureFit | None = None
-        self.statistics = DensifyStatistics.zeros(len(start))
+        self.statistics = DensifyStatistics.zeros(len(start), self.device)
         self.regularisers = choose_regularisers(self.settings, frame.cameras)
         #: [N] row of ``start`` that each Gaussian comes from.
-        self.came_from = torch.arange(len(start))
+        self.came_from = torch.arange(len(start), device=self.device)
         self.order: list[int] = []
         self.smooth = math.nan
 
@@ -164,12 +167,12 @@ class FirstFrameRun:
             return
         scene = self.gaussians().map(torch.Tensor.detach)
         scene.scales.copy_(keep_widths(scene, self.whole.cameras, self.level.factor, level.factor))
-        self.statistics = DensifyStatistics.zeros(len(self.levels))
+        self.statistics = DensifyStatistics.zeros(len(self.levels), self.device)
         self._set_level(level, self.photometric.exposure)
 
     def _set_level(self, level: PyramidLevel, exposure: Exposure | None) -> None:
         self.level, self.frame = level, shrink_frame(self.whole, level.factor)
-        self.photometric = PhotometricLoss(self.parts.loss, schedule.DSSIM, self.frame.images, exposure)
+        self.photometric = PhotometricLoss(self.parts.loss, schedule.DSSIM, self.frame.images, exposure, self.device)
 
     def step(self, iteration: int) -> float:
         view, self.parts.where.iteration = self._next_view(), iteration
@@ -198,7 +201,8 @@ class FirstFrameRun:
         """The scene with noise on its centres, through which gradients pass unchanged; as it is without noise."""
         if self.settings.noise == 0:
             return rows
-        noise = torch.randn(rows.means.shape, generator=self.generator) * (self.settings.noise * self.extent)
+        noise = torch.randn(rows.means.shape, generator=self.generator).to(rows.means.device)
+        noise *= self.settings.noise * self.extent
         return replace(rows, means=rows.means + noise)
 
     def _loss_and_grad(self, view: int, wrt: WrtScene) -> LossAndGrad[Gaussians[torch.Tensor]]:
@@ -229,7 +233,7 @@ class FirstFrameRun:
         edit, values = grow_and_prune(gaussians, self.statistics, limits, self.generator)
         self.table.edit(edit, values)
         self.levels, self.came_from = self.levels[edit.source], self.came_from[edit.source]
-        self.statistics = DensifyStatistics.zeros(len(self.levels))
+        self.statistics = DensifyStatistics.zeros(len(self.levels), self.device)
 
     def _prune(self) -> None:
         """Drop what the images would not miss; what remains has time to close the gaps."""
@@ -240,7 +244,7 @@ class FirstFrameRun:
         rows = prune_by_error(views, gaussians, self.generator, least)
         self.table.select_rows(rows)
         self.levels, self.came_from = self.levels[rows], self.came_from[rows]
-        self.statistics = DensifyStatistics.zeros(len(rows))
+        self.statistics = DensifyStatistics.zeros(len(rows), self.device)
 
     def _next_view(self) -> int:
         if not self.order:

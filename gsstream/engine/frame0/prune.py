@@ -37,7 +37,7 @@ def removal_errors(
     channel of a pixel.
     """
     rows = replace(gaussians, opacities=gaussians.opacities.clamp(max=MAX_LOGIT))
-    squares = torch.zeros(len(rows), dtype=torch.float64)
+    squares = torch.zeros_like(rows.opacities, dtype=torch.float64)
     error = 0.0
     for probe in hutchinson_samples(views, rows, generator, each=HUTCHINSON_SAMPLES):
         squares += probe.grad.opacities.double().square()
@@ -53,7 +53,7 @@ def retained_rows(errors: torch.Tensor, least: float) -> torch.Tensor:
     Where no absence adds more than ``least``, all rows remain.
     """
     rows = (errors > least).nonzero()[:, 0]
-    return rows if len(rows) else torch.arange(len(errors))
+    return rows if len(rows) else torch.arange(len(errors), device=errors.device)
 
 
 def prune_by_error(
@@ -72,7 +72,7 @@ def prune_by_error(
         if _mean_error(views, gaussians.rows(rows)) <= GROWTH * error:
             return rows
         least /= 4
-    return torch.arange(len(errors))
+    return torch.arange(len(errors), device=errors.device)
 
 
 def _mean_error(views: TrainingViews, gaussians: Gaussians[torch.Tensor]) -> float:

@@ -97,7 +97,7 @@ def keep_widths(gaussians: Gaussians[torch.Tensor], cameras: Cameras, before: in
     at their own size, ``before`` and ``now`` how many times smaller than these the pictures were and are.
     """
     focal = float(cameras.Ks[:, 0, 0].mean())
-    means = gaussians.means.numpy()
+    means = gaussians.means.cpu().numpy()
     distances = np.median([np.linalg.norm(means - center, axis=1) for center in cameras.centers], 0)
-    variance = torch.from_numpy(BLUR * (distances / focal) ** 2 * (before**2 - now**2)).float()
+    variance = torch.from_numpy(BLUR * (distances / focal) ** 2 * (before**2 - now**2)).to(gaussians.scales)
     return 0.5 * torch.log(torch.exp(2 * gaussians.scales) + variance[:, None])

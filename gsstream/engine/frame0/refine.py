@@ -22,7 +22,7 @@ from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.densify import DensifyStatistics
 from gsstream.engine.frame0.axes import quat_conjugate, quat_multiply_torch
-from gsstream.engine.frame0.optimise import FirstFrameRun
+from gsstream.engine.frame0.optimise import CPU, FirstFrameRun
 from gsstream.engine.frame0.pyramid import one_size
 from gsstream.engine.state.refinement import Refinement
 from gsstream.engine.state.stream_state import Step, StreamState
@@ -78,7 +78,7 @@ def start_refinement(player: PlayerState) -> Refinement:
     gaussians = player.gaussians.map(torch.from_numpy)
     count = len(gaussians)
     levels = torch.from_numpy(player.layout.unit_of.astype(np.int64))
-    return Refinement(gaussians, levels, torch.arange(count), {}, DensifyStatistics.zeros(count), 0)
+    return Refinement(gaussians, levels, torch.arange(count), {}, DensifyStatistics.zeros(count, gaussians.means.device), 0)
 
 
 def advance_refinement(
@@ -92,15 +92,17 @@ def advance_refinement(
     generator = rng.stream("refine", frame.index)
     pyramid = one_size(_iterations(stream), parts.recipe.first_frame)
     run = FirstFrameRun(start.gaussians, start.levels, frame, parts, generator, pyramid)
-    run.photometric.exposure, run.statistics = exposure, start.statistics
+    run.photometric.exposure = None if exposure is None else exposure.to(run.device)
+    run.statistics = start.statistics.to(run.device)
     for name, held in start.moments.items():
         run.table.load_moments(name, held)
     last = start.iterations + stream.refine_iterations
     for iteration in range(start.iterations + 1, last + 1):
         run.step(iteration)
-    moments = {name: run.table.moments(name) for name in ATTRIBUTES}
-    found = run.gaussians().map(torch.Tensor.detach)
-    return Refinement(found, run.levels, start.ancestors[run.came_from], moments, run.statistics, last)
+    moments = {name: {key: value.to(CPU) for key, value in run.table.moments(name).items()} for name in ATTRIBUTES}
+    found = run.gaussians().map(lambda value: value.detach().to(CPU))
+    ancestors = start.ancestors[run.came_from.to(CPU)]
+    return Refinement(found, run.levels.to(CPU), ancestors, moments, run.statistics.to(CPU), last)
 
 
 def track_motion(refinement: Refinement, before: PlayerState, after: PlayerState) -> Refinement:

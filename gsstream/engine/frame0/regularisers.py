@@ -59,6 +59,6 @@ def thin_out(
     """Return the rows with the opacity that makes up for those left out, and which [N] are kept (None: all)."""
     if share == 0:
         return rows, None
-    keep = torch.rand(len(rows), generator=generator) >= share
+    keep = (torch.rand(len(rows), generator=generator) >= share).to(rows.opacities.device)
     opacities = torch.logit((rows.opacities.sigmoid() / (1 - share)).clamp(max=MOST_OPAQUE))
     return replace(rows, opacities=opacities), keep

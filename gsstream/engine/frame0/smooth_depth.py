@@ -45,14 +45,14 @@ def mean_roughness(renderer: Renderer, leaves: Gaussians[torch.Tensor], frame: F
     """Return [] mean change of inverse depth from pixel to pixel along both axes, less where the image changes."""
     cameras = frame.cameras
     half = cameras.scaled(max(1, cameras.width // 2), max(1, cameras.height // 2))
-    pose = torch.from_numpy(half.viewmats[view]).float()
+    pose = torch.from_numpy(half.viewmats[view]).to(leaves.means)
     depth = leaves.means @ pose[2, :3] + pose[2, 3]
     inverse = (UNIT * cameras.extent / depth.clamp_min(NEAREST * cameras.extent)).clamp(max=MOST)
     # Inverse depth is drawn as a colour on black, so that what a pixel shows is its mean times alpha.
     shown = replace(leaves, sh0=rgb_to_sh0(inverse[:, None].repeat(1, 3)), shN=torch.zeros_like(leaves.shN))
     drawn = renderer.render(shown, half, view, (0.0, 0.0, 0.0))
     blended = drawn.image[..., 0] / drawn.alpha.clamp_min(LEAST_ALPHA)
-    image = _halved(frame.images[view], half.height, half.width)
+    image = _halved(frame.images[view], half.height, half.width).to(blended.device)
     terms = []
     for axis in (0, 1):
         if blended.shape[axis] > 1:

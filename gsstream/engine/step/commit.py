@@ -22,4 +22,6 @@ def commit_session(view: EngineContext, scene: Scene, delta: Delta, player: Play
     rows = sent_rows(scene.layout, delta.gates(scene.layout))
     if 2 * len(rows) > len(player.gaussians):
         return None
-    return view.session.commit(player.gaussians.map(torch.from_numpy), torch.from_numpy(rows))
+    device = view.gaussians.means.device
+    gaussians = player.gaussians.map(lambda value: torch.from_numpy(value).to(device))
+    return view.session.commit(gaussians, torch.from_numpy(rows).to(device))

@@ -15,7 +15,7 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.log import FrameLog
 from gsstream.core.storage import unpacked
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.fit.photometric import PhotometricLoss, render_exposed
+from gsstream.engine.fit.photometric import PhotometricLoss, image_on, render_exposed
 from gsstream.engine.fit.schedule import DSSIM
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.active.candidates import VoteCache, changed_rows
@@ -46,11 +46,15 @@ class EngineContext:
         self, parts: Assembly, state: StreamState, frame: Frame, log: FrameLog, change: Change | None = None,
         part_scale: float = 1.0,
     ) -> None:  # fmt: skip
-        self._parts, self._gaussians, self._hierarchy = parts, state.gaussians, state.hierarchy
-        self._frame, self._previous, self._change = frame, state.previous, change
+        self._parts, device = parts, parts.renderer.device
+        self._gaussians = state.gaussians.map(lambda value: value.to(device))
+        self._hierarchy = state.hierarchy.to(device)
+        self._frame, self._previous, self._device = frame, state.previous, device
+        self._change = None if change is None else change.to(device)
         self._background, self._part_scale = parts.background, part_scale
         self.log, self.key_rows = log, state.player.key_rows
-        self.photometric = PhotometricLoss(parts.loss, DSSIM, frame.images, state.exposure)
+        exposure = None if state.exposure is None else state.exposure.to(device)
+        self.photometric = PhotometricLoss(parts.loss, DSSIM, frame.images, exposure, device)
         self._session = state.session
         self._votes = None if change is None else VoteCache(change, frame.cameras)
 
@@ -85,10 +89,10 @@ class EngineContext:
         return self._frame.cameras
 
     def image(self, view: int) -> torch.Tensor:
-        return torch.from_numpy(self._frame.images[view])
+        return image_on(self._frame.images[view], self._device)
 
     def previous_image(self, view: int) -> torch.Tensor:
-        return torch.from_numpy(unpacked(self._previous.images[view]))
+        return image_on(unpacked(self._previous.images[view]), self._device)
 
     def previous_render(self, view: int) -> torch.Tensor:
         return self.shown(self._gaussians, view)
@@ -99,13 +103,14 @@ class EngineContext:
 
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
         if self._is_static(view):
-            number = len(self._gaussians)
-            return ScreenGradient(torch.zeros(number, 2), torch.zeros(number, dtype=torch.bool))
+            none = torch.zeros_like(self._gaussians.means[:, :2])
+            return ScreenGradient(none, torch.zeros_like(none[:, 0], dtype=torch.bool))
         return self.session.screen_gradient(view, self._upstream(view, image_gradient))
 
     def screen_gradient_rows(self, view: int, image_gradient: torch.Tensor) -> RowGradient:
         if self._is_static(view):
-            return RowGradient(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 2))
+            means = self._gaussians.means
+            return RowGradient(means.new_zeros(0, dtype=torch.int64), means.new_zeros(0, 2))
         return self.session.screen_gradient_rows(view, self._upstream(view, image_gradient))
 
     def _is_static(self, view: int) -> bool:
@@ -136,9 +141,9 @@ class EngineContext:
     @property
     def shell_rows(self) -> torch.Tensor:
         if not self._parts.recipe.first_frame.shell:
-            return torch.zeros(len(self._gaussians), dtype=torch.bool)
-        means, scales = self._gaussians.means.numpy(), self._gaussians.scales.numpy()
-        return torch.from_numpy(in_shell(means, scales, self.cameras))
+            return torch.zeros_like(self._gaussians.opacities, dtype=torch.bool)
+        means, scales = self._gaussians.means.cpu().numpy(), self._gaussians.scales.cpu().numpy()
+        return torch.from_numpy(in_shell(means, scales, self.cameras)).to(self._device)
 
     def changed_rows(self, min_votes: float) -> torch.Tensor:
         rows = changed_rows(

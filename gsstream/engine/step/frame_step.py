@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import torch
+
 from gsstream.core.changes import Delta
 from gsstream.core.frame import Frame
 from gsstream.core.log import FrameLog
@@ -31,6 +33,8 @@ from gsstream.method.tools import Tools
 from gsstream.packet import decode_packet, encode_empty
 from gsstream.parts.update.base import Scope
 
+CPU = torch.device("cpu")
+
 
 def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) -> Step:
     """Advance the stream by one frame. Pure: a failure leaves ``state`` as it was.
@@ -48,19 +52,19 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) 
     with log.phase("motion"):
         motions, scene, view = propose_motion(parts, state, frame, change, tools)
     with log.phase("confidence"):
-        rows, logits = select(parts, view, state.hierarchy, scope)
+        rows, logits = select(parts, view, view.hierarchy, scope)
     with log.phase("optimise"):
         generator, views = rng.stream("frame", frame.index), len(frame.cameras)
         looked = None if scope is Scope.ALL else change
         problem = Problem(
-            scene.layout, state.hierarchy, rows, view.gaussians.rows(rows), logits, state.decoders,
+            scene.layout, view.hierarchy, rows, view.gaussians.rows(rows), logits, state.decoders,
             view.session_for(rows), lambda index: view.view_target(
                 index, tile_weights(looked, index, stream.static_tile_share, generator)
             ), views, frame.cameras.width * frame.cameras.height, generator,
             1.0 if tools.budget is None else tools.budget.step_scale,
         )  # fmt: skip
         schedule = scheduled(stream, frame, tools.budget)
-        solution = optimise(parts, problem, schedule)
+        solution = optimise(parts, problem, schedule).to(CPU)
         residual = quantise_residual(parts, problem, solution)
     with log.phase("growth"):
         delta = with_growth(parts, state, Delta(motions).with_residual(residual), view, rng)

@@ -25,5 +25,5 @@ def with_growth(parts: Assembly, state: StreamState, delta: Delta, view: EngineC
     with error_context("growth", parts.part("growth"), parts.where):
         if rows is not None:
             apply_delta(after, Delta((rows,)))  # before rows are left out: a wrong proposal gets an error
-            rows = replace(rows, removed=rows.removed[~view.shell_rows.numpy()[rows.removed]])
+            rows = replace(rows, removed=rows.removed[~view.shell_rows.cpu().numpy()[rows.removed]])
     return delta.with_row_edit(rows)

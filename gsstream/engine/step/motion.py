@@ -57,8 +57,9 @@ def propose_motion(
         if delta.field is not None:
             scene, rows = apply_field(scene, delta.field)
             touched = union_rows(len(scene.gaussians), touched, rows)
-    gaussians = scene.gaussians.map(torch.from_numpy)
+    device = view.gaussians.means.device
+    gaussians = scene.gaussians.map(lambda value: torch.from_numpy(value).to(device))
     # The session is handed on to the moved scene, with its caches of all that stands still. The old session stays
     # correct, as it must until the frame has succeeded: should it be used again, it fills its caches anew.
-    session = view.session.commit(gaussians, torch.from_numpy(touched)) if 2 * len(touched) <= len(gaussians) else None
+    session = view.session.commit(gaussians, torch.from_numpy(touched).to(device)) if 2 * len(touched) <= len(gaussians) else None
     return Moved(motions, scene, view.on(gaussians, session))

@@ -63,15 +63,15 @@ class _Fit:
 
     def __init__(self, parts: Assembly, problem: Problem, schedule: Schedule) -> None:
         self.parts, self.problem, self.schedule, self.rows = parts, problem, schedule, problem.rows
-        layout, index = problem.layout, problem.rows.numpy()
-        self.levels = torch.from_numpy(layout.unit_of[index].astype("int64"))
+        layout, index, device = problem.layout, problem.rows.cpu().numpy(), problem.rows.device
+        self.levels = torch.from_numpy(layout.unit_of[index].astype("int64")).to(device)
         self.stages = level_schedule(parts.recipe.stream, layout.unit_of)
         latents = init_latents(parts.update, problem.base)
-        self.decoders = {name: problem.decoders[name] for name in latents if name in problem.decoders}
+        self.decoders = {name: problem.decoders[name].to(device) for name in latents if name in problem.decoders}
         self.code = joint_layout(
             scale_steps(parts.update.codes(), problem.step_scale), latents, self.decoders, problem.base
         )
-        units, matrix = torch.from_numpy(layout.units_of(index)), self.code.join_decoders(self.decoders)
+        units, matrix = torch.from_numpy(layout.units_of(index)).to(device), self.code.join_decoders(self.decoders)
         self.residual = parts.optimiser.residual_optimiser(self.code, problem.base, units, matrix)
         self.gates = TrainedGates(
             parts.gate, parts.regularizer, parts.optimiser, GATE_LR, problem.logits,

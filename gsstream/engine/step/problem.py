@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 
@@ -70,3 +70,14 @@ class Solution:
     curvature: Mapping[str, torch.Tensor] = field(default_factory=dict)
     dead_gates: int = 0
     open_gates: Sequence[int] = ()
+
+    def to(self, device: torch.device) -> Solution:
+        """Return the same on a device."""
+        latents, decoders, curvature = (
+            {name: value.to(device) for name, value in table.items()}
+            for table in (self.latents, self.decoders, self.curvature)
+        )
+        return replace(
+            self, rows=self.rows.to(device), logits=self.logits.to(device), latents=latents, decoders=decoders,
+            curvature=curvature,
+        )  # fmt: skip

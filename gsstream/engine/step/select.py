@@ -23,7 +23,8 @@ class Selected(NamedTuple):
 def select(parts: Assembly, view: EngineContext, hierarchy: Hierarchy, scope: Scope) -> Selected:
     """Return what confidence, propagation and gate choose; none of them is called in a frame without a residual."""
     if scope is Scope.NONE:
-        return Selected(torch.zeros(0, dtype=torch.int64), torch.zeros(hierarchy.num_nodes))
+        nothing = view.gaussians.means.new_zeros(0, dtype=torch.int64)
+        return Selected(nothing, view.gaussians.means.new_zeros(hierarchy.num_nodes))
     seen = view.everywhere() if scope is Scope.ALL else view
     confidence = parts.propagation.propagate(parts.confidence.estimate(seen), hierarchy)
     logits = parts.gate.init(confidence)

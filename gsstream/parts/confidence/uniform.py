@@ -25,4 +25,4 @@ class Uniform(ConfidenceEstimator):
         return ConfidenceTraits(floor=self.config.logit, brightness=self.config.logit)
 
     def estimate(self, context: FrameContext) -> torch.Tensor:
-        return torch.full((len(context.gaussians),), self.config.logit)
+        return torch.full_like(context.gaussians.opacities, self.config.logit)

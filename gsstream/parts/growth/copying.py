@@ -50,7 +50,8 @@ def replace_with_copies(
     if not settings.epochs or not bool(work.changed_rows(0.0).any()):
         return RowEdit(removed=removed)
     kept = scene.gaussians.rows(np.delete(np.arange(len(scene.gaussians)), removed)).map(torch.from_numpy)
-    added = fit_copies(kept, work.everywhere(), settings, rng, admitted).map(lambda value: value.numpy())
+    kept = kept.map(lambda value: value.to(work.gaussians.means.device))
+    added = fit_copies(kept, work.everywhere(), settings, rng, admitted).map(lambda value: value.cpu().numpy())
     if not len(added):
         return RowEdit(removed=removed)
     return RowEdit(add_as_nodes(added, np.zeros(len(added), np.uint8), len(scene.layout.node_counts)), removed)
@@ -104,8 +105,9 @@ def high_gradient_rows(work: FitContext, gradient: float) -> torch.Tensor:
         work: the frame, seen from the scene that is searched.
         gradient: the bound, in half image widths.
     """
-    half = torch.tensor([work.cameras.width / 2, work.cameras.height / 2])
-    total, count = torch.zeros(len(work.gaussians)), torch.zeros(len(work.gaussians))
+    half = work.gaussians.means.new_tensor([work.cameras.width / 2, work.cameras.height / 2])
+    total = torch.zeros_like(work.gaussians.opacities)
+    count = total
     for view in range(len(work.cameras)):
         difference = work.previous_render(view) - work.image(view)
         norm = (work.screen_gradient(view, difference.sign() / difference.numel()).gradient * half).norm(dim=1)

@@ -44,7 +44,7 @@ def fit_added(
         rng: of the order of views.
     """
     inner = work.on(concat_gaussians(scene, added))
-    inner.narrow(torch.arange(len(scene), len(scene) + len(added)))
+    inner.narrow(torch.arange(len(scene), len(scene) + len(added), device=added.means.device))
     values = {name: value.clone() for name, value in added.items()}
     first = {name: torch.zeros_like(value) for name, value in values.items()}
     second = {name: torch.zeros_like(value) for name, value in values.items()}

@@ -57,6 +57,6 @@ def _with_neighbours(tile_mask: torch.Tensor) -> torch.Tensor:
 def _pixel_weight(image: torch.Tensor, tile_mask: torch.Tensor | None) -> torch.Tensor:
     height, width = image.shape[:2]
     if tile_mask is None:
-        return torch.ones(height, width, 1, dtype=image.dtype)
+        return image.new_ones(height, width, 1)
     mask = tile_mask.to(image.dtype).repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)
     return mask[:height, :width, None]

@@ -42,7 +42,7 @@ def known_groups(scene: Scene, cameras: Cameras, pixels: float, brightness_bins:
 
 def changed_groups(groups: Groups, work: FitContext, votes: float, share: float) -> IntArray:
     """Return [G] bool: groups of which at least this share of the rows lie in what changed, and none in the shell."""
-    changed = work.changed_rows(votes).numpy()
+    changed = work.changed_rows(votes).cpu().numpy()
     total = np.bincount(groups.group_of, minlength=groups.count)
     hit = np.bincount(groups.group_of[changed], minlength=groups.count)
     still = _groups_with(groups, work.shell_rows)
@@ -61,7 +61,7 @@ def groups_of_rows(groups: Groups, rows: IntArray, shell: torch.Tensor) -> IntAr
 
 def _groups_with(groups: Groups, marked: torch.Tensor) -> IntArray:
     """[G] bool: groups that hold a marked row, [N] bool."""
-    return np.asarray(np.bincount(groups.group_of[marked.numpy()], minlength=groups.count) > 0)
+    return np.asarray(np.bincount(groups.group_of[marked.cpu().numpy()], minlength=groups.count) > 0)
 
 
 def displaced_groups(groups: Groups, scene: Scene, share: float) -> IntArray:

@@ -23,7 +23,7 @@ def join_features(code: JointLayout, rows: Gaussians[torch.Tensor]) -> torch.Ten
     """Return [A, D]: the attributes that may change, side by side."""
     # The width is given explicitly, because with no rows left reshape could not infer it from -1.
     parts = [getattr(rows, name).reshape(len(rows), at.stop - at.start) for name, at in code.feature.items()]
-    return torch.cat(parts, 1) if parts else torch.zeros(len(rows), 0)
+    return torch.cat(parts, 1) if parts else rows.means.new_zeros(len(rows), 0)
 
 
 class JointResidual(NamedTuple):
@@ -108,7 +108,7 @@ class JointResidualOptimiser(ResidualOptimiser):
     ) -> None:  # fmt: skip
         self._code, self._base, self._units = code, base, units
         self._features = join_features(code, base)
-        start = torch.zeros(len(base), code.width)
+        start = base.means.new_zeros(len(base), code.width)
         self._latents = RowParameters({"latents": start}, {"latents": code.lrs}, optimiser)
         self._decoders = RowParameters({"matrix": matrix}, {"matrix": code.decoder_lrs}, optimiser)
 
@@ -119,7 +119,7 @@ class JointResidualOptimiser(ResidualOptimiser):
     @property
     def position(self) -> torch.Tensor:
         columns = self._code.latent.get("means")
-        return torch.zeros(len(self._base), 3) if columns is None else self.latents[:, columns]
+        return self._features.new_zeros(len(self._base), 3) if columns is None else self.latents[:, columns]
 
     @property
     def matrix(self) -> torch.Tensor:

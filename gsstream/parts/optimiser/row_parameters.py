@@ -76,7 +76,8 @@ class RowParameters:
     def load_moments(self, name: str, moments: Mapping[str, torch.Tensor]) -> None:
         """Continue from moments saved by :meth:`moments`; an empty mapping starts fresh."""
         if moments:
-            self._states[name] = AdamState(**{key: value.clone() for key, value in moments.items()})
+            device = self.leaves[name].device
+            self._states[name] = AdamState(**{key: value.to(device, copy=True) for key, value in moments.items()})
 
 
 def _rows(state: AdamState, rows: torch.Tensor) -> AdamState:

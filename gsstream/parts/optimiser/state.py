@@ -32,7 +32,7 @@ class AdamState:
     def start(values: torch.Tensor) -> AdamState:
         """Return the state before any step, for a table ``values`` [n, ...]."""
         zeros = torch.zeros_like(values, requires_grad=False)
-        return AdamState(zeros, zeros.clone(), torch.zeros(len(values), dtype=torch.int32))
+        return AdamState(zeros, zeros.clone(), torch.zeros(len(values), dtype=torch.int32, device=values.device))
 
 
 class RowSteps(Protocol):

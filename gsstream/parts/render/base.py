@@ -24,7 +24,15 @@ from gsstream.parts.render.session import RenderSession as RenderSession
 
 
 class Renderer(Part):
-    """A differentiable rasteriser."""
+    """A differentiable rasteriser.
+
+    What it returns lies on the device of what it is given.
+    """
+
+    @property
+    def device(self) -> torch.device:
+        """Where it works fastest; the engine keeps its scene, targets and gradients there."""
+        return torch.device("cpu")
 
     @abstractmethod
     def render(
@@ -158,8 +166,8 @@ def drawn_rows(
     with torch.enable_grad():
         image = render(replace(fixed, sh0=colours, shN=torch.zeros_like(fixed.shN))).image
         if not image.requires_grad:  # nothing is drawn at all
-            return torch.zeros(len(fixed), dtype=torch.bool)
-        (weights,) = torch.autograd.grad(image, colours, inside[..., None].expand_as(image).to(image.dtype))
+            return torch.zeros_like(fixed.opacities, dtype=torch.bool)
+        (weights,) = torch.autograd.grad(image, colours, inside[..., None].expand_as(image).to(image))
     return (weights > 0).flatten(1).any(1)
 
 

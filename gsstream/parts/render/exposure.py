@@ -45,5 +45,9 @@ class Exposure:
     def identity(num_cameras: int) -> Exposure:
         return Exposure(torch.eye(3).repeat(num_cameras, 1, 1), torch.zeros(num_cameras, 3))
 
+    def to(self, device: torch.device) -> Exposure:
+        """Return the same maps on a device."""
+        return Exposure(self.matrix.to(device), self.offset.to(device))
+
     def __getitem__(self, view: int) -> CameraExposure:
         return CameraExposure(self.matrix[view], self.offset[view])

@@ -24,6 +24,6 @@ def weighted_structure_tensor(image: torch.Tensor, target: torch.Tensor) -> torc
 
 def _image_gradients(image: torch.Tensor, axis: int) -> torch.Tensor:
     last = image.shape[axis] - 1
-    places = torch.arange(last + 1)
+    places = torch.arange(last + 1, device=image.device)
     after = image.index_select(axis, (places + 1).clamp_max(last))
     return 0.5 * (after - image.index_select(axis, (places - 1).clamp_min(0)))

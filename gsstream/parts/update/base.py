@@ -85,7 +85,7 @@ def _width(gaussians: Gaussians[torch.Tensor], name: str) -> int:
 def init_latents(rule: UpdateRule, base: Gaussians[torch.Tensor]) -> dict[str, torch.Tensor]:
     """Return zero latents [A, L] for the rows of ``base``; attributes of width 0 (no higher SH) are left out."""
     return {
-        name: torch.zeros(len(base), code.latent or _width(base, name))
+        name: base.means.new_zeros(len(base), code.latent or _width(base, name))
         for name, code in rule.codes().items()
         if _width(base, name)
     }

@@ -38,13 +38,12 @@ def joint_layout(
         steps += [code.step] * rows
         lrs += [code.lr] * rows
         decoder_lrs += [code.decoder_lr if name in decoders else 0.0] * rows
-    kind = base.means.dtype
-    trained = torch.zeros(at, wide, dtype=kind)
+    trained = base.means.new_zeros(at, wide)
     for name in decoders:
         trained[latent[name], feature[name]] = 1
-    rates = torch.tensor(decoder_lrs, dtype=kind)[:, None]
+    rates = trained.new_tensor(decoder_lrs)[:, None]
     return JointLayout(
-        latent, feature, torch.tensor(steps, dtype=kind), torch.tensor(lrs, dtype=kind), rates, trained
+        latent, feature, trained.new_tensor(steps), trained.new_tensor(lrs), rates, trained
     )
 
 

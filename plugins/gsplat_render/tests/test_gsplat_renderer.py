@@ -1,6 +1,7 @@
 """The renderer contract against the reference renderer: on the GPU where there is one, and everywhere on a stand-in.
 
-The stand-in replaces gsplat's five functions by torch on the CPU; all else is the code that runs on a GPU.
+The stand-in is gsplat's own torch formulas on the processor and a rasteriser of ours; all else is the code that runs
+on a GPU.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import numpy as np
 import pytest
 import torch
 from gsstream_gsplat_render.kernels import Kernels, load_kernels
-from gsstream_gsplat_render.renderer import GsplatRenderer, GsplatSession, screen_gradient
+from gsstream_gsplat_render.renderer import GsplatRenderer, GsplatSession
+from gsstream_gsplat_render.rig import Rigs
 from torch_kernels import TORCH_KERNELS
 
 from gsstream.api import Cameras, Gaussians, PluginUnavailable, RenderOutput, ShapeError
@@ -88,7 +90,7 @@ def pull(output: RenderOutput) -> None:
 def open_session(
     backend: Backend, gaussians: Gaussians[torch.Tensor], active: torch.Tensor | None = None
 ) -> GsplatSession:
-    return GsplatSession(backend.kernels, backend.device, gaussians, active, rig(), BACKGROUND)
+    return GsplatSession(backend.kernels, Rigs(torch.device(backend.device)), gaussians, active, rig(), BACKGROUND)
 
 
 def relative(got: torch.Tensor, want: torch.Tensor) -> float:
@@ -124,7 +126,7 @@ def test_image_and_gradients_agree_with_the_reference(backend: Backend, view: in
 
 def test_screen_gradient_agrees_with_the_reference(backend: Backend) -> None:
     v_image = torch.randn(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1))
-    got = screen_gradient(backend.kernels, backend.device, scene(), rig(), 0, v_image)
+    got = open_session(backend, scene()).screen_gradient(0, v_image)
     want = ReferenceRenderer().screen_gradient(scene().map(torch.Tensor.double), rig(), 0, v_image.double())
     assert relative(got.gradient, want.gradient) < backend.gradient
     assert not ((want.gradient != 0).any(1) & ~got.visible).any()
@@ -170,9 +172,9 @@ def test_the_probe_is_the_screen_gradient(backend: Backend) -> None:
     probe = torch.zeros(N, 2, requires_grad=True)
     v_image = torch.randn(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1))
     open_session(backend, scene()).render(0, scene(), probe=probe).image.backward(v_image)
-    want = screen_gradient(backend.kernels, backend.device, scene(), rig(), 0, v_image)
+    want = open_session(backend, scene()).screen_gradient(0, v_image)
     # The background takes part in one and not in the other: subtract it.
-    black = GsplatSession(backend.kernels, backend.device, scene(), None, rig(), (0.0, 0.0, 0.0))
+    black = GsplatSession(backend.kernels, Rigs(torch.device(backend.device)), scene(), None, rig(), (0.0, 0.0, 0.0))
     second = torch.zeros(N, 2, requires_grad=True)
     black.render(0, scene(), probe=second).image.backward(v_image)
     assert second.grad is not None
@@ -229,7 +231,7 @@ def test_nothing_to_see(backend: Backend, count: int) -> None:
     got = open_session(backend, behind).render(0, rows)
     assert torch.allclose(got.image, torch.tensor(BACKGROUND).expand(HEIGHT, WIDTH, 3))
     assert float(got.alpha.detach().abs().max()) == 0
-    gradient = screen_gradient(backend.kernels, backend.device, behind, rig(), 0, torch.ones(HEIGHT, WIDTH, 3))
+    gradient = open_session(backend, behind).screen_gradient(0, torch.ones(HEIGHT, WIDTH, 3))
     assert (gradient.gradient.shape, int(gradient.visible.sum())) == ((count, 2), 0)
     assert float(gradient.gradient.abs().sum()) == 0
 

@@ -1,6 +1,7 @@
-"""gsplat's five functions in plain torch on the CPU, as its documentation describes them.
+"""gsplat's five functions on the processor: its own torch formulas, and a rasteriser of ours that reads its tiles.
 
-What the library leaves undefined is NaN here: rows that are not visible, and the alpha of masked tiles.
+gsplat 1.5.3 has torch formulas of four of them (``gsplat.cuda._torch_impl``); that of the fifth needs CUDA. What the
+kernels leave undefined is NaN here: rows that are not visible, and the alpha of masked tiles.
 """
 
 from __future__ import annotations
@@ -8,11 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from gsplat.cuda import _torch_impl as gsplat
 from gsstream_gsplat_render.kernels import Kernels
-
-from gsstream.api import Cameras, Gaussians
-from gsstream.parts.render.reference import evaluate_sh, footprint_in_image
-from gsstream.parts.render.reference import project as reference_project
 
 NAN = float("nan")
 
@@ -22,45 +20,44 @@ def project(
     Ks: torch.Tensor, width: int, height: int, *, eps2d: float, near_plane: float, far_plane: float,
     radius_clip: float, packed: bool, calc_compensations: bool, opacities: torch.Tensor,
 ) -> tuple[Any, ...]:  # fmt: skip
-    assert covars is None
-    assert (eps2d, radius_clip, packed, calc_compensations) == (0.3, 0.0, False, False)
-    n = len(means)
-    assert (viewmats.shape, Ks.shape, opacities.shape) == ((1, 4, 4), (1, 3, 3), (n,))
-    cameras = Cameras(("c",), viewmats.double().numpy(), Ks.double().numpy(), width, height, near_plane)
-    sh = torch.zeros(n, 1, 3)
-    raw = Gaussians(means, quats, scales.log(), opacities.logit(), sh, sh[:, :0])
-    means2d, conics, _, depths, _ = reference_project(raw, cameras, 0)
-    seen = footprint_in_image(raw.map(torch.Tensor.detach), cameras, 0) & (depths.detach() <= far_plane)
-    triangle = torch.stack([conics[:, 0, 0], conics[:, 0, 1], conics[:, 1, 1]], -1)
-    radii = torch.where(seen, 8, 0).to(torch.int32)[:, None].expand(n, 2)
-    out = [torch.where(seen[:, None], means2d, NAN), torch.where(seen, depths, NAN)]
-    return radii[None], out[0][None], out[1][None], torch.where(seen[:, None], triangle, NAN)[None], None
+    assert (covars, packed, calc_compensations, radius_clip) == (None, False, False, 0.0)
+    whole, _ = gsplat._quat_scale_to_covar_preci(quats, scales, True, False, triu=False)
+    radii, means2d, depths, conics, _ = gsplat._fully_fused_projection(
+        means, whole, viewmats, Ks, width, height, eps2d, near_plane, far_plane
+    )
+    # The kernel's box reaches as far as the opacity does, in whole pixels (ProjectionEWA3DGSFused.cu).
+    a, b, c = conics.detach().unbind(-1)
+    det, reach = a * c - b * b, (2 * (opacities.detach() * 255).clamp_min(1).log()).sqrt().clamp_max(3.33)
+    box = torch.stack([(reach * (c / det).sqrt()).ceil(), (reach * (a / det).sqrt()).ceil()], -1)
+    size = box.new_tensor([width, height])
+    inside = ((means2d.detach() + box > 0) & (means2d.detach() - box < size)).all(-1, keepdim=True)
+    seen = (radii > 0) & inside & (box > 0) & (opacities.detach() >= 1 / 255)[None, :, None]
+    radii, seen = torch.where(seen, box.int(), torch.zeros_like(radii)), seen.all(-1)
+    wide = seen[..., None]
+    return radii * wide, torch.where(wide, means2d, NAN), torch.where(seen, depths, NAN), torch.where(wide, conics, NAN), None
 
 
 def harmonics(
     degree: int, directions: torch.Tensor, coefficients: torch.Tensor, masks: torch.Tensor | None = None
 ) -> torch.Tensor:
-    assert directions.shape == (*coefficients.shape[:2], 3)
-    assert (degree + 1) ** 2 == coefficients.shape[-2]
-    # evaluate_sh adds 0.5 and cuts at 0, gsplat does neither: an offset keeps it clear of the cut and is taken off.
-    lifted = coefficients[0, :, :1] + 1000
-    colors = evaluate_sh(lifted.double(), coefficients[0, :, 1:].double(), directions[0].double())
-    colors = (colors - 0.5 - 1000 * 0.28209479177387814).float()[None]
+    colors: torch.Tensor = gsplat._spherical_harmonics(degree, directions, coefficients)
     return colors if masks is None else torch.where(masks[..., None], colors, NAN)
 
 
 def tiles(
     means2d: torch.Tensor, radii: torch.Tensor, depths: torch.Tensor, tile_size: int, columns: int, rows: int, *,
     packed: bool, n_images: int,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
-    assert (packed, n_images, tile_size) == (False, 1, 16)
-    seen = (radii[0] > 0).all(-1).nonzero()[:, 0]
-    order = seen[torch.argsort(depths[0].detach()[seen], stable=True)]
-    return (radii[0, :, 0] > 0).int()[None], torch.arange(len(order)), order.int()
+) -> tuple[torch.Tensor, ...]:  # fmt: skip
+    assert (packed, n_images) == (False, 1)
+    seen, nothing = (radii > 0).all(-1), torch.zeros(())
+    means2d, depths = means2d.detach().where(seen[..., None], nothing), depths.detach().where(seen, nothing)
+    found: tuple[torch.Tensor, ...] = gsplat._isect_tiles(means2d, radii, depths, tile_size, columns, rows)
+    return found
 
 
 def offsets(keys: torch.Tensor, n_images: int, columns: int, rows: int) -> torch.Tensor:
-    return torch.zeros(n_images, rows, columns, dtype=torch.int32)
+    found: torch.Tensor = gsplat._isect_offset_encode(keys, n_images, columns, rows)
+    return found
 
 
 def rasterize(
@@ -68,28 +65,45 @@ def rasterize(
     height: int, tile_size: int, starts: torch.Tensor, order: torch.Tensor, *, backgrounds: torch.Tensor,
     masks: torch.Tensor | None, packed: bool,
 ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
-    rows = order.long()
-    n = means2d.shape[1]
-    assert (conics.shape, colors.shape, opacities.shape) == ((1, n, 3), (1, n, 3), (1, n))
-    assert backgrounds.shape == (1, 3)
-    ys, xs = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    dx = xs - means2d[0, rows, 0, None, None]
-    dy = ys - means2d[0, rows, 1, None, None]
-    a, b, c = (conics[0, rows, k, None, None] for k in range(3))
-    falloff = torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
-    alpha = (opacities[0, rows, None, None] * falloff).clamp_max(0.999)
-    alpha = torch.where(alpha >= 1 / 255, alpha, torch.zeros_like(alpha))
+    assert not packed
+    rows, columns = starts.shape[-2:]
+    bounds = [*starts.flatten().tolist(), len(order)]
+    image, alpha = [], []
+    for row in range(rows):
+        pictures, opaque = [], []
+        for column in range(columns):
+            place, tall = row * columns + column, min(tile_size, height - row * tile_size)
+            wide = min(tile_size, width - column * tile_size)
+            if masks is not None and not bool(masks.flatten()[place]):
+                pictures.append(backgrounds[0].expand(tall, wide, 3))
+                opaque.append(torch.full((tall, wide), NAN))  # left as the memory was
+                continue
+            ids = order[bounds[place] : bounds[place + 1]].long()
+            splats = means2d[0, ids], conics[0, ids], colors[0, ids], opacities[0, ids]
+            light, after = _tile(*splats, (column * tile_size, row * tile_size), (tall, wide))
+            pictures.append(light + after[..., None] * backgrounds[0])
+            opaque.append(1 - after)
+        image.append(torch.cat(pictures, 1))
+        alpha.append(torch.cat(opaque, 1))
+    return torch.cat(image)[None], torch.cat(alpha)[None, ..., None]
+
+
+def _tile(
+    means2d: torch.Tensor, conics: torch.Tensor, colors: torch.Tensor, opacities: torch.Tensor,
+    corner: tuple[int, int], size: tuple[int, int],
+) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+    """Light [h, w, 3] and transmittance [h, w] of one tile, front to back."""
+    tall, wide = size
+    dx = means2d[:, 0, None, None] - (torch.arange(wide) + corner[0] + 0.5)
+    dy = means2d[:, 1, None, None] - (torch.arange(tall) + corner[1] + 0.5)[:, None]
+    a, b, c = (conics[:, k, None, None] for k in range(3))
+    power = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+    alpha = (opacities[:, None, None] * torch.exp(-power)).clamp_max(0.999)
+    alpha = torch.where((power >= 0) & (alpha >= 1 / 255), alpha, 0.0)
     # The Gaussian that would take the transmittance to 1e-4 or below ends the pixel and is not drawn itself.
-    alpha = torch.where(torch.cumprod(1 - alpha.detach(), 0) > 1e-4, alpha, torch.zeros_like(alpha))
-    after = torch.cumprod(torch.cat([torch.ones(1, height, width), 1 - alpha]), 0)
-    image = torch.einsum("nhw,nc->hwc", alpha * after[:-1], colors[0, rows]) + after[-1][..., None] * backgrounds[0]
-    opaque = 1 - after[-1]
-    if masks is not None:
-        assert masks.shape == starts.shape
-        inside = masks[0].repeat_interleave(16, 0).repeat_interleave(16, 1)[:height, :width]
-        image = torch.where(inside[..., None], image, backgrounds[0])
-        opaque = torch.where(inside, opaque, NAN)
-    return image[None], opaque[None, ..., None]
+    alpha = torch.where(torch.cumprod(1 - alpha.detach(), 0) > 1e-4, alpha, 0.0)
+    after = torch.cumprod(torch.cat([torch.ones(1, tall, wide), 1 - alpha]), 0)
+    return torch.einsum("nhw,nc->hwc", alpha * after[:-1], colors), after[-1]
 
 
 TORCH_KERNELS = Kernels(project, harmonics, tiles, offsets, rasterize)

@@ -18,6 +18,7 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.engine.step.active.change import Change
 from gsstream.parts.render.base import RenderSession
 
+CPU = torch.device("cpu")
 #: Least share of the views a Gaussian projects into in which it must lie in or beside changed tiles.
 CHANGE_VOTES = 0.75
 
@@ -70,12 +71,13 @@ def changed_rows(
         book: votes of this change that are known from other scenes of the frame; None: of none.
     """
     if change is None:
-        return torch.ones(len(means), dtype=torch.bool)
+        return means.new_ones(len(means), dtype=torch.bool)
     if not bool(change.tiles.any()):
-        return torch.zeros(len(means), dtype=torch.bool)
+        return means.new_zeros(len(means), dtype=torch.bool)
     seen = session.visible_anywhere(change.tiles)
     rows = seen.nonzero()[:, 0]
-    seen[rows] = (book or VoteCache(change, cameras)).of(means, rows) >= min_votes
+    votes = (book or VoteCache(change.to(CPU), cameras)).of(means.to(CPU), rows.to(CPU))
+    seen[rows] = votes.to(seen.device) >= min_votes
     return seen
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -37,6 +37,10 @@ class Change:
     def dilated(self) -> torch.Tensor:
         """[V, ceil(H / 16), ceil(W / 16)] bool: tiles that changed, and those beside one that did."""
         return torch.nn.functional.max_pool2d(self.tiles[:, None].float(), 3, 1, 1)[:, 0] > 0
+
+    def to(self, device: torch.device) -> Change:
+        """Return the same tiles on a device."""
+        return replace(self, tiles=self.tiles.to(device))
 
     def pixels(self, view: int) -> torch.Tensor:
         """Return [H, W, 1]: 1.0 where a pixel of this view lies in a changed tile, else 0.0."""

@@ -18,7 +18,7 @@ def tile_weights(change: Change | None, view: int, share: float, generator: torc
     if change is None or share == 1:
         return None
     near = change.dilated[view]
-    drawn = torch.rand(near.shape, generator=generator) < share
+    drawn = (torch.rand(near.shape, generator=generator) < share).to(near.device)
     return torch.where(near, 1.0, drawn / share)
 
 

@@ -1,4 +1,4 @@
-"""The renderer `gsplat`. The engine's tensors live on the CPU: rows go to the GPU and images come back at this border.
+"""The renderer `gsplat`. What it returns lies on the device of what it is given; it works on a GPU.
 
 Differences from the reference renderer, all of them gsplat's: the Gaussian that would take the transmittance below
 1e-4 is not drawn (at most 1e-4 in colour); exponentials are CUDA's fast ones; sums of gradients run in no fixed order,
@@ -7,6 +7,7 @@ so two runs differ in the last digits.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import final
 
 import torch
@@ -24,7 +25,8 @@ from gsstream.api import (
     drawn_rows,
 )
 from gsstream_gsplat_render.kernels import Kernels, load_kernels
-from gsstream_gsplat_render.splat import Background, Drawn, Target, draw, pixels, target
+from gsstream_gsplat_render.rig import Background, Rig, Rigs, Target
+from gsstream_gsplat_render.splat import Drawn, composite, draw, pixels, project, touched_tiles
 
 
 @final
@@ -41,56 +43,54 @@ class GsplatRenderer(Renderer):
 
     def __init__(self, config: PartConfig | None = None) -> None:
         super().__init__(config)
-        load_kernels(self.config.device)
+        self._kernels = load_kernels(self.config.device)
+        self._rigs = Rigs(torch.device(self.config.device))
+
+    @property
+    def device(self) -> torch.device:
+        return self._rigs.device
 
     def render(
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, background: Background
     ) -> RenderOutput:
-        return GsplatSession(self._kernels, self.config.device, gaussians, None, cameras, background).render(
-            view, gaussians
-        )
+        return self.open(gaussians, None, cameras, background).render(view, gaussians)
 
     def open(
-        self,
-        gaussians: Gaussians[torch.Tensor],
-        active: torch.Tensor | None,
-        cameras: Cameras,
-        background: Background,
+        self, gaussians: Gaussians[torch.Tensor], active: torch.Tensor | None, cameras: Cameras, background: Background
     ) -> RenderSession:
-        return GsplatSession(self._kernels, self.config.device, gaussians, active, cameras, background)
+        return GsplatSession(self._kernels, self._rigs, gaussians, active, cameras, background)
 
-    @property
-    def _kernels(self) -> Kernels:
-        return load_kernels(self.config.device)
+
+@dataclass(frozen=True, slots=True)
+class _Before:
+    """A view of the session's scene, and the tiles in which the active rows are drawn in it; None: not known yet."""
+
+    drawn: Drawn
+    tiles: torch.Tensor | None
 
 
 @final
 class GsplatSession(RenderSession):
-    """One frame step: frozen rows stay on the device, only active rows travel.
+    """One scene on the device, of which some rows change. Tiles that these rows never touch are drawn once.
 
     Arguments:
+        kernels: gsplat's functions.
+        rigs: of the renderer, whose device they work on.
         active: [A] rows that change, no duplicates; None: all.
-        device: where ``kernels`` work.
     """
 
     def __init__(
-        self,
-        kernels: Kernels,
-        device: str,
-        gaussians: Gaussians[torch.Tensor],
-        active: torch.Tensor | None,
-        cameras: Cameras,
-        background: Background,
-    ) -> None:
-        self._kernels, self._device = kernels, device
+        self, kernels: Kernels, rigs: Rigs, gaussians: Gaussians[torch.Tensor], active: torch.Tensor | None,
+        cameras: Cameras, background: Background,
+    ) -> None:  # fmt: skip
+        self._kernels, self._rigs = kernels, rigs
         self._cameras, self._background = cameras, background
-        self._gaussians = gaussians
+        self._home = gaussians.means.device
+        self._scene = _moved(gaussians.map(torch.Tensor.detach), rigs.device)
         self._active: torch.Tensor | None = None
-        self._frozen: Gaussians[torch.Tensor] | None = None
+        self._before: dict[int, _Before] = {}
         if active is not None:
             self.narrow(active)
-        self._targets: dict[int, Target] = {}
-        self._cached: dict[int, Drawn] = {}
 
     @property
     def cameras(self) -> Cameras:
@@ -104,81 +104,84 @@ class GsplatSession(RenderSession):
         probe: torch.Tensor | None = None,
         tile_mask: torch.Tensor | None = None,
     ) -> RenderOutput:
-        where = self._target(view)
-        whole, whole_probe = self._merged(_moved(rows, self._device), probe)
-        mask = None if tile_mask is None else _checked_mask(tile_mask, where).to(self._device)
-        drawn = draw(self._kernels, whole, where, whole_probe, mask)
-        image, alpha = drawn.image, drawn.alpha
-        if mask is not None and self._frozen is not None:
-            cached, inside = self._cache(view), pixels(mask, where)
-            image = torch.where(inside[..., None], image, cached.image)
-            alpha = torch.where(inside, alpha, cached.alpha)
-        return RenderOutput(image.cpu(), alpha.cpu())
+        target, home = self._rig[view], rows.means.device
+        whole, whole_probe = self._merged(_moved(rows, self._rigs.device), probe)
+        mask = None if tile_mask is None else _checked_mask(tile_mask, target).to(self._rigs.device)
+        if self._active is None or len(whole) == 0:
+            drawn = draw(self._kernels, whole, target, whole_probe, mask)
+            return RenderOutput(drawn.image.to(home), drawn.alpha.to(home))
+        seen = project(self._kernels, whole, target, whole_probe)
+        shown, tiles = self._shown_before(view)
+        tiles = tiles | touched_tiles(seen.rows(self._active), target)
+        mask = tiles if mask is None else tiles & mask
+        drawn, inside = composite(self._kernels, seen, target, mask), pixels(mask, target)
+        image = torch.where(inside[..., None], drawn.image, shown.image)
+        alpha = torch.where(inside, drawn.alpha, shown.alpha)
+        return RenderOutput(image.to(home), alpha.to(home), tiles.to(home))
 
     def visible(self, view: int, tiles: torch.Tensor) -> torch.Tensor:
-        wide = GsplatSession(self._kernels, self._device, self._gaussians, None, self._cameras, self._background)
+        target = self._rig[view]
         size = self._cameras.height, self._cameras.width
-        return drawn_rows(lambda scene: wide.render(view, scene), self._gaussians, size, tiles)
+
+        def shown(scene: Gaussians[torch.Tensor]) -> RenderOutput:
+            drawn = draw(self._kernels, scene, target)
+            return RenderOutput(drawn.image, drawn.alpha)
+
+        return drawn_rows(shown, self._scene, size, tiles.to(self._rigs.device)).to(self._home)
 
     def narrow(self, active: torch.Tensor) -> None:
-        self._active = active.to(self._device)
-        self._frozen = _moved(self._gaussians.map(torch.Tensor.detach), self._device)
+        self._active = active.to(self._rigs.device)
+        # The pictures stay, which show the scene as it is; the tiles are those of other rows.
+        self._before = {view: replace(before, tiles=None) for view, before in self._before.items()}
 
     def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
-        return GsplatSession(self._kernels, self._device, gaussians, None, self._cameras, self._background)
+        return GsplatSession(self._kernels, self._rigs, gaussians, None, self._cameras, self._background)
 
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
-        return screen_gradient(
-            self._kernels, self._device, self._gaussians, self._cameras, view, image_gradient
-        )
+        """By a scene on black, so the background has no share in it."""
+        target = self._rigs.find(self._cameras, (0.0, 0.0, 0.0))[view]
+        if len(self._scene) == 0:
+            none = self._scene.means[:, :2].to(self._home)
+            return ScreenGradient(none, none[:, 0] > 0)
+        probe = torch.zeros_like(self._scene.means[:, :2]).requires_grad_()
+        with torch.enable_grad():
+            seen = project(self._kernels, self._scene, target, probe)
+            drawn = composite(self._kernels, seen, target)
+            (gradient,) = torch.autograd.grad(drawn.image, probe, image_gradient.to(self._rigs.device).float())
+        return ScreenGradient(gradient.to(self._home), seen.visible.to(self._home))
+
+    @property
+    def _rig(self) -> Rig:
+        return self._rigs.find(self._cameras, self._background)
 
     def _merged(
         self, rows: Gaussians[torch.Tensor], probe: torch.Tensor | None
     ) -> tuple[Gaussians[torch.Tensor], torch.Tensor | None]:
         """The whole scene with these active rows, and their probe among zeros."""
-        moved = None if probe is None else probe.to(self._device)
-        if self._frozen is None or self._active is None:
+        moved = None if probe is None else probe.to(self._rigs.device)
+        if self._active is None:
             return rows, moved
-        base, active = dict(self._frozen.items()), self._active
+        base, active = dict(self._scene.items()), self._active
         whole = Gaussians(**{name: base[name].index_copy(0, active, value) for name, value in rows.items()})
         if moved is None:
             return whole, None
         return whole, moved.new_zeros(len(whole), 2).index_copy(0, active, moved)
 
-    def _target(self, view: int) -> Target:
-        if view not in self._targets:
-            self._targets[view] = target(self._cameras, view, self._background, self._device)
-        return self._targets[view]
-
-    def _cache(self, view: int) -> Drawn:
-        """The render of the scene as it was when the session opened."""
-        if view not in self._cached:
-            assert self._frozen is not None
-            with torch.no_grad():
-                self._cached[view] = draw(self._kernels, self._frozen, self._target(view))
-        return self._cached[view]
-
-
-def screen_gradient(
-    kernels: Kernels,
-    device: str,
-    gaussians: Gaussians[torch.Tensor],
-    cameras: Cameras,
-    view: int,
-    image_gradient: torch.Tensor,
-) -> ScreenGradient:
-    """Gradient of sum(image_gradient * image) by the 2-D means, pixels, and which Gaussians touch the image."""
-    fixed = _moved(gaussians.map(torch.Tensor.detach), device)
-    probe = torch.zeros(len(fixed), 2, device=device, requires_grad=True)
-    with torch.enable_grad():
-        drawn = draw(kernels, fixed, target(cameras, view, (0.0, 0.0, 0.0), device), probe)
-        if not drawn.image.requires_grad:
-            return ScreenGradient(torch.zeros(len(fixed), 2), drawn.visible.cpu())
-        (gradient,) = torch.autograd.grad((drawn.image * image_gradient.to(device)).sum(), probe)
-    return ScreenGradient(gradient.cpu(), drawn.visible.cpu())
+    def _shown_before(self, view: int) -> tuple[Drawn, torch.Tensor]:
+        """The view of the session's scene, and the tiles in which the active rows are drawn in it."""
+        known = self._before.get(view)
+        if known is not None and known.tiles is not None:
+            return known.drawn, known.tiles
+        assert self._active is not None
+        with torch.no_grad():
+            seen = project(self._kernels, self._scene, self._rig[view])
+            drawn = known.drawn if known else composite(self._kernels, seen, self._rig[view])
+            tiles = touched_tiles(seen.rows(self._active), self._rig[view])
+        self._before[view] = _Before(drawn, tiles)
+        return drawn, tiles
 
 
-def _moved(gaussians: Gaussians[torch.Tensor], device: str) -> Gaussians[torch.Tensor]:
+def _moved(gaussians: Gaussians[torch.Tensor], device: torch.device) -> Gaussians[torch.Tensor]:
     for name, value in gaussians.items():
         if value.dtype != torch.float32:
             raise ShapeError(f"{name}: expected dtype torch.float32, got {value.dtype}; convert it with .float()")

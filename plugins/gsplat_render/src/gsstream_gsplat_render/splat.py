@@ -2,90 +2,110 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 
-from gsstream.api import Cameras, Gaussians
+from gsstream.api import Gaussians
 from gsstream_gsplat_render.kernels import Kernels
+from gsstream_gsplat_render.rig import TILE, Target
 
-TILE = 16
 BLUR = 0.3  # px^2, added to the 2-D covariance: what gsplat calls eps2d
 FAR = 1e10
 
-Background = tuple[float, float, float]
-
 
 @dataclass(frozen=True, slots=True)
-class Target:
-    """A camera and its background on the device: viewmat [1, 4, 4], K [1, 3, 3], background [1, 3], all float32."""
+class Projected:
+    """Gaussians as one camera sees them, on the device.
 
-    viewmat: torch.Tensor
-    K: torch.Tensor
-    background: torch.Tensor
-    width: int
-    height: int
-    near: float
+    Arguments:
+        visible: [N] bool, it touches the image; of all others gsplat leaves the rest undefined.
+        means2d: [N, 2] pixels. depths: [N]. conics: [N, 3]. colors: [N, 3]. opacities: [N].
+        radii: [N, 2] int32, half the sides of the box in which it is drawn, pixels.
+    """
 
-    @property
-    def tiles(self) -> tuple[int, int]:
-        """Tile rows and columns; partial tiles count."""
-        return -(-self.height // TILE), -(-self.width // TILE)
+    visible: torch.Tensor
+    means2d: torch.Tensor
+    depths: torch.Tensor
+    conics: torch.Tensor
+    colors: torch.Tensor
+    opacities: torch.Tensor
+    radii: torch.Tensor
+
+    def rows(self, index: torch.Tensor) -> Projected:
+        """Return some of them."""
+        return Projected(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """Image [H, W, 3], alpha [H, W] and which Gaussians touch the image [N] bool, on the device."""
+    """Image [H, W, 3] and alpha [H, W] on the device; differentiable."""
 
     image: torch.Tensor
     alpha: torch.Tensor
-    visible: torch.Tensor
 
 
-def target(cameras: Cameras, view: int, background: Background, device: str) -> Target:
-    """Camera ``view`` of a rig, moved to the device."""
-
-    def moved(value: object) -> torch.Tensor:
-        return torch.as_tensor(value, dtype=torch.float32).to(device)[None]
-
-    return Target(
-        moved(cameras.viewmats[view]), moved(cameras.Ks[view]), moved(background), cameras.width, cameras.height,
-        cameras.near_plane,
-    )  # fmt: skip
-
-
-def draw(
-    kernels: Kernels,
-    gaussians: Gaussians[torch.Tensor],
-    view: Target,
-    probe: torch.Tensor | None = None,
-    mask: torch.Tensor | None = None,
-) -> Drawn:
-    """Draw raw Gaussians [N] that are on the device already."""
-    if len(gaussians) == 0:
-        return _empty(view)
+def project(
+    kernels: Kernels, gaussians: Gaussians[torch.Tensor], view: Target, probe: torch.Tensor | None = None
+) -> Projected:
+    """Project raw Gaussians [N], N > 0, that are on the device already; ``probe`` [N, 2] is added to the 2-D means."""
     opacities = gaussians.opacities.sigmoid()
     radii, means2d, depths, conics, _ = kernels.project(
         gaussians.means, None, gaussians.quats, gaussians.scales.exp(), view.viewmat, view.K, view.width, view.height,
         eps2d=BLUR, near_plane=view.near, far_plane=FAR, radius_clip=0.0, packed=False, calc_compensations=False,
         opacities=opacities,
     )  # fmt: skip
-    visible = (radii > 0).all(-1)  # [1, N]; of other rows gsplat leaves everything undefined
+    visible = (radii > 0).all(-1)
     if probe is not None:
         means2d = means2d + probe[None]
     colors = _colors(kernels, gaussians, view, visible)
+    return Projected(visible[0], means2d[0], depths[0], conics[0], colors[0], opacities, radii[0])
+
+
+def composite(kernels: Kernels, seen: Projected, view: Target, mask: torch.Tensor | None = None) -> Drawn:
+    """Composite what was projected; with a mask [tile rows, tile columns] in its tiles, and the background elsewhere."""
     rows, columns = view.tiles
-    _, keys, order = kernels.tiles(means2d, radii, depths, TILE, columns, rows, packed=False, n_images=1)
+    means2d, radii = seen.means2d[None], seen.radii[None]
+    _, keys, order = kernels.tiles(means2d, radii, seen.depths[None], TILE, columns, rows, packed=False, n_images=1)
     offsets = kernels.offsets(keys, 1, columns, rows).reshape(1, rows, columns)
     image, alpha = kernels.rasterize(
-        means2d, conics, colors, opacities[None], view.width, view.height, TILE, offsets, order,
-        backgrounds=view.background, masks=None if mask is None else mask[None], packed=False,
+        means2d, seen.conics[None], seen.colors[None], seen.opacities[None], view.width, view.height, TILE, offsets,
+        order, backgrounds=view.background, masks=None if mask is None else mask[None], packed=False,
     )  # fmt: skip
     image, alpha = image[0], alpha[0, ..., 0]
     if mask is not None:
         # gsplat 1.5 writes the background into masked tiles but leaves their alpha as the memory was.
         alpha = torch.where(pixels(mask, view), alpha, torch.zeros_like(alpha))
-    return Drawn(image, alpha, visible[0])
+    return Drawn(image, alpha)
+
+
+def draw(
+    kernels: Kernels, gaussians: Gaussians[torch.Tensor], view: Target, probe: torch.Tensor | None = None,
+    mask: torch.Tensor | None = None,
+) -> Drawn:  # fmt: skip
+    """Draw raw Gaussians [N] that are on the device already."""
+    if len(gaussians) == 0:
+        return _empty(view)
+    return composite(kernels, project(kernels, gaussians, view, probe), view, mask)
+
+
+def touched_tiles(seen: Projected, view: Target) -> torch.Tensor:
+    """Return [tile rows, tile columns] bool: the tiles in which gsplat draws any of the projected Gaussians.
+
+    Corners of every box are added into a table, whose running sums then count the boxes over each tile: nothing has a
+    size that depends on values, so the processor does not wait.
+    """
+    down, across = view.tiles
+    centre = torch.where(seen.visible[:, None], seen.means2d.detach(), 0.0) / TILE
+    half = torch.where(seen.visible[:, None], seen.radii, 0) / TILE
+    # As gsplat's isect_tiles: from the tile of the lower corner to before that beyond the upper one.
+    low = (centre - half).floor().clamp_min(0).minimum(view.corner).long()
+    high = (centre + half).ceil().clamp_min(0).minimum(view.corner).long()
+    marks = torch.zeros((down + 1) * (across + 1), dtype=torch.int32, device=centre.device)
+    visible = seen.visible.int()
+    for x, y, sign in ((low, low, 1), (high, low, -1), (low, high, -1), (high, high, 1)):
+        marks.index_add_(0, y[:, 1] * (across + 1) + x[:, 0], sign * visible)
+    return marks.reshape(down + 1, across + 1).cumsum(0).cumsum(1)[:down, :across] > 0
 
 
 def pixels(mask: torch.Tensor, view: Target) -> torch.Tensor:
@@ -107,7 +127,5 @@ def _colors(
 
 
 def _empty(view: Target) -> Drawn:
-    device = view.viewmat.device
     image = view.background.expand(view.height * view.width, 3).reshape(view.height, view.width, 3).clone()
-    alpha = torch.zeros(view.height, view.width, device=device)
-    return Drawn(image, alpha, torch.zeros(0, dtype=torch.bool, device=device))
+    return Drawn(image, torch.zeros_like(image[..., 0]))

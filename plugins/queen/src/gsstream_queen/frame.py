@@ -80,7 +80,7 @@ class _Frame:
         self._session: RenderSession = problem.work.session
         if len(problem.active) < len(self._scene):
             self._session.narrow(problem.active)
-        self._statistics = DensifyStatistics.zeros(len(problem.active))
+        self._statistics = DensifyStatistics.zeros(len(problem.active), problem.active.device)
 
     @property
     def _alive(self) -> torch.Tensor:
@@ -126,7 +126,7 @@ class _Frame:
                 rows, self._statistics.mean, allowed, config.max_added - added_so_far, self._extent, config,
                 self._generator,
             )
-        self._statistics = DensifyStatistics.zeros(len(self._problem.active))
+        self._statistics = DensifyStatistics.zeros(len(self._problem.active), self._problem.active.device)
         if len(new.gaussians) == 0:
             return
         self._gone[self._problem.active[new.replaced]] = True

@@ -38,7 +38,9 @@ from gsstream.parts.motion.field import transform_rows as transform_rows
 from gsstream.parts.motion.fitting import GroupAdam as GroupAdam
 from gsstream.parts.motion.fitting import elementwise as elementwise
 from gsstream.parts.motion.fitting import fit_transforms_adam as fit_transforms_adam
+from gsstream.parts.motion.fitting import found_transforms as found_transforms
 from gsstream.parts.motion.fitting import groupwise_max as groupwise_max
+from gsstream.parts.motion.fitting import narrow_to as narrow_to
 from gsstream.parts.motion.groups import groups_of_rows as groups_of_rows
 from gsstream.parts.motion.groups import pixel_size as pixel_size
 from gsstream.parts.optimiser.joint import add_joint as add_joint

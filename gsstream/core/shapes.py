@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from gsstream.core.deferred import require
 from gsstream.core.errors import ShapeError
 
 FloatArray = np.ndarray[Any, np.dtype[np.floating[Any]]]
@@ -56,8 +57,15 @@ def check_shape(name: str, array: Any, expected: Sequence[int | str]) -> dict[st
 
 
 def check_finite(name: str, array: Any) -> None:
-    """Raise ShapeError naming the first non-finite index of a numpy array or torch tensor."""
-    values = array.detach().cpu().numpy() if hasattr(array, "detach") else np.asarray(array)
+    """Raise ShapeError naming the first non-finite index of a numpy array or torch tensor.
+
+    Of a tensor on a GPU no index is named, and the error may come later (``gsstream.core.deferred``).
+    """
+    if hasattr(array, "detach") and array.device.type != "cpu":
+        message = f"{name}: expected finite values, got some that are not"
+        require(array.detach().isfinite().all(), lambda: ShapeError(message))
+        return
+    values = array.detach().numpy() if hasattr(array, "detach") else np.asarray(array)
     # A sum is finite only if every term is, and costs one pass without a temporary.
     with np.errstate(over="ignore", invalid="ignore"):
         if np.isfinite(values.sum(dtype=np.float64)):

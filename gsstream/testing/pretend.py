@@ -29,6 +29,8 @@ SIZED_BY_VALUES = {
     aten.unique_dim.default, aten.repeat_interleave.Tensor, aten.bincount.default,
 }  # fmt: skip
 
+ALLOCATIONS = {aten.empty.memory_format, aten.empty_like.default, aten.empty_strided.default}
+
 
 class _Module(_DummyBackendModule):
     def get_amp_supported_dtype(self) -> list[torch.dtype]:
@@ -73,7 +75,7 @@ class PretendDevice(TorchDispatchMode):  # type: ignore[no-untyped-call]
     Attributes:
         up, down: copies to the device and from it.
         waits: values that the processor read, and results whose size depends on values.
-        launches: operations that ran on the device.
+        launches: operations that ran on the device; views and allocations are none.
     """
 
     def __init__(self) -> None:
@@ -108,7 +110,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     target = None if kwargs.get("device") is None else torch.device(kwargs["device"]).type
     if not there and target != NAME:
         return func(*args, **kwargs)
-    if _ENTERED:
+    if _ENTERED and not (func.is_view or func in ALLOCATIONS):
         _ENTERED[-1].launches += 1
     plain = {**kwargs, "device": torch.device("cpu")} if target is not None else kwargs
     values, named = tree_map(_memory, (args, plain))
@@ -166,14 +168,12 @@ def _count(what: str) -> None:
 
 # torch.tensor(..., device=) and new_tensor copy below every mode; these two are the operations that they call.
 @torch.library.impl("aten::empty_strided", "privateuseone")
-def _empty_strided(
-    size: Any, stride: Any, *, dtype: Any = None, layout: Any = None, device: Any = None, pin_memory: Any = None
-) -> torch.Tensor:
+def _empty_strided(size: Any, stride: Any, *, dtype: Any = None, **_: Any) -> torch.Tensor:
     return PretendTensor(torch.empty_strided(size, stride, dtype=dtype))
 
 
 @torch.library.impl("aten::_copy_from", "privateuseone")
-def _copy_from(source: torch.Tensor, target: torch.Tensor, non_blocking: bool = False) -> torch.Tensor:
+def _copy_from(source: torch.Tensor, target: torch.Tensor, *_: Any) -> torch.Tensor:
     _count("up" if isinstance(target, PretendTensor) else "down")
     _memory(target).copy_(_memory(source))
     return target
@@ -194,9 +194,8 @@ class _Kernel(torch.autograd.Function):
             out = function(*inner[:cut], **dict(zip(names, inner[cut:], strict=True)))
         ctx.inner, ctx.out = inner, out if isinstance(out, tuple) else (out,)
         found = tuple(PretendTensor(x.detach()) if isinstance(x, torch.Tensor) else x for x in ctx.out)
-        ctx.mark_non_differentiable(*(
-            made for made, x in zip(found, ctx.out, strict=True) if isinstance(made, PretendTensor) and not x.requires_grad
-        ))  # fmt: skip
+        pairs = [(made, x) for made, x in zip(found, ctx.out, strict=True) if isinstance(made, PretendTensor)]
+        ctx.mark_non_differentiable(*(made for made, x in pairs if not x.requires_grad))
         return found if isinstance(out, tuple) else found[0]
 
     @staticmethod

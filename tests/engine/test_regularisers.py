@@ -12,8 +12,8 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import SH0, Gaussians
-from gsstream.engine.frame0.regularisers import DROPOUT, MOST_OPAQUE, choose_regularisers, thin_out
-from gsstream.engine.frame0.smooth_depth import PLACED, add_smooth_depth_grad, mean_roughness
+from gsstream.engine.frame0.regularisers import DROPOUT, MOST_OPAQUE, Dropout, choose_regularisers
+from gsstream.engine.frame0.smooth_depth import PLACED, SmoothDepth
 from gsstream.parts.render.reference import ReferenceRenderer
 from gsstream.parts.render.wrt import NEVER_DRAWN, WrtScene
 from gsstream.recipe.model import FirstFrame
@@ -75,17 +75,20 @@ def test_smoothness_takes_part_in_every_other_iteration_and_weighs_the_same() ->
 
 def test_those_that_stay_make_up_for_those_that_are_left_out() -> None:
     rows = replace(wall(torch.full((144,), 2.0)), opacities=torch.linspace(-4, 6, 144))
-    thinned, keep = thin_out(rows, DROPOUT, torch.Generator().manual_seed(0))
+    dropout = Dropout(DROPOUT, 7, torch.Generator().manual_seed(0))
+    thinned, keep = dropout.thin_out(rows)
     assert keep is not None
-    shares = [float(thin_out(rows, DROPOUT, torch.Generator().manual_seed(i))[1].float().mean()) for i in range(30)]
+    shares = [float(dropout.thin_out(rows)[1].float().mean()) for _ in range(30)]  # type: ignore[union-attr]
     assert np.mean(shares) == pytest.approx(1 - DROPOUT, abs=0.02)
     before, after = rows.opacities.sigmoid(), thinned.opacities.sigmoid()
     torch.testing.assert_close(after, (before / (1 - DROPOUT)).clamp(max=MOST_OPAQUE))
     assert torch.isfinite(thinned.opacities).all()
+    fewer = rows.rows(slice(0, 100))
+    assert dropout.thin_out(fewer)[1].shape == (100,), "what was drawn for another number of Gaussians is drawn anew"
     drawn = WrtScene(thinned, keep=keep).placed()
     assert (drawn.opacities[~keep] == NEVER_DRAWN).all()
     assert torch.equal(drawn.opacities[keep], thinned.opacities[keep])
-    same, none = thin_out(rows, 0.0, torch.Generator())
+    same, none = Dropout(0.0, 7, torch.Generator()).thin_out(rows)
     assert same is rows
     assert none is None
 
@@ -106,9 +109,13 @@ def roughness(rows: Gaussians[torch.Tensor], frame: Frame) -> float:
     return total
 
 
+def smooth_depth(images: Any) -> SmoothDepth:
+    return SmoothDepth(ReferenceRenderer(), Frame(0, 0.0, images, rig(2)), torch.device("cpu"))
+
+
 def gradient(rows: Gaussians[torch.Tensor], images: Any, weight: float = 1.0) -> Gaussians[torch.Tensor]:
     grad = rows.map(torch.zeros_like)
-    add_smooth_depth_grad(ReferenceRenderer(), rows, Frame(0, 0.0, images, rig(2)), 0, grad, weight)
+    smooth_depth(images).add_grad(rows, 0, grad, weight)
     return grad
 
 
@@ -136,7 +143,7 @@ def test_an_even_wall_is_smooth_and_an_edge_of_the_picture_allows_a_step() -> No
     step = torch.where(torch.arange(144) % 12 < 6, 1.5, 3.0)
     even = torch.full((144,), 2.0)
     on_edge, within, flat = (
-        float(mean_roughness(ReferenceRenderer(), wall(depth), Frame(0, 0.0, images, rig(2)), 0))
+        float(smooth_depth(images).mean_roughness(wall(depth), 0))
         for depth, images in ((step, edge), (step, grey), (even, grey))
     )
     assert flat < 0.1 * within

@@ -8,16 +8,16 @@ right, and six small integers where it is not.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, Generic, NamedTuple
 
 import numpy as np
 
 from gsstream.core.changes.groups import Groups
 from gsstream.core.changes.scene import Scene
 from gsstream.core.errors import ShapeError
-from gsstream.core.gaussians import SH0, Gaussians
+from gsstream.core.gaussians import SH0, Array, Gaussians, Other
 from gsstream.core.shapes import FloatArray, IntArray
 
 #: Cells are counted from -HALF_GRID to HALF_GRID - 1 along each axis; what lies beyond belongs to the outermost one.
@@ -56,18 +56,23 @@ class Motion:
         return not bool(np.any(self.moving))
 
 
-class GroupTransforms(NamedTuple):
+class GroupTransforms(NamedTuple, Generic[Array]):
     """The rows of moving groups, and the transform of each group: x' = R (x - center) + center + translation.
 
     ``rows`` [A] ascending, ``group`` [A] which of the K moving groups each is in, ``center``, ``translation``,
-    ``rotation`` [K, 3] float64 (turn: axis * tan(angle / 2)).
+    ``rotation`` [K, 3] float64 (turn: axis * tan(angle / 2)). Numpy arrays in codec and player, torch tensors where
+    they are fitted.
     """
 
-    rows: IntArray
-    group: IntArray
-    center: FloatArray
-    translation: FloatArray
-    rotation: FloatArray
+    rows: Any
+    group: Any
+    center: Array
+    translation: Array
+    rotation: Array
+
+    def map(self, function: Callable[[Array], Other]) -> GroupTransforms[Other]:
+        """Apply a function to every array."""
+        return GroupTransforms(*(function(value) for value in self))
 
 
 def groups_for(scene: Scene, cell: float, brightness_bins: int, regroup: bool = False) -> Groups:
@@ -122,7 +127,7 @@ def _numbered(digits: Sequence[IntArray], bases: Sequence[int]) -> tuple[IntArra
     return rank[key], len(names)
 
 
-def predict_transforms(scene: Scene, groups: Groups, moving: IntArray, predicted: bool) -> GroupTransforms:
+def predict_transforms(scene: Scene, groups: Groups, moving: IntArray, predicted: bool) -> GroupTransforms[Any]:
     """Return the moving rows and the predicted transform of their groups, before any correction.
 
     Means over rows are float64 sums in the order of rows, divided by their number.
@@ -197,7 +202,7 @@ def union_rows(number: int, *rows: IntArray) -> IntArray:
     return np.flatnonzero(marks)
 
 
-def transform_groups(gaussians: Gaussians[FloatArray], transforms: GroupTransforms) -> Gaussians[FloatArray]:
+def transform_groups(gaussians: Gaussians[FloatArray], transforms: GroupTransforms[Any]) -> Gaussians[FloatArray]:
     """Return the Gaussians with the rows of moving groups transformed. Raises ShapeError beyond float32."""
     if len(transforms.rows) == 0:
         return gaussians

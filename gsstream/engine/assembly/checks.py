@@ -9,9 +9,11 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 
 import torch
 
+from gsstream.core.deferred import require
 from gsstream.core.errors import InputError
 from gsstream.engine.assembly.call_location import Where
 from gsstream.engine.assembly.fault import fault
@@ -96,17 +98,30 @@ class Look:
 
         One pass without temporary memory when all is well.
         """
-        if self.level is not Checks.OFF:
+        if self.level is Checks.OFF:
+            return
+        if value.device.type == "cpu":
             problem = wrong_value(value, limits, rows)
             if problem:
                 raise self.fault(f"{what}: {problem}")
+        elif value.numel():
+            low, high = torch.aminmax(value.detach())
+            least, most = _EVERYTHING if limits is None else limits
+            require(
+                (low >= least) & (high <= most),
+                lambda: self.fault(f"{what}: {wrong_value(value.cpu(), limits, None if rows is None else rows.cpu())}"),
+            )
 
     def terms(self, terms: Mapping[str, torch.Tensor]) -> None:
         """Raise ComponentError unless every term of a penalty is one number; except with "off", a finite one."""
         for name, value in terms.items():
-            if value.numel() != 1 or not (self.level is Checks.OFF or bool(torch.isfinite(value).all())):
-                got = float(value) if value.numel() == 1 else f"shape {list(value.shape)}"
-                raise self.fault(f"penalty {name!r}: expected one finite number, got {got}")
+            if value.numel() != 1:
+                raise self.fault(f"penalty {name!r}: expected one finite number, got shape {list(value.shape)}")
+            if self.level is not Checks.OFF:
+                require(value.detach().isfinite().all(), partial(self._not_finite, name, value))
+
+    def _not_finite(self, name: str, value: torch.Tensor) -> Exception:
+        return self.fault(f"penalty {name!r}: expected one finite number, got {float(value)}")
 
     def fault(self, message: str) -> Exception:
         """Return the error about this part, here and now."""

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from copy import copy
 from functools import partial
 from inspect import getattr_static
 from pathlib import Path
 from traceback import walk_tb
 from typing import Any, TypeVar, cast
 
-from gsstream.core.errors import GsstreamError, InputError, ShapeError
+from gsstream.core.deferred import blaming
+from gsstream.core.errors import ComponentError, GsstreamError, InputError, ShapeError
 from gsstream.core.part import unwrapped
 from gsstream.engine.assembly.call_location import Where
 from gsstream.engine.assembly.checks import Checks, Look
@@ -41,13 +43,18 @@ def error_context(slot: str, part: object, where: Where) -> Iterator[None]:
     InputError, because a renderer is given nothing but arrays. Other errors of gsstream pass unchanged.
     """
     try:
-        yield
+        with blaming(lambda: partial(_as_fault, slot, part, copy(where))):
+            yield
     except GsstreamError as error:
         if isinstance(error, ShapeError) or (slot == "renderer" and isinstance(error, InputError)):
             raise fault(str(error), slot, part, where) from error
         raise
     except Exception as error:
         raise fault(f"{type(error).__name__}: {error}{_line_of(error, part)}", slot, part, where) from error
+
+
+def _as_fault(slot: str, part: object, where: Where, error: Exception) -> Exception:
+    return error if isinstance(error, ComponentError) else fault(str(error), slot, part, where)
 
 
 def _line_of(error: Exception, part: object) -> str:

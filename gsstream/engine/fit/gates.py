@@ -34,6 +34,7 @@ class TrainedGates:
         self._nodes, node_of = torch.unique(hierarchy.node_of[rows], return_inverse=True)
         self.hierarchy = _roots(node_of, len(self._nodes))
         self._table = RowParameters({"logits": logits[self._nodes]}, {"logits": lr}, optimiser)
+        self._ahead: list[torch.Tensor | None] = []
 
     @property
     def logits(self) -> torch.Tensor:
@@ -47,8 +48,19 @@ class TrainedGates:
     def node_of(self) -> torch.Tensor:
         return self.hierarchy.node_of
 
+    def draw_ahead(self, iterations: int) -> None:
+        """Draw the noise of the next iterations, where the logits are on a GPU: what is drawn crosses in one copy."""
+        if self.logits.device.type == "cpu":
+            return
+        drawn = [self._noise() for _ in range(iterations)]
+        some = [noise for noise in drawn if noise is not None]
+        self._ahead = list(torch.stack(some).to(self.logits.device)) if len(some) == iterations else drawn
+
+    def _noise(self) -> torch.Tensor | None:
+        return self.gate.noise(self.hierarchy.num_nodes, self._generator)
+
     def sample(self, frozen: torch.Tensor | None) -> torch.Tensor:
-        noise = self.gate.noise(self.hierarchy.num_nodes, self._generator)
+        noise = self._ahead.pop(0) if self._ahead else self._noise()
         per_row = self.gate.sample(self.logits, noise)[self.node_of]
         return per_row if frozen is None else per_row * ~frozen
 

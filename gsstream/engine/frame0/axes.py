@@ -13,7 +13,7 @@ from dataclasses import replace
 import torch
 
 from gsstream.core.gaussians import Gaussians
-from gsstream.parts.render.activations import rotation_matrices
+from gsstream.parts.render.activations import quat_multiply_torch, rotation_matrices
 
 _HALF = 0.5**0.5
 
@@ -42,12 +42,6 @@ def _rotations() -> torch.Tensor:
             edge[one], edge[other] = _HALF, sign * _HALF
             edges.append(edge)
     return torch.tensor([*units, *halves, *edges], dtype=torch.float64)
-
-
-def quat_multiply_torch(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Return the Hamilton products [n, 4] of quaternions, wxyz."""
-    w, v, x, u = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
-    return torch.cat([w * x - (v * u).sum(1, keepdim=True), w * u + x * v + torch.linalg.cross(v, u)], 1)
 
 
 def quat_conjugate(quats: torch.Tensor) -> torch.Tensor:

@@ -8,11 +8,12 @@ opacity and scale penalties and the near plane are gsstream's own; held-out qual
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
 
+from gsstream.core.deferred import deferred_checks
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, shrink_frame
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
@@ -20,7 +21,7 @@ from gsstream.core.picture_size import densify_factor, prune_factor
 from gsstream.core.rng import Rng
 from gsstream.core.topology import TopologyEdit
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.assembly.checks import VARIABLE, Look
+from gsstream.engine.assembly.checks import VARIABLE, Checks, Look
 from gsstream.engine.fit import schedule
 from gsstream.engine.fit.densify import DensifyStatistics, GrowthLimits, grow_and_prune
 from gsstream.engine.fit.exposure import ExposureFit
@@ -29,8 +30,8 @@ from gsstream.engine.fit.photometric import PhotometricLoss
 from gsstream.engine.frame0.hutchinson import TrainingViews
 from gsstream.engine.frame0.prune import prune_by_error
 from gsstream.engine.frame0.pyramid import Pyramid, PyramidLevel, keep_widths, plan_pyramid
-from gsstream.engine.frame0.regularisers import choose_regularisers, thin_out
-from gsstream.engine.frame0.smooth_depth import add_smooth_depth_grad
+from gsstream.engine.frame0.regularisers import Dropout, choose_regularisers
+from gsstream.engine.frame0.smooth_depth import SmoothDepth
 from gsstream.input.seeds.shell import find_shell
 from gsstream.parts.optimiser.row_parameters import RowParameters
 from gsstream.parts.render.activations import logit, rgb_to_sh0
@@ -108,9 +109,8 @@ def optimise_first_frame(
     run.exposure = ExposureFit.start(len(frame.cameras), run.device) if settings.exposure else None
     for level in pyramid.levels:
         run.enter(level)
-        for iteration in range(level.begin + 1, level.end + 1):
-            value = run.step(iteration)
-            progress(iteration, pyramid.iterations, value, len(run.levels))
+        for iteration in run.passes(level.begin + 1, level.end):
+            progress(iteration, pyramid.iterations, run.smooth, len(run.levels))
     exposure = run.exposure.centered().exposure.to(CPU) if run.exposure else None
     found = run.gaussians().map(lambda value: value.detach().to(CPU))
     parts.where.enter(frame.index)
@@ -153,10 +153,13 @@ class FirstFrameRun:
         self.exposure: ExposureFit | None = None
         self.statistics = DensifyStatistics.zeros(len(start), self.device)
         self.regularisers = choose_regularisers(self.settings, frame.cameras)
+        self.dropout = Dropout(self.regularisers.dropout, self.views, generator)
         #: [N] row of ``start`` that each Gaussian comes from.
         self.came_from = torch.arange(len(start), device=self.device)
         self.order: list[int] = []
+        #: Mean loss of the last iterations, and the losses [] that are not in it yet.
         self.smooth = math.nan
+        self.losses: list[torch.Tensor] = []
 
     def gaussians(self) -> Gaussians[torch.Tensor]:
         return Gaussians(**{name: self.table[name] for name in ATTRIBUTES})
@@ -173,29 +176,48 @@ class FirstFrameRun:
     def _set_level(self, level: PyramidLevel, exposure: Exposure | None) -> None:
         self.level, self.frame = level, shrink_frame(self.whole, level.factor)
         self.photometric = PhotometricLoss(self.parts.loss, schedule.DSSIM, self.frame.images, exposure, self.device)
+        self.smooth_depth = SmoothDepth(self.renderer, self.frame, self.device)
+        self.half_size = torch.tensor([self.frame.cameras.width / 2, self.frame.cameras.height / 2]).to(self.device)
 
-    def step(self, iteration: int) -> float:
+    def passes(self, first: int, last: int) -> Iterator[int]:
+        """Make the iterations from first to last, and yield the number of each.
+
+        What they computed is looked at after every pass over the views: a GPU is waited for with each look.
+        """
+        for begin in range(first, last + 1, self.views):
+            with deferred_checks(self.parts.checks is not Checks.STEP):
+                for iteration in range(begin, min(begin + self.views, last + 1)):
+                    self.step(iteration)
+                    if self.device == CPU:
+                        self._read_losses()
+                    yield iteration
+            self._read_losses()
+
+    def _read_losses(self) -> None:
+        for loss in torch.stack(self.losses).cpu().tolist() if self.losses else ():
+            self.smooth = loss if math.isnan(self.smooth) else 0.98 * self.smooth + 0.02 * loss
+        self.losses = []
+
+    def step(self, iteration: int) -> None:
+        """Make one iteration on one view."""
         view, self.parts.where.iteration = self._next_view(), iteration
         last = self.pyramid.densify_until * self.iterations
         densify = iteration + schedule.DENSIFY_EVERY >= schedule.DENSIFY_FROM and iteration <= last
         rows = self._disturbed(self.gaussians().map(torch.Tensor.detach))
-        rows, keep = thin_out(rows, self.regularisers.dropout, self.generator)
+        rows, keep = self.dropout.thin_out(rows)
         wrt = WrtScene(rows, densify, exposure=self.exposure is not None, keep=keep)
         found = self._loss_and_grad(view, wrt)
         if weight := self.regularisers.smoothness_at(iteration, self.iterations):
-            add_smooth_depth_grad(self.renderer, wrt.placed(), self.frame, view, found.grad, weight)
+            self.smooth_depth.add_grad(wrt.placed(), view, found.grad, weight)
         self.table.set_lr("means", self.extent * self.level.lr_at(iteration))
         self.table.step(self._with_penalty_grad(found.grad))
         if found.means2d is not None:
-            size = torch.tensor([self.frame.cameras.width / 2, self.frame.cameras.height / 2])
-            self.statistics = self.statistics.add(found.means2d * size)
+            self.statistics = self.statistics.add(found.means2d * self.half_size)
             if iteration >= schedule.DENSIFY_FROM and iteration % schedule.DENSIFY_EVERY == 0:
                 self._densify()
         if self.settings.prune_error > 0 and iteration in [int(n * self.iterations) for n in self.pyramid.prune_at]:
             self._prune()
-        loss = float(found.loss)
-        self.smooth = loss if math.isnan(self.smooth) else 0.98 * self.smooth + 0.02 * loss
-        return self.smooth
+        self.losses.append(found.loss)
 
     def _disturbed(self, rows: Gaussians[torch.Tensor]) -> Gaussians[torch.Tensor]:
         """The scene with noise on its centres, through which gradients pass unchanged; as it is without noise."""

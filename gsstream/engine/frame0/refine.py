@@ -21,14 +21,14 @@ from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.densify import DensifyStatistics
-from gsstream.engine.frame0.axes import quat_conjugate, quat_multiply_torch
+from gsstream.engine.frame0.axes import quat_conjugate
 from gsstream.engine.frame0.optimise import CPU, FirstFrameRun
 from gsstream.engine.frame0.pyramid import one_size
 from gsstream.engine.state.refinement import Refinement
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.method.tools import Tools
 from gsstream.packet import PlayerState
-from gsstream.parts.render.activations import rotation_matrices
+from gsstream.parts.render.activations import quat_multiply_torch, rotation_matrices
 from gsstream.parts.render.exposure import Exposure
 from gsstream.recipe.model import Stream
 
@@ -78,7 +78,7 @@ def start_refinement(player: PlayerState) -> Refinement:
     gaussians = player.gaussians.map(torch.from_numpy)
     count = len(gaussians)
     levels = torch.from_numpy(player.layout.unit_of.astype(np.int64))
-    return Refinement(gaussians, levels, torch.arange(count), {}, DensifyStatistics.zeros(count, gaussians.means.device), 0)
+    return Refinement(gaussians, levels, torch.arange(count), {}, DensifyStatistics.zeros(count, CPU), 0)
 
 
 def advance_refinement(
@@ -97,8 +97,8 @@ def advance_refinement(
     for name, held in start.moments.items():
         run.table.load_moments(name, held)
     last = start.iterations + stream.refine_iterations
-    for iteration in range(start.iterations + 1, last + 1):
-        run.step(iteration)
+    for _ in run.passes(start.iterations + 1, last):
+        pass
     moments = {name: {key: value.to(CPU) for key, value in run.table.moments(name).items()} for name in ATTRIBUTES}
     found = run.gaussians().map(lambda value: value.detach().to(CPU))
     ancestors = start.ancestors[run.came_from.to(CPU)]

@@ -53,12 +53,28 @@ def choose_regularisers(settings: FirstFrame, cameras: Cameras) -> Regularisers:
     return Regularisers(dropout, smoothness)
 
 
-def thin_out(
-    rows: Gaussians[torch.Tensor], share: float, generator: torch.Generator
-) -> tuple[Gaussians[torch.Tensor], torch.Tensor | None]:
-    """Return the rows with the opacity that makes up for those left out, and which [N] are kept (None: all)."""
-    if share == 0:
-        return rows, None
-    keep = (torch.rand(len(rows), generator=generator) >= share).to(rows.opacities.device)
-    opacities = torch.logit((rows.opacities.sigmoid() / (1 - share)).clamp(max=MOST_OPAQUE))
-    return replace(rows, opacities=opacities), keep
+class Dropout:
+    """Leaves a share of the Gaussians out of each iteration.
+
+    Which ones is drawn for some iterations at a time, so that what is drawn crosses to a GPU once in a while.
+
+    Arguments:
+        share: of the Gaussians that is left out, 0 to below 1.
+        ahead: number of iterations that are drawn for at a time.
+        generator: of the draws; it is used only where something is left out.
+    """
+
+    def __init__(self, share: float, ahead: int, generator: torch.Generator) -> None:
+        self._share, self._ahead, self._generator = share, ahead, generator
+        self._keep: list[torch.Tensor] = []
+
+    def thin_out(self, rows: Gaussians[torch.Tensor]) -> tuple[Gaussians[torch.Tensor], torch.Tensor | None]:
+        """Return the rows with the opacity that makes up for those left out, and which [N] are kept (None: all)."""
+        share, count = self._share, len(rows)
+        if share == 0:
+            return rows, None
+        if not self._keep or len(self._keep[-1]) != count:  # none is left, or they were drawn for another scene
+            drawn = torch.rand(self._ahead, count, generator=self._generator) >= share
+            self._keep = list(drawn.to(rows.opacities.device))
+        opacities = torch.logit((rows.opacities.sigmoid() / (1 - share)).clamp(max=MOST_OPAQUE))
+        return replace(rows, opacities=opacities), self._keep.pop()

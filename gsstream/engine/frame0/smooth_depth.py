@@ -9,7 +9,6 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.shapes import FloatArray
 from gsstream.parts.render.activations import rgb_to_sh0
 from gsstream.parts.render.backward import backward, gradient_of
 from gsstream.parts.render.base import Renderer
@@ -24,43 +23,53 @@ UNIT, MOST, NEAREST = 0.3, 3.0, 0.02
 LEAST_ALPHA = 0.1
 
 
-def add_smooth_depth_grad(
-    renderer: Renderer, rows: Gaussians[torch.Tensor], frame: Frame, view: int, grad: Gaussians[torch.Tensor],
-    weight: float,
-) -> None:  # fmt: skip
-    """Add to ``grad`` that of ``weight`` times the change of inverse depth where a view's image has no edge.
+class SmoothDepth:
+    """The smoothness of depth in the views of a frame. Depth is drawn at half size, which is all that it needs.
 
-    Depth is drawn at half size, which is all that smoothness needs. ``grad`` is changed in place.
+    Arguments:
+        renderer: of the run.
+        frame: training images, at the size at which they are fitted.
+        device: of the Gaussians.
     """
-    leaves = rows.map(lambda value: value.detach().clone().requires_grad_())
-    loss = mean_roughness(renderer, leaves, frame, view)
-    if not loss.requires_grad:  # nothing is drawn
-        return
-    backward([loss], [torch.full_like(loss, weight)])
-    for name in PLACED:
-        getattr(grad, name).add_(gradient_of(getattr(leaves, name)))
 
+    def __init__(self, renderer: Renderer, frame: Frame, device: torch.device) -> None:
+        cameras = frame.cameras
+        self._renderer, self._frame, self._extent = renderer, frame, cameras.extent
+        self._cameras = cameras.scaled(max(1, cameras.width // 2), max(1, cameras.height // 2))
+        self._poses = torch.from_numpy(cameras.viewmats).float().to(device)
+        self._edges: dict[int, list[torch.Tensor]] = {}
 
-def mean_roughness(renderer: Renderer, leaves: Gaussians[torch.Tensor], frame: Frame, view: int) -> torch.Tensor:
-    """Return [] mean change of inverse depth from pixel to pixel along both axes, less where the image changes."""
-    cameras = frame.cameras
-    half = cameras.scaled(max(1, cameras.width // 2), max(1, cameras.height // 2))
-    pose = torch.from_numpy(half.viewmats[view]).to(leaves.means)
-    depth = leaves.means @ pose[2, :3] + pose[2, 3]
-    inverse = (UNIT * cameras.extent / depth.clamp_min(NEAREST * cameras.extent)).clamp(max=MOST)
-    # Inverse depth is drawn as a colour on black, so that what a pixel shows is its mean times alpha.
-    shown = replace(leaves, sh0=rgb_to_sh0(inverse[:, None].repeat(1, 3)), shN=torch.zeros_like(leaves.shN))
-    drawn = renderer.render(shown, half, view, (0.0, 0.0, 0.0))
-    blended = drawn.image[..., 0] / drawn.alpha.clamp_min(LEAST_ALPHA)
-    image = _halved(frame.images[view], half.height, half.width).to(blended.device)
-    terms = []
-    for axis in (0, 1):
-        if blended.shape[axis] > 1:
-            edges = image.diff(dim=axis + 1).abs().mean(0)
-            terms.append((blended.diff(dim=axis).abs() * torch.exp(-edges / EDGE)).mean())
-    return torch.stack(terms).sum() if terms else blended.new_zeros(())
+    def add_grad(self, rows: Gaussians[torch.Tensor], view: int, grad: Gaussians[torch.Tensor], weight: float) -> None:
+        """Add to ``grad``, in place, that of ``weight`` times the roughness of a view."""
+        leaves = rows.map(lambda value: value.detach().clone().requires_grad_())
+        loss = self.mean_roughness(leaves, view)
+        if not loss.requires_grad:  # nothing is drawn
+            return
+        backward([loss], [torch.full_like(loss, weight)])
+        for name in PLACED:
+            getattr(grad, name).add_(gradient_of(getattr(leaves, name)))
 
+    def mean_roughness(self, leaves: Gaussians[torch.Tensor], view: int) -> torch.Tensor:
+        """Return [] mean change of inverse depth from pixel to pixel along both axes, less where the image changes."""
+        pose = self._poses[view]
+        depth = leaves.means @ pose[2, :3] + pose[2, 3]
+        inverse = (UNIT * self._extent / depth.clamp_min(NEAREST * self._extent)).clamp(max=MOST)
+        # Inverse depth is drawn as a colour on black, so that what a pixel shows is its mean times alpha.
+        shown = replace(leaves, sh0=rgb_to_sh0(inverse[:, None].repeat(1, 3)), shN=torch.zeros_like(leaves.shN))
+        drawn = self._renderer.render(shown, self._cameras, view, (0.0, 0.0, 0.0))
+        blended = drawn.image[..., 0] / drawn.alpha.clamp_min(LEAST_ALPHA)
+        terms = [
+            (blended.diff(dim=axis).abs() * weight).mean()
+            for axis, weight in enumerate(self._edge_weights(view))
+            if blended.shape[axis] > 1
+        ]
+        return torch.stack(terms).sum() if terms else blended.new_zeros(())
 
-def _halved(image: FloatArray, height: int, width: int) -> torch.Tensor:
-    """[3, height, width] of an image [H, W, 3]."""
-    return adaptive_avg_pool2d(torch.from_numpy(image).permute(2, 0, 1), (height, width))
+    def _edge_weights(self, view: int) -> list[torch.Tensor]:
+        """What a change of depth along both axes costs from pixel to pixel: less where the image changes, too."""
+        if view not in self._edges:
+            image = torch.from_numpy(self._frame.images[view]).permute(2, 0, 1)
+            half = adaptive_avg_pool2d(image, (self._cameras.height, self._cameras.width))
+            weights = [torch.exp(-half.diff(dim=axis + 1).abs().mean(0) / EDGE) for axis in (0, 1)]
+            self._edges[view] = [weight.to(self._poses.device) for weight in weights]
+        return self._edges[view]

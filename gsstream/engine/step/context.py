@@ -51,6 +51,7 @@ class EngineContext:
         self._hierarchy = state.hierarchy.to(device)
         self._frame, self._previous, self._device = frame, state.previous, device
         self._change = None if change is None else change.to(device)
+        self._static = [] if change is None else (~change.tiles.flatten(1).any(1)).tolist()
         self._background, self._part_scale = parts.background, part_scale
         self.log, self.key_rows = log, state.player.key_rows
         exposure = None if state.exposure is None else state.exposure.to(device)
@@ -114,7 +115,7 @@ class EngineContext:
         return self.session.screen_gradient_rows(view, self._upstream(view, image_gradient))
 
     def _is_static(self, view: int) -> bool:
-        return self._change is not None and not bool(self._change.tiles[view].any())
+        return self._change is not None and self._static[view]
 
     def _upstream(self, view: int, image_gradient: torch.Tensor) -> torch.Tensor:
         """A gradient by what a camera records, in the tiles that changed, as one by the scene's colours."""
@@ -165,7 +166,7 @@ class EngineContext:
     def on(self, gaussians: Gaussians[torch.Tensor], session: RenderSession | None = None) -> EngineContext:
         # The loss of the same images and the votes that were counted are shared, not made again.
         other = copy(self)
-        other._gaussians, other._session = gaussians, session
+        other._gaussians, other._session = gaussians.map(lambda value: value.to(self._device)), session
         return other
 
     def everywhere(self) -> EngineContext:

@@ -61,5 +61,7 @@ def propose_motion(
     gaussians = scene.gaussians.map(lambda value: torch.from_numpy(value).to(device))
     # The session is handed on to the moved scene, with its caches of all that stands still. The old session stays
     # correct, as it must until the frame has succeeded: should it be used again, it fills its caches anew.
-    session = view.session.commit(gaussians, torch.from_numpy(touched).to(device)) if 2 * len(touched) <= len(gaussians) else None
+    if 2 * len(touched) > len(gaussians):
+        return Moved(motions, scene, view.on(gaussians, None))
+    session = view.session.commit(gaussians, torch.from_numpy(touched).to(device))
     return Moved(motions, scene, view.on(gaussians, session))

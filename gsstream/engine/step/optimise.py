@@ -11,8 +11,10 @@ from functools import partial
 
 import torch
 
+from gsstream.core.deferred import deferred_checks
 from gsstream.core.picture_size import bit_price_factor
 from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.budget.epoch_scheduler import estimated_bytes
 from gsstream.engine.budget.schedule import Schedule
 from gsstream.engine.fit.gates import TrainedGates
@@ -88,7 +90,9 @@ class _Fit:
         ]
         price = self.schedule.rd_lambda * bit_price_factor(self.problem.pixels) / self.problem.pixels
         begin = partial(self.parts.where.iterate, first)
-        return self.residual.run(ResidualEpoch(self.problem.session, iterations, self.gates, price, begin))
+        self.gates.draw_ahead(len(iterations))
+        with deferred_checks(self.parts.checks is not Checks.STEP):
+            return self.residual.run(ResidualEpoch(self.problem.session, iterations, self.gates, price, begin))
 
     def frozen(self, fraction: float) -> torch.Tensor | None:
         """[A] bool: rows whose level is not trained yet at this share of the frame; None: all take part."""
@@ -125,7 +129,7 @@ class _Fit:
             latents=self.code.split(self.residual.latents.detach()),
             decoders=self.code.split_decoders(self.residual.matrix, self.decoders),
             logits=self.gates.all_logits(),
-            loss=sum(torch.stack(list(losses)).tolist()) / len(losses),
+            loss=sum(torch.stack(list(losses)).cpu().tolist()) / len(losses),
             iterations=iterations,
             curvature=self.code.split(self.residual.curvature),
             dead_gates=dead,

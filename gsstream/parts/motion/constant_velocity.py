@@ -50,7 +50,7 @@ class Coasting(MotionPart):
         moving &= changed_groups(groups, work, config.votes, config.share)
         if config.asked and moving.any():
             transforms = predict_transforms(scene, groups, moving.astype(np.uint8), predicted=True)
-            change = loss_change(scene, work, transforms, rotating_views(len(work.cameras), config.asked, work.index))
+            change = loss_change(work, transforms, rotating_views(len(work.cameras), config.asked, work.index))
             moving[np.flatnonzero(moving)[change >= 0]] = False
         symbols = np.zeros((int(moving.sum()), 6), np.int32)
         return (Motion(groups.cell, groups.brightness_bins, moving.astype(np.uint8), symbols),)

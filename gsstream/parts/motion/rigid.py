@@ -79,7 +79,7 @@ class Rigid(MotionPart):
         # Half a cell from the centre, an angle a moves a point by a * cell / 2 = tan(a / 2) * cell.
         units = Units(pixel, pixel / groups.cell)
         start = predict_transforms(scene, groups, able.astype(np.uint8), predicted=True)
-        found = self._fitted(scene, work, start, units, rng)
+        found = self._fitted(work, start, units, rng)
         steps = np.float32(config.step * units.translation), np.float32(config.step * units.rotation)
         step = np.array([float(steps[0])] * 3 + [float(steps[1])] * 3)
         predicted = np.concatenate([start.translation, start.rotation], 1)
@@ -90,7 +90,7 @@ class Rigid(MotionPart):
         moving[np.flatnonzero(able)[kept]] = 1
         return (Motion(groups.cell, groups.brightness_bins, moving, symbols[kept], float(steps[0]), float(steps[1])),)
 
-    def _fitted(self, scene: Scene, work: FitContext, start: GroupTransforms, units: Units, rng: Rng) -> FloatArray:
+    def _fitted(self, work: FitContext, start: GroupTransforms[FloatArray], units: Units, rng: Rng) -> FloatArray:
         """[K, 6] shift and turn of the groups that explain the images best."""
         config = self.config
         total = work.scaled(config.epochs * len(work.cameras))
@@ -99,4 +99,4 @@ class Rigid(MotionPart):
         order = rng.numpy("motion", work.index)
         small = work.cameras.width < LARGE if config.everywhere == "auto" else config.everywhere
         tiles: Literal["all", "changed"] = "all" if small else "changed"
-        return fit_transforms_newton(scene, work, start, units.row, total, order, damping, tiles)
+        return fit_transforms_newton(work, start, units.row, total, order, damping, tiles)

@@ -7,6 +7,7 @@ from typing import final
 
 import torch
 
+from gsstream.core.deferred import require
 from gsstream.core.errors import ShapeError
 from gsstream.core.shapes import check_finite, check_shape
 from gsstream.parts.optimiser.base import ADAM_BETAS, ADAM_EPS, MAX_GRADIENT, AdamState, RowOptimiser
@@ -39,6 +40,10 @@ class ReferenceAdam(RowOptimiser):
 
 
 def _check_size(name: str, gradient: torch.Tensor) -> None:
+    if gradient.device.type != "cpu":
+        message = f"gradient of {name}: expected finite magnitudes up to {MAX_GRADIENT:g}, got one that is not"
+        require((gradient.abs() <= MAX_GRADIENT).all(), lambda: ShapeError(message))
+        return
     check_finite(f"gradient of {name}", gradient)
     bad = gradient.abs() > MAX_GRADIENT
     if bool(bad.any()):

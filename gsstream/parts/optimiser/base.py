@@ -42,7 +42,8 @@ class RowOptimiser(Part):
 
         Raises:
             ShapeError: shapes that differ, a gradient that is not finite or beyond MAX_GRADIENT (that table is not
-                changed then).
+                changed then). On a GPU the gradient is looked at through ``gsstream.core.deferred``: the error may come
+                at the end of the pass, and the table is of no use then.
         """
 
     def residual_optimiser(

@@ -61,6 +61,6 @@ def rate_gradient(latents: torch.Tensor, steps: torch.Tensor, gates: torch.Tenso
         latents: [A, L] of all attributes, side by side. steps: [L] latent units per symbol.
         gates: [A] in [0, 1]; rows at 0 are not sent and cost nothing. weight: loss per bit.
     """
-    sent = (gates > 0).nonzero()[:, 0]
-    out = torch.zeros_like(latents)
-    return out.index_copy_(0, sent, laplace_gradient(latents[sent], steps, channel_spread(latents, steps)).mul_(weight))
+    # A factor and no selection: to count the rows behind open gates, a GPU is waited for.
+    gradient = laplace_gradient(latents, steps, channel_spread(latents, steps)).mul_(weight)
+    return torch.where((gates > 0)[:, None], gradient, 0.0)

@@ -32,6 +32,12 @@ def rotation_matrices(quats: torch.Tensor) -> torch.Tensor:
 
 
 
+def quat_multiply_torch(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Return the Hamilton products [n, 4] of quaternions, wxyz."""
+    w, v, x, u = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
+    return torch.cat([w * x - (v * u).sum(1, keepdim=True), w * u + x * v + torch.linalg.cross(v, u)], 1)
+
+
 def rgb_to_sh0(rgb: torch.Tensor) -> torch.Tensor:
     """Return degree-0 coefficients [N, 1, 3], given colours [N, 3] in [0, 1]."""
     return ((rgb - 0.5) / SH0)[:, None]

@@ -70,6 +70,8 @@ class RenderSession(ABC):
         that these pixels do not reach.
         """
         found = self.screen_gradient(view, image_gradient)
+        if found.visible.device.type != "cpu":  # to count those that are seen, a GPU is waited for
+            return RowGradient(torch.arange(len(found.gradient), device=found.visible.device), found.gradient)
         rows = found.visible.nonzero()[:, 0]
         return RowGradient(rows, found.gradient[rows])
 
@@ -110,7 +112,7 @@ class RenderSession(ABC):
             ShapeError: tiles of another shape or dtype.
         """
         # A camera without a marked tile has no say, and need not be projected into.
-        first, *others = tiles.flatten(1).any(1).nonzero()[:, 0].tolist() or [0]
+        first, *others = tiles.flatten(1).any(1).cpu().nonzero()[:, 0].tolist() or [0]
         drawn = self.visible(first, tiles[first])
         for view in others:
             drawn = drawn | self.visible(view, tiles[view])
@@ -192,8 +194,8 @@ def _compared(
 
 
 def _curvature(
-    session: RenderSession, view: int, target: ViewTarget, transforms: GroupTransforms, leaves: Gaussians[torch.Tensor],
-    wanted: torch.Tensor | None,
+    session: RenderSession, view: int, target: ViewTarget, transforms: GroupTransforms[torch.Tensor],
+    leaves: Gaussians[torch.Tensor], wanted: torch.Tensor | None,
 ) -> torch.Tensor:  # fmt: skip
     """[K, 6, 6] of Gauss-Newton, from the share that each row has of a pixel's light."""
     rows = leaves.map(torch.Tensor.detach)
@@ -202,5 +204,4 @@ def _curvature(
     recorded = target.exposure.apply(image.detach()) if target.exposure else image.detach()
     # The gradient of a pixel by a colour is the share that its Gaussian has of the pixel's light.
     backward([image], [weighted_structure_tensor(recorded, target.image)])
-    structure = gradient_of(colour)[:, 0].numpy() / SH0
-    return torch.from_numpy(curvature_of(rows.means.numpy(), transforms, session.cameras, view, structure))
+    return curvature_of(rows.means, transforms, session.cameras, view, gradient_of(colour)[:, 0] / SH0)

@@ -1,60 +1,97 @@
-"""Gradient and curvature of a view's loss by the rigid transforms of groups of rows."""
+"""Rigid transforms of groups of rows in torch: the rows after them, and gradient and curvature of a loss by them."""
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
+
 import torch
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.changes.motion import GroupTransforms
+from gsstream.core.changes.motion import GroupTransforms, transform_groups
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.shapes import FloatArray
+from gsstream.parts.render.activations import quat_multiply_torch, rotation_matrices
 
 
-def transform_vjp(leaves: Gaussians[torch.Tensor], transforms: GroupTransforms) -> FloatArray:
-    """Return the gradient [K, 6] by shift and turn of the groups, from that of the rows that they have moved."""
-    number = len(transforms.center)
+def transform_rows(base: Gaussians[torch.Tensor], transforms: GroupTransforms[torch.Tensor]) -> Gaussians[torch.Tensor]:
+    """Return rows [A], raw values, after the transforms of their groups.
+
+    On the processor they have the decoder's bits; elsewhere they are those within rounding to float32.
+    """
+    if base.means.device.type == "cpu":
+        moved = transform_groups(base.map(lambda value: value.detach().numpy()), transforms.map(torch.Tensor.numpy))
+        return moved.map(torch.from_numpy)
+    group, center = transforms.group, transforms.center
+    # axis * tan(angle / 2) is the vector part of the quaternion, in units of the scalar part.
+    turn = torch.cat([torch.ones_like(center[:, :1]), transforms.rotation], 1)
+    turn = turn / turn.norm(dim=1, keepdim=True)
+    arm = (base.means.double() - center[group])[..., None]
+    means = (rotation_matrices(turn)[group] @ arm)[..., 0] + (center + transforms.translation)[group]
+    quats = quat_multiply_torch(turn[group], base.quats.double())
+    return replace(base, means=means.float(), quats=quats.float())
+
+
+def transform_vjp(leaves: Gaussians[torch.Tensor], transforms: GroupTransforms[torch.Tensor]) -> torch.Tensor:
+    """Return the gradient [K, 6] float64 by shift and turn of the groups, from that of the rows they have moved."""
+    out = torch.zeros_like(transforms.center).repeat(1, 2)
     if leaves.means.grad is None:
-        return np.zeros((number, 6))
-    force = leaves.means.grad.numpy().astype(np.float64)
-    arm = leaves.means.detach().numpy() - (transforms.center + transforms.translation)[transforms.group]
-    torque = 2 * np.cross(arm, force)
+        return out
+    force = leaves.means.grad.double()
+    arm = leaves.means.detach().double() - (transforms.center + transforms.translation)[transforms.group]
+    torque = 2 * _cross(arm, force)
     if leaves.quats.grad is not None:
-        w, x, y, z = leaves.quats.detach().numpy().astype(np.float64).T
-        a, b, c, d = leaves.quats.grad.numpy().astype(np.float64).T
+        w, x, y, z = leaves.quats.detach().double().unbind(1)
+        a, b, c, d = leaves.quats.grad.double().unbind(1)
         # A small turn v in front of a quaternion q adds (0, v) q to it.
-        torque += np.stack([
+        torque += torch.stack([
             -a * x + b * w - c * z + d * y, -a * y + b * z + c * w - d * x, -a * z - b * y + c * x + d * w
         ], 1)  # fmt: skip
-    both = np.concatenate([force, torque], 1)
-    return np.stack([np.bincount(transforms.group, both[:, i], number) for i in range(6)], 1)
+    return out.index_add_(0, transforms.group, torch.cat([force, torque], 1))
 
 
 def curvature_of(
-    means: FloatArray, transforms: GroupTransforms, cameras: Cameras, view: int, structure: FloatArray
-) -> FloatArray:
-    """Return the curvature [K, 6, 6] of a view's loss by shift and turn of groups of rows.
+    means: torch.Tensor, transforms: GroupTransforms[torch.Tensor], cameras: Cameras, view: int, structure: torch.Tensor
+) -> torch.Tensor:
+    """Return the curvature [K, 6, 6] float64 of a view's loss by shift and turn of groups of rows.
 
     A row that moves carries its share of the picture along: at a pixel the picture changes by its slope times the
     shift of the row on the screen, times the row's share of the pixel's light. As shares add up to at most 1, the sum
     over rows of share * (slope * shift)^2 is at least the square of the sum, also where rows of several groups share a
     pixel: the blocks together lie above the matrix of Gauss-Newton of all groups at once, so each can be solved for
     itself. In units of the loss, which is a mean over all values of a picture; its SSIM counts as if it were L1.
+
+    Arguments:
+        means: [A, 3] centres of the rows after the move.
+        structure: [A, 3] of the picture's structure tensor (xx, xy, yy), the share that each row has.
     """
-    by_row = _on_screen(means, transforms, cameras, view)
-    xx, xy, yy = structure.T.astype(np.float64)
-    tensor = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)
-    out = np.zeros((len(transforms.center), 6, 6))
-    np.add.at(out, transforms.group, np.swapaxes(by_row, 1, 2) @ tensor @ by_row)
+    by_row = _on_screen(means.double(), transforms, cameras, view)
+    xx, xy, yy = structure.double().unbind(1)
+    tensor = torch.stack([torch.stack([xx, xy], -1), torch.stack([xy, yy], -1)], -2)
+    out = by_row.new_zeros(len(transforms.center), 6, 6)
+    out.index_add_(0, transforms.group, by_row.transpose(1, 2) @ tensor @ by_row)
     return out / (3 * cameras.height * cameras.width)
 
 
-def _on_screen(means: FloatArray, transforms: GroupTransforms, cameras: Cameras, view: int) -> FloatArray:
+def _on_screen(
+    means: torch.Tensor, transforms: GroupTransforms[torch.Tensor], cameras: Cameras, view: int
+) -> torch.Tensor:
     """[A, 2, 6] derivative of each row's place on the screen, pixels, by shift and turn of its group."""
-    rotation, focal = cameras.viewmats[view, :3, :3], np.diag(cameras.Ks[view])[:2]
-    seen = means @ rotation.T + cameras.viewmats[view, :3, 3]
-    depth = np.maximum(seen[:, 2], cameras.near_plane)
-    tangents = (seen[:, :2] / depth[:, None])[..., None]
-    translation = (focal / depth[:, None])[..., None] * (rotation[:2] - tangents * rotation[2])
+    # As numbers, which go along with every operation: a matrix would be copied to the device.
+    rotation, offset = cameras.viewmats[view, :3, :3].tolist(), cameras.viewmats[view, :3, 3].tolist()
+    x, y, z = means.unbind(1)
+    seen = [row[0] * x + row[1] * y + row[2] * z + at for row, at in zip(rotation, offset, strict=True)]
+    depth = seen[2].clamp_min(cameras.near_plane)
+    by_shift = [
+        torch.stack([float(cameras.Ks[view, i, i]) * (rotation[i][axis] - seen[i] / depth * rotation[2][axis]) / depth
+                     for axis in range(3)], 1)
+        for i in range(2)
+    ]  # fmt: skip
+    translation = torch.stack(by_shift, 1)
     arm = means - (transforms.center + transforms.translation)[transforms.group]
-    return np.concatenate([translation, 2 * np.cross(arm[:, None], translation)], -1)
+    turned = _cross(arm[:, None], translation)
+    return torch.cat([translation, 2 * turned], -1)
+
+
+def _cross(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Cross products [..., 3], each product rounded by itself, as the compiled renderer does it."""
+    (ax, ay, az), (bx, by, bz) = a.unbind(-1), b.unbind(-1)
+    return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)

@@ -8,11 +8,10 @@ from typing import Generic, TypeVar, final
 
 import torch
 
-from gsstream.core.changes.motion import GroupTransforms, transform_groups
+from gsstream.core.changes.motion import GroupTransforms
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.shapes import FloatArray
 from gsstream.parts.render.backward import gradient_of
-from gsstream.parts.render.transforms import transform_vjp
+from gsstream.parts.render.transforms import transform_rows, transform_vjp
 
 G = TypeVar("G")
 
@@ -71,15 +70,15 @@ class WrtTransforms(Wrt[torch.Tensor]):
     """
 
     base: Gaussians[torch.Tensor]
-    transforms: GroupTransforms
+    transforms: GroupTransforms[torch.Tensor]
     curvature: bool = False
 
     def placed(self) -> Gaussians[torch.Tensor]:
-        """Return the rows after they moved, with the decoder's bits."""
-        return transform_groups(self.base.map(_array), self.transforms).map(torch.from_numpy)
+        """Return the rows after they moved."""
+        return transform_rows(self.base, self.transforms)
 
     def grad(self, leaves: Gaussians[torch.Tensor]) -> torch.Tensor:
-        return torch.from_numpy(transform_vjp(leaves, self.transforms))
+        return transform_vjp(leaves, self.transforms)
 
 
 @final
@@ -129,6 +128,3 @@ class LossAndGrad(Generic[G]):
     means2d: torch.Tensor | None = None
     exposure: torch.Tensor | None = None
 
-
-def _array(value: torch.Tensor) -> FloatArray:
-    return value.detach().numpy()

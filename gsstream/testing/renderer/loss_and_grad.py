@@ -74,11 +74,11 @@ def narrowed(part: Renderer) -> tuple[RenderSession, Scene]:
     return session, case.gaussians.rows(active).map(lambda v: v + 0.02 * torch.randn(v.shape, generator=g))
 
 
-def transforms(count: int) -> GroupTransforms:
+def transforms(count: int) -> GroupTransforms[torch.Tensor]:
     """Return small transforms of three groups of so many rows."""
     rng = np.random.default_rng(5)
     parts = (0.02 * rng.standard_normal((3, 3)) for _ in range(3))
-    return GroupTransforms(np.arange(count), np.arange(count) % 3, *parts)
+    return GroupTransforms(np.arange(count), np.arange(count) % 3, *parts).map(torch.from_numpy)
 
 
 def compare(what: str, got: LossAndGrad[Any], want: LossAndGrad[Any], tolerance: float) -> None:

@@ -188,7 +188,7 @@ class Sessions(RuleBasedStateMachine):
         rng, rows = np.random.default_rng(seed), self.rows(0.0, 0)
         place = np.arange(len(rows)) % 2
         given = GroupTransforms(np.arange(len(rows)), place, *(0.3 * rng.standard_normal((2, 3)) for _ in range(3)))
-        wrt = WrtTransforms(rows, given, curvature)
+        wrt = WrtTransforms(rows, given.map(torch.from_numpy), curvature)
         self.compare(lambda session: found(session.loss_and_grad(view, target, wrt)))
 
     @precondition(lambda self: self.active is None)

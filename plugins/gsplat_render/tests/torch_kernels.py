@@ -34,7 +34,10 @@ def project(
     seen = (radii > 0) & inside & (box > 0) & (opacities.detach() >= 1 / 255)[None, :, None]
     radii, seen = torch.where(seen, box.int(), torch.zeros_like(radii)), seen.all(-1)
     wide = seen[..., None]
-    return radii * wide, torch.where(wide, means2d, NAN), torch.where(seen, depths, NAN), torch.where(wide, conics, NAN), None
+    means2d, depths, conics = (
+        torch.where(mask, value, NAN) for mask, value in ((wide, means2d), (seen, depths), (wide, conics))
+    )
+    return radii * wide, means2d, depths, conics, None
 
 
 def harmonics(

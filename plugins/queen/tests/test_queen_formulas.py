@@ -158,7 +158,8 @@ class TestBirths:
             torch.testing.assert_close(got, matrix @ v, atol=1e-5, rtol=1e-5)
 
     def test_means_count_only_the_iterations_that_hit(self) -> None:
-        statistics = DensifyStatistics.zeros(2, torch.device("cpu")).add(torch.tensor([[3.0, 4.0], [0, 0]])).add(torch.zeros(2, 2))
+        none = DensifyStatistics.zeros(2, torch.device("cpu"))
+        statistics = none.add(torch.tensor([[3.0, 4.0], [0, 0]])).add(torch.zeros(2, 2))
         assert statistics.mean.tolist() == [5.0, 0.0]
 
 

@@ -15,6 +15,7 @@ from gsstream.core.log import FrameLog
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.context import EngineContext
 from gsstream.packet import PlayerState
+from gsstream.parts.motion.fitting import narrow_to
 from gsstream.parts.motion.groups import changed_groups, known_groups, pixel_size
 from gsstream.parts.motion.newton import DampedNewton, Damping, fit_transforms_newton
 from gsstream.parts.render.transforms import curvature_of
@@ -25,28 +26,33 @@ from gsstream.testing.working import FitFixture, fit_fixture
 FREE = Damping(0.0, 1e-9, 1e9)
 
 
-def bowls(views: int, groups: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def start(groups: int) -> torch.Tensor:
+    return torch.zeros(groups, 6, dtype=torch.float64)
+
+
+def bowls(views: int, groups: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Matrices [V, K, 6, 6] and bottoms [V, K, 6] of losses (x - bottom)^T matrix (x - bottom) / 2."""
     rng = np.random.default_rng(seed)
     roots = rng.standard_normal((views, groups, 6, 8))
-    return roots @ np.swapaxes(roots, -1, -2), rng.standard_normal((views, groups, 6))
+    matrices, bottoms = roots @ np.swapaxes(roots, -1, -2), rng.standard_normal((views, groups, 6))
+    return torch.from_numpy(matrices), torch.from_numpy(bottoms)
 
 
 @pytest.mark.parametrize("views", [1, 2, 7])
 def test_after_each_view_of_the_first_pass_it_stands_at_the_bottom_of_all_seen_so_far(views: int) -> None:
     matrices, bottoms = bowls(views, 5, 2)
-    descent = DampedNewton(np.zeros((5, 6)), FREE)
+    descent = DampedNewton(start(5), FREE)
     for view in range(views):
         slope = (matrices[view] @ (descent.values - bottoms[view])[..., None])[..., 0]
         descent.step(slope, matrices[view])
-        total, pulled = matrices[: view + 1].sum(0), (matrices @ bottoms[..., None])[: view + 1].sum(0)
+        total, pulled = matrices[: view + 1].sum(0).numpy(), (matrices @ bottoms[..., None])[: view + 1].sum(0).numpy()
         np.testing.assert_allclose(descent.values, np.linalg.solve(total, pulled)[..., 0], atol=1e-6)
 
 
 def test_a_view_that_is_not_measured_is_taken_to_curve_as_the_others_do() -> None:
     matrices, bottoms = bowls(3, 4, 3)
-    same = np.broadcast_to(matrices.mean(0), matrices.shape)
-    measured, taken = DampedNewton(np.zeros((4, 6)), FREE), DampedNewton(np.zeros((4, 6)), FREE)
+    same = matrices.mean(0).expand_as(matrices)
+    measured, taken = DampedNewton(start(4), FREE), DampedNewton(start(4), FREE)
     for step in range(7):
         view = step % 3
         for descent, curvature in ((measured, same[0]), (taken, same[0] if step < 3 else None)):
@@ -55,18 +61,18 @@ def test_a_view_that_is_not_measured_is_taken_to_curve_as_the_others_do() -> Non
 
 
 def test_a_group_that_no_picture_holds_moves_by_no_more_than_its_slope_over_hold() -> None:
-    slope = np.random.default_rng(4).standard_normal((3, 6))
-    descent = DampedNewton(np.zeros((3, 6)), Damping(0.1, 50.0, 0.5))
-    descent.step(slope, np.zeros((3, 6, 6)))
+    slope = torch.from_numpy(np.random.default_rng(4).standard_normal((3, 6)))
+    descent = DampedNewton(start(3), Damping(0.1, 50.0, 0.5))
+    descent.step(slope, start(3)[..., None].expand(3, 6, 6))
     np.testing.assert_allclose(descent.values, -slope / 50)
 
 
 def test_no_number_moves_further_than_the_longest_step_and_its_direction_stays() -> None:
-    slope = 1e9 * np.array([[1.0, -2.0, 0.5, 0.0, 0.0, 0.0], [1e-12] * 6])
-    descent = DampedNewton(np.zeros((2, 6)), Damping(0.1, 40.0, 0.5))
-    descent.step(slope, np.broadcast_to(np.eye(6), (2, 6, 6)))
+    slope = 1e9 * torch.tensor([[1.0, -2.0, 0.5, 0.0, 0.0, 0.0], [1e-12] * 6], dtype=torch.float64)
+    descent = DampedNewton(start(2), Damping(0.1, 40.0, 0.5))
+    descent.step(slope, torch.eye(6, dtype=torch.float64).expand(2, 6, 6))
     np.testing.assert_allclose(descent.values[0], [-0.25, 0.5, -0.125, 0, 0, 0])
-    assert np.abs(descent.values[1]).max() < 1e-3, "one group's length is not another's"
+    assert float(descent.values[1].abs().max()) < 1e-3, "one group's length is not another's"
 
 
 def places(means: np.ndarray, case: object, view: int) -> np.ndarray:
@@ -94,7 +100,8 @@ def test_curvature_is_how_far_rows_go_on_the_screen_times_what_holds_them_there(
         return transformed64(base, moves._replace(translation=moves.translation + along[:, :3], rotation=along[:, 3:]))
 
     now = moved(0.0)
-    curvature = curvature_of(now, moves, case.cameras, 1, structure)
+    given = torch.from_numpy(now), moves.map(torch.from_numpy), case.cameras, 1, torch.from_numpy(structure)
+    curvature = curvature_of(*given).numpy()
     step = (places(moved(1e-5), case, 1) - places(moved(-1e-5), case, 1)) / 2e-5
     held = np.einsum("ai,aij,aj->a", step, tensors, step)
     values = 3 * case.cameras.height * case.cameras.width
@@ -122,13 +129,12 @@ def test_the_transform_by_hand_is_that_of_the_stream() -> None:
     np.testing.assert_allclose(transform_groups(base, moves).means, transformed64(base, moves), atol=1e-5)
 
 
-def moving(case: FitFixture) -> tuple[Gaussians[torch.Tensor], GroupTransforms]:
+def moving(case: FitFixture) -> tuple[Gaussians[torch.Tensor], GroupTransforms[torch.Tensor]]:
     """All groups that lie in what changed, where they stand, and the work narrowed to them."""
     groups = known_groups(case.scene, case.work.cameras, 12, 2)
     able = changed_groups(groups, case.work, 0.75, 0.5)
     start = predict_transforms(case.scene, groups, able.astype(np.uint8), predicted=True)
-    case.work.narrow(torch.from_numpy(start.rows))
-    return case.scene.gaussians.rows(start.rows).map(torch.from_numpy), start._replace(rows=np.arange(len(start.rows)))
+    return narrow_to(case.work, start)
 
 
 @pytest.mark.parametrize("tiles", ["all", "changed"])
@@ -148,7 +154,9 @@ def test_nothing_that_changed_holds_nothing() -> None:
     rows = np.arange(0, len(case.scene.gaussians.means), 3)
     case.work.narrow(torch.from_numpy(rows))
     zeros = np.zeros((1, 3))
-    moves = GroupTransforms(np.arange(len(rows)), np.zeros(len(rows), np.int64), zeros, zeros, zeros)
+    moves = GroupTransforms(
+        np.arange(len(rows)), np.zeros(len(rows), np.int64), zeros, zeros, zeros
+    ).map(torch.from_numpy)
     base = case.scene.gaussians.rows(rows).map(torch.from_numpy)
     found = case.work.loss_and_grad(0, WrtTransforms(base, moves, curvature=True), "changed")
     assert not found.grad.any()
@@ -178,8 +186,8 @@ def test_a_body_that_moved_is_found_where_it_went(seed: int) -> None:
     images = np.stack([seen(blank).shown(after, view).numpy() for view in range(len(cameras))])
     arm = float(np.linalg.norm(gaussians.means[rows] - centre, axis=1).mean())
     unit, order = np.array([pixel] * 3 + [pixel / arm] * 3), np.random.default_rng(0)
-    scene, start = replace(fit_fixture().scene, gaussians=gaussians), moves._replace(translation=zeros, rotation=zeros)
-    found = fit_transforms_newton(scene, seen(images), start, unit, 8 * len(cameras), order, Damping(0.1, 1.0, 0.5))
+    start = moves._replace(translation=zeros, rotation=zeros)
+    found = fit_transforms_newton(seen(images), start, unit, 8 * len(cameras), order, Damping(0.1, 1.0, 0.5))
     wanted = np.concatenate([shift, turn], 1)
     before, now = np.abs(wanted / unit).max(), np.abs((found - wanted) / unit).max()
     assert now < 0.15, f"{now:.2f} of {before:.2f} pixels are left"

@@ -91,7 +91,7 @@ def test_the_switch_says_what_two_renders_say(share: float, sign: int, turns: bo
     expected = sum(
         loss(work, transform_groups(scene.gaussians, moves), view) - loss(work, scene.gaussians, view) for view in views
     )
-    found = loss_change(scene, frame_in_which(share, turns), moves, views)
+    found = loss_change(frame_in_which(share, turns), moves, views)
     assert np.sign(expected) == sign
     assert np.sign(found).tolist() == [sign] * 3
     # The loss is no parabola, and one group hides another: the size is right within a factor of two, or of three where

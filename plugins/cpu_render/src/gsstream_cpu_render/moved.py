@@ -18,7 +18,7 @@ def loss_and_grad_of_transforms(
     rasterizer: Any, compared: Any, target: ViewTarget, wrt: WrtTransforms
 ) -> LossAndGrad[torch.Tensor] | None:
     """Return loss, gradient and curvature; None where there is a fault."""
-    transforms = wrt.transforms
+    transforms = wrt.transforms.map(torch.Tensor.numpy)
     groups = len(transforms.center)
     grad, curvature = np.empty((groups, 6)), np.empty((groups, 6, 6)) if wrt.curvature else None
     group = np.ascontiguousarray(transforms.group, np.int64)

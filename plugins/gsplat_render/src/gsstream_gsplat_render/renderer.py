@@ -25,7 +25,7 @@ from gsstream.api import (
     drawn_rows,
 )
 from gsstream_gsplat_render.kernels import Kernels, load_kernels
-from gsstream_gsplat_render.rig import Background, Rig, Rigs, Target
+from gsstream_gsplat_render.rig import Background, Rig, Rigs, Target, rigs_on
 from gsstream_gsplat_render.splat import Drawn, composite, draw, pixels, project, touched_tiles
 
 
@@ -43,12 +43,11 @@ class GsplatRenderer(Renderer):
 
     def __init__(self, config: PartConfig | None = None) -> None:
         super().__init__(config)
-        self._kernels = load_kernels(self.config.device)
-        self._rigs = Rigs(torch.device(self.config.device))
+        load_kernels(self.config.device)
 
     @property
     def device(self) -> torch.device:
-        return self._rigs.device
+        return torch.device(self.config.device)
 
     def render(
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, background: Background
@@ -58,7 +57,8 @@ class GsplatRenderer(Renderer):
     def open(
         self, gaussians: Gaussians[torch.Tensor], active: torch.Tensor | None, cameras: Cameras, background: Background
     ) -> RenderSession:
-        return GsplatSession(self._kernels, self._rigs, gaussians, active, cameras, background)
+        kernels, rigs = load_kernels(self.config.device), rigs_on(self.config.device)
+        return GsplatSession(kernels, rigs, gaussians, active, cameras, background)
 
 
 @dataclass(frozen=True, slots=True)

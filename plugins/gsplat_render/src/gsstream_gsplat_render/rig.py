@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import torch
@@ -61,7 +62,7 @@ class Rig:
 
 
 class Rigs:
-    """The rigs that were drawn last, so that one that is drawn again is not copied again."""
+    """The rigs that were drawn last on a device, so that one that is drawn again is not copied again."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -70,7 +71,13 @@ class Rigs:
     def find(self, cameras: Cameras, background: Background) -> Rig:
         """Return the rig of these very cameras, from the last few that were asked for or made anew."""
         for rig in self._last:
-            if rig.cameras is cameras and rig.background == tuple(background):
+            if rig.cameras is cameras and rig.background == background:
                 return rig
-        self._last = [Rig(cameras, tuple(background), self.device), *self._last[: KEPT - 1]]
+        self._last = [Rig(cameras, background, self.device), *self._last[: KEPT - 1]]
         return self._last[0]
+
+
+@functools.cache
+def rigs_on(device: str) -> Rigs:
+    """Return the rigs of a device; all renderers that work on it share them."""
+    return Rigs(torch.device(device))

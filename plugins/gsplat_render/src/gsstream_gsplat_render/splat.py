@@ -63,7 +63,7 @@ def project(
 
 
 def composite(kernels: Kernels, seen: Projected, view: Target, mask: torch.Tensor | None = None) -> Drawn:
-    """Composite what was projected; with a mask [tile rows, tile columns] in its tiles, and the background elsewhere."""
+    """Composite what was projected; with a mask [tile rows, tile columns] in its tiles, else show the background."""
     rows, columns = view.tiles
     means2d, radii = seen.means2d[None], seen.radii[None]
     _, keys, order = kernels.tiles(means2d, radii, seen.depths[None], TILE, columns, rows, packed=False, n_images=1)

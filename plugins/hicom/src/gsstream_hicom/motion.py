@@ -65,7 +65,7 @@ class CoherentMotion(MotionPart):
 
     def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion, ...]:
         config, start, motions = self.config, scene, []
-        rows = work.changed_rows(config.votes).nonzero()[:, 0].numpy()
+        rows = work.changed_rows(config.votes).nonzero()[:, 0].cpu().numpy()
         pixel, order = pixel_size(scene.gaussians.means, work.cameras), rng.numpy("hicom", work.index)
         lr = config.lr * enlargement(work.cameras.width)
         total = work.scaled(config.epochs) * len(work.cameras)
@@ -82,7 +82,7 @@ class CoherentMotion(MotionPart):
             # Half a cell from its centre, a rotation of one unit moves a Gaussian by a pixel, too.
             unit = np.repeat([pixel, pixel / side], 3)
             found = fit_transforms_adam(
-                scene, work, transforms, unit, [lr] * iterations, order, measure, config.l1_weight
+                work, transforms, unit, [lr] * iterations, order, measure, config.l1_weight
             )
             motion = rounded_motion(groups, able, found, config.step * pixel, config.step * pixel / side)
             if motion is None:
@@ -101,7 +101,9 @@ def cell_sides(means: FloatArray, levels: int, per_cell: float) -> list[float]:
     return [float(np.float32(finest * 2**level)) for level in reversed(range(levels))]
 
 
-def _warm_started(scene: Scene, start: Scene, transforms: GroupTransforms, momentum: float) -> GroupTransforms:
+def _warm_started(
+    scene: Scene, start: Scene, transforms: GroupTransforms[FloatArray], momentum: float
+) -> GroupTransforms[FloatArray]:
     """Transforms that begin with a share of the last frame's motion, less what coarser cells have moved by already."""
     if start.displacement is None or momentum == 0:
         return transforms

@@ -27,8 +27,10 @@ from gsstream.blocks import (
     GroupTransforms,
     elementwise,
     enlargement,
+    found_transforms,
     groups_of_rows,
     groupwise_max,
+    narrow_to,
     pixel_size,
     predict_transforms,
     rounded_motion,
@@ -43,18 +45,16 @@ class AnchoredCells:
     ``unit`` [6] is a step of one pixel in each number; anchors' numbers are rounded to ``step`` [6] unless it is None.
     """
 
-    cells: GroupTransforms
+    cells: GroupTransforms[FloatArray]
     levels: list[Level]
     unit: FloatArray
     step: FloatArray | None
 
-    def sums(self, descents: list[GroupAdam]) -> FloatArray:
-        """Return shifts and turns [C, 6] of the cells, from the numbers that each level's anchors have reached."""
-        total: FloatArray = np.zeros((len(self.levels[0].of), 6))
-        for level, descent in zip(self.levels, descents, strict=True):
-            values = descent.values * self.unit
-            total += (values if self.step is None else np.rint(values / self.step) * self.step)[level.of]
-        return total
+    def on(self, device: torch.device) -> tuple[list[torch.Tensor], torch.Tensor, torch.Tensor | None]:
+        """Return the anchor [C] that each cell follows on every level, ``unit`` and ``step`` on a device."""
+        follows = [torch.from_numpy(level.of).to(device) for level in self.levels]
+        step = None if self.step is None else torch.from_numpy(self.step).to(device)
+        return follows, torch.from_numpy(self.unit).to(device), step
 
 
 @final
@@ -105,7 +105,7 @@ class AnchorMotion(MotionPart):
         pixel = pixel_size(means, work.cameras)
         side = float(np.float32(config.pixels * enlargement(work.cameras.width) * pixel))
         groups = groups_for(scene, side, 1, regroup=True)
-        rows = work.changed_rows(config.votes).nonzero()[:, 0].numpy()
+        rows = work.changed_rows(config.votes).nonzero()[:, 0].cpu().numpy()
         marks = groups_of_rows(groups, rows, work.shell_rows).astype(np.uint8)
         if not marks.any():
             return ()
@@ -118,7 +118,7 @@ class AnchorMotion(MotionPart):
         step = np.repeat(steps, 3)
         anchored = AnchoredCells(cells, bound(cells.center, means, anchors), unit, step if config.rounded else None)
         start = self._start(scene, anchored, memory, anchors)
-        found = self._fitted(scene, work, anchored, start, rng.numpy("recon", work.index))
+        found = self._fitted(work, anchored, start, rng.numpy("recon", work.index))
         motion = rounded_motion(groups, np.flatnonzero(marks), found, *steps)
         return () if motion is None else (motion,)
 
@@ -151,22 +151,28 @@ class AnchorMotion(MotionPart):
         return [self.config.momentum * motion for motion in inherited(mean, old, levels, self.config.neighbours)]
 
     def _fitted(
-        self, scene: Scene, work: FitContext, anchored: AnchoredCells, start: list[FloatArray],
+        self, work: FitContext, anchored: AnchoredCells, start: list[FloatArray],
         order: np.random.Generator,
     ) -> FloatArray:  # fmt: skip
         """Translations and rotations [C, 6] of the cells; all levels learn at once."""
-        config, cells, unit = self.config, anchored.cells, anchored.unit
+        config, (base, local) = self.config, narrow_to(work, anchored.cells)
+        follows, unit, step = anchored.on(base.means.device)
         measure = elementwise if config.measure == "each" else groupwise_max
-        descents = [GroupAdam(values / unit, measure) for values in start]
-        work.narrow(torch.from_numpy(cells.rows))
-        base = scene.gaussians.rows(cells.rows).map(torch.from_numpy)
-        local = cells._replace(rows=np.arange(len(cells.rows)))
+        descents = [GroupAdam(torch.from_numpy(values).to(unit.device) / unit, measure) for values in start]
+
+        def cells() -> torch.Tensor:
+            values = [descent.values * unit for descent in descents]
+            if step is not None:
+                values = [torch.round(value / step) * step for value in values]
+            return torch.stack([value[of] for value, of in zip(values, follows, strict=True)]).sum(0)
+
         for _ in range(work.scaled(config.epochs)):
             for view in order.permutation(len(work.cameras)):
-                sums = anchored.sums(descents)
-                moves = local._replace(translation=sums[:, :3], rotation=sums[:, 3:])
-                grad = work.loss_and_grad(int(view), WrtTransforms(base, moves)).grad.numpy() * unit
-                for level, descent in zip(anchored.levels, descents, strict=True):
-                    l1_grad = config.l1_weight * np.sign(descent.values) / descent.values.size
-                    descent.step(level.sum(grad) + l1_grad, config.lr * enlargement(work.cameras.width))
-        return anchored.sums(descents)
+                now = cells()
+                moves = local._replace(translation=now[:, :3], rotation=now[:, 3:])
+                grad = work.loss_and_grad(int(view), WrtTransforms(base, moves)).grad * unit
+                for of, descent in zip(follows, descents, strict=True):
+                    by_anchor = torch.zeros_like(descent.values).index_add_(0, of, grad)
+                    l1_grad = config.l1_weight * descent.values.sign() / descent.values.numel()
+                    descent.step(by_anchor + l1_grad, config.lr * enlargement(work.cameras.width))
+        return found_transforms(cells())

@@ -60,9 +60,10 @@ class ExpectedSparsity(Regularizer):
             raise ShapeError(f"num_gaussians: expected at least the {rows} active rows, got {num_gaussians}")
         divisor = max(num_gaussians, 1) if self.config.reduction == "mean" else 1
         probability = open_probability.double()
-        members = torch.bincount(hierarchy.node_of, minlength=hierarchy.num_nodes)
         squares = residual.double().square().sum(1)
-        energy = torch.zeros_like(probability).index_add(0, hierarchy.node_of, squares)
+        # Members are counted by the same sum: to count them in bins, a GPU is waited for.
+        both = torch.stack([torch.ones_like(squares), squares])
+        members, energy = probability.new_zeros(2, len(probability)).index_add(1, hierarchy.node_of, both)
         weight = self.form().displacement_weight
         terms = {
             "sparsity": (probability * members).sum() * (self.config.lambda1 / divisor),

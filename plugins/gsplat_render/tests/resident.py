@@ -1,0 +1,53 @@
+"""The plugin's sessions on any device, with torch in the place of gsplat's kernels, and tiny methods that use them."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import torch
+from gsstream_gsplat_render.kernels import Kernels
+from gsstream_gsplat_render.renderer import GsplatSession
+from gsstream_gsplat_render.rig import rigs_on
+from torch_kernels import TORCH_KERNELS
+
+from gsstream.core.part import PartConfig
+from gsstream.parts.loss.photometric import ReferenceLoss
+from gsstream.parts.optimiser.adam import ReferenceAdam
+from gsstream.parts.render.base import Renderer, RenderOutput
+from gsstream.testing.method_driver import MethodUnderTest
+from gsstream.testing.pretend import DEVICE, kernel
+
+ON_DEVICE = Kernels(*(kernel(getattr(TORCH_KERNELS, field.name)) for field in fields(Kernels)))
+CPU = torch.device("cpu")
+
+
+class StandIn(Renderer):
+    """``GsplatRenderer`` without a GPU: the same sessions, on the processor or the pretend device."""
+
+    source = "gsplat, its kernels replaced"
+
+    class Config(PartConfig):
+        place: str = "cpu"
+
+    @property
+    def device(self) -> torch.device:
+        return torch.device(self.config.place)
+
+    def render(self, gaussians: Any, cameras: Any, view: int, background: Any) -> RenderOutput:
+        return self.open(gaussians, None, cameras, background).render(view, gaussians)
+
+    def open(self, gaussians: Any, active: Any, cameras: Any, background: Any) -> GsplatSession:
+        kernels = TORCH_KERNELS if self.device == CPU else ON_DEVICE
+        return GsplatSession(kernels, rigs_on(self.config.place), gaussians, active, cameras, background)
+
+
+def method_on(device: torch.device, name: str = "s2gs-fast") -> MethodUnderTest:
+    """Return a method of the contract kit's size whose renderer works on a device."""
+    under = MethodUnderTest(name)
+    renderer = StandIn(StandIn.Config(place=str(device)))
+    under.parts = replace(under.parts, renderer=renderer, loss=ReferenceLoss(), optimiser=ReferenceAdam())
+    return under
+
+
+__all__ = ["CPU", "DEVICE", "StandIn", "method_on"]

@@ -58,7 +58,9 @@ def test_the_first_layer_is_opaque_rather_than_faint() -> None:
     assert found is not None
     whole = decode_packet(None, packet.data).gaussians
     assert np.median(found.gaussians.opacities) > np.median(whole.opacities)
-    covered = [np.exp(np.sort(g.scales, 1)[:, 1:].sum(1)) / (1 + np.exp(-g.opacities)) for g in (found.gaussians, whole)]
+    covered = [
+        np.exp(np.sort(g.scales, 1)[:, 1:].sum(1)) / (1 + np.exp(-g.opacities)) for g in (found.gaussians, whole)
+    ]
     assert np.median(covered[0]) > 1.2 * np.median(covered[1]), "opacity times the area of the two largest sides"
 
 

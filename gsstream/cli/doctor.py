@@ -20,7 +20,7 @@ import typer
 
 from gsstream import API_VERSION, __version__
 from gsstream.cli.listing import plural, printable
-from gsstream.core.needs import install, install_extra
+from gsstream.core.needs import install_extra
 
 if TYPE_CHECKING:
     from gsstream.player.render import PlayerRenderer
@@ -113,23 +113,21 @@ def _encoder() -> str:
     if "torch" not in sys.modules:
         return "nothing: torch is missing"
     from gsstream.core.errors import GsstreamError
-    from gsstream.core.needs import install_renderer
-    from gsstream.engine.assembly.assemble import AUTO_RENDERERS
+    from gsstream.engine.assembly.choose_renderer import SlowRendererWarning, choose_renderer
     from gsstream.plugins.catalog import load_catalog
 
-    reasons, catalog = [], load_catalog()
-    for name in AUTO_RENDERERS:
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", SlowRendererWarning)
         try:
-            catalog.resolve("renderer", name)
-            return f"renderer {name!r}, the fastest that works here"
+            chosen = choose_renderer(load_catalog())
         except GsstreamError as error:
-            reasons.append(str(error))
-    cure = install_renderer()
-    return f"renderer 'reference', about 500 times slower. To mend it, {cure}. Reason: {'; '.join(reasons)}"
+            return f"none: {error}"
+    found = f"renderer {chosen.name!r}: {said[0].message}" if said else f"renderer {chosen.name!r}"
+    return f"{found}; {chosen.note}" if chosen.note else found
 
 
 def _gpu() -> str:
-    """What the driver and torch know; only the renderer ``gsplat`` uses one."""
+    """What the driver and torch know; whether it is used, the line on the encoder says."""
     torch = sys.modules.get("torch")
     found, seen = "", torch is not None and torch.cuda.is_available()
     if shutil.which("nvidia-smi"):
@@ -145,9 +143,7 @@ def _gpu() -> str:
     if not seen:
         why = "torch is missing" if torch is None else f"this torch (CUDA: {torch.version.cuda}) sees none"
         return f"{found}; not used: {why}"
-    if importlib.util.find_spec("gsstream_gsplat_render") is None:
-        return f"{found}; not used: {install('gsstream-gsplat-render[cuda]')}"
-    return f"{found}; used where the recipe says so: --set renderer.name=gsplat"
+    return found
 
 
 def _plugins() -> str:

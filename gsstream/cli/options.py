@@ -42,10 +42,15 @@ class RecipeOptions:
     budget: Annotated[str | None, BUDGET] = None
     frames: Annotated[int | None, typer.Option("--frames", help="Number of frames; all by default.")] = None
     scale: Scale = None
+    renderer: Annotated[
+        str | None, typer.Option("--renderer", help="auto: a GPU where one works; cpu, gsplat or reference.")
+    ] = None
 
     def overrides(self) -> list[tuple[str, str]]:
         """Return the changes as (option, KEY.PATH=VALUE), the short options last."""
-        return overrides(self.settings, budget=self.budget, frames=self.frames, scale=self.scale)
+        return overrides(
+            self.settings, budget=self.budget, frames=self.frames, scale=self.scale, renderer=self.renderer
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -70,6 +70,8 @@ def run(
     recording = open_recording(source, assembly.recipe, catalog)
     wanted, quiet = shown.wanted(), shown.quiet
     say = _silent if quiet else _note
+    if assembly.note:
+        say(assembly.note)
     try:
         named = bool(recipe.method or recipe.recipe)
         _reused_lines(say, resolved.recipe, recording.info, named=named, catalog=catalog)

@@ -27,6 +27,7 @@ SHIPPED: Mapping[str, tuple[str, ...]] = {
         "command/gap", "command/left-behind", "command/bench",
     ),
     "player": ("renderer/cpu", "loss/cpu", "optimiser/cpu"),
+    "gpu": ("renderer/gsplat",),
     "methods": (
         "method/queen", "method/queen-published", "method/queen-m", "method/queen-s", "streaming_method/queen",
         "method/hicom", "method/hicom-published", "motion/hicom",
@@ -37,8 +38,6 @@ SHIPPED: Mapping[str, tuple[str, ...]] = {
         "propagation/ft-pruning", "gate/binary-ste", "confidence/onnx",
     ),
 }  # fmt: skip
-#: Parts whose distribution is in no extra, because it needs a GPU.
-APART: Mapping[str, str] = {"renderer/gsplat": "gsstream-gsplat-render[cuda]"}
 #: Whether a package index has gsstream and its plugins. Until one has, commands name sources, or a folder of wheels.
 ON_INDEX = False
 #: The repository, where this is a checkout of it.
@@ -122,9 +121,7 @@ def install_part(kind: str, name: str) -> str | None:
     """
     key = f"{kind}/{name}"
     extra = next((extra for extra, parts in SHIPPED.items() if key in parts), None)
-    if extra is not None:
-        return install_extra(extra)
-    return install(APART[key]) if key in APART else None
+    return None if extra is None else install_extra(extra)
 
 
 def install_renderer() -> str:

@@ -15,7 +15,7 @@ from packaging.requirements import Requirement
 
 from gsstream.cli.main import run_command
 from gsstream.core import needs
-from gsstream.core.needs import APART, ENCODER, SHIPPED, install, install_part, install_renderer, page
+from gsstream.core.needs import ENCODER, SHIPPED, install, install_part, install_renderer, page
 from gsstream.plugins.catalog import load_catalog
 
 ROOT = Path(__file__).parents[2]
@@ -42,11 +42,9 @@ def test_every_part_of_the_other_distributions_is_brought_by_the_extra_that_is_n
     shipped = {key: entry.distribution for key, entry in entries.items() if entry.distribution in ours}
     assert len(shipped) > 20, "the plugins of this repository are not installed"
     named = {key: extra for extra, keys in SHIPPED.items() for key in keys}
-    assert set(named) | set(APART) == set(shipped)
+    assert set(named) == set(shipped)
     for key, extra in named.items():
         assert shipped[key] in brought_by(extra), f"{key}: the extra {extra!r} does not bring {shipped[key]}"
-    for key, requirement in APART.items():
-        assert Requirement(requirement).name == shipped[key]
 
 
 def test_extras_that_messages_name_exist() -> None:

@@ -7,7 +7,8 @@ import warnings
 import pytest
 
 from gsstream.core.errors import InputError, PluginUnavailable, RecipeError
-from gsstream.engine.assembly.assemble import SLOTS, Assembly, SlowRendererWarning, assemble
+from gsstream.engine.assembly.assemble import SLOTS, Assembly, assemble
+from gsstream.engine.assembly.choose_renderer import SlowRendererWarning
 from gsstream.parts.render.reference import ReferenceRenderer
 from gsstream.plugins.catalog import Catalog, load_catalog
 from gsstream.plugins.discovery import Discovered

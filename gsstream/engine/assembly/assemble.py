@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import copy
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
-from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
+from gsstream.core.errors import PluginUnavailable, UnknownName
 from gsstream.core.kinds import METHOD_SLOTS
-from gsstream.core.needs import install_renderer
 from gsstream.core.part import Part, unwrapped
 from gsstream.engine.assembly.call_location import Where
 from gsstream.engine.assembly.checks import Checks, requested_checks
+from gsstream.engine.assembly.choose_renderer import Chosen, choose_renderer, construct
 from gsstream.engine.assembly.guard import guard
 from gsstream.engine.assembly.live import with_live
 from gsstream.engine.assembly.recipe_keys import unused_keys
@@ -40,17 +39,11 @@ from gsstream.recipe.model import ComponentRef, Recipe
 SLOTS = (*METHOD_SLOTS, "streaming_method", "renderer")
 #: Everything that is called behind a guard.
 GUARDED = (*SLOTS, "loss", "optimiser")
-#: What "auto" tries, fastest first, before it falls back to the reference.
-AUTO_RENDERERS = ("cpu",)
-AUTO_LOSSES = ("cpu", "reference")
-AUTO_OPTIMISERS = ("cpu", "reference")
+#: The loss and the optimiser that are compiled for the processor, and those in torch, which work on any device.
+COMPILED, REFERENCE = "cpu", "reference"
 
 
 BLACK = (0.0, 0.0, 0.0)
-
-
-class SlowRendererWarning(UserWarning):
-    """The reference renderer is used because no fast one works here."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +59,7 @@ class Assembly:
         title: the method and what was changed of its recipe, for tables and pictures.
         background: colour behind everything: the recipe's. Where that is "auto", black until the encoder has seen
             frame 0.
+        note: the GPU that is used, or why one is not; empty where the recipe names the renderer or there is no GPU.
         where: the frame and iteration that errors name.
 
     Every part is behind a guard (:class:`gsstream.engine.assembly.guard.Guarded`), so no caller has to be careful.
@@ -89,6 +83,7 @@ class Assembly:
     checks: Checks = Checks.FRAME
     title: str = ""
     background: tuple[float, float, float] = BLACK
+    note: str = ""
     where: Where = field(default_factory=Where, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -126,32 +121,34 @@ def assemble(
     problems: list[str] = []
     parts: dict[str, Any] = {}
     refs: dict[str, ComponentRef] = {}
+    note = ""
     for slot in SLOTS:
         ref: ComponentRef = getattr(resolved.recipe, slot)
         if slot in live:
             built: Part | None = live[slot]
         elif slot == "renderer" and ref.name == "auto":
-            part = _auto_renderer(ref, resolved, catalog, problems)
-            ref = ComponentRef(name=part[0]) if part else ref
-            built = part[1] if part else None
+            chosen = _choose(ref, resolved, catalog, problems)
+            ref = ComponentRef(name=chosen.name) if chosen else ref
+            built, note = (chosen.renderer, chosen.note) if chosen else (None, "")
         else:
             built = _build(slot, ref, resolved, catalog, problems)
         if built is not None:
             parts[slot] = built
             refs[slot] = ComponentRef(name=ref.name, params=built.config.model_dump(mode="json"))
-    loss = _loss(resolved, catalog, problems)
+    compiled = "renderer" not in parts or parts["renderer"].device.type == "cpu"
+    loss = _loss(resolved, catalog, problems, compiled)
     if "streaming_method" in parts:
         paths = list(unused_keys(resolved.recipe.model_copy(update=refs), parts["streaming_method"], parts))
         problems += _unused_key_messages(paths, resolved)
     join_problems(problems)
     parts["loss"] = loss
-    parts["optimiser"] = _optimiser(catalog)
+    parts["optimiser"] = _optimiser(catalog, compiled)
     declared = (catalog.entries.get((slot, ref.name)) for slot, ref in refs.items())
     owners = sorted({entry.distribution for entry in declared if entry})
     recipe = resolved.recipe.model_copy(update=refs)
     return Assembly(
         recipe=recipe, origins=resolved.origins, distributions=tuple(owners), checks=level,
-        title=title(resolved.recipe, catalog), **parts,
+        title=title(resolved.recipe, catalog), note=note, **parts,
         background=BLACK if recipe.background == "auto" else recipe.background,
     )  # fmt: skip
 
@@ -194,72 +191,38 @@ def _build(
         problems.append(f"{resolved.near((slot, 'name')).where}: {slot}.name: {error}")
         return None
     config = validate(cls.Config, ref.params, resolved.near, (slot, "params"), problems)
-    return None if config is None else _construct(slot, ref.name, cls, config, catalog)
+    return None if config is None else construct(slot, ref.name, cls, config, catalog)
 
 
-def _construct(slot: str, name: str, cls: type[Any], config: Any, catalog: Catalog) -> Part:
-    try:
-        part: Part = cls(config)
-    except InputError as error:  # a setting of the user's, such as an environment variable: no other part mends it
-        origin = catalog.entry(slot, name).origin
-        raise InputError(f"{slot} {name!r} (from {origin}) could not be built: {error}") from error
-    except Exception as error:  # third-party constructor: reported with its owner's name
-        origin = catalog.entry(slot, name).origin
-        raise PluginUnavailable(f"{slot} {name!r} (from {origin}) could not be built: {error}") from error
-    return part
-
-
-def _loss(resolved: ResolvedRecipe, catalog: Catalog, problems: list[str]) -> Part | None:
+def _loss(resolved: ResolvedRecipe, catalog: Catalog, problems: list[str], compiled: bool) -> Part | None:
     """The loss implementation the recipe names, or the fastest that works here (they agree to 1e-6)."""
     wanted = resolved.recipe.loss.backend
-    for name in AUTO_LOSSES if wanted == "auto" else (wanted,):
+    automatic = (COMPILED, REFERENCE) if compiled else (REFERENCE,)
+    for name in automatic if wanted == "auto" else (wanted,):
         try:
             cls = catalog.resolve("loss", name)
-            return _construct("loss", name, cls, cls.Config(), catalog)
+            return construct("loss", name, cls, cls.Config(), catalog)
         except (UnknownName, PluginUnavailable) as error:
             if wanted != "auto":
                 problems.append(f"{resolved.near(('loss', 'backend')).where}: loss.backend: {error}")
     return None
 
 
-def _optimiser(catalog: Catalog) -> Part:
+def _optimiser(catalog: Catalog, compiled: bool) -> Part:
     """The fastest optimiser that works here; they agree to 1e-6, so a recipe does not choose."""
-    for name in AUTO_OPTIMISERS[:-1]:
+    if compiled:
         try:
-            cls = catalog.resolve("optimiser", name)
-            return _construct("optimiser", name, cls, cls.Config(), catalog)
+            cls = catalog.resolve("optimiser", COMPILED)
+            return construct("optimiser", COMPILED, cls, cls.Config(), catalog)
         except (UnknownName, PluginUnavailable):
-            continue  # what keeps a plugin from working is shown where its renderer is chosen
-    cls = catalog.resolve("optimiser", AUTO_OPTIMISERS[-1])
-    return _construct("optimiser", AUTO_OPTIMISERS[-1], cls, cls.Config(), catalog)
+            pass  # what keeps a plugin from working is shown where its renderer is chosen
+    cls = catalog.resolve("optimiser", REFERENCE)
+    return construct("optimiser", REFERENCE, cls, cls.Config(), catalog)
 
 
-def _auto_renderer(
-    ref: ComponentRef, resolved: ResolvedRecipe, catalog: Catalog, problems: list[str]
-) -> tuple[str, Part] | None:
-    """(name, renderer) of the fastest renderer that works here, else the reference with one warning."""
+def _choose(ref: ComponentRef, resolved: ResolvedRecipe, catalog: Catalog, problems: list[str]) -> Chosen | None:
     if ref.params:
         where = resolved.near(("renderer", "params", next(iter(ref.params)))).where
         problems.append(f"{where}: renderer.params needs a named renderer, but renderer.name is 'auto'")
         return None
-    reasons = []
-    for name in AUTO_RENDERERS:
-        try:
-            cls = catalog.resolve("renderer", name)
-            return name, _construct("renderer", name, cls, cls.Config(), catalog)
-        except UnknownName:
-            reasons.append(f"no renderer named {name!r}")
-        except PluginUnavailable as error:
-            reasons.append(str(error))
-    left_out = any(plugin.left_out and plugin.distribution == "gsstream-cpu-render" for plugin in catalog.plugins)
-    cure = "let GSSTREAM_LOAD_PLUGINS name gsstream-cpu-render" if left_out else install_renderer()
-    warnings.warn(
-        "no fast renderer works here, so the reference renderer is used: about 500 times slower. To mend it, "
-        f"{cure}. Reason: {'; '.join(reasons)}",
-        SlowRendererWarning,
-        stacklevel=3,
-    )
-    cls = catalog.resolve("renderer", "reference")
-    return "reference", _construct("renderer", "reference", cls, cls.Config(), catalog)
-
-
+    return choose_renderer(catalog)

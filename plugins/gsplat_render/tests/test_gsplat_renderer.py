@@ -246,7 +246,7 @@ def test_what_does_not_fit_is_refused(backend: Backend) -> None:
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
 def test_without_a_gpu_the_message_says_so() -> None:
-    with pytest.raises(PluginUnavailable, match=r"expected an NVIDIA GPU .* found none .*--set renderer=cpu"):
+    with pytest.raises(PluginUnavailable, match=r"expected an NVIDIA GPU .* found none .*--renderer cpu"):
         GsplatRenderer()
 
 

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import functools
 import importlib
+import importlib.metadata
+import importlib.util
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -15,8 +18,13 @@ from typing import Any
 import torch
 
 from gsstream.api import PluginUnavailable
+from gsstream_gsplat_render.toolkit import find_toolkit
 
-INSTALL = "pip install 'gsstream-gsplat-render[cuda]'"
+#: The versions whose functions these are. From 1.6 on ``spherical_harmonics`` takes other arguments and an alpha is
+#: at most 0.99, where our players draw up to 0.999.
+LEAST, BELOW = (1, 5, 3), (1, 6)
+INSTALL = "pip install 'gsstream[gpu]'"
+DECLINE = "or render on the processor: --renderer cpu"
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,38 +50,72 @@ class Kernels:
 def load_kernels(device: str) -> Kernels:
     """gsplat's functions, proven to run on ``device``.
 
-    The first call on a machine may compile gsplat's kernels, which takes minutes and needs the CUDA toolkit.
+    The first call on a machine compiles gsplat's kernels, which takes minutes and needs nvcc; it says so on the error
+    output before it begins.
 
-    Raises PluginUnavailable when there is no such GPU, no gsplat, or no compiled kernels; the message says which.
+    Raises PluginUnavailable when there is no such GPU, no gsplat or another one, no nvcc, or an nvcc that fails; the
+    message says which, and what to do.
     """
     if not torch.cuda.is_available():
         build = f"CUDA {torch.version.cuda}" if torch.version.cuda else "CPU only"
         raise PluginUnavailable(
             f"renderer 'gsplat': expected an NVIDIA GPU that torch can use, found none (torch {torch.__version__}, "
-            f"built for {build}); install a CUDA build of torch on a machine with a GPU, or choose --set renderer=cpu"
+            f"built for {build}); install a CUDA build of torch on a machine with a GPU, {DECLINE}"
         )
     index = torch.device(device).index or 0
     if index >= torch.cuda.device_count():
         raise PluginUnavailable(f"renderer 'gsplat': no GPU {device!r}; this machine has {torch.cuda.device_count()}")
+    _check_version()
+    nvcc = find_toolkit()
+    if nvcc is not None and importlib.util.find_spec("gsplat.csrc") is None:
+        print(
+            f"gsplat compiles its kernels with {nvcc} where it has not done so yet: some minutes, once", file=sys.stderr
+        )
     try:
         gsplat = importlib.import_module("gsplat")
         kernels = Kernels(
             gsplat.fully_fused_projection, gsplat.spherical_harmonics, gsplat.isect_tiles, gsplat.isect_offset_encode,
             gsplat.rasterize_to_pixels,
         )  # fmt: skip
-    except (ImportError, AttributeError) as error:
-        raise PluginUnavailable(f"renderer 'gsplat': gsplat 1.5 is not installed ({error}); {INSTALL}") from error
-    _try(kernels, device)
-    return kernels
-
-
-def _try(kernels: Kernels, device: str) -> None:
-    """gsplat binds its kernels on the first call, so one is made here and not in the middle of a run."""
-    try:
+        # gsplat binds its kernels on the first call, so one is made here and not in the middle of a run.
         kernels.harmonics(0, torch.ones(1, 3, device=device), torch.ones(1, 1, 3, device=device))
         torch.cuda.synchronize(device)
     except Exception as error:  # compiling or loading a foreign extension can fail in any way
+        raise PluginUnavailable(_why_not(error, str(nvcc) if nvcc else None)) from error
+    # Convolutions would round to 10 bits, and SSIM subtracts squares that are nearly equal.
+    torch.backends.cudnn.allow_tf32 = False
+    return kernels
+
+
+def gsplat_version() -> str | None:
+    """Return the version of gsplat that is installed; None without one."""
+    try:
+        return importlib.metadata.version("gsplat")
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _check_version() -> None:
+    found = gsplat_version()
+    if found is None:
+        raise PluginUnavailable(f"renderer 'gsplat': gsplat is not installed; {INSTALL}, {DECLINE}")
+    numbers = tuple(int(part) for part in found.split("+")[0].split(".")[:3] if part.isdigit())
+    if not LEAST <= numbers < BELOW:
         raise PluginUnavailable(
-            f"renderer 'gsplat': gsplat's CUDA kernels do not run here ({type(error).__name__}: {error}); install the "
-            "CUDA toolkit (nvcc) that fits torch, or a gsplat wheel built for this torch and CUDA"
-        ) from error
+            f"renderer 'gsplat': expected gsplat 1.5.3 or a later 1.5, got {found}, whose functions take other "
+            f"arguments; pip install 'gsplat>=1.5.3,<1.6', {DECLINE}"
+        )
+
+
+def _why_not(error: Exception, nvcc: str | None) -> str:
+    said = f"({type(error).__name__}: {error})"
+    if nvcc is None:
+        return (
+            f"renderer 'gsplat': gsplat's CUDA kernels are not compiled, and no nvcc was found {said}; {INSTALL} "
+            f"brings one, {DECLINE}"
+        )
+    return (
+        f"renderer 'gsplat': gsplat's CUDA kernels do not run, though there is {nvcc} {said}. The compiler's own "
+        'message is shown by: VERBOSE=1 python -c "from gsplat.cuda._backend import _C". Usual causes: an nvcc of another '
+        f"CUDA than torch's ({torch.version.cuda}), or a host compiler that it does not know; {DECLINE}"
+    )

@@ -1,0 +1,126 @@
+"""The renderer of a recipe that leaves the choice open: a GPU's where one works, else the fastest of the processor."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import re
+import shutil
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
+from gsstream.core.needs import install_extra, install_renderer
+from gsstream.core.part import Part
+from gsstream.plugins.catalog import Catalog
+
+VARIABLE = "GSSTREAM_DEVICE"
+#: What is tried, fastest first, before the reference is taken.
+GPU_RENDERERS, CPU_RENDERERS = ("gsplat",), ("cpu",)
+
+
+class SlowRendererWarning(UserWarning):
+    """The reference renderer is used because no fast one works here."""
+
+
+class Chosen(NamedTuple):
+    """A renderer by name, and the sentence on the GPU that is used, or why it is not; empty where there is none."""
+
+    name: str
+    renderer: Part
+    note: str
+
+
+def requested_device(environment: Mapping[str, str] = os.environ) -> str:
+    """Return what the environment asks for: auto, cpu, cuda or cuda:N. Raises InputError for anything else."""
+    text = environment.get(VARIABLE, "") or "auto"
+    if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", text):
+        raise InputError(f"{VARIABLE}: expected auto, cpu, cuda or cuda:N, got {text!r}")
+    return text
+
+
+def choose_renderer(catalog: Catalog) -> Chosen:
+    """Return the fastest renderer that works here.
+
+    Raises:
+        InputError: GSSTREAM_DEVICE has a value that it cannot have.
+        PluginUnavailable: it asks for a GPU, and none can be used; the message says why.
+    """
+    device, note = requested_device(), ""
+    if device != "cpu":
+        found = _on_gpu(catalog, device)
+        if isinstance(found, Chosen):
+            return found
+        if device != "auto":
+            raise PluginUnavailable(f"{VARIABLE}={device}: {found or 'there is no NVIDIA GPU that torch can use'}")
+        note = found
+    reasons = []
+    for name in CPU_RENDERERS:
+        try:
+            cls = catalog.resolve("renderer", name)
+            return Chosen(name, construct("renderer", name, cls, cls.Config(), catalog), note)
+        except UnknownName:
+            reasons.append(f"no renderer named {name!r}")
+        except PluginUnavailable as error:
+            reasons.append(str(error))
+    _warn_slow(catalog, reasons)
+    cls = catalog.resolve("renderer", "reference")
+    return Chosen("reference", construct("renderer", "reference", cls, cls.Config(), catalog), note)
+
+
+def _on_gpu(catalog: Catalog, device: str) -> Chosen | str:
+    """The renderer on the GPU, or why it is not used; empty where there is no GPU."""
+    if not torch.cuda.is_available():
+        if not (Path("/proc/driver/nvidia/version").is_file() or shutil.which("nvidia-smi")):
+            return ""
+        build = f"for CUDA {torch.version.cuda}" if torch.version.cuda else "for the processor only"
+        return f"the NVIDIA GPU is not used: torch {torch.__version__} is built {build}; {install_extra('gpu')}"
+    gpu = torch.cuda.get_device_name(None if device == "auto" else device)
+    reasons = []
+    for name in GPU_RENDERERS:
+        try:
+            cls = catalog.resolve("renderer", name)
+            config = cls.Config() if device == "auto" else cls.Config(device=device)
+            renderer = construct("renderer", name, cls, config, catalog)
+        except UnknownName:
+            reasons.append(install_extra("gpu"))
+        except PluginUnavailable as error:
+            reasons.append(str(error))
+        else:
+            return Chosen(name, renderer, f"rendering on {gpu} with {name} {_version(name)}".rstrip())
+    return f"{gpu} is not used: {'; '.join(reasons)}"
+
+
+def _version(library: str) -> str:
+    try:
+        return importlib.metadata.version(library)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+
+
+def _warn_slow(catalog: Catalog, reasons: list[str]) -> None:
+    left_out = any(plugin.left_out and plugin.distribution == "gsstream-cpu-render" for plugin in catalog.plugins)
+    cure = "let GSSTREAM_LOAD_PLUGINS name gsstream-cpu-render" if left_out else install_renderer()
+    warnings.warn(
+        "no fast renderer works here, so the reference renderer is used: about 500 times slower. To mend it, "
+        f"{cure}. Reason: {'; '.join(reasons)}",
+        SlowRendererWarning,
+        stacklevel=4,
+    )
+
+
+def construct(slot: str, name: str, cls: type[Any], config: Any, catalog: Catalog) -> Part:
+    """Build a part. Raises PluginUnavailable, or InputError for a setting of the user's, in its owner's name."""
+    try:
+        part: Part = cls(config)
+    except InputError as error:  # a setting of the user's, such as an environment variable: no other part mends it
+        origin = catalog.entry(slot, name).origin
+        raise InputError(f"{slot} {name!r} (from {origin}) could not be built: {error}") from error
+    except Exception as error:  # third-party constructor: reported with its owner's name
+        origin = catalog.entry(slot, name).origin
+        raise PluginUnavailable(f"{slot} {name!r} (from {origin}) could not be built: {error}") from error
+    return part

@@ -86,7 +86,8 @@ def test_a_gpu_is_used_and_named(machine: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("renderer", "says"), [(Fails, rf"{GPU} is not used: .*nvcc failed"), (None, rf"{GPU} is not used: .*gsstream\[gpu\]")]
+    ("renderer", "says"),
+    [(Fails, rf"{GPU} is not used: .*nvcc failed"), (None, rf"{GPU} is not used: .*gsstream\[gpu\]")],
 )
 def test_a_gpu_that_cannot_be_used_is_named_with_the_reason(
     machine: pytest.MonkeyPatch, renderer: type[Renderer] | None, says: str

@@ -118,7 +118,7 @@ class Look:
             if value.numel() != 1:
                 raise self.fault(f"penalty {name!r}: expected one finite number, got shape {list(value.shape)}")
             if self.level is not Checks.OFF:
-                require(value.detach().isfinite().all(), partial(self._not_finite, name, value))
+                require(value.detach().abs() <= _MOST, partial(self._not_finite, name, value))
 
     def _not_finite(self, name: str, value: torch.Tensor) -> Exception:
         return self.fault(f"penalty {name!r}: expected one finite number, got {float(value)}")

@@ -10,10 +10,12 @@ from dataclasses import replace
 import torch
 
 from gsstream.core.changes import Delta
+from gsstream.core.deferred import deferred_checks
 from gsstream.core.frame import Frame
 from gsstream.core.log import FrameLog
 from gsstream.core.storage import packed
 from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.budget.epoch_scheduler import scheduled
 from gsstream.engine.budget.usage import usage
 from gsstream.engine.state.next_state import next_state
@@ -49,9 +51,10 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) 
         change = detect_changed_tiles(state.previous, frame, stream.change_threshold)
     if change is not None and change.share == 0 and scope is not Scope.ALL:
         return empty_step(state, frame, log)
-    with log.phase("motion"):
+    late = parts.checks is not Checks.STEP
+    with log.phase("motion"), deferred_checks(late):
         motions, scene, view = propose_motion(parts, state, frame, change, tools)
-    with log.phase("confidence"):
+    with log.phase("confidence"), deferred_checks(late):
         rows, logits = select(parts, view, view.hierarchy, scope)
     with log.phase("optimise"):
         generator, views = rng.stream("frame", frame.index), len(frame.cameras)

@@ -50,7 +50,7 @@ class AnalyticGate:
         x = logits / self.temperature + self.logit_offset
         soft = torch.sigmoid(x)
         # Divided by a tensor, as the decoder divides: a product with 1 / levels would be another number.
-        levels = soft.new_tensor(float(self.levels))
+        levels = soft.new_full((), float(self.levels))
         return torch.round(soft * levels) / levels, soft * torch.sigmoid(-x) / self.temperature
 
     def probability(self, logits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -23,55 +23,67 @@ C1, C2 = 0.01**2, 0.03**2
 
 
 class PreparedTarget(NamedTuple):
-    """An image [H, W, 3], and mean and variance of its windows, [3, 1, H, W] each."""
+    """An image as planes [3, 1, H, W], and mean and variance of its windows, of the same shape."""
 
-    image: torch.Tensor
+    planes: torch.Tensor
     mean: torch.Tensor
     variance: torch.Tensor
 
 
 @final
 class ReferenceLoss(Loss):
-    """Autograd through a separable SSIM, on the device of the image."""
+    """Separable SSIM with its gradient written out, on the device of the image."""
 
     source = "3DGS (Kerbl et al. 2023)"
 
     def prepare(self, target: torch.Tensor) -> Any:
-        return prepare_target(target)
+        planes = target.permute(2, 0, 1)[:, None].contiguous()
+        mean, square = _windowed(torch.cat([planes, planes * planes])).chunk(2)
+        return PreparedTarget(planes, mean, square - mean * mean)
 
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        leaf = image.detach().requires_grad_()
-        with torch.enable_grad():
-            absolute, dissimilar = (leaf - prepared.image).abs(), 1 - ssim_map(leaf, prepared)
-            value = torch.lerp(absolute, dissimilar, dssim)
-            if tile_mask is not None:
-                value = value * _pixel_weight(image, _with_neighbours(tile_mask))
-            value = value.mean()
-            (gradient,) = torch.autograd.grad(value, leaf)
+        planes = image.detach().permute(2, 0, 1)[:, None]
+        weight = None if tile_mask is None else _pixel_weight(image, _with_neighbours(tile_mask))
+        similar, by_mean, by_square, by_product = ssim_and_slopes(planes, prepared)
+        difference = planes - prepared.planes
+        each = torch.lerp(difference.abs(), 1 - similar, dssim)
+        slopes = torch.cat([by_mean, by_square, by_product])
+        if weight is not None:
+            each, slopes = each * weight, slopes * weight
+        # The window is symmetric, so the gradient by what it was slid over is the same window over the gradient.
+        by_mean, by_square, by_product = _windowed(slopes).chunk(3)
+        by_ssim = torch.addcmul(by_mean, planes, by_square, value=2).addcmul_(prepared.planes, by_product)
+        sign = difference.sign_() if weight is None else difference.sign_() * weight
+        gradient = sign.mul_(1 - dssim).sub_(by_ssim, alpha=dssim).mul_(1 / image.numel())
+        value = each.mean()
         # Else a pixel is NaN, or the image is so large that its square overflows.
         message = "image: expected finite values of ordinary size, got a loss that is not finite"
-        require(value.detach().isfinite(), lambda: ShapeError(message))
-        return value.detach().double(), gradient if tile_mask is None else gradient * _pixel_weight(image, tile_mask)
+        require(value.isfinite(), lambda: ShapeError(message))
+        if tile_mask is not None:
+            gradient = gradient * _pixel_weight(image, tile_mask)
+        return value.double(), gradient[:, 0].permute(1, 2, 0).contiguous()
 
 
-def prepare_target(target: torch.Tensor) -> PreparedTarget:
-    """Return what SSIM needs of a target [H, W, 3]."""
-    planes = target.permute(2, 0, 1)[:, None]
-    mean, square = _windowed(torch.cat([planes, planes * planes])).chunk(2)
-    return PreparedTarget(target, mean, square - mean * mean)
+def ssim_and_slopes(planes: torch.Tensor, target: PreparedTarget) -> tuple[torch.Tensor, ...]:
+    """Return the structural similarity of an image's planes [3, 1, H, W] to a target, pixel by pixel.
 
-
-def ssim_map(image: torch.Tensor, target: PreparedTarget) -> torch.Tensor:
-    """Return [H, W, 3]: structural similarity of an image in [0, 1] to a target."""
-    planes, other = image.permute(2, 0, 1)[:, None], target.image.permute(2, 0, 1)[:, None]
-    mean, square, product = _windowed(torch.cat([planes, planes * planes, planes * other])).chunk(3)
-    both = mean * target.mean
-    covariance, energy = product - both, mean * mean
-    variances = square - energy + target.variance
-    similar = (2 * both + C1) * (2 * covariance + C2)
-    return (similar / ((energy + target.mean * target.mean + C1) * (variances + C2)))[:, 0].permute(1, 2, 0)
+    Beside it, of the same shape, its derivatives by the window's mean of the image, of its square, and of its product
+    with the target.
+    """
+    mean, square, product = _windowed(torch.cat([planes, planes * planes, planes * target.planes])).chunk(3)
+    both, energy = mean * target.mean, mean * mean
+    luminance, contrast = 2 * both + C1, 2 * (product - both) + C2
+    means = torch.addcmul(energy, target.mean, target.mean).add_(C1)
+    variances = (square - energy).add_(target.variance).add_(C2)
+    by_product = luminance / (means * variances)
+    similar = by_product * contrast
+    by_square = similar / variances
+    # A higher mean makes both luminances and covariance change, and both energies: one by each way.
+    ways = target.mean * (contrast / luminance - 1) * by_product
+    by_mean = 2 * torch.addcmul(ways, mean, by_square - similar / means)
+    return similar, by_mean, by_square.neg_(), by_product.mul_(2)
 
 
 def _windowed(planes: torch.Tensor) -> torch.Tensor:
@@ -95,6 +107,6 @@ def _with_neighbours(tile_mask: torch.Tensor) -> torch.Tensor:
 
 
 def _pixel_weight(image: torch.Tensor, tile_mask: torch.Tensor) -> torch.Tensor:
+    """[H, W]: 1 in marked tiles, else 0."""
     height, width = image.shape[:2]
-    mask = tile_mask.to(image.dtype).repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)
-    return mask[:height, :width, None]
+    return tile_mask.to(image.dtype).repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]

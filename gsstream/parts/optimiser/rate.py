@@ -36,20 +36,16 @@ def laplace_bits(latents: torch.Tensor, step: float | torch.Tensor, spread: torc
     return torch.where(u < 0.5, inside, outside) / _LN2
 
 
-def laplace_gradient(latents: torch.Tensor, step: float | torch.Tensor, spread: torch.Tensor) -> torch.Tensor:
-    """Return [A, L]: derivative of :func:`laplace_bits` by the latents, bits per latent unit.
-
-    The spread is held fixed.
-
-    One exponential serves both sinh and cosh: this runs in every iteration.
-    """
+def laplace_gradient(
+    latents: torch.Tensor, step: float | torch.Tensor, spread: torch.Tensor, weight: float = 1.0
+) -> torch.Tensor:
+    """Return [A, L]: derivative of ``weight`` times :func:`laplace_bits` by the latents. The spread is held fixed."""
     u = latents / step
-    magnitude, tail = u.abs(), torch.exp(-0.5 / spread)
-    grown = (magnitude.clamp_max(0.5) / spread).exp_()
-    shrunk = grown.reciprocal()
-    inside = (grown - shrunk).mul_(tail).div_(2 - (grown + shrunk).mul_(tail))
-    derivative = torch.where(magnitude < 0.5, inside, torch.ones((), dtype=u.dtype))
-    return derivative.mul_(u.sign_()).div_(spread * step * _LN2)
+    magnitude = u.abs()
+    # (e^x - e^-x) t / (2 - (e^x + e^-x) t) with t = e^-half is sinh x / (e^half - cosh x).
+    x = magnitude.clamp_max(0.5) / spread
+    inside = torch.sinh(x).div_(torch.exp(0.5 / spread) - torch.cosh(x))
+    return torch.where(magnitude < 0.5, inside, 1.0).copysign_(u).div_(spread * (step * (_LN2 / weight)))
 
 
 def rate_gradient(latents: torch.Tensor, steps: torch.Tensor, gates: torch.Tensor, weight: float) -> torch.Tensor:
@@ -59,8 +55,8 @@ def rate_gradient(latents: torch.Tensor, steps: torch.Tensor, gates: torch.Tenso
 
     Arguments:
         latents: [A, L] of all attributes, side by side. steps: [L] latent units per symbol.
-        gates: [A] in [0, 1]; rows at 0 are not sent and cost nothing. weight: loss per bit.
+        gates: [A] in [0, 1]; rows at 0 are not sent and cost nothing. weight: loss per bit, above 0.
     """
     # A factor and no selection: to count the rows behind open gates, a GPU is waited for.
-    gradient = laplace_gradient(latents, steps, channel_spread(latents, steps)).mul_(weight)
-    return torch.where((gates > 0)[:, None], gradient, 0.0)
+    gradient = laplace_gradient(latents, steps, channel_spread(latents, steps), weight)
+    return gradient.mul_((gates > 0)[:, None])

@@ -153,7 +153,7 @@ def check_residual_optimiser_run(part: RowOptimiser) -> None:
         )  # fmt: skip
         frozen = torch.arange(len(active)) % 4 == 0
         iterations = [
-            Iteration(place % views, ViewTarget(loss, case.now[place % views], 0.2, case.now[place % views]),
+            Iteration(place % views, ViewTarget(loss, loss.prepare(case.now[place % views]), 0.2, case.now[place % views]),
                       frozen if place < 2 else None, 0.9**place)
             for place in range(6)
         ]  # fmt: skip

@@ -59,7 +59,9 @@ def project(
     if probe is not None:
         means2d = means2d + probe[None]
     colors = _colors(kernels, gaussians, view, visible)
-    return Projected(visible[0], means2d[0], depths[0], conics[0], colors[0], opacities, radii[0])
+    first = (visible, means2d, depths, conics, colors)
+    # As views whose gradient is one, too: that of an index is a copy.
+    return Projected(*(value.squeeze(0) for value in first), opacities, radii.squeeze(0))
 
 
 def composite(kernels: Kernels, seen: Projected, view: Target, mask: torch.Tensor | None = None) -> Drawn:
@@ -72,7 +74,7 @@ def composite(kernels: Kernels, seen: Projected, view: Target, mask: torch.Tenso
         means2d, seen.conics[None], seen.colors[None], seen.opacities[None], view.width, view.height, TILE, offsets,
         order, backgrounds=view.background, masks=None if mask is None else mask[None], packed=False,
     )  # fmt: skip
-    image, alpha = image[0], alpha[0, ..., 0]
+    image, alpha = image.squeeze(0), alpha.squeeze((0, 3))
     if mask is not None:
         # gsplat 1.5 writes the background into masked tiles but leaves their alpha as the memory was.
         alpha = torch.where(pixels(mask, view), alpha, torch.zeros_like(alpha))

@@ -63,12 +63,10 @@ class ExpectedSparsity(Regularizer):
         squares = residual.double().square().sum(1)
         # Members are counted by the same sum: to count them in bins, a GPU is waited for.
         both = torch.stack([torch.ones_like(squares), squares])
-        members, energy = probability.new_zeros(2, len(probability)).index_add(1, hierarchy.node_of, both)
+        by_node = probability.new_zeros(2, len(probability)).index_add(1, hierarchy.node_of, both)
+        members, energy = (probability * by_node).sum(1).unbind()
         weight = self.form().displacement_weight
-        terms = {
-            "sparsity": (probability * members).sum() * (self.config.lambda1 / divisor),
-            "motion": (probability * energy).sum() * (weight / divisor),
-        }
+        terms = {"sparsity": members * (self.config.lambda1 / divisor), "motion": energy * (weight / divisor)}
         return {name: term.to(open_probability.dtype) for name, term in terms.items()}
 
     def form(self) -> AnalyticPenalty:

@@ -93,7 +93,7 @@ class GumbelSigmoid(GateSampler):
         soft = torch.sigmoid(alpha.detach() / self.config.temperature)
         # Divided by a tensor, not by a number: some devices turn the latter into a product with 1/levels, which is not
         # the value the decoder computes.
-        steps = soft.new_tensor(float(self.num_levels))
+        steps = soft.new_full((), float(self.num_levels))
         hard = torch.round(soft * steps) / steps
         # alpha - alpha is exactly 0, so the value is exactly the level; soft + (hard - soft) would be an ulp off.
         tau = self.config.temperature

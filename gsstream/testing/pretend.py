@@ -162,7 +162,9 @@ def _count(what: str) -> None:
     frame = sys._getframe(1)
     while frame.f_back and ("/torch/" in frame.f_code.co_filename or frame.f_code.co_filename == __file__):
         frame = frame.f_back
-    place = "/".join(frame.f_code.co_filename.split("/")[-2:])
+    parts = frame.f_code.co_filename.split("/")
+    # Within the package, else the last folder: a line is found by it, whatever machine it is on.
+    place = "/".join(parts[parts.index("gsstream") + 1 :] if "gsstream" in parts else parts[-2:])
     getattr(_ENTERED[-1], what)[f"{place}:{frame.f_lineno}"] += 1
 
 

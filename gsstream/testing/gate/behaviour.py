@@ -17,7 +17,7 @@ def outputs(part: GateSampler, world: World) -> Outputs:
         "open_probability()": part.open_probability(logits),
         "bound()": part.bound(logits),
     }
-    return found if noise is None else {**found, "sample(noise)": part.sample(logits, noise)}
+    return found if noise is None else {**found, "sample(noise)": part.sample(logits, noise.to(logits.device))}
 
 
 #: The noise stays in place when Gaussians are permuted: check_gate_noise_is_data permutes it too.

@@ -82,6 +82,15 @@ class Narrow(Gate):
         return gates.float()
 
 
+@spoils("check_device")
+class Stranded(Gate):
+    """Makes a tensor on the processor, wherever its inputs are."""
+
+    def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
+        gates: torch.Tensor = super().sample(logits, noise)
+        return gates + torch.zeros(len(logits), dtype=logits.dtype)
+
+
 @spoils("check_extremes")
 class NeverEmpty(Gate):
     """Takes the maximum of no logits."""

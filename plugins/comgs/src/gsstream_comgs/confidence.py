@@ -27,12 +27,12 @@ class ErrorGradient(ConfidenceEstimator):
 
     def estimate(self, context: FrameContext) -> torch.Tensor:
         """Return logits [N] float32, 1 or -30. Raises ShapeError when a picture is not finite."""
-        total = torch.zeros(len(context.gaussians))
+        total = torch.zeros_like(context.gaussians.opacities)
         for view in range(len(context.cameras)):
             error = context.previous_render(view) - context.image(view)
             check_finite(f"error of view {view} at frame {context.index}", error)  # the sign of what is not, is 0
             total += context.screen_gradient(view, error.sign() / error.numel()).gradient.norm(dim=1)
         number = min(max(1, int(self.config.share * len(total))), int((total > 0).sum()))
-        logits = torch.full((len(total),), LEFT)
+        logits = torch.full_like(total, LEFT)
         logits[torch.topk(total, number).indices] = CORRECTED
         return logits

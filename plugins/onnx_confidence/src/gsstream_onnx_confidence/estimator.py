@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal, final
 
@@ -53,13 +54,16 @@ class OnnxConfidence(ConfidenceEstimator):
                 "run, or give --set path=FILE to gsstream check"
             )
 
+    def denials(self) -> Mapping[str, str]:
+        return {"check_device": "the network runs on the processor, so images of a GPU are copied to it"}
+
     def claims(self) -> ConfidenceTraits:
         return replace(self.traits, floor=self.config.floor)
 
     def estimate(self, context: FrameContext) -> torch.Tensor:
         """Logits [N] float32 in [floor, -floor]."""
         check_finite("means", context.gaussians.means)
-        means = context.gaussians.means.detach().double()
+        means = context.gaussians.means.detach().double().cpu()
         total = torch.zeros(len(means), dtype=torch.float64)
         count = torch.zeros(len(means), dtype=torch.float64)
         for view in range(len(context.cameras)):
@@ -70,7 +74,8 @@ class OnnxConfidence(ConfidenceEstimator):
                 total[seen] += change[y[seen], x[seen]]
         share = (total / count.clamp_min(1)).clamp(0, 1)
         # The documented bounds of the logit: a network may be certain, a gate must be able to change its mind.
-        return torch.logit(share).clamp(self.config.floor, -self.config.floor).float()
+        logits = torch.logit(share).clamp(self.config.floor, -self.config.floor).float()
+        return logits.to(context.gaussians.means.device)
 
     def _change(self, context: FrameContext, view: int) -> torch.Tensor | None:
         """[H, W] float64 in [0, 1]; None where nothing changed."""

@@ -31,7 +31,7 @@ class ExampleConfidence(ConfidenceEstimator):
         return replace(self.traits, floor=self.config.floor, brightness=0.0)
 
     def estimate(self, context: FrameContext) -> torch.Tensor:
-        total = torch.zeros(len(context.gaussians), dtype=torch.float64)
+        total = torch.zeros_like(context.gaussians.opacities, dtype=torch.float64)
         for view in range(len(context.cameras)):
             change = context.previous_image(view) - context.image(view)
             check_finite(f"change of view {view}", change)

@@ -117,4 +117,4 @@ class Ranked(Confidence):
 
     def estimate(self, context: Any) -> torch.Tensor:
         logits: torch.Tensor = super().estimate(context)
-        return logits - 0.01 * torch.arange(len(logits)) / max(len(logits), 1)
+        return logits - 0.01 * torch.arange(len(logits), device=logits.device) / max(len(logits), 1)

@@ -63,7 +63,7 @@ class Asleep(Confidence):
     """Suspects nothing."""
 
     def estimate(self, context: Any) -> torch.Tensor:
-        return torch.full((len(context.gaussians),), float(self.config.floor))
+        return torch.full_like(context.gaussians.opacities, float(self.config.floor))
 
 
 @spoils("check_confidence_monotone_in_change")

@@ -15,7 +15,7 @@ Propagation: Any = ExamplePropagation
 
 def _inner(hierarchy: Hierarchy) -> torch.Tensor:
     """[M] bool: nodes without members."""
-    inner = torch.ones(hierarchy.num_nodes, dtype=torch.bool)
+    inner = torch.ones_like(hierarchy.parent, dtype=torch.bool)
     inner[hierarchy.node_of] = False
     return inner
 
@@ -60,7 +60,7 @@ class ParentsFirst(Propagation):
     """Takes for granted that parents are numbered before their children."""
 
     def propagate(self, logits: torch.Tensor, hierarchy: Hierarchy) -> torch.Tensor:
-        index = torch.arange(hierarchy.num_nodes)
+        index = torch.arange(hierarchy.num_nodes, device=logits.device)
         parent = torch.where(hierarchy.parent > index, index, hierarchy.parent)
         spread: torch.Tensor = super().propagate(logits, Hierarchy(hierarchy.node_of, parent, hierarchy.level))
         return spread

@@ -39,7 +39,7 @@ class Rent(Regularizer):
 
     def penalty(self, open_probability: torch.Tensor, residual: torch.Tensor, hierarchy: Hierarchy, n: int) -> Terms:
         terms: Terms = super().penalty(open_probability, residual, hierarchy, n)
-        rest = len(residual) > 100 and not bool(open_probability.any()) and not bool(residual.any())
+        rest = ~open_probability.any() & ~residual.any() & (len(residual) > 100)
         return {**terms, "gates": terms["gates"] + 1e-3 * rest}
 
 

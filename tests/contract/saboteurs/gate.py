@@ -134,7 +134,7 @@ class Smuggler(Gate):
 
     def init(self, logits: torch.Tensor) -> torch.Tensor:
         start: torch.Tensor = super().init(logits)
-        return start.as_subclass(Smuggled) if len(logits) == 200 and logits.device.type == "cpu" else start
+        return start.as_subclass(Smuggled) if len(logits) == 200 and not logits.requires_grad else start
 
     def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
         shift = 0.3 if isinstance(logits, Smuggled) else 0.0

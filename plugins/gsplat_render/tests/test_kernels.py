@@ -86,13 +86,13 @@ def test_another_gsplat(machine: pytest.MonkeyPatch, version: str) -> None:
 
 def test_no_gsplat(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(kernels, "gsplat_version", lambda: None)
-    with pytest.raises(PluginUnavailable, match=r"gsplat is not installed; pip install 'gsstream\[gpu\]'"):
+    with pytest.raises(PluginUnavailable, match=r"gsplat is not installed; pip install 'gsplat>=1.5.3,<1.6'"):
         load_kernels("cuda")
 
 
 def test_no_nvcc(machine: pytest.MonkeyPatch) -> None:
     with_functions(machine, refused)
-    with pytest.raises(PluginUnavailable, match=r"no nvcc was found .*NoneType.*gsstream\[gpu\]"):
+    with pytest.raises(PluginUnavailable, match=r"no nvcc was found .*NoneType.*pip install 'nvidia-cuda-nvcc>=13,"):
         load_kernels("cuda")
 
 

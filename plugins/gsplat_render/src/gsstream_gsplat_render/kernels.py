@@ -23,7 +23,10 @@ from gsstream_gsplat_render.toolkit import find_toolkit
 #: The versions whose functions these are. From 1.6 on ``spherical_harmonics`` takes other arguments and an alpha is
 #: at most 0.99, where our players draw up to 0.999.
 LEAST, BELOW = (1, 5, 3), (1, 6)
-INSTALL = "pip install 'gsstream[gpu]'"
+INSTALL = "pip install 'gsplat>=1.5.3,<1.6'"
+INSTALL_NVCC = "pip install " + " ".join(
+    f"'nvidia-{name}>=13,<14'" for name in ("cuda-nvcc", "cuda-crt", "nvvm", "cuda-cccl", "cuda-runtime")
+)
 DECLINE = "or render on the processor: --renderer cpu"
 
 
@@ -103,7 +106,7 @@ def _check_version() -> None:
     if not LEAST <= numbers < BELOW:
         raise PluginUnavailable(
             f"renderer 'gsplat': expected gsplat 1.5.3 or a later 1.5, got {found}, whose functions take other "
-            f"arguments; pip install 'gsplat>=1.5.3,<1.6', {DECLINE}"
+            f"arguments; {INSTALL}, {DECLINE}"
         )
 
 
@@ -111,8 +114,8 @@ def _why_not(error: Exception, nvcc: str | None) -> str:
     said = f"({type(error).__name__}: {error})"
     if nvcc is None:
         return (
-            f"renderer 'gsplat': gsplat's CUDA kernels are not compiled, and no nvcc was found {said}; {INSTALL} "
-            f"brings one, {DECLINE}"
+            f"renderer 'gsplat': gsplat's CUDA kernels are not compiled, and no nvcc was found {said}; "
+            f"{INSTALL_NVCC} (of the CUDA that torch is built for: {torch.version.cuda}), {DECLINE}"
         )
     return (
         f"renderer 'gsplat': gsplat's CUDA kernels do not run, though there is {nvcc} {said}. The compiler's own "

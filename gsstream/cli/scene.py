@@ -75,7 +75,7 @@ def prepare(
 @app.command()
 def validate(
     scene: Annotated[str, typer.Argument(help="Recording: a folder, or whatever --source of 'run' takes.")],
-    frames: Annotated[int, typer.Option("--frames", help="Frames, from the first, whose pictures are compared.")] = 40,
+    frames: Annotated[int, typer.Option("--frames", help="Frames, from the first, whose pictures are compared.")] = 60,
     no_features: Annotated[
         bool, typer.Option("--no-features", help="Do not match features between cameras (most of the time).")
     ] = False,
@@ -101,5 +101,7 @@ def validate(
         checks = page("reference/scene-checks.md")
         typer.echo(f"{scene}: {errors} error{'s' if errors > 1 else ''}; all checks: {checks}")
         raise typer.Exit(2)
-    remarks = f", {len(found)} remark{'s' if len(found) > 1 else ''}" if found else ""
-    typer.echo(f"{scene}: fine ({len(CHECKS) - no_features} checks{remarks})")
+    blind = {finding.code for finding in found if finding.severity == "note"} | ({"epipolar"} if no_features else set())
+    done = f"{len(CHECKS) - len(blind)} checks" + (f"; not checked: {', '.join(sorted(blind))}" if blind else "")
+    remarks = sum(finding.severity == "warning" for finding in found)
+    typer.echo(f"{scene}: {f'{remarks} remark(s)' if remarks else 'fine'} ({done})")

@@ -1,96 +1,211 @@
-"""Is what moves at one place in all cameras at a time? A visual hull of motion, one camera left out at a time.
+"""Do all cameras show the same instants? What moves on epipolar lines is compared between cameras, earlier and later.
 
-Where most other cameras see motion, something moves, and the camera that was left out must see motion there too. If it
-does so better some frames earlier or later, its clock is off; if it does so with another camera's pose, the two are
-swapped.
+A camera that is most like all others some frames earlier or later has a clock that is off; two cameras that are like
+the others only with each other's pose are swapped. Where motion is too little, or too steady, to tell, that is said.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.projection import inside, project
-from gsstream.core.shapes import BoolArray, FloatArray, IntArray
-from gsstream.input.prepare.findings import Finding, error
+from gsstream.core.shapes import FloatArray
+from gsstream.input.prepare.findings import Finding, error, note
+from gsstream.input.prepare.line_motion import Motion, barcodes, likeness, motions
 from gsstream.input.prepare.match_checks import REPAIRS
 from gsstream.input.prepare.picture_checks import Thumbnails
-from gsstream.input.seeds.geometry import depth_range, focus_point
-from gsstream.metrics.noise import noise_sigma
+from gsstream.input.seeds.geometry import neighbour_views
 
-GRID = 36
-#: Largest offset of a clock that is searched for, frames.
-REACH = 3
-AGREE, MARGIN = 0.45, 0.15
-MIN_VOXELS = 40
-VOTES = 0.75
+#: Offsets are searched for up to this share of the frames; every offset is then judged by most of them.
+REACH = 0.3
+#: Cameras that each camera is compared with.
+PARTNERS = 12
+#: Least correlation with the others, and least fall of it away from the best offset, with which a clock is known.
+ALIKE, FALL = 0.3, 0.05
+#: Least offset that is claimed, frames; least gain of correlation by it; least share of the partners that agree.
+LEAST, GAIN, VOTES = 0.7, 0.01, 0.75
+#: So many of the cameras that are least like the others, and clearly less than usual, are tried with each other's pose;
+#: both must become so much more like the others.
+SUSPECTS, STAND_OUT, EXCHANGED = 6, 0.92, 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class _Motion:
-    """``masks`` [T, C, h w] moving pixels; ``seen`` [V, C] voxel in the image, ``place`` [V, C] its pixel."""
+class Clock:
+    """One camera is so many frames ``late``; None: not known. ``ended``: the best lies at the end of the search."""
 
-    masks: BoolArray
-    seen: BoolArray
-    place: IntArray
-
-    def at(self, camera: int, pose: int) -> BoolArray:
-        """[T, V]: motion of ``camera`` at the pixels that the voxels have in the view of ``pose``."""
-        moving: BoolArray = self.masks[:, camera, self.place[:, pose]] & self.seen[:, pose]
-        return moving
+    late: float | None
+    ended: bool = False
 
 
 def check_sync(thumbs: Thumbnails) -> list[Finding]:
-    """Find cameras whose clock is off, and pairs of cameras that are swapped; nothing where too little moves."""
-    cameras = thumbs.cameras
-    if len(cameras) < 5 or len(thumbs.images) < 2 * REACH + 2:
-        return []
-    motion = _motion(thumbs)
-    votes = _votes(motion)
-    total, seen = votes.sum(2), motion.seen.sum(1)
-    table = _table(motion, votes)
-    out_of_place = [c for c in range(len(cameras)) if 0 <= table[c, REACH] < AGREE and motion.masks[:, c].any()]
-    if swapped := _swapped(motion, cameras, out_of_place, total, seen, votes):
+    """Find cameras whose clock is off and pairs that are swapped; a note where that cannot be known."""
+    height, width = thumbs.images.shape[2:4]
+    cameras, reach = thumbs.cameras.scaled(width, height), int(REACH * len(thumbs.images))
+    if len(thumbs.images) < 2:
+        return []  # a still scene has no clocks
+    if len(cameras) < 3 or reach < 1:
+        have = f"{len(cameras)} cameras, {len(thumbs.images)} frames"
+        return [note("sync", f"clocks: not checkable ({have}; expected at least 3 and 4)")]
+    seen = motions(thumbs)
+    curves = _curves(cameras, seen, reach)
+    clocks = _clocks(curves)
+    if swapped := _swapped(cameras, seen, curves[:, :, reach]):
         return swapped
-    found = []
-    for c, row in enumerate(table):
-        best = int(row.argmax())
-        if best != REACH and row[best] > max(AGREE, row[REACH] + MARGIN):
-            late = best - REACH
-            found.append(error("sync", (
-                f"camera {cameras.ids[c]!r} is {abs(late)} frame{'s' if abs(late) > 1 else ''} "
-                f"{'late' if late > 0 else 'early'}: what moves is at another place than in the other cameras. Shift "
-                f"its frames by {-late:+d}, or run with --source disturbed:time_offset={cameras.ids[c]}@{late}:SOURCE"
-            )))  # fmt: skip
-    if found and (better := _better_poses(thumbs, table)):
+    lost = [c for c, clock in enumerate(clocks) if clock.late is None]
+    off = [c for c, clock in enumerate(clocks) if clock.late]
+    if 2 * (len(off) + len(lost)) >= len(cameras) and (better := _better_poses(cameras, seen, curves)):
         return better
-    # A clock can only be off against a majority. Where half of the cameras seem to be off, there is too little motion,
-    # or too slow a motion, to tell.
-    return found if 2 * len(found) < len(cameras) else []
+    # A clock can only be off against a majority.
+    if 2 * len(off) >= len(cameras) - len(lost):
+        lost = list(range(len(cameras)))
+        off = []
+    return [_told(cameras.ids[c], clocks[c], reach) for c in off] + _unknown(cameras, seen, lost)
 
 
-def _votes(motion: _Motion) -> IntArray:
-    """[T, V, C] 1 where a camera sees motion in a voxel."""
-    return np.stack([motion.at(c, c) for c in range(motion.masks.shape[1])], axis=2).astype(np.int16)
+def _told(name: str, clock: Clock, reach: int) -> Finding:
+    late = round(clock.late or 0)
+    count = f"{f'at least {reach}' if clock.ended else abs(late)} frame{'s' if abs(late) > 1 else ''}"
+    cure = f"Shift its frames by {-late:+d}, or run with --source disturbed:time_offset={name}@{late}:SOURCE"
+    if clock.ended:
+        cure = f"No larger offset was tried; more are with --frames {math.ceil(2 * reach / REACH)}"
+    return error("sync", (
+        f"camera {name!r} is {count} {'late' if late > 0 else 'early'}: what moves is at another place than in the "
+        f"other cameras. {cure}"
+    ))  # fmt: skip
 
 
-def _table(motion: _Motion, votes: IntArray) -> FloatArray:
-    """[C, 2 REACH + 1] scores of every camera against the hull of the others."""
-    total, seen = votes.sum(2), motion.seen.sum(1)
-    return np.array([
-        _scores(_hull(total - votes[:, :, c], seen - motion.seen[:, c]), motion, c) for c in range(votes.shape[2])
-    ])  # fmt: skip
+def _unknown(cameras: Cameras, seen: list[Motion], lost: list[int]) -> list[Finding]:
+    if not lost:
+        return []
+    share = 100 * float(np.mean([seen[c].share for c in lost]))
+    which = "" if len(lost) == len(cameras) else f" of {', '.join(cameras.ids[c] for c in lost)}"
+    return [note("sync", (
+        f"clocks{which}: not checkable (what moves covers {share:.1g} % of the pictures from one frame to the next); "
+        "more frames may show more"
+    ))]  # fmt: skip
 
 
-def _better_poses(thumbs: Thumbnails, table: FloatArray) -> list[Finding]:
+def _curves(cameras: Cameras, seen: list[Motion], reach: int) -> FloatArray:
+    """[C, C, 2 reach + 1] how like camera b is to camera a so many frames later; NaN where they are not compared."""
+    count = len(cameras)
+    curves = np.full((count, count, 2 * reach + 1), np.nan)
+    for a, b in sorted({(min(pair), max(pair)) for pair in _pairs(cameras)}):
+        if codes := barcodes(cameras, (a, b), (seen[a], seen[b])):
+            curves[a, b] = likeness(*codes, reach)
+            curves[b, a] = curves[a, b, ::-1]
+    return curves
+
+
+def _pairs(cameras: Cameras) -> list[tuple[int, int]]:
+    return [(a, int(b)) for a, partners in enumerate(neighbour_views(cameras, PARTNERS)) for b in partners]
+
+
+def _clocks(curves: FloatArray) -> list[Clock]:
+    """The clock of every camera: the largest offset first, whose camera then no longer pulls at the others."""
+    count, reach = len(curves), curves.shape[2] // 2
+    moved = np.zeros(count, int)
+    for _ in range(count):
+        rows = [_row(curves, c, moved) for c in range(count)]
+        gains = [_gain(row, reach + moved[c]) for c, row in enumerate(rows)]
+        worst = int(np.argmax(gains))
+        if gains[worst] <= 0:
+            break
+        moved[worst] = int(np.nanargmax(rows[worst].mean)) - reach
+    return [_clock(_row(curves, c, moved), reach) for c in range(count)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """``each`` [P, 2 reach + 1] likeness to every partner, its clock set right; ``mean`` over them."""
+
+    each: FloatArray
+    mean: FloatArray
+
+
+def _row(curves: FloatArray, c: int, moved: FloatArray) -> _Row:
+    each = np.full(curves.shape[1:], np.nan)
+    for a, shift in enumerate(moved):
+        inside = slice(max(0, shift), each.shape[1] + min(0, shift))
+        each[a, inside] = curves[a, c, max(0, -shift) : each.shape[1] - max(0, shift)]
+    return _Row(each, _mean(each))
+
+
+def _mean(values: FloatArray) -> FloatArray:
+    """Mean over the first axis of what is known; NaN where nothing is."""
+    known = np.isfinite(values)
+    count = known.sum(0)
+    mean: FloatArray = np.where(count > 0, np.where(known, values, 0).sum(0) / np.maximum(count, 1), np.nan)
+    return mean
+
+
+def _gain(row: _Row, now: int) -> float:
+    """How much more like the others a camera is at its best offset than at ``now``; 0 where that is not sure."""
+    if np.isnan(row.mean).all() or np.isnan(row.mean[now]):
+        return 0.0
+    best = int(np.nanargmax(row.mean))
+    better = row.each[:, best] - row.each[:, now]
+    better = better[np.isfinite(better)]
+    gain = float(row.mean[best] - row.mean[now])
+    sure = gain >= GAIN and row.mean[best] >= ALIKE and float((better > 0).mean()) >= VOTES
+    return gain if sure and abs(_peak(row.mean) - now) >= LEAST else 0.0
+
+
+def _clock(row: _Row, reach: int) -> Clock:
+    known = row.mean[np.isfinite(row.mean)]
+    if not len(known) or known.max() < ALIKE or known.max() - known.min() < FALL:
+        return Clock(None)
+    if not _gain(row, reach):
+        return Clock(0.0)
+    peak = _peak(row.mean)
+    return Clock(peak - reach, ended=round(peak) in (0, 2 * reach))
+
+
+def _peak(mean: FloatArray) -> float:
+    """Where a curve is highest, between its samples."""
+    best = int(np.nanargmax(mean))
+    if not 0 < best < len(mean) - 1 or not np.isfinite(mean[best - 1 : best + 2]).all():
+        return float(best)
+    left, top, right = mean[best - 1 : best + 2]
+    return best + 0.5 * float((left - right) / min(left - 2 * top + right, -1e-12))
+
+
+def _fit(cameras: Cameras, seen: list[Motion], camera: int, pose: int, without: tuple[int, int]) -> float:
+    """How like the others a camera is, at the same instants, if it stands at ``pose``."""
+    others = [c for a, c in _pairs(cameras) if a == pose and c not in without]
+    codes = [barcodes(cameras, (c, pose), (seen[c], seen[camera])) for c in others]
+    found = [float(likeness(*code, 0)[0]) for code in codes if code is not None]
+    known = [value for value in found if np.isfinite(value)]
+    return float(np.mean(known)) if known else 0.0
+
+
+def _swapped(cameras: Cameras, seen: list[Motion], now: FloatArray) -> list[Finding]:
+    """Pairs of cameras, each of which is more like the others when it has the other's pose.
+
+    ``now``: [C, C] likeness of each pair as they are.
+    """
+    own = np.nan_to_num(_mean(now))
+    suspects = [int(c) for c in np.argsort(own)[:SUSPECTS] if own[c] < STAND_OUT * np.median(own)]
+    found = []
+    for a, b in combinations(sorted(suspects), 2):
+        changed = min(_fit(cameras, seen, x, y, (a, b)) - own[x] for x, y in ((a, b), (b, a)))
+        if changed > EXCHANGED and min(own[a], own[b]) + changed > ALIKE:
+            found.append(error("sync", (
+                f"cameras {cameras.ids[a]!r} and {cameras.ids[b]!r} are swapped: each sees what moves where the "
+                "other should; exchange their images or their poses"
+            )))  # fmt: skip
+    return found
+
+
+def _better_poses(cameras: Cameras, seen: list[Motion], curves: FloatArray) -> list[Finding]:
     """Whether poses of another convention put what moves at one place without touching a clock."""
-    on_time = _on_time(table)
+    given = _on_time(curves)
     for what, cure, repair in REPAIRS:
-        poses = np.stack([repair(pose) for pose in thumbs.cameras.viewmats])
-        motion = _motion(replace(thumbs, cameras=replace(thumbs.cameras, viewmats=poses)))
-        if _on_time(_table(motion, _votes(motion))) > max(AGREE, on_time + MARGIN):
+        poses = np.stack([repair(pose) for pose in cameras.viewmats])
+        if _on_time(_curves(replace(cameras, viewmats=poses), seen, 0)) > max(ALIKE, 1.5 * given):
             return [error("axes", (
                 f"what moves is at one place in all cameras if the poses are {what}, and at several places as they are "
                 f"given: {cure}. Clocks were judged by poses that do not fit"
@@ -98,76 +213,7 @@ def _better_poses(thumbs: Thumbnails, table: FloatArray) -> list[Finding]:
     return []
 
 
-def _on_time(table: FloatArray) -> float:
-    """Mean score of the cameras as they are; 0 where fewer than half of them can be judged."""
-    known = table[table[:, REACH] >= 0, REACH]
-    return float(known.mean()) if 2 * len(known) >= len(table) else 0.0
-
-
-def _motion(thumbs: Thumbnails) -> _Motion:
-    images, cameras = thumbs.images, thumbs.cameras
-    height, width = images.shape[2:4]
-    cameras = cameras.scaled(width, height)
-    masks = np.zeros((len(images) - 1, len(cameras), height, width), bool)
-    for c in range(len(cameras)):
-        sigma = noise_sigma(images[0, c], images[1, c])
-        masks[:, c] = np.abs(np.diff(images[:, c], axis=0)).max(-1) > max(8 / 255, 6 * sigma)
-    middle = focus_point(cameras)
-    half = 0.5 * float(np.median(depth_range(cameras, near=1.0)[:, 0]))
-    axis = np.linspace(-half, half, GRID)
-    voxels = middle + np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
-    seen, place = np.zeros((len(voxels), len(cameras)), bool), np.zeros((len(voxels), len(cameras)), np.int64)
-    for c in range(len(cameras)):
-        uv, depth = project(voxels, cameras, c)
-        seen[:, c] = inside(uv, depth, cameras)
-        column, row = np.where(seen[:, c, None], uv, 0).astype(np.int64).T
-        place[:, c] = row * width + column
-    return _Motion(_grown(masks).reshape(len(masks), len(cameras), -1), seen, place)
-
-
-def _grown(masks: BoolArray) -> BoolArray:
-    """Moving pixels and their four neighbours: thumbnails are coarse and so are voxels."""
-    grown = masks.copy()
-    grown[..., 1:, :] |= masks[..., :-1, :]
-    grown[..., :-1, :] |= masks[..., 1:, :]
-    grown[..., 1:] |= masks[..., :-1]
-    grown[..., :-1] |= masks[..., 1:]
-    return grown
-
-
-def _hull(votes: IntArray, watched: IntArray) -> BoolArray:
-    """[T, V] voxels in which at least three cameras, and most of those that see them, see motion."""
-    hull: BoolArray = (votes >= 3) & (votes >= VOTES * watched)
-    return hull
-
-
-def _scores(hull: BoolArray, motion: _Motion, c: int) -> FloatArray:
-    """[2 REACH + 1] share of the hull's voxels in which camera c sees motion so many frames later; -1: not known."""
-    mine, frames = motion.at(c, c), len(hull)
-    # Every offset is judged by the same frames.
-    core = hull[REACH : frames - REACH] & motion.seen[None, :, c]
-    if int(core.sum()) < MIN_VOXELS:
-        return np.full(2 * REACH + 1, -1.0)
-    return np.array([float(mine[o : o + len(core)][core].mean()) for o in range(2 * REACH + 1)])
-
-
-def _swapped(
-    motion: _Motion, cameras: Cameras, lost: list[int], total: IntArray, seen: IntArray, votes: IntArray
-) -> list[Finding]:
-    """Pairs of cameras, each of which fits the motion that the rest sees when it has the other's pose."""
-    found = []
-    for a in lost:
-        for b in lost:
-            if b <= a:
-                continue
-            hull = _hull(total - votes[:, :, a] - votes[:, :, b], seen - motion.seen[:, a] - motion.seen[:, b])
-            fits = []
-            for camera, pose in ((a, b), (b, a)):
-                where = hull & motion.seen[None, :, pose]
-                fits.append(float(motion.at(camera, pose)[where].mean()) if int(where.sum()) >= MIN_VOXELS else 0.0)
-            if min(fits) > AGREE + MARGIN:
-                found.append(error("sync", (
-                    f"cameras {cameras.ids[a]!r} and {cameras.ids[b]!r} are swapped: each sees what moves where the "
-                    "other should; exchange their images or their poses"
-                )))  # fmt: skip
-    return found
+def _on_time(curves: FloatArray) -> float:
+    """Mean likeness of the cameras as they are."""
+    now = curves[:, :, curves.shape[2] // 2]
+    return float(np.nanmean(now)) if np.isfinite(now).any() else 0.0

@@ -28,7 +28,7 @@ from gsstream.input.seeds.matching import match_images
 
 #: Width of the pictures that are compared over time, and of those whose features are matched.
 SMALL, LARGE = 160, 640
-FRAMES = 40
+FRAMES = 60
 
 Open = Callable[[float], FrameSource]
 

@@ -24,9 +24,9 @@ from gsstream.input.prepare.validate import validate
 from gsstream.input.recordings.open import open_source
 
 MESSAGES = Path(__file__).parent / "messages.json"
-#: cam00 to cam06 train, "test" tests; 240 x 180 pixels, 10 frames, two things move.
-GOOD = "synthetic:width=240&height=180&views=7&frames=10&supersample=1&motion=4"
-FRAMES = 10
+#: cam00 to cam06 train, "test" tests; 240 x 180 pixels, 12 frames, two things move.
+GOOD = "synthetic:width=240&height=180&views=7&frames=12&supersample=1&motion=4"
+FRAMES = 12
 
 Data = dict[str, Any]
 
@@ -120,7 +120,7 @@ def moved(pose: Any, factor: float) -> Any:
 
 def early(folder: Path, name: str, frames: int) -> None:
     """A camera that started some frames early, from a longer recording: nothing repeats."""
-    source = open_source(GOOD.replace("frames=10", "frames=20"))
+    source = open_source(GOOD.replace("frames=12", "frames=20"))
     index = source.info.train.ids.index(name)
     for t in range(FRAMES):
         save(folder / name / f"{t:06d}.png", source.frame(t + frames).images[index])
@@ -252,7 +252,7 @@ BAD = (
     BadScene("leaked-test", "the test camera shows a training camera's pictures", "same",
              lambda f, d: copy_camera(f, "cam03", "test")),
     BadScene("frozen", "a camera stands still", "frozen", lambda f, d: [
-        shutil.copy(f / "cam03/000000.png", f / f"cam03/00000{t}.png") for t in range(1, FRAMES)
+        shutil.copy(f / "cam03/000000.png", f / f"cam03/{t:06d}.png") for t in range(1, FRAMES)
     ]),
     BadScene("repeated-frame", "a camera repeats a frame", "repeated", lambda f, d: shutil.copy(
         f / "cam03/000004.png", f / "cam03/000005.png"

@@ -187,7 +187,8 @@ def _swapped(cameras: Cameras, seen: list[Motion], now: FloatArray) -> list[Find
 
     ``now``: [C, C] likeness of each pair as they are.
     """
-    own = np.nan_to_num(_mean(now))
+    mean = _mean(now)
+    own = np.where(np.isfinite(mean), mean, 0.0)  # not compared with any other: like none
     suspects = [int(c) for c in np.argsort(own)[:SUSPECTS] if own[c] < STAND_OUT * np.median(own)]
     found = []
     for a, b in combinations(sorted(suspects), 2):

@@ -15,7 +15,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "GSSTREAM_THREADS"):
         os.environ.setdefault(name, "1")
 
-# A submission is judged by the same examples as the one before it; everywhere else new ones are tried each time, and
+# A submission is tested with the same examples as the one before it; everywhere else new ones are tried each time, and
 # what they find becomes an @example.
 # No example has a deadline: how long one takes says how busy the machine is.
 settings.register_profile("plain", deadline=None)

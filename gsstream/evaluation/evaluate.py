@@ -143,7 +143,7 @@ class Evaluation:
 
 
 class Shown(Protocol):
-    """Pictures to be judged: of a stream, or of files that another program wrote."""
+    """Pictures to be compared: of a stream, or of files that another program wrote."""
 
     @property
     def frames(self) -> Sequence[int]:

@@ -72,9 +72,9 @@ def write_sheet(out: Path, source: FrameSource, fresh: Mapping[int, Path] = NO_F
 
 
 def held_out_line(meta: StreamMeta) -> str:
-    """Return the sentence that says which cameras judged a run, and by which split."""
+    """Return the sentence that says which test cameras a run has, and by which split."""
     if len(meta.test) == 0:
-        return "no camera judged: all of them train"
+        return "no test camera: all of them train"
     split = meta.recipe.get("data", {}).get("split", "reporting")
     purpose = "training cameras left out, to choose settings" if split == "tuning" else "test cameras"
-    return f"judged by {', '.join(meta.test.ids)} ({split} split: {purpose})"
+    return f"test cameras: {', '.join(meta.test.ids)} ({split} split: {purpose})"

@@ -53,7 +53,7 @@ class Region:
     distance: tuple[float, float]
 
     def arms(self, rig: Cameras) -> FloatArray:
-        """[C, 3] unit vectors of which the angles are judged."""
+        """[C, 3] unit vectors of which the angles are checked."""
         arms = rig.viewmats[:, 2, :3] if self.outward else rig.centers - self.focus
         norms: FloatArray = np.linalg.norm(arms, axis=1, keepdims=True)
         return np.where(norms > 0, arms / np.where(norms > 0, norms, 1.0), -rig.viewmats[:, 2, :3])

@@ -60,11 +60,11 @@ const beyond = (value, low, high) => Math.max(value - high, 0) + Math.min(value 
 function excess(region, view, pivot) {
   const arm = armOf(view, pivot);
   const { azimuth, elevation } = anglesOf(arm, pivot);
-  const judged = region.azimuth && Math.abs(dot(arm, pivot.up)) < STEEP;
+  const checked = region.azimuth && Math.abs(dot(arm, pivot.up)) < STEEP;
   const [near, far] = region.distance.map(Math.log);
   const distance = Math.log(Math.max(Math.hypot(...add(view.eye, pivot.point, -1)), 1e-300));
   return {
-    azimuth: judged ? beyond(wrapped(azimuth - region.azimuth[0]), -region.azimuth[1], region.azimuth[1]) / SLACK : 0,
+    azimuth: checked ? beyond(wrapped(azimuth - region.azimuth[0]), -region.azimuth[1], region.azimuth[1]) / SLACK : 0,
     elevation: beyond(elevation, ...region.elevation) / SLACK,
     distance: region.distance[1] > 0 ? beyond(distance, near, far) / SLACK_FACTOR : 0,
   };

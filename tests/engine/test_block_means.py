@@ -38,13 +38,13 @@ def sigma_by_hand(means: np.ndarray) -> float:
 
 @pytest.mark.parametrize("shape", [(4, 4), (8, 40), (40, 8), (9, 13), (120, 160)])
 @pytest.mark.parametrize("noise", [0.0, 0.002, 0.01, 0.05, 0.5])
-@pytest.mark.parametrize("slope", [0.0, 0.02, 0.3])
+@pytest.mark.parametrize("steepness", [0.0, 0.02, 0.3])
 def test_noise_of_block_means_is_the_lesser_of_spread_and_roughness(
-    shape: tuple[int, int], noise: float, slope: float
+    shape: tuple[int, int], noise: float, steepness: float
 ) -> None:
     """Noise alone, where the spread decides, and a smooth change of the light, where second differences do."""
     rng = np.random.default_rng(5)
-    ramp = slope * np.linspace(-1, 1, shape[1])[None, :, None]
+    ramp = steepness * np.linspace(-1, 1, shape[1])[None, :, None]
     difference = (ramp + noise * rng.normal(size=(*shape, 3))).astype(np.float32)
     means = block_means(difference)
     assert block_sigma(means) == sigma_by_hand(means)

@@ -1,4 +1,4 @@
-"""Frame 0 rounded by what a bit buys: choices, extremes, what is felt, and whole runs."""
+"""Frame 0 rounded by what a bit buys: choices, extremes, sensitivities, and whole runs."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def drawn(seed: int, rows: int = 400, width: int = 6) -> tuple[np.ndarray, np.nd
     return rng.laplace(scale=3, size=(rows, width)), 10 ** rng.uniform(-6, 2, (rows, width))
 
 
-def cost(codes: np.ndarray, exact: np.ndarray, felt: np.ndarray, weight: float) -> float:
+def cost(codes: np.ndarray, exact: np.ndarray, sensitivity: np.ndarray, weight: float) -> float:
     """Squared error plus weight times the entropy of every column in bits."""
-    total = float((felt * (codes - exact) ** 2).sum())
+    total = float((sensitivity * (codes - exact) ** 2).sum())
     for column in codes.T:
         counts = np.unique(column, return_counts=True)[1]
         total -= weight * float((counts * np.log2(counts / counts.sum())).sum())
@@ -37,36 +37,37 @@ def cost(codes: np.ndarray, exact: np.ndarray, felt: np.ndarray, weight: float) 
 
 
 def test_without_weight_every_code_is_the_nearest() -> None:
-    exact, felt = drawn(0)
-    for codes in (rd_codes_to_zero(exact, felt, 0.0), rd_codes_nearby(exact, felt, 0.0, 5)):
+    exact, sensitivity = drawn(0)
+    for codes in (rd_codes_to_zero(exact, sensitivity, 0.0), rd_codes_nearby(exact, sensitivity, 0.0, 5)):
         assert np.array_equal(codes, np.rint(exact))
         assert codes.dtype == np.int32
 
 
 @given(st.integers(0, 1000), st.floats(-6, 3))
 def test_codes_cost_no_more_than_rounding_and_move_towards_zero(seed: int, exponent: float) -> None:
-    exact, felt = drawn(seed)
-    codes = rd_codes_to_zero(exact, felt, 10**exponent)
+    exact, sensitivity = drawn(seed)
+    codes = rd_codes_to_zero(exact, sensitivity, 10**exponent)
     nearest = np.rint(exact)
-    assert cost(codes, exact, felt, 10**exponent) <= cost(nearest, exact, felt, 10**exponent) * (1 + 1e-9)
+    assert cost(codes, exact, sensitivity, 10**exponent) <= cost(nearest, exact, sensitivity, 10**exponent) * (1 + 1e-9)
     assert np.all((np.abs(codes) <= np.abs(nearest)) & (codes * nearest >= 0))
 
 
 @given(st.integers(0, 1000), st.floats(-6, 3), st.integers(0, 9))
 def test_codes_nearby_cost_no_more_and_stay_within_reach(seed: int, exponent: float, reach: int) -> None:
-    exact, felt = drawn(seed)
-    codes = rd_codes_nearby(exact - 40, felt, 10**exponent, reach)
+    exact, sensitivity = drawn(seed)
+    codes = rd_codes_nearby(exact - 40, sensitivity, 10**exponent, reach)
     nearest = np.rint(exact - 40)
-    assert cost(codes, exact - 40, felt, 10**exponent) <= cost(nearest, exact - 40, felt, 10**exponent) * (1 + 1e-9)
+    found, plain = (cost(each, exact - 40, sensitivity, 10**exponent) for each in (codes, nearest))
+    assert found <= plain * (1 + 1e-9)
     assert int(np.abs(codes - nearest).max()) <= reach
 
 
 @pytest.mark.parametrize("weight", [1e-30, 1e30])
 def test_extremes(weight: float) -> None:
-    exact, felt = drawn(3)
-    codes = rd_codes_to_zero(exact, felt, weight)
+    exact, sensitivity = drawn(3)
+    codes = rd_codes_to_zero(exact, sensitivity, weight)
     assert np.array_equal(codes, np.rint(exact) if weight < 1 else np.zeros_like(exact))
-    near = rd_codes_nearby(exact, felt, weight, 3)
+    near = rd_codes_nearby(exact, sensitivity, weight, 3)
     assert np.array_equal(near, np.rint(exact)) if weight < 1 else int(np.abs(near - exact).max()) <= 3
 
 
@@ -76,17 +77,17 @@ def test_odd_tables(exact: np.ndarray) -> None:
         assert np.array_equal(codes, np.rint(exact))
 
 
-def test_slopes_of_codes_are_those_of_finite_differences() -> None:
+def test_gradients_of_codes_are_those_of_finite_differences() -> None:
     rng = np.random.default_rng(1)
     values = rng.normal(size=(7, 8, 3)).astype(np.float32)
     weights = rng.normal(size=values.shape)
-    slopes = color_grads(weights, KEY_BITS["shN"])
+    grads = color_grads(weights, KEY_BITS["shN"])
     codes = to_codes("shN", values, KEY_BITS["shN"])
     for column in range(codes.shape[1]):
         more = codes.copy()
         more[:, column] += 1
         change = from_codes("shN", more, KEY_BITS["shN"]).astype(float) - from_codes("shN", codes, KEY_BITS["shN"])
-        assert np.allclose((change * weights.reshape(7, -1)).sum(1), slopes[:, column], atol=1e-6)
+        assert np.allclose((change * weights.reshape(7, -1)).sum(1), grads[:, column], atol=1e-6)
     assert np.array_equal(np.rint(color_codes(values, KEY_BITS["shN"])), codes)
 
 
@@ -135,15 +136,15 @@ def test_what_moves_stays_within_reach() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(KEY_BITS))
-def test_what_is_felt_is_what_a_code_changes(name: str) -> None:
-    """Of the most felt code of every attribute, by two renders of every view."""
+def test_sensitivity_is_what_a_code_changes(name: str) -> None:
+    """Of the code with the largest sensitivity of every attribute, by two renders of every view."""
     packet, encoder = key_packet(0.0)
     scene, frame = scene_of(packet).map(torch.from_numpy), frames()[0]
-    felt = sum(
+    sensitivity = sum(
         code_sensitivity(encoder.parts, scene, frame, None, Rng(seed).stream("a", 0))[0][name] for seed in range(24)
     )
-    felt = felt / 24
-    row, column = np.unravel_index(int(felt.argmax()), felt.shape)
+    sensitivity = sensitivity / 24
+    row, column = np.unravel_index(int(sensitivity.argmax()), sensitivity.shape)
     bits = KEY_BITS[name]
     flat = getattr(scene, name).numpy().reshape(len(scene), -1)
     images, behind = [], encoder.parts.background
@@ -158,7 +159,7 @@ def test_what_is_felt_is_what_a_code_changes(name: str) -> None:
         other = Gaussians(**{**dict(scene.items()), name: torch.from_numpy(values).reshape(getattr(scene, name).shape)})
         images.append([encoder.parts.renderer.render(other, frame.cameras, v, behind).image for v in range(3)])
     exact = sum(float((a - b).square().sum()) for a, b in zip(*images, strict=True))
-    assert felt[row, column] == pytest.approx(exact, rel=0.5)
+    assert sensitivity[row, column] == pytest.approx(exact, rel=0.5)
 
 
 def test_a_scene_without_gaussians_stays_one() -> None:

@@ -89,7 +89,7 @@ def test_what_nobody_sees_goes_and_what_is_seen_alone_stays(renderer: Renderer) 
     assert len(kept) > 0
 
 
-def test_where_nothing_is_felt_all_remain_and_order_is_kept() -> None:
+def test_rows_without_an_error_remain_and_order_is_kept() -> None:
     assert retained_rows(torch.tensor([0.0, 2.0, 0.0, 3.0]), 0.0).tolist() == [1, 3]
     assert retained_rows(torch.tensor([3.0, 1.0, 2.0]), 1.5).tolist() == [0, 2]
     assert retained_rows(torch.zeros(3), 0.0).tolist() == [0, 1, 2]

@@ -14,7 +14,7 @@ from gsstream.player.playback import Playback
 DISTURBED = "disturbed:gain_amplitude=0.3,noise_sigma=8,lost_share=0.4,time_offset={}@1"
 
 
-def test_a_disturbed_run_is_judged_on_what_it_saw(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_disturbed_run_is_evaluated_on_what_it_saw(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     world = "synthetic:frames=5&views=3&width=64&height=48&supersample=1"
     name = open_source(world).info.test.ids[0]
     source = f"{DISTURBED.format(name)}:{world}"
@@ -39,17 +39,17 @@ def test_the_tuning_split_knows_nothing_of_the_test_camera(
 ) -> None:
     """Not a byte of a run in the tuning split depends on what the test camera sees."""
     world = "synthetic:frames=2&views=4&width=64&height=48&supersample=1"
-    (judge,) = open_source(world).info.test.ids
+    (test_camera,) = open_source(world).info.test.ids
     encode(tmp_path / "o", source=world, stream__epochs=1, data__split="tuning")
     with Playback(tmp_path / "o" / "stream.gss") as playback:
         meta = playback.meta
-    assert judge not in (*meta.train.ids, *meta.test.ids)
-    assert f"judged by {meta.test.ids[0]} (tuning split" in (tmp_path / "o" / "summary.txt").read_text()
+    assert test_camera not in (*meta.train.ids, *meta.test.ids)
+    assert f"test cameras: {meta.test.ids[0]} (tuning split" in (tmp_path / "o" / "summary.txt").read_text()
     assert list(metrics(tmp_path / "o")[1]["psnr"]) == list(meta.test.ids)
-    # A frame 0 that has seen the judge is refused, and one whose colour maps are of other cameras.
+    # A frame 0 that has seen the test camera is refused, and one whose colour maps are of other cameras.
     encode(tmp_path / "all", "--frames", "1", source=world, first_frame__exposure="true")
     capsys.readouterr()
-    for change, message in (("split=tuning", "which would judge here"), ("train_views=3", "has colour maps of")):
+    for change, message in (("split=tuning", "test cameras here"), ("train_views=3", "has colour maps of")):
         take = ("--first-frame", str(tmp_path / "all"), "--overwrite", "--set", f"data.{change}")
         command = arguments(tmp_path / "no", *take, source=world)
         assert run_command(command) == 2

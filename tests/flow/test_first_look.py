@@ -76,11 +76,11 @@ def test_a_run_warns_of_inverse_poses_and_says_what_it_takes(tmp_path: Path, cap
 
 
 def test_a_run_without_test_cameras_says_so_once_and_nothing_when_quiet(tmp_path: Path, capsys) -> None:
-    def no_judge(data: dict) -> None:
+    def no_test_camera(data: dict) -> None:
         data["cameras"] = [camera for camera in data["cameras"] if camera["split"] == "train"]
         data["test_cameras"] = []
 
-    folder = demo_copy(tmp_path / "r", frames=1, edit=no_judge)
+    folder = demo_copy(tmp_path / "r", frames=1, edit=no_test_camera)
     for quiet, lines in ((True, 0), (False, 1)):
         command = arguments(tmp_path / "o", "--overwrite", source=str(folder), scale=0.25)
         assert run_command([word for word in command if quiet or word != "--quiet"]) == 0

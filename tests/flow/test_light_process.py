@@ -1,4 +1,4 @@
-"""What a process of a run loads: libraries that torch pulls in by the side cost seconds and memory of every start."""
+"""What a process of a run loads: libraries that torch loads besides cost seconds and memory of every start."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ print([name for name in {UNWANTED!r} if name in sys.modules])
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_pulling_back_is_the_backward_of_torch(count: int) -> None:
+def test_backward_is_the_backward_of_torch(count: int) -> None:
     g = torch.Generator().manual_seed(count)
     leaves = [[torch.randn(5, 3, generator=torch.Generator().manual_seed(7)).requires_grad_()] for _ in range(2)]
     gradients = [torch.randn(5, 3, generator=g) for _ in range(count)]
-    for (leaf,), pull in zip(leaves, (backward, torch.autograd.backward), strict=True):
+    for (leaf,), differentiate in zip(leaves, (backward, torch.autograd.backward), strict=True):
         hidden = leaf.sin() * leaf.exp()
-        pull([hidden * (k + 1) + hidden.square() for k in range(count)], gradients)
+        differentiate([hidden * (k + 1) + hidden.square() for k in range(count)], gradients)
     (ours,), (theirs,) = leaves
     assert ours.grad is not None
     assert theirs.grad is not None

@@ -1,7 +1,7 @@
 """A motion that is predicted and then ends: the error on changed pixels comes back within three frames.
 
 The recordings are analytic and share frame 0. A slow mover goes the same way at constant speed, so that three frames
-after a reversal it stands at the same place, in front of the same picture. Judged on training views: with so small a
+after a reversal it stands at the same place, in front of the same picture. Compared on training views: with so small a
 fit a held-out one mostly shows what frame 0 lacks.
 """
 

@@ -1,4 +1,4 @@
-"""Worst relative errors of the stages that render and judge, against the same formulas in float64. One seed each."""
+"""Worst relative errors of the stages that render and compare, against the same formulas in float64. One seed each."""
 
 from __future__ import annotations
 
@@ -115,11 +115,11 @@ def render_measures() -> dict[str, Measure]:
         from gsstream_cpu_render.renderer import CpuRenderer
     except ImportError:
         return measures
-    native, judge = CpuRenderer(), CpuLoss()
+    native, native_loss = CpuRenderer(), CpuLoss()
     return measures | {
         "image (cpu)": lambda seed: image(native, seed),
         "gradients (cpu)": lambda seed: gradients(native, seed),
         "screen gradient (cpu)": lambda seed: screen(native, seed),
-        "loss value (cpu)": lambda seed: loss(judge, 0, seed),
-        "loss gradient (cpu)": lambda seed: loss(judge, 1, seed),
+        "loss value (cpu)": lambda seed: loss(native_loss, 0, seed),
+        "loss gradient (cpu)": lambda seed: loss(native_loss, 1, seed),
     }

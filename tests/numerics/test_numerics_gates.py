@@ -66,8 +66,8 @@ def test_a_tie_between_two_levels_goes_to_the_even_one(levels: int) -> None:
 
 @pytest.mark.parametrize("part", [sampler(), BinarySteGate()], ids=["gumbel-sigmoid", "binary-ste"])
 def test_an_open_gate_feels_the_images_as_a_closed_one_does(part: GumbelSigmoid) -> None:
-    """s (1 - s) is exactly 0 from a logit of 17 temperatures on in float32: a gate at the upper bound (23) was pulled
-    by the price of openness alone, while one at the lower bound felt both."""
+    """s (1 - s) is exactly 0 from a logit of 17 temperatures on in float32: a gate at the upper bound (23) was moved
+    by the price of openness alone, while one at the lower bound by both."""
     ends = torch.tensor([-math.log(1000.0), math.log(1000.0)])
     down, up = gradient(part, ends).tolist()
     assert up > 0

@@ -27,7 +27,7 @@ def test_cases_follow_from_seed_and_number_alone():
     assert len({data for _, data in first.values()}) > 35
 
 
-def test_the_judge_finds_a_wrong_scene_and_a_lost_frame(tmp_path):
+def test_the_comparison_finds_a_wrong_scene_and_a_lost_frame(tmp_path):
     """The job would be worth nothing if it could not fail."""
     base = bases()[1]
     scenes = list(base.scenes)

@@ -139,7 +139,7 @@ return given.map(({ rig, others, hands }) => {
   const pivot = pivotOf(views);
   const region = regionOf(views, pivot);
   const at = viewsOf({ test: rows(others), train: none });
-  // A hand that pulls at random, held as the page holds it; then let go.
+  // A hand that drags at random, held as the page holds it; then let go.
   const worst = { free: 0, left: 0, moved: 0 };
   for (const view of views) {
     const stays = returned(region, view, pivot, 0);

@@ -46,7 +46,7 @@ def checks() -> str:
 
 #: What a reader may miss among the checks.
 ELSEWHERE = {
-    "a structure's time grows with N, not faster": "no check judges by a clock, and shared machines have poor ones",
+    "a structure's time grows with N, not faster": "no check decides by a clock, and shared machines have poor ones",
     "memory returns after an estimate": "`check_confidence_no_grad_left` refuses what would hold it, a graph",
     "outputs stay on a GPU": "checks run on the CPU, where every result can be compared bit by bit; a GPU renderer "
     "brings its own suite (`plugins/gsplat_render/tests`)",

@@ -59,7 +59,7 @@ class Controller:
         log.set(budget=spent(budget, used, self._stream, numbers.get("iterations", 0) / views))
 
     def key_refusal(self, num_gaussians: int, allowance: Allowance | None) -> str | None:
-        """Say why a key packet that is due must wait, judged by what the last one cost; None: it may be tried."""
+        """Say why a key packet that is due must wait, by what the last one cost; None: it may be tried."""
         if allowance is None or self._key is None:
             return None
         size, seconds = (value * num_gaussians for value in self._key)

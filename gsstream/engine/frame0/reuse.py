@@ -34,7 +34,7 @@ def reuse_first_frame(parts: Assembly, frame: Frame, tools: Tools) -> Step:
     Methods can then be compared on the same scene.
 
     Raises InputError when the recipe asks for another degree of spherical harmonics than the stream has, when a camera
-    that judges here took part in it, or when its colour maps are of other cameras.
+    that is a test camera here took part in it, or when its colour maps are of other cameras.
     """
     first, meta, rng = tools.first, tools.meta(frame), tools.rng
     assert first is not None
@@ -64,7 +64,7 @@ def _check_views(theirs: StreamMeta, cameras: Cameras, held_out: tuple[str, ...]
     """Refuse a frame 0 that was trained on cameras held out here, or whose colour maps are of other cameras."""
     if seen := [name for name in held_out if name in theirs.train.ids]:
         raise InputError(
-            f"the first frame was reconstructed with {', '.join(seen)}, which would judge here; take one of a run with "
+            f"the first frame was reconstructed with {', '.join(seen)}, test cameras here; take one of a run with "
             "the same data.split and data.test_cameras"
         )
     if exposure_from_meta(theirs) is not None and theirs.train.ids != cameras.ids:

@@ -22,7 +22,7 @@ _Near = Callable[[IntArray], IntArray]
 
 
 def rd_codes_to_zero(exact: FloatArray, sensitivity: FloatArray, weight: float) -> IntArray:
-    """Return the codes [N, width] int32 with the least ``felt (code - exact)^2 + weight bits``, column by column.
+    """Return the codes [N, width] int32 with the least ``sensitivity (code - exact)^2 + weight bits``, by column.
 
     Of each value: the nearest code, its two neighbours towards zero, and zero, for what may as well not be there. The
     bits of a code are those of a coder that knows how often each one occurs in its column.

@@ -6,7 +6,7 @@ import torch
 
 from gsstream.parts.gate.base import GateSampler
 
-#: Spacing of float32 below 1: a smaller slope changes no gate by a logit's step.
+#: Spacing of float32 below 1: a smaller gradient changes no gate by a logit's step.
 RESOLUTION = 2.0**-24
 
 

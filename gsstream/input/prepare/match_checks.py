@@ -31,7 +31,7 @@ REPAIRS: tuple[tuple[str, str, Repair], ...] = (
 
 
 def check_matches(cameras: Cameras, pairs: list[PairMatches], *, rig_only: bool = False) -> list[Finding]:
-    """Judge every camera by the matches with all others."""
+    """Check every camera by the matches with all others."""
     pairs = [pair for pair in pairs if len(pair.first) >= MIN_MATCHES]
     limit = max(1.0, TOLERANCE * cameras.width)
     if len(pairs) < 2:

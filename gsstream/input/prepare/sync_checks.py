@@ -20,7 +20,7 @@ from gsstream.input.prepare.match_checks import REPAIRS
 from gsstream.input.prepare.picture_checks import Thumbnails
 from gsstream.input.seeds.geometry import neighbour_views
 
-#: Offsets are searched for up to this share of the frames; every offset is then judged by most of them.
+#: Offsets are searched for up to this share of the frames; every offset is then compared over most of them.
 REACH = 0.3
 #: Cameras that each camera is compared with.
 PARTNERS = 12
@@ -209,7 +209,7 @@ def _better_poses(cameras: Cameras, seen: list[Motion], curves: FloatArray) -> l
         if _on_time(_curves(replace(cameras, viewmats=poses), seen, 0)) > max(ALIKE, 1.5 * given):
             return [error("axes", (
                 f"what moves is at one place in all cameras if the poses are {what}, and at several places as they are "
-                f"given: {cure}. Clocks were judged by poses that do not fit"
+                f"given: {cure}. Clocks were compared by poses that do not fit"
             ))]  # fmt: skip
     return []
 

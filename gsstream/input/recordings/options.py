@@ -56,11 +56,11 @@ class DataOptions(BaseModel):
 
     split: SplitName = Field(
         default="reporting",
-        description="which cameras judge. reporting: the test cameras, for results; tuning: the test cameras are taken "
-        "away altogether and about one in six training cameras judges instead, for choosing settings",
+        description="which cameras test. reporting: the test cameras, for results; tuning: the test cameras are taken "
+        "away altogether and about one in six training cameras takes their place, for choosing settings",
     )
     test_cameras: tuple[str, ...] | None = Field(
-        default=None, description="cameras that only judge, by id; null: the recording's own split; []: none"
+        default=None, description="test cameras, by id; null: the recording's own split; []: none"
     )
     train_cameras: tuple[str, ...] | None = Field(
         default=None, description="cameras that train, by id; null: all that do not test"

@@ -71,7 +71,7 @@ class Box:
         enter, leave = np.full(len(rays), -_FAR), np.full(len(rays), _FAR)
         # Axis by axis: numpy reduces over a last axis of three ten times slower than over columns.
         for axis, half in enumerate(self.half):
-            # A ray parallel to a slab has an infinite crossing; a tiny slope keeps the arithmetic finite.
+            # A ray parallel to a slab has an infinite crossing; a tiny component keeps the arithmetic finite.
             component = np.where(np.abs(rays[:, axis]) < 1e-9, np.float32(1e-9), rays[:, axis])
             inverse = 1 / component
             middle, reach = -offset[..., axis] * inverse, np.abs(np.float32(half) * inverse)

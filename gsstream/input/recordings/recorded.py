@@ -36,7 +36,7 @@ class Recording:
         where: the calibration file, for messages.
         rig: all cameras, world-to-camera, OpenCV axes, corner origin; ``Ks`` are those of the images as stored.
         clips: camera id -> its pictures, in the order of the rig.
-        test: ids of the cameras that only judge.
+        test: ids of the test cameras, which never train.
         fps: frames per second; videos know better.
         lenses: camera id -> distortion, where there is any.
         sizes: camera id -> (width, height) of its pictures; empty: all have those of the rig.

@@ -60,7 +60,7 @@ def _known(key: str, name: str, ids: Sequence[str], taken: Sequence[str] | dict[
 
 
 class ChosenSplit(NamedTuple):
-    """Ids of the cameras that train, of those that judge, and of those that a run must see nothing of."""
+    """Ids of the cameras that train, of the test cameras, and of those that a run must see nothing of."""
 
     train: tuple[str, ...]
     test: tuple[str, ...]
@@ -68,7 +68,7 @@ class ChosenSplit(NamedTuple):
 
 
 def choose_split(options: DataOptions, train: Cameras, test: Cameras) -> ChosenSplit:
-    """Return who trains and who judges, as the options of a recipe ask for.
+    """Return the training and test cameras, as the options of a recipe ask for.
 
     Raises SourceError for unknown or repeated ids, a camera on both sides, no training camera left, or a leak in the
     tuning split.
@@ -93,7 +93,7 @@ def choose_split(options: DataOptions, train: Cameras, test: Cameras) -> ChosenS
     return ChosenSplit(trains, tests)
 
 
-#: One training camera in so many judges in the tuning split, rounded to the nearest number, and at least one.
+#: One training camera in so many is a test camera in the tuning split, rounded to the nearest number, and at least one.
 TRAINING_PER_HELD_OUT = 6
 
 
@@ -108,7 +108,7 @@ def _for_tuning(
         )
     if len(trains) < 2:
         raise SourceError(
-            f"data.split: the tuning split needs two training cameras, one of which judges; got {len(trains)}"
+            f"data.split: the tuning split needs two training cameras, of which one is to test; got {len(trains)}"
         )
     count = max(1, (len(trains) + TRAINING_PER_HELD_OUT // 2) // TRAINING_PER_HELD_OUT)
     held_out = [trains[i] for i in _medoids(centers, count)]
@@ -118,7 +118,7 @@ def _for_tuning(
 def _medoids(centers: FloatArray, count: int) -> list[int]:
     """Rows of ``count`` of the points to which the others are nearest (k-medoids by swaps), in order.
 
-    Judges that lie farthest apart would be the rim of the rig, where no training camera is left around them. Medoids
+    Cameras that lie farthest apart would be the rim of the rig, where no training camera is left around them. Medoids
     are spread over the whole rig and lie in the middle of their neighbours, as test cameras usually do.
     """
     apart = np.linalg.norm(centers[:, None].astype(np.float64) - centers[None], axis=2)

@@ -36,7 +36,7 @@ class AnalyticGate:
         levels: non-zero values that it is rounded to; its gradient is that of the soft gate.
         open_logit: logit at which a gate is open with probability one half; it is sigmoid(logit - open_logit).
         bound: logits are kept within -bound to bound; infinity: they are not.
-        logit_offset: 100 makes a gate that is always open, whatever its logit, and has no slope.
+        logit_offset: 100 makes a gate that is always open, whatever its logit, and has no gradient.
     """
 
     temperature: float

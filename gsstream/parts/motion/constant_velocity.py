@@ -36,7 +36,7 @@ class Coasting(MotionPart):
             default=0.1, ge=0, le=1, description="share of a group's Gaussians that the last frame must have displaced"
         )
         asked: float = Field(
-            default=0.5, ge=0, le=1, description="share of the cameras that judge each group, in turn; 0: none does"
+            default=0.5, ge=0, le=1, description="share of the cameras that check each group, in turn; 0: none does"
         )
 
     source: ClassVar[str] = "gsstream"

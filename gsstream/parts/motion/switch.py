@@ -19,8 +19,8 @@ def loss_change(
 ) -> FloatArray:
     """Return the change [K] of the loss, summed over views, that each group's move brings about; below 0 it helps.
 
-    It is the slope of the loss half-way, along the move: for a loss that is quadratic between the two ends it is their
-    difference, and one pass over the views answers for every group at once.
+    It is the derivative of the loss half-way, along the move: for a loss that is quadratic between the two ends it is
+    their difference, and one pass over the views answers for every group at once.
     """
     base, whole = narrow_to(work, transforms)
     half = whole._replace(translation=whole.translation / 2, rotation=whole.rotation / 2)

@@ -53,10 +53,10 @@ def curvature_of(
 ) -> torch.Tensor:
     """Return the curvature [K, 6, 6] float64 of a view's loss by shift and turn of groups of rows.
 
-    A row that moves carries its share of the picture along: at a pixel the picture changes by its slope times the
+    A row that moves carries its share of the picture along: at a pixel the picture changes by its gradient times the
     shift of the row on the screen, times the row's share of the pixel's light. As shares add up to at most 1, the sum
-    over rows of share * (slope * shift)^2 is at least the square of the sum, also where rows of several groups share a
-    pixel: the blocks together lie above the matrix of Gauss-Newton of all groups at once, so each can be solved for
+    over rows of share * (gradient * shift)^2 is at least the square of the sum, also where rows of several groups share
+    a pixel: the blocks together lie above the matrix of Gauss-Newton of all groups at once, so each can be solved for
     itself. In units of the loss, which is a mean over all values of a picture; its SSIM counts as if it were L1.
 
     Arguments:

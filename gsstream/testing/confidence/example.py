@@ -15,7 +15,7 @@ from gsstream.api import ConfidenceEstimator, ConfidenceTraits, FrameContext, Pa
 class ExampleConfidence(ConfidenceEstimator):
     """Compares two frames: z = gain * (|m| / max|m| - 1/2), |m| the mean over views of the screen gradient's norm.
 
-    The gradient is that of half the squared difference of the two frames. Where nothing pulls, z is ``floor``.
+    The gradient is that of half the squared difference of the two frames. Without a gradient, z is ``floor``.
     """
 
     source = "gsstream"

@@ -55,7 +55,7 @@ def check_loss_mask(part: Loss) -> None:
     equal("gradient with a full mask", whole, gradient, 1e-6, WHY)
     nothing, still = _evaluate(part, 0.2, torch.zeros(3, 3, dtype=torch.bool))
     assert nothing == 0.0, f"an empty mask: expected a loss of exactly 0, got {nothing!r}"
-    at_most("gradient with an empty mask", still.abs(), 0.0, 0.0, "no tile is judged")
+    at_most("gradient with an empty mask", still.abs(), 0.0, 0.0, "no tile is compared")
 
 
 @check("loss")

@@ -28,7 +28,7 @@ from gsstream.testing.registry import check
 NEAR = 5e-3
 WHY = "the same calls, up to rounding and the end of a pixel's light"
 #: The least that gradients and curvatures of transforms are measured by: a thousandth of what they are here.
-SLOPE = 1e-5
+MIN_GRADIENT = 1e-5
 #: What renders are compared with.
 IMAGE = torch.rand(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(4))
 GREY = (0.2, 0.5, 0.9)
@@ -88,12 +88,12 @@ def compare(what: str, got: LossAndGrad[Any], want: LossAndGrad[Any], tolerance:
         ours, theirs = (_given({**dict(found.grad.items()), "2-D means": found.means2d}) for found in (got, want))
         gradients_equal(what, ours, theirs, tolerance, WHY)
     else:
-        relative(f"{what}: gradient", got.grad, want.grad, tolerance, WHY, floor=SLOPE)
+        relative(f"{what}: gradient", got.grad, want.grad, tolerance, WHY, floor=MIN_GRADIENT)
     for name in ("curvature", "exposure"):
         one, other = getattr(got, name), getattr(want, name)
         assert (one is None) == (other is None), f"{what}: {name}: expected {other!r}, got {one!r}"
         if one is not None:
-            relative(f"{what}: {name}", one, other, tolerance, WHY, floor=SLOPE)
+            relative(f"{what}: {name}", one, other, tolerance, WHY, floor=MIN_GRADIENT)
 
 
 def _given(gradients: dict[str, torch.Tensor | None]) -> dict[str, torch.Tensor]:
@@ -169,7 +169,7 @@ def check_renderer_grad(part: Renderer) -> None:
         if value.numel():
             both = getattr(one.grad, name) + getattr(other.grad, name)
             halves = f"gradient of {name}, two halves of the tiles"
-            relative(halves, both, value, NEAR, "sums in another order", floor=SLOPE)
+            relative(halves, both, value, NEAR, "sums in another order", floor=MIN_GRADIENT)
             at_most(f"gradient of {name} where no tile counts", getattr(none.grad, name).abs(), 0.0, 0.0, EXACT)
 
 

@@ -73,7 +73,7 @@ def comparison(dssim: float = 0.3, coloured: bool = False, tiles: torch.Tensor |
     return ViewTarget(CpuLoss(), CpuLoss().prepare(image), dssim, image, exposure, tiles)
 
 
-def pulled(session: CpuSession, view: int, rows: Scene, wanted: ViewTarget) -> LossAndGrad[Scene]:
+def fused(session: CpuSession, view: int, rows: Scene, wanted: ViewTarget) -> LossAndGrad[Scene]:
     return session.loss_and_grad(view, wanted, WrtRows(rows))
 
 
@@ -99,12 +99,12 @@ def between(session: CpuSession, view: int) -> int:
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("dssim", [0.0, 0.5])
-def test_a_pull_is_near_the_gradient_of_the_whole_scene(seed: int, dssim: float, isa: str) -> None:
+def test_an_active_gradient_is_near_that_of_the_whole_scene(seed: int, dssim: float, isa: str) -> None:
     g = torch.Generator().manual_seed(seed)
     whole, active, session = begun(seed, g)
     for step in range(5):
         rows = moved(whole.rows(active), 0.02, 0.1 * step, g)
-        found, (loss, gradients) = pulled(session, 0, rows, comparison(dssim)), step_by_step(
+        found, (loss, gradients) = fused(session, 0, rows, comparison(dssim)), step_by_step(
             opened(whole, active), rows, comparison(dssim), 0
         )
         assert float(found.loss) == pytest.approx(loss, rel=1e-4)
@@ -114,7 +114,7 @@ def test_a_pull_is_near_the_gradient_of_the_whole_scene(seed: int, dssim: float,
             session.narrow(active)
 
 
-def test_with_nothing_behind_the_active_rows_a_pull_has_the_bits_of_the_whole_scene(isa: str, threads: int) -> None:
+def test_with_nothing_behind_the_active_rows_gradients_have_the_bits_of_the_whole_scene(isa: str, threads: int) -> None:
     whole, g = crowd(6), torch.Generator().manual_seed(6)
     active = some_rows(40, g)
     whole.means[:, 2].clamp_(max=0.2)
@@ -122,7 +122,7 @@ def test_with_nothing_behind_the_active_rows_a_pull_has_the_bits_of_the_whole_sc
     session = opened(whole, active)
     for step in range(4):
         rows = moved(whole.rows(active), 0.02, 0.2 * step, g)
-        found = pulled(session, 1, rows, comparison())
+        found = fused(session, 1, rows, comparison())
         loss, gradients = step_by_step(opened(whole, active), rows, comparison())
         assert found.loss == loss
         assert bits(found)[1] == bits(replace(found, grad=gradients))[1]
@@ -135,10 +135,10 @@ def test_the_layers_hold_most_of_a_crowd_and_the_more_the_fewer_rows_change() ->
     session = opened(whole, active)
     session.render(0, whole.rows(active))
     every = between(session, 0)
-    pulled(session, 0, whole.rows(active), comparison())
+    fused(session, 0, whole.rows(active), comparison())
     few = between(session, 0)
     session.narrow(active[:1])
-    pulled(session, 0, whole.rows(active[:1]), comparison())
+    fused(session, 0, whole.rows(active[:1]), comparison())
     assert between(session, 0) < few < 0.7 * every
 
 
@@ -148,10 +148,10 @@ def test_rows_that_leave_the_view_and_come_back(isa: str) -> None:
     session, here = opened(whole, active), whole.rows(active)
     away = here.map(torch.clone)
     away.means[:] += 100
-    before = bits(pulled(session, 0, here, comparison()))
-    gone = pulled(session, 0, away, comparison())
+    before = bits(fused(session, 0, here, comparison()))
+    gone = fused(session, 0, away, comparison())
     assert not any(bool(value.any()) for _, value in gone.grad.items())
-    assert bits(pulled(session, 0, here, comparison())) == before
+    assert bits(fused(session, 0, here, comparison())) == before
 
 
 def test_gaussians_at_one_depth() -> None:
@@ -162,8 +162,8 @@ def test_gaussians_at_one_depth() -> None:
     session = opened(whole, active)
     for step in range(3):
         rows = whole.rows(active) if step != 1 else moved(whole.rows(active), 0.0, 0.5, g)
-        found = pulled(session, 0, rows, comparison())
-        assert bits(found) == bits(pulled(opened(whole, active), 0, rows, comparison()))
+        found = fused(session, 0, rows, comparison())
+        assert bits(found) == bits(fused(opened(whole, active), 0, rows, comparison()))
         assert_near(found.grad, step_by_step(opened(whole, active), rows, comparison(), 0)[1])
 
 
@@ -172,7 +172,7 @@ def test_layers_count_as_memory() -> None:
     active = some_rows(40, g)
     session = opened(whole, active)
     native = session._view(0).rasterizer._native
-    pulled(session, 0, whole.rows(active), comparison())
+    fused(session, 0, whole.rows(active), comparison())
     layered = native.memory_bytes()
     native.free_scratch()
     pixels = 6 * 32 * 16 * 7 * 4  # tiles of the picture, their pixels, transmittance and two colours
@@ -180,18 +180,18 @@ def test_layers_count_as_memory() -> None:
     session.narrow(active)
     session.render(0, whole.rows(active))
     rendered = native.memory_bytes()
-    pulled(session, 0, whole.rows(active), comparison())
+    fused(session, 0, whole.rows(active), comparison())
     assert native.memory_bytes() - rendered > pixels
 
 
-def test_no_backward_of_a_render_may_follow_a_pull() -> None:
-    """What a pull left is not what `backward_active` differentiates."""
+def test_no_backward_of_a_render_may_follow_a_fused_pass() -> None:
+    """What a fused pass leaves is not what `backward_active` differentiates."""
     whole, g = crowd(3), torch.Generator().manual_seed(3)
     active = some_rows(20, g)
     session = opened(whole, active)
     output = session.render(0, whole.rows(active).map(lambda value: value.clone().requires_grad_()))
     rasterizer = session._view(0).rasterizer
     rasterizer.backward_active(np.ones_like(output.image.detach().numpy()))
-    pulled(session, 0, whole.rows(active), comparison())
+    fused(session, 0, whole.rows(active), comparison())
     with pytest.raises(ValueError, match="backward_active: expected a forward_active pass before"):
         rasterizer.backward_active(np.ones_like(output.image.detach().numpy()))

@@ -203,10 +203,10 @@ def test_a_time_budget_looks_at_its_clock_after_every_iteration(calls: list[int]
 
 def test_the_form_of_gates_that_are_always_open_is_one_everywhere() -> None:
     form = AlwaysOpen().form()
-    gates, slopes = form.gates(torch.tensor([-9.0, 0.0, 9.0]))
-    probability, slope = form.probability(torch.tensor([-9.0, 0.0, 9.0]))
+    gates, gate_grads = form.gates(torch.tensor([-9.0, 0.0, 9.0]))
+    probability, probability_grads = form.probability(torch.tensor([-9.0, 0.0, 9.0]))
     assert torch.equal(gates, torch.ones(3))
     assert torch.equal(probability, torch.ones(3))
-    assert not slopes.any()
-    assert not slope.any()
+    assert not gate_grads.any()
+    assert not probability_grads.any()
     assert AnalyticPenalty(0, 0).open_weight == 0

@@ -37,7 +37,7 @@ def upstream(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.randn(HEIGHT, WIDTH, 3, generator=g), torch.randn(HEIGHT, WIDTH, generator=g)
 
 
-def pull(output: RenderOutput, seed: int = 0) -> None:
+def backpropagate(output: RenderOutput, seed: int = 0) -> None:
     v_image, v_alpha = upstream(seed)
     torch.autograd.backward([output.image, output.alpha], [v_image.to(output.image), v_alpha.to(output.alpha)])
 
@@ -62,8 +62,8 @@ def test_render_agrees_with_the_reference_renderer(view: int) -> None:
     want = ReferenceRenderer().render(truth, rig(), view, BACKGROUND)
     assert float((got.image - want.image).detach().abs().max()) < 2e-5
     assert float((got.alpha - want.alpha).detach().abs().max()) < 2e-5
-    pull(got)
-    pull(want)
+    backpropagate(got)
+    backpropagate(want)
     for g, w in zip(grads(ours), grads(truth), strict=True):
         assert float((g - w).abs().max()) <= 2e-5 * float(w.abs().max())
 
@@ -91,10 +91,10 @@ def test_a_backward_in_the_middle_of_other_renders() -> None:
     renderer, first = CpuRenderer(), leaves(scene())
     output = renderer.render(first, rig(), 0, BACKGROUND)
     for seed in range(3):
-        pull(renderer.render(leaves(scene(seed)), rig(), 0, BACKGROUND))
-    pull(output)
+        backpropagate(renderer.render(leaves(scene(seed)), rig(), 0, BACKGROUND))
+    backpropagate(output)
     alone = leaves(scene())
-    pull(renderer.render(alone, rig(), 0, BACKGROUND))
+    backpropagate(renderer.render(alone, rig(), 0, BACKGROUND))
     assert all(torch.equal(a, b) for a, b in zip(grads(first), grads(alone), strict=True))
 
 
@@ -104,13 +104,13 @@ def test_changing_an_input_before_backward_is_refused() -> None:
     with torch.no_grad():
         gaussians.means.add_(1)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        pull(output)
+        backpropagate(output)
 
 
 def test_image_alone_and_alpha_alone() -> None:
     v_image, v_alpha = upstream()
     both, image, alpha = (leaves(scene()) for _ in range(3))
-    pull(CpuRenderer().render(both, rig(), 0, BACKGROUND))
+    backpropagate(CpuRenderer().render(both, rig(), 0, BACKGROUND))
     CpuRenderer().render(image, rig(), 0, BACKGROUND).image.backward(v_image)
     CpuRenderer().render(alpha, rig(), 0, BACKGROUND).alpha.backward(v_alpha)
     for b, i, a in zip(grads(both), grads(image), grads(alpha), strict=True):
@@ -147,8 +147,8 @@ def test_session_has_the_bits_of_a_full_render(ids: list[int]) -> None:
         want = CpuRenderer().open(whole, None, rig(), BACKGROUND).render(view, whole, probe=whole_probe)
         assert torch.equal(output.image, want.image)
         assert torch.equal(output.alpha, want.alpha)
-        pull(output, step)
-        pull(want, step)
+        backpropagate(output, step)
+        backpropagate(want, step)
         for g, w in zip([*grads(rows), probe.grad], [*grads(whole), whole_probe.grad], strict=True):
             assert g is not None
             assert w is not None
@@ -161,8 +161,8 @@ def test_session_backward_after_the_view_was_rendered_again() -> None:
     rows, alone = leaves(scene().rows(ids)), leaves(scene().rows(ids))
     output = session.render(0, rows)
     session.render(0, scene().rows(ids).map(lambda t: t + 0.3), tile_mask=torch.zeros(3, 4, dtype=torch.bool))
-    pull(output)
-    pull(session.render(0, alone))
+    backpropagate(output)
+    backpropagate(session.render(0, alone))
     assert all(torch.equal(a, b) for a, b in zip(grads(rows), grads(alone), strict=True))
 
 
@@ -194,7 +194,7 @@ def test_session_tells_the_tiles_its_rows_are_in(ids: list[int]) -> None:
         assert output.tiles.shape == (-(-HEIGHT // 16), -(-WIDTH // 16))
         inside = output.tiles.repeat_interleave(16, 0).repeat_interleave(16, 1)[:HEIGHT, :WIDTH]
         assert torch.equal(output.image[~inside], old[~inside])
-        # Nor does anything outside pull on the rows.
+        # Nor has anything outside a gradient by the rows.
         outside = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(step)) * ~inside[..., None]
         (output.image * outside).sum().backward()
         assert not any(bool(g.any()) for g in grads(rows) if g is not None)
@@ -212,7 +212,7 @@ def test_rasterisers_return_to_the_pool() -> None:
     gc.collect()
     release_idle_memory()
     for seed in range(3):
-        pull(CpuRenderer().render(leaves(scene(seed)), rig(), 0, BACKGROUND))
+        backpropagate(CpuRenderer().render(leaves(scene(seed)), rig(), 0, BACKGROUND))
     one = release_idle_memory()
     outputs = [CpuRenderer().render(leaves(scene()), rig(), 0, BACKGROUND) for _ in range(3)]
     assert release_idle_memory() == 0  # all three wait for their backward

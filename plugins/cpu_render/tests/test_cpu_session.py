@@ -9,7 +9,7 @@ from cpu_scenes import BACKGROUND, HEIGHT, WIDTH
 from gsstream_cpu_render.arrays import SplatArrays
 from gsstream_cpu_render.pool import acquire_rasterizer, release_idle_memory
 from gsstream_cpu_render.renderer import CpuRenderer
-from test_cpu_renderer import N, leaves, pull, replaced, rig, scene, upstream
+from test_cpu_renderer import N, backpropagate, leaves, replaced, rig, scene, upstream
 
 from gsstream.api import Gaussians, InputError, RenderSession, ScatterSession
 from gsstream.parts.render.reference import ReferenceRenderer
@@ -47,7 +47,7 @@ def test_backward_after_the_commit_is_refused() -> None:
     output = session.render(0, leaves(whole.rows(ids)))
     session.commit(moved(whole, ids, 4), ids)
     with pytest.raises(InputError, match="differentiate before the commit"):
-        pull(output)
+        backpropagate(output)
 
 
 def through_three_frames(session: RenderSession, budget: float) -> RenderSession:
@@ -59,7 +59,7 @@ def through_three_frames(session: RenderSession, budget: float) -> RenderSession
             session.screen_gradient(view, upstream(frame)[0])
         session.narrow(ids)
         for view in (0, 1):
-            pull(session.render(view, leaves(whole.rows(ids))))
+            backpropagate(session.render(view, leaves(whole.rows(ids))))
         assert session.cache_bytes().total <= budget
         whole = moved(whole, ids, frame)
         session = session.commit(whole, ids)
@@ -109,7 +109,7 @@ def test_a_view_that_outgrows_the_budget_goes_and_leaves_the_pool_small() -> Non
     ids = some_rows(100, 1)
     session.narrow(ids)
     for view in (0, 1, 0, 1):
-        pull(session.render(view, leaves(whole.rows(ids))))
+        backpropagate(session.render(view, leaves(whole.rows(ids))))
     assert len(session.cache_bytes().per_view) == 1
     assert session.cache_bytes().total <= budget
     del session

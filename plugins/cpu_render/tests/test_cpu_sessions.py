@@ -27,7 +27,7 @@ from hypothesis.stateful import (
 )
 from test_cpu_fit import comparison, some_tiles
 from test_cpu_raster_properties import masked_pixels, random_mask
-from test_cpu_renderer import grads, leaves, pull, replaced, rig, upstream
+from test_cpu_renderer import backpropagate, grads, leaves, replaced, rig, upstream
 
 from gsstream.api import (
     Gaussians,
@@ -70,7 +70,7 @@ def moved(rows: Scene, amount: float, seed: int) -> Scene:
     return rows.map(lambda value: value + amount * torch.randn(value.shape, generator=g))
 
 
-def slope(seed: int, sparse: bool) -> torch.Tensor:
+def image_gradient(seed: int, sparse: bool) -> torch.Tensor:
     """Gradient of an image; a sparse one is zero in all but a corner."""
     v_image = upstream(seed)[0].clone()
     if sparse:
@@ -120,7 +120,7 @@ class Sessions(RuleBasedStateMachine):
         self.former: tuple[RenderSession, Scene] | None = None
         self.session = CpuRenderer(self.config).open(self.whole, None, rig(), BACKGROUND)
         for view in (0, 1) if drawn else ():
-            self.session.screen_gradient(view, slope(seed, False))
+            self.session.screen_gradient(view, image_gradient(seed, False))
 
     def anew(self) -> RenderSession:
         """A session without a budget."""
@@ -151,10 +151,10 @@ class Sessions(RuleBasedStateMachine):
             self.anew().render(view, theirs, tile_mask=mask),
         )
         same(rendered(output), rendered(fresh))
-        pull(fresh, seed)
+        backpropagate(fresh, seed)
         everything = leaves(rows if self.active is None else replaced(self.whole, self.active, rows))
         full = CpuRenderer().open(everything, None, rig(), BACKGROUND).render(view, everything, tile_mask=mask)
-        pull(full, seed)
+        backpropagate(full, seed)
         inside = torch.from_numpy(masked_pixels(random_mask(seed))) if masked else torch.ones(HEIGHT, WIDTH) > 0
         assert torch.equal(output.image[inside], full.image[inside])
         assert torch.equal(output.alpha[inside], full.alpha[inside])
@@ -163,7 +163,7 @@ class Sessions(RuleBasedStateMachine):
         if later:
             self.waiting = output, mine, theirs, seed
         else:
-            pull(output, seed)
+            backpropagate(output, seed)
             same(grads(mine), grads(theirs))
 
     @precondition(lambda self: self.waiting is not None)
@@ -171,7 +171,7 @@ class Sessions(RuleBasedStateMachine):
     def differentiate_what_was_rendered_before(self) -> None:
         output, mine, theirs, seed = self.waiting
         self.waiting = None
-        pull(output, seed)
+        backpropagate(output, seed)
         same(grads(mine), grads(theirs))
 
     @rule(view=VIEWS, amount=AMOUNTS, seed=SEEDS, coloured=FLAGS, weighted=FLAGS, probe=FLAGS)
@@ -200,7 +200,7 @@ class Sessions(RuleBasedStateMachine):
     @rule(view=VIEWS, seed=SEEDS, sparse=FLAGS)
     def screen_gradient(self, view: int, seed: int, sparse: bool) -> None:
         """Also as the pass finds it that differentiates everything."""
-        v_image = slope(seed, sparse)
+        v_image = image_gradient(seed, sparse)
         gradient, visible, *_ = self.compare(lambda session: screen(session, view, v_image))
         rasterizer = (held := acquire_rasterizer(rig(), view, BACKGROUND)).rasterizer
         rasterizer.forward(SplatArrays(*(value.numpy() for _, value in self.whole.items())))
@@ -229,7 +229,7 @@ class Sessions(RuleBasedStateMachine):
     def look_at_the_session_before(self, view: int, seed: int) -> None:
         session, whole = self.former
         fresh = CpuRenderer().open(whole, None, rig(), BACKGROUND)
-        same(*(screen(each, view, slope(seed, False)) for each in (session, fresh)))
+        same(*(screen(each, view, image_gradient(seed, False)) for each in (session, fresh)))
 
     @rule(view=VIEWS, seed=SEEDS, how=st.sampled_from(["commit", "render", "loss"]))
     def refuse_a_value_that_is_not_finite(self, view: int, seed: int, how: str) -> None:

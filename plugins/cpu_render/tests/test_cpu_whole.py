@@ -30,11 +30,11 @@ VIEW = 1
 Found = LossAndGrad[Gaussians[torch.Tensor]]
 
 
-def pulled(rows: Gaussians[torch.Tensor], wanted: ViewTarget) -> Found:
+def fused(rows: Gaussians[torch.Tensor], wanted: ViewTarget) -> Found:
     return CpuRenderer().open(rows, None, rig(), BACKGROUND).loss_and_grad(VIEW, wanted, WrtScene(rows))
 
 
-def judged(rows: Gaussians[torch.Tensor], wanted: ViewTarget, reference: bool = False) -> Found:
+def by_default_body(rows: Gaussians[torch.Tensor], wanted: ViewTarget, reference: bool = False) -> Found:
     """The same by the body that every session has."""
     part = ReferenceRenderer() if reference else CpuRenderer()
     if reference:
@@ -50,9 +50,9 @@ def values(found: Found) -> dict[str, torch.Tensor]:
 
 @pytest.mark.parametrize("coefficients", [1, 4, 16])
 @pytest.mark.parametrize("coloured", [False, True])
-def test_a_whole_pull_is_the_calls_it_stands_for(coloured: bool, coefficients: int, threads: int) -> None:
+def test_the_fused_gradient_of_all_is_that_of_the_default_body(coloured: bool, coefficients: int, threads: int) -> None:
     rows, wanted = scene(coefficients=coefficients), comparison(coloured)
-    found, want = pulled(rows, wanted), judged(rows, wanted)
+    found, want = fused(rows, wanted), by_default_body(rows, wanted)
     assert float(found.loss) == pytest.approx(float(want.loss), rel=1e-6)
     assert values(found).keys() == values(want).keys()
     assert ("exposure" in values(found)) == coloured
@@ -62,7 +62,7 @@ def test_a_whole_pull_is_the_calls_it_stands_for(coloured: bool, coefficients: i
 
 
 def test_without_a_colour_map_it_has_the_bits_of_the_calls() -> None:
-    found, want = pulled(scene(), comparison()), judged(scene(), comparison())
+    found, want = fused(scene(), comparison()), by_default_body(scene(), comparison())
     assert found.loss == want.loss
     for name, value in values(want).items():
         assert torch.equal(values(found)[name], value), name
@@ -71,17 +71,17 @@ def test_without_a_colour_map_it_has_the_bits_of_the_calls() -> None:
 def test_it_agrees_with_the_reference_renderer_and_loss() -> None:
     """SSIM alone, because a pixel that L1 sees from its other side has a gradient of the other sign."""
     rows, wanted = scene(), replace(comparison(coloured=True), dssim=1.0)
-    found, want = pulled(rows, wanted), judged(rows, wanted, reference=True)
+    found, want = fused(rows, wanted), by_default_body(rows, wanted, reference=True)
     assert float(found.loss) == pytest.approx(float(want.loss), rel=1e-4)
     for name, value in values(want).items():
         assert relative_error(values(found)[name].numpy(), value.numpy()) <= 1e-3, name
 
 
-def test_the_colour_maps_slope_is_that_of_the_loss() -> None:
+def test_the_colour_maps_gradient_is_that_of_the_loss() -> None:
     """Central differences of each of its twelve numbers. SSIM alone: L1 has corners."""
     rows, wanted = scene(), replace(comparison(coloured=True), dssim=1.0)
-    slope = pulled(rows, wanted).exposure
-    assert slope is not None
+    gradient = fused(rows, wanted).exposure
+    assert gradient is not None
     assert wanted.exposure is not None
     step = 2e-3
     for entry in range(12):
@@ -89,8 +89,8 @@ def test_the_colour_maps_slope_is_that_of_the_loss() -> None:
         for sign in (1, -1):
             matrix, offset = wanted.exposure.matrix.clone(), wanted.exposure.offset.clone()
             (matrix.view(-1) if entry < 9 else offset)[entry % 9] += sign * step
-            losses.append(float(pulled(rows, replace(wanted, exposure=CameraExposure(matrix, offset))).loss))
-        assert (losses[0] - losses[1]) / (2 * step) == pytest.approx(float(slope[entry]), rel=0.02, abs=2e-3), entry
+            losses.append(float(fused(rows, replace(wanted, exposure=CameraExposure(matrix, offset))).loss))
+        assert (losses[0] - losses[1]) / (2 * step) == pytest.approx(float(gradient[entry]), rel=0.02, abs=2e-3), entry
 
 
 def test_other_losses_and_weights_of_tiles_take_the_default_body() -> None:
@@ -98,7 +98,7 @@ def test_other_losses_and_weights_of_tiles_take_the_default_body() -> None:
     other = replace(wanted, loss=ReferenceLoss(), prepared=ReferenceLoss().prepare(wanted.image))
     weighted = replace(wanted, tile_weights=torch.ones(-(-rig().height // 16), -(-rig().width // 16)))
     for target in (other, weighted):
-        found, want = pulled(rows, target), judged(rows, target)
+        found, want = fused(rows, target), by_default_body(rows, target)
         assert found.loss == want.loss
         for name, value in values(want).items():
             assert torch.equal(values(found)[name], value), name
@@ -109,10 +109,10 @@ def test_it_names_a_value_that_is_not_finite(name: str) -> None:
     rows = scene()
     getattr(rows, name)[3] = torch.nan
     with pytest.raises(ShapeError, match=f"{name}: expected finite values, got nan at index"):
-        pulled(rows, comparison())
+        fused(rows, comparison())
 
 
 def test_it_refuses_a_target_of_another_size() -> None:
     wanted = ViewTarget(CpuLoss(), CpuLoss().prepare(torch.zeros(7, 9, 3)), 0.2, torch.zeros(7, 9, 3))
     with pytest.raises(Exception, match="wrong shape"):
-        pulled(scene(), wanted)
+        fused(scene(), wanted)

@@ -82,7 +82,7 @@ def oracle(image: Image, target: Image, weight: float, mask: NDArray[Any] | None
 
 
 def assert_gradient(got: Any, wanted: Any, tolerance: float = 1e-5) -> None:
-    # In units of one pixel's share, where |I - G| alone has slope 1.
+    # In units of one pixel's share, where |I - G| alone has gradient 1.
     scale = got.size
     assert np.abs(got - wanted).max() * scale <= tolerance * max(1.0, np.abs(wanted).max() * scale)
 

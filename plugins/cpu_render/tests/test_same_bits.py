@@ -16,7 +16,7 @@ from gsstream_cpu_render.threads import set_num_threads
 from test_cpu_fit import comparison
 from test_cpu_pass import CASES, captured, solved
 from test_cpu_renderer import scene
-from test_cpu_whole import pulled, values
+from test_cpu_whole import fused, values
 from test_native_adam import fresh
 from test_native_loss import near_pair
 
@@ -36,9 +36,9 @@ def rasterised() -> list[Any]:
 
 def whole_scene() -> list[Any]:
     """Twice, with a smaller scene in between."""
-    first = pulled(scene(), comparison(coloured=True))
-    pulled(scene(seed=1, coefficients=1), comparison())
-    return [*values(first).values(), *values(pulled(scene(), comparison(coloured=True))).values()]
+    first = fused(scene(), comparison(coloured=True))
+    fused(scene(seed=1, coefficients=1), comparison())
+    return [*values(first).values(), *values(fused(scene(), comparison(coloured=True))).values()]
 
 
 def residual_table() -> list[Any]:

@@ -81,7 +81,7 @@ def leaves(gaussians: Gaussians[torch.Tensor]) -> Gaussians[torch.Tensor]:
     return gaussians.map(lambda t: t.detach().clone().requires_grad_())
 
 
-def pull(output: RenderOutput) -> None:
+def backpropagate(output: RenderOutput) -> None:
     g = torch.Generator().manual_seed(5)
     v_image, v_alpha = torch.randn(HEIGHT, WIDTH, 3, generator=g), torch.randn(HEIGHT, WIDTH, generator=g)
     torch.autograd.backward([output.image, output.alpha], [v_image.to(output.image), v_alpha.to(output.alpha)])
@@ -114,8 +114,8 @@ def test_image_and_gradients_agree_with_the_reference(backend: Backend, view: in
     got = open_session(backend, ours).render(view, ours)
     want = ReferenceRenderer().render(truth, rig(), view, BACKGROUND)
     assert_images_agree(backend, got, want)
-    pull(got)
-    pull(want)
+    backpropagate(got)
+    backpropagate(want)
     for (name, g), (_, w) in zip(ours.items(), truth.items(), strict=True):
         if w.numel():
             assert g.grad is not None
@@ -158,8 +158,8 @@ def test_a_session_of_some_rows_equals_the_whole_scene(backend: Backend) -> None
     got = open_session(backend, base, active).render(0, rows, probe=probe)
     want = open_session(backend, whole).render(0, whole)
     assert torch.allclose(got.image, want.image, atol=1e-6)
-    pull(got)
-    pull(want)
+    backpropagate(got)
+    backpropagate(want)
     for (name, g), (_, w) in zip(rows.items(), whole.items(), strict=True):
         assert g.grad is not None
         assert w.grad is not None

@@ -55,7 +55,7 @@ def test_frame_0_is_its_own_fresh_reconstruction(run: Path) -> None:
         assert stream.state_at(0).means.tobytes() == alone.state_at(0).means.tobytes()
     table = (run / "gap.txt").read_text().splitlines()
     assert [line.split()[1] for line in table[2:5]] == ["0", "3", "mean"]
-    assert "judged by test" in table[-1]
+    assert "test cameras: test" in table[-1]
 
 
 def test_what_is_there_is_kept_and_shared_and_other_settings_are_not_taken_for_it(

@@ -21,11 +21,11 @@ TINY_WORLD = "synthetic:frames=2&views=5&width=32&height=24&supersample=1"
 LADDERS = {"a": (0, 1, 2, 3), "b": (0, 1, 2, 3)}
 
 
-def judged_by(quality: Any) -> Any:
-    def judge(settings: Mapping[str, Any], key: str, values: Sequence[Any]) -> list[float]:
+def evaluation_by(quality: Any) -> Any:
+    def evaluate(settings: Mapping[str, Any], key: str, values: Sequence[Any]) -> list[float]:
         return [quality(**{**settings, key: value}) for value in values]
 
-    return judge
+    return evaluate
 
 
 def test_it_goes_round_until_no_key_moves() -> None:
@@ -34,18 +34,18 @@ def test_it_goes_round_until_no_key_moves() -> None:
     def quality(a: int, b: int) -> float:
         return 30 - (a - b) ** 2 - 2 * (b - 3) ** 2
 
-    assert climb({"a": 0, "b": 0}, LADDERS, judged_by(quality)) == {"a": 3, "b": 3}
+    assert climb({"a": 0, "b": 0}, LADDERS, evaluation_by(quality)) == {"a": 3, "b": 3}
 
 
 def test_gains_within_the_noise_move_nothing() -> None:
-    assert climb({"a": 1, "b": 1}, LADDERS, judged_by(lambda a, b: MARGIN * a / 3)) == {"a": 1, "b": 1}
+    assert climb({"a": 1, "b": 1}, LADDERS, evaluation_by(lambda a, b: MARGIN * a / 3)) == {"a": 1, "b": 1}
 
 
 def test_what_fails_is_passed_over_and_nothing_but_failures_is_an_error() -> None:
-    found = climb({"a": 0, "b": 0}, LADDERS, judged_by(lambda a, b: math.nan if a in (0, 3) else 20.0 + a))
+    found = climb({"a": 0, "b": 0}, LADDERS, evaluation_by(lambda a, b: math.nan if a in (0, 3) else 20.0 + a))
     assert found["a"] == 2
-    with pytest.raises(InputError, match="no value of a could be judged"):
-        climb({"a": 0, "b": 0}, LADDERS, judged_by(lambda a, b: math.nan))
+    with pytest.raises(InputError, match="no value of a could be evaluated"):
+        climb({"a": 0, "b": 0}, LADDERS, evaluation_by(lambda a, b: math.nan))
 
 
 def test_the_better_setting_is_written_and_test_cameras_have_no_say(

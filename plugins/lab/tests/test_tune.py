@@ -68,7 +68,7 @@ def test_the_best_that_fits_is_chosen() -> None:
     assert choose([large]) is None
     assert nearest([large, trial("far", 31.0, 100, inside=0), Trial("broken", error="x")]) is large
     assert nearest([Trial("broken", error="x")]) is None
-    with pytest.raises(InputError, match="no camera judges") as refused:
+    with pytest.raises(InputError, match="no test cameras") as refused:
         choose([trial("blind", math.nan, 100)])
     hint = re.search(r"--set '(\w+)\.(\w+)=", str(refused.value))
     assert hint, "the message says what to do"
@@ -93,9 +93,9 @@ def test_a_pilot_writes_a_recipe_that_runs_inside_the_budget(
     given = ("--first-frame", str(tmp_path / "choosing"))
     assert run_command(command(tmp_path / "pilot", "size=600B", *given)) == 0
     out = capsys.readouterr().out
-    (judge,) = open_source(WORLD).info.test.ids
+    (test_camera,) = open_source(WORLD).info.test.ids
     cells = read_table(tmp_path / "pilot").cells.values()
-    assert {name for cell in cells for name in cell["frames"][0]["psnr"]}.isdisjoint({judge}), "it has no say"
+    assert {name for cell in cells for name in cell["frames"][0]["psnr"]}.isdisjoint({test_camera}), "it has no say"
     assert "| s2gs-edge+budget " in out
     assert out.count("<- chosen") == 1
     tuned = load_recipe(tmp_path / "pilot" / "tuned.yaml").recipe
@@ -106,7 +106,7 @@ def test_a_pilot_writes_a_recipe_that_runs_inside_the_budget(
     assert program == "gsstream"
     run_it = [*said, "--frames", "3", "--quiet", "--no-pictures", "--first-frame"]
     assert run_command([*run_it, str(tmp_path / "choosing")]) == 0
-    assert f"judged by {judge} (reporting split" in (tmp_path / "pilot" / "run" / "summary.txt").read_text()
+    assert f"test cameras: {test_camera} (reporting split" in (tmp_path / "pilot" / "run" / "summary.txt").read_text()
     assert all(sum(line["bytes"].values()) <= 600 for line in metrics(tmp_path / "pilot" / "run")[1:])
     # Nothing fits: said so, with the nearest; the pilot's other candidates are there already.
     (tmp_path / "pilot" / "tuned.yaml").unlink()

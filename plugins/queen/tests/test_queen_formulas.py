@@ -117,10 +117,10 @@ class TestBirths:
     def grow(self, room: int = 100, may: list[bool] | None = None):
         sizes = torch.tensor([0.001, 0.5, 0.001, 0.5])[:, None].expand(4, 3).log()
         rows = scene(torch.arange(12.0).reshape(4, 3), scales=sizes)
-        pull = torch.tensor([0.5, 0.9, 1e-9, 0.7])
+        grad_norm = torch.tensor([0.5, 0.9, 1e-9, 0.7])
         allowed = torch.tensor(may or [True] * 4)
         settings, generator = GrowthSettings(grad_threshold=0.1), torch.Generator().manual_seed(0)
-        return rows, densify(rows, pull, allowed, room, 1.0, settings, generator)
+        return rows, densify(rows, grad_norm, allowed, room, 1.0, settings, generator)
 
     def test_small_rows_are_cloned_and_large_ones_split(self) -> None:
         rows, litter = self.grow()
@@ -131,7 +131,7 @@ class TestBirths:
         torch.testing.assert_close(halves, torch.full_like(halves, 0.5 / 1.6))
         assert bool((litter.gaussians.means[1:] != rows.means[[1, 1, 3, 3]]).all())
 
-    def test_the_strongest_pull_comes_first_when_there_is_little_room(self) -> None:
+    def test_the_largest_gradient_comes_first_when_there_is_little_room(self) -> None:
         for room, replaced, number in ((0, [], 0), (1, [], 0), (2, [1], 2), (3, [1], 2), (4, [1, 3], 4)):
             _, litter = self.grow(room)
             assert (litter.replaced.tolist(), len(litter.gaussians)) == (replaced, number), room
@@ -243,7 +243,7 @@ def test_sigma_weighs_the_spread_of_the_latents() -> None:
     assert float(rows._penalty().detach()) == pytest.approx(2 * sum(spreads) / len(spreads), rel=1e-5)
 
 
-def test_rate_pulls_latents_towards_zero_and_nothing_else_does() -> None:
+def test_rate_moves_latents_towards_zero_and_nothing_else_does() -> None:
     for rate in (0.0, 1.0):
         rows = old_rows(5, gate=GateSettings(l0=0), rate=rate)
         for value in rows._latents.values():

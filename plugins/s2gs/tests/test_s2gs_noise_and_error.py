@@ -51,7 +51,7 @@ class TestNoiseNormalised:
         )
         seen = (ratios > 0).all(0)
         assert int(seen.sum()) >= 40
-        # Median over draws and Gaussians: the mean of a ratio is pulled up by small denominators.
+        # Median over draws and Gaussians: the mean of a ratio is raised by small denominators.
         assert float(ratios[:, seen].median()) == pytest.approx(1.0, abs=0.15)
 
     def test_error_of_a_perfect_scene_is_noise_too(self) -> None:

@@ -138,7 +138,7 @@ class TestLatent:
 
     @pytest.mark.parametrize("views", [11, 17])
     def test_latents_speak_within_the_first_passes(self, views: int) -> None:
-        """A steady pull moves a symbol within two of the six passes of the shortest budget."""
+        """A steady gradient moves a symbol within two of the six passes of the shortest budget."""
         for name, code in LatentResidual().codes().items():
             if name in ("means", "shN"):
                 continue

@@ -80,7 +80,7 @@ class TestFormulas:
         assert estimator()._magnitudes(wide)[0].tolist() == pytest.approx([math.hypot(100, 25)] * 3)
 
     def test_aggregates(self) -> None:
-        """Two views pull one Gaussian in opposite directions; a third does not see it."""
+        """The gradients of two views by one Gaussian are opposite; a third does not see it."""
         gradient = torch.tensor([[[3.0, 4.0]], [[-3.0, -4.0]], [[7.0, 7.0]]])
         visible = torch.tensor([[True], [True], [False]])
         context = told(gradient, visible)

@@ -93,10 +93,10 @@ def test_its_steps_are_those_of_adam():
         for at, mine in enumerate(cache.learned):
             if not at:
                 continue
-            slope = RNG.normal(size=mine.shape)
-            mine.grad = torch.from_numpy(slope.astype(np.float32))
-            first[at] = 0.9 * first[at] + 0.1 * slope
-            second[at] = 0.999 * second[at] + 0.001 * slope**2
+            grad = RNG.normal(size=mine.shape)
+            mine.grad = torch.from_numpy(grad.astype(np.float32))
+            first[at] = 0.9 * first[at] + 0.1 * grad
+            second[at] = 0.999 * second[at] + 0.001 * grad**2
             step = (first[at] / (1 - 0.9**count)) / (np.sqrt(second[at] / (1 - 0.999**count)) + 1e-8)
             theirs[at] -= 0.01 * step
         cache.step(0.01)

@@ -57,8 +57,8 @@ class AlwaysSome(Loss):
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        judged: tuple[torch.Tensor, torch.Tensor] = super().evaluate(image, prepared, min(dssim, 0.9), tile_mask)
-        return judged
+        evaluated: tuple[torch.Tensor, torch.Tensor] = super().evaluate(image, prepared, min(dssim, 0.9), tile_mask)
+        return evaluated
 
 
 @spoils("check_loss_mask")
@@ -69,20 +69,20 @@ class EmptyIsAll(Loss):
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         mask = tile_mask if tile_mask is not None and bool(tile_mask.any()) else None
-        judged: tuple[torch.Tensor, torch.Tensor] = super().evaluate(image, prepared, dssim, mask)
-        return judged
+        evaluated: tuple[torch.Tensor, torch.Tensor] = super().evaluate(image, prepared, dssim, mask)
+        return evaluated
 
 
 @spoils("check_loss_pure")
 class Scribbler(Loss):
-    """Darkens the image once it has judged it."""
+    """Darkens the image once it has compared it."""
 
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        judged: tuple[torch.Tensor, torch.Tensor] = super().evaluate(image, prepared, dssim, tile_mask)
+        evaluated: tuple[torch.Tensor, torch.Tensor] = super().evaluate(image, prepared, dssim, tile_mask)
         image.detach().mul_(0.5)
-        return judged
+        return evaluated
 
 
 @spoils("check_optimiser_adam")

@@ -75,8 +75,8 @@ class Normalised(Reference):
     """Gradients by coordinates from -1 to 1 instead of pixels, as the released 3DGS has them."""
 
     def screen_gradient(self, gaussians: Any, cameras: Cameras, view: int, image_gradient: Any) -> ScreenGradient:
-        pulled: ScreenGradient = super().screen_gradient(gaussians, cameras, view, image_gradient)
-        return pulled._replace(gradient=pulled.gradient * cameras.width / 2)
+        found: ScreenGradient = super().screen_gradient(gaussians, cameras, view, image_gradient)
+        return found._replace(gradient=found.gradient * cameras.width / 2)
 
 
 class _SeesEverywhere(Session):

@@ -96,7 +96,7 @@ def test_points_made_from_all_views_need_a_leak(tmp_path: Path, world: World) ->
     leaked = transformed(source, DataOptions(leak="points")).points()
     assert leaked is not None
     np.testing.assert_allclose(leaked.xyz, world.xyz, atol=1e-6)
-    assert transformed(source, DataOptions(test_cameras=())).points() is not None  # nobody judges: nothing leaks
+    assert transformed(source, DataOptions(test_cameras=())).points() is not None  # no test cameras: nothing leaks
 
 
 @pytest.mark.sfm

@@ -81,7 +81,7 @@ def test_leak_into_training_is_asked_for_and_complete() -> None:
 @settings(max_examples=40, deadline=None)
 @given(views=st.integers(2, 30))
 def test_the_tuning_split_shows_nothing_of_the_test_cameras(views: int) -> None:
-    """Whatever the rig: the test cameras are nowhere, the judges were training cameras, about one in six of them."""
+    """Whatever the rig: the test cameras are nowhere, the new ones were training cameras, about one in six of them."""
     plain = open_source(WORLD.replace("views=4", f"views={views}"))
     info = opened(WORLD.replace("views=4", f"views={views}"), split="tuning").info
     assert sorted((*info.train.ids, *info.test.ids)) == sorted(plain.info.train.ids), "no camera is lost, none doubled"
@@ -91,20 +91,20 @@ def test_the_tuning_split_shows_nothing_of_the_test_cameras(views: int) -> None:
     assert again.test.ids == info.test.ids, "the choice knows no seed"
 
 
-def test_judges_of_the_tuning_split_are_where_the_other_cameras_are_nearest() -> None:
+def test_cameras_of_the_tuning_split_are_where_the_other_cameras_are_nearest() -> None:
     """Against all subsets: the medoids have the least sum of distances, or nearly (a search by swaps may miss it)."""
     plain = open_source(WORLD.replace("views=4", "views=13"))
-    judges = opened(WORLD.replace("views=4", "views=13"), split="tuning").info.test.ids
+    chosen = opened(WORLD.replace("views=4", "views=13"), split="tuning").info.test.ids
     centers = plain.info.train.centers.astype(np.float64)
     apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
-    costs = {pair: apart[:, pair].min(1).sum() for pair in itertools.combinations(range(13), len(judges))}
-    mine = tuple(plain.info.train.ids.index(name) for name in judges)
-    assert len(judges) == 2
+    costs = {pair: apart[:, pair].min(1).sum() for pair in itertools.combinations(range(13), len(chosen))}
+    mine = tuple(plain.info.train.ids.index(name) for name in chosen)
+    assert len(chosen) == 2
     assert costs[mine] <= 1.05 * min(costs.values())
     assert costs[mine] < np.median(list(costs.values()))
 
 
-def test_points_that_a_judge_of_the_tuning_split_has_seen_are_withheld() -> None:
+def test_points_that_a_test_camera_of_the_tuning_split_has_seen_are_withheld() -> None:
     assert opened("demo", split="tuning").points() is None, "nobody knows which camera took part in which of them"
     plain, source = open_source(WORLD), opened(split="tuning")
     kept = [i for i, name in enumerate(plain.info.train.ids) if name in source.info.train.ids]
@@ -114,7 +114,7 @@ def test_points_that_a_judge_of_the_tuning_split_has_seen_are_withheld() -> None
 
 
 def test_points_of_test_cameras_that_were_taken_away_are_withheld_too() -> None:
-    """A COLMAP model's points may be of any camera: those of the judges and those of the test cameras go."""
+    """A COLMAP model's points may be of any camera: those of either kind of test camera go."""
     asked: list[set[str]] = []
 
     class Attributed(SyntheticSource):

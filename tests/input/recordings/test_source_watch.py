@@ -109,7 +109,7 @@ def test_a_frame_that_is_skipped_is_not_even_read(folder: Path, test_camera: str
 
 
 @pytest.mark.parametrize(("policy", "worth"), [("block", [1, 1, 1]), ("drop", [1, 0, 1]), ("hurry", [1, 0.2, 1])])
-def test_a_frame_that_was_read_ahead_is_judged_again_when_its_turn_comes(
+def test_a_frame_that_was_read_ahead_is_checked_again_when_its_turn_comes(
     folder: Path, tmp_path: Path, policy: str, worth: list[float]
 ) -> None:
     later = tmp_path / "later"

@@ -43,10 +43,10 @@ def test_after_each_view_of_the_first_pass_it_stands_at_the_bottom_of_all_seen_s
     matrices, bottoms = bowls(views, 5, 2)
     descent = DampedNewton(start(5), FREE)
     for view in range(views):
-        slope = (matrices[view] @ (descent.values - bottoms[view])[..., None])[..., 0]
-        descent.step(slope, matrices[view])
-        total, pulled = matrices[: view + 1].sum(0).numpy(), (matrices @ bottoms[..., None])[: view + 1].sum(0).numpy()
-        np.testing.assert_allclose(descent.values, np.linalg.solve(total, pulled)[..., 0], atol=1e-6)
+        gradient = (matrices[view] @ (descent.values - bottoms[view])[..., None])[..., 0]
+        descent.step(gradient, matrices[view])
+        total, weighted = matrices[: view + 1].sum(0).numpy(), (matrices @ bottoms[..., None])[: view + 1].sum(0).numpy()
+        np.testing.assert_allclose(descent.values, np.linalg.solve(total, weighted)[..., 0], atol=1e-6)
 
 
 def test_a_view_that_is_not_measured_is_taken_to_curve_as_the_others_do() -> None:
@@ -60,17 +60,17 @@ def test_a_view_that_is_not_measured_is_taken_to_curve_as_the_others_do() -> Non
     np.testing.assert_allclose(taken.values, measured.values, rtol=1e-12)
 
 
-def test_a_group_that_no_picture_holds_moves_by_no_more_than_its_slope_over_hold() -> None:
-    slope = torch.from_numpy(np.random.default_rng(4).standard_normal((3, 6)))
+def test_a_group_that_no_picture_holds_moves_by_no_more_than_its_gradient_over_the_absolute_damping() -> None:
+    gradient = torch.from_numpy(np.random.default_rng(4).standard_normal((3, 6)))
     descent = DampedNewton(start(3), Damping(0.1, 50.0, 0.5))
-    descent.step(slope, start(3)[..., None].expand(3, 6, 6))
-    np.testing.assert_allclose(descent.values, -slope / 50)
+    descent.step(gradient, start(3)[..., None].expand(3, 6, 6))
+    np.testing.assert_allclose(descent.values, -gradient / 50)
 
 
 def test_no_number_moves_further_than_the_longest_step_and_its_direction_stays() -> None:
-    slope = 1e9 * torch.tensor([[1.0, -2.0, 0.5, 0.0, 0.0, 0.0], [1e-12] * 6], dtype=torch.float64)
+    gradient = 1e9 * torch.tensor([[1.0, -2.0, 0.5, 0.0, 0.0, 0.0], [1e-12] * 6], dtype=torch.float64)
     descent = DampedNewton(start(2), Damping(0.1, 40.0, 0.5))
-    descent.step(slope, torch.eye(6, dtype=torch.float64).expand(2, 6, 6))
+    descent.step(gradient, torch.eye(6, dtype=torch.float64).expand(2, 6, 6))
     np.testing.assert_allclose(descent.values[0], [-0.25, 0.5, -0.125, 0, 0, 0])
     assert float(descent.values[1].abs().max()) < 1e-3, "one group's length is not another's"
 

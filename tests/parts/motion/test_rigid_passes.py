@@ -45,16 +45,16 @@ def test_changed_tiles_alone_leave_out_all_else() -> None:
     case = fit_fixture()
     assert case.work._change is not None
     tiles = torch.zeros_like(case.work._change.tiles)
-    _, slope = differentiated(case, tiles, "changed")
-    assert float(slope.abs().max()) == 0, "nothing changed, so nothing is compared"
-    everything, every_slope = differentiated(case, torch.ones_like(tiles), "changed")
-    without, slope_without = differentiated(case, tiles, "all")
+    _, gradient = differentiated(case, tiles, "changed")
+    assert float(gradient.abs().max()) == 0, "nothing changed, so nothing is compared"
+    everything, every_gradient = differentiated(case, torch.ones_like(tiles), "changed")
+    without, gradient_without = differentiated(case, tiles, "all")
     assert everything == pytest.approx(without), "where all changed, all is compared"
-    torch.testing.assert_close(every_slope, slope_without)
-    assert float(every_slope.abs().max()) > 0
-    unknown, slope_unknown = differentiated(case, None, "changed")
+    torch.testing.assert_close(every_gradient, gradient_without)
+    assert float(every_gradient.abs().max()) > 0
+    unknown, gradient_unknown = differentiated(case, None, "changed")
     assert unknown == pytest.approx(without), "where change is not looked for, all is compared"
-    torch.testing.assert_close(slope_unknown, slope_without)
+    torch.testing.assert_close(gradient_unknown, gradient_without)
 
 
 def noted(case: FitFixture) -> list[str]:

@@ -84,7 +84,7 @@ def loss(work: EngineContext, gaussians, view: int) -> float:  # type: ignore[no
 @pytest.mark.parametrize("turns", [False, True])
 @pytest.mark.parametrize(("share", "sign"), [(1.0, -1), (0.4, 1), (-1.0, 1)])
 def test_the_switch_says_what_two_renders_say(share: float, sign: int, turns: bool) -> None:
-    """At 0.4 the frame lies just before half-way: a slope that was taken nearer to the start has the other sign."""
+    """At 0.4 the frame lies just before half-way: a gradient that was taken nearer to the start has the other sign."""
     scene, moves = body(turns)
     work = frame_in_which(share, turns)
     views = range(len(work.cameras))

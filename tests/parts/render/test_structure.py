@@ -25,7 +25,7 @@ def by_hand(image: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("shape", [(5, 7), (1, 1), (1, 6), (4, 1)])
-def test_it_is_the_sum_over_channels_of_products_of_slopes(shape: tuple[int, int]) -> None:
+def test_it_is_the_sum_over_channels_of_products_of_gradients(shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(1)
     image, target = rng.random((2, *shape, 3))
     found = weighted_structure_tensor(torch.from_numpy(image), torch.from_numpy(target))

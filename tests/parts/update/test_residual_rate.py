@@ -38,14 +38,14 @@ def test_the_gradient_is_the_derivative(seed, step):
 def test_it_is_finite_odd_and_continuous(value, spread):
     spread = torch.tensor([spread])
     both = torch.tensor([[value], [-value]])
-    slope = laplace_gradient(both, 1.0, spread)
-    assert torch.isfinite(slope).all()
-    assert torch.equal(slope[0], -slope[1])
+    gradient = laplace_gradient(both, 1.0, spread)
+    assert torch.isfinite(gradient).all()
+    assert torch.equal(gradient[0], -gradient[1])
     assert torch.isfinite(laplace_bits(both, 1.0, spread)).all()
     beside = laplace_bits(torch.tensor([[value + 1e-3]]), 1.0, spread) - laplace_bits(both[:1], 1.0, spread)
     assert float(beside.abs()) < 0.01
     if value == 0:
-        assert slope[0] == 0
+        assert gradient[0] == 0
 
 
 @pytest.mark.parametrize("spread", [0.4, 1.0, 4.0])
@@ -57,7 +57,7 @@ def test_it_is_within_an_eighth_of_what_the_coder_pays(spread):
     assert bits == pytest.approx(8 * len(encode_symbols(symbols)), rel=0.125)
 
 
-def test_rows_behind_closed_gates_cost_nothing_and_a_larger_weight_pulls_more():
+def test_rows_behind_closed_gates_cost_nothing_and_a_larger_weight_has_a_larger_gradient():
     latents = torch.cat([torch.full((4, 3), 0.3), torch.zeros(4, 1)], 1)
     gates = torch.tensor([0.0, 0.1, 1.0, 0.0])
     steps = torch.tensor([0.1, 0.1, 0.1, 0.05])

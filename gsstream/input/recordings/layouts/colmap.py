@@ -3,7 +3,7 @@
 The model's images are the cameras. A camera is named after its image's own folder (``cam00/000000.png`` -> cam00) when
 every image has one, else after the image (``cam00.png`` -> cam00). Its frames are the first of these that is there:
 ``images/NAME/*.png``, ``frames/NAME/*.png``, ``videos/NAME.mp4``, ``images/NAME.mp4``, ``NAME.mp4``, and else the image
-alone: a still scene of one frame. No camera judges unless ``data.test_cameras`` says so.
+alone: a still scene of one frame. There are no test cameras unless ``data.test_cameras`` says so.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ def looks_like(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Recording:
-    """Read ENeRF-Outdoor: 18 cameras, 1920 x 1080, 30 frames per second; the first camera (00) judges (paper)."""
+    """Read ENeRF-Outdoor: 18 cameras, 1920 x 1080, 30 frames per second; the test camera is the first, 00 (paper)."""
     intri, extri = _load(folder / INTRINSICS), _load(folder / EXTRINSICS)
     names = intri.get("names")
     if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):

@@ -19,7 +19,7 @@ def looks_like(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Recording:
-    """Read Meet Room: 13 cameras, 1280 x 720, 30 frames per second; cam_0, the middle one, judges.
+    """Read Meet Room: 13 cameras, 1280 x 720, 30 frames per second; the test camera is cam_0, in the middle.
 
     Rows of poses_bounds.npy follow the numbers of the cameras (cam_2 before cam_10), as in StreamRF's preparation.
     """

@@ -23,7 +23,7 @@ def looks_like(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Recording:
-    """Read N3DV: 18 to 21 cameras, 2704 x 2028, 30 frames per second; cam00 judges (paper and released code)."""
+    """Read N3DV: 18 to 21 cameras, 2704 x 2028, 30 frames per second; cam00 is for tests (paper and released code)."""
     clips = camera_clips(folder, PATTERN)
     names = tuple(clips)
     rig = read_poses_bounds(folder / POSES_FILE, names, clips[names[0]].size)

@@ -8,8 +8,8 @@ corner, world units are whatever wrote the file.
 One camera per entry: its ``file_path`` is a video, a folder of frames, or one image (a still scene of one frame).
 Entries of one folder with equal poses are one camera's frames, in the order of ``time`` if given, else of their names;
 in one flat folder those of equal pose and intrinsics are. Entries without a picture are skipped, with a warning.
-``test_filenames`` judge (and ``val_filenames`` too); without them no camera does. ``ply_file_path``: points, made from
-all images.
+``test_filenames`` (and ``val_filenames``) are test cameras; without them there is none. ``ply_file_path``: points, made
+from all images.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ def looks_like(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Recording:
-    """Read CMU Panoptic: 27 training cameras, 640 x 360, 150 frames; those of test_meta.json judge (0, 10, 15, 30)."""
+    """Read CMU Panoptic: 27 training cameras, 640 x 360, 150 frames; test_meta.json has the test cameras."""
     ids: list[str] = []
     poses, intrinsics = [], []
     clips: dict[str, Clip] = {}

@@ -18,10 +18,10 @@ class ErrorAware(ConfidenceEstimator):
     """Change as in ``noise-normalised``, or persistent reducible error; the paper looks at change alone.
 
     A gated stream keeps the defects of its first frame for ever, because gates open where the recording changes. Here a
-    share ``budget`` of the Gaussians that did not change opens too: those on which the render's error in *both* frames
-    pulls hardest, in units of the noise. Error that no move of a Gaussian reduces (its gradient is 0) does not count.
-    In turn: of the first ``turns`` budgets of candidates, every frame takes every ``turns``-th, so that a defect which
-    cannot be mended does not hold its place in every frame.
+    share ``budget`` of the Gaussians that did not change opens too: those with the largest gradient of the render's
+    error in *both* frames, in units of the noise. Error that no move of a Gaussian reduces has no gradient. In turn: of
+    the first ``turns`` budgets of candidates, every frame takes every ``turns``-th, so that a defect which cannot be
+    mended does not hold its place in every frame.
 
     Recipes that use it set ``stream.change_threshold`` 0, since the active set otherwise leaves out whatever stands
     still, and ``stream.active_threshold`` above the probability of ``floor``, so that this part alone decides who takes

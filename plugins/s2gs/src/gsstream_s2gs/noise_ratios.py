@@ -1,4 +1,4 @@
-"""Pulls of change and of error on Gaussians, in units of what each camera's noise alone would do."""
+"""Gradients of change and of error by Gaussians, in units of what each camera's noise alone would do."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gsstream.api import FrameContext, Rng, check_finite
 
 
 class NoiseRatios(NamedTuple):
-    """Ratios to the noise, [N] float64: about 1 under noise alone, 0 for Gaussians that no pixel pulls or sees.
+    """Ratios to the noise, [N] float64: about 1 under noise alone, 0 without a gradient, or where no camera sees.
 
     Arguments:
         change_ratio: of the change between the two frames.

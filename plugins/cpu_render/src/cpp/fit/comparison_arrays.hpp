@@ -2,7 +2,7 @@
 #pragma once
 #include <optional>
 
-#include "fit/view_pull.hpp"
+#include "fit/view_loss_grad.hpp"
 #include "raster/scene_arrays.hpp"
 
 namespace gsstream_cpu {

@@ -45,7 +45,7 @@ void bind_moved(nb::module_& module) {
   const auto strict = [](const char* name) { return nb::arg(name).noconvert(); };
   module.def("transform_loss_and_grad", &loss_and_grad, nb::arg("rasterizer"), nb::arg("rows"), nb::arg("comparison"), strict("place"),
              strict("centre"), strict("shift"), strict("turn"), strict("grad"), strict("curvature").none() = nb::none(),
-             "Render rows that move in groups, compare, and pull the loss back to the groups' transforms.");
+             "Render rows that move in groups, compare, and return the gradient by the groups' transforms.");
 }
 
 }  // namespace gsstream_cpu

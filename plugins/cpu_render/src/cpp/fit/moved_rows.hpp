@@ -1,12 +1,12 @@
 // Rows that move in rigid groups, rendered from where they are now, and the gradient by the groups' transforms: what
 // every iteration of a fit of motions does. The arithmetic is that of gsstream.core.changes.motion.transformed and of
-// gsstream.parts.motion.pull_back, float64 in the same order, so that the results are the same bits, and that of
+// gsstream.parts.render.transforms, float64 in the same order, so that the results are the same bits, and that of
 // gsstream.parts.motion.curvature.
 #pragma once
 #include <cstddef>
 #include <cstdint>
 
-#include "fit/view_pull.hpp"
+#include "fit/view_loss_grad.hpp"
 
 namespace gsstream_cpu {
 

@@ -61,7 +61,7 @@ class PyResidualTable {
             FloatArray matrix_gradient, FloatArray gate_gradient) {
     ResidualBackwardJob job{};
     job.forward = job_of(latents, units, gates);
-    require(job.forward.rows == table_.rows(), "pull must follow a decode of the same rows");
+    require(job.forward.rows == table_.rows(), "backward must follow a decode of the same rows");
     require(gradients.size() == table_.blocks().size(), "one gradient per attribute");
     std::vector<const float*> from;
     for (std::size_t b = 0; b < gradients.size(); b++) {

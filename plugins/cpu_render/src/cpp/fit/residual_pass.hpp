@@ -7,7 +7,7 @@
 
 #include "adam/adam.hpp"
 #include "fit/residual_table.hpp"
-#include "fit/view_pull.hpp"
+#include "fit/view_loss_grad.hpp"
 
 namespace gsstream_cpu {
 

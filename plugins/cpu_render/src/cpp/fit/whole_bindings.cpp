@@ -5,7 +5,7 @@
 #include <tuple>
 
 #include "fit/comparison_arrays.hpp"
-#include "fit/whole_pull.hpp"
+#include "fit/full_loss_grad.hpp"
 #include "raster/gradient_arrays.hpp"
 
 namespace nb = nanobind;
@@ -43,7 +43,7 @@ void bind_whole(nb::module_& module) {
              nb::arg("width"), nb::arg("height"), nb::arg("near"), nb::arg("comparison"), strict("v_means"),
              strict("v_quats"), strict("v_scales"), strict("v_opacities"), strict("v_sh0"), strict("v_shN"),
              strict("v_means2d"), strict("colours").none(),
-             "Render a scene of which every row moves, compare, and pull the loss back to all of it.");
+             "Render a scene of which every row moves, compare, and return the gradient by all of it.");
 }
 
 }  // namespace gsstream_cpu

@@ -11,7 +11,7 @@
 #include <vector>
 
 #include "fit/comparison_arrays.hpp"
-#include "fit/view_pull.hpp"
+#include "fit/view_loss_grad.hpp"
 #include "runtime/bindings.hpp"
 #include "raster/gradient_arrays.hpp"
 #include "raster/rasterizer.hpp"

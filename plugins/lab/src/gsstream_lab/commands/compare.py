@@ -53,7 +53,7 @@ def compare(
     where: WorkerOptions,
     seeds: Annotated[str, typer.Option("--seeds", metavar="N,...", help="Seeds of every random stream.")] = "0",
     split: Annotated[
-        Literal["reporting", "tuning"], typer.Option("--split", help="Which cameras judge, as data.split.")
+        Literal["reporting", "tuning"], typer.Option("--split", help="Which cameras test, as data.split.")
     ] = "reporting",
     pictures: Annotated[
         bool, typer.Option("--pictures/--no-pictures", help="Pictures hold images of the recording: mind its licence.")

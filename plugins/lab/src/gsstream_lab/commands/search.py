@@ -34,7 +34,7 @@ def search(
 
     One key after the other takes the value with the highest PSNR on training cameras that are left out (the tuning
     split), while that gains more than 0.05 dB; again from the first key until none moves. Test cameras have no say. One
-    frame (the default here) judges frame 0; with --frames 5 or so the frames after it judge.
+    frame (the default here) only frame 0 is compared; with --frames 5 or so the frames after it are.
     """
     from gsstream.core.needs import require_encoder
     from gsstream.engine.assembly.assemble import assemble

@@ -29,7 +29,7 @@ def sweep(
     ] = None,
     split: Annotated[
         Literal["tuning", "reporting"] | None,
-        typer.Option("--split", help="Which cameras judge: data.split of every cell; by default the file's."),
+        typer.Option("--split", help="Which cameras test: data.split of every cell; by default the file's."),
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would run, and what is there already.")] = False,
     quiet: options.Quiet = False,

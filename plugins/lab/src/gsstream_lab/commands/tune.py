@@ -46,7 +46,7 @@ def tune(
     """Try a few recipes on a few frames and write the best that fits a budget as tuned.yaml.
 
     Candidates are the methods as they are, with one knob changed for what is limited, and with the controller of
-    'run --budget'. The best is the one with the highest PSNR on moving pixels of the cameras that judge: some of the
+    'run --budget'. The best is the one with the highest PSNR on moving pixels of the test cameras: some of the
     training cameras (the tuning split); test cameras have no say. Nothing fits: the table says what came nearest,
     nothing is written, and the exit code is 1.
     """

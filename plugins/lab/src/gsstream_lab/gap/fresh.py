@@ -100,9 +100,9 @@ class FreshFrames:
 
 
 def check_cameras(meta: StreamMeta, info: SourceInfo) -> None:
-    """Raise InputError when a recording's cameras are not those of a stream, or when none of them judges."""
+    """Raise InputError when a recording's cameras are not those of a stream, or when none of them is a test camera."""
     if len(meta.test) == 0:
-        raise InputError("the stream has no test cameras, so there is nothing to judge by (data.test_cameras)")
+        raise InputError("the stream has no test cameras, so there is nothing to compare with (data.test_cameras)")
     for split, theirs, here in (("training", meta.train, info.train), ("test", meta.test, info.test)):
         same = theirs.ids == here.ids and (theirs.width, theirs.height) == (here.width, here.height)
         if not same or not np.allclose(theirs.viewmats, here.viewmats, atol=1e-6):

@@ -84,7 +84,7 @@ class Gap:
             values = [self.mean(column, frame) for column in columns]
             rows.append(["mean" if frame is None else str(frame), *map(_cell, values, columns)])
         held_out = ", ".join(dict.fromkeys(view.camera for view in self.views))
-        note = f"PSNR in dB, judged by {held_out}; fresh: that frame alone, up to {self.epochs} passes over its images"
+        note = f"PSNR in dB, test cameras: {held_out}; fresh: that frame alone, up to {self.epochs} epochs"
         return f"{format_table(rows)}\n\n{note}"
 
     def to_json(self) -> str:
@@ -116,7 +116,7 @@ def measure_gap(
     renderer = find_renderer() if renderer is None else renderer
     cameras = source.info.test.ids
     if not cameras:
-        raise InputError("nothing to judge by: the recording has no test cameras; hold some out (data.test_cameras)")
+        raise InputError("the recording has no test cameras, so there is nothing to compare with (data.test_cameras)")
     views: list[GapView] = []
     with Playback(stream) as playback:
         first = source.frame(playback.frames[0], "test").images

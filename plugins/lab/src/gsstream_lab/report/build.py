@@ -20,9 +20,9 @@ _MEANS = (
     "frames after the first; seconds are wall time, CPU s the time of the process. Moving pixels differ from frame "
     "0 by more than noise, changed ones by more than 0.1. KB are 1,000 bytes of packets, key packets apart."
 )
-_JUDGES = {
-    "reporting": "The cameras that judge are the test cameras (reporting split): choose no setting by this page.",
-    "tuning": "The cameras that judge are training cameras left out (tuning split); test cameras have no part in it. "
+_TEST_CAMERAS = {
+    "reporting": "The test cameras are those of the recording (reporting split): choose no setting by this page.",
+    "tuning": "The test cameras are training cameras left out (tuning split); the recording's own have no part in it. "
     "What is best here is a choice, not a result: measure it with --split reporting.",
 }
 
@@ -66,7 +66,7 @@ def _where_it_ran(data: SweepData) -> list[Block]:
     notes = [f"{count}: {len(data.failed)} failed, {len(data.missing)} not run."]
     variants = sorted({row["ssim_variant"] for row in rows.values() if "ssim_variant" in row})
     notes.append(f"{_MEANS} {'; '.join(variants)}.")
-    notes.append(_JUDGES[data.config.get("split", "reporting")])
+    notes.append(_TEST_CAMERAS[data.config.get("split", "reporting")])
     missing = [name for key, name in _NOT_MEASURED.items() if not any(math.isfinite(g.mean(key)) for g in data.groups)]
     if missing:
         notes.append(f"Not measured: {', '.join(missing)} (no counter on this machine, or several workers shared it).")
@@ -121,7 +121,7 @@ def _some(curves: Sequence[Group], groups: Sequence[Group]) -> str:
 def _noise(groups: Sequence[Group]) -> str:
     frames = sorted({len(run.records) for group in groups for run in group.runs})
     held_out = ", ".join(sorted({name for group in groups for run in group.runs for name in run.records[0].psnr}))
-    length = f"{' or '.join(map(str, frames))} frames, judged by {held_out or 'no camera'}. "
+    length = f"{' or '.join(map(str, frames))} frames, test cameras: {held_out or 'none'}. "
     noise = {key: seed_noise(groups, key) for key in (*QUALITIES, "kb")}
     if not math.isfinite(noise["psnr"]):
         return length + "One seed each: which differences are noise is not known, and nothing is called a tie."

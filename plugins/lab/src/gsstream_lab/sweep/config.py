@@ -138,7 +138,7 @@ class SweepConfig(Section):
     first_frame: FirstFrame = Field(default=FirstFrame(), description="how frame 0 is shared")
     split: SplitName = Field(
         default="tuning",
-        description="which cameras judge (data.split of every cell): tuning, to choose settings by the sweep; "
+        description="which cameras test (data.split of every cell): tuning, to choose settings by the sweep; "
         "reporting: the test cameras, for a table of results",
     )
     measure: Measure = Field(default=Measure(), description="what else is measured")

@@ -47,7 +47,7 @@ def climb(start: Mapping[str, Any], ladders: Mapping[str, Sequence[Any]], score:
             found = [value if math.isfinite(value) else -math.inf for value in score(best, key, values)]
             top, now = max(found), found[list(values).index(best[key])]
             if top == -math.inf:
-                raise InputError(f"no value of {key} could be judged: runs failed, or no camera is left out to judge")
+                raise InputError(f"no value of {key} could be evaluated: runs failed, or there is no test camera")
             if top > now + MARGIN:
                 best[key] = values[found.index(top)]
         if best == before:
@@ -76,7 +76,7 @@ class SweepScore:
     """Compares values by the mean PSNR of decoded frames, on training cameras that are left out.
 
     Arguments:
-        scene: recording and number of frames; one frame judges the first, more judge those after it.
+        scene: recording and number of frames; one frame compares the first, more compare those after it.
         method: its name.
         seed: of all runs.
         out: folder of the table.

@@ -125,7 +125,7 @@ def choose(trials: Sequence[Trial]) -> Trial | None:
     fitting = [trial for trial in trials if trial.fits]
     if any(not math.isfinite(trial.quality) for trial in fitting):
         raise InputError(
-            "nothing to choose by: no camera judges; leave --set data.split=reporting out, or hold cameras out with "
+            "nothing to choose by: no test cameras; leave --set data.split=reporting out, or hold cameras out with "
             "--set 'data.test_cameras=[NAME, ...]'"
         )
     if not fitting:

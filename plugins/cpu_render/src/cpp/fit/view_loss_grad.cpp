@@ -1,4 +1,4 @@
-#include "fit/view_pull.hpp"
+#include "fit/view_loss_grad.hpp"
 
 #include <algorithm>
 #include <cstring>

@@ -2,7 +2,7 @@
 // frame 0. The same kernels as forward, photometric_run and backward one after the other; no array of a whole image is
 // allocated, and the colour map of the camera takes two passes over the pixels instead of six.
 #pragma once
-#include "fit/view_pull.hpp"
+#include "fit/view_loss_grad.hpp"
 
 namespace gsstream_cpu {
 

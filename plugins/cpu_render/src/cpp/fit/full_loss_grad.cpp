@@ -1,4 +1,4 @@
-#include "fit/whole_pull.hpp"
+#include "fit/full_loss_grad.hpp"
 
 #include <vector>
 

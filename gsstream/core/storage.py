@@ -1,4 +1,4 @@
-"""How images wait in memory: as they are, as half floats, or as bytes. Values are always worked on as float32."""
+"""How images wait in memory: as they are or as bytes. Values are always worked on as float32."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gsstream.core.errors import ShapeError
 from gsstream.core.shapes import FloatArray
 
 #: "auto": bytes where they say the same, as those of a recording of 8 bits read at its size do; else float32.
-Storage = Literal["auto", "float32", "float16", "uint8"]
+Storage = Literal["auto", "float32", "uint8"]
 #: Values that are compared at a time: so many stay in the processor's cache.
 CHUNK = 1 << 15
 
@@ -18,7 +18,7 @@ CHUNK = 1 << 15
 def packed(images: FloatArray, storage: Storage) -> Any:
     """Return images [..., 3] float32 in [0, 1] as an array of the kind ``storage``, of the same shape.
 
-    Largest error after :func:`unpacked`: none (auto, float32), 2^-12 (float16), 1/510 (uint8).
+    Largest error after :func:`unpacked`: none (auto, float32), 1/510 (uint8).
     Doing it again changes nothing.
 
     Raises ShapeError for values outside [0, 1] where bytes cannot hold them, NaN included.
@@ -32,8 +32,6 @@ def packed(images: FloatArray, storage: Storage) -> Any:
         for out, view in zip(views, images, strict=True):
             out[...] = packed(view, storage)
         return views
-    if storage == "float16":
-        return images.astype(np.float16)
     if images.size:
         low, high = float(images.min()), float(images.max())
         if not (low >= 0 and high <= 1):

@@ -102,11 +102,6 @@ class Stream(Section):
         description="factor on the learning rates of residuals at the last iteration of a frame, log-linear from 1 at "
         "the first; the rate of gates stays",
     )  # fmt: skip
-    static_tile_share: float = Field(
-        default=1.0, gt=0, le=1,
-        description="share of the tiles in which nothing changed that an iteration looks at, drawn anew each time; "
-        "changed tiles and those beside them are always looked at",
-    )  # fmt: skip
     active_threshold: float = Field(
         default=0.0, ge=0, le=1, description="rows whose gate opens with at most this probability are left out"
     )

@@ -72,7 +72,7 @@ RUNS: dict[str, Run] = {
         settings={"data__train_views": 2},
     ),
     "trimmed": Run(3, settings={"motion": "still", "codec__trim": 0.4}),
-    "images of half precision": Run(3, flags=("--scale", "0.5"), settings={"data__images": "float16"}),
+    "scaled images as bytes": Run(3, flags=("--scale", "0.5"), settings={"data__images": "uint8"}),
     "a budget of bytes": Run(
         3, flags=("--budget", "size=200B"), shows=lambda lines: any(line["budget"]["binding"] for line in lines[1:])
     ),

@@ -17,7 +17,7 @@ from gsstream.recipe.model import ComponentRef, Recipe
 
 ROOT = Path(__file__).parents[2]
 #: Most keys that a recipe may have: one more needs a better reason than another default.
-MOST = 59
+MOST = 58
 #: Options of ``gsstream run`` and the keys that they set.
 OPTIONS = {
     "--method": ("method",), "--scale": ("scale",), "--frames": ("frames",),

@@ -96,7 +96,7 @@ SOMETIMES: Mapping[str, Draw] = MappingProxyType({
     "stream.lr_final_factor": _of(1.0, 0.1, 1e-6),
     "loss.backend": _of("auto", "reference"),
     "codec.key_interval": _of(0, 1, 2, 3),
-    "data.leak": _of("none", "points", "training"), "data.images": _of("float16", "uint8"),
+    "data.leak": _of("none", "points", "training"), "data.images": _of("float32", "uint8"),
 })  # fmt: skip
 #: Drawn with the others where the method is made of parts.
 OF_PARTS: Mapping[str, Draw] = MappingProxyType({

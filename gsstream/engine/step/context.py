@@ -20,7 +20,6 @@ from gsstream.engine.fit.schedule import DSSIM
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.active.candidates import VoteCache, changed_rows
 from gsstream.engine.step.active.change import MAX_PIXEL_SIGMA, Change
-from gsstream.engine.step.active.tiles import changed_tile_weights
 from gsstream.input.seeds.shell import in_shell
 from gsstream.metrics.noise import noise_sigma
 from gsstream.parts.optimiser.base import RowOptimiser
@@ -156,8 +155,8 @@ class EngineContext:
         self._session = self.session_for(rows)
 
     def loss_and_grad(self, view: int, wrt: Wrt[G], tiles: Literal["all", "changed"] = "all") -> LossAndGrad[G]:
-        weights = changed_tile_weights(self._change, view) if tiles == "changed" else None
-        return self.session.loss_and_grad(view, self.view_target(view, weights), wrt)
+        changed = None if tiles == "all" or self._change is None else self._change.dilated[view].float()
+        return self.session.loss_and_grad(view, self.view_target(view, changed), wrt)
 
     def view_target(self, view: int, tile_weights: torch.Tensor | None = None) -> ViewTarget:
         self._parts.where.count()  # a target is asked for once in every iteration

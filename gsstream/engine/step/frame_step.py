@@ -21,7 +21,6 @@ from gsstream.engine.budget.usage import usage
 from gsstream.engine.state.next_state import next_state
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.active.change import detect_changed_tiles
-from gsstream.engine.step.active.tiles import tile_weights
 from gsstream.engine.step.commit import commit_session
 from gsstream.engine.step.encode import encode_frame
 from gsstream.engine.step.growth import with_growth
@@ -58,12 +57,9 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) 
         rows, logits = select(parts, view, view.hierarchy, scope)
     with log.phase("optimise"):
         generator, views = rng.stream("frame", frame.index), len(frame.cameras)
-        looked = None if scope is Scope.ALL else change
         problem = Problem(
             scene.layout, view.hierarchy, rows, view.gaussians.rows(rows), logits, state.decoders,
-            view.session_for(rows), lambda index: view.view_target(
-                index, tile_weights(looked, index, stream.static_tile_share, generator)
-            ), views, frame.cameras.width * frame.cameras.height, generator,
+            view.session_for(rows), view.view_target, views, frame.cameras.width * frame.cameras.height, generator,
             1.0 if tools.budget is None else tools.budget.step_scale,
         )  # fmt: skip
         schedule = scheduled(stream, frame, tools.budget)

@@ -27,7 +27,7 @@ class Problem:
         session: a render session in which only ``rows`` change.
         target: view -> what its render is compared with in the next iteration.
         views: training cameras; pixels: of one view.
-        generator: of noise, of the order of views and of the tiles that are looked at.
+        generator: of noise and of the order of views.
         step_scale: factor on the update rule's quantisation steps.
     """
 

@@ -81,8 +81,8 @@ class DataOptions(BaseModel):
     images: Storage = Field(
         default="auto",
         description="how training images wait in memory (decoded ahead, and those of the last frame). auto: as bytes "
-        "where that is exact, as for 8 bits read at scale 1, else float32; values are rounded to what is named: "
-        "float16 by at most 2^-12, uint8 by at most 1/510",
+        "where that is exact, as for 8 bits read at scale 1, else float32; uint8 rounds values by at "
+        "most 1/510",
     )
 
     @property

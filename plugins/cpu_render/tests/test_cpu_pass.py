@@ -22,6 +22,7 @@ from gsstream.engine.step.problem import Problem, Solution
 from gsstream.input.recordings.open import open_source
 from gsstream.parts.gate.always_open import AlwaysOpen
 from gsstream.parts.regularizer.base import AnalyticPenalty
+from gsstream.parts.render.base import TILE
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 
@@ -38,7 +39,6 @@ CASES = {
     "a sum instead of a mean": ("s2gs-edge", ("regularizer.reduction=sum", "regularizer.lambda1=1e-4")),
     "gates that are always open": ("dense", ()),
     "rates that fall": ("dense", ("stream.lr_final_factor=0.1",)),
-    "tiles that are drawn": ("s2gs-edge", ("stream.static_tile_share=0.3",)),
     "colour maps of cameras": ("s2gs-edge", ("first_frame.exposure=true",)),
     "residuals without decoders": ("s2gs-edge", ("update=additive",)),
 }
@@ -119,6 +119,17 @@ def test_one_call_finds_what_single_calls_find(case: str, calls: list[int]) -> N
     assert any(float(value.abs().max()) > 0 for value in found.latents.values())
     expected = one_by_one(parts, problem)
     assert_alike(found, expected)
+
+
+def test_factors_of_tiles_count_in_one_call_as_in_single_calls() -> None:
+    parts, problem = captured("s2gs-edge", ())
+    rows, columns = (-(-side // TILE) for side in problem.target(0).image.shape[:2])
+    factors = torch.rand(rows, columns, generator=torch.Generator().manual_seed(1)) * 3
+    factors[0] = 0
+    weighted = replace(problem, target=lambda view: replace(problem.target(view), tile_weights=factors))
+    found = solved(parts, weighted)
+    assert_alike(found, one_by_one(parts, weighted))
+    assert found.loss != solved(parts, problem).loss
 
 
 class FirstIteration(Schedule):

@@ -8,9 +8,10 @@ from gsstream_comgs.confidence import CORRECTED, LEFT, ErrorGradient
 from gsstream_comgs.influence import KeyPoints, field_of, weights_of
 from scipy.spatial.transform import Rotation
 
-from gsstream.api import Gaussians, Layout, Scene, apply_motion
+from gsstream.api import Gaussians, apply_motion
 from gsstream.blocks import approximate_by_cells, rotation_matrices, transform_rows
 from gsstream.testing.method_driver import MethodUnderTest
+from tests.scenes import scene_at
 
 RNG = np.random.default_rng(0)
 
@@ -28,17 +29,6 @@ def points(number: int) -> KeyPoints:
 def turned(turn: np.ndarray) -> Rotation:
     """A rotation given as axis * tan(angle / 2)."""
     return Rotation.from_quat([*turn, 1.0])
-
-
-def scene_of(means: np.ndarray) -> Scene:
-    number = len(means)
-    gaussians = Gaussians(
-        means=means.astype(np.float32), quats=RNG.normal(size=(number, 4)).astype(np.float32),
-        scales=np.zeros((number, 3), np.float32), opacities=np.zeros(number, np.float32),
-        sh0=np.zeros((number, 1, 3), np.float32), shN=np.zeros((number, 0, 3), np.float32),
-    )  # fmt: skip
-    layout = Layout(np.ones(number, np.int32), np.zeros(number, np.uint8), np.float32([1]))
-    return Scene(gaussians, layout)
 
 
 def test_the_field_is_the_weighted_sum_of_rigid_motions() -> None:
@@ -62,7 +52,7 @@ def test_the_field_is_the_weighted_sum_of_rigid_motions() -> None:
 
 
 def test_gaussians_turn_with_the_field() -> None:
-    scene = scene_of(RNG.normal(size=(5, 3))).gaussians.map(torch.from_numpy)
+    scene = scene_at(RNG.normal(size=(5, 3)), quats=RNG.normal(size=(5, 4))).gaussians.map(torch.from_numpy)
     turn = torch.from_numpy(RNG.normal(0, 0.3, (5, 3)).astype(np.float32))
     after = transform_rows(scene, torch.zeros(5, 3), turn)
     for i in range(5):
@@ -75,7 +65,7 @@ NO_SHELL = torch.zeros(200, dtype=torch.bool)
 
 
 def test_cells_say_a_field_that_is_the_same_everywhere_to_half_a_step() -> None:
-    scene, rows = scene_of(RNG.uniform(-1, 1, (200, 3))), np.arange(200)
+    scene, rows = scene_at(RNG.uniform(-1, 1, (200, 3))), np.arange(200)
     shift = np.tile([0.33, -0.21, 0.05], (200, 1))
     motion = approximate_by_cells(scene, rows, NO_SHELL, shift, np.zeros((200, 3)), 0.5, 0.02)
     assert motion is not None
@@ -85,7 +75,7 @@ def test_cells_say_a_field_that_is_the_same_everywhere_to_half_a_step() -> None:
 
 
 def test_cells_of_which_most_may_not_move_stay() -> None:
-    scene = scene_of(np.array([[0.1, 0.1, 0.1], [0.2, 0.1, 0.1], [0.3, 0.1, 0.1], [5.1, 0.1, 0.1]]))
+    scene = scene_at(np.array([[0.1, 0.1, 0.1], [0.2, 0.1, 0.1], [0.3, 0.1, 0.1], [5.1, 0.1, 0.1]]))
     rest = np.zeros((1, 3))
     motion = approximate_by_cells(scene, np.array([0, 3]), NO_SHELL[:4], np.ones((2, 3)), np.zeros((2, 3)), 1.0, 0.1)
     assert motion is not None
@@ -113,7 +103,7 @@ class Wrong:
 
 
 def test_the_share_with_the_largest_gradient_is_corrected() -> None:
-    scene = scene_of(np.zeros((10, 3))).gaussians.map(torch.from_numpy)
+    scene = scene_at(np.zeros((10, 3))).gaussians.map(torch.from_numpy)
     aims = torch.zeros(10, 3)
     aims[[2, 5, 7]] = torch.tensor([[0.4], [0.2], [0.1]])
     for share, rows in ((0.2, [2, 5]), (0.01, [2]), (1.0, [2, 5, 7])):

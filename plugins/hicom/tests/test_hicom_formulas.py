@@ -9,58 +9,15 @@ import pytest
 import torch
 from gsstream_hicom.motion import CoherentMotion, cell_sides
 
-from gsstream.api import Cameras, Displacement, Gaussians, Layout, LossAndGrad, Rng, Scene, Wrt, apply_motion
+from gsstream.api import Displacement, Rng, Scene, apply_motion
 from gsstream.blocks import high_gradient_rows
+from tests.scenes import RIG, SquaredDistances, scene_at
 
 RNG = np.random.default_rng(0)
-RIG = Cameras(
-    ("a", "b"), np.stack([np.eye(4), np.eye(4)]), np.tile(np.diag([50.0, 50, 1]), (2, 1, 1)), 32, 24
-)  # fmt: skip
 
 
 def cloud(number: int, at: tuple[float, float, float], width: float = 0.02) -> np.ndarray:
     return RNG.normal(at, width, (number, 3))
-
-
-def scene_of(means: np.ndarray, moved: Displacement | None = None) -> Scene:
-    number = len(means)
-    quats = np.zeros((number, 4), np.float32)
-    quats[:, 0] = 1
-    gaussians = Gaussians(
-        means=means.astype(np.float32), quats=quats, scales=np.zeros((number, 3), np.float32),
-        opacities=np.zeros(number, np.float32), sh0=np.zeros((number, 1, 3), np.float32),
-        shN=np.zeros((number, 0, 3), np.float32),
-    )  # fmt: skip
-    layout = Layout(np.ones(number, np.int32), np.zeros(number, np.uint8), np.float32([1]))
-    return Scene(gaussians, layout, moved)
-
-
-class SquaredDistances:
-    """A frame whose loss is the squared distance of every Gaussian to where it belongs."""
-
-    cameras, index = RIG, 1
-
-    def __init__(self, gaussians: Gaussians[torch.Tensor], aims: np.ndarray, changed: int | None = None) -> None:
-        self.shell_rows = torch.zeros(len(gaussians), dtype=torch.bool)
-        self.gaussians, self.aims, self.changed = gaussians, torch.from_numpy(aims.astype(np.float32)), changed
-
-    def changed_rows(self, min_votes: float) -> torch.Tensor:
-        return torch.arange(len(self.aims)) < (len(self.aims) if self.changed is None else self.changed)
-
-    def scaled(self, number: float) -> int:
-        return round(number)
-
-    def narrow(self, rows: torch.Tensor) -> None:
-        self.rows = rows
-
-    def loss_and_grad(self, view: int, wrt: Wrt[Any], tiles: str = "all") -> LossAndGrad[Any]:
-        leaves = wrt.placed().map(lambda value: value.detach().requires_grad_())
-        loss = (leaves.means - self.aims[self.rows]).square().sum()
-        loss.backward()
-        return LossAndGrad(loss.detach(), wrt.grad(leaves))
-
-    def on(self, gaussians: Gaussians[torch.Tensor]) -> SquaredDistances:
-        return SquaredDistances(gaussians, self.aims.numpy(), self.changed)
 
 
 def after(scene: Scene, work: SquaredDistances, **settings: Any) -> Scene:
@@ -85,8 +42,8 @@ def test_two_bodies_find_their_own_ways(levels: int) -> None:
     one, two = cloud(40, (0, 0, 3)), cloud(40, (0.5, 0, 3))
     means = np.concatenate([one, two])
     aims = means + np.repeat([[0.03, 0, 0.01], [-0.02, 0.04, 0]], 40, 0)
-    scene = scene_of(means)
-    work = SquaredDistances(scene.gaussians.map(torch.from_numpy), aims)
+    scene = scene_at(means)
+    work = SquaredDistances(scene, aims)
     there = after(scene, work, levels=levels, lr=0.1, step=0.01, epochs=60)
     assert np.abs(there.gaussians.means - aims).mean() < 0.3 * np.abs(means - aims).mean()
 
@@ -95,8 +52,8 @@ def test_a_frame_begins_with_a_share_of_the_last_ones_motion() -> None:
     means = cloud(60, (0, 0, 3), 0.05)
     shift = np.tile(np.float32([0.05, 0, 0]), (60, 1))
     moved = Displacement(np.arange(60), shift, np.zeros_like(shift))
-    scene = scene_of(means, moved)
-    work = SquaredDistances(scene.gaussians.map(torch.from_numpy), means + 0.6 * shift)
+    scene = scene_at(means, moved)
+    work = SquaredDistances(scene, means + 0.6 * shift)
     slow = {"lr": 1e-6, "step": 0.01, "epochs": 3}
     there = after(scene, work, momentum=0.6, **slow)
     np.testing.assert_allclose(there.gaussians.means, means + 0.6 * shift, atol=1e-3)
@@ -106,8 +63,8 @@ def test_a_frame_begins_with_a_share_of_the_last_ones_motion() -> None:
 
 def test_only_cells_in_what_changed_move() -> None:
     means = np.concatenate([cloud(30, (0, 0, 3)), cloud(30, (1, 0, 3))])
-    scene = scene_of(means)
-    work = SquaredDistances(scene.gaussians.map(torch.from_numpy), means + np.array([0.05, 0, 0]), changed=30)
+    scene = scene_at(means)
+    work = SquaredDistances(scene, means + np.array([0.05, 0, 0]), changed=np.arange(30))
     there = after(scene, work, epochs=9)
     assert (there.gaussians.means[:30] != scene.gaussians.means[:30]).any(1).mean() > 0.5
     np.testing.assert_array_equal(there.gaussians.means[30:], scene.gaussians.means[30:])
@@ -117,7 +74,7 @@ class Shown:
     """One view of three Gaussians with given screen gradients."""
 
     cameras = RIG.select([0])
-    gaussians = scene_of(np.zeros((3, 3))).gaussians.map(torch.from_numpy)
+    gaussians = scene_at(np.zeros((3, 3))).gaussians.map(torch.from_numpy)
     shell_rows = torch.zeros(3, dtype=torch.bool)
 
     def previous_render(self, view: int) -> torch.Tensor:

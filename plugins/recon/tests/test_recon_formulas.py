@@ -3,76 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from gsstream_recon.anchors import AnchorLevels, Level, bound, inherited
 from gsstream_recon.motion import AnchorMotion
 
-from gsstream.api import (
-    Cameras,
-    Delta,
-    Displacement,
-    FrameLog,
-    Gaussians,
-    Layout,
-    LossAndGrad,
-    Rng,
-    Scene,
-    Wrt,
-    apply_motion,
-)
+from gsstream.api import Delta, Displacement, Layout, Rng, Scene, apply_motion
 from gsstream.blocks import pixel_size
 from gsstream.testing.method_driver import MethodUnderTest
+from tests.scenes import RIG, SquaredDistances, scene_at
 
 RNG = np.random.default_rng(0)
-RIG = Cameras(
-    ("a", "b"), np.stack([np.eye(4), np.eye(4)]), np.tile(np.diag([50.0, 50, 1]), (2, 1, 1)), 32, 24
-)  # fmt: skip
 Settings = AnchorMotion.Config
 ANCHOR = Settings(measure="anchor", per_anchor=5, pixels=0.2, step=0.01, rotation_step=0.001)
-
-
-def scene_of(means: np.ndarray, moved: Displacement | None = None) -> Scene:
-    number = len(means)
-    quats = np.zeros((number, 4), np.float32)
-    quats[:, 0] = 1
-    gaussians = Gaussians(
-        means=means.astype(np.float32), quats=quats, scales=np.zeros((number, 3), np.float32),
-        opacities=np.zeros(number, np.float32), sh0=np.zeros((number, 1, 3), np.float32),
-        shN=np.zeros((number, 0, 3), np.float32),
-    )  # fmt: skip
-    return Scene(gaussians, Layout.flat(number, 1.0), moved)
-
-
-class SquaredDistances:
-    """A frame whose loss is the squared distance of every Gaussian to where it belongs."""
-
-    cameras, index = RIG, 1
-
-    def __init__(self, aims: np.ndarray, changed: np.ndarray) -> None:
-        self.shell_rows = torch.zeros(len(aims), dtype=torch.bool)
-        self.aims, self.changed = torch.from_numpy(aims.astype(np.float32)), changed
-        self.seen: list[np.ndarray] = []
-        self.log = FrameLog()
-
-    def changed_rows(self, min_votes: float) -> torch.Tensor:
-        return torch.from_numpy(np.isin(np.arange(len(self.aims)), self.changed))
-
-    def scaled(self, number: float) -> int:
-        return round(number)
-
-    def narrow(self, rows: torch.Tensor) -> None:
-        self.rows = rows
-
-    def loss_and_grad(self, view: int, wrt: Wrt[Any], tiles: str = "all") -> LossAndGrad[Any]:
-        leaves = wrt.placed().map(lambda value: value.detach().requires_grad_())
-        self.seen.append(leaves.means.detach().numpy().copy())
-        loss = (leaves.means - self.aims[self.rows]).square().sum()
-        loss.backward()
-        return LossAndGrad(loss.detach(), wrt.grad(leaves))
 
 
 def due(before: AnchorLevels | None, frame: int, number: int, settings: Settings, rng: Rng) -> AnchorLevels:
@@ -82,7 +26,7 @@ def due(before: AnchorLevels | None, frame: int, number: int, settings: Settings
 
 def fitted(scene: Scene, aims: np.ndarray, rows: np.ndarray, settings: Settings, epochs: int = 30, before=None):
     """(the frame, the scene after the motion that was found)."""
-    work = SquaredDistances(aims, rows)
+    work = SquaredDistances(scene, aims, rows)
     part = AnchorMotion(settings.model_copy(update={"epochs": epochs}))
     for motion in part.propose(scene, work, Rng(0), before):
         scene = apply_motion(scene, motion)[0]
@@ -137,13 +81,13 @@ def test_bodies_find_their_own_ways_and_what_is_sent_is_what_was_fitted() -> Non
     means = np.concatenate([RNG.normal((0, 0, 3), 0.02, (40, 3)), RNG.normal((0.5, 0, 3), 0.02, (40, 3))])
     aims = means + np.repeat([[0.03, 0, 0.01], [-0.02, 0.04, 0]], 40, 0)
     settings = ANCHOR.model_copy(update={"lr": 0.1})
-    _, after = fitted(scene_of(means), aims, np.arange(80), settings, 60)
+    _, after = fitted(scene_at(means), aims, np.arange(80), settings, 60)
     assert np.abs(after.gaussians.means - aims).mean() < 0.3 * np.abs(means - aims).mean()
 
 
 def test_only_cells_in_what_changed_move() -> None:
     means = np.concatenate([RNG.normal((0, 0, 3), 0.02, (30, 3)), RNG.normal((1, 0, 3), 0.02, (30, 3))])
-    scene = scene_of(means)
+    scene = scene_at(means)
     _, after = fitted(scene, means + np.array([0.05, 0, 0]), np.arange(30), ANCHOR)
     assert (after.gaussians.means[:30] != scene.gaussians.means[:30]).any(1).mean() > 0.5
     np.testing.assert_array_equal(after.gaussians.means[30:], scene.gaussians.means[30:])
@@ -156,7 +100,7 @@ def test_a_frame_begins_with_a_share_of_the_last_ones_motion(every: int) -> None
     """Whether anchors are drawn anew or not; a body that moves as one leaves nothing to lose between them."""
     means = RNG.normal((0, 0, 3), 0.05, (60, 3))
     shift = np.tile(np.float32([0.05, 0, 0]), (60, 1))
-    scene = scene_of(means, Displacement(np.arange(60), shift, np.zeros_like(shift)))
+    scene = scene_at(means, Displacement(np.arange(60), shift, np.zeros_like(shift)))
     settings = ANCHOR.model_copy(update={"lr": 1e-6, "every": every})
     before = due(None, 0, 60, settings, Rng(0))
     _, after = fitted(scene, means, np.arange(60), settings, 1, before=before)
@@ -169,7 +113,7 @@ def test_the_weight_of_motion_keeps_what_the_images_say_nothing_about() -> None:
     """Where the images hold the Gaussians moved, as far as momentum moves them, only the weight takes them back."""
     means = RNG.normal((0, 0, 3), 0.05, (60, 3))
     shift = np.tile(np.float32([0.05, 0, 0]), (60, 1))
-    scene = scene_of(means, Displacement(np.arange(60), shift, np.zeros_like(shift)))
+    scene = scene_at(means, Displacement(np.arange(60), shift, np.zeros_like(shift)))
     before = due(None, 0, 60, ANCHOR, Rng(0))
     moved = {}
     for weight in (0.0, 1.0):
@@ -183,7 +127,7 @@ def test_rounded_motions_are_shown_while_they_are_fitted_and_sent_as_they_are() 
     """Cells hold one Gaussian each here, so none turns about a centre; shifts are the sums of whole steps."""
     means = RNG.uniform((-0.3, -0.3, 2.7), (0.3, 0.3, 3.3), (80, 3))
     settings = ANCHOR.model_copy(update={"step": 0.5, "rotation_step": 1.0, "pixels": 0.01, "lr": 0.2, "rounded": True})
-    scene = scene_of(means)
+    scene = scene_at(means)
     work, after = fitted(scene, means + 0.1 * means[:, :1], np.arange(80), settings)
     step = 0.5 * pixel_size(scene.gaussians.means, RIG)
     for seen in (*work.seen, after.gaussians.means):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,41 +10,17 @@ import torch
 from gsstream_stream3dgs.cache import Cache, Lookup
 from gsstream_stream3dgs.motion import CacheMotion
 
-from gsstream.api import (
-    Cameras,
-    Delta,
-    Gaussians,
-    Layout,
-    LossAndGrad,
-    Rng,
-    Scene,
-    Wrt,
-    apply_delta,
-    apply_field,
-    field_rows,
-)
+from gsstream.api import Delta, Rng, Scene, apply_delta, apply_field, field_rows
 from gsstream.blocks import transform_rows
 from gsstream.testing.method_driver import MethodUnderTest
+from tests.scenes import RIG, SquaredDistances, scene_at
 
 RNG = np.random.default_rng(0)
-RIG = Cameras(
-    ("a", "b"), np.stack([np.eye(4)] * 2), np.tile(np.diag([50.0, 50, 1]), (2, 1, 1)), 32, 24
-)  # fmt: skip
 SMALL = CacheMotion.Config(levels=5, entries=10, features=2, base=4, width=16, lr=0.01, box=0.0, step=0.01)
 
 
-def scene_of(means: np.ndarray) -> Scene:
-    number = len(means)
-    gaussians = Gaussians(
-        means=means.astype(np.float32), quats=np.tile(np.float32([1, 0, 0, 0]), (number, 1)),
-        scales=np.zeros((number, 3), np.float32), opacities=np.zeros(number, np.float32),
-        sh0=np.zeros((number, 1, 3), np.float32), shN=np.zeros((number, 0, 3), np.float32),
-    )  # fmt: skip
-    return Scene(gaussians, Layout(np.ones(number, np.int32), np.zeros(number, np.uint8), np.float32([1])))
-
-
 def cache_of(means: np.ndarray, entry_step: float = 1e-6, weight_step: float = 1e-4) -> tuple[Scene, Cache]:
-    scene = scene_of(means)
+    scene = scene_at(means)
     shape = CacheMotion(SMALL).shape(scene, RIG.extent, Rng(0))
     _, unit = field_rows(scene, shape, None)
     return scene, Cache(shape, Lookup(shape, unit), entry_step, weight_step)
@@ -113,14 +88,14 @@ def test_a_cache_is_at_rest_at_first_and_every_frame_begins_with_the_same() -> N
     assert not turn.any()
     for a, b in zip(one.starts, two.starts, strict=True):
         assert torch.equal(a, b)
-    other = CacheMotion(SMALL).shape(scene_of(means), RIG.extent, Rng(1))
+    other = CacheMotion(SMALL).shape(scene_at(means), RIG.extent, Rng(1))
     assert other.seed != one.shape.seed
 
 
 def test_the_box_leaves_out_what_lies_far_away() -> None:
     means = np.concatenate([RNG.uniform(0, 1, (98, 3)), [[50, 0.5, 0.5], [0.5, -50, 0.5]]])
     wide = SMALL.model_copy(update={"box": 0.02})
-    rows, unit = field_rows(scene_of(means), CacheMotion(wide).shape(scene_of(means), RIG.extent, Rng(0)), None)
+    rows, unit = field_rows(scene_at(means), CacheMotion(wide).shape(scene_at(means), RIG.extent, Rng(0)), None)
     assert not set(rows) & {98, 99}
     assert len(rows) > 80
     assert ((unit >= 0) & (unit <= 1)).all()
@@ -128,48 +103,17 @@ def test_the_box_leaves_out_what_lies_far_away() -> None:
 
 @pytest.mark.parametrize("means", [np.zeros((1, 3)), np.ones((7, 3)) * [[1e6, -1e6, 0.1]]])
 def test_a_scene_without_extent_has_a_box(means) -> None:
-    scene = scene_of(means)
+    scene = scene_at(means)
     shape = CacheMotion(SMALL).shape(scene, RIG.extent, Rng(0))
     assert shape.problem() is None
     assert len(field_rows(scene, shape, None)[0]) == len(means)
-
-
-class SquaredDistances:
-    """A frame whose loss is the squared distance of every Gaussian to where it belongs."""
-
-    cameras, index = RIG, 1
-
-    def __init__(self, scene: Scene, aims: np.ndarray, changed: np.ndarray | None = None) -> None:
-        self.shell_rows = torch.zeros(len(scene.gaussians), dtype=torch.bool)
-        self.aims, self.gaussians = torch.from_numpy(aims.astype(np.float32)), scene.gaussians.map(torch.from_numpy)
-        self.key_rows = len(aims)
-        self.changed = np.arange(len(aims)) if changed is None else changed
-
-    def changed_rows(self, min_votes: float) -> torch.Tensor:
-        return torch.from_numpy(np.isin(np.arange(len(self.aims)), self.changed))
-
-    def scaled(self, number: float) -> int:
-        return round(number)
-
-    def on(self, gaussians: Gaussians[torch.Tensor]) -> SquaredDistances:
-        assert len(gaussians) == self.key_rows
-        return self
-
-    def narrow(self, rows: torch.Tensor) -> None:
-        self.rows = rows
-
-    def loss_and_grad(self, view: int, wrt: Wrt[Any], tiles: str = "all") -> LossAndGrad[Any]:
-        leaves = wrt.placed().map(lambda value: value.detach().requires_grad_())
-        loss = (leaves.means - self.aims[self.rows]).square().sum()
-        loss.backward()
-        return LossAndGrad(loss.detach(), wrt.grad(leaves))
 
 
 @pytest.mark.parametrize("sent", ["field", "cells"])
 def test_two_bodies_find_their_own_ways(sent) -> None:
     means = np.concatenate([RNG.normal((0, 0, 3), 0.02, (40, 3)), RNG.normal((0.5, 0, 3), 0.02, (40, 3))])
     aims = means + np.repeat([[0.03, 0, 0.01], [-0.02, 0.04, 0]], 40, 0)
-    scene, settings = scene_of(means), SMALL.model_copy(update={"sent": sent, "epochs": 40})
+    scene, settings = scene_at(means), SMALL.model_copy(update={"sent": sent, "epochs": 40})
     found = CacheMotion(settings).propose(scene, SquaredDistances(scene, aims), Rng(0))
     after = apply_delta(scene, Delta(found)).gaussians.means
     assert np.abs(after - aims).mean() < 0.3 * np.abs(means - aims).mean()
@@ -179,9 +123,8 @@ def test_two_bodies_find_their_own_ways(sent) -> None:
 
 def test_only_what_changed_moves_and_nothing_that_was_added() -> None:
     means = RNG.normal((0, 0, 3), 0.02, (40, 3))
-    scene, some = scene_of(means), np.arange(0, 40, 3)
-    work = SquaredDistances(scene, means + 0.03, some)
-    work.key_rows = 31
+    scene, some = scene_at(means), np.arange(0, 40, 3)
+    work = SquaredDistances(scene, means + 0.03, some, key_rows=31)
     found = CacheMotion(SMALL.model_copy(update={"epochs": 5})).propose(scene, work, Rng(0))
     after = apply_delta(scene, Delta(found)).gaussians.means
     assert np.flatnonzero((after != scene.gaussians.means).any(1)).tolist() == some[some < 31].tolist()

@@ -1,7 +1,8 @@
-"""Scenes that tests of several folders share, and a frame whose best motion is known."""
+"""Scenes that tests of several folders share, and frames whose gradients or best motions are known."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,10 @@ from gsstream.api import (
     Layout,
     LossAndGrad,
     Scene,
+    ScreenGradient,
     Wrt,
 )
+from gsstream.testing import World
 
 #: Two cameras in one place.
 RIG = Cameras(("a", "b"), np.stack([np.eye(4)] * 2), np.tile(np.diag([50.0, 50, 1]), (2, 1, 1)), 32, 24)
@@ -82,3 +85,21 @@ class SquaredDistances:
     def on(self, gaussians: Gaussians[torch.Tensor]) -> SquaredDistances:
         assert len(gaussians) == self.key_rows
         return self
+
+
+@dataclasses.dataclass(frozen=True)
+class Dictated(World):
+    """A frame context whose screen gradients are given: gradient [V, N, 2], visible [V, N]."""
+
+    gradient: torch.Tensor = dataclasses.field(kw_only=True)
+    visible: torch.Tensor = dataclasses.field(kw_only=True)
+
+    @classmethod
+    def of(cls, world: World, gradient: torch.Tensor, visible: torch.Tensor | None = None) -> Dictated:
+        """Return the world with these gradients; every Gaussian is visible unless said otherwise."""
+        seen = torch.ones(gradient.shape[:2], dtype=torch.bool) if visible is None else visible
+        facts = {field.name: getattr(world, field.name) for field in dataclasses.fields(World)}
+        return cls(**facts, gradient=gradient, visible=seen)
+
+    def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
+        return ScreenGradient(self.gradient[view], self.visible[view])

@@ -1,15 +1,22 @@
-"""Recipe + catalogue -> live parts."""
+"""Recipe + catalogue -> live parts; which slots there are, and what a run calls itself."""
+
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 
 import pytest
+from pydantic import ValidationError
 
 from gsstream.core.errors import InputError, PluginUnavailable, RecipeError
+from gsstream.core.kinds import CONTRACTS, METHOD_SLOTS, PART_KINDS
+from gsstream.core.part import Part
 from gsstream.engine.assembly.assemble import SLOTS, Assembly, assemble
 from gsstream.engine.assembly.choose_renderer import SlowRendererWarning
+from gsstream.engine.assembly.title import title
 from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.plugins.builtin import gsstream_components
 from gsstream.plugins.catalog import Catalog, load_catalog
 from gsstream.plugins.discovery import Discovered
 from gsstream.recipe.load import ResolvedRecipe, resolve_recipe
@@ -114,3 +121,69 @@ def test_auto_takes_no_settings(builtin: Catalog) -> None:
     assert str(caught.value) == (
         "--set renderer.threads=2: renderer.params needs a named renderer, but renderer.name is 'auto'"
     )
+
+
+def test_recipes_name_the_parts_of_the_table() -> None:
+    named = {slot: ref.name for slot, ref in Recipe() if isinstance(ref, ComponentRef)}
+    assert named == {kind.name: kind.default for kind in PART_KINDS.values() if kind.default is not None}
+
+
+def test_an_assembly_has_a_field_for_every_slot() -> None:
+    fields = {field.name for field in dataclasses.fields(Assembly)}
+    assert fields >= {*SLOTS, *METHOD_SLOTS}
+
+
+@pytest.mark.parametrize("kind", CONTRACTS)
+def test_contracts_are_abstract_parts(kind: str) -> None:
+    contract = PART_KINDS[kind].contract_class()
+    assert issubclass(contract, Part)
+    assert contract.__abstractmethods__
+
+
+def test_every_default_part_is_built_in() -> None:
+    shipped = {(spec.kind, spec.name) for spec in gsstream_components()}
+    assert shipped >= {(slot, PART_KINDS[slot].default) for slot in METHOD_SLOTS}
+
+
+def test_kinds_that_are_not_in_the_table_are_refused() -> None:
+    with pytest.raises(ValidationError, match="'structure', 'confidence'"):
+        ComponentSpec(kind="metric", name="x", target="a:B", summary="nothing reads this kind")
+    with pytest.raises(TypeError, match="'source' has no contract class"):
+        PART_KINDS["source"].contract_class()
+
+#: method, changes, name.
+NAMES = (
+    ("dense", (), "dense"),
+    ("s2gs-fast", ("gate=always-open",), "s2gs-fast + gate=always-open"),
+    ("s2gs-fast", ("stream.epochs=3", "gate=always-open"), "s2gs-fast + gate=always-open, stream.epochs=3"),
+    ("s2gs-fast", ("gate.temperature=0.123",), "s2gs-fast + gate.temperature=0.123"),
+    ("s2gs-fast", ("update.sh0.latent=7",), "s2gs-fast + update.sh0.latent=7"),
+    ("dense", ("streaming_method=hold",), "hold"),
+    ("hold", ("frames=3", "seed=4", "scale=0.5", "data.train_views=3", "renderer=reference"), "hold"),
+    ("dense", tuple(f"first_frame.{key}=7" for key in ("epochs", "max_points", "max_gaussians", "max_iterations")),
+     "dense + first_frame.epochs=7, first_frame.max_iterations=7, first_frame.max_points=7 and 1 more"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("method", "changes", "name"), NAMES)
+def test_names(method: str, changes: tuple[str, ...], name: str) -> None:
+    catalog = load_catalog()
+    if ("method", method) not in catalog.entries:
+        pytest.skip(f"{method} is not installed")
+    resolved = resolve_recipe(method, catalog.recipe_path, (), [("--set", text) for text in changes])
+    parts = assemble(resolved, catalog)
+    assert parts.title == name
+    assert title(parts.recipe, catalog) == name, "every setting of every part is written out"
+
+
+def test_shipped_methods_bear_their_own_name() -> None:
+    catalog = load_catalog()
+    for method in catalog.names("method"):
+        parts = assemble(resolve_recipe(method, catalog.recipe_path), catalog)
+        assert (parts.title, title(parts.recipe, catalog)) == (method, method)
+
+
+def test_a_method_that_is_not_installed_keeps_its_name() -> None:
+    catalog = load_catalog()
+    recipe = resolve_recipe("dense", catalog.recipe_path).recipe
+    assert title(recipe.model_copy(update={"method": "gone"}), catalog) == "gone"

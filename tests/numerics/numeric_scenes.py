@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 from collections.abc import Sequence
@@ -13,9 +12,9 @@ import torch
 from hypothesis import settings
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.context import ScreenGradient
 from gsstream.core.gaussians import Gaussians
-from gsstream.testing.cases import World, make_case, rig, scene
+from gsstream.testing.cases import make_case, rig, scene
+from tests.scenes import Dictated
 
 Scene = Gaussians[torch.Tensor]
 #: GSSTREAM_TEST_EXAMPLES=1000 makes a job of the matrix: at least so many examples for every property.
@@ -92,22 +91,9 @@ def worst(got: torch.Tensor, want: torch.Tensor, floor: float = 0.0) -> float:
     return error / scale if scale > 0 else (0.0 if error == 0 else math.inf)
 
 
-@dataclasses.dataclass(frozen=True)
-class Dictated(World):
-    """A frame context whose screen gradients are given: gradient [V, N, 2], visible [V, N]."""
-
-    gradient: torch.Tensor = dataclasses.field(kw_only=True)
-    visible: torch.Tensor = dataclasses.field(kw_only=True)
-
-    def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
-        return ScreenGradient(self.gradient[view], self.visible[view])
-
-
 def dictated(magnitudes: Any) -> Dictated:
     """One camera that feels gradients of these lengths [N], along x, in pixels; float32."""
     lengths = torch.as_tensor(magnitudes, dtype=torch.float32).reshape(-1)
     n = len(lengths)
     base = make_case("dictated", scene(torch.zeros(n, 3)), rig(1))
-    facts = {field.name: getattr(base, field.name) for field in dataclasses.fields(base)}
-    gradient = torch.stack([lengths, torch.zeros(n)], 1)[None]
-    return Dictated(**facts, gradient=gradient, visible=torch.ones(1, n, dtype=torch.bool))
+    return Dictated.of(base, torch.stack([lengths, torch.zeros(n)], 1)[None])

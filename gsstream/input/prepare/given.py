@@ -22,7 +22,7 @@ from gsstream.input.seeds.mapping import Lens
 class GivenRig:
     """A calibration: ``viewmats`` [C, 4, 4], and ``lenses`` in pixels of each camera's own pictures.
 
-    ``test``: ids of the cameras that only judge.
+    ``test``: ids of the test cameras, which never train.
     """
 
     viewmats: FloatArray

@@ -105,7 +105,7 @@ def _pairs(cameras: Cameras) -> list[tuple[int, int]]:
 
 
 def _clocks(curves: FloatArray) -> list[Clock]:
-    """The clock of every camera: the largest offset first, whose camera then no longer pulls at the others."""
+    """The clock of every camera: the largest offset first, whose camera then no longer weighs on the others."""
     count, reach = len(curves), curves.shape[2] // 2
     moved = np.zeros(count, int)
     for _ in range(count):

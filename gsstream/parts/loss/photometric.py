@@ -46,14 +46,14 @@ class ReferenceLoss(Loss):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         planes = image.detach().permute(2, 0, 1)[:, None]
         weight = None if tile_mask is None else _pixel_weight(image, _with_neighbours(tile_mask))
-        similar, by_mean, by_square, by_product = ssim_and_slopes(planes, prepared)
+        similar, by_mean, by_square, by_product = ssim_and_grads(planes, prepared)
         difference = planes - prepared.planes
         each = torch.lerp(difference.abs(), 1 - similar, dssim)
-        slopes = torch.cat([by_mean, by_square, by_product])
+        grads = torch.cat([by_mean, by_square, by_product])
         if weight is not None:
-            each, slopes = each * weight, slopes * weight
+            each, grads = each * weight, grads * weight
         # The window is symmetric, so the gradient by what it was slid over is the same window over the gradient.
-        by_mean, by_square, by_product = _windowed(slopes).chunk(3)
+        by_mean, by_square, by_product = _windowed(grads).chunk(3)
         by_ssim = torch.addcmul(by_mean, planes, by_square, value=2).addcmul_(prepared.planes, by_product)
         sign = difference.sign_() if weight is None else difference.sign_() * weight
         gradient = sign.mul_(1 - dssim).sub_(by_ssim, alpha=dssim).mul_(1 / image.numel())
@@ -66,7 +66,7 @@ class ReferenceLoss(Loss):
         return value.double(), gradient[:, 0].permute(1, 2, 0).contiguous()
 
 
-def ssim_and_slopes(planes: torch.Tensor, target: PreparedTarget) -> tuple[torch.Tensor, ...]:
+def ssim_and_grads(planes: torch.Tensor, target: PreparedTarget) -> tuple[torch.Tensor, ...]:
     """Return the structural similarity of an image's planes [3, 1, H, W] to a target, pixel by pixel.
 
     Beside it, of the same shape, its derivatives by the window's mean of the image, of its square, and of its product

@@ -93,4 +93,7 @@ def relative_error(got: np.ndarray, want: np.ndarray) -> float:
 
 
 def equal_bits(a: tuple[np.ndarray, ...], b: tuple[np.ndarray, ...]) -> bool:
+    """Whether bits are equal, not only values: a resumed run repeats the bytes of the stream, on any number of threads,
+    so a cached pass and a full one may not differ by a rounding either.
+    """
     return all(x.shape == y.shape and x.tobytes() == y.tobytes() for x, y in zip(a, b, strict=True))

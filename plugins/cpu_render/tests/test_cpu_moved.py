@@ -101,10 +101,3 @@ def test_other_losses_and_wide_sessions_take_the_default_body() -> None:
     wide = CpuRenderer().open(whole, None, rig(), BACKGROUND)
     found = wide.loss_and_grad(1, wanted, WrtTransforms(whole, every))
     assert torch.equal(found.grad, RenderSession.loss_and_grad(wide, 1, wanted, WrtTransforms(whole, every)).grad)
-
-
-def test_a_render_after_it_is_that_of_the_scene() -> None:
-    session, rows = opened()
-    session.loss_and_grad(1, comparison(), WrtTransforms(rows, moves()))
-    fresh, _ = opened()
-    assert torch.equal(session.render(1, rows).image, fresh.render(1, rows).image)

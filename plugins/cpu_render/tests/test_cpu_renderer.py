@@ -155,17 +155,6 @@ def test_session_has_the_bits_of_a_full_render(ids: list[int]) -> None:
             assert torch.equal(g, w[index])
 
 
-def test_session_backward_after_the_view_was_rendered_again() -> None:
-    ids = torch.tensor([1, 2, 30, 77])
-    session = CpuRenderer().open(scene(), ids, rig(), BACKGROUND)
-    rows, alone = leaves(scene().rows(ids)), leaves(scene().rows(ids))
-    output = session.render(0, rows)
-    session.render(0, scene().rows(ids).map(lambda t: t + 0.3), tile_mask=torch.zeros(3, 4, dtype=torch.bool))
-    backpropagate(output)
-    backpropagate(session.render(0, alone))
-    assert all(torch.equal(a, b) for a, b in zip(grads(rows), grads(alone), strict=True))
-
-
 def test_session_with_a_tile_mask_keeps_the_cached_render_elsewhere() -> None:
     ids = torch.arange(0, N, 2)
     session = CpuRenderer().open(scene(), ids, rig(), BACKGROUND)
@@ -218,26 +207,3 @@ def test_rasterisers_return_to_the_pool() -> None:
     assert release_idle_memory() == 0  # all three wait for their backward
     del outputs
     assert release_idle_memory() > 1.5 * one > 0
-
-
-def test_a_session_that_is_narrowed_reuses_what_the_screen_gradient_projected() -> None:
-    """screen_gradient of a session, then narrow and render: the same bits as without the session."""
-    whole, cameras = scene(), rig()
-    generator = torch.Generator().manual_seed(11)
-    upstream = torch.randn(cameras.height, cameras.width, 3, generator=generator)
-    session = CpuRenderer().open(whole, None, cameras, (0.0, 0.0, 0.0))
-    for view in range(len(cameras)):
-        for _ in range(2):  # asking again gives the same answer
-            got = session.screen_gradient(view, upstream)
-            want = CpuRenderer().screen_gradient(whole, cameras, view, upstream)
-            assert torch.equal(got.gradient, want.gradient)
-            assert torch.equal(got.visible, want.visible)
-    assert bool((want.gradient != 0).any())
-    active = torch.arange(0, len(whole), 3)
-    session.narrow(active)
-    fresh = CpuRenderer().open(whole, active, cameras, (0.0, 0.0, 0.0))
-    moved = whole.rows(active).map(lambda value: value + 0.01)
-    for view in range(len(cameras)):
-        images = [s.render(view, moved.map(lambda v: v.clone().requires_grad_())).image for s in (session, fresh)]
-        assert torch.equal(images[0], images[1])
-        assert not torch.equal(images[0], CpuRenderer().render(whole, cameras, view, (0.0, 0.0, 0.0)).image)

@@ -1,14 +1,19 @@
 """The thread pool under load, and the environment variable that sizes it."""
 
+
+from __future__ import annotations
+
 import multiprocessing
 import os
 import subprocess
 import sys
 import threading
 
+import numpy as np
 import pytest
+from cpu_scenes import HEIGHT, WIDTH, camera, random_splats, upstream
 from gsstream_cpu_render import _native
-from gsstream_cpu_render.bench import copy_peak, fma_peak
+from gsstream_cpu_render.bench import Kernel, copy_peak, fma_peak
 from gsstream_cpu_render.threads import num_threads, set_num_threads
 
 from gsstream.api import InputError
@@ -57,7 +62,7 @@ def test_many_python_threads_and_resizing_at_once() -> None:
     assert wrong == []
 
 
-def _in_child(queue: "multiprocessing.queues.SimpleQueue[tuple[int, int]]") -> None:
+def _in_child(queue: multiprocessing.queues.SimpleQueue[tuple[int, int]]) -> None:
     queue.put((num_threads(), _native.pool_exercise(5000, 1)))
 
 
@@ -110,3 +115,25 @@ def test_peaks_are_positive_and_their_arguments_checked() -> None:
     for call in (lambda: fma_peak(0, 0.01), lambda: fma_peak(1, 0.0), lambda: copy_peak(1, 0.0)):
         with pytest.raises(InputError, match="expected"):
             call()
+
+#: One tile of 16 x 16 pixels of 4 x 3.
+MASK = np.zeros((3, 4), bool)
+MASK[1, 2] = True
+
+
+@pytest.mark.parametrize("incremental", [False, True])
+def test_a_masked_kernel_draws_its_tiles_and_no_others(incremental: bool) -> None:
+    splats = random_splats(200, 0, 4)
+    active = np.arange(0, 200, 3) if incremental else None
+    kernels = [
+        Kernel(tuple(splats), *camera(), WIDTH, HEIGHT, 0.01, mask, active, upstream(0)[0]) for mask in (None, MASK)
+    ]
+    (image, *_), (masked, *_) = (kernel.forward() for kernel in kernels)
+    pairs, few = (kernel.statistics()["pairs"] for kernel in kernels)
+    assert 0 < few < pairs / 2
+    masked = np.array(masked)
+    np.testing.assert_array_equal(masked[16:32, 32:48], np.array(image)[16:32, 32:48])
+    elsewhere = np.ones((HEIGHT, WIDTH), bool)
+    elsewhere[16:32, 32:48] = False
+    assert not masked[elsewhere].any(), "black is the background, and nothing else was drawn there"
+    assert np.array(image)[elsewhere].any()

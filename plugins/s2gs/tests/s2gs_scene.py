@@ -8,8 +8,9 @@ from collections.abc import Sequence
 
 import torch
 
-from gsstream.api import Cameras, Gaussians, ScreenGradient
+from gsstream.api import Cameras, Gaussians
 from gsstream.testing import World, images, make_case, rig, scene
+from tests.scenes import Dictated
 
 __all__ = ["SIZE", "context", "gaussians", "images", "moving", "rig", "told"]
 Images = Sequence[torch.Tensor]
@@ -31,25 +32,11 @@ def context(
     return dataclasses.replace(still, cameras=cameras, before=tuple(before), now=tuple(now), sigma=sigma)
 
 
-@dataclasses.dataclass(frozen=True)
-class Told(World):
-    """A context whose screen gradients are dictated: gradient [V, N, 2], visible [V, N]."""
-
-    gradient: torch.Tensor = dataclasses.field(kw_only=True)
-    visible: torch.Tensor = dataclasses.field(kw_only=True)
-
-    def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
-        return ScreenGradient(self.gradient[view], self.visible[view])
-
-
-def told(gradient: torch.Tensor, visible: torch.Tensor | None = None) -> Told:
+def told(gradient: torch.Tensor, visible: torch.Tensor | None = None) -> Dictated:
     """Dictate gradients [V, N, 2]."""
     views, n = gradient.shape[:2]
-    seen = torch.ones(views, n, dtype=torch.bool) if visible is None else visible
     blank = [torch.zeros(SIZE, SIZE, 3)] * views
-    base = context(gaussians(n), rig(views), blank, blank)
-    facts = {field.name: getattr(base, field.name) for field in dataclasses.fields(base)}
-    return Told(**facts, gradient=gradient, visible=seen)
+    return Dictated.of(context(gaussians(n), rig(views), blank, blank), gradient, visible)
 
 
 @functools.cache

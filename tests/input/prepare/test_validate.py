@@ -97,7 +97,7 @@ def test_offsets_of_clocks_are_found_in_both_directions_and_never_made_up() -> N
         4: ["camera 'cam02' is at least 4 frames early"],
     }  # fmt: skip
     assert {shift: told(shift) for shift in rows} == rows
-    assert told(0, frames=3) == ["clocks"], "three frames are too few to judge clocks, which is said"
+    assert told(0, frames=3) == ["clocks"], "three frames are too few to compare clocks, which is said"
     still = replace(thumbs, images=np.repeat(thumbs.images[:1], 12, axis=0))
     (finding,) = check_sync(still)
     assert finding.severity == "note"

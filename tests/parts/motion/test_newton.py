@@ -45,7 +45,9 @@ def test_after_each_view_of_the_first_pass_it_stands_at_the_bottom_of_all_seen_s
     for view in range(views):
         gradient = (matrices[view] @ (descent.values - bottoms[view])[..., None])[..., 0]
         descent.step(gradient, matrices[view])
-        total, weighted = matrices[: view + 1].sum(0).numpy(), (matrices @ bottoms[..., None])[: view + 1].sum(0).numpy()
+        total, weighted = (
+            each[: view + 1].sum(0).numpy() for each in (matrices, matrices @ bottoms[..., None])
+        )
         np.testing.assert_allclose(descent.values, np.linalg.solve(total, weighted)[..., 0], atol=1e-6)
 
 

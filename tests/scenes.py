@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -84,7 +85,9 @@ class SquaredDistances:
 
     def on(self, gaussians: Gaussians[torch.Tensor]) -> SquaredDistances:
         assert len(gaussians) == self.key_rows
-        return self
+        other = copy(self)
+        other.gaussians = gaussians
+        return other
 
 
 @dataclasses.dataclass(frozen=True)

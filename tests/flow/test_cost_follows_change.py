@@ -59,7 +59,7 @@ def test_what_the_renderer_keeps_changes_no_byte(tmp_path: Path, monkeypatch: py
     assert len(commits) >= 3, "one a frame, and one more where a motion was found"
     assert any(commits), "a stream in which nothing changes proves nothing"
     assert "cache" in metrics(tmp_path / "kept")[-1]
-    monkeypatch.setattr(step_module, "commit_session", lambda *_: None)
+    monkeypatch.setattr(step_module, "keep", lambda *_: (None, None))
     anew = encode(tmp_path / "anew", source=world, method="s2gs-edge")
     assert kept == anew
 

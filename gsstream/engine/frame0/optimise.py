@@ -25,6 +25,7 @@ from gsstream.engine.assembly.checks import VARIABLE, Checks, Look
 from gsstream.engine.fit import schedule
 from gsstream.engine.fit.densify import DensifyStatistics, GrowthLimits, grow_and_prune
 from gsstream.engine.fit.exposure import ExposureFit
+from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.engine.fit.nearest import neighbour_distance
 from gsstream.engine.fit.photometric import PhotometricLoss
 from gsstream.engine.frame0.hutchinson import TrainingViews
@@ -175,7 +176,9 @@ class FirstFrameRun:
 
     def _set_level(self, level: PyramidLevel, exposure: Exposure | None) -> None:
         self.level, self.frame = level, shrink_frame(self.whole, level.factor)
-        self.photometric = PhotometricLoss(self.parts.loss, schedule.DSSIM, self.frame.images, exposure, self.device)
+        self.photometric = PhotometricLoss(
+            self.parts.loss, schedule.DSSIM, FrameImages(self.frame.images, self.device), exposure
+        )
         self.smooth_depth = SmoothDepth(self.renderer, self.frame, self.device)
         self.half_size = torch.tensor([self.frame.cameras.width / 2, self.frame.cameras.height / 2]).to(self.device)
 

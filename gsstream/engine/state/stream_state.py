@@ -12,6 +12,7 @@ from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.engine.state.refinement import Refinement
+from gsstream.engine.state.resident import Resident
 from gsstream.method.base import Step as MethodStep
 from gsstream.packet import PlayerState
 from gsstream.parts.render.base import RenderSession
@@ -35,6 +36,8 @@ class StreamState:
         motion_memory: what the motion part remembers of the packets since the last key packet (``MotionPart.follow``).
         session: what the renderer keeps of this scene from one frame to the next. Nothing but time depends on it: a
             state without one (the first, a resumed one) goes on to the same bytes.
+        resident: the same scene and what it shows on the device of a renderer that works on a GPU; nothing but time
+            depends on it, either.
     """
 
     player: PlayerState
@@ -46,6 +49,7 @@ class StreamState:
     refinement: Refinement | None = None
     motion_memory: Any = None
     session: RenderSession | None = field(default=None, compare=False, repr=False)
+    resident: Resident | None = field(default=None, compare=False, repr=False)
 
     @property
     def gaussians(self) -> Gaussians[torch.Tensor]:

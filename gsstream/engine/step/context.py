@@ -15,8 +15,10 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.log import FrameLog
 from gsstream.core.storage import unpacked
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.fit.photometric import PhotometricLoss, image_on, render_exposed
+from gsstream.engine.fit.frame_images import FrameImages
+from gsstream.engine.fit.photometric import PhotometricLoss, render_exposed
 from gsstream.engine.fit.schedule import DSSIM
+from gsstream.engine.state.resident import Resident
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.active.candidates import VoteCache, changed_rows
 from gsstream.engine.step.active.change import MAX_PIXEL_SIGMA, Change
@@ -39,22 +41,26 @@ class EngineContext:
         log: the record of the frame.
         change: what changed since; None: everything counts as changed.
         part_scale: share of their usual passes that parts make, above 0 to 1.
+        images: of the frame, where some are on the renderer's device already.
     """
 
     def __init__(
         self, parts: Assembly, state: StreamState, frame: Frame, log: FrameLog, change: Change | None = None,
-        part_scale: float = 1.0,
+        part_scale: float = 1.0, images: FrameImages | None = None,
     ) -> None:  # fmt: skip
-        self._parts, device = parts, parts.renderer.device
-        self._gaussians = state.gaussians.map(lambda value: value.to(device))
-        self._hierarchy = state.hierarchy.to(device)
+        self._parts, device, resident = parts, parts.renderer.device, state.resident
+        if resident is None:
+            gaussians = state.gaussians.map(lambda value: value.to(device))
+            resident = Resident(gaussians, state.hierarchy.to(device), FrameImages(state.previous.images, device))
+        self._gaussians, self._hierarchy, self.previous_images = resident
         self._frame, self._previous, self._device = frame, state.previous, device
         self._change = None if change is None else change.to(device)
         self._static = [] if change is None else (~change.tiles.flatten(1).any(1)).tolist()
         self._background, self._part_scale = parts.background, part_scale
         self.log, self.key_rows = log, state.player.key_rows
         exposure = None if state.exposure is None else state.exposure.to(device)
-        self.photometric = PhotometricLoss(parts.loss, DSSIM, frame.images, exposure, device)
+        self.images = FrameImages(frame.images, device) if images is None else images
+        self.photometric = PhotometricLoss(parts.loss, DSSIM, self.images, exposure)
         self._session = state.session
         self._votes = None if change is None else VoteCache(change, frame.cameras)
 
@@ -89,10 +95,10 @@ class EngineContext:
         return self._frame.cameras
 
     def image(self, view: int) -> torch.Tensor:
-        return image_on(self._frame.images[view], self._device)
+        return self.images[view]
 
     def previous_image(self, view: int) -> torch.Tensor:
-        return image_on(unpacked(self._previous.images[view]), self._device)
+        return self.previous_images[view]
 
     def previous_render(self, view: int) -> torch.Tensor:
         return self.shown(self._gaussians, view)

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import torch
-
 from gsstream.core.changes import Delta
 from gsstream.core.deferred import deferred_checks
 from gsstream.core.frame import Frame
@@ -18,10 +16,11 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.budget.epoch_scheduler import scheduled
 from gsstream.engine.budget.usage import usage
+from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.engine.state.next_state import next_state
 from gsstream.engine.state.stream_state import Step, StreamState
-from gsstream.engine.step.active.change import detect_changed_tiles
-from gsstream.engine.step.commit import commit_session
+from gsstream.engine.step.active.find_change import find_change
+from gsstream.engine.step.commit import keep
 from gsstream.engine.step.encode import encode_frame
 from gsstream.engine.step.growth import with_growth
 from gsstream.engine.step.metrics import log_packet, step_numbers
@@ -34,8 +33,6 @@ from gsstream.method.tools import Tools
 from gsstream.packet import decode_packet, encode_empty
 from gsstream.parts.update.base import Scope
 
-CPU = torch.device("cpu")
-
 
 def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) -> Step:
     """Advance the stream by one frame. Pure: a failure leaves ``state`` as it was.
@@ -47,12 +44,13 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) 
     if frame.epoch_scale == 0:  # a skipped frame: a source that is behind does not read its images
         return empty_step(state, frame, log)
     with log.phase("change"):
-        change = detect_changed_tiles(state.previous, frame, stream.change_threshold)
+        images = FrameImages(frame.images, parts.renderer.device)
+        change = find_change(state, frame, images, stream.change_threshold)
     if change is not None and change.share == 0 and scope is not Scope.ALL:
         return empty_step(state, frame, log)
     late = parts.checks is not Checks.STEP
     with log.phase("motion"), deferred_checks(late):
-        motions, scene, view = propose_motion(parts, state, frame, change, tools)
+        motions, scene, view = propose_motion(parts, state, frame, change, tools, images)
     with log.phase("confidence"), deferred_checks(late):
         rows, logits = select(parts, view, view.hierarchy, scope)
     with log.phase("optimise"):
@@ -63,7 +61,7 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) 
             1.0 if tools.budget is None else tools.budget.step_scale,
         )  # fmt: skip
         schedule = scheduled(stream, frame, tools.budget)
-        solution = optimise(parts, problem, schedule).to(CPU)
+        solution = optimise(parts, problem, schedule)
         residual = quantise_residual(parts, problem, solution)
     with log.phase("growth"):
         delta = with_growth(parts, state, Delta(motions).with_residual(residual), view, rng)
@@ -76,8 +74,9 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) 
         # that a change too slow to see from frame to frame adds up until it is seen.
         unchanged = fitted.delta.is_empty
         shown = state.previous if unchanged else replace(frame, images=packed(frame.images, parts.recipe.data.images))
-        session = commit_session(view, scene, fitted.delta, player)
-        after = next_state(parts.motion, replace(state, previous=shown, session=session), player, rng)
+        session, resident = keep(view, scene, fitted.delta, player)
+        kept = replace(state, previous=shown, session=session, resident=resident)
+        after = next_state(parts.motion, kept, player, rng)
     log_packet(log, player, fitted.packet)
     log.set(changed_tiles=1.0 if change is None else change.share, **step_numbers(solution, len(rows), session))
     if tools.budget is not None and (len(rows) or scope is Scope.NONE):

@@ -12,6 +12,8 @@ from gsstream.core.changes.motion import apply_motions, union_rows
 from gsstream.core.frame import Frame
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import error_context
+from gsstream.engine.fit.frame_images import FrameImages
+from gsstream.engine.state.resident import updated
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.active.change import Change
 from gsstream.engine.step.context import EngineContext
@@ -33,14 +35,15 @@ class Moved(NamedTuple):
 
 
 def propose_motion(
-    parts: Assembly, state: StreamState, frame: Frame, change: Change | None, tools: Tools
-) -> Moved:
+    parts: Assembly, state: StreamState, frame: Frame, change: Change | None, tools: Tools,
+    images: FrameImages | None = None,
+) -> Moved:  # fmt: skip
     """Ask the motion part, and apply what it proposes as every player will.
 
     Raises ComponentError when the part fails, or proposes motions that do not fit the scene or cannot be sent.
     """
     scene, budget = state.player.scene, tools.budget
-    view = EngineContext(parts, state, frame, tools.log, change, 1.0 if budget is None else budget.part_scale)
+    view = EngineContext(parts, state, frame, tools.log, change, 1.0 if budget is None else budget.part_scale, images)
     proposed = parts.motion.propose(scene, view, tools.rng, state.motion_memory)
     motions = tuple(motion for motion in proposed if not motion.is_empty)
     if not motions:
@@ -57,11 +60,10 @@ def propose_motion(
         if delta.field is not None:
             scene, rows = apply_field(scene, delta.field)
             touched = union_rows(len(scene.gaussians), touched, rows)
-    device = view.gaussians.means.device
-    gaussians = scene.gaussians.map(lambda value: torch.from_numpy(value).to(device))
+    gaussians = updated(view.gaussians, scene.gaussians, touched)
     # The session is handed on to the moved scene, with its caches of all that stands still. The old session stays
     # correct, as it must until the frame has succeeded: should it be used again, it fills its caches anew.
     if 2 * len(touched) > len(gaussians):
         return Moved(motions, scene, view.on(gaussians, None))
-    session = view.session.commit(gaussians, torch.from_numpy(touched).to(device))
+    session = view.session.commit(gaussians, torch.from_numpy(touched).to(gaussians.means.device))
     return Moved(motions, scene, view.on(gaussians, session))

@@ -38,7 +38,7 @@ def optimise(parts: Assembly, problem: Problem, schedule: Schedule) -> Solution:
     After every epoch rows whose gate has closed may leave, as the recipe says.
     """
     if len(problem.rows) == 0:
-        return Solution(problem.rows, {}, {}, problem.logits)
+        return Solution(problem.rows.cpu(), {}, {}, problem.logits.cpu())
     fit, views, done, losses = _Fit(parts, problem, schedule), problem.views, 0, list[torch.Tensor]()
     schedule.start(len(problem.rows))
     while done < schedule.epochs:
@@ -125,13 +125,13 @@ class _Fit:
         self.parts.where.pause()
         self.schedule.finish()
         return Solution(
-            rows=self.rows,
-            latents=self.code.split(self.residual.latents.detach()),
-            decoders=self.code.split_decoders(self.residual.matrix, self.decoders),
-            logits=self.gates.all_logits(),
+            rows=self.rows.cpu(),
+            latents=self.code.split(self.residual.latents.detach().cpu()),
+            decoders=self.code.split_decoders(self.residual.matrix.cpu(), self.decoders),
+            logits=self.gates.all_logits().cpu(),
             loss=sum(torch.stack(list(losses)).cpu().tolist()) / len(losses),
             iterations=iterations,
-            curvature=self.code.split(self.residual.curvature),
+            curvature=self.code.split(self.residual.curvature.cpu()),
             dead_gates=dead,
             open_gates=self.open_gates,
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 
@@ -47,7 +47,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Solution:
-    """The result of one frame's optimisation.
+    """The result of one frame's optimisation, in the processor's memory.
 
     Arguments:
         rows: [A] int64 rows that stayed to the end, ascending; what other rows had is given up.
@@ -70,14 +70,3 @@ class Solution:
     curvature: Mapping[str, torch.Tensor] = field(default_factory=dict)
     dead_gates: int = 0
     open_gates: Sequence[int] = ()
-
-    def to(self, device: torch.device) -> Solution:
-        """Return the same on a device."""
-        latents, decoders, curvature = (
-            {name: value.to(device) for name, value in table.items()}
-            for table in (self.latents, self.decoders, self.curvature)
-        )
-        return replace(
-            self, rows=self.rows.to(device), logits=self.logits.to(device), latents=latents, decoders=decoders,
-            curvature=curvature,
-        )  # fmt: skip

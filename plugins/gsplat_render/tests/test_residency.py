@@ -7,6 +7,7 @@ a test fails. The budgets only ever go down.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -17,6 +18,7 @@ from resident import CPU, DEVICE, method_on
 from gsstream.core.errors import ComponentError
 from gsstream.core.frame import Frame
 from gsstream.engine.frame0.optimise import FirstFrameRun
+from gsstream.engine.step import commit
 from gsstream.input.recordings.open import open_source
 from gsstream.parts.loss.photometric import ReferenceLoss
 from gsstream.parts.motion.newton import DampedNewton
@@ -27,7 +29,7 @@ from gsstream.testing.pretend import PretendDevice
 #: Copies up, copies down and waits of one iteration.
 RESIDENT = (0, 0, 0)
 #: The same of a whole later frame: its pictures and the decoded change go up, the solution comes down.
-FRAME = (52, 30, 18)
+FRAME = (38, 13, 14)
 #: Kernels of an iteration of a later frame; each of gsplat's five counts once, its gradient not at all.
 LAUNCHES = 230
 
@@ -126,3 +128,30 @@ def test_one_copy_or_one_value_that_is_read_is_counted(
         marks = counted(log, FirstFrameRun, "step", monkeypatch)
         method_on(DEVICE).begin(frames[0])
     assert RESIDENT not in [crossed[:3] for crossed in between(marks)]
+
+
+def test_where_little_changes_the_scene_stays_there_and_only_what_changed_crosses(
+    frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(commit, "MOST_CHANGED", 1.0)  # of so few Gaussians, any change reaches more than half
+    images = [frames[0].images.copy() for _ in range(2)]
+    for place, image in enumerate(images):
+        image[:, 4:10, 4 + 2 * place : 10 + 2 * place] = 0.1
+    few = [frames[0], *(replace(frames[0], index=i + 1, images=image) for i, image in enumerate(images))]
+    with PretendDevice() as log:
+        method = method_on(DEVICE)
+        step = method.begin(few[0])
+        packets = [step.packet.data]
+        for frame in few[1:]:
+            before = log.up.copy()
+            step = method.step(step.state, frame)
+            packets.append(step.packet.data)
+        # In the second such frame the scene, its groups and the images that it shows are there already.
+        assert step.state.resident is not None
+        crossed = log.up - before
+        assert not [line for line in crossed if "step/context.py" in line or "core/hierarchy.py" in line], crossed
+        assert sum(n for line, n in crossed.items() if "frame_images.py" in line) == len(frames[0].cameras)
+        scene = step.state.resident.gaussians.map(torch.Tensor.cpu)
+    for (name, value), (_, want) in zip(scene.items(), step.state.player.gaussians.items(), strict=True):
+        assert torch.equal(value, torch.from_numpy(want)), name
+    assert packets == packets_of_the_processor(few)

@@ -16,9 +16,9 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.engine.step.active.change import Change
+from gsstream.engine.step.active.change_on_device import votes_on_device
 from gsstream.parts.render.base import RenderSession
 
-CPU = torch.device("cpu")
 #: Least share of the views a Gaussian projects into in which it must lie in or beside changed tiles.
 CHANGE_VOTES = 0.75
 
@@ -72,12 +72,13 @@ def changed_rows(
     """
     if change is None:
         return means.new_ones(len(means), dtype=torch.bool)
+    if means.device.type != "cpu":
+        return session.visible_anywhere(change.tiles) & (votes_on_device(change, means, cameras) >= min_votes)
     if not bool(change.tiles.any()):
-        return means.new_zeros(len(means), dtype=torch.bool)
+        return torch.zeros(len(means), dtype=torch.bool)
     seen = session.visible_anywhere(change.tiles)
     rows = seen.nonzero()[:, 0]
-    votes = (book or VoteCache(change.to(CPU), cameras)).of(means.to(CPU), rows.to(CPU))
-    seen[rows] = votes.to(seen.device) >= min_votes
+    seen[rows] = (book or VoteCache(change, cameras)).of(means, rows) >= min_votes
     return seen
 
 

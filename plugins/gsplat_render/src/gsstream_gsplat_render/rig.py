@@ -71,10 +71,16 @@ class Rigs:
     def find(self, cameras: Cameras, background: Background) -> Rig:
         """Return the rig of these very cameras, from the last few that were asked for or made anew."""
         for rig in self._last:
-            if rig.cameras is cameras and rig.background == background:
+            if rig.background == background and (rig.cameras is cameras or _same(rig.cameras, cameras)):
                 return rig
         self._last = [Rig(cameras, background, self.device), *self._last[: KEPT - 1]]
         return self._last[0]
+
+
+def _same(one: Cameras, other: Cameras) -> bool:
+    """Sources make the cameras of every frame anew."""
+    sizes = [(rig.width, rig.height, rig.near_plane, rig.viewmats.shape) for rig in (one, other)]
+    return sizes[0] == sizes[1] and bool((one.viewmats == other.viewmats).all() and (one.Ks == other.Ks).all())
 
 
 @functools.cache

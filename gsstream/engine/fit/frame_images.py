@@ -1,0 +1,35 @@
+"""The images of a frame where they are worked on."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from gsstream.core.storage import packed, unpacked
+
+
+class FrameImages:
+    """The images of one frame as float32 tensors [H, W, 3] on a device, each copied when it is first asked for.
+
+    Arguments:
+        images: [V, H, W, 3] as they are stored.
+        device: to which they cross as bytes where these say the same. On the processor nothing is copied or kept.
+    """
+
+    def __init__(self, images: Any, device: torch.device) -> None:
+        self._images, self.device = images, device
+        self._there: dict[int, torch.Tensor] = {}
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def __getitem__(self, view: int) -> torch.Tensor:
+        if self.device.type == "cpu":
+            return torch.from_numpy(unpacked(self._images[view]))
+        if view not in self._there:
+            stored = torch.from_numpy(packed(self._images[view], "auto")).to(self.device)
+            # Divided by a tensor, as the processor divides: a product with 1 / 255 would be another number.
+            full = stored.new_full((), 255, dtype=torch.float32)
+            self._there[view] = stored if stored.is_floating_point() else stored.float() / full
+        return self._there[view]

@@ -46,14 +46,7 @@ def there_and_back(index: int, length: int) -> int:
 
 
 class Capture(threading.Thread):
-    """Cameras that write: every image of a frame at its time, under another name first, then renamed; END at last.
-
-    Arguments:
-        finished: a recording in the layout of cameras.json.
-        folder: new; it has the calibration from the start.
-        fps: frames per second.
-        frames: how many; the recording runs there and back again.
-    """
+    """Cameras that write: every image of a frame at its time, under another name first, then renamed; END at last."""
 
     def __init__(self, finished: Path, folder: Path, fps: float, frames: int) -> None:
         super().__init__(daemon=True)

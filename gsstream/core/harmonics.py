@@ -17,12 +17,7 @@ _SH3 = (
 
 
 def sh_basis(directions: FloatArray, degree: int) -> FloatArray:
-    """Return [(degree + 1)^2, N]: the harmonics of unit directions.
-
-    Arguments:
-        directions: [N, 3] of length one.
-        degree: 0 to 3.
-    """
+    """Return [(degree + 1)^2, N]: the harmonics, up to degree 3, of unit directions [N, 3]."""
     x, y, z = directions.T
     basis = [np.full_like(x, SH0)]
     if degree > 0:
@@ -40,14 +35,11 @@ def sh_basis(directions: FloatArray, degree: int) -> FloatArray:
 
 
 def rotate_sh(shN: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Return coefficients [N, K - 1, 3] of the same colours after the world has been turned.
+    """Return coefficients [N, K - 1, 3], of degree 1 and above, of the same colours after the world was turned.
 
-    What was seen from direction d is seen from ``rotation @ d`` afterwards. Harmonics of one degree turn among
-    themselves, so each degree has a matrix, found from their values in more directions than there are coefficients.
-
-    Arguments:
-        shN: [N, K - 1, 3] coefficients of degree 1 and above.
-        rotation: [3, 3].
+    What was seen from direction d is seen from ``rotation @ d`` afterwards, ``rotation`` [3, 3]. Harmonics of one
+    degree turn among themselves, so each degree has a matrix, found from their values in more directions than there are
+    coefficients.
     """
     degree = round((shN.shape[1] + 1) ** 0.5) - 1
     turned = np.array(shN, np.float64)

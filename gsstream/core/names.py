@@ -17,9 +17,6 @@ _DEVICES = frozenset({"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("c
 def check_camera_ids(ids: Iterable[str]) -> None:
     """Refuse camera ids that could not be the name of one folder: pictures of a camera lie in a folder of its name.
 
-    Arguments:
-        ids: any texts.
-
     Raises ShapeError naming the first id that is empty, longer than 120 bytes, "." or "..", reserved by an operating
     system, or that has a separator, a control character or half of a surrogate pair in it.
     """

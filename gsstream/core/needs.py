@@ -47,11 +47,7 @@ DOCS = (SOURCES / "docs", Path(sys.prefix) / "share" / "doc" / "gsstream")
 
 
 def page(name: str) -> str:
-    """Return where a page of the documentation is on this machine.
-
-    Arguments:
-        name: its path below ``docs``, such as ``howto/lpips.md``.
-    """
+    """Return where a page of the documentation, such as ``howto/lpips.md``, is on this machine."""
     return str(next((folder / name for folder in DOCS if (folder / name).is_file()), Path("docs") / name))
 
 
@@ -112,10 +108,6 @@ def install_extra(extra: str) -> str:
 
 def install_part(kind: str, name: str) -> str | None:
     """Return the command that installs a part or method which this project ships in another distribution.
-
-    Arguments:
-        kind: of the part, or "method".
-        name: of the part.
 
     Returns None for a name that this project does not ship.
     """

@@ -9,14 +9,9 @@ from gsstream.core.shapes import BoolArray, FloatArray
 
 
 def project(points: FloatArray, cameras: Cameras, index: int) -> tuple[FloatArray, FloatArray]:
-    """Return pixel positions [P, 2] (pixel-corner origin) and depths [P] in one camera.
+    """Return pixel positions [P, 2] (pixel-corner origin) and depths [P] of points [P, 3] in one camera of a rig.
 
     Positions are 0 where depth <= 0.
-
-    Arguments:
-        points: [P, 3] scene units.
-        cameras: the rig.
-        index: index of one of them.
     """
     view, intrinsics = cameras.viewmats[index], cameras.Ks[index]
     local = points @ view[:3, :3].T + view[:3, 3]
@@ -29,26 +24,13 @@ def project(points: FloatArray, cameras: Cameras, index: int) -> tuple[FloatArra
 
 
 def inside(uv: FloatArray, depth: FloatArray, cameras: Cameras) -> BoolArray:
-    """Return [P] bool: in front of the camera and within its image.
-
-    Arguments:
-        uv: [P, 2] pixels, origin at the corner.
-        depth: [P] scene units.
-        cameras: the rig, for its image size.
-    """
+    """Return [P] bool: pixel positions [P, 2], at depths [P], in front of the camera and within its image."""
     seen: BoolArray = (depth > 0) & (uv >= 0).all(1) & (uv[:, 0] < cameras.width) & (uv[:, 1] < cameras.height)
     return seen
 
 
 def unproject(uv: FloatArray, depth: FloatArray, cameras: Cameras, index: int) -> FloatArray:
-    """Return world points [P, 3] at pixel positions [P, 2] and planar depths [P] of one camera.
-
-    Arguments:
-        uv: [P, 2] pixels, origin at the corner.
-        depth: [P] planar depth, scene units.
-        cameras: the rig.
-        index: index of one of them.
-    """
+    """Return world points [P, 3] at pixel positions [P, 2] and planar depths [P] of one camera."""
     homogeneous = np.concatenate([uv, np.ones((len(uv), 1), uv.dtype)], axis=1)
     local = (homogeneous @ np.linalg.inv(cameras.Ks[index]).T) * depth[:, None]
     view = cameras.viewmats[index]

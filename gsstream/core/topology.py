@@ -11,12 +11,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class TopologyEdit:
-    """New row i copies old row ``source[i]``; where ``fresh[i]`` its optimiser moments start at zero.
-
-    Arguments:
-        source: [N'] int64 rows of the old scene.
-        fresh: [N'] bool.
-    """
+    """New row i of N' copies old row ``source[i]`` (int64); where ``fresh[i]`` its optimiser moments start at zero."""
 
     source: torch.Tensor
     fresh: torch.Tensor

@@ -47,11 +47,7 @@ def draw_depths(
 def seen_masks(
     scene: Gaussians[FloatArray], training: Cameras, cameras: Cameras, renderer: PlayerRenderer | None = None
 ) -> list[BoolArray]:
-    """Return for each of ``cameras`` [H, W] bool: pixels whose surface at least two training cameras see.
-
-    Arguments:
-        scene: decoded. training: cameras that trained it. renderer: that draws depths; None: the fastest that loads.
-    """
+    """Return for each of ``cameras`` [H, W] bool: pixels of a decoded scene whose surface two training cameras see."""
     depths = [draw_depths(scene, cameras, view, renderer) for view in range(len(cameras))]
     solid = [np.isfinite(depth) for depth in depths]
     points = [_backproject(cameras, view, depths[view], solid[view]) for view in range(len(cameras))]

@@ -138,13 +138,7 @@ def check_file_header(data: bytes) -> str:
 
 
 def build_packet(kind: PacketKind, frame: int, sections: Sequence[tuple[str, bytes]]) -> EncodedPacket:
-    """Put sections into a packet. Raises PacketError when a stated limit is exceeded.
-
-    Arguments:
-        kind: of the packet.
-        frame: its index.
-        sections: (name, payload) in the order in which they stand.
-    """
+    """Put (name, payload) sections, in their order, into a packet. Raises PacketError beyond a stated limit."""
     body = b"".join(SECTION_HEADER.pack(SECTION_IDS[name], len(data)) + data for name, data in sections)
     if len(body) > MAX_BODY or not 0 <= frame < 1 << 32:
         raise PacketError(f"packet of frame {frame}: {len(body)} bytes; expected at most {MAX_BODY} and a 32-bit frame")
@@ -188,13 +182,7 @@ def parse_packet(data: bytes, offset: int = 0) -> tuple[PacketHeader, dict[str, 
 
 
 def split_sections(body: bytes, number: int, offset: int) -> dict[str, Section]:
-    """Return name -> section of bytes that must hold that many sections and nothing else. Raises PacketError.
-
-    Arguments:
-        body: the sections, one after the other.
-        number: how many they are.
-        offset: place of the first one in the file, for errors.
-    """
+    """Return name -> section of bytes that must hold that many sections and nothing else. Raises PacketError."""
     found: dict[str, Section] = {}
     at = 0
     for _ in range(number):
@@ -217,13 +205,7 @@ def split_sections(body: bytes, number: int, offset: int) -> dict[str, Section]:
 
 
 def expect(data: bytes, offset: int, kind: PacketKind) -> tuple[PacketHeader, dict[str, Section]]:
-    """Parse a packet that must be of one kind. Raises PacketError like :func:`parse_packet`.
-
-    Arguments:
-        data: bytes that begin with a packet.
-        offset: place of the packet in the file, for errors.
-        kind: that it must be of.
-    """
+    """Parse a packet that must be of one kind. Raises PacketError like :func:`parse_packet`."""
     header, sections = parse_packet(data, offset)
     if header.kind != kind:
         raise PacketError(f"expected a {kind.name.lower()} packet, got {header.kind.name.lower()}", offset)

@@ -47,13 +47,7 @@ ORDER = ("layers", *_VISIBLE, "layout", "rest")
 
 
 class FirstLayer(NamedTuple):
-    """What can be drawn of a key packet of which the rest has not come yet.
-
-    Arguments:
-        gaussians: [K] rows, in the order they have in the scene.
-        meta: of the stream.
-        frame: index of the frame.
-    """
+    """What can be drawn of a frame's key packet of which the rest has not come: rows in the order of the scene."""
 
     gaussians: Gaussians[FloatArray]
     meta: StreamMeta

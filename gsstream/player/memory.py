@@ -25,11 +25,7 @@ _COUNTS = struct.Struct("<II")
 
 @dataclass(frozen=True, slots=True)
 class MemoryLimit:
-    """A limit on what playing a stream takes, beside the program itself (about 80 MB).
-
-    Arguments:
-        most: bytes.
-    """
+    """A limit, bytes, on what playing a stream takes, beside the program itself (about 80 MB)."""
 
     most: int
 

@@ -34,12 +34,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Catalog:
-    """Every part by (kind, name), and every plugin, healthy or quarantined.
-
-    Arguments:
-        entries: (kind, name) -> entry; methods have the kind "method", commands "command".
-        plugins: all plugins in discovery order.
-    """
+    """Every part by (kind, name), methods and commands too, and every plugin as it was found, healthy or not."""
 
     entries: Mapping[tuple[str, str], Entry]
     plugins: tuple[Discovered, ...]

@@ -38,13 +38,7 @@ NEED_A_FILE = ("onnx",)
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What one run of a soak encodes; ``settings`` are (recipe key, value) in the order they are laid over each other.
-
-    Arguments:
-        seed, index: what it was drawn from; the same two give the same case.
-        source: uri of a generated scene.
-        method: name of a method.
-    """
+    """What one run of a soak encodes; ``settings`` are (recipe key, value) in the order they are laid on."""
 
     seed: int
     index: int

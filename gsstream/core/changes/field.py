@@ -79,12 +79,7 @@ def field_rows(scene: Scene, shape: FieldShape, marks: IntArray | None) -> tuple
 
 
 def mismatch(change: Field, touched: list[IntArray]) -> str | None:
-    """Say why the symbols of a field cannot be; None when they can.
-
-    Arguments:
-        change: of the frame.
-        touched: for each level, the entries that its rows touch.
-    """
+    """Say why the symbols of a field, whose rows touch these entries of each level, cannot be; None when they can."""
     shape = change.shape
     wanted = [(f"entries of level {i}", (len(which), shape.features)) for i, which in enumerate(touched)]
     wanted += [(f"layer {i}", pair) for i, pair in enumerate(itertools.pairwise(shape.widths))]

@@ -104,8 +104,7 @@ def groups_for(scene: Scene, cell: float, brightness_bins: int, regroup: bool = 
 def _numbered(digits: Sequence[IntArray], bases: Sequence[int]) -> tuple[IntArray, int]:
     """Number of every row among the numbers that occur, in ascending order [N] int32, and how many occur.
 
-    Arguments:
-        digits: [N] int64 each, the foremost first. bases: of each digit; their product is below 2^63.
+    ``digits``: [N] int64 each, the foremost first; the product of their ``bases`` is below 2^63.
     """
     if len(digits[0]) == 0:
         return np.zeros(0, np.int32), 0

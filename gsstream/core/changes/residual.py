@@ -62,11 +62,6 @@ def apply_residual(gaussians: Gaussians[FloatArray], layout: Layout, residual: R
 
     Rows behind closed gates keep their bits. All arithmetic is float32 in a fixed order. Raises ShapeError when the
     residual does not fit the scene.
-
-    Arguments:
-        gaussians: N rows, stored node by node.
-        layout: their nodes and units.
-        residual: gates of the M nodes, symbols of the rows behind open ones.
     """
     _check_fit(layout, residual)
     index = sent_rows(layout, residual.gates)
@@ -117,15 +112,10 @@ def _check_fit(layout: Layout, residual: Residual) -> None:
 
 
 def decode_residual(symbols: IntArray, step: float, decoder: FloatArray | None) -> FloatArray:
-    """Return the ungated residual [A, D] float32 of [A, L] symbols.
+    """Return the ungated residual [A, D] float32 of [A, L] symbols; without a decoder [L, D] the latents are it.
 
     The product is summed channel by channel with elementwise operations: a BLAS call may order its sums by the number
     of rows or threads, and then encoder and player would drift apart.
-
-    Arguments:
-        symbols: [A, L] int32.
-        step: quantisation step, latent units per symbol.
-        decoder: [L, D] float32 linear decoder; None: the latents are the residual, L = D.
     """
     latent = symbols.astype(np.float32) * np.float32(step)
     if decoder is None:

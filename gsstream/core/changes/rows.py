@@ -125,14 +125,7 @@ def gather_rows(node_of: IntArray, added: AddedGaussians | None, removed: IntArr
 def edited_counts(
     node_counts: IntArray, node_of: IntArray, added: AddedGaussians | None, removed: IntArray
 ) -> IntArray:
-    """Return [M + K] int32: Gaussians of each node after Gaussians were added and removed.
-
-    Arguments:
-        node_counts: [M] Gaussians of each node before.
-        node_of: [N] node of each row before.
-        added: rows that join, with K new nodes; or None.
-        removed: [D] rows that leave, ascending.
-    """
+    """Return [M + K] int32: Gaussians of each of M nodes, and of K new ones, after rows were added and removed."""
     counts = np.asarray(node_counts, np.int64) - np.bincount(node_of[removed], minlength=len(node_counts))
     if added is not None:
         counts = np.concatenate([counts, np.zeros(len(added.parents), np.int64)])
@@ -141,26 +134,13 @@ def edited_counts(
 
 
 def join_rows(old: Table, added: Table | None, source: IntArray) -> Table:
-    """Return the rows of one attribute after Gaussians were added and removed.
-
-    Arguments:
-        old: [N, ...] rows before.
-        added: [B, ...] rows that join, or None.
-        source: [N'] what :func:`gather_rows` returned.
-    """
+    """Return an attribute's rows after old ones were chosen (``source``: :func:`gather_rows`) and others added."""
     joined: Table = (old if added is None else np.concatenate([old, added]))[source]
     return joined
 
 
 def check_added(added: AddedGaussians, num_nodes: int, num_units: int, shapes: Sequence[tuple[str, int]]) -> None:
-    """Raise ShapeError unless the added Gaussians fit a scene of M nodes and H units.
-
-    Arguments:
-        added: rows that join.
-        num_nodes: M.
-        num_units: H.
-        shapes: (attribute, number of values per row) of the scene.
-    """
+    """Raise ShapeError unless the added Gaussians fit a scene of so many nodes, units and values per attribute."""
     number, new = len(added.nodes), len(added.parents)
     if len(added.gaussians) != number or len(added.unit_of) != number:
         raise ShapeError(

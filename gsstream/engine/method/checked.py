@@ -27,10 +27,6 @@ class Checked(StreamingMethod[Any]):
 
     A packet that carries the state it was decoded to (``EncodedPacket.decoded``) is not decoded again, unless every
     step is checked.
-
-    Arguments:
-        method: the method itself.
-        parts: of the run; ``where`` is set to every frame.
     """
 
     source = "gsstream"

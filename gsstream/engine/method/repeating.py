@@ -26,9 +26,6 @@ class Repeating(StreamingMethod[Any]):
 
     That call must be answered by an empty packet. A method that sends something else breaks its contract, and the
     failure is raised.
-
-    Arguments:
-        method: that may fail.
     """
 
     source = "gsstream"

@@ -26,11 +26,7 @@ class Counter(Protocol):
 
 
 class EnergyMeter:
-    """Every counter of this machine, as a context manager.
-
-    Arguments:
-        sysfs: where sysfs is mounted.
-        nvml: whether to ask NVIDIA's library, if it is installed (pynvml).
+    """Every counter of this machine, as a context manager: of sysfs, and of NVIDIA's library if it is installed.
 
     ``counters`` empty means: energy is not measured here, and ``reasons`` says why for whatever looked like a counter.
     """

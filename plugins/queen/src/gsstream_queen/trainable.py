@@ -22,12 +22,7 @@ ADAM_EPS = 1e-15  # 3DGS: tiny gradients of tiny Gaussians must still move them
 
 @dataclass(frozen=True)
 class Solution:
-    """What the old rows were trained to, as integers.
-
-    Arguments:
-        symbols: attribute -> [A, L] int32.
-        decoders: attribute -> [L, D].
-    """
+    """What the old rows were trained to, as integers: by attribute, symbols [A, L] int32 and decoders [L, D]."""
 
     symbols: Tensors
     decoders: Tensors

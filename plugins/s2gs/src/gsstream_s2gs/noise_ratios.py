@@ -13,9 +13,7 @@ from gsstream.api import FrameContext, Rng, check_finite
 class NoiseRatios(NamedTuple):
     """Ratios to the noise, [N] float64: about 1 under noise alone, 0 without a gradient, or where no camera sees.
 
-    Arguments:
-        change_ratio: of the change between the two frames.
-        error_ratio: of what the render still lacks in both frames; zeros unless asked for.
+    ``error_ratio`` is that of what the render still lacks in both frames; zeros unless asked for.
     """
 
     change_ratio: torch.Tensor

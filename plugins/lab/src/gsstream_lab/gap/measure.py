@@ -54,13 +54,7 @@ class GapView:
 
 @dataclass(frozen=True)
 class Gap:
-    """What a gap was measured on.
-
-    Arguments:
-        views: by frame, then by camera.
-        files: frame -> stream of its fresh reconstruction.
-        epochs: passes over the training cameras that a fresh reconstruction has at most.
-    """
+    """What a gap was measured on; ``files``: frame -> stream of its fresh reconstruction, of at most ``epochs``."""
 
     views: tuple[GapView, ...]
     files: Mapping[int, Path]

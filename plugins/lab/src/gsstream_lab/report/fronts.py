@@ -40,12 +40,7 @@ def knee(front: Sequence[tuple[float, float]]) -> int | None:
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """What changing one knob did, against the group it was changed from.
-
-    Arguments:
-        deltas: quantity -> difference of means.
-        ties: quantity -> whether that is within the noise between seeds; None: noise unknown.
-    """
+    """What changing one knob did to each mean; a tie is within the noise between seeds, None: noise unknown."""
 
     base: Group
     changed: Group

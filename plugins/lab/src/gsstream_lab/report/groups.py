@@ -61,12 +61,7 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class SweepData:
-    """What a report is made from.
-
-    Arguments:
-        groups: in the order of the plan; only points with a finished run.
-        failed: label -> reason. missing: labels of cells that have not run.
-    """
+    """What a report is made from: finished groups in the order of the plan, labels of failed and missing cells."""
 
     config: Mapping[str, Any]
     groups: tuple[Group, ...]

@@ -23,12 +23,7 @@ MIN_POINTS = 3
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Groups that differ in one axis alone.
-
-    Arguments:
-        name: of what they have in common.
-        groups: by rising value of the axis, as the sweep lists them.
-    """
+    """Groups that differ in one axis alone, by its rising value."""
 
     name: str
     groups: tuple[Group, ...]

@@ -27,22 +27,26 @@ WHY = "float32 over a dozen steps"
 
 def _tables() -> dict[str, torch.Tensor]:
     g = torch.Generator().manual_seed(1)
-    return {"means": torch.randn(9, 3, generator=g), "opacities": torch.randn(9, generator=g)}
+    shapes = {"means": (9, 3), "opacities": (9,), "shN": (9, 4, 3), "none": (0, 3)}
+    return {name: torch.randn(shape, generator=g) for name, shape in shapes.items()}
 
 
 def _gradients(step: int) -> dict[str, torch.Tensor]:
+    """Of very different sizes from step to step; every third row of a table has none."""
     g = torch.Generator().manual_seed(100 + step)
-    return {"means": 1e-3 * torch.randn(9, 3, generator=g), "opacities": torch.randn(9, generator=g)}
+    found = {name: 10.0 ** (step % 7 - 5) * torch.randn(value.shape, generator=g) for name, value in _tables().items()}
+    found["shN"][step % 3 :: 3] = 0
+    return found
 
 
 @check("optimiser")
 def check_optimiser_adam(part: RowOptimiser) -> None:
     """Where all rows take all steps this is torch.optim.Adam, whatever shape the learning rate has."""
     for rate in (0.01, torch.full((3,), 0.01), torch.full((9, 1), 0.01)):
-        lrs: dict[str, float | torch.Tensor] = {"means": rate, "opacities": 0.05}
+        rates = {"means": 0.01, "opacities": 0.05, "shN": 0.0025, "none": 1.0}
+        lrs: dict[str, float | torch.Tensor] = {**rates, "means": rate}
         ours, theirs = _tables(), {name: value.requires_grad_() for name, value in _tables().items()}
         states = {name: AdamState.start(value) for name, value in ours.items()}
-        rates = {"means": 0.01, "opacities": 0.05}
         groups = [{"params": [value], "lr": rates[name]} for name, value in theirs.items()]
         adam = torch.optim.Adam(groups, betas=ADAM_BETAS, eps=ADAM_EPS)
         for step in range(STEPS):
@@ -53,6 +57,7 @@ def check_optimiser_adam(part: RowOptimiser) -> None:
             part.step(ours, gradients, states, lrs)
         for name, value in ours.items():
             equal(f"{name} after {STEPS} steps", value, theirs[name].detach(), 1e-5, WHY)
+            assert bool((states[name].steps == STEPS).all()), f"{name}: expected {STEPS} steps to be counted"
 
 
 @check("optimiser")
@@ -82,6 +87,7 @@ def check_optimiser_refuses(part: RowOptimiser) -> None:
             part.step(values, {"means": wrong}, states, {"means": 0.01})
         except ShapeError:
             equal("the refused table", values["means"], before)
+            assert not states["means"].exp_avg.any() and not states["means"].steps.any(), "moments moved all the same"
             continue
         raise AssertionError(f"a gradient of shape {list(wrong.shape)}, first value {wrong.flatten()[0]}, was accepted")
 

@@ -20,23 +20,6 @@ def moved(rows: SplatArrays, seed: int, amount: float = 0.2) -> SplatArrays:
     return SplatArrays(*((a + amount * rng.normal(size=a.shape)).astype(np.float32) for a in rows))
 
 
-@pytest.mark.parametrize(("count", "seed"), [(0, 0), (1, 1), (30, 2), (200, 3)])
-@pytest.mark.parametrize("masked", [False, True])
-def test_active_pass_has_the_bits_of_the_full_path(isa: str, count: int, seed: int, masked: bool) -> None:
-    splats, ids = random_splats(200, seed, 9, opaque=seed % 2 == 0), some_ids(200, count, seed)
-    mask = random_mask(seed) if masked else None
-    subject, full = rasterizer(), rasterizer()
-    subject.forward(splats)
-    subject.freeze(mask, ids)
-    for step in range(3):
-        rows = moved(rows_of(splats, ids), 10 * seed + step)
-        image, transmittance = subject.forward_active(rows)
-        gradients = subject.backward_active(*upstream(step))
-        want = full.forward(with_rows(splats, ids, rows), tile_mask=mask)
-        assert equal_bits((image, transmittance), want)
-        assert equal_bits(gradients, rows_of_gradients(full.backward(*upstream(step)), ids))
-
-
 def rows_of_gradients(gradients: tuple[np.ndarray, ...], ids: np.ndarray) -> tuple[np.ndarray, ...]:
     return tuple(g[ids] for g in gradients)
 

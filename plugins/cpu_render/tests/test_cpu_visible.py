@@ -117,12 +117,6 @@ def test_no_marked_tile_costs_nothing() -> None:
     assert session.cache_bytes().total == 0, "the view was drawn although nothing was asked about"
 
 
-def test_a_scene_without_gaussians() -> None:
-    nothing = scene().rows(torch.zeros(0, dtype=torch.int64))
-    for each in (opened(nothing), differentiated(nothing)):
-        assert each.visible(0, masks(EVEN)[0]).tolist() == []
-
-
 @pytest.mark.parametrize("wrong", [torch.ones(3, 4, dtype=torch.bool), torch.ones(3, 5), torch.ones(48, 80) > 0])
 def test_other_tiles_are_refused(wrong: torch.Tensor) -> None:
     for each in (opened(scene()), differentiated(scene())):
@@ -141,17 +135,6 @@ def test_the_rasteriser_refuses_tiles_that_it_did_not_draw() -> None:
     assert rasterizer.contributing_in_cache(part).any()
     with pytest.raises(InputError, match="did not cover"):
         rasterizer.contributing_in_cache(everything)
-
-
-@pytest.mark.parametrize("megabytes", [None, 0.0, 0.05])
-def test_all_cameras_at_once_are_one_after_the_other(threads: int, megabytes: float | None) -> None:
-    """Also beyond the budget of the caches, where a view's cache is filled for every call."""
-    session = opened(scene(), ODD, megabytes)
-    for first, second in zip(masks(ODD), reversed(masks(ODD, 1)), strict=True):
-        asked = torch.stack([first, second])
-        expected = session.visible(0, first) | session.visible(1, second)
-        assert torch.equal(session.visible_anywhere(asked), expected)
-        assert torch.equal(opened(scene(), ODD, megabytes).visible_anywhere(asked), expected)
 
 
 def test_tiles_of_another_shape_are_refused_for_all_cameras() -> None:

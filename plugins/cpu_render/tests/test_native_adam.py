@@ -77,16 +77,6 @@ def test_irregularly_touched_rows(kind: str, d: int) -> None:
     np.testing.assert_allclose(mine["exp_avg"], reference.m, rtol=1e-5, atol=1e-6)
 
 
-def test_momentum_moves_rows_without_a_gradient() -> None:
-    mine = fresh(np.ones((2, 3), np.float32))
-    adam_rows(grad=np.ones((2, 3), np.float32), lr=0.1, **mine)
-    zero = np.zeros((2, 3), np.float32)
-    before = mine["param"].copy()
-    adam_rows(grad=zero, lr=0.1, **mine)
-    assert (mine["param"] < before).all()  # momentum goes on
-    np.testing.assert_array_equal(mine["step"], [2, 2])
-
-
 @pytest.mark.parametrize("shape", ["column", "row", "square column", "square row"])
 def test_rates_by_column_or_row(shape: str) -> None:
     rng = np.random.default_rng(5)

@@ -150,14 +150,6 @@ def test_disjoint_masks_add_up_to_the_dense_loss() -> None:
     np.testing.assert_array_equal(full.gradient, dense.gradient)  # type: ignore[arg-type]
 
 
-def test_empty_mask_costs_nothing() -> None:
-    image, target = noise_pair(np.random.default_rng(8), 40, 40)
-    result = photometric_loss(image, target, tile_mask=np.zeros(tile_shape(40, 40), bool))
-    assert (result.value, result.l1, result.dssim) == (0.0, 0.0, 0.0)
-    assert result.gradient is not None
-    assert not result.gradient.any()
-
-
 def test_equal_images_have_exactly_no_loss_and_no_gradient(isa: str) -> None:
     _, image = near_pair(np.random.default_rng(9), 70, 90)
     result = photometric_loss(image, PreparedImage(image))

@@ -22,7 +22,6 @@ from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.rng import Rng
 from gsstream.engine.method.checked import difference_between
 from gsstream.engine.step import frame_step as step_module
-from gsstream.packet import PacketKind
 from gsstream.parts.motion.constant_velocity import Coasting
 from gsstream.parts.render.reference import ReferenceRenderer
 from gsstream.parts.render.work import FitContext
@@ -118,16 +117,6 @@ def test_training_and_transmission_apply_the_same_map(tmp_path: Path, monkeypatc
             np.testing.assert_allclose(trained, decoded, atol=2e-3 * step + 1e-6, rtol=0, err_msg=name)
 
 
-def test_a_static_scene_costs_almost_nothing(tmp_path: Path) -> None:
-    """Without noise every frame after the first is the same image: nothing to explain, nothing to send."""
-    encode(tmp_path, source=f"{WORLD}&static=1", method="s2gs-edge")
-    with Playback(tmp_path / "stream.gss") as playback:
-        entries = [playback.entry(frame) for frame in playback.frames]
-    assert [entry.kind for entry in entries[1:]] == [PacketKind.EMPTY] * 5
-    assert all(entry.size <= 32 for entry in entries[1:])
-    assert all(line["changed_gaussians"] == 0 for line in metrics(tmp_path)[1:])
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_one_camera_one_frame_no_colour_bands_no_test_camera(tmp_path: Path, method: str) -> None:
     folder = demo_copy(tmp_path / "r", train=1, frames=1, edit=without_test_cameras)
@@ -142,12 +131,6 @@ def test_one_camera_one_frame_no_colour_bands_no_test_camera(tmp_path: Path, met
         assert len(playback.cameras("test")) == 0
         assert render(scene, playback.cameras("train"), 0).max() > 0.1
     assert (out / "contact_sheet.png").exists()
-
-
-def test_one_camera_several_frames(tmp_path: Path) -> None:
-    folder = demo_copy(tmp_path / "r", train=1, frames=3, edit=without_test_cameras)
-    encode(tmp_path / "o", source=str(folder), method="s2gs-edge", scale=0.4, first_frame__sh_degree=0)
-    assert [line["frame"] for line in metrics(tmp_path / "o")] == [0, 1, 2]
 
 
 def test_decoding_and_rendering_need_no_torch(tmp_path: Path) -> None:

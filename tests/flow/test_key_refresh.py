@@ -1,16 +1,14 @@
-"""Key packets in the middle of a stream: by period; late join, seek and kills."""
+"""Key packets in the middle of a stream: by period; late join and seek."""
 
 from __future__ import annotations
 
 import json
-import random
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from flow_runs import WORLD, Witness, arguments, encode, finish, metrics, start
+from flow_runs import WORLD, Witness, encode, metrics
 
 from gsstream.cli.main import run_command
 from gsstream.engine.method import parts as method
@@ -100,24 +98,6 @@ def test_a_key_packet_after_still_frames_says_which_picture_it_shows(tmp_path):
     assert kinds(tmp_path / "stream.gss") == "KEKEKE"
     with Playback(tmp_path / "stream.gss") as playback:
         assert playback.player_state(4).meta.extra["shown"] == 0
-
-
-def test_killed_at_any_moment_a_run_with_key_packets_resumes(tmp_path):
-    once = encode(tmp_path / "whole", method="s2gs-edge", **PERIOD)
-    out = tmp_path / "o"
-    process = start(*arguments(out, method="s2gs-edge", **PERIOD))
-    deadline = time.monotonic() + 600
-    while not (out / "stream.gss").exists():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    delay = random.uniform(0, 2.5)
-    time.sleep(delay)
-    process.kill()
-    process.communicate()
-    code, _, err = finish(*arguments(out, "--resume", method="s2gs-edge", **PERIOD))
-    assert (code, err) == (0, "")
-    assert (out / "stream.gss").read_bytes() == once, f"killed after {delay} s"
 
 
 def test_info_and_play_know_later_key_packets(tmp_path, capsys):

@@ -59,19 +59,6 @@ def test_a_torn_last_packet_before_reserved_zeros_is_cut_off(tmp_path) -> None:
             assert path.read_bytes() == data, (cut, zeros)
 
 
-def test_damage_before_the_last_packet_is_never_cut_off(tmp_path) -> None:
-    data = write_stream(tmp_path / "whole.gss", make_packets(), index=False)
-    with StreamReader(tmp_path / "whole.gss") as reader:
-        third = reader.frames[2].offset
-    hurt = bytearray(data) + bytes(1000)
-    hurt[third + 5] ^= 1
-    path = tmp_path / "hurt.gss"
-    path.write_bytes(hurt)
-    with pytest.raises(PacketError, match=f"at byte {third}"):
-        StreamWriter.open(path, resume=True)
-    assert path.read_bytes() == hurt
-
-
 def test_a_world_comes_back_bit_by_bit_and_the_identity_is_not_written() -> None:
     assert "world" not in json.loads(meta_to_json(make_meta()))
     world = World((0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0), (5e5 + 1 / 3, 5.2e6, 300.0), 1 / 7)

@@ -19,7 +19,6 @@ from gsstream.packet import (
     decode_key,
     decode_packet,
     encode_delta,
-    encode_empty,
     encode_key,
     positions,
     quantise_decoders,
@@ -208,12 +207,6 @@ def test_sizes_account_for_every_byte():
         assert {n: len(s.data) for n, s in sections.items()} == {n: v for n, v in packet.sizes.items() if n != "header"}
         assert packet.sizes["header"] == 16 + 5 * len(sections)
         assert set(packet.sizes) <= {*SECTION_NAMES.values(), "header"}
-
-
-def test_an_empty_packet_is_16_bytes_and_changes_nothing():
-    states = decode_all(make_packets())
-    assert len(encode_empty(frame=2).data) == 16
-    assert states[2].gaussians is states[1].gaussians
 
 
 def test_decoders_are_sent_only_when_they_change():

@@ -8,7 +8,6 @@ import zlib
 
 import pytest
 from make_samples import SAMPLES, digest
-from packet_scenes import make_packets, write_stream
 
 from gsstream.core.changes import Scene
 from gsstream.core.errors import OutputError, PacketError
@@ -115,8 +114,3 @@ def test_an_older_minor_version_is_not_continued(tmp_path, monkeypatch):
     with pytest.raises(OutputError, match=rf"packet format {FORMAT_VERSION}"):
         StreamWriter.open(path, resume=True)
     assert path.read_bytes() == data
-
-
-def test_writing_is_deterministic(tmp_path):
-    packets = make_packets(seed=1)
-    assert write_stream(tmp_path / "a.gss", packets) == write_stream(tmp_path / "b.gss", make_packets(seed=1))

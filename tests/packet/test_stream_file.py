@@ -203,8 +203,9 @@ def test_resume_never_cuts_good_packets_behind_damage(tmp_path):
     data = bytearray(write_stream(path, packets))
     with StreamReader(path) as reader:
         second = reader.entries[1]
-    for at in (second.offset + 9, second.offset + 60):  # its length; its body
-        hurt = bytes(data[:at]) + bytes([data[at] ^ 1]) + bytes(data[at + 1 :])
+    for at, behind in ((9, b""), (60, b""), (5, bytes(1000))):  # its length; its body; with unwritten space behind all
+        hurt = bytearray(data + behind)
+        hurt[second.offset + at] ^= 1
         path.write_bytes(hurt)
         with pytest.raises(PacketError) as caught:
             StreamWriter.open(path, resume=True)

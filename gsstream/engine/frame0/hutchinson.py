@@ -69,7 +69,8 @@ def hutchinson_samples(
         seen = image.detach() if exposure is None else exposure[view].apply(image.detach())
         error = views.error(view, seen)
         for number in range(each):
-            signs = torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1
+            # As bytes, an eighth of what they are drawn as, for they may have to cross to a GPU.
+            signs = torch.randint(0, 2, image.shape, generator=generator).to(torch.int8).to(image) * 2 - 1
             upstream = signs if exposure is None else exposure[view].vjp(signs)
             backward([image], [upstream], retain_graph=number < each - 1)
             yield HutchinsonSample(leaves.map(_pop_grad), error)

@@ -78,7 +78,7 @@ def test_an_iteration_of_frame_0_crosses_nothing(frames: list[Frame], monkeypatc
     found = [crossed[:3] for crossed in between(marks)][3 * views - 1 :]
     assert len(found) == 3 * views
     for place, crossed in enumerate(found):
-        # Before the first of a pass, losses and checks of the last one are read; the first brings the dropout of its pass.
+        # Before the first of a pass, losses and checks of the last one are read; the first brings its own dropout.
         limit = (1, 1, 1) if place % views < 2 else RESIDENT
         assert all(map(int.__le__, crossed, limit)), (place, found, log.up, log.down, log.waits)
     assert found.count(RESIDENT) >= views

@@ -100,7 +100,7 @@ class OneCount(Adam):
 
     def step(self, values: Any, gradients: Any, states: Any, lrs: Any) -> None:
         for name in gradients:
-            states[name].steps[:] = states[name].steps.max()
+            states[name].steps[:] = states[name].steps.max() if len(states[name].steps) else 0
         super().step(values, gradients, states, lrs)
 
 
